@@ -12,7 +12,6 @@ import re
 import warnings
 from array import array
 from collections.abc import Iterator
-from itertools import islice
 from tempfile import TemporaryFile
 from typing import IO
 
@@ -97,12 +96,6 @@ def parse_obj(data: bytes) -> Raw:
 
 def parse_off(data: bytes) -> Raw:
     """Return the vertices (n, 3) and triangles (m, 3) of an OFF file in text."""
-    filled, last = 0, ""
-    for last in _text_lines(data):
-        filled += bool(last.partition("#")[0].strip())
-    # Without a line end, the last number may have lost digits.
-    if last[-1:] != "\n" and (words := last.partition("#")[0].split()) and not _complete_face(words):
-        raise MeshError("the OFF file breaks off in its last line")
     lines = (words for line in _text_lines(data) if (words := line.partition("#")[0].split()))
     first = next(lines, [""])
     kind = re.fullmatch(r"(C?N?)OFF", first[0])
@@ -112,19 +105,20 @@ def parse_off(data: bytes) -> Raw:
     if len(counts) not in (2, 3) or not all(map(_is_count, counts)):
         raise MeshError("the OFF header does not announce vertices and faces")
     vertex_count, face_count = int(counts[0]), int(counts[1])
-    found = filled - (1 if first[1:] else 2)
+    vertices, corners, sizes = array("d"), array("q"), array("q")
+    found = 0
+    for found, words in enumerate(lines, 1):
+        if found <= vertex_count:
+            vertices.extend(_off_vertex(words, found, 3 + _OFF_EXTRAS[kind[1]]))
+        else:
+            polygon = _off_polygon(words, found - vertex_count)
+            corners.extend(polygon)
+            sizes.append(len(polygon))
     if vertex_count + face_count != found:
         raise MeshError(
             f"the OFF header announces {vertex_count + face_count} lines, {vertex_count} for vertices and "
             f"{face_count} for faces, found {found}"
         )
-    vertices, corners, sizes = array("d"), array("q"), array("q")
-    for number, words in enumerate(islice(lines, vertex_count), 1):
-        vertices.extend(_off_vertex(words, number, 3 + _OFF_EXTRAS[kind[1]]))
-    for number, words in enumerate(lines, 1):
-        polygon = _off_polygon(words, number)
-        corners.extend(polygon)
-        sizes.append(len(polygon))
     return np.array(vertices).reshape(-1, 3), triangle_fans(np.array(corners), np.array(sizes))
 
 
@@ -261,10 +255,6 @@ def _off_polygon(words: list[str], number: int) -> list[int]:
     if size < 0 or len(words) - 1 - size not in _OFF_FACE_EXTRAS:
         raise MeshError(f"face {number} announces {size} corners, but {len(words) - 1} numbers follow")
     return [_integer(word, f"face {number}") for word in words[1 : 1 + size]]
-
-
-def _complete_face(words: list[str]) -> bool:
-    return _is_count(words[0]) and len(words) - 1 - int(words[0]) in _OFF_FACE_EXTRAS
 
 
 def _stl_text_corners(data: bytes) -> NDArray[np.float64]:

@@ -11,6 +11,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 from uuid import uuid4
@@ -69,14 +70,14 @@ class Format:
 
     Attributes:
         suffixes: Suffixes of its files, in lower case.
-        parse: Function of the contents of a file and its path, which returns vertices and triangles.
+        parse: Function of the contents of a file, which returns vertices and triangles.
         file_bytes: Bytes of each triangle, in a file of nothing but positions and triangles.
         memory_bytes: Bytes of each triangle, at the measured peak of reading it.
         write: Function of a mesh, which returns the contents of a file; None for a format that is only read.
     """
 
     suffixes: tuple[str, ...]
-    parse: Callable[[bytes, Path], Raw]
+    parse: Callable[[bytes], Raw]
     file_bytes: int
     memory_bytes: int
     write: Callable[[Mesh], bytes] | None = None
@@ -85,15 +86,15 @@ class Format:
 # FreeSurfer's files have names of their own.
 _FREESURFER = "freesurfer"
 _FORMATS = (
-    Format((".ply",), lambda data, _: parse_ply(data), 19, 90, write_ply),
-    Format((".obj",), lambda data, _: parse_obj(data), 35, 240, write_obj),
-    Format((".stl",), lambda data, _: parse_stl(data), 50, 270, write_stl),
-    Format((".off",), lambda data, _: parse_off(data), 35, 240, write_off),
-    Format((".gltf", ".glb"), lambda data, _: parse_gltf(data), 18, 190),
-    Format((".gii",), lambda data, _: parse_gifti(data), 10, 90),
-    Format((".vtk",), parse_vtk, 22, 290),
-    Format((".vtp", ".vtu"), parse_vtk, 10, 215),
-    Format((_FREESURFER,), lambda data, _: parse_freesurfer(data), 18, 80),
+    Format((".ply",), parse_ply, 19, 90, write_ply),
+    Format((".obj",), parse_obj, 35, 240, write_obj),
+    Format((".stl",), parse_stl, 50, 270, write_stl),
+    Format((".off",), parse_off, 35, 240, write_off),
+    Format((".gltf", ".glb"), parse_gltf, 18, 190),
+    Format((".gii",), parse_gifti, 10, 90),
+    Format((".vtk",), partial(parse_vtk, suffix=".vtk"), 22, 290),
+    *(Format((suffix,), partial(parse_vtk, suffix=suffix), 10, 215) for suffix in (".vtp", ".vtu")),
+    Format((_FREESURFER,), parse_freesurfer, 18, 80),
 )
 _BY_SUFFIX = {suffix: form for form in _FORMATS for suffix in form.suffixes}
 # What makes the contents of a file from a mesh, by suffix.
@@ -135,7 +136,7 @@ def read_mesh(path: str | Path) -> Mesh:
     Mesh(3 vertices, 1 triangles)
     """
     path = Path(path)
-    suffix = mesh_format(path).removesuffix(".gz")
+    suffix = mesh_format(path)
     if suffix not in _BY_SUFFIX:
         known = ", ".join(name for name in _BY_SUFFIX if name != _FREESURFER)
         raise MeshError(
@@ -150,7 +151,7 @@ def read_mesh(path: str | Path) -> Mesh:
         # Numbers that overflow become infinite, which the mesh refuses.
         with np.errstate(all="ignore"):
             # Only the parser holds the bytes, so that it can free them early.
-            vertices, triangles = form.parse(data.pop(), path)
+            vertices, triangles = form.parse(data.pop())
             for array in (vertices, triangles):
                 array.setflags(write=False)
             return Mesh(vertices, triangles)
@@ -172,17 +173,16 @@ def expected_size(path: Path) -> tuple[int, float]:
     of this length can hold. Both are zero where the file cannot be read.
     """
     suffix = mesh_format(path)
-    unpacked_suffix = suffix.removesuffix(".gz")
-    form = _BY_SUFFIX.get(unpacked_suffix)
+    form = _BY_SUFFIX.get(suffix)
     if form is None:
         return 0, 0.0
     try:
         with open_regular(path) as file:
             length = checked_length(file)
-            if suffix.endswith(".gz"):
+            if is_gzipped(path):
                 length = min(_PACKING * length, unpacked_limit(length))
-            if unpacked_suffix == ".ply":
-                unpacked = gzip.GzipFile(fileobj=file) if suffix.endswith(".gz") else file
+            if suffix == ".ply":
+                unpacked = gzip.GzipFile(fileobj=file) if is_gzipped(path) else file
                 return _announced_size(unpacked.read(HEADER_BYTES), length)
     except (OSError, EOFError, ValueError, zlib.error, MeshError):
         return 0, 0.0
@@ -202,21 +202,21 @@ def _announced_size(header: bytes, length: int) -> tuple[int, float]:
 
 
 def mesh_format(path: Path) -> str:
-    """Return the suffix in lower case or "freesurfer", with .gz where it has that: it decides on the parser."""
-    name, packing = _unpacked_name(path).lower(), ".gz" if is_gzipped(path) else ""
+    """Return the suffix in lower case and without .gz, or "freesurfer": it decides on the parser."""
+    name = _unpacked_name(path).lower()
     suffix = Path(name).suffix
-    return (_FREESURFER if suffix not in _BY_SUFFIX and is_freesurfer_name(name) else suffix) + packing
+    return _FREESURFER if suffix not in _BY_SUFFIX and is_freesurfer_name(name) else suffix
 
 
 def is_mesh_name(path: Path) -> bool:
     """Return whether a file has the name of a mesh in a format that is read."""
-    return mesh_format(path).removesuffix(".gz") in _BY_SUFFIX
+    return mesh_format(path) in _BY_SUFFIX
 
 
 def mesh_stem(path: Path) -> str:
     """Return the name of a file without its format and compression; FreeSurfer's names are all stem."""
     name = _unpacked_name(path)
-    return name if mesh_format(path).startswith(_FREESURFER) else Path(name).stem
+    return name if mesh_format(path) == _FREESURFER else Path(name).stem
 
 
 def _unpacked_name(path: Path) -> str:

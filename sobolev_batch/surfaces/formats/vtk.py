@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 from collections import deque
-from pathlib import Path
 from tempfile import NamedTemporaryFile
 from threading import Lock
 from typing import Any
@@ -28,14 +27,8 @@ _END = b"</VTKFile>"
 _shared = Lock()
 
 
-def parse_vtk(data: bytes, path: Path) -> Raw:
-    """Return the vertices and triangles of a VTK file.
-
-    Args:
-        data: Contents of the file, legacy or XML.
-        path: Path of the file, whose name shows which.
-    """
-    suffix = Path(path.name.lower().removesuffix(".gz")).suffix
+def parse_vtk(data: bytes, suffix: str) -> Raw:
+    """Return the vertices and triangles of a VTK file, legacy (.vtk) or XML (.vtp, .vtu)."""
     if suffix != ".vtk":
         _check_xml(data)
     try:

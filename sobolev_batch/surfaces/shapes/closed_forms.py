@@ -41,7 +41,7 @@ class Sphere:
         center: Centre.
 
     Raises:
-        InputError: The radius is not positive and finite, or the centre is not three finite numbers.
+        InputError: The radius is not positive, or beyond 1e150, or the centre is not three finite numbers.
 
     >>> import sobolev_batch as sb
     >>> sphere = sb.Sphere(2.0, center=(1.0, 0.0, 0.0))
@@ -53,10 +53,8 @@ class Sphere:
     center: Point = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if not (is_finite_number(self.radius) and self.radius > 0):
-            raise InputError(f"a sphere's radius must be positive and finite, found {self.radius}")
-        if float(self.radius) > LARGEST_LENGTH:
-            raise InputError(f"a sphere's radius must be at most {LARGEST_LENGTH:g}, found {self.radius}")
+        if not (is_finite_number(self.radius) and 0 < self.radius <= LARGEST_LENGTH):
+            raise InputError(f"a sphere's radius must be positive, at most {LARGEST_LENGTH:g}, found {self.radius}")
         object.__setattr__(self, "radius", float(self.radius))
         object.__setattr__(self, "center", checked_point(self.center, "a sphere's center"))
 
@@ -95,8 +93,7 @@ class Ellipsoid(Smooth):
         center: Centre c.
 
     Raises:
-        InputError: The semi-axes are not three positive finite numbers, or the centre is not three
-            finite numbers.
+        InputError: The semi-axes are not three numbers from 1e-150 to 1e150, or the centre is not three finite numbers.
 
     >>> import sobolev_batch as sb
     >>> ellipsoid = sb.Ellipsoid((1.0, 0.8, 0.5))
@@ -108,11 +105,10 @@ class Ellipsoid(Smooth):
     center: Point = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if len(self.axes) != 3 or not all(is_finite_number(axis) and axis > 0 for axis in self.axes):
-            raise InputError(f"an ellipsoid's semi-axes must be three positive finite numbers, found {self.axes}")
-        if not all(1 / LARGEST_LENGTH <= float(axis) <= LARGEST_LENGTH for axis in self.axes):
+        shortest = 1 / LARGEST_LENGTH
+        if len(self.axes) != 3 or not all(is_finite_number(a) and shortest <= a <= LARGEST_LENGTH for a in self.axes):
             raise InputError(
-                f"an ellipsoid's semi-axes must lie between {1 / LARGEST_LENGTH:g} and {LARGEST_LENGTH:g}, "
+                f"an ellipsoid's semi-axes must be three numbers between {shortest:g} and {LARGEST_LENGTH:g}, "
                 f"found {self.axes}"
             )
         object.__setattr__(self, "axes", tuple(map(float, self.axes)))
@@ -197,10 +193,10 @@ class Torus(Smooth):
     center: Point = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if not (is_finite_number(self.R) and is_finite_number(self.r) and 0 < self.r < self.R):
-            raise InputError(f"a torus needs finite radii with 0 < r < R, found R = {self.R} and r = {self.r}")
-        if float(self.R) > LARGEST_LENGTH:
-            raise InputError(f"a torus's radii must be at most {LARGEST_LENGTH:g}, found {self.R}")
+        if not (is_finite_number(self.R) and is_finite_number(self.r) and 0 < self.r < self.R <= LARGEST_LENGTH):
+            raise InputError(
+                f"a torus needs radii with 0 < r < R, R at most {LARGEST_LENGTH:g}, found R = {self.R} and r = {self.r}"
+            )
         object.__setattr__(self, "R", float(self.R))
         object.__setattr__(self, "r", float(self.r))
         object.__setattr__(self, "center", checked_point(self.center, "a torus's center"))

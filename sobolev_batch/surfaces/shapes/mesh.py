@@ -55,7 +55,7 @@ class Mesh:
     triangles: NDArray[np.int64]
 
     def __init__(self, vertices: ArrayLike, triangles: ArrayLike) -> None:
-        checked_vertices = checked_points(vertices, "vertices")
+        checked_vertices = _checked_vertices(vertices)
         checked_triangles = _checked_triangles(triangles, len(checked_vertices))
         object.__setattr__(self, "vertices", checked_vertices)
         object.__setattr__(self, "triangles", checked_triangles)
@@ -280,22 +280,17 @@ def _array(values: ArrayLike, name: str) -> NDArray[Any]:
         raise MeshError(f"{name} must be an array of rows of three, found rows of different lengths") from error
 
 
-def checked_points(values: ArrayLike, name: str) -> NDArray[np.float64]:
-    """Return coordinates as a read-only float64 array (n, 3) that nobody else can change.
-
-    Raises:
-        MeshError: They are not real and finite, or not (n, 3); the message calls them ``name``.
-    """
-    array = _array(values, name)
+def _checked_vertices(vertices: ArrayLike) -> NDArray[np.float64]:
+    array = _array(vertices, "vertices")
     if array.dtype.kind not in "fiu":
-        raise MeshError(f"{name} must be real numbers, found dtype {array.dtype}")
+        raise MeshError(f"vertices must be real numbers, found dtype {array.dtype}")
     if array.ndim != 2 or array.shape[1] != 3:
-        raise MeshError(f"{name} must have shape (n, 3), found {array.shape}")
+        raise MeshError(f"vertices must have shape (n, 3), found {array.shape}")
     with np.errstate(over="ignore"):
         converted = _owned(array, np.float64)
     bad = np.flatnonzero(~np.isfinite(converted).all(axis=1))
     if bad.size:
-        raise MeshError(f"{bad.size} of {len(array)} {name} have NaN or infinite coordinates: {_listed(bad, array)}")
+        raise MeshError(f"{bad.size} of {len(array)} vertices have NaN or infinite coordinates: {_listed(bad, array)}")
     return _frozen(converted)
 
 

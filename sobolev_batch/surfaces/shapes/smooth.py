@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,14 +150,12 @@ class Smooth(ABC):
         (u, along_u), (v, along_v) = (
             interval.rule(count) for interval, count in zip(self.intervals, counts, strict=True)
         )
-        interpolated = self._interpolated(u, v)
+        whole = self._on_grid(u, v) if self.tangents(u[:1], v[:1]) is None else None
         rows = max(1, most // counts[1])
         for first_row in range(0, counts[0], rows):
             batch = slice(first_row, first_row + rows)
-            if interpolated is None:
-                positions, tangents = self._given(u[batch], v)
-            else:
-                positions, tangents = interpolated[0][:, batch], (interpolated[1][:, batch], interpolated[2][:, batch])
+            parts = self._on_grid(u[batch], v) if whole is None else tuple(values[:, batch] for values in whole)
+            positions, *tangents = parts
             weights = _cross_lengths(*tangents)
             weights *= along_u[batch, None]
             weights *= along_v
@@ -165,22 +163,14 @@ class Smooth(ABC):
             for start in range(0, len(flat_weights), most):
                 yield np.ascontiguousarray(points[:, start : start + most]), flat_weights[start : start + most]
 
-    def _given(self, u: Reals, v: Reals) -> tuple[Reals, tuple[Reals, Reals]]:
-        """Return positions and given derivatives (3, n, m) on a grid."""
-        first, second = np.meshgrid(u, v, indexing="ij")
-        tangents = self.tangents(first, second)
+    def _on_grid(self, u: Reals, v: Reals) -> tuple[Reals, Reals, Reals]:
+        """Return positions and their derivatives (3, n, m) on a grid; those of an interpolant need it whole."""
+        grid = np.meshgrid(u, v, indexing="ij")
+        positions, tangents = self.positions(*grid), self.tangents(*grid)
         if tangents is None:
-            raise TypeError(f"{type(self).__name__} has derivatives at some points and none at others")
-        return self.positions(first, second), tangents
-
-    def _interpolated(self, u: Reals, v: Reals) -> tuple[Reals, Reals, Reals] | None:
-        """Return positions and derivatives (3, n, m) of the interpolant; None where derivatives are given."""
-        if self.tangents(u[:1], v[:1]) is not None:
-            return None
-        first, second = np.meshgrid(u, v, indexing="ij")
-        positions = self.positions(first, second)
-        along_u, along_v = self.intervals
-        return positions, along_u.derivative(positions, 1), along_v.derivative(positions, 2)
+            along_u, along_v = self.intervals
+            tangents = along_u.derivative(positions, 1), along_v.derivative(positions, 2)
+        return positions, *tangents
 
     @cached_property
     def area(self) -> float:
@@ -399,19 +389,12 @@ def _vectors(returned: object, shape: tuple[int, ...]) -> Reals:
             raise ValueError
         vectors = np.stack([np.broadcast_to(coordinate, shape) for coordinate in coordinates]).astype(np.float64)
     except (TypeError, ValueError) as error:
+        parts: Sequence[Any] = returned if isinstance(returned, tuple | list) else [returned]
+        kinds = ", ".join(f"{getattr(part, 'dtype', type(part).__name__)} {np.shape(part)}" for part in parts[:4])
         raise InputError(
             f"position must return three arrays of real numbers in the shape of u and v, {shape}, "
-            f"found {_described(returned)}"
+            f"found {len(parts)}: {kinds}"
         ) from error
     if not np.isfinite(vectors).all():
         raise InputError("position is not finite everywhere on the surface")
     return vectors
-
-
-def _described(returned: object) -> str:
-    if isinstance(returned, np.ndarray):
-        return f"{returned.dtype} {returned.shape}"
-    if isinstance(returned, tuple | list):
-        shapes = ", ".join(str(getattr(entry, "shape", type(entry).__name__)) for entry in returned[:4])
-        return f"{len(returned)} of {shapes}"
-    return type(returned).__name__

@@ -297,13 +297,13 @@ def test_other_vertices_that_coincide_stay_apart_and_odd_faces_are_kept(read: Re
     ("name", "form", "stem"),
     [
         ("lh.pial", "freesurfer", "lh.pial"),
-        ("rh.sphere.reg.gz", "freesurfer.gz", "rh.sphere.reg"),
+        ("rh.sphere.reg.gz", "freesurfer", "rh.sphere.reg"),
         ("sub-01_LH.white", "freesurfer", "sub-01_LH.white"),
         ("inner_skull.surf", "freesurfer", "inner_skull.surf"),
         ("lh.pial.surf.gii", ".gii", "lh.pial.surf"),
         ("lh.aparc.annot", ".annot", "lh.aparc"),
         ("lh.asc", "freesurfer", "lh.asc"),
-        ("scan.VTP.GZ", ".vtp.gz", "scan"),
+        ("scan.VTP.GZ", ".vtp", "scan"),
         ("alh.pial", ".pial", "alh"),
     ],
 )

@@ -125,18 +125,18 @@ NO_POINTS: list[tuple[float, ...]] = [(0.0, 0.0), (0.0,) * 4, (), (math.nan, 0.0
     ("kind", "arguments", "message"),
     [
         *(
-            (Ellipsoid, (axes,), "three positive finite numbers")
+            (Ellipsoid, (axes,), "three numbers between 1e-150 and 1e\\+150")
             for axes in ((1.0, 1.0), (1.0, 1.0, 0.0), (1.0, math.nan, 1.0), (1.0, math.inf, 1.0), (1.0, True, 1.0))
         ),
-        (Ellipsoid, ((1.0, 1.0, 1e200),), "between 1e-150 and 1e\\+150"),
+        (Ellipsoid, ((1.0, 1.0, 1e200),), "three numbers between"),
         (Ellipsoid, ((1.0, 1.0, 1.0), (0.0, math.nan, 0.0)), "center must be three finite numbers"),
         *(
             (Torus, radii, "0 < r < R")
             for radii in ((1.0, 1.0), (1.0, 0.0), (1.0, -0.4), (math.inf, 1.0), (1.0, math.nan), (True, 0.5))
         ),
-        (Torus, (1e200, 1.0), "at most 1e\\+150"),
+        (Torus, (1e200, 1.0), "0 < r < R, R at most 1e\\+150"),
         (Torus, (1.0, 0.4, (0.0, 0.0)), "center must be three finite numbers"),
-        *((Sphere, (x,), "radius must be positive and finite") for x in NOT_POSITIVE),
+        *((Sphere, (x,), "radius must be positive, at most 1e\\+150") for x in NOT_POSITIVE),
         *((Similarity, (x,), "scale must be positive and finite") for x in NOT_POSITIVE),
         *((Sphere, (1.0, point), "center must be three finite numbers") for point in NO_POINTS),
         *((Similarity, (1.0, point), "origin must be three finite numbers") for point in NO_POINTS),

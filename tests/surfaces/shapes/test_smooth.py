@@ -84,12 +84,12 @@ def test_a_period_that_does_not_close_is_refused() -> None:
 @pytest.mark.parametrize(
     ("position", "found"),
     [
-        (lambda u, v: (u, v), "2 of "),
-        (lambda u, v: None, "NoneType"),
-        (lambda u, v: (u, v, 1j * u), "3 of "),
-        (lambda u, v: (u, v, np.zeros(5)), r"3 of .*\(5,\)"),
-        (lambda u, v: u, r"float64 \("),
-        (lambda u, v: (u, v, "height"), "3 of "),
+        (lambda u, v: (u, v), "2: float64"),
+        (lambda u, v: None, "1: NoneType"),
+        (lambda u, v: (u, v, 1j * u), "3: .* complex128"),
+        (lambda u, v: (u, v, np.zeros(5)), r"3: .*\(5,\)"),
+        (lambda u, v: u, r"1: float64 \("),
+        (lambda u, v: (u, v, "height"), "3: .* str"),
     ],
 )
 def test_positions_must_be_three_arrays(position: Any, found: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from collections.abc import Sequence
@@ -175,10 +174,9 @@ def test_the_fingerprint_of_a_file_is_that_of_its_bytes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["other.off", "deep/box.off", "OTHER.OFF", "box.v2.off", "2026.01.31.off"])
 def test_the_fingerprint_of_a_file_is_not_that_of_its_name_but_of_its_format(tmp_path: Path, name: str) -> None:
-    put(tmp_path, "box.off", "box.ply", "box.off.gz", name)
-    found = [json.dumps(fingerprint(tmp_path, one)) for one in ("box.off", "box.ply", "box.off.gz", name)]
-    assert found[3] == found[0]
-    assert len(set(found)) == 3
+    put(tmp_path, "box.off", "box.ply", name)
+    whole, other, same = (fingerprint(tmp_path, one) for one in ("box.off", "box.ply", name))
+    assert whole == same != other
 
 
 @pytest.fixture

@@ -264,7 +264,7 @@ def test_every_parameter_is_part_of_the_fingerprint(table: dict[str, Any]) -> No
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        ({"source": "torus", "R": 1.0, "r": 1.5}, r"0 < r < R, found R = 1\.0 and r = 1\.5"),
+        ({"source": "torus", "R": 1.0, "r": 1.5}, r"0 < r < R, .* found R = 1\.0 and r = 1\.5"),
         ({"source": "ellipsoid", "axes": [1.0, 1.0, 1e-200]}, "between 1e-150 and"),
         ({**RING, "levels": [12]}, "level 12 of 12 x 6 cells has 2415919104 triangles, at most 1000000000"),
     ],
