@@ -53,7 +53,7 @@ class Sphere:
     center: Point = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if not (is_finite_number(self.radius) and 0 < self.radius <= LARGEST_LENGTH):
+        if not (is_finite_number(self.radius) and 0 < float(self.radius) <= LARGEST_LENGTH):
             raise InputError(f"a sphere's radius must be positive, at most {LARGEST_LENGTH:g}, found {self.radius}")
         object.__setattr__(self, "radius", float(self.radius))
         object.__setattr__(self, "center", checked_point(self.center, "a sphere's center"))
@@ -106,7 +106,9 @@ class Ellipsoid(Smooth):
 
     def __post_init__(self) -> None:
         shortest = 1 / LARGEST_LENGTH
-        if len(self.axes) != 3 or not all(is_finite_number(a) and shortest <= a <= LARGEST_LENGTH for a in self.axes):
+        if len(self.axes) != 3 or not all(
+            is_finite_number(a) and shortest <= float(a) <= LARGEST_LENGTH for a in self.axes
+        ):
             raise InputError(
                 f"an ellipsoid's semi-axes must be three numbers between {shortest:g} and {LARGEST_LENGTH:g}, "
                 f"found {self.axes}"
@@ -193,7 +195,7 @@ class Torus(Smooth):
     center: Point = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if not (is_finite_number(self.R) and is_finite_number(self.r) and 0 < self.r < self.R <= LARGEST_LENGTH):
+        if not (is_finite_number(self.R) and is_finite_number(self.r) and 0 < self.r < float(self.R) <= LARGEST_LENGTH):
             raise InputError(
                 f"a torus needs radii with 0 < r < R, R at most {LARGEST_LENGTH:g}, found R = {self.R} and r = {self.r}"
             )
