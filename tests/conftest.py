@@ -40,7 +40,6 @@ _seconds: dict[str, float] = defaultdict(float)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the option of `make durations`."""
     parser.addoption("--record-durations", action="store_true", help="write the seconds of each file to durations.tsv")
 
 
@@ -68,7 +67,6 @@ def _only_if_marked(start: Callable[..., None]) -> Callable[..., None]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
-    """Know which test runs."""
     _running.append(item)
     try:
         return (yield)
@@ -95,12 +93,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
-    """Add up what each file takes."""
     _seconds[report.location[0]] += report.duration
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    """Print the slowest files, or record all."""
     if config.getoption("record_durations"):
         durations.record(_seconds)
     terminalreporter.section("slowest files")
@@ -159,8 +155,6 @@ def spheres(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
 
 @pytest.fixture
 def read(tmp_path: Path) -> Read:
-    """Write a file whose name has this ending, and read it."""
-
     def write_and_read(ending: str, content: bytes) -> Mesh:
         path = tmp_path / f"mesh{ending}"
         path.write_bytes(content)

@@ -5,8 +5,6 @@ A count is the same on each machine, where seconds are not. A change that raises
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -107,15 +105,6 @@ WORK: dict[str, tuple[Callable[[], object], int, int, int, str]] = {
         "its fields are stored, with their probes",
     ),
 }
-# What is used first, with the largest number of the package's own modules that it may load, and why.
-MODULES = {
-    "import sobolev_batch": (1, "names are loaded when they are used"),
-    "import sobolev_batch as sb; sb.distance": (75, "surfaces and spectral, and no study, store or table"),
-    "import sobolev_batch as sb; sb.same_surface": (82, "a distance; the files of a failed assertion come later"),
-    "import sobolev_batch as sb; sb.run": (126, "a study, its store and its cluster"),
-    "import sobolev_batch.cli": (22, "help texts appear before anything computes"),
-    "import sobolev_batch.testing.pytest_plugin": (3, "every session of pytest loads it"),
-}
 
 
 def work_of(call: Callable[[], object]) -> dict[str, int]:
@@ -161,12 +150,3 @@ def test_a_count_sees_each_transform() -> None:
     one, two = (work_of(norms(times)) for times in (1, 2))
     assert min(one.values()) > 0
     assert two == {name: 2 * count for name, count in one.items()}
-
-
-@pytest.mark.process
-@pytest.mark.parametrize("code", MODULES)
-def test_a_first_use_loads_no_more_modules_than_its_row(code: str) -> None:
-    most, reason = MODULES[code]
-    command = f"{code}; import sys; print(*(name for name in sys.modules if name.split('.')[0] == 'sobolev_batch'))"
-    loaded = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True, check=True).stdout.split()
-    assert 0 < len(loaded) <= most, (reason, sorted(loaded))

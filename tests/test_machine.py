@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import click
 import numpy as np
 import psutil
 import pytest
@@ -15,7 +14,6 @@ import pytest
 import sobolev_batch as sb
 from sobolev_batch.batch.cluster.clients import memory_limit
 from sobolev_batch.batch.cluster.workers import Workers, allowed_bytes
-from sobolev_batch.cli import cli
 from sobolev_batch.parameters import available_cores, machine_memory, require_machine_memory
 from sobolev_batch.spectral.transform.settings import thread_count
 from tests.support.studies import small_table
@@ -47,7 +45,6 @@ MEMORY: dict[str, tuple[str | None, dict[str, str], int | None]] = {
 
 
 def make_root(root: Path, groups: str | None, files: dict[str, str]) -> Path:
-    """A file system with control groups."""
     paths = {f"sys/fs/cgroup/{name}": text for name, text in files.items()}
     if groups is not None:
         paths["proc/self/cgroup"] = groups
@@ -122,19 +119,6 @@ def test_every_function_with_a_memory_is_asked() -> None:
     }
     functions = {name: value for name, value in (public | methods).items() if inspect.isfunction(value)}
     assert {name for name, one in functions.items() if "memory" in inspect.signature(one).parameters} == set(ASKING)
-
-
-def test_every_command_with_a_memory_is_known() -> None:
-    """What `compare`, with and without a bound, and `run` do with it, the tests of commands try."""
-    options = {
-        name: [option for parameter in command.params for option in parameter.opts if "memory" in option]
-        for name, command in cli.commands.items()
-        if isinstance(command, click.Command)
-    }
-    assert {name: found for name, found in options.items() if found} == {
-        "compare": ["--memory"],
-        "run": ["--memory"],
-    }
 
 
 def test_workers_together_have_no_more_than_the_machine() -> None:

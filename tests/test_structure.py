@@ -39,7 +39,6 @@ def modules() -> dict[str, Path]:
 
 
 def imports_of(parts: Path, known: dict[str, Path]) -> Iterator[Path]:
-    """The modules that a module imports, inside of functions too."""
     for node in ast.walk(ast.parse((PACKAGE.joinpath(*parts)).with_suffix(".py").read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom):
             for alias in node.names:

@@ -32,7 +32,6 @@ def bumps(mesh: sb.Mesh, height: float, frequency: float = 5.0) -> sb.Mesh:
 
 
 def decimated(mesh: sb.Mesh, triangles: int, aggression: float = 7.0) -> sb.Mesh:
-    """Return a mesh with fewer triangles, by quadric errors."""
     vertices, faces = np.array(mesh.vertices), np.array(mesh.triangles, dtype=np.int32)
     return sb.Mesh(*fast_simplification.simplify(vertices, faces, target_count=triangles, agg=aggression))
 
@@ -97,7 +96,6 @@ def scans(folder: Path) -> None:
 
 
 def statue(folder: Path) -> None:
-    """A mesh and a simpler one."""
     whole = bumps(sb.icosphere(4), 0.15)
     write(whole, folder / "statue.ply")
     write(decimated(whole, 500), folder / "simple.ply")

@@ -43,7 +43,6 @@ def certificates(home: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def others(home: Path) -> Path:
-    """Return certificates of somebody else."""
     assert finished(CERTIFICATES, home / "others", "2").returncode == 0
     return home / "others"
 

@@ -44,7 +44,6 @@ def documents() -> list[dict[str, Any]]:
 
 
 def pods() -> Mapping[str, dict[str, Any]]:
-    """Return the pod of each kind of container."""
     cluster, gpu = (document["spec"] for document in documents()[:2])
     return {
         "worker": cluster["worker"]["spec"],

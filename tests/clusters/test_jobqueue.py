@@ -1,4 +1,4 @@
-"""SLURM and PBS: scripts of jobs, and studies on jobs that are processes of this machine."""
+"""SLURM and PBS: scripts of jobs and of one allocation, and studies on jobs that are processes of this machine."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import psutil
 import pytest
 import yaml
 
@@ -27,7 +28,6 @@ SCANCEL = 'kill -- "-$1"'
 def jobqueue(
     home: Path, *options: str, settings: Path = SETTINGS, **variables: str
 ) -> subprocess.CompletedProcess[str]:
-    """Run the documented command with further options."""
     command = documented("python workflows/clusters/jobqueue.py")[-1][1:3]
     script, study = FOLDER / Path(command[0]).name, command[1]
     return run_recipe(home, sys.executable, script, study, *options, DASK_CONFIG=str(settings), **variables)
@@ -121,7 +121,6 @@ def test_a_job_whose_workers_have_left_is_replaced(slurm: Path) -> None:
     assert not list(slurm.glob(".sobolev-batch*"))
 
 
-@pytest.mark.process
 @pytest.mark.all
 def test_a_job_that_is_refused(slurm: Path) -> None:
     write_study(slurm)
@@ -132,7 +131,6 @@ def test_a_job_that_is_refused(slurm: Path) -> None:
     assert not list(slurm.glob(".sobolev-batch*"))
 
 
-@pytest.mark.process
 @pytest.mark.all
 def test_settings_that_cannot_serve(tmp_path: Path) -> None:
     completed = jobqueue(tmp_path, "--system", "slurm", settings=tmp_path / "nothing.yaml")
@@ -144,3 +142,40 @@ def test_settings_that_cannot_serve(tmp_path: Path) -> None:
     everywhere.write_text(SETTINGS.read_text().replace("    interface: ib0", "    interface: null"))
     completed = jobqueue(tmp_path, "--system", "pbs", "--print-script", settings=everywhere)
     assert "jobqueue.pbs.interface is not set, and the scheduler would listen on all networks" in completed.stderr
+
+
+# Options first, then the command, once per task.
+SRUN = """
+while [[ $1 == -* ]]; do shift; done
+trap 'kill $(jobs -p)' TERM
+for _ in $(seq "$SLURM_NTASKS"); do "$@" 2>> "$HOME/workers.log" & done
+wait
+wait
+"""
+
+
+@pytest.mark.all
+def test_a_study_in_one_allocation(tmp_path: Path) -> None:
+    add_command(tmp_path, "srun", SRUN)
+    write_study(tmp_path)
+    script, study = documented("sbatch workflows")[0][1:]
+    loopback = next(name for name, found in psutil.net_if_addrs().items() if found[0].address == "127.0.0.1")
+    variables = {"INTERFACE": loopback, "RECIPES": str(FOLDER), "SLURM_SUBMIT_DIR": str(tmp_path)}
+    variables |= {"SLURM_NTASKS": "1", "SLURM_MEM_PER_CPU": "2048"}
+    recipe = FOLDER / Path(script).name
+    completed = run_recipe(tmp_path, "bash", recipe, study, "--store", "results.zarr", **variables)
+    assert completed.returncode == 0, completed.stderr
+    assert re.search(TABLE, completed.stdout)
+    log = (tmp_path / "workers.log").read_text()
+    assert len(re.findall(r"Start worker at: +tls://127\.0\.0\.1", log)) == 1
+    assert log.count("Memory:                   2.00 GiB") == 1
+    assert len(re.findall("End worker", log)) == 1
+    assert not list(tmp_path.glob(".sobolev-batch.*"))
+
+
+def test_its_directives_come_before_its_commands() -> None:
+    lines = (FOLDER / "slurm.sbatch").read_text().splitlines()
+    commands = [i for i, line in enumerate(lines) if line and not line.startswith("#")]
+    directives = [i for i, line in enumerate(lines) if line.startswith("#SBATCH ")]
+    assert max(directives) < min(commands)
+    assert len(directives) == 10

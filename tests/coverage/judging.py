@@ -56,7 +56,6 @@ def judge(cases: Sequence[Case]) -> list[dict[str, Any]]:
 
 
 def _measured(case: Case, settings: Mapping[str, Any]) -> dict[str, float]:
-    """Return the distance of a case with its error, as the package reports them."""
     found: xr.Dataset
     if "rtol" in settings:
         found = distance(*case.pair.surfaces, case.order, memory=_MEMORY, **settings)

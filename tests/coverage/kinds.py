@@ -74,7 +74,6 @@ def placed(mesh: Mesh, sphere: Sphere, turn: Reals | None = None) -> Mesh:
 
 @lru_cache
 def cortex(triangles: int) -> Mesh:
-    """Return the cortical surface with a number of triangles, within the unit ball."""
     (original,) = FileSource(paths=(_CORTEX,), distribution="nilearn").members(Path())
     loaded = decimated(load_mesh(original), triangles)
     mesh = Similarity.to_unit_ball(loaded).apply(loaded)
@@ -165,13 +164,11 @@ def _one_vertex_moved(rng: np.random.Generator) -> Surfaces:
 
 
 def _distant_spheres(rng: np.random.Generator) -> Surfaces:
-    """Return two small spheres some units apart."""
     radii, middle = rng.uniform(0.02, 0.3, size=2), rng.uniform(0.5, 3) * direction(rng)
     return sphere_at(radii[0], -middle), sphere_at(radii[1], middle)
 
 
 def _distant_tetrahedra(rng: np.random.Generator) -> Surfaces:
-    """Return two small tetrahedra some units apart."""
     triangles, middle = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]], rng.uniform(0.5, 3) * direction(rng)
     a, b = (Mesh(sign * middle + rng.uniform(-0.2, 0.2, size=(4, 3)), triangles) for sign in (-1, 1))
     return a, b

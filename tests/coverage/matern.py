@@ -219,7 +219,6 @@ def _quarters(triangles: Reals) -> Iterator[Reals]:
 
 @lru_cache
 def _gauss(count: int) -> tuple[Reals, Reals]:
-    """Return Gauss nodes and weights on [0, 1]."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     return (nodes + 1) / 2, weights / 2
 

@@ -100,21 +100,6 @@ def test_the_kernel_is_the_matern_function_and_its_integral_that_of_the_kernel(p
     assert np.allclose(radial_integral(r, power), rest, rtol=1e-9, atol=0)
 
 
-@pytest.mark.all
-def test_real_space_agrees_with_the_radial_integral_of_spheres() -> None:
-    # Icospheres come nearer to spheres by a factor of 4 a level; extrapolation leads to them.
-    first, second = Sphere(), Sphere(0.5, (0.2, 0.1, 0.0))
-    levels = []
-    for level in (0, 1, 2):
-        outer = icosphere(level)
-        inner = Mesh(0.5 * outer.vertices + np.array(second.center), outer.triangles)
-        levels.append([truth.value for truth in summed_in_real_space(outer, inner, WHOLE, 16_000)])
-    coarse, middle, fine = np.array(levels)
-    near, nearer = middle + (middle - coarse) / 3, fine + (fine - middle) / 3
-    exact = [truth.value for truth in truths_of_spheres(first, second, WHOLE)]
-    assert np.allclose(nearer + (nearer - near) / 15, exact, rtol=4e-4, atol=0)
-
-
 @pytest.mark.parametrize(
     ("a", "b"),
     [

@@ -69,7 +69,6 @@ class Truth:
 
     @classmethod
     def of_square(cls, square: float, slack: float) -> Truth:
-        """Return the truth from the squared distance and its uncertainty."""
         value = np.sqrt(max(square, 0.0))
         low, high = np.sqrt(max(square - slack, 0.0)), np.sqrt(max(square + slack, 0.0))
         return cls(float(value), float(max(high - value, value - low)))
@@ -95,11 +94,9 @@ class Pair:
 
     @property
     def surfaces(self) -> tuple[Surface, Surface]:
-        """Both surfaces."""
         return self.first, self.second
 
     def swapped(self) -> Pair:
-        """Return the pair in the other order."""
         return replace(self, first=self.second, second=self.first)
 
     def truths(self, orders: Sequence[float]) -> Sequence[Truth | None]:

@@ -41,7 +41,6 @@ class Moment:
 
     @property
     def pids(self) -> list[int]:
-        """The processes that got the signal."""
         path = Path(self.log)
         return list(map(int, path.read_text().split())) if path.exists() else []
 
@@ -59,8 +58,6 @@ class Moment:
             return
 
     def before(self, function: Callable[..., Any], concerns: Callable[..., bool]) -> Callable[..., Any]:
-        """A function before whose calls the worker ends, if they concern the row."""
-
         def wrapped(*arguments: Any, **options: Any) -> Any:
             if concerns(*arguments):
                 self.strike()

@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from distributed import Client
 
-from sobolev_batch import StoreError, Study, open_store, run
+from sobolev_batch import StoreError, Study, open_store, run, verify
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.store.metadata import SCHEMA_VERSION
 from sobolev_batch.batch.study import plan as plan_module
@@ -65,15 +65,23 @@ def test_a_change_of_the_study(
     assert np.isfinite(variable(tree, "convergence", "distance").values).all()
 
 
-def test_tables_in_another_unit_of_length_are_withdrawn_first(folder: Path, store_path: Path, client: Client) -> None:
+@pytest.mark.parametrize("changes", [{"scaling": {"mode": "fixed", "scale": 0.5}}, {"transform": {"eps": 1e-7}}])
+def test_tables_of_fields_that_are_replaced_are_withdrawn_first(
+    changes: dict[str, Any], folder: Path, store_path: Path, client: Client
+) -> None:
     run(study_of(folder), store_path, client)
 
     def interrupt(progress: Progress) -> None:
-        raise KeyboardInterrupt
+        if progress.stage == "fields" and progress.done == 1:
+            raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run(study_of(folder, scaling={"mode": "fixed", "scale": 0.5}), store_path, client, on_progress=interrupt)
-    assert "convergence" not in open_store(store_path).children
+        run(study_of(folder, **changes), store_path, client, on_progress=interrupt)
+    tree = open_store(store_path)
+    assert "convergence" not in tree.children
+    assert tree["fourier"].to_dataset()["quality"].values.tolist() == [""] * 3
+    assert run(study_of(folder, **changes), store_path, client).failed == {}
+    assert verify(store_path).is_sound
 
 
 def test_distances_are_those_to_the_reference_of_the_study(folder: Path, store_path: Path, client: Client) -> None:

@@ -198,12 +198,6 @@ def test_what_is_damaged_again_and_again_ends_the_run(store: Path, threads: Clie
         run(study, store, threads, on_progress=ruin)
 
 
-def test_a_run_with_nothing_to_do_sees_what_is_missing(store: Path, study: Study, threads: Client) -> None:
-    truncate(store / FIELD.format(row=3))
-    delete(store / FIELD.format(row=1))
-    assert run(study, store, threads).computed == ("ico/1", "ico/3")
-
-
 def test_a_damaged_record_counts_as_none(store: Path, mended: Callable[..., None]) -> None:
     for row, damage in enumerate((truncate, empty, flip, delete)):
         damage(store / f"records/record/c/{row}")
@@ -269,23 +263,6 @@ def test_files_larger_than_any_memory_are_named_and_made_again(store: Path, stud
     assert verify(store).is_sound
 
 
-def test_fields_that_are_replaced_are_not_described_any_more(store: Path, threads: Client) -> None:
-    """A driver that is killed after a field and before the tables."""
-
-    def stop(progress: Progress) -> None:
-        if progress.stage == "fields" and progress.done == 1:
-            raise KeyboardInterrupt
-
-    study = Study.from_table(small_table(transform={"eps": 1e-7}))
-    with pytest.raises(KeyboardInterrupt):
-        run(study, store, threads, on_progress=stop)
-    tree = open_store(store)
-    assert "convergence" not in tree.children
-    assert tree["fourier"].to_dataset()["quality"].values.tolist() == [""] * 5
-    assert run(study, store, threads).failed == {}
-    assert verify(store).is_sound
-
-
 def test_an_earlier_field_with_its_record(store: Path, earlier: Path, mended: Callable[..., None]) -> None:
     bring_back = restore(FIELD.format(row=1), RECORD.format(row=1))
     bring_back(store, earlier)
@@ -327,7 +304,6 @@ def test_metadata_of_one_node(name: str, store: Path, mended: Callable[..., None
 
 
 def alter(store: Path, *place: str, value: object) -> None:
-    """Write another value into the metadata at the root."""
     root = node = json.loads((store / "zarr.json").read_text())
     for name in place[:-1]:
         node = node[name]

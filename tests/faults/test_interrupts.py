@@ -80,72 +80,63 @@ sys.meta_path.insert(0, Herald)
 sys.argv[1:] = ["plan", "study.toml"]
 door.main()
 """
-# A command within a function of C, which does not return to Python while a transform goes on.
-COMPUTING = """
+WORKING = """
 import ctypes
-import click
-import sobolev_batch.cli as line
-
-@click.command("table")
-def compute():
-    block = ctypes.CDLL(None).pthread_mutex_lock
-    mutex = ctypes.create_string_buffer(256)
-    block(mutex)
-    click.echo("computes", err=True)
-    block(mutex)  # held already
-
-line.cli.add_command(compute)
-line.sys.argv[1:] = ["table"]
-line.main()
-"""
-
-
-@pytest.mark.all
-@pytest.mark.parametrize(("script", "line"), [(IMPORTING, "here"), (COMPUTING, "computes")])
-@pytest.mark.parametrize("number", WORDS)
-def test_a_command_ends_while_it_starts_and_while_a_library_computes(script: str, line: str, number: int) -> None:
-    word = "interrupted before anything began"
-    with started(script=script) as process:
-        assert read_until(process, line)
-        if script == COMPUTING:
-            wait_until(lambda: psutil.Process(process.pid).status() == psutil.STATUS_SLEEPING)
-            word = WORDS[number]
-        _, rest = interrupted(process, number)
-    assert (process.returncode, rest) == (128 + number, f"{word}\n")
-
-
-# Work that keeps what it has is asked again for each part that takes long, and is not killed.
-KEEPING = """
 import click
 import sobolev_batch.cli as line
 from sobolev_batch.cli.interruption import Deadline
 
-@click.command("keep")
-def keep():
+@click.command("work")
+def work():
+    %s
+
+line.cli.add_command(work)
+line.sys.argv[1:] = ["work"]
+line.main()
+"""
+# A function of C, which does not return to Python while a transform goes on.
+COMPUTING = (
+    WORKING
+    % """
+    block = ctypes.CDLL(None).pthread_mutex_lock
+    mutex = ctypes.create_string_buffer(256)
+    block(mutex)
+    click.echo("here", err=True)
+    block(mutex)  # held already
+"""
+)
+# Work that keeps what it has is asked again for each part that takes long, and is not killed.
+KEEPING = (
+    WORKING
+    % """
     parts = []
     with Deadline.with_results(lambda: True):
         for part in range(3):
             try:
-                click.echo("works", err=True)
+                click.echo("here", err=True)
                 while True:
                     line.signal.pause()
             except KeyboardInterrupt:
                 parts.append(part)
     click.echo(f"written: {parts}")
-
-line.cli.add_command(keep)
-line.sys.argv[1:] = ["keep"]
-line.main()
 """
+)
 
 
 @pytest.mark.all
+@pytest.mark.parametrize("script", [IMPORTING, COMPUTING, KEEPING], ids=["importing", "computing", "keeping"])
 @pytest.mark.parametrize("number", WORDS)
-def test_work_that_keeps_what_it_has_is_asked_again_and_not_killed(number: int) -> None:
-    with started(script=KEEPING) as process:
-        assert read_until(process, "works")
+def test_a_command_ends_while_it_starts_and_computes_and_with_what_it_has(script: str, number: int) -> None:
+    with started(script=script) as process:
+        assert read_until(process, "here")
+        if script == COMPUTING:
+            wait_until(lambda: psutil.Process(process.pid).status() == psutil.STATUS_SLEEPING)
         output, rest = interrupted(process, number)
-    assert (process.returncode, output) == (0, "written: [0, 1, 2]\n"), rest
+    if script == KEEPING:
+        assert (process.returncode, output) == (0, "written: [0, 1, 2]\n"), rest
+    else:
+        word = "interrupted before anything began" if script == IMPORTING else WORDS[number]
+        assert (process.returncode, rest) == (128 + number, f"{word}\n")
 
 
 @pytest.mark.all

@@ -45,7 +45,6 @@ class Guard(NamedTuple):
 
 
 def guards_of(source: str, path: str) -> Iterator[Guard]:
-    """Yield the guards of a module in the order of its syntax tree."""
     tree = ast.parse(source)
     for node in ast.walk(tree):
         field = ""
@@ -97,7 +96,6 @@ def _first_failure(copy: Path, tests: str) -> str:
 
 
 def _copy(folder: Path) -> Path:
-    """Copy the files of the repository, as they are on the disk."""
     listed = subprocess.check_output(["git", "ls-files", "-z", "-co", "--exclude-standard"], cwd=ROOT, text=True)
     for name in filter(None, listed.split("\0")):
         if (ROOT / name).is_file():

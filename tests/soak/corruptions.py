@@ -118,7 +118,6 @@ def damages(
 
 
 def _answer(read: Callable[[Path], dict[str, str]], store: Path, truth: dict[str, str]) -> str:
-    """Return what a way to read a store did."""
     try:
         return answer_to(read(store), truth)
     except _ToldError:
@@ -128,7 +127,6 @@ def _answer(read: Callable[[Path], dict[str, str]], store: Path, truth: dict[str
 
 
 def answer_to(found: Mapping[str, str], truth: Mapping[str, str]) -> str:
-    """Return what texts say beside those of a whole store."""
     if found.get(_REMARKS) != truth.get(_REMARKS):
         return "told"
     told = {key for key, text in found.items() if text.startswith(_TOLD) or _IS_TOLD.search(text)}

@@ -34,8 +34,6 @@ ROLES = ("worker", "nanny", "scheduler", "driver")
 EXCHANGED = ("chunks", "exchanged")
 _WORKERS = 2
 _POLL_SECONDS = 0.1
-# A stopped driver keeps its lock, so somebody has to continue it, or to kill it.
-_STOPPED_DRIVER_SECONDS = 3.0
 _LONGEST_SECONDS = 3600.0
 
 
@@ -68,7 +66,6 @@ class Outcome:
 
 
 def strikes_of(seed: int, count: int, meshes: int) -> tuple[Strike, ...]:
-    """Return some strikes at random, in the order of their moments."""
     chance = random.Random(seed)
     kinds = [(role, what) for role in ROLES for what in SIGNALS] + [EXCHANGED]
     moments = sorted(chance.choices(range(meshes + 1), k=count))
@@ -91,7 +88,8 @@ def strike_all(
             if rate:
                 server = stack.enter_context(serving(seed))
                 stack.enter_context(taken_for_s3(server.environment()))
-                store, server.rule = Location.parse(f"s3://{BUCKET}/struck.zarr"), Rule(rate)
+                store = Location.parse(f"s3://{BUCKET}/struck.zarr")
+                server.obey(Rule(rate))
             yield _strike(_Run(study, store, own), clean, seed, strikes, server)
 
 
@@ -109,7 +107,8 @@ def _strike(struck: _Run, clean: Location, seed: int, strikes: tuple[Strike, ...
         struck.end()
     seconds, failures = time.monotonic() - started, Counter[str]()
     if server is not None:
-        server.rule, failures = HEALTHY, Counter(map(str, server.failures().elements()))
+        server.obey(HEALTHY)
+        failures = Counter(map(str, server.failures().elements()))
     came = strikes[: len(strikes) - len(due)]
     return Outcome(
         came, seconds, struck.commands, failures, tuple(differences(open_store(struck.store), open_store(clean)))
@@ -128,7 +127,6 @@ class _Run:
     def __init__(self, study: Path, store: Location, folder: Path) -> None:
         self.store, self.is_done, self.commands = store, False, 0
         self._study, self._folder, self._starts = study, folder, 0
-        self._stopped_since: float | None = None
         self._port = str(free_port())
         self._scheduler = self._start_scheduler()
         self._nannies = [self._start_nanny() for _ in range(_WORKERS)]
@@ -161,7 +159,9 @@ class _Run:
         self._nannies = [nanny if nanny.poll() is None else self._start_nanny() for nanny in self._nannies]
         status = self._driver.poll()
         if status is None:
-            self._continue_if_stopped()
+            # It keeps its lock, so somebody has to continue it, or to kill it.
+            if self._driver.status() == psutil.STATUS_STOPPED:
+                self._driver.send_signal(signal.SIGCONT)
         elif status == 0 and self._is_verified():
             self.is_done = True
         else:
@@ -172,17 +172,8 @@ class _Run:
             self._driver = self._start_driver()
 
     def end(self) -> None:
-        """Kill all processes."""
         for process in (self._driver, self._scheduler, *self._nannies):
             _kill(process)
-
-    def _continue_if_stopped(self) -> None:
-        if self._driver.status() != psutil.STATUS_STOPPED:
-            self._stopped_since = None
-        elif self._stopped_since is None:
-            self._stopped_since = time.monotonic()
-        elif time.monotonic() - self._stopped_since > _STOPPED_DRIVER_SECONDS:
-            self._driver.send_signal(signal.SIGCONT)
 
     def _is_verified(self) -> bool:
         return subprocess.run([*COMMAND, "verify", str(self.store)], capture_output=True).returncode == 0
@@ -210,7 +201,6 @@ class _Run:
 
 
 def _kill(process: psutil.Popen) -> None:
-    """Kill a process and those that it started."""
     family = [process]
     with suppress(psutil.NoSuchProcess):
         family = [*process.children(recursive=True), process]

@@ -20,8 +20,6 @@ _FLAGS = (
 
 
 class Browser:
-    """Chromium, driven by selenium."""
-
     def __init__(self, driver: Any) -> None:
         self.driver = driver
 
@@ -37,15 +35,12 @@ class Browser:
         WebDriverWait(self.driver, 20, 0.05).until(lambda _: self.tell(expression))
 
     def command(self, name: str, **arguments: Any) -> Any:
-        """A command of the browser's own protocol."""
         return self.driver.execute_cdp_cmd(name, arguments)
 
     def tell(self, expression: str) -> Any:
-        """The value of an expression on the page."""
         return self.driver.execute_script(f"return {expression}")
 
     def texts(self, selector: str) -> list[str]:
-        """The text of each element that is shown."""
         shown = f"[...document.querySelectorAll({json.dumps(selector)})].filter(e => e.offsetParent)"
         return list(self.tell(f"{shown}.map(e => e.innerText.trim())"))
 

@@ -40,7 +40,6 @@ COMMAND = [sys.executable, "-m", "sobolev_batch"]
 
 
 def write_toml(folder: Path) -> Path:
-    """Write the small study into a folder."""
     path = folder / "study.toml"
     path.write_text(TOML)
     return path
@@ -70,7 +69,6 @@ def call(*arguments: object, folder: Path = Path()) -> subprocess.CompletedProce
 
 
 def finished(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
-    """Run any program to its end."""
     return subprocess.run([*map(str, words)], capture_output=True, text=True, check=False, **options)
 
 

@@ -18,7 +18,6 @@ def recorded_seconds() -> dict[str, float]:
 
 
 def record(seconds: Mapping[str, float]) -> None:
-    """Write the seconds of files, longest first."""
     today = datetime.now(UTC).date()
     head = f"# make test on {os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}, {today}\n"
     rows = sorted(seconds.items(), key=lambda row: (-round(row[1], 1), row[0]))

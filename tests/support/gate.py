@@ -17,7 +17,6 @@ if not hasattr(Job, "load_without_gate"):
 
 
 def gate_of(path: Path) -> Path:
-    """Return the gate of a mesh file."""
     return path.with_suffix(".gate")
 
 

@@ -42,7 +42,6 @@ KINDS: dict[str, dict[str, Any]] = {
 
 
 def members(table: dict[str, Any], folder: Path = Path()) -> tuple[Member, ...]:
-    """Return the members of the source that a table names."""
     return parse_source(table).members(folder)
 
 
@@ -54,7 +53,6 @@ def loaded(member: Member) -> Mesh:
 
 
 def listed(members: tuple[Member, ...]) -> list[tuple[str, int]]:
-    """Return names and levels."""
     return [(member.name, member.level) for member in members]
 
 

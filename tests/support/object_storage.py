@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import os
 import random
 import socket
 import struct
@@ -12,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from io import BytesIO
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, NoReturn
 
 import fsspec
 import pytest
@@ -21,8 +23,6 @@ from sobolev_batch.batch.storage.location import _remote_store
 
 SECRET, TOKEN = "a-secret-that-nobody-may-see", "a-token-that-nobody-may-see"
 BUCKET = "studies"
-# Fewer attempts of the driver, for processes in which all of them fail.
-IMPATIENT = {"AWS_MAX_ATTEMPTS": "2"}
 
 Kind = Literal["kept", "truncated", "error", "slow down", "reset before", "reset after"]
 # Kinds that few requests can meet come first and are drawn first. After "reset after", the request was carried out
@@ -61,8 +61,6 @@ GONE = Rule(1.0, ("error",))
 
 
 class Request(NamedTuple):
-    """A request, and its failure, if any."""
-
     method: str
     path: str
     failure: Kind | None
@@ -80,8 +78,11 @@ class Server:
 
     def __init__(self, seed: int = 0) -> None:
         # Imported late, as below: they take a second each.
-        from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
+        from moto.moto_server.werkzeug_app import DomainDispatcherApplication, MotoRequestHandler, create_backend_app
         from werkzeug.serving import make_server
+
+        # Requests are recorded here.
+        logging.getLogger("werkzeug").setLevel(logging.ERROR)
 
         self._moto = DomainDispatcherApplication(create_backend_app)
         self._random = random.Random(seed)
@@ -90,18 +91,12 @@ class Server:
         self._failed: Counter[Kind] = Counter()
         self._requests: list[Request] = []
         self._lock, self._conditional = threading.Lock(), threading.Lock()
-        self.http = make_server("127.0.0.1", 0, self._answer, threaded=True, request_handler=_handler())
+        self.http = make_server("127.0.0.1", 0, self._answer, threaded=True, request_handler=MotoRequestHandler)
         self.url = f"http://127.0.0.1:{self.http.server_port}"
         threading.Thread(target=self.http.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True).start()
         self.client().create_bucket(Bucket=BUCKET)
 
-    @property
-    def rule(self) -> Rule:
-        """Rule by which requests fail from now on."""
-        return self._rule
-
-    @rule.setter
-    def rule(self, rule: Rule) -> None:
+    def obey(self, rule: Rule) -> None:
         with self._lock:
             self._rule, self._failed = rule, Counter()
 
@@ -111,12 +106,10 @@ class Server:
             self._turn = [(method, part, rule)] * number
 
     def requests(self) -> tuple[Request, ...]:
-        """Return all requests so far, in order."""
         with self._lock:
             return tuple(self._requests)
 
     def failures(self) -> Counter[Kind]:
-        """Return the number of failures so far, by kind."""
         return Counter(request.failure for request in self.requests() if request.failure)
 
     def environment(self, key: str = "tester", secret: str = SECRET) -> dict[str, str]:
@@ -135,7 +128,6 @@ class Server:
     def client(self, service: str = "s3") -> Any:
         """Return a client of the server that shares nothing with the code under test."""
         import boto3
-        from botocore.config import Config
 
         return boto3.client(
             service,
@@ -143,11 +135,9 @@ class Server:
             aws_access_key_id="tester",
             aws_secret_access_key=SECRET,
             region_name="us-east-1",
-            config=Config(retries={"max_attempts": 1}),
         )
 
     def keys(self, prefix: str) -> list[str]:
-        """Return the keys below a prefix."""
         pages = self.client().get_paginator("list_objects_v2").paginate(Bucket=BUCKET, Prefix=prefix)
         return [entry["Key"] for page in pages for entry in page.get("Contents", ())]
 
@@ -162,7 +152,7 @@ class Server:
         body = environ["wsgi.input"].read(int(environ.get("CONTENT_LENGTH") or 0))
         kind = self._draw(environ["REQUEST_METHOD"], environ["REQUEST_URI"])
         if kind == "reset before":
-            environ["handler"].reset()
+            _reset(environ)
         if kind in _ANSWERS:
             status, document = _ANSWERS[kind]
             start_response(status, [("Content-Type", "application/xml"), ("Content-Length", str(len(document)))])
@@ -174,7 +164,7 @@ class Server:
                 self._moto({**environ, "wsgi.input": BytesIO(body)}, lambda *arguments: head.extend(arguments))
             )
         if kind == "reset after":
-            environ["handler"].reset()
+            _reset(environ)
         start_response(*head)
         return [answer[: len(answer) // 2] if kind == "truncated" else answer]
 
@@ -201,27 +191,12 @@ class Server:
         return kind
 
 
-def _handler() -> Any:
-    """Return the class that handles requests."""
-    from moto.moto_server.werkzeug_app import MotoRequestHandler
-
-    class Handler(MotoRequestHandler):
-        def log(self, *arguments: object) -> None:
-            """Do nothing: requests are recorded."""
-
-        def make_environ(self) -> dict[str, Any]:
-            return {**super().make_environ(), "handler": self}
-
-        def reset(self) -> None:
-            """Reset the connection, and leave the application."""
-            self.close_connection = True
-            self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-            # The base class would flush and say goodbye first.
-            self.connection.close()
-            self.rfile.close()
-            raise ConnectionResetError
-
-    return Handler
+def _reset(environ: Mapping[str, Any]) -> NoReturn:
+    """Reset the connection of a request without an answer, and leave the application."""
+    connection = environ["werkzeug.socket"]
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    os.close(connection.detach())
+    raise ConnectionResetError
 
 
 def forget_drivers() -> None:
@@ -244,7 +219,6 @@ def taken_for_s3(environment: Mapping[str, str]) -> Iterator[None]:
 
 @contextmanager
 def serving(seed: int = 0) -> Iterator[Server]:
-    """Run a server with one empty bucket, on a free port."""
     server = Server(seed)
     try:
         yield server

@@ -36,7 +36,6 @@ def wait_until(condition: Callable[[], T]) -> T:
 
 
 def dask(*arguments: str) -> subprocess.Popen[str]:
-    """Start a process of Dask."""
     return subprocess.Popen([sys.executable, "-m", "dask", *arguments], stderr=subprocess.PIPE, text=True)
 
 
@@ -72,7 +71,6 @@ def listening(*pids: int) -> set[tuple[str, int]]:
 
 
 def scheduler_address(scheduler: subprocess.Popen[str]) -> str:
-    """Return the address of a scheduler that was just started."""
     assert scheduler.stderr is not None
     return next(match[0] for line in scheduler.stderr if (match := re.search(r"tcp://127\.0\.0\.1:\d+", line)))
 

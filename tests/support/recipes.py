@@ -22,7 +22,6 @@ TABLE = r"(?s)ico/3 +1,280 .*file/tetrahedron +4 "  # in its table
 
 
 def write_study(folder: Path) -> None:
-    """Write the study into a folder as study.toml."""
     (folder / "study.toml").write_text(TOML.replace("-10.0, ", "") + FAMILY)
     (folder / "tetrahedron.off").write_text(TETRAHEDRON)
 
@@ -48,7 +47,6 @@ def run_recipe(folder: Path, *words: object, **variables: str) -> CompletedProce
 
 
 def add_command(home: Path, name: str, script: str) -> None:
-    """Add a command to the PATH of `environment`."""
     (home / "bin").mkdir(exist_ok=True)
     (home / "bin" / name).write_text(f"#!/bin/bash\n{script}")
     (home / "bin" / name).chmod(0o755)

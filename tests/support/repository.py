@@ -21,7 +21,6 @@ def blocks(path: str, language: str) -> list[str]:
 
 
 def imported(path: Path) -> set[str]:
-    """The names of the modules that a module imports."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):

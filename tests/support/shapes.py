@@ -43,7 +43,6 @@ TETRAHEDRON_AREA = 1.5 + np.sqrt(3) / 2
 
 
 def box() -> Mesh:
-    """Return the box as a mesh."""
     return Mesh(BOX_VERTICES, BOX_TRIANGLES)
 
 

@@ -86,7 +86,6 @@ def full_disk(most_bytes: int | None = None) -> Iterator[Callable[[int], None]]:
 
 
 def contents(store: Path) -> dict[Path, bytes]:
-    """Return the content of each file of a store."""
     return {path: path.read_bytes() for path in store.rglob("*") if path.is_file()}
 
 

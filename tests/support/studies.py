@@ -28,7 +28,6 @@ def small_table(**changes: Any) -> dict[str, Any]:
 
 
 def variable(tree: xr.DataTree, group: str, name: str) -> xr.DataArray:
-    """Return a variable of one group of a store."""
     return tree[group].to_dataset()[name]
 
 
@@ -52,7 +51,6 @@ def balls(**radii: float) -> list[dict[str, Any]]:
 
 
 def methods_of(egg: str = "egg") -> list[dict[str, Any]]:
-    """Return two families of two meshes each."""
     return [
         {"name": "ico", "source": "icosphere", "levels": [1, 2]},
         {"name": egg, "source": "ellipsoid", "axes": [1.0, 1.0, 0.8], "levels": [1, 2]},

@@ -28,7 +28,6 @@ from tests.support.object_storage import (
     BUCKET,
     GONE,
     HEALTHY,
-    IMPATIENT,
     KINDS,
     Kind,
     Rule,
@@ -54,7 +53,7 @@ def storage(served: Server, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]
     """The server, healthy again after each test, and a driver that gives up sooner than it would."""
     monkeypatch.setattr("s3fs.S3FileSystem.retries", 2)
     yield served
-    served.rule = HEALTHY
+    served.obey(HEALTHY)
 
 
 @pytest.fixture
@@ -71,7 +70,7 @@ def test_what_fails_once_is_done_again(storage: Server, location: Location, kind
     before = storage.failures()[kind]
 
     def fail_once() -> None:
-        storage.rule = Rule(1.0, (kind,), most=1)
+        storage.obey(Rule(1.0, (kind,), most=1))
 
     fail_once()
     assert location.read("d") == DOCUMENT
@@ -101,10 +100,10 @@ def got(location: Location, key: str) -> bytes | None:
 @pytest.mark.slow
 def test_keys_that_a_server_does_not_remove_are_reported(storage: Server, location: Location) -> None:
     location.write({"a/b": b"1", "a/c": b"2"})
-    storage.rule = Rule(1.0, ("kept",))
+    storage.obey(Rule(1.0, ("kept",)))
     with pytest.raises(StoreError, match=r"the store cannot be written: 2 keys are still there, such as \S+/a/b"):
         location.remove("a")
-    storage.rule = HEALTHY
+    storage.obey(HEALTHY)
     location.remove("a")
     assert location.read("a/b") is None
 
@@ -116,7 +115,7 @@ def test_keys_that_a_server_does_not_remove_are_reported(storage: Server, locati
 )
 def test_an_outage_ends_in_one_line(storage: Server, location: Location, kind: Kind, reason: str) -> None:
     location.write({"a": DOCUMENT})
-    storage.rule = Rule(1.0, (kind,))
+    storage.obey(Rule(1.0, (kind,)))
     with pytest.raises(StoreError, match=rf"^{location}: the store cannot be read: .*{reason}"):
         location.read("a")
     with pytest.raises(StoreError, match=rf"the store cannot be read: .*{reason}"), location.access("read"):
@@ -124,7 +123,7 @@ def test_an_outage_ends_in_one_line(storage: Server, location: Location, kind: K
     if kind != "truncated":
         with pytest.raises(StoreError, match=rf"^{location}: the store cannot be written: .*{reason}"):
             location.write({"a": b"2"})
-    storage.rule = HEALTHY
+    storage.obey(HEALTHY)
     assert location.read("a") == DOCUMENT
 
 
@@ -145,10 +144,10 @@ def test_storage_that_never_answers_is_given_up(location: Location, monkeypatch:
 def test_a_study_on_storage_that_fails_now_and_then(served: Server, location: Location, finished_store: Path) -> None:
     before = served.failures()
     # Often enough that each kind comes with certainty.
-    served.rule = Rule(0.2)
+    served.obey(Rule(0.2))
     with local_client(2) as client:
         summary = run(Study.from_table(small_table()), location, client)
-    served.rule = HEALTHY
+    served.obey(HEALTHY)
     assert (len(summary.computed), summary.failed) == (5, {})
     assert list(differences(open_store(location.name), open_store(finished_store))) == []
     failures = served.failures() - before
@@ -166,13 +165,15 @@ def test_a_run_whose_store_fails_for_good_ends_and_is_resumed(
     served: Server, location: Location, tmp_path: Path, rule: Rule, verb: str
 ) -> None:
     def go() -> subprocess.CompletedProcess[str]:
-        return command("run", "study.toml", "--workers", "1", "--store", location, folder=tmp_path, **IMPATIENT)
+        return command(
+            "run", "study.toml", "--workers", "1", "--store", location, folder=tmp_path, AWS_MAX_ATTEMPTS="2"
+        )
 
     (tmp_path / "study.toml").write_text(STUDY)
     # The field of the second mesh, after the record of the first.
     served.await_turn("PUT", "/fourier/fourier/c/", 2, rule)
     done = go()
-    served.rule = HEALTHY
+    served.obey(HEALTHY)
     assert (done.returncode, done.stdout) == (2, ""), done.stderr
     last = done.stderr.splitlines()[-1]
     assert re.match(rf"error: {location}: the store cannot be {verb}: .*InternalError", last), done.stderr
