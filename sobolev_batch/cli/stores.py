@@ -189,7 +189,7 @@ def table_command(
             raise click.UsageError(f"{name} belongs to --over-time")
     from sobolev_batch.batch.collection_store import CollectionStore
     from sobolev_batch.results.open import open_store
-    from sobolev_batch.results.tables.convergence import format_smallest, format_table, format_tables
+    from sobolev_batch.results.tables.convergence import format_smallest, format_table
     from sobolev_batch.results.tables.evolution import REMESHING_FACTOR, format_evolution
     from sobolev_batch.results.tables.matrix import format_matrix
 
@@ -198,7 +198,7 @@ def table_command(
     if collection is not None:
         if matrix or over_time or below is not None:
             raise click.UsageError(f"name the store of one object, such as {store}/{collection.objects[0]}")
-        echo_lines(format_tables(collection.existing_stores, style, chosen, x=x))
+        echo_lines(format_table(collection.existing_stores, style, chosen, x=x))
         return
     tree = open_store(store)
     if over_time:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,7 @@ from sobolev_batch.results.tables.text import (
     percent,
     printed_table,
     prose,
+    section,
     with_error,
 )
 from sobolev_batch.spectral.metrics.datasets import observed_rates
@@ -194,68 +195,49 @@ def tables_of(
     trees = {name: as_tree(place) for name, place in stores.items()}
     finished = {name: tree for name, tree in trees.items() if "convergence" in tree.children}
     if not finished:
-        raise InputError("no object has tables yet: run the study to its end")
+        raise InputError("there are no tables yet: run the study to its end")
     return {name: table(tree, order, x=x) for name, tree in finished.items()}
 
 
 def format_table(
-    tree: xr.DataTree, style: Format = "text", orders: Sequence[float] | None = None, *, x: str = EDGE_LENGTH
+    stores: xr.DataTree | Mapping[str, AnyStore],
+    style: Format = "text",
+    orders: Sequence[float] | None = None,
+    *,
+    x: str = EDGE_LENGTH,
 ) -> str:
-    """Return the convergence table of an open store as text; see `table`."""
-    frame = table(tree, orders, x=x)
-    if style in ("csv", "json"):
-        return machine_table(frame, style)
-    notes = [*_notes([tree], [frame], x), *_order_notes(tree, frame)]
-    return "\n\n".join([*_tables(tree, frame, style), prose(notes, style), *_remarks(tree, frame, style)])
-
-
-def format_tables(
-    stores: Mapping[str, AnyStore], style: Format = "text", orders: Sequence[float] | None = None, *, x: str
-) -> str:
-    """Return the convergence tables of several objects as text, one after the other; see `table`."""
-    trees = {name: as_tree(place) for name, place in stores.items()}
+    """Return the convergence tables of an open store, or of several objects by their names, as text; see `table`."""
+    named = {"": stores} if isinstance(stores, xr.DataTree) else stores
+    trees = {name: as_tree(place) for name, place in named.items()}
     frames = tables_of(trees, orders, x=x)
     if style in ("csv", "json"):
-        return machine_table(_joined(frames), style)
+        return machine_table(frames[""] if "" in frames else _joined(frames), style)
     sections: list[str] = []
     for name, frame in frames.items():
         tree = trees[name]
-        sections += [prose([f"Object {name}"], style), *_tables(tree, frame, style)]
-        sections += filter(None, [prose(_order_notes(tree, frame), style), *_remarks(tree, frame, style)])
-    notes = _notes([trees[name] for name in frames], list(frames.values()), x)
-    return "\n\n".join([*sections, prose(notes, style)])
+        sections += [prose([f"Object {name}"], style)] if name else []
+        sections += _tables(tree, frame, style)
+        computed = order_note(tree, frame.attrs["computed"]) if "computed" in frame.attrs else []
+        doubts = [f"{mesh}: {doubt}" for mesh, doubt in placement_doubts(tree).items()]
+        sections += [prose(lines, style) for lines in (computed, [*_failures(tree, frame), *doubts]) if lines]
+    return "\n\n".join([*sections, prose(_notes([trees[name] for name in frames], list(frames.values()), x), style)])
 
 
-def _tables(tree: xr.DataTree, frame: pd.DataFrame, style: Format) -> list[str]:
-    """Return the table of each order with its caption, and that of other distances where there are any."""
-    sections = []
-    for order, rows in frame.groupby("order", sort=False):
+def _tables(tree: xr.DataTree, frame: pd.DataFrame, style: Format) -> Iterator[str]:
+    """Yield the table of each order with its caption, and that of other distances where there are any."""
+    marked = with_remarks(frame)
+    for order, rows in marked.groupby("order", sort=False):
         caption = f"Sobolev distance of order {order:g} to {frame.attrs['reference']}"
-        sections.append(_section(caption, rows, _COLUMNS, style, _nearest(rows)))
+        yield section(caption, [_table(rows, _COLUMNS, style)], _nearest(rows), style)
     if has_proximity(tree):
-        once = frame[frame["order"] == frame["order"].iloc[0]]
-        sections.append(_section("Other distances, the same at all orders", once, (_MESH, *_PROXIMITY_COLUMNS), style))
-    return sections
+        once = marked[marked["order"] == marked["order"].iloc[0]]
+        table = _table(once, (_MESH, *_PROXIMITY_COLUMNS), style)
+        yield section("Other distances, the same at all orders", [table], [], style)
 
 
-def _remarks(tree: xr.DataTree, frame: pd.DataFrame, style: Format) -> list[str]:
-    """Return what failed and what is doubtful, as one paragraph, or nothing."""
-    remarks = [*_failures(tree, frame), *(f"{mesh}: {doubt}" for mesh, doubt in placement_doubts(tree).items())]
-    return [prose(remarks, style)] if remarks else []
-
-
-def _section(caption: str, frame: pd.DataFrame, columns: Sequence[Column], style: Format, sentence: str = "") -> str:
-    """Return a caption, the table of some columns of one order, and a sentence."""
-    cells = [
-        [row["mesh"], *(_cell(column, row) for column in columns[1:])]
-        for row in with_remarks(frame).to_dict(orient="records")
-    ]
-    parts = [
-        prose([caption], style),
-        printed_table(cells, [column.header for column in columns], style),
-        prose([sentence] if sentence else [], style),
-    ]
-    return ("\n" if style == "latex" else "\n\n").join(filter(None, parts))
+def _table(frame: pd.DataFrame, columns: Sequence[Column], style: Format) -> str:
+    cells = [[row["mesh"], *(_cell(column, row) for column in columns[1:])] for row in frame.to_dict(orient="records")]
+    return printed_table(cells, [column.header for column in columns], style)
 
 
 def _cell(column: Column, row: Mapping[Any, Any]) -> str:
@@ -279,15 +261,15 @@ def nearest(frame: pd.DataFrame) -> tuple[pd.Series, tuple[str, ...]] | None:
     return best, tuple(rivals["mesh"])
 
 
-def _nearest(frame: pd.DataFrame) -> str:
-    """Return a sentence about the mesh that is nearest to the reference at one order."""
+def _nearest(frame: pd.DataFrame) -> list[str]:
+    """Return a sentence about the mesh that is nearest to the reference at one order, if one is known to be."""
     closest = nearest(frame)
     if closest is None:
-        return ""
+        return []
     best, rivals = closest
     amount = percent(best["relative"], best["relative_error"])
     doubt = f"; its errors leave open whether {rivals[0]} is nearer" if rivals else ""
-    return f"Nearest: {best['mesh']}, which differs by {amount}{doubt}."
+    return [f"Nearest: {best['mesh']}, which differs by {amount}{doubt}."]
 
 
 def page_columns(tree: xr.DataTree) -> tuple[Column, ...]:
@@ -315,10 +297,6 @@ def _notes(trees: Sequence[xr.DataTree], frames: Sequence[pd.DataFrame], x: str)
     for rtol in dict.fromkeys(frame.attrs["rtol"] for frame in frames if "rtol" in frame.attrs):
         notes += _ACCURACY_NOTE.format(rtol=rtol).splitlines()
     return notes
-
-
-def _order_notes(tree: xr.DataTree, frame: pd.DataFrame) -> list[str]:
-    return order_note(tree, frame.attrs["computed"]) if "computed" in frame.attrs else []
 
 
 def _failures(tree: xr.DataTree, frame: pd.DataFrame) -> list[str]:
@@ -405,8 +383,7 @@ def format_smallest(
         cells = [
             {**row, "mesh": row["mesh"] or "none", "remark": _remark(row)} for row in rows.to_dict(orient="records")
         ]
-        separator = "\n" if style == "latex" else "\n\n"
-        sections.append(separator.join([prose([caption], style), column_table(_SMALLEST_COLUMNS, cells, style)]))
+        sections.append(section(caption, [column_table(_SMALLEST_COLUMNS, cells, style)], [], style))
     return "\n\n".join([*sections, prose(_SMALLEST_NOTE.splitlines(), style)])
 
 

@@ -30,7 +30,7 @@ from sobolev_batch.results.tables.statistics import (
     sign_flip_test,
     within_objects,
 )
-from sobolev_batch.results.tables.text import Column, column_table, machine_table, prose
+from sobolev_batch.results.tables.text import Column, column_table, machine_table, prose, section
 from sobolev_batch.spectral.adaptive.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.spectral.shells import Orders
 from sobolev_batch.surfaces.sources.names import quoted
@@ -424,10 +424,10 @@ def format_league(leagues: Sequence[League], style: Format = "text") -> str:
     sections = []
     for one in leagues:
         rows = column_table(LEAGUE_COLUMNS[:-1], one.table.to_dict(orient="records"), style)
-        sections += [prose([one.caption], style), rows, prose(pair_lines(one), style)]
+        sections.append(section(one.caption, [rows], pair_lines(one), style))
     notes = LEAGUE_NOTE.format(x=leagues[0].x).splitlines()
     notes += [f"{name} is left out{where}: {reason}." for name, where, reason in left_out(leagues)]
-    return "\n\n".join([*filter(None, sections), prose(notes, style)])
+    return "\n\n".join([*sections, prose(notes, style)])
 
 
 def left_out(leagues: Sequence[League]) -> Iterator[tuple[str, str, str]]:
@@ -447,10 +447,8 @@ def format_changes(changes: pd.DataFrame, style: Format = "text") -> str:
         return machine_table(changes, style)
     sections = []
     for order, frame in changes.groupby("order", sort=False):
-        sections += [
-            prose([f"New study against the old one at order {order:g}"], style),
-            column_table(_CHANGE_COLUMNS, frame.to_dict(orient="records"), style),
-        ]
+        rows = column_table(_CHANGE_COLUMNS, frame.to_dict(orient="records"), style)
+        sections.append(section(f"New study against the old one at order {order:g}", [rows], [], style))
     units = "objects" if (changes["objects"] > 1).all() else "meshes"
     notes = _CHANGES_NOTE.format(units=units).splitlines()
     least = least_objects(changes["method"].nunique())

@@ -14,7 +14,15 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.results.open import AnyStore, as_tree, chosen_orders, complete_meshes, finished_group, reference_of
 from sobolev_batch.results.store_accessor import distances_at, order_note, reference_norm_at
 from sobolev_batch.results.tables import Format
-from sobolev_batch.results.tables.text import LINE_LENGTH, concise, machine_table, middle_cut, printed_table, prose
+from sobolev_batch.results.tables.text import (
+    LINE_LENGTH,
+    concise,
+    machine_table,
+    middle_cut,
+    printed_table,
+    prose,
+    section,
+)
 from sobolev_batch.spectral.budget import quotients
 from sobolev_batch.spectral.shells import check_orders
 
@@ -124,8 +132,8 @@ def format_matrix(tree: xr.DataTree, style: Format = "text", orders: Sequence[fl
     sections = []
     for order in chosen:
         values, errors, unit = _shown_numbers(tree, distances.sel(order=order).load())
-        caption = prose([f"Sobolev distances of order {order:g}, {unit}"], style)
-        sections.append("\n\n".join([caption, *_tables(distances, values, errors, style)]))
+        caption = f"Sobolev distances of order {order:g}, {unit}"
+        sections.append(section(caption, _tables(distances, values, errors, style), [], style))
     notes = _NOTE.splitlines()
     if "computed" in distances.attrs:
         notes += order_note(tree, distances.attrs["computed"])

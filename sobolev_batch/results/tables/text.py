@@ -324,6 +324,12 @@ def column_table(columns: Sequence[Column], rows: Iterable[Mapping[Any, Any]], s
     return printed_table(cells, [column.header for column in columns], style)
 
 
+def section(caption: str, tables: Iterable[str], sentences: Iterable[str], style: Format) -> str:
+    """Return a caption, tables and sentences below each other."""
+    parts = prose([caption], style), *tables, prose(sentences, style)
+    return ("\n" if style == "latex" else "\n\n").join(filter(None, parts))
+
+
 def machine_table(frame: pd.DataFrame, style: Format) -> str:
     """Return a table as CSV or JSON, which spells control characters itself; missing numbers are blank or null."""
     if style == "csv":
