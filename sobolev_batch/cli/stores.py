@@ -358,11 +358,10 @@ def report_command(store: Location, output: Path, folder: Path, up: Axis, meshes
     The page needs no other files and makes no requests. What it leaves out is listed. The page of a collection has its
     league; each object has a store, and a report, of its own.
     """
-    from sobolev_batch.results.report.build import make_report, written_to
+    from sobolev_batch.results.report.build import make_report, write_page
 
-    with written_to(output) as write:
-        page, omissions = make_report(store, folder=folder, witnesses=meshes, up=up)
-        write(page)
+    page, omissions = make_report(store, folder=folder, witnesses=meshes, up=up)
+    write_page(output, page)
     echo(output)
     for omission in omissions:
         echo(f"left out: {omission}", err=True)

@@ -66,7 +66,7 @@ def plot(
       reference at the wavelengths where its line is far below 1; where it reaches 1, they have nothing in common.
 
     A matrix shows up to 300 meshes, the first ones and the reference. Spectrum and energy read the field of each mesh,
-    and show up to 24, evenly through each family; the title says so.
+    and show up to 24, evenly through the study; the title says so.
 
     Args:
         store: Path, URL or opened DataTree of the store.

@@ -128,13 +128,11 @@ class Spectra:
 
     @classmethod
     def from_tree(cls, tree: xr.DataTree, orders: Sequence[float], meshes: Sequence[str]) -> Self:
-        """Return the spectra of some of the meshes of an open store, evenly through each family."""
-        reference, family_of = reference_of(tree), families_of(tree)
+        """Return the spectra of some of the meshes of an open store, evenly through the study."""
+        reference = reference_of(tree)
         fields = tree["fourier"].to_dataset()["fourier"]
         affordable = _MOST_SAMPLES // int(np.prod(fields.shape[1:]))
-        labels = _spread_over_families(
-            [(family_of[label], label) for label in meshes], max(1, min(MOST_SPECTRA, affordable))
-        )
+        labels = spread(meshes, max(1, min(MOST_SPECTRA, affordable)))
         scale = tree.attrs["similarity"]["scale"]
         if "octaves" in tree:
             accessor = StoreAccessor(tree)
@@ -169,21 +167,6 @@ class Spectra:
             f"> {short:.3g}" if np.isinf(long) else f"{long:.3g} – {short:.3g}"
             for long, short in zip(self.longest, self.shortest, strict=True)
         )
-
-
-def _spread_over_families(labels: Sequence[tuple[str, str]], most: int) -> list[str]:
-    """Return a limited number of labels, of all families alike, from the family and label of each mesh."""
-    members: dict[str, list[str]] = {}
-    for family, label in labels:
-        members.setdefault(family, []).append(label)
-    counts = dict.fromkeys(spread(list(members), most), 1)
-    left = most - len(counts)
-    while left > 0 and (growing := [name for name in counts if counts[name] < len(members[name])]):
-        for name in growing[:left]:
-            counts[name] += 1
-        left -= len(growing)
-    kept = {label for name, count in counts.items() for label in spread(members[name], count)}
-    return [label for _, label in labels if label in kept]
 
 
 def spread(items: Sequence[Item], most: int) -> list[Item]:

@@ -60,7 +60,7 @@ COVERED_AREA, _OUTLYING = 0.99, 1.25
 # Places count by this power of their values: the worst ones alone decide.
 _POWER = 4
 # The worst places face one way if the mean of their normals is as long, and the usual view shows them if the cosine
-# between both is as large. A view is not steeper than this height of the unit vector.
+# between both is as large. A view that is steeper than this height of the unit vector is turned to the usual one.
 _ONE_WAY, _SHOWN, _STEEPEST = 0.5, 0.4, 0.9
 
 # Of a plot: its height, orders of one mesh, panels in a row, and meshes beside each other.
@@ -139,10 +139,9 @@ class MeshView:
         if length <= _ONE_WAY * total or facing @ FRONT >= _SHOWN * length:
             return self
         eye = facing / length
-        level = np.hypot(*eye[:2]) or 1.0
-        height = float(np.clip(eye[2], -_STEEPEST, _STEEPEST))
-        sideways = eye[:2] / level if np.hypot(*eye[:2]) > 1e-6 else FRONT[:2] / np.hypot(*FRONT[:2])
-        return replace(self, eye=np.append(sideways * np.sqrt(1 - height**2), height))
+        if abs(eye[2]) > _STEEPEST:
+            eye = eye + FRONT / 2
+        return replace(self, eye=eye / np.linalg.norm(eye))
 
     @property
     def _normals(self) -> Reals:

@@ -6,14 +6,11 @@ import base64
 import gzip
 import hashlib
 import math
-import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 import numpy as np
 import pandas as pd
@@ -97,31 +94,16 @@ def report(
     >>> sb.report("storage/icosphere.zarr", "report.html").name  # doctest: +SKIP
     'report.html'
     """
-    with written_to(Path(path)) as write:
-        write(make_report(store, folder=folder, witnesses=witnesses, up=up)[0])
+    write_page(Path(path), make_report(store, folder=folder, witnesses=witnesses, up=up)[0])
     return Path(path)
 
 
-@contextmanager
-def written_to(path: Path) -> Iterator[Callable[[str], object]]:
-    """Refuse a path that cannot be written before there is anything to write; the old file stays until the new one is.
-
-    Raises:
-        StoreError: It is a folder, its folder cannot be written, or the disk is full.
-    """
-    target = Path(os.path.realpath(path))
-    # A device or a pipe has nothing that could stay.
-    place = target if target.exists() and not target.is_file() else target.with_name(f".{uuid4().hex}.html")
+def write_page(path: Path, text: str) -> None:
+    """Write a page; StoreError where that cannot be done."""
     try:
-        with place.open("w", encoding="utf-8") as file:
-            yield file.write
-        if place != target:
-            place.replace(target)
+        path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise StoreError(f"{path}: the report cannot be written there: {error.strerror or error}") from error
-    finally:
-        if place != target:
-            place.unlink(missing_ok=True)
 
 
 def make_report(
