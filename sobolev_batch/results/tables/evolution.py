@@ -13,7 +13,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.results.open import AnyStore, as_tree, complete_meshes, finished_group, has_times, reference_of
 from sobolev_batch.results.store_accessor import StoreAccessor, convergence_at
 from sobolev_batch.results.tables import Format
-from sobolev_batch.results.tables.text import concise, machine_table, printed_table, prose, section
+from sobolev_batch.results.tables.text import machine_table, printed_table, prose, section, with_error
 from sobolev_batch.spectral.metrics.datasets import NUMBER, VARIABLES, described
 from sobolev_batch.spectral.shells import Orders, check_orders
 from sobolev_batch.surfaces.sources.names import quoted
@@ -22,9 +22,8 @@ from sobolev_batch.surfaces.sources.names import quoted
 REMESHING_FACTOR = 2.0
 _NUMBERS = ("distance", "error", "relative", "relative_error")
 _NOTE = """\
-Digits in brackets are the error in units of the last digit. If a new mesh of as many
-triangles would be as near as the first one, it pays once the distance has certainly
-grown to {factor:g} times that of the first time."""
+If a new mesh of as many triangles would be as near as the first one, it pays once the
+distance has certainly grown to {factor:g} times that of the first time."""
 
 
 def evolution(
@@ -177,7 +176,7 @@ def _dataset(
 
 
 def _cell(found: xr.Dataset) -> str:
-    text = concise(100 * found["relative"].item(), 100 * found["relative_error"].item())
+    text = with_error(100 * found["relative"].item(), 100 * found["relative_error"].item())
     growth = found["growth"].item()
     return f"{text}  {growth:5.2f} ×" if np.isfinite(growth) else text
 

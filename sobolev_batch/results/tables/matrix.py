@@ -16,12 +16,12 @@ from sobolev_batch.results.store_accessor import distances_at, order_note, refer
 from sobolev_batch.results.tables import Format
 from sobolev_batch.results.tables.text import (
     LINE_LENGTH,
-    concise,
     machine_table,
     middle_cut,
     printed_table,
     prose,
     section,
+    with_error,
 )
 from sobolev_batch.spectral.budget import quotients
 from sobolev_batch.spectral.shells import check_orders
@@ -32,10 +32,7 @@ _COLUMNS = ("distance", "error", "truncation", "aliasing", "discretisation", "st
 # A longer printed matrix cannot be read.
 _MOST_MESHES = 20
 _LONGEST_LABEL = 30
-_NOTE = """\
-Digits in brackets are the error, meant as a bound, in units of the last digit:
-1.234(5) is 1.234 ± 0.005. The columns have the numbers of the rows; the matrix is
-symmetric."""
+_NOTE = "Errors are meant as bounds. The columns have the numbers of the rows; the matrix is symmetric."
 
 
 def pairs_of(
@@ -134,7 +131,7 @@ def format_matrix(tree: xr.DataTree, style: Format = "text", orders: Sequence[fl
         values, errors, unit = _shown_numbers(tree, distances.sel(order=order).load())
         caption = f"Sobolev distances of order {order:g}, {unit}"
         sections.append(section(caption, _tables(distances, values, errors, style), [], style))
-    notes = _NOTE.splitlines()
+    notes = [_NOTE]
     if "computed" in distances.attrs:
         notes += order_note(tree, distances.attrs["computed"])
     return "\n\n".join([*sections, prose(notes, style)])
@@ -161,7 +158,7 @@ def _tables(distances: xr.Dataset, numbers: Reals, errors: Reals, style: Format)
     names = [f"{i} {middle_cut(label, _LONGEST_LABEL)}" for i, label in enumerate(labels, 1)]
     cells = [
         [
-            "" if is_symmetric and i <= j else concise(float(numbers[i, j]), float(errors[i, j])) or "missing"
+            "" if is_symmetric and i <= j else with_error(float(numbers[i, j]), float(errors[i, j])) or "missing"
             for j in range(len(others))
         ]
         for i in range(len(labels))

@@ -24,7 +24,6 @@ _MOST_DIGITS = 7
 _DIGITS_WITHOUT_ERROR = 4
 # Beyond these, powers of ten are easier to read.
 _SMALLEST_PLAIN, _LARGEST_PLAIN, _LAST_PLAIN = 1e-3, 1e5, -6
-_LARGEST_BRACKETED = 3
 _POWER = " × 10"
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 # Surfaces whose distance, relative to the reference, is certainly smaller differ by rounding.
@@ -79,10 +78,10 @@ def bound(fraction: float) -> str:
 def rounded_outwards(lower: float, upper: float) -> tuple[str, str]:
     """Return two bounds with two digits, the lower one rounded down and the upper one up.
 
-    >>> rounded_outwards(0.01239, 0.1231)
-    ('0.012', '0.13')
+    >>> rounded_outwards(0.01239, 0.1231), rounded_outwards(0.012, 0.13)
+    (('0.012', '0.13'), ('0.012', '0.13'))
     """
-    low, high = _rounded_down(lower, 2), _rounded_up(upper, 2)
+    low, high = -_rounded_up(-lower, 2), _rounded_up(upper, 2)
     return _shown(low, _magnitude(low) - 1), _shown(high, _magnitude(high) - 1)
 
 
@@ -102,35 +101,6 @@ def second_digit(value: float) -> float:
     100.0
     """
     return 10.0 ** (_magnitude(value) - 1) if math.isfinite(value) else math.nan
-
-
-def concise(value: float, error: float) -> str:
-    """Return a number with its error, rounded up, in brackets in units of the last digit.
-
-    NaN gives an empty text; "?" stands for an unknown error.
-    """
-    if not math.isfinite(value):
-        return ""
-    power = _magnitude(value)
-    if not math.isfinite(error):
-        return _bracketed(value, "?", power, power - _DIGITS_WITHOUT_ERROR + 1)
-    if error == 0:
-        return f"{value:.4g}"
-    rounded = _rounded_up(error, 1)
-    power = _magnitude(value or rounded)
-    last = max(_magnitude(rounded), power - _MOST_DIGITS + 1)
-    # Rounding may carry into the next power, or leave nothing of a value below its error.
-    power = max(_magnitude(round(value, -last)) if round(value, -last) else last, last)
-    # Where digits were left out, the error is that of the last one shown.
-    shown = max(1, math.ceil(rounded / 10.0**last * (1 - 1e-9)))
-    return _bracketed(value, str(shown), power, last)
-
-
-def _bracketed(value: float, error: str, power: int, last: int) -> str:
-    """Return a value of a power of ten, down to the last one, with the digit of its error."""
-    if _magnitude(_SMALLEST_PLAIN) <= power <= _LARGEST_BRACKETED and last <= power:
-        return f"{round(value, -last):.{max(0, -last)}f}({error}{'0' * last})"
-    return f"{value / 10.0**power:.{power - last}f}({error})e{power:+03d}"
 
 
 def duration(seconds: float, digits: int = 3) -> str:
@@ -251,12 +221,8 @@ def _magnitude(value: float) -> int:
 
 def _rounded_up(value: float, digits: int) -> float:
     unit = 10.0 ** (_magnitude(value) - digits + 1)
-    return float(f"{math.ceil(value / unit * (1 - 1e-9)) * unit:.{digits}g}")
-
-
-def _rounded_down(value: float, digits: int) -> float:
-    unit = 10.0 ** (_magnitude(value) - digits + 1)
-    return float(f"{math.floor(value / unit * (1 + 1e-9)) * unit:.{digits}g}")
+    # Less a little, so that no rounding error of the division counts.
+    return float(f"{math.ceil(value / unit - 1e-9 * abs(value / unit)) * unit:.{digits}g}")
 
 
 def _shown(value: float, last: int) -> str:
