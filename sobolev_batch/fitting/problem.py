@@ -15,8 +15,7 @@ from sobolev_batch.fitting import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEP
 from sobolev_batch.fitting.gradient import SquaredDistance, factors_of
 from sobolev_batch.fitting.transform import MeshTransform
 from sobolev_batch.parameters import is_whole_number
-from sobolev_batch.spectral.adaptive.lattice_selection import core_lattice, lattice_of
-from sobolev_batch.spectral.adaptive.tolerance import Accuracy
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy, core_lattice, lattice_of
 from sobolev_batch.spectral.backends import Complexes
 from sobolev_batch.spectral.budget import Support
 from sobolev_batch.spectral.fields import (

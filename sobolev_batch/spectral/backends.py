@@ -265,13 +265,7 @@ _log = logging.getLogger(__name__)
 
 
 class Backend:
-    """The processor with FINUFFT; a `Gpu` is another one.
-
-    Attributes:
-        name: "cpu" or "gpu".
-        library: Name of the NUFFT library.
-        costs: Costs of that library.
-    """
+    """The processor with FINUFFT; a `Gpu` is another one."""
 
     name: ClassVar[Literal["cpu", "gpu"]] = "cpu"
     library: ClassVar[Literal["finufft", "cufinufft"]] = "finufft"
@@ -289,11 +283,8 @@ class Backend:
         """Return a plan of the library: its `setpts` takes angles, its `execute` the strengths of the points.
 
         It is of type 1 with the sign -1; the adjoint is of type 2 with the sign +1 and takes the coefficients of the
-        modes. The modes of an axis of n samples start at -(n // 2). A plan keeps references to angles, not copies.
-
-        Args:
-            spec: Specification with its oversampling set.
-            adjoint: True for the adjoint.
+        modes. The modes of an axis of n samples start at -(n // 2). A plan keeps references to angles, not copies. The
+        oversampling must be set.
 
         Raises:
             RuntimeError: cuFINUFFT failed to make it; it does not say why.
@@ -320,13 +311,7 @@ CPU = Backend()
 
 @dataclass(frozen=True, eq=False)
 class Gpu(Backend):
-    """The first device that CUDA shows; `gpu_backend` returns it.
-
-    Attributes:
-        cupy: Module.
-        cufinufft: Module.
-        runtime: CUDA runtime of cuFINUFFT; CuPy has one of its own.
-    """
+    """The first device that CUDA shows; `gpu_backend` returns it. CuPy has a CUDA runtime of its own."""
 
     name: ClassVar[Literal["cpu", "gpu"]] = "gpu"
     library: ClassVar[Literal["finufft", "cufinufft"]] = "cufinufft"

@@ -197,19 +197,10 @@ def compute_field(
     *,
     sample: Sample | None = None,
 ) -> Field:
-    """Return the field of a surface by given settings, with its probe for some orders.
+    """Return the field of a surface by given settings, with its probe for some orders; see `transform_block`.
 
-    Args:
-        surface: Surface in units of length.
-        lattice: Lattice of the field.
-        settings: Accuracy and dtype.
-        orders: Sobolev orders that the field is probed for.
-        execution: Means of the transform; the exact values of the probe are always computed on the processor.
-        sample: Sample of the surface, drawn for these orders and `USUAL_DEGREE`, if there is one.
-
-    Raises:
-        LatticeError: The surface extends beyond the lattice's half period.
-        InputError: The allowed memory is too little.
+    A sample of the surface, drawn for these orders and `USUAL_DEGREE`, saves time. The exact values of the probe are
+    always computed on the processor.
     """
     block = lattice.half
     plan = settings.plan(surface, lattice)

@@ -48,12 +48,6 @@ class Draws:
     frequencies: Reals
     scales: Reals
 
-    def within(self, block: Block) -> Draws:
-        """Return the draws that lie in a block."""
-        offsets = self.indices - block.start
-        inside = np.all((offsets >= 0) & (offsets < block.shape), axis=1)
-        return Draws(self.indices[inside], self.frequencies[inside], self.scales[inside])
-
     def places(self, block: Block) -> tuple[NDArray[np.int64], ...]:
         """Return the array indices of the draws in a block that holds them all."""
         return tuple((self.indices - block.start).T)
@@ -207,7 +201,9 @@ def probe_block(
     """
     if not needs_probe(surface, settings):
         return Probe()
-    draws = draws.within(block)
+    offsets = draws.indices - block.start
+    inside = np.all((offsets >= 0) & (offsets < block.shape), axis=1)
+    draws = Draws(draws.indices[inside], draws.frequencies[inside], draws.scales[inside])
     probe = measure(draws, values[draws.places(block)], Sample.from_surface(surface, draws).exact)
     change = settings.plan(surface, lattice).change
     # Once for the whole field.

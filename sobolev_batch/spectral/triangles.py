@@ -154,15 +154,10 @@ def _sums(corners: Corners, frequencies: Reals) -> Complexes:
 def _contributions(
     doubled: Reals, points: Sequence[Reals], edges: Sequence[Reals], frequency: Reals, plain: bool, widest: float
 ) -> tuple[Reals, Reals]:
-    """Return real and imaginary parts of the transform of each triangle.
+    """Return real and imaginary parts of the transform of each triangle, at ξ (3,) for all or (3, k) for each.
 
-    Args:
-        doubled: Twice the areas (k,).
-        points: Centroids and the three corners, (3, k) each.
-        edges: Edges from the first corner to the second and to the third, (3, k) each.
-        frequency: ξ, (3,) for all triangles or (3, k) for each.
-        plain: True if phases are small enough for plain dot products.
-        widest: Bound on all gaps, in radians.
+    The points are centroids and the three corners, the edges those from the first corner, (3, k) each. Phases are
+    plain dot products if these are good enough; all gaps are at most the widest one, in radians.
     """
     ab, ac = (_dots(-2 * np.pi * frequency, edge) for edge in edges)
     if widest < _SERIES_GAP:

@@ -11,9 +11,8 @@ import numpy as np
 from sobolev_batch.errors import InputError, SobolevBatchError, one_line
 from sobolev_batch.parameters import available, available_cores, check_seed
 from sobolev_batch.results.tables.text import rounded_outwards, with_error
-from sobolev_batch.spectral.adaptive.lattice_selection import core_lattice
 from sobolev_batch.spectral.adaptive.threshold import Method, relative_distance
-from sobolev_batch.spectral.adaptive.tolerance import Accuracy
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy, core_lattice
 from sobolev_batch.spectral.budget import Support
 from sobolev_batch.spectral.fields import fourier_transform
 from sobolev_batch.spectral.shells import single_order

@@ -21,11 +21,10 @@ from sobolev_batch.batch.study.schema import MOST_OCTAVES
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.errors import AccuracyError, InputError, MeshError, StudyError
 from sobolev_batch.parameters import available_cores
-from sobolev_batch.spectral.adaptive.lattice_selection import FINER_LATTICE, core_lattice, good_intervals, lattice_of
 from sobolev_batch.spectral.adaptive.octaves import solve_in_octaves
 from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, error_target
 from sobolev_batch.spectral.adaptive.solve import Pilot, coarser_than, permits_octaves, prefers_octaves, run_pilot
-from sobolev_batch.spectral.adaptive.tolerance import Accuracy
+from sobolev_batch.spectral.adaptive.tolerance import FINER_LATTICE, Accuracy, core_lattice, good_intervals, lattice_of
 from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.budget import NormEstimate, Support
 from sobolev_batch.spectral.lattice import Lattice

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import AccuracyError
-from sobolev_batch.spectral.adaptive.lattice_selection import first_lattice, larger_pilot, lattice_of, refined
 from sobolev_batch.spectral.adaptive.octaves import solve_in_octaves
 from sobolev_batch.spectral.adaptive.problem import (
     ESTIMATE_CAUTION,
@@ -22,7 +21,7 @@ from sobolev_batch.spectral.adaptive.problem import (
     SurfaceValues,
     error_target,
 )
-from sobolev_batch.spectral.adaptive.tolerance import Accuracy
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy, first_lattice, larger_pilot, lattice_of, refined
 from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.budget import NormEstimate, Sums, estimate_norms, modulus_bound, sums_of_shells
 from sobolev_batch.spectral.fields import Field, field_for

@@ -9,11 +9,10 @@ from typing import Literal, Self
 
 import numpy as np
 
-from sobolev_batch.spectral.adaptive.lattice_selection import core_lattice, lattice_of
 from sobolev_batch.spectral.adaptive.octaves import solve_in_octaves
 from sobolev_batch.spectral.adaptive.problem import Problem, error_target
 from sobolev_batch.spectral.adaptive.solve import difference_on, solve
-from sobolev_batch.spectral.adaptive.tolerance import Accuracy
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy, core_lattice, lattice_of
 from sobolev_batch.spectral.budget import area_bound, area_bounds
 from sobolev_batch.spectral.fields import USUAL_DEGREE, Field, compute_field
 from sobolev_batch.spectral.lattice import Lattice

@@ -1,19 +1,39 @@
-"""Accuracy that a user requests, and its division among the sources of error."""
+"""Accuracy that a user requests: its division among the sources of error, and the lattices that give it.
+
+A first lattice follows from the sizes of surfaces, a refined one from their sums.
+"""
 
 from __future__ import annotations
 
 import math
 from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate, repeat, takewhile
+from operator import mul
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import next_fast_len
+from scipy.special import betainc
 
 from sobolev_batch.errors import AccuracyError, InputError
-from sobolev_batch.spectral.budget import NormEstimate
+from sobolev_batch.spectral.budget import (
+    ALIASING_CAUTION,
+    TRUNCATION_CAUTION,
+    NormEstimate,
+    Sums,
+    Support,
+    aliased,
+    image_weight,
+    truncated,
+)
 from sobolev_batch.spectral.lattice import LARGEST_M, Lattice
+from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.spectral.transform.settings import FINEST_EPS, TransformSettings
 from sobolev_batch.spectral.transform.transform import projected_bytes
+
+Reals = NDArray[np.float64]
 
 # Fraction of the accuracy for aliasing; the rest is for truncation and the fields' own errors.
 _ALIASING_FRACTION = 0.1
@@ -22,6 +42,25 @@ _TRUNCATION_FRACTION, _HIGH_ORDER = 0.7, 2.0
 _DEFAULT_BYTES = 2e9
 # A relative distance below this one tells of rounding, of coordinates in files too, and not of the surfaces.
 NEXT_TO_EQUAL = 1e-5
+# Before a pair is measured: how much larger than the kernel alone predicts its images may be, and
+# how much larger its tail than that of two surfaces close to each other.
+_IMAGE_MARGIN, _TAIL_MARGIN = 30.0, 2.0
+# If those laws ask for more than this, a pilot lattice of this size measures the pair first.
+_PILOT_M = 64
+# Before an accuracy is refused, a larger pilot may look further.
+_LARGER_PILOT_M = 128
+_HIGHEST_FREQUENCY = 1e4
+# Surfaces end this much short of the period.
+_CLEARANCE = 1.001
+# Surfaces may be as small as a point, but the kernel is a unit of length wide.
+_LEAST_WIDTH = 0.01
+# An accuracy called reachable must hold when it is requested, on a pilot that differs a little.
+_REACHABLE_MARGIN = 1.5
+_STEP = 1.04
+# Factor of the M of a lattice with octaves whose images are too large.
+FINER_LATTICE = 1.15
+# At this distance the kernel exp(-2πr) is below the smallest double.
+_VANISHED = 120.0
 
 
 @dataclass(frozen=True)
@@ -59,7 +98,7 @@ class Accuracy:
         """
         return np.asarray(estimate.errors <= self.rtol * self.scale(estimate.values))
 
-    def scale(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def scale(self, values: Reals) -> Reals:
         """Return what errors of norms or distances are relative to: themselves, or the floor."""
         return np.maximum(values, self.floor)
 
@@ -120,3 +159,140 @@ def _projected_bytes(intervals: int) -> float:
     half = Lattice(1.0, intervals).half
     # An accuracy may lead to any eps, and the finest eps takes the finest grid.
     return projected_bytes(half, TransformSettings(FINEST_EPS["complex128"])) + 2 * 16 * half.size
+
+
+def first_lattice(support: Support, orders: Sequence[float], accuracy: Accuracy) -> tuple[Lattice, bool]:
+    """Return the lattice for two surfaces close to each other, before anything else is known of them.
+
+    Their energy then grows like |ξ|², which makes the tail beyond ξ_max a closed form. If that requires
+    a large lattice, the result is a small pilot lattice.
+
+    Args:
+        support: Sizes of the surfaces, reach included: the period is above twice that.
+        orders: Orders s.
+        accuracy: Accuracy of the distance.
+
+    Returns:
+        The lattice, and True if it is a pilot that is likely to be `refined`.
+    """
+    period = max(_first_period(support.widths, orders, accuracy), _CLEARANCE * 2 * support.reach)
+    radii = np.geomspace(0.5, _HIGHEST_FREQUENCY, 400)
+    highest = radii[0]
+    for order in orders:
+        # ∫_x^∞ r² (1+r²)^s dr over the same from zero; it diverges from order -3/2 on.
+        tails = betainc(max(-order - 1.5, 1e-9), 1.5, 1 / (1 + radii**2))
+        allowed = accuracy.truncation_part(order) / (TRUNCATION_CAUTION * _TAIL_MARGIN / 2)
+        enough = np.flatnonzero(tails <= allowed)
+        highest = max(highest, radii[enough[0]] if enough.size and order < -1.5 else radii[-1])
+    most = min(_PILOT_M, accuracy.largest_intervals)
+    return lattice_of(highest, period, most), 2 * highest * period > most
+
+
+def core_lattice(support: Support, orders: Sequence[float], accuracy: Accuracy) -> Lattice:
+    """Return a small lattice whose period holds the surfaces and their images apart, for the innermost frequencies.
+
+    Octaves of larger lattices measure the rest, so that its M can be the same for every accuracy.
+    """
+    period = max(_first_period(support.widths, orders, accuracy), _CLEARANCE * 2 * support.reach)
+    return lattice_of(_HIGHEST_FREQUENCY, period, min(_PILOT_M, accuracy.largest_intervals))
+
+
+def larger_pilot(lattice: Lattice, accuracy: Accuracy) -> Lattice | None:
+    """Return a pilot that sees further than one on which an accuracy seemed out of reach, or None."""
+    intervals = min(_LARGER_PILOT_M, accuracy.largest_intervals)
+    return Lattice(intervals * lattice.spacing / 2, intervals) if intervals > lattice.M else None
+
+
+def lattice_of(highest: float, period: float, most: int) -> Lattice:
+    """Return the lattice of a period 1/h that reaches to a frequency, or to the one that M allows.
+
+    Args:
+        highest: Frequency to reach, in cycles per unit length. A good M may reach beyond it.
+        period: Period 1/h, in units of length.
+        most: Largest M.
+    """
+    intervals = most if 2 * highest * period > most else min(good_intervals(2 * highest * period), most)
+    return Lattice(intervals / (2 * period), intervals)
+
+
+def refined(sums: Sums, weights: SobolevWeights, support: Support, accuracy: Accuracy, label: str) -> Lattice:
+    """Return the lattice that distances need, from their sums on a smaller one.
+
+    Args:
+        sums: Sums of the difference of a pair of surfaces, or of several pairs.
+        weights: Weights of these sums, on the smaller lattice.
+        support: Sizes of the surfaces.
+        accuracy: Accuracy of the distances.
+        label: Name of the pair in messages.
+
+    Returns:
+        A lattice at least as fine and as large as the smaller one. A best effort takes the largest one at last.
+
+    Raises:
+        AccuracyError: The lattice does not fit into the memory; the message gives the reachable rtol.
+    """
+    lattice, orders = weights.lattice, weights.orders
+    period = _refined_period(sums, weights, support.widths, accuracy)
+
+    def tail(highest: float) -> Reals:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            tails = np.nan_to_num(truncated(sums, weights, support, highest) / (2 * sums.totals), posinf=0.0)
+        return np.asarray(tails.reshape(len(orders), -1).max(axis=1))
+
+    most = accuracy.largest_intervals
+    allowed = np.array([accuracy.truncation_part(order) for order in orders])
+    larger = accumulate(repeat(_STEP), mul, initial=lattice.xi_max)
+    candidates = [next(larger), *takewhile(lambda highest: 2 * highest * period <= most, larger)]
+    highest = next((highest for highest in candidates if not np.any(tail(highest) > allowed)), None)
+    if highest is None and accuracy.best_effort:
+        return lattice_of(_HIGHEST_FREQUENCY, period, most)
+    if highest is None:
+        excess = tail(max(most / (2 * period), lattice.xi_max)) / allowed
+        worst = int(np.argmax(excess))
+        raise unreachable(
+            f"{label}: rtol {accuracy.rtol:g} is out of reach at order {orders[worst]:g} within "
+            f"{accuracy.allowed_bytes / 1e9:.3g} GB of memory (M <= {most}; more memory permits a larger one)",
+            accuracy.rtol,
+            _REACHABLE_MARGIN * float(excess[worst]) * accuracy.rtol,
+        )
+    return lattice_of(highest, period, most)
+
+
+def good_intervals(least: float) -> int:
+    """Return an even M of at least ``least`` for which the FFT of the fine grid is fast and hardly padded."""
+
+    def fine_grid(modes: int) -> int:
+        return 2 * int(next_fast_len(modes, real=True))
+
+    smallest = 2 * math.ceil(least / 2)
+    choices = range(smallest, smallest + max(8, smallest // 8), 2)
+    return min(choices, key=lambda M: (fine_grid(M + 1) ** 2 * fine_grid(M // 2 + 1), -M))
+
+
+def _refined_period(sums: Sums, weights: SobolevWeights, widths: Reals, accuracy: Accuracy) -> float:
+    """Return the period 1/h at which the images that the sums show are small enough."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        images = np.nan_to_num(aliased(sums, weights, widths) / (2 * sums.totals), posinf=0.0)
+    images = images.reshape(len(weights.orders), -1).max(axis=1)
+    first = 1 / weights.lattice.spacing
+    before = [image_weight(1 / first, order, widths) for order in weights.orders]
+
+    def suffices(period: float) -> bool:
+        return period >= first + 8 or not any(
+            image * image_weight(1 / period, order, widths) / weight > accuracy.aliasing_part
+            for image, order, weight in zip(images, weights.orders, before, strict=True)
+        )
+
+    return next(filter(suffices, accumulate(repeat(0.02 / weights.lattice.spacing), initial=first)))
+
+
+def _first_period(widths: Reals, orders: Sequence[float], accuracy: Accuracy) -> float:
+    """Return the period 1/h at which the kernel alone predicts images that are small enough."""
+    allowed = accuracy.aliasing_part / (ALIASING_CAUTION * _IMAGE_MARGIN / 2)
+
+    farthest = float(widths.max()) + _VANISHED
+
+    def suffices(period: float) -> bool:
+        return period > farthest or all(image_weight(1 / period, order, widths) <= allowed for order in orders)
+
+    return next(filter(suffices, accumulate(repeat(1.01), mul, initial=max(float(widths.max()), _LEAST_WIDTH))))

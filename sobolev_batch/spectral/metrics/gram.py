@@ -19,6 +19,7 @@ from sobolev_batch.spectral.shells import SobolevWeights
 
 Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
+Run = tuple[slice, int, int | None]
 
 # A squared distance this much smaller than the squared distances to the center has lost six of its
 # sixteen digits.
@@ -31,21 +32,6 @@ _FEWEST_SAMPLED = 1 << 10
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
-    """Neighbouring samples of an arrangement that count towards the same sums.
-
-    Attributes:
-        samples: Positions in the arrangement.
-        residue: |k|² mod 4 of the samples.
-        window: Outer range that the samples represent, or None.
-    """
-
-    samples: slice
-    residue: int
-    window: int | None
-
-
-@dataclass(frozen=True, eq=False)
 class Arrangement:
     """Samples of a block of the half lattice, sorted by the sums that they count towards.
 
@@ -54,7 +40,8 @@ class Arrangement:
 
     Attributes:
         order: Position in the block of each sample, int64 (block.size,).
-        runs: Runs of samples that cover the block.
+        runs: Neighbouring samples that count towards the same sums, and cover the block: their positions, |k|² mod 4,
+            and the outer range that they represent, or None.
         shells: |k|² of each sample, int32 (block.size,).
         trapezoid: Weight of each sample in the sum over the lattice (block.size,).
         by_order: Weights of the shells for each order (orders, lattice.shell_count).
@@ -85,7 +72,7 @@ class Arrangement:
         order = np.argsort(kinds, kind="stable")
         ends = np.cumsum(np.bincount(kinds, minlength=12)).tolist()
         runs = tuple(
-            Run(slice(start, end), kind // 3, kind % 3 - 1 if kind % 3 else None)
+            (slice(start, end), kind // 3, kind % 3 - 1 if kind % 3 else None)
             for kind, (start, end) in enumerate(zip([0, *ends], ends, strict=False))
             if end > start
         )
@@ -133,17 +120,19 @@ class Arrangement:
     def _column_batches(self) -> Iterator[tuple[Run, slice, Reals]]:
         """Yield columns of real and imaginary parts that stay in cache, with weights (orders or one more, columns)."""
         for run in self.runs:
-            rows = self.by_order if run.window is None else np.vstack([self.by_order, self.by_window[run.window]])
-            for start in range(run.samples.start, run.samples.stop, _COLUMNS):
-                stop = min(start + _COLUMNS, run.samples.stop)
+            samples, _, window = run
+            rows = self.by_order if window is None else np.vstack([self.by_order, self.by_window[window]])
+            for start in range(samples.start, samples.stop, _COLUMNS):
+                stop = min(start + _COLUMNS, samples.stop)
                 weights = rows[:, self.shells[start:stop]] * self.trapezoid[start:stop]
                 yield run, slice(2 * start, 2 * stop), np.repeat(weights, 2, axis=1)
 
     def _add(self, sums: Sums, run: Run, products: Reals) -> None:
+        _, residue, window = run
         orders = len(self.by_order)
-        sums.squares[:, run.residue] += products[:orders]
-        if run.window is not None:
-            sums.outer[run.window] += products[orders]
+        sums.squares[:, residue] += products[:orders]
+        if window is not None:
+            sums.outer[window] += products[orders]
 
 
 def differences(products: Sums, first: Sums, second: Sums) -> tuple[Sums, NDArray[np.bool_]]:

@@ -236,19 +236,14 @@ def require_inside(surface: Surface, lattice: Lattice) -> None:
         LatticeError: Some |coordinate| is not below 1/(2h).
     """
     kind = "mesh" if kind_of(surface).triangles else "surface"
-    _require_reach(max(float(np.abs(bound).max()) for bound in surface.bounds), lattice, f"the {kind} reaches", "it")
+    require_points_inside(np.stack(surface.bounds), lattice, f"the {kind} reaches", "it")
 
 
-def require_points_inside(coordinates: NDArray[np.float64], lattice: Lattice) -> None:
-    """Check that points (3, n) lie within the lattice's period.
-
-    Raises:
-        LatticeError: Some |coordinate| is not below 1/(2h).
-    """
-    _require_reach(float(np.abs(coordinates).max(initial=0.0)), lattice, "the points reach", "them")
-
-
-def _require_reach(reach: float, lattice: Lattice, subject: str, pronoun: str) -> None:
+def require_points_inside(
+    coordinates: NDArray[np.float64], lattice: Lattice, subject: str = "the points reach", pronoun: str = "them"
+) -> None:
+    """Check that coordinates lie within the lattice's period; see `require_inside`."""
+    reach = float(np.abs(coordinates).max(initial=0.0))
     if not reach < lattice.half_period:
         intervals = 2 * math.floor(2 * lattice.xi_max * reach) + 2
         raise LatticeError(

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from sobolev_batch import InputError, Sphere
-from sobolev_batch.spectral.adaptive.lattice_selection import first_lattice, good_intervals
-from sobolev_batch.spectral.adaptive.tolerance import Accuracy
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy, first_lattice, good_intervals
 from sobolev_batch.spectral.budget import NormEstimate, Support
 
 
