@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
 from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.spectral.backends import ComplexDtype, Complexes, backend_named
@@ -60,11 +61,8 @@ class TailQuality:
     own: Remainder
     difference: Remainder | None = None
 
-    @classmethod
-    def from_table(cls, table: dict[str, Any]) -> Self:
-        """Return the quality from a table of its attributes."""
-        own, difference = (part and Remainder.from_table(part) for part in (table["own"], table["difference"]))
-        return cls(tuple(table["radii"]), tuple(table["squares"]), own, difference)
+
+_TAIL_QUALITY = TypeAdapter(TailQuality)
 
 
 @dataclass(frozen=True)
@@ -106,7 +104,7 @@ class Quality:
         """Read a quality from a line of `to_json`."""
         area, lowest, highest, shells, sums, *tail = json.loads(text)
         extent, probe = Extent(tuple(lowest), tuple(highest)), Probe(tuple(shells), tuple(sums))
-        return cls(area, extent, probe, TailQuality.from_table(*tail) if tail else None)
+        return cls(area, extent, probe, _TAIL_QUALITY.validate_python(*tail) if tail else None)
 
 
 @dataclass(frozen=True, eq=False)

@@ -98,13 +98,10 @@ def second_difference(ab: Reals, ac: Reals) -> Complexes:
 
 
 def doubled_areas(corners: Corners) -> Reals:
-    """Return twice the area of each triangle (m,), to rounding even if its corners are nearly collinear.
+    """Return twice the area of each triangle (m,), to rounding even if its corners (3, m) are nearly collinear.
 
     On flat triangles the edge vectors and their cross product are formed in double-double arithmetic: in doubles, an
     aspect ratio of 1e6 costs six digits.
-
-    Args:
-        corners: First, second and third corners, (3, m) each, one row per axis.
     """
     a, b, c = corners
     (ux, uy, uz), (vx, vy, vz) = b - a, c - a
@@ -292,14 +289,9 @@ def sampled_transform(mesh: Mesh, frequencies: Reals, threads: int = 1) -> Compl
     neighbouring triangles share. It is several times as fast as `exact_transform` where triangles are not small beside
     the wavelength.
 
-    Args:
-        mesh: Mesh in units of length.
-        frequencies: ξ, float64 (P, 3), in cycles per unit length.
-        threads: Number of threads.
-
     Returns:
-        complex128 (P,). The error of a triangle is at most about 1e-9 of its area. Of whole meshes at random
-        frequencies it was measured to be at most 1e-13 of the area.
+        complex128 (P,), for ξ, float64 (P, 3). The error of a triangle is at most about 1e-9 of its area. That of whole
+        meshes at random frequencies was measured to be at most 1e-13 of the area.
     """
     frequencies = np.asarray(frequencies, dtype=np.float64)
     lengths = np.linalg.norm(frequencies, axis=1)

@@ -93,12 +93,7 @@ class Frequencies:
 
     @classmethod
     def from_solution(cls, problem: Problem, solution: Solution) -> Self:
-        """Return the frequencies that a problem was solved with.
-
-        Args:
-            problem: Norm or distance.
-            solution: Its solution, for which something had to be computed.
-        """
+        """Return the frequencies that a problem was solved with, for which something had to be computed."""
         widths = problem.support.widths
         return cls(cast(Lattice, solution.lattice), solution.octaves, problem.orders, widths, solution.has_tail)
 
@@ -113,11 +108,6 @@ class Frequencies:
 
     def values(self, surface: Surface, target: ErrorTarget, execution: Execution) -> SurfaceValues:
         """Return the values of a surface, with an error within a target.
-
-        Args:
-            surface: Surface in units of length.
-            target: Largest error of the values.
-            execution: Threads, and memory that the transforms of octaves may take.
 
         Raises:
             LatticeError: The surface extends beyond the lattice's half period.
@@ -135,16 +125,7 @@ class Frequencies:
         return self.norms_of(Measure.from_values(values, signs), surfaces, signs, self.errors(values))
 
     def moved(self, values: SurfaceValues, surface: Surface, length: float) -> Reals:
-        """Return the distance of a surface to itself moved by a length, the root mean square over all directions.
-
-        Args:
-            values: Values of the surface.
-            surface: The surface.
-            length: Length of the move, in units of length.
-
-        Returns:
-            float64 (orders,).
-        """
+        """Return the distance (orders,) of a surface to itself moved by a length: the rms over all directions."""
         # ∫ |1 - exp(-2πi ξ·v)|² over directions of v, on average: 2 - 2 sin(2π|ξ||v|)/(2π|ξ||v|).
         own = Measure.from_values([values], [1])
         radii = self.lattice.spacing * np.sqrt(np.arange(self.lattice.shell_count))
@@ -212,15 +193,10 @@ class Reference:
 
     @classmethod
     def for_problem(cls, problem: Problem, solution: Solution, seed: int) -> Self:
-        """Return the reference of a distance.
+        """Return the reference of a distance between surfaces that are not equal.
 
         Its values are among those that the distance was computed from. But where the surfaces share triangles, which
         cancel, the reference has more than those, and gets frequencies of its own.
-
-        Args:
-            problem: Distance, between surfaces that are not equal.
-            solution: Its solution.
-            seed: Seed of the random frequencies of octaves.
         """
         if problem.is_whole:
             frequencies = Frequencies.from_solution(problem, solution)

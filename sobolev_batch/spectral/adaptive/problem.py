@@ -139,12 +139,7 @@ class Problem:
             )
 
     def out_of_reach(self, found: NormEstimate, limits: str) -> AccuracyError:
-        """Return the error that says what can be reached instead of the accuracy.
-
-        Args:
-            found: Nearest that was reached, (orders,).
-            limits: What limits it.
-        """
+        """Return the error for an accuracy out of reach, from the nearest that was reached and what limits it."""
         relative = found.errors / found.values
         worst = int(np.argmax(relative))
         return unreachable(

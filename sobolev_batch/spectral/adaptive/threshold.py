@@ -66,16 +66,8 @@ def relative_distance(
 ) -> tuple[Interval, Method]:
     """Bound a distance over the norm of its reference closely enough to tell on which side of a threshold it is.
 
-    One lattice decides, or two, where the areas alone bound what lies beyond them; else octaves measure it.
-
-    Args:
-        surface: Surface, in the unit of length of the norm.
-        reference: Reference, likewise.
-        order: Order s.
-        threshold: Relative distance to compare with.
-        accuracy: Memory to compute with; its rtol does not matter.
-        threads: Threads to compute with.
-        seed: Seed of the random frequencies of octaves.
+    One lattice decides, or two, where the areas alone bound what lies beyond them; else octaves measure it, at random
+    frequencies that follow from the seed. The memory of the accuracy counts, and its rtol does not.
 
     Returns:
         The bounds, and what they follow from.

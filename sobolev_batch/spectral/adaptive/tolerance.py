@@ -138,13 +138,7 @@ class Accuracy:
 
 
 def unreachable(problem: str, rtol: float, reachable: float) -> AccuracyError:
-    """Return the error for an accuracy that is out of reach, with advice.
-
-    Args:
-        problem: What cannot be reached, and why.
-        rtol: Requested accuracy.
-        reachable: Smallest rtol that is expected to be met.
-    """
+    """Return the error for an rtol that is out of reach, with advice by the smallest one that is not."""
     if not reachable < 1:
         advice = "not even one digit can be reached; take a more negative order, or a best effort"
         return AccuracyError(f"{problem}; {advice}", rtol, reachable)
@@ -164,16 +158,8 @@ def _projected_bytes(intervals: int) -> float:
 def first_lattice(support: Support, orders: Sequence[float], accuracy: Accuracy) -> tuple[Lattice, bool]:
     """Return the lattice for two surfaces close to each other, before anything else is known of them.
 
-    Their energy then grows like |ξ|², which makes the tail beyond ξ_max a closed form. If that requires
-    a large lattice, the result is a small pilot lattice.
-
-    Args:
-        support: Sizes of the surfaces, reach included: the period is above twice that.
-        orders: Orders s.
-        accuracy: Accuracy of the distance.
-
-    Returns:
-        The lattice, and True if it is a pilot that is likely to be `refined`.
+    Their energy then grows like |ξ|², which makes the tail beyond ξ_max a closed form. If that requires a large
+    lattice, the result is a small pilot lattice, which is likely to be `refined`, and True.
     """
     period = max(_first_period(support.widths, orders, accuracy), _CLEARANCE * 2 * support.reach)
     radii = np.geomspace(0.5, _HIGHEST_FREQUENCY, 400)
@@ -204,29 +190,18 @@ def larger_pilot(lattice: Lattice, accuracy: Accuracy) -> Lattice | None:
 
 
 def lattice_of(highest: float, period: float, most: int) -> Lattice:
-    """Return the lattice of a period 1/h that reaches to a frequency, or to the one that M allows.
+    """Return the lattice of a period 1/h that reaches to a frequency, or to the one that the largest M allows.
 
-    Args:
-        highest: Frequency to reach, in cycles per unit length. A good M may reach beyond it.
-        period: Period 1/h, in units of length.
-        most: Largest M.
+    A good M may reach beyond it. Frequencies are in cycles per unit length.
     """
     intervals = most if 2 * highest * period > most else min(good_intervals(2 * highest * period), most)
     return Lattice(intervals / (2 * period), intervals)
 
 
 def refined(sums: Sums, weights: SobolevWeights, support: Support, accuracy: Accuracy, label: str) -> Lattice:
-    """Return the lattice that distances need, from their sums on a smaller one.
+    """Return the lattice that distances need, from their sums on a smaller one with these weights.
 
-    Args:
-        sums: Sums of the difference of a pair of surfaces, or of several pairs.
-        weights: Weights of these sums, on the smaller lattice.
-        support: Sizes of the surfaces.
-        accuracy: Accuracy of the distances.
-        label: Name of the pair in messages.
-
-    Returns:
-        A lattice at least as fine and as large as the smaller one. A best effort takes the largest one at last.
+    It is at least as fine and as large as the smaller one. A best effort takes the largest one at last.
 
     Raises:
         AccuracyError: The lattice does not fit into the memory; the message gives the reachable rtol.

@@ -138,13 +138,9 @@ class Arrangement:
 def differences(products: Sums, first: Sums, second: Sums) -> tuple[Sums, NDArray[np.bool_]]:
     """Return squared differences of pairs from their inner products, and a mask of those that cancelled.
 
-    Args:
-        products: Products of the differences to the center, (orders, 4, m, n) and (2, m, n).
-        first: Squares of the differences a to the center, (orders, 4, m) and (2, m).
-        second: Squares of the differences b to the center, (orders, 4, n) and (2, n).
-
-    Returns:
-        The squares of a - b, and a mask (m, n) of the pairs that lost more than about six digits at any order.
+    The products are those of the differences to the center, (orders, 4, m, n) and (2, m, n). The others are squares of
+    these differences, (orders, 4, m) and (orders, 4, n). The mask (m, n) is True for pairs that lost more than about
+    six digits at any order.
     """
     sums = first.squares[..., :, None] + second.squares[..., None, :]
     squares = sums - 2 * products.squares

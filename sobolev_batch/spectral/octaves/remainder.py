@@ -17,10 +17,10 @@ foot.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
@@ -91,16 +91,6 @@ class Remainder:
         """Return a part whose mean energy lies between bounds."""
         return cls(cutoff, (-1.0,), ((lowest + highest) / 2,), (abs(highest - lowest) / 2,))
 
-    @classmethod
-    def from_table(cls, table: Mapping[str, Any]) -> Self:
-        """Return the part that a table holds."""
-        orders, energies, errors = (tuple(table[name]) for name in ("orders", "energies", "errors"))
-        return cls(table["cutoff"], orders, energies, errors, table["points"], table["pairs"])
-
-    def to_table(self) -> dict[str, Any]:
-        """Return the part as a table, from which `from_table` makes it again."""
-        return asdict(self)
-
     def at(self, orders: Sequence[float]) -> tuple[Reals, Reals]:
         """Return the part of the squared norm (orders,), and how far off it may be; energies are interpolated."""
         values, errors = np.zeros(len(orders)), np.zeros(len(orders))
@@ -129,14 +119,14 @@ def remainder(
     points: int | None = None,
     seed: int = 0,
 ) -> Remainder:
-    """Estimate what lies beyond a cutoff in the norm of a signed sum of surfaces.
+    """Estimate what lies beyond a cutoff in the norm of a signed sum of surfaces, in units of length.
 
     Args:
         surfaces: Surfaces, in units of length.
         signs: Sign of each.
         cutoff: |ξ| at which the `smooth_step` ends, in cycles per unit length.
         orders: Orders s; by default enough of them to interpolate between.
-        points: Number of random points; by default as many as take about a second, at most 1,000.
+        points: Number of random points; by default as many as take about a second, at most 256.
         seed: Seed of the points.
     """
     known = tuple(sorted({max(order, LOWEST_ORDER) for order in orders or _USUAL_ORDERS}, reverse=True))

@@ -76,11 +76,9 @@ class OctaveWeights:
         return np.asarray(self.by_order[:-1] @ products)
 
     def sums(self, squares: Reals) -> OctaveSums:
-        """Return the integrals of |field|², or of products of two fields, with their variances.
+        """Return the integrals of |field|², or of products of two fields, with variances, from all samples (n,).
 
-        Args:
-            squares: Values of |field|² or of the products at all samples (n,). What is known of the integrals
-                otherwise may have been subtracted.
+        What is known of the integrals otherwise may have been subtracted from the samples.
         """
         sums, variances, degrees = np.zeros(len(self.by_order)), np.zeros((2, len(self.by_order))), [0, 0]
         for part in self.sampling.parts:
@@ -167,10 +165,8 @@ class Tail:
     def estimate(self, core: Reals, images: Reals, discretisation: Reals) -> NormEstimate:
         """Return norms with their errors, each (orders, ...).
 
-        Args:
-            core: Squared norm of the innermost frequencies.
-            images: Bound on its change by the lattice's spacing.
-            discretisation: Norms of the errors of all values.
+        They follow from the squared norm of the innermost frequencies, the bound on its change by the lattice's
+        spacing, and the norms of the errors of all values.
         """
         squares = np.maximum(np.maximum(core, 0.0) + self.squares, 0.0)
         return NormEstimate(

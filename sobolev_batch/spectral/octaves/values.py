@@ -89,15 +89,9 @@ def octave_values(
 ) -> OctaveValues:
     """Return the transform of a surface at the samples of an octave.
 
-    Args:
-        surface: Surface in units of length.
-        sampling: The octave and its samples.
-        orders: Orders that errors are measured for.
-        settings: Settings of nonuniform FFTs. Values at drawn frequencies, and on lattices where large triangles would
-            take many points, are exact.
-        execution: Backend, threads and memory.
-        known: Values at some of the samples: on the first lattices, and maybe at the same drawn frequencies. They are
-            not computed again.
+    Values on lattices come from nonuniform FFTs by these settings, and their errors are measured for some orders. Those
+    at drawn frequencies, and on lattices where large triangles would take many points, are exact. Known values, on the
+    first lattices and maybe at the same drawn frequencies, are not computed again.
 
     Raises:
         InputError: The quadrature of a parametrised surface does not converge.

@@ -107,9 +107,9 @@ class SurfaceKind(ABC):
 
     @abstractmethod
     def batches(self, capacity: int, backend: Backend = CPU) -> Iterator[WeightedPoints]:
-        """Yield the points in batches of at most a number, which are nearly equal for a mesh.
+        """Yield the points in batches of at most a number, at least 8 times that of the largest rule (3,624).
 
-        The number is at least 8 times that of the largest rule (3,624).
+        Those of a mesh are nearly equal.
 
         Raises:
             InputError: A parametrised surface whose quadrature does not converge.

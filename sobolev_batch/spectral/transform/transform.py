@@ -153,13 +153,8 @@ def _on_gpu(
 def fastest_spec(whole: NufftSpec, workload: Workload, costs: Costs, allowed_bytes: float) -> NufftSpec:
     """Return the sub-blocks, batches and oversampling that are predicted to be the fastest within the allowed memory.
 
-    If the whole block fits, nothing is subdivided or prescribed: the values are then those of unlimited memory.
-
-    Args:
-        whole: NUFFT with the shape of the block and the largest allowed batch.
-        workload: Points to transform.
-        costs: Costs of the library.
-        allowed_bytes: Memory that the transform may take, without the result and the mesh.
+    That memory is without the result and the mesh. If the whole block fits, nothing is subdivided or prescribed: the
+    values are then those of unlimited memory.
 
     Raises:
         InputError: Nothing fits; the message names the smallest memory that works.

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import sobolev_batch as sb
 from sobolev_batch import Mesh, Sphere
-from sobolev_batch.spectral.octaves.remainder import Remainder, remainder
+from sobolev_batch.spectral.fields import Quality, TailQuality
+from sobolev_batch.spectral.octaves.remainder import remainder
+from sobolev_batch.spectral.probe import Probe
 from sobolev_batch.surfaces.shapes.surface import Surface
 from tests.support.rectangles import Rectangles
 
@@ -97,9 +99,12 @@ def test_vertices_that_no_triangle_uses_and_triangles_without_area_do_not_matter
     assert remainder([stray], [1], 60.0, ORDERS).energies == pytest.approx(remainder([BOX], [1], 60.0, ORDERS).energies)
 
 
-def test_a_remainder_survives_its_table() -> None:
+def test_a_remainder_survives_the_quality_of_a_field() -> None:
     beyond = remainder([BOX], [1], 60.0, ORDERS, points=100)
-    assert Remainder.from_table(json.loads(json.dumps(beyond.to_table()))) == beyond
+    for difference in (beyond, None):
+        quality = Quality.from_surface(BOX, Probe((1, 2), (0.5, 0.25)))
+        quality = replace(quality, tail=TailQuality((1.0,), (2.0,), beyond, difference))
+        assert Quality.from_json(quality.to_json()) == quality
 
 
 def test_between_the_orders_of_a_study_energies_are_interpolated() -> None:
