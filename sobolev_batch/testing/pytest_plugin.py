@@ -6,7 +6,6 @@ pytest loads it in every session of an environment, so it imports nothing else b
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from hashlib import sha256
 from itertools import count
 from pathlib import Path
@@ -18,17 +17,16 @@ if TYPE_CHECKING:
     from sobolev_batch.surfaces.formats.readers import SurfaceLike
     from sobolev_batch.testing.verdict import Verdict
 
-_OPTION, _INI = "--sobolev-witness-folder", "sobolev_witness_folder"
+_OPTION = "--sobolev-witness-folder"
 _HELP = (
     "Folder for PLY files of the surfaces that assert_same_surface finds different; relative to the root of the tests. "
-    "By default in the cache of pytest, or in the test's temporary folder if there is no cache."
+    "By default the temporary folder of the test."
 )
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the option and the setting for the folder of witness files."""
+    """Add the option for the folder of witness files."""
     parser.getgroup("sobolev-batch").addoption(_OPTION, metavar="FOLDER", default=None, help=_HELP)
-    parser.addini(_INI, _HELP, default="")
 
 
 @pytest.fixture
@@ -53,18 +51,6 @@ def _path(request: pytest.FixtureRequest, number: int) -> Path:
     # Parameters may be long, or differ in characters that names of files cannot have.
     digest = sha256(request.node.nodeid.encode()).hexdigest()[:8]
     stem = file_stem(number, request.node.name).partition("-")[2] or "test"
-    return _folder(request) / f"{stem}-{digest}-{number}"
-
-
-def _folder(request: pytest.FixtureRequest) -> Path:
-    config = request.config
-    chosen = config.getoption(_OPTION) or config.getini(_INI)
-    if chosen:
-        return config.rootpath / str(chosen)
-    # Without its plug-in, pytest has no cache; and a project may lie where nothing can be written.
-    cache: pytest.Cache | None = getattr(config, "cache", None)
-    if cache is not None:
-        with suppress(OSError):
-            return cache.mkdir("sobolev-witness")
-    temporary: Path = request.getfixturevalue("tmp_path")
-    return temporary
+    chosen = request.config.getoption(_OPTION)
+    folder = request.config.rootpath / str(chosen) if chosen else Path(request.getfixturevalue("tmp_path"))
+    return folder / f"{stem}-{digest}-{number}"

@@ -216,11 +216,7 @@ def assert_same_surface(
 
 
 def require_place(path: Path) -> None:
-    """Create the folder of the files that `write_difference` writes.
-
-    Raises:
-        InputError: The path names no file, or its folder cannot be created.
-    """
+    """Create the folder of the files that `write_difference` writes; InputError where that cannot be done."""
     if not path.name:
         raise InputError(f"{str(path)!r} names no file; files get {str(Path('failures', 'part'))!r} and an ending")
     try:
@@ -232,9 +228,7 @@ def require_place(path: Path) -> None:
 def write_difference(
     a: Surface, b: Surface, path: Path, order: float, *, scaling: bool = True, subject: str = "a"
 ) -> str:
-    """Write two meshes, each with the witness function of a against b at its vertices.
-
-    Surfaces that are no meshes have no file.
+    """Write the meshes among two surfaces, each with the witness function of a against b at its vertices.
 
     Args:
         a: Surface.
@@ -256,8 +250,7 @@ def write_difference(
 
     similarity = Similarity.to_unit_ball(b) if scaling else Similarity()
     pair = [similarity.apply(surface) for surface in (a, b)]
-    middle = np.mean(Extent.union([surface.extent for surface in pair]).box, axis=0)
-    x, y, z = middle.tolist()
+    x, y, z = np.mean(Extent.union([surface.extent for surface in pair]).box, axis=0).tolist()
     centered = [Similarity(1.0, (x, y, z)).apply(surface) for surface in pair]
     extent = Extent.union([surface.extent for surface in centered])
     area = np.array(sum(surface.area for surface in centered))
@@ -278,8 +271,6 @@ def write_difference(
         written.append(file)
     if not written:
         return "no witness: neither surface is a mesh"
-    files = f"witness: {' '.join(map(str, written))}"
-    if greatest == 0:
-        return f"they differ nowhere; {files}"
     kind = "more" if greatest > 0 else "less"
-    return f"{subject} has {kind} area near ({', '.join(f'{x:.4g}' for x in place)}); {files}"
+    near = f"{subject} has {kind} area near ({', '.join(f'{x:.4g}' for x in place)})"
+    return f"{near if greatest else 'they differ nowhere'}; witness: {' '.join(map(str, written))}"

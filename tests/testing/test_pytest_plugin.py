@@ -40,35 +40,20 @@ def _without_other_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "options", "folder"),
-    [
-        ("", [], ".pytest_cache/d/sobolev-witness"),
-        pytest.param("", ["--sobolev-witness-folder=chosen/here"], "chosen/here", marks=pytest.mark.all),
-        pytest.param("[pytest]\nsobolev_witness_folder = of_settings", [], "of_settings", marks=pytest.mark.all),
-    ],
+    ("options", "folder"), [([], "temp/test_lost_*_0"), (["--sobolev-witness-folder=chosen/here"], "chosen/here")]
 )
-def test_files_lie_beside_the_failure(
-    pytester: pytest.Pytester, settings: str, options: list[str], folder: str
-) -> None:
+def test_files_lie_where_the_message_says(pytester: pytest.Pytester, options: list[str], folder: str) -> None:
     pytester.makepyfile(test_meshes=TESTS)
-    pytester.path.joinpath("pytest.ini").write_text(settings or "[pytest]")
-    result = pytester.runpytest_subprocess("-p", MODULE, *options)
+    pytester.path.joinpath("pytest.ini").write_text("[pytest]")
+    result = pytester.runpytest_subprocess("-p", MODULE, f"--basetemp={pytester.path}/temp", *options)
     result.assert_outcomes(passed=1, failed=2)
-    files = sorted(file.name for file in pytester.path.joinpath(folder).glob("*.ply"))
-    assert len(files) == 4
+    files = sorted(file.name for file in pytester.path.glob(f"{folder}/*.ply"))
     # Of the second comparison of each test.
     assert [name.rpartition("-2-")[2] for name in files] == ["a.ply", "b.ply", "a.ply", "b.ply"]
     assert files[0].startswith("test-lost-a-b-")
     assert files[2].startswith("test-lost-c-")
     result.stdout.fnmatch_lines([f"E *AssertionError: different surfaces: *; witness: *{folder}/{files[0]} *"])
     assert "verdict.py" not in result.stdout.str()
-
-
-def test_without_a_cache_files_lie_in_the_temporary_folder(pytester: pytest.Pytester) -> None:
-    pytester.makepyfile(test_meshes=TESTS)
-    result = pytester.runpytest_subprocess("-p", MODULE, "-p", "no:cacheprovider", f"--basetemp={pytester.path}/temp")
-    result.assert_outcomes(passed=1, failed=2)
-    assert len(list(pytester.path.glob("temp/test_lost_*_0/*.ply"))) == 4
 
 
 def test_loading_it_imports_no_library() -> None:
