@@ -14,10 +14,9 @@ from distributed import Client
 
 from sobolev_batch.batch.analysis.proximity import have_proximities, measure_proximities
 from sobolev_batch.batch.analysis.tabulate import are_tabulated, tabulate_fields
-from sobolev_batch.batch.cluster import GIVE_UP_AFTER
 from sobolev_batch.batch.cluster.clients import local_client, memory_limit, thread_client
 from sobolev_batch.batch.cluster.execution import Cluster, Notify, Progress
-from sobolev_batch.batch.cluster.watch import Watch, require_give_up_after
+from sobolev_batch.batch.cluster.watch import Watch
 from sobolev_batch.batch.cluster.workers import require_store_access
 from sobolev_batch.batch.collection_store import CollectionStore, for_each_object, labelled
 from sobolev_batch.batch.fields.compute import compute_fields, copy_fields
@@ -94,7 +93,6 @@ def run(
     memory: float | str | None = None,
     on_progress: Notify | None = None,
     reuse: Sequence[str | Path | Location] = (),
-    give_up_after: float = GIVE_UP_AFTER,
 ) -> Summary:
     """Compute the fields that a store lacks of a study, then norms, distances and convergence tables.
 
@@ -110,8 +108,6 @@ def run(
         reuse: Paths or URLs of other stores. Their fields of the same surface, reference, scaling, accuracy and lattice
             are copied, whatever the mesh is called there; from the store of a collection, those of the same object. If
             the study requests an accuracy, a new store takes the lattice of the first one.
-        give_up_after: Seconds after which a worker that says nothing is given up, and its tasks are given to others. A
-            scheduler that says nothing for so long counts as lost.
 
     Returns:
         Meshes that were computed, that were reused, and that failed. A mesh that fails does not raise. In a collection,
@@ -123,7 +119,7 @@ def run(
         StoreError: The store cannot be reached or written, belongs to another study, or is being written by another run
             (LockError).
         ClusterError: No worker has the GPU or the memory that the study requests; or the scheduler was lost.
-        InputError: The memory is no size, or not there; or give_up_after is less than 10 seconds.
+        InputError: The memory is no size, or not there.
 
     >>> import sobolev_batch as sb
     >>> study = sb.Study.from_table({
@@ -139,18 +135,31 @@ def run(
     >>> sb.run(study, "memory://run-example.zarr").reused
     ('ball/sphere', 'reference')
     """
-    require_give_up_after(give_up_after)
     location, reusable = Location.parse(store), _reusable_stores(map(Location.parse, reuse))
     if client is not None:
         location = location.absolute()
+    notify = on_progress or _ignore
     with ExitStack() as stack:
         # One cluster serves all studies, and none is started where nothing is missing.
         own = nullcontext(client) if client is not None else _own_cluster(study, location, workers, memory)
         start = cache(lambda: stack.enter_context(own))
-        driver = Driver(start, give_up_after, on_progress or (lambda progress: None), client is not None)
+
+        def run_study(study: Study, location: Location, others: Sequence[Location], notify: Notify) -> Summary:
+            lock = Lock.of_this_process()
+            require_usable(location)
+            with locked(location, lock):
+                if client is not None:
+                    with Watch(client).kept():
+                        require_store_access(client, location, lock)
+                return carry_out(study, location, lock, start, notify, others)
+
         if isinstance(study, Study):
-            return _run_study(study, location, driver, [place for _, place in reusable])
-        return _run_collection(study, location, driver, reusable)
+            return run_study(study, location, [place for _, place in reusable], notify)
+        return _run_collection(study, location, run_study, notify, reusable)
+
+
+def _ignore(progress: Progress) -> None:
+    """Report a step of a run to nobody."""
 
 
 def _own_cluster(
@@ -182,31 +191,22 @@ def _reusable_stores(locations: Iterable[Location]) -> list[tuple[str, Location]
     return reusable
 
 
-def _run_study(study: Study, location: Location, driver: Driver, others: Sequence[Location]) -> Summary:
-    """Lock the store of a study and run it; fields of other stores are copied."""
-    lock = Lock.of_this_process()
-    require_usable(location)
-    with locked(location, lock):
-        if driver.has_foreign_cluster:
-            client = driver.client()
-            with Watch(client, False, driver.give_up_after).kept():
-                require_store_access(client, location, lock)
-        return driver.run(study, location, lock, others)
-
-
 def _run_collection(
-    collection: StudyCollection, location: Location, driver: Driver, reusable: Sequence[tuple[str, Location]]
+    collection: StudyCollection,
+    location: Location,
+    run_study: Callable[[Study, Location, Sequence[Location], Notify], Summary],
+    notify: Notify,
+    reusable: Sequence[tuple[str, Location]],
 ) -> Summary:
-    """Run the study of each object of a collection; see `_run_study`."""
+    """Run the study of each object of a collection."""
     CollectionStore.prepared(location, collection)
     names = list(collection.studies)
 
     def run_object(name: str, study: Study, place: Location) -> Summary:
         part = f"{name}, {names.index(name) + 1} of {len(names)}"
-        telling = replace(driver, notify=lambda progress: driver.notify(replace(progress, part=part)))
         others = [other for owner, other in reusable if owner in ("", name)]
         try:
-            return _run_study(study, place, telling, others)
+            return run_study(study, place, others, lambda progress: notify(replace(progress, part=part)))
         except InputError as error:
             _log.error("%s: %s", name, error)
             raise
@@ -226,51 +226,45 @@ def _run_collection(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Driver:
-    """The process that drives runs, and its cluster.
+def carry_out(
+    study: Study,
+    location: Location,
+    lock: Lock,
+    start: Callable[[], Client],
+    notify: Notify = _ignore,
+    others: Sequence[Location] = (),
+) -> Summary:
+    """Run a study in a store that this process has locked; fields of other stores are copied.
 
-    Attributes:
-        client: Function that returns the client of the cluster, called if anything is missing.
-        give_up_after: Seconds after which what is silent is given up.
-        notify: Callback for each step.
-        has_foreign_cluster: True if the caller has started the cluster, whose workers may see another store.
+    The client of the cluster is requested if anything is missing.
     """
+    plan = make_plan(study, next(filter(None, map(stored_choice, [location, *others])), None))
+    # Planning may take minutes.
+    lock.require(location)
+    workspace = Workspace.prepared(location.fenced(lock.fence), plan)
+    with Heartbeat(workspace.store, lock) as heartbeat:
+        workspace.withdraw_lost_fields()
+        if others:
+            workspace.withdraw_results_of(copy_fields(workspace, others))
+        if not workspace.pending and are_tabulated(workspace) and have_proximities(workspace):
+            return _summary(workspace, set())
+        client = start()
+        with Watch(client, study.backend == "gpu").kept() as watch:
+            heartbeat.find_obstacle = lambda: watch.obstacle
+            heartbeat.cluster = client.scheduler.address
+            heartbeat.write("running")
+            notify(Progress("cluster", 0, 0, client.dashboard_link))
 
-    client: Callable[[], Client]
-    give_up_after: float
-    notify: Notify = lambda progress: None
-    has_foreign_cluster: bool = False
+            def beat(progress: Progress) -> None:
+                heartbeat.require_lock()
+                heartbeat.stage = f"{progress.stage}, {progress.done} of {progress.total}"
+                notify(progress)
 
-    def run(self, study: Study, location: Location, lock: Lock, others: Sequence[Location] = ()) -> Summary:
-        """Run a study in a store that this process has locked; fields of other stores are copied."""
-        plan = make_plan(study, next(filter(None, map(stored_choice, [location, *others])), None))
-        # Planning may take minutes.
-        lock.require(location)
-        workspace = Workspace.prepared(location.fenced(lock.fence), plan)
-        with Heartbeat(workspace.store, lock) as heartbeat:
-            workspace.withdraw_lost_fields()
-            if others:
-                workspace.withdraw_results_of(copy_fields(workspace, others))
-            if not workspace.pending and are_tabulated(workspace) and have_proximities(workspace):
-                return _summary(workspace, set())
-            client = self.client()
-            with Watch(client, study.backend == "gpu", self.give_up_after).kept() as watch:
-                heartbeat.find_obstacle = lambda: watch.obstacle
-                heartbeat.cluster = client.scheduler.address
-                heartbeat.write("running")
-                self.notify(Progress("cluster", 0, 0, client.dashboard_link))
-
-                def beat(progress: Progress) -> None:
-                    heartbeat.require_lock()
-                    heartbeat.stage = f"{progress.stage}, {progress.done} of {progress.total}"
-                    self.notify(progress)
-
-                cluster = Cluster.prepare(client, study.libraries, beat)
-                # Asked before anything is computed: a GPU that nobody has would be waited for.
-                cluster.workers.with_backend(study.backend)
-                cluster.workers.require_accuracy(study.accuracy)
-                return _compute(cluster, heartbeat, workspace)
+            cluster = Cluster.prepare(client, study.libraries, beat)
+            # Asked before anything is computed: a GPU that nobody has would be waited for.
+            cluster.workers.with_backend(study.backend)
+            cluster.workers.require_accuracy(study.accuracy)
+            return _compute(cluster, heartbeat, workspace)
 
 
 def _compute(cluster: Cluster, heartbeat: Heartbeat, workspace: Workspace) -> Summary:

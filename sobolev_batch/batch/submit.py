@@ -13,11 +13,10 @@ from uuid import uuid4
 
 from distributed import Client, Future, Status, fire_and_forget, get_worker, worker_client
 
-from sobolev_batch.batch.cluster import GIVE_UP_AFTER
-from sobolev_batch.batch.cluster.watch import Watch, require_give_up_after
+from sobolev_batch.batch.cluster.watch import Watch
 from sobolev_batch.batch.cluster.workers import prepare_workers, require_store_access
 from sobolev_batch.batch.collection_store import CollectionStore, for_each_object
-from sobolev_batch.batch.run import Driver
+from sobolev_batch.batch.run import carry_out
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, acquire, release
 from sobolev_batch.batch.store.create import require_usable
@@ -59,13 +58,7 @@ class Submission:
     refused: Mapping[str, str] = field(default_factory=dict)
 
 
-def submit(
-    study: Study | StudyCollection,
-    store: str | Path | Location,
-    client: Client,
-    *,
-    give_up_after: float = GIVE_UP_AFTER,
-) -> Submission:
+def submit(study: Study | StudyCollection, store: str | Path | Location, client: Client) -> Submission:
     """Hand a study over to a cluster and return; it goes on without this process.
 
     One of the workers drives it, in a thread besides those for tasks; should that worker be lost,
@@ -76,37 +69,32 @@ def submit(
         study: Study to carry out, of one object or of several.
         store: Path or URL of a new or existing store, which this process and all workers reach under this name.
         client: Client of the cluster; it may be closed afterwards.
-        give_up_after: Time in seconds after which a worker that says nothing is given up; see `run`.
 
     Raises:
         StudyError, MeshError, LatticeError, AccuracyError, StoreError: See `run`; nothing was handed over.
         ClusterError: No worker has the GPU that the study requests, or the scheduler did not take the study in time.
-        InputError: See `run`.
 
     >>> import sobolev_batch as sb
     >>> with Client("tls://scheduler:8786") as client:  # doctest: +SKIP
     ...     sb.submit(sb.Study.from_toml("study.toml"), "s3://bucket/results.zarr", client).missing
     2
     """
-    require_give_up_after(give_up_after)
     location = Location.parse(store).absolute()
     if isinstance(study, Study):
-        return _submit(study, location, client, give_up_after)
+        return _submit(study, location, client)
     CollectionStore.prepared(location, study)
-    objects, refused = for_each_object(
-        study, location, lambda _, part, place: _submit(part, place, client, give_up_after)
-    )
+    objects, refused = for_each_object(study, location, lambda _, part, place: _submit(part, place, client))
     surfaces = sum(submission.surfaces for submission in objects.values())
     missing = sum(submission.missing for submission in objects.values())
     return Submission(str(location), surfaces, missing, objects, refused)
 
 
-def _submit(study: Study, location: Location, client: Client, give_up_after: float) -> Submission:
+def _submit(study: Study, location: Location, client: Client) -> Submission:
     require_usable(location)
     lock = Lock.of_this_process(outlives_process=True)
     acquire(location, lock)
     try:
-        with Watch(client, False, give_up_after).kept():
+        with Watch(client).kept():
             require_store_access(client, location, lock)
             workers = prepare_workers(client, study.libraries)
         workers.with_backend(study.backend)
@@ -116,7 +104,7 @@ def _submit(study: Study, location: Location, client: Client, give_up_after: flo
         heartbeat = Heartbeat(workspace.store, lock)
         heartbeat.cluster = client.scheduler.address
         heartbeat.write("submitted")
-        arguments = dict(study.table), str(study.folder.absolute()), workspace.store.path, lock.run, give_up_after
+        arguments = dict(study.table), str(study.folder.absolute()), workspace.store.path, lock.run
         # Before all tasks of other studies, from which it takes no thread: it leaves its own at once.
         future = client.submit(drive, *arguments, key=f"sobolev-batch-drive-{uuid4().hex}", pure=False, priority=1)
         fire_and_forget(future)
@@ -127,7 +115,7 @@ def _submit(study: Study, location: Location, client: Client, give_up_after: flo
     return Submission(workspace.store.path, len(plan.rows), len(workspace.pending))
 
 
-def drive(table: Mapping[str, Any], folder: str, store: str, run: str, give_up_after: float) -> None:
+def drive(table: Mapping[str, Any], folder: str, store: str, run: str) -> None:
     """Run a study from a worker of the cluster that computes it, with the lock of its submission.
 
     This does not raise: the store says what went wrong, and trying again would not help.
@@ -137,7 +125,6 @@ def drive(table: Mapping[str, Any], folder: str, store: str, run: str, give_up_a
         folder: Folder that paths in the study are relative to.
         store: Path or URL of the store.
         run: Run that the store is locked for.
-        give_up_after: See `submit`.
     """
     location = Location.parse(store)
     lock = Lock.of_this_process(run, outlives_process=True)
@@ -149,7 +136,7 @@ def drive(table: Mapping[str, Any], folder: str, store: str, run: str, give_up_a
         acquire(location, lock)
         with worker_client() as client:
             study = Study.from_table(table, folder=folder)
-            Driver(lambda: client, give_up_after).run(study, location, lock)
+            carry_out(study, location, lock, lambda: client)
     except Exception as error:
         if get_worker().status != Status.running:
             # Dask has another worker drive, which takes the lock over.

@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from sobolev_batch.batch.cluster import GIVE_UP_AFTER, LEAST_GIVE_UP_AFTER
 from sobolev_batch.results.tables import FORMATS
 from sobolev_batch.visible import visible, visible_lines
 
@@ -138,14 +137,6 @@ best_effort_option = click.option(
     "--best-effort",
     is_flag=True,
     help="Take the nearest attainable accuracy where the requested one is out of reach, and mark it.",
-)
-give_up_option = click.option(
-    "--give-up-after",
-    type=click.FloatRange(min=LEAST_GIVE_UP_AFTER),
-    default=GIVE_UP_AFTER,
-    show_default=True,
-    metavar="SECONDS",
-    help="Give up a worker that has said nothing for this time, and give its tasks to others.",
 )
 trust_option = click.option(
     "--trust-network",

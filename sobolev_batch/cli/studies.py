@@ -17,7 +17,6 @@ from sobolev_batch.cli.common import (
     cli,
     echo,
     echo_lines,
-    give_up_option,
     location,
     memory_option,
     progress_reports,
@@ -79,7 +78,6 @@ def init_command(folder: Path, output: Path) -> None:
     metavar="STORE",
     help="Copy fields of this store that the study would compute again; may be repeated.",
 )
-@give_up_option
 @click.pass_context
 def run_command(
     context: click.Context,
@@ -91,7 +89,6 @@ def run_command(
     memory: int | None,
     best_effort: bool,
     reuse: tuple[Location, ...],
-    give_up_after: float,
 ) -> None:
     """Compute what is missing of STUDY and print its tables.
 
@@ -115,17 +112,10 @@ def run_command(
     with progress_reports() as show:
         if scheduler:
             with remote_client(scheduler, trust_network) as client:
-                summary = run(parsed, place, client, on_progress=show, reuse=reuse, give_up_after=give_up_after)
+                summary = run(parsed, place, client, on_progress=show, reuse=reuse)
         else:
-            summary = run(
-                parsed,
-                place,
-                workers=workers,
-                memory=None if memory is None else f"{memory}B",
-                on_progress=show,
-                reuse=reuse,
-                give_up_after=give_up_after,
-            )
+            limit = None if memory is None else f"{memory}B"
+            summary = run(parsed, place, workers=workers, memory=limit, on_progress=show, reuse=reuse)
     if isinstance(parsed, Study):
         echo_lines(format_table(open_store(place)))
     else:
@@ -157,7 +147,6 @@ def run_command(
 @trust_option
 @store_option
 @best_effort_option
-@give_up_option
 @click.pass_context
 def submit_command(
     context: click.Context,
@@ -166,7 +155,6 @@ def submit_command(
     trust_network: bool,
     store: Location | None,
     best_effort: bool,
-    give_up_after: float,
 ) -> None:
     """Hand STUDY over to a cluster and return.
 
@@ -179,7 +167,7 @@ def submit_command(
     parsed = _parsed(study, best_effort=best_effort)
     location = (store or _made_default_store(parsed)).absolute()
     with remote_client(scheduler, trust_network) as client:
-        submission = submit(parsed, location, client, give_up_after=give_up_after)
+        submission = submit(parsed, location, client)
 
     def show(one: Submission) -> None:
         echo(f"{one.missing} of {one.surfaces} surfaces to be computed by the cluster at {scheduler}")

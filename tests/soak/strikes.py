@@ -6,6 +6,7 @@ so is a command that ended badly.
 
 from __future__ import annotations
 
+import os
 import random
 import signal
 import subprocess
@@ -34,6 +35,8 @@ ROLES = ("worker", "nanny", "scheduler", "driver")
 EXCHANGED = ("chunks", "exchanged")
 _WORKERS = 2
 _POLL_SECONDS = 0.1
+# Whoever is silent is given up after this time.
+_IMPATIENT = {"DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL": "10s"}
 _LONGEST_SECONDS = 3600.0
 
 
@@ -180,7 +183,7 @@ class _Run:
 
     def _start_driver(self) -> psutil.Popen:
         self.commands += 1
-        options = ["--store", str(self.store), "--scheduler", f"tcp://127.0.0.1:{self._port}", "--give-up-after", "10"]
+        options = ["--store", str(self.store), "--scheduler", f"tcp://127.0.0.1:{self._port}"]
         return self._start([*COMMAND, "run", str(self._study), *options])
 
     def _start_scheduler(self) -> psutil.Popen:
@@ -197,7 +200,7 @@ class _Run:
     def _start(self, command: list[str]) -> psutil.Popen:
         self._starts += 1
         with (self._folder / f"{self._starts}.log").open("w") as log:
-            return psutil.Popen(command, stdout=log, stderr=subprocess.STDOUT)
+            return psutil.Popen(command, stdout=log, stderr=subprocess.STDOUT, env={**os.environ, **_IMPATIENT})
 
 
 def _kill(process: psutil.Popen) -> None:

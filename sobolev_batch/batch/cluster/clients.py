@@ -20,7 +20,7 @@ import dask
 from dask.utils import parse_timedelta
 from distributed import Client, LocalCluster, Security
 from distributed.comm import connect
-from distributed.comm.addressing import parse_address, parse_host_port
+from distributed.comm.addressing import get_address_host_port, parse_address
 
 from sobolev_batch.batch.cluster import workers as workers_module
 from sobolev_batch.errors import ClusterError, InputError, one_line
@@ -35,9 +35,6 @@ _LARGEST_KEPT_BYTES = 32 << 20
 # After a worker has died, Dask looks once whether it is back, and gives it up for ever if it is just then
 # being started again, as after a second death. Nannies start workers for as long as they live themselves.
 _LOST_WORKER_SECONDS = 10**7
-_ENCRYPTED = ("tls", "wss")
-_PLAIN = ("tcp", "ws", "ucx", "ucxx")
-_WITHIN_A_PROCESS = "inproc"
 
 
 @contextmanager
@@ -187,10 +184,7 @@ def remote_client(address: str, trust_network: bool = False) -> Iterator[Client]
         InputError: The address is malformed, or its network would have to be trusted.
         ClusterError: Nothing answers there, or Dask's configuration does not fit.
     """
-    if trust_network:
-        _parts(address)
-    else:
-        require_private(address, "the scheduler")
+    require_private(address, "the scheduler", trust_network)
     seconds = parse_timedelta(dask.config.get("distributed.comm.timeouts.connect"))
     check_connection(address, seconds)
     try:
@@ -201,26 +195,35 @@ def remote_client(address: str, trust_network: bool = False) -> Iterator[Client]
         workers = client.scheduler_info(n_workers=-1)["workers"]
         if not workers:
             raise ClusterError(f"the scheduler at {address} has no workers; start some with: dask worker {address}")
-        if not trust_network:
-            # An address on loopback may be one end of a tunnel.
-            for worker in workers:
-                require_private(worker, "a worker")
+        # An address on loopback may be one end of a tunnel.
+        for worker in workers:
+            require_private(worker, "a worker", trust_network)
         yield client
 
 
-def require_private(name: str, who: str) -> None:
+def require_private(name: str, who: str, trust_network: bool = False) -> None:
     """Check that nobody else reaches an address: it demands certificates, or is on loopback.
 
     Args:
         name: Address, such as tls://host:8786; without a scheme, Dask's default is meant.
         who: Process that listens there, for the message.
+        trust_network: True where others may reach it.
 
     Raises:
         InputError: The address is malformed, or others may reach it.
         ClusterError: The host does not exist.
     """
-    scheme, host, port = _parts(name)
-    if scheme in (*_ENCRYPTED, _WITHIN_A_PROCESS):
+    scheme, _ = parse_address(name)
+    if scheme == "inproc":
+        return
+    try:
+        host, port = get_address_host_port(name)
+        if not host or not 0 < port < 65536:
+            raise ValueError("it has no host, or a port out of range")
+    except ValueError as error:
+        message = f"{name!r} is not the address of a scheduler ({error}); one is tls://host:8786"
+        raise InputError(message) from error
+    if trust_network or scheme in ("tls", "wss"):
         return
     try:
         infos = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
@@ -233,24 +236,6 @@ def require_private(name: str, who: str) -> None:
             "could run programs on these machines and read the meshes. Use tls:// (docs/clusters.md), or "
             "--trust-network (in Python trust_network=True) where nobody else is on that network"
         )
-
-
-def _parts(name: str) -> tuple[str, str, int]:
-    """Return scheme, host and port of an address; within a process, there are no host and no port."""
-    scheme, rest = parse_address(name)
-    if scheme == _WITHIN_A_PROCESS:
-        return scheme, "", 0
-    if scheme not in (*_ENCRYPTED, *_PLAIN):
-        raise _malformed(name, f"{scheme!r} is not one of {', '.join((*_ENCRYPTED, *_PLAIN))}")
-    try:
-        host, port = parse_host_port(rest)
-    except ValueError as error:
-        raise _malformed(name, str(error)) from error
-    if not host or any(character.isspace() or character in "/@" for character in host):
-        raise _malformed(name, f"{host!r} is no host")
-    if not 0 < port < 65536:
-        raise _malformed(name, f"{port} is no port")
-    return scheme, host, port
 
 
 def check_connection(address: str, seconds: float) -> None:
@@ -290,7 +275,3 @@ def _is_loopback(host: str) -> bool:
     address = ip_address(host)
     mapped = address.ipv4_mapped if isinstance(address, IPv6Address) else None
     return (mapped or address).is_loopback
-
-
-def _malformed(name: str, reason: str) -> InputError:
-    return InputError(f"{name!r} is not the address of a scheduler ({reason}); one is tls://host:8786")

@@ -1,26 +1,27 @@
-"""The watch over a cluster: what keeps a run from going on is told, and what stays silent is given up.
+"""The watch over a cluster: it reports what keeps a run from going on, and ends a run whose scheduler stays silent.
 
-Dask takes a process for alive as long as its connection is open. A process that was stopped, or whose machine hangs,
-keeps it open and says nothing, and a run would wait for it for ever.
+A process that was stopped, or whose machine hangs, keeps its connections open and says nothing. Dask gives up such a
+worker after the time ``distributed.scheduler.worker-ttl``. For such a scheduler, a run would wait for ever.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import Any
-from uuid import uuid4
 
+import dask
+from dask.utils import parse_timedelta
 from distributed import CancelledError, Client
 from distributed.comm import CommClosedError
 
-from sobolev_batch.batch.cluster import LEAST_GIVE_UP_AFTER
 from sobolev_batch.batch.cluster.workers import GPU
-from sobolev_batch.errors import ClusterError, InputError
+from sobolev_batch.errors import ClusterError
 
 _log = logging.getLogger(__name__)
 
@@ -28,7 +29,6 @@ _log = logging.getLogger(__name__)
 # minute.
 _TELL_AFTER_SECONDS = 30.0
 _POLL_SECONDS = 5.0
-_RESTART_SECONDS = 15.0
 _MOST_NAMED = 4
 
 # When a process was last heard of, the time from which on it has said nothing, and the seconds since. The first is
@@ -43,16 +43,17 @@ class Watch:
     Args:
         client: Client of the cluster.
         needs_gpu: True if the run waits for a worker with a GPU.
-        give_up_after: Seconds of silence after which a worker is started again if it can be, and its tasks are given
-            to others; and after which a scheduler counts as lost.
 
     Attributes:
         obstacle: What keeps the run from going on, for people; empty if nothing does.
     """
 
-    def __init__(self, client: Client, needs_gpu: bool, give_up_after: float) -> None:
+    def __init__(self, client: Client, needs_gpu: bool = False) -> None:
         self.obstacle = ""
-        self._client, self._needs_gpu, self._give_up_after = client, needs_gpu, give_up_after
+        self._client, self._needs_gpu = client, needs_gpu
+        # A scheduler gets as long as it gives to its workers; without a limit, for ever.
+        limit = dask.config.get("distributed.scheduler.worker-ttl")
+        self._patience_seconds = parse_timedelta(limit) if limit else math.inf
         self._address = str(client.scheduler.address)
         self._workers: dict[str, _Silence] = {}
         self._scheduler = _silence(None)
@@ -82,7 +83,7 @@ class Watch:
 
     @property
     def _has_lost_scheduler(self) -> bool:
-        return self._scheduler[2] > self._give_up_after
+        return self._scheduler[2] > self._patience_seconds
 
     def _look_out(self) -> None:
         before = time.monotonic()
@@ -113,9 +114,6 @@ class Watch:
             address: _silence(worker["last_seen"], self._workers.get(address), elapsed)
             for address, worker in workers.items()
         }
-        for address, (_, since, seconds) in self._workers.items():
-            if seconds > self._give_up_after:
-                self._give_up(address, since)
         silent = {name: since for name, (_, since, seconds) in self._workers.items() if seconds > _TELL_AFTER_SECONDS}
         if silent:
             return self._silent_workers(silent)
@@ -135,58 +133,24 @@ class Watch:
             told.append(f"the worker {address} has said nothing since {since}{held}")
         if len(silences) > _MOST_NAMED:
             told.append(f"and {len(silences) - _MOST_NAMED} more workers have")
-        return (
-            f"{'; '.join(told)}. Whoever says nothing for {self._give_up_after:g} s is given up, and the tasks are "
-            "given to others"
-        )
+        return f"{'; '.join(told)}. Dask gives up whoever stays silent (worker-ttl), and others get the tasks"
 
     def _silent_scheduler(self) -> str:
         return f"the scheduler at {self._address} has said nothing since {self._scheduler[1]}"
-
-    def _give_up(self, address: str, since: str) -> None:
-        """Have a worker started again by its nanny, or forgotten; its tasks go to others."""
-        message = "the worker %s has said nothing since %s and is given up; its tasks are given to others"
-        _log.warning(message, address, since)
-        reason = f"sobolev-batch-silent-{uuid4().hex}"
-        try:
-            self._ask(
-                "restart_workers",
-                _seconds=2 * _RESTART_SECONDS,
-                workers=[address],
-                timeout=_RESTART_SECONDS,
-                wait_for_workers=False,
-                on_error="return",
-                stimulus_id=reason,
-            )
-        except Exception as error:  # whatever has become of its nanny
-            _log.debug("%s could not be started again: %r", address, error)
-            self._ask("unregister", address=address, stimulus_id=reason)
 
     def _hang_up(self) -> None:
         self._client.rpc.remove(self._address)
         self._client.scheduler_comm.comm.abort()
 
-    def _ask(self, operation: str, *, _seconds: float = _POLL_SECONDS, **arguments: Any) -> Any:
+    def _ask(self, operation: str, **arguments: Any) -> Any:
         """Return what the scheduler answers.
 
         Raises:
             TimeoutError: It does not answer in time.
         """
-        return self._client.sync(getattr(self._client.scheduler, operation), callback_timeout=_seconds, **arguments)
-
-
-def require_give_up_after(seconds: float) -> float:
-    """Return a time after which what is silent is given up.
-
-    Raises:
-        InputError: It is too short: a worker is silent for some seconds now and then.
-    """
-    if not seconds >= LEAST_GIVE_UP_AFTER:
-        raise InputError(
-            f"give_up_after must be at least {LEAST_GIVE_UP_AFTER:g} seconds, found {seconds!r}: a worker that is busy "
-            "says nothing for some seconds now and then"
+        return self._client.sync(
+            getattr(self._client.scheduler, operation), callback_timeout=_POLL_SECONDS, **arguments
         )
-    return seconds
 
 
 def _silence(heard: object, before: _Silence | None = None, elapsed: float = 0.0) -> _Silence:
