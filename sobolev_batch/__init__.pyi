@@ -26,11 +26,11 @@ from .fitting.fit import Fit as Fit
 from .fitting.fit import FitProgress as FitProgress
 from .fitting.fit import FitQuality as FitQuality
 from .fitting.fit import fit as fit
+from .fitting.fit import refine as refine
 from .fitting.gradient import SquaredDistance as SquaredDistance
 from .fitting.gradient import gradient as gradient
 from .fitting.gradient import jax_function as jax_function
 from .fitting.gradient import torch_function as torch_function
-from .fitting.refine import refine as refine
 from .results.accessor import SobolevAccessor as SobolevAccessor
 from .results.figures.meshes import write_witness as write_witness
 from .results.figures.plots import plot as plot

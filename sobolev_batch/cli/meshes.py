@@ -284,9 +284,8 @@ def fit_command(
     """
     import numpy as np
 
-    from sobolev_batch.fitting.fit import fit
+    from sobolev_batch.fitting.fit import fit, refine
     from sobolev_batch.fitting.problem import require_comparable
-    from sobolev_batch.fitting.refine import refine
     from sobolev_batch.surfaces.formats.readers import read_mesh, require_writable, write_mesh
     from sobolev_batch.surfaces.shapes.mesh import Mesh
     from sobolev_batch.surfaces.shapes.surface import Similarity

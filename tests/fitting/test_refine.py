@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import sobolev_batch as sb
-from sobolev_batch.fitting import refine as module
+from sobolev_batch.fitting import fit as module
 from sobolev_batch.surfaces.shapes.subdivision import Edges
 from tests.support.members import loaded, members
 

@@ -29,7 +29,7 @@ from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.metrics.gram import Arrangement, differences
 from sobolev_batch.spectral.octaves.remainder import Remainder
 from sobolev_batch.spectral.octaves.sampling import TailSampling
-from sobolev_batch.spectral.octaves.sums import OctaveSums, OctaveWeights, Tail, squared_moduli
+from sobolev_batch.spectral.octaves.values import OctaveSums, OctaveWeights, Tail, squared_moduli
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent
 

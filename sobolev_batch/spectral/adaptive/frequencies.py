@@ -33,8 +33,15 @@ from sobolev_batch.spectral.fields import field_for
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.remainder import remainder
 from sobolev_batch.spectral.octaves.sampling import OctaveSampling
-from sobolev_batch.spectral.octaves.sums import OctaveSums, OctaveWeights, Tail, squared_moduli, statistical_errors
-from sobolev_batch.spectral.octaves.values import octave_values, settings_for
+from sobolev_batch.spectral.octaves.values import (
+    OctaveSums,
+    OctaveWeights,
+    Tail,
+    octave_values,
+    settings_for,
+    squared_moduli,
+    statistical_errors,
+)
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, TransformSettings, permits_single
 from sobolev_batch.surfaces.shapes.surface import Surface

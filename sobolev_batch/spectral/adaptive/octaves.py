@@ -18,13 +18,16 @@ from sobolev_batch.spectral.lattice import Lattice, OctaveLattice
 from sobolev_batch.spectral.octaves.normals import FaceNormals
 from sobolev_batch.spectral.octaves.remainder import Remainder, remainder, tail_integral
 from sobolev_batch.spectral.octaves.sampling import Octave, OctaveSampling
-from sobolev_batch.spectral.octaves.sums import OctaveSums, OctaveWeights, Tail, squared_moduli
 from sobolev_batch.spectral.octaves.values import (
     POINTS_PER_SQUARE,
+    OctaveSums,
     OctaveValues,
+    OctaveWeights,
     SurfaceSize,
+    Tail,
     octave_values,
     settings_for,
+    squared_moduli,
 )
 from sobolev_batch.spectral.probe import estimate as estimate_from
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums

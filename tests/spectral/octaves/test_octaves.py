@@ -13,8 +13,15 @@ from scipy.integrate import quad
 from sobolev_batch import Mesh, Sphere, Torus, icosphere
 from sobolev_batch.spectral.octaves.normals import FaceNormals
 from sobolev_batch.spectral.octaves.sampling import Octave, OctaveSampling, TailSampling
-from sobolev_batch.spectral.octaves.sums import OctaveSums, OctaveWeights, squared_moduli, statistical_errors
-from sobolev_batch.spectral.octaves.values import OctaveValues, octave_values, settings_for
+from sobolev_batch.spectral.octaves.values import (
+    OctaveSums,
+    OctaveValues,
+    OctaveWeights,
+    octave_values,
+    settings_for,
+    squared_moduli,
+    statistical_errors,
+)
 from sobolev_batch.spectral.shells import smooth_step
 from sobolev_batch.spectral.transform.settings import ErrorTarget
 from sobolev_batch.spectral.triangles import exact_transform
