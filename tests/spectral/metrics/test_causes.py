@@ -11,7 +11,6 @@ from sobolev_batch import (
     InputError,
     Lattice,
     LatticeError,
-    Mesh,
     OrderError,
     Similarity,
     Sphere,
@@ -26,7 +25,6 @@ from sobolev_batch.spectral import fields
 from sobolev_batch.spectral.backends import NufftSpec
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.metrics import causes
-from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.quadrature.meshes import WeightedPoints
 from sobolev_batch.spectral.transform.nufft import evaluate_at, transform_points
 from tests.support.oracles import full_lattice_norm
@@ -227,19 +225,6 @@ def test_evaluation_is_the_adjoint_of_the_transform() -> None:
     transformed, _ = transform_points([WeightedPoints(points, weights)], RANDOM, block, NufftSpec(block.shape, 1e-13))
     (values,) = evaluate_at(points, coefficients, RANDOM, block, NufftSpec(block.shape, 1e-13))
     assert weights @ values == pytest.approx(np.vdot(transformed, coefficients).real, rel=1e-11)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("other", [Mesh(0.7 * icosphere(1).vertices, icosphere(1).triangles), BOX])
-def test_its_integral_against_the_difference_is_the_squared_distance(other: Mesh) -> None:
-    lattice, mesh = Lattice(4.0, 32), icosphere(2)
-    a, b = (fourier_transform(surface, lattice, 1e-14) for surface in (mesh, other))
-    total = np.zeros(len(WITNESS_ORDERS))
-    for surface, sign in ((mesh, 1.0), (other, -1.0)):
-        for batch in kind_of(surface).plan(lattice.highest_frequency, 1e-14).batches(1 << 20):
-            values = witness(a, b, WITNESS_ORDERS, batch.coordinates.T, eps=1e-14).values
-            total += sign * values @ batch.weights
-    assert total == pytest.approx(distance(a, b, WITNESS_ORDERS)["distance"].values ** 2, rel=1e-10)
 
 
 def test_is_positive_where_the_first_has_more() -> None:
