@@ -15,14 +15,15 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
+import dask
 import pytest
 from distributed import Client
+from distributed.utils import get_mp_context
 
 from sobolev_batch import Mesh, Study, read_mesh, run
 from sobolev_batch.batch.cluster.clients import local_client, thread_client
 from tests.support import durations
 from tests.support.mesh_files import Read
-from tests.support.processes import forked_workers
 from tests.support.repository import ROOT
 from tests.support.spheres import make_study
 from tests.support.studies import small_table
@@ -106,9 +107,13 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
 
 @pytest.fixture(scope="session")
 def client() -> Iterator[Client]:
-    """Two worker processes, shared by all tests that only submit to them."""
+    """Two worker processes, shared by all tests that only submit to them.
+
+    They are forked from one process that has imported everything, five times as fast, and have its environment.
+    """
     with ExitStack() as stack:
-        with forked_workers():
+        with dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}):
+            get_mp_context().set_forkserver_preload(["sobolev_batch.batch.run"])
             client = stack.enter_context(local_client(2))
         yield client
 

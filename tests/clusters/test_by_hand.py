@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import re
+import shutil
 import socket
 import ssl
 import stat
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +23,7 @@ from distributed import Client
 from sobolev_batch import ClusterError, open_store
 from sobolev_batch.batch.cluster.clients import check_connection, remote_client
 from tests.support.commands import COMMAND, finished
-from tests.support.processes import PATIENCE_SECONDS, listening, stop
+from tests.support.processes import PATIENCE_SECONDS, listening, scheduler_address, stop
 from tests.support.recipes import CERTIFICATES, TABLE, documented, environment, run_recipe, write_study
 from tests.support.stores import contents
 
@@ -61,33 +63,25 @@ class Cluster(NamedTuple):
 @pytest.fixture(scope="module")
 def cluster(home: Path, certificates: Path) -> Iterator[Cluster]:
     """Yield a scheduler and two workers, started as documented but on loopback and free ports."""
-    (export,) = {tuple(words) for words in documented("export DASK_CONFIG=~/dask-tls")}
-    variable, value = export[1].replace("~", str(home)).split("=")
+    ((_, export),) = documented("export DASK_CONFIG=~/dask-tls")
+    variable, value = export.replace("~", str(home)).split("=")
     (scheduler,), (worker, *_) = documented("dask scheduler"), documented("dask worker")
-    log = (home / "worker.log").open("w")
-    processes: list[subprocess.Popen[str]] = []
     changes = {"8786": "0", "127.0.0.1:8787": "127.0.0.1:0", "--interface": "--host", "eth0": "127.0.0.1", "-1": "2"}
 
-    def start(words: list[str], stderr: Any, **replaced: str) -> subprocess.Popen[str]:
-        arguments = [{**changes, **replaced}.get(word, word) for word in words[1:]]
-        command = [sys.executable, "-m", words[0], *arguments]
-        processes.append(
-            subprocess.Popen(command, env=environment(home, **{variable: value}), stderr=stderr, text=True)
-        )
-        return processes[-1]
+    def start(words: list[str], stderr: Any) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", words[0], *(changes.get(word, word) for word in words[1:])]
+        process = subprocess.Popen(command, env=environment(home, **{variable: value}), stderr=stderr, text=True)
+        stack.callback(stop, process)
+        return process
 
-    try:
-        lines = start(scheduler, subprocess.PIPE).stderr
-        assert lines is not None
-        address = next(match[0] for line in lines if (match := re.search(r"tls://127\.0\.0\.1:\d+", line)))
-        start(worker, log, **{"tls://HOST:8786": address})
+    with ExitStack() as stack:
+        log = stack.enter_context((home / "worker.log").open("w"))
+        first = start(scheduler, subprocess.PIPE)
+        changes["tls://HOST:8786"] = address = scheduler_address(first)
+        second = start(worker, log)
         with configured(certificates), Client(address) as client:
             client.wait_for_workers(2, timeout=PATIENCE_SECONDS)
-        yield Cluster(address, processes)
-    finally:
-        for process in reversed(processes):
-            stop(process)
-        log.close()
+        yield Cluster(address, [first, second])
 
 
 def test_certificates_are_for_their_owner_and_stay(certificates: Path, home: Path) -> None:
@@ -157,11 +151,9 @@ def test_each_way_to_miss_an_encrypted_scheduler_is_told_in_one_line(
 
     plain = cluster.address.replace("tls", "tcp")
     # The right authority, and a certificate that it did not sign.
-    for name in ("certificate.pem", "key.pem"):
-        (tmp_path / name).write_bytes((others / name).read_bytes())
-    (tmp_path / "ca.pem").write_bytes((certificates / "ca.pem").read_bytes())
-    settings = (others / "tls.yaml").read_text().replace(str(others), str(tmp_path))
-    (tmp_path / "tls.yaml").write_text(settings)
+    shutil.copytree(others, tmp_path, dirs_exist_ok=True)
+    shutil.copy(certificates / "ca.pem", tmp_path)
+    (tmp_path / "tls.yaml").write_text((others / "tls.yaml").read_text().replace(str(others), str(tmp_path)))
     for folder, address, reason in [
         (None, cluster.address, "TLS expects a `ssl_context`"),
         (None, plain, "closed"),
@@ -188,19 +180,16 @@ def test_each_way_to_miss_an_encrypted_scheduler_is_told_in_one_line(
 )
 def test_what_listens_and_is_no_scheduler(certificates: Path, scheme: str, says: bytes, message: str) -> None:
     """Dask's own client waits for ever in the first case and runs out of memory in the third."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        connections = []
 
-        def answer() -> None:
-            connections.append(server.accept()[0])
-            connections[0].recv(1)
-            connections[0].sendall(says)
+    def answer() -> socket.socket:
+        connection, _ = server.accept()
+        connection.recv(1)
+        connection.sendall(says)
+        return connection
 
-        thread = threading.Thread(target=answer)
-        thread.start()
+    with socket.create_server(("127.0.0.1", 0)) as server, ThreadPoolExecutor(1) as pool:
+        answered = pool.submit(answer)
         address = f"{scheme}://127.0.0.1:{server.getsockname()[1]}"
         with configured(certificates if scheme == "tls" else None), pytest.raises(ClusterError, match=message):
             check_connection(address, 0.5)
-        thread.join()
-        for connection in connections:
-            connection.close()
+        answered.result().close()

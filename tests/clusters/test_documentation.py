@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -39,18 +38,13 @@ def check_options(words: list[str]) -> None:
             assert takes_value[word] != (following.startswith("--")), f"{word} {following}"
 
 
-def documents() -> list[dict[str, Any]]:
-    return list(yaml.safe_load_all((FOLDER / "kubernetes.yaml").read_text()))
-
-
-def pods() -> Mapping[str, dict[str, Any]]:
-    cluster, gpu = (document["spec"] for document in documents()[:2])
-    return {
-        "worker": cluster["worker"]["spec"],
-        "scheduler": cluster["scheduler"]["spec"],
-        "gpu": gpu["worker"]["spec"],
-        "submit": documents()[-1]["spec"]["template"]["spec"],
-    }
+CLUSTER, GPU, TO_SCHEDULER, TO_WORKERS, STUDY, JOB = yaml.safe_load_all((FOLDER / "kubernetes.yaml").read_text())
+PODS: dict[str, dict[str, Any]] = {
+    "worker": CLUSTER["spec"]["worker"]["spec"],
+    "scheduler": CLUSTER["spec"]["scheduler"]["spec"],
+    "gpu": GPU["spec"]["worker"]["spec"],
+    "submit": JOB["spec"]["template"]["spec"],
+}
 
 
 def test_documented_options_exist() -> None:
@@ -64,9 +58,9 @@ def test_documented_options_exist() -> None:
     assert importlib.util.find_spec("dask_jobqueue") is not None
 
 
-@pytest.mark.parametrize("name", ["worker", "scheduler", "gpu", "submit"])
+@pytest.mark.parametrize("name", PODS)
 def test_pods(name: str) -> None:
-    pod = pods()[name]
+    pod = PODS[name]
     (container,) = pod["containers"]
     check_options(container["args"])
     assert pod["automountServiceAccountToken"] is False
@@ -87,40 +81,39 @@ def test_pods(name: str) -> None:
 
 
 def test_the_parts_of_the_manifest_name_each_other() -> None:
-    cluster, gpu, to_scheduler, to_workers, study, job = documents()
-    name = cluster["metadata"]["name"]
-    assert gpu["spec"]["cluster"] == name
+    name = CLUSTER["metadata"]["name"]
+    assert GPU["spec"]["cluster"] == name
     selector = {"dask.org/cluster-name": name, "dask.org/component": "scheduler"}
-    assert cluster["spec"]["scheduler"]["service"]["selector"] == selector
-    assert to_scheduler["spec"]["podSelector"]["matchLabels"] == selector
+    assert CLUSTER["spec"]["scheduler"]["service"]["selector"] == selector
+    assert TO_SCHEDULER["spec"]["podSelector"]["matchLabels"] == selector
     ports = [{"protocol": "TCP", "port": port} for port in (8786, 8787)]
     # From this namespace, and from this cluster.
-    assert to_scheduler["spec"]["ingress"] == [{"from": [{"podSelector": {}}], "ports": ports}]
-    assert to_workers["spec"]["podSelector"]["matchLabels"] == {**selector, "dask.org/component": "worker"}
+    assert TO_SCHEDULER["spec"]["ingress"] == [{"from": [{"podSelector": {}}], "ports": ports}]
+    assert TO_WORKERS["spec"]["podSelector"]["matchLabels"] == {**selector, "dask.org/component": "worker"}
     own = {"podSelector": {"matchLabels": {"dask.org/cluster-name": name}}}
-    assert to_workers["spec"]["ingress"] == [{"from": [own]}]
-    (container,) = job["spec"]["template"]["spec"]["containers"]
+    assert TO_WORKERS["spec"]["ingress"] == [{"from": [own]}]
+    (container,) = PODS["submit"]["containers"]
     assert f"tcp://{name}-scheduler:8786" in container["args"]
     assert "--trust-network" in container["args"]
     (secret,) = (words for words in documented("kubectl") if "secret" in words)
     assert container["envFrom"][0]["secretRef"]["name"] == secret[secret.index("generic") + 1]
-    assert study["metadata"]["name"] in str(job)
+    assert STUDY["metadata"]["name"] in str(JOB)
 
 
 def test_the_study_of_the_manifest_is_valid(tmp_path: Path) -> None:
-    ((name, text),) = documents()[-2]["data"].items()
+    ((name, text),) = STUDY["data"].items()
     (tmp_path / name).write_text(text)
     assert Study.from_toml(tmp_path / name).name == "icosphere"
-    assert f"/study/{name}" in pods()["submit"]["containers"][0]["args"]
+    assert f"/study/{name}" in PODS["submit"]["containers"][0]["args"]
 
 
 def test_the_image() -> None:
     lines = (FOLDER / "Dockerfile").read_text().splitlines()
     (build,) = documented("docker build")
-    assert build[build.index("--tag") + 1] == pods()["worker"]["containers"][0]["image"]
-    copied = [line.split()[1:-1] for line in lines if line.startswith("COPY ") and "--from" not in line]
-    sources = [word for words in copied for word in words]
+    assert build[build.index("--tag") + 1] == PODS["worker"]["containers"][0]["image"]
+    copied = [line for line in lines if line.startswith("COPY ") and "--from" not in line]
+    sources = [word for line in copied for word in line.split()[1:-1]]
     assert {"pyproject.toml", "sobolev_batch"} <= set(sources)
     assert all((ROOT / source).exists() for source in sources)
-    user = str(pods()["worker"]["securityContext"]["runAsUser"])
+    user = str(PODS["worker"]["securityContext"]["runAsUser"])
     assert f"USER {user}:{user}" in lines

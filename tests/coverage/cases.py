@@ -31,15 +31,10 @@ _SLOW_ORDER, _SLOW_TRIANGLES, _SLOW_RTOL = -2.0, 500, 8e-2
 
 @dataclass(frozen=True)
 class Case:
-    """One distance.
+    """One distance of a pair, which its other cases share.
 
-    Attributes:
-        kind: Kind of the pair.
-        index: Index of the pair, which its cases share.
-        pair: Two surfaces, most of them within about the unit ball.
-        order: Order s.
-        settings: The accuracy `rtol`, for which the package chooses everything else; or the settings of transforms
-            on a lattice, as a user might choose them, well or badly.
+    `settings` are the accuracy `rtol`, for which the package chooses everything else; or settings of transforms on a
+    lattice, as a user might choose them, well or badly.
     """
 
     kind: str

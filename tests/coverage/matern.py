@@ -9,13 +9,14 @@ This module uses no frequencies, lattices or fields, and none of the package's r
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations_with_replacement
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 from scipy.special import gamma, k0, k1, kv
@@ -106,14 +107,9 @@ def double_sum(points: Reals, weights: Reals, powers: Sequence[float]) -> Reals:
 
 @dataclass(frozen=True)
 class Sides:
-    """Directed sides of flat faces.
+    """Directed sides of flat faces, by their first ends and lengths, with unit vectors (E, 3).
 
-    Attributes:
-        starts: First end of each side (E, 3).
-        tangents: Unit vectors along the sides (E, 3).
-        lengths: Lengths of the sides (E,).
-        outwards: Unit vectors in the plane of the face, away from it (E, 3).
-        normals: Unit normals of that plane (E, 3).
+    Tangents go along the sides, outward vectors away from the face in its plane, and normals out of the plane.
     """
 
     starts: Reals
@@ -199,22 +195,13 @@ _COWPER = ((0.445948490915965, 0.223381589678011), (0.091576213509771, 0.1099517
 
 def divided_points(mesh: Mesh, level: int) -> tuple[Reals, Reals]:
     """Return points (n, 3) and weights (n,) of a rule of degree 4 on a mesh's triangles cut into 4^level."""
-    triangles = mesh.vertices[mesh.triangles]
+    vertices, triangles = mesh.vertices, mesh.triangles
     for _ in range(level):
-        triangles = np.concatenate(list(_quarters(triangles)))
-    areas = np.tile(mesh.areas / 4**level, 4**level)
+        vertices, triangles = trimesh.remesh.subdivide(vertices, triangles)
     barycentric = np.array([np.roll([1 - 2 * at, at, at], turn) for at, _ in _COWPER for turn in range(3)])
     weights = np.repeat([weight for _, weight in _COWPER], 3)
-    weights = weights / weights.sum()
-    points = np.einsum("qc,tci->tqi", barycentric, triangles).reshape(-1, 3)
-    return points, np.outer(areas, weights).ravel()
-
-
-def _quarters(triangles: Reals) -> Iterator[Reals]:
-    a, b, c = (triangles[:, i] for i in range(3))
-    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
-    for corners in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)):
-        yield np.stack(corners, axis=1)
+    points = np.einsum("qc,tci->tqi", barycentric, vertices[triangles]).reshape(-1, 3)
+    return points, np.outer(Mesh(vertices, triangles).areas, weights / weights.sum()).ravel()
 
 
 @lru_cache

@@ -78,12 +78,8 @@ class Truth:
 class Pair:
     """Two surfaces.
 
-    Attributes:
-        first: One of them.
-        second: The other one.
-        rectangles: What they were made of if they are axis-parallel rectangles, perhaps turned and moved together.
-        turned: True if they were.
-        equal: True if they are one surface in different triangles.
+    They may be made of axis-parallel `rectangles`, and `turned` and moved together; or be `equal`, one surface in
+    different triangles.
     """
 
     first: Surface
@@ -212,7 +208,7 @@ def closed_within(a: Surface, b: Surface, orders: Sequence[float]) -> tuple[Trut
     meshes = [(Sides.from_mesh(surface), sign) for surface, sign in signed if isinstance(surface, Mesh)]
     candidates = []
     for count in _OUTER:
-        squares, norms = _spheres_alone(a, b, orders)
+        squares = norms = _spheres_alone(a, b, orders)
         for surface, sign in signed:
             if not isinstance(surface, Mesh):
                 continue
@@ -243,7 +239,7 @@ def summed_in_real_space(
     levels = [level for level in range(6) if 6 * triangles * 4**level <= most][-3:]
     rows = []
     for level in levels:
-        squares, norms = _spheres_alone(a, b, orders)
+        squares = norms = _spheres_alone(a, b, orders)
         sets = [(divided_points(surface, level), sign) for surface, sign in signed if isinstance(surface, Mesh)]
         points = np.concatenate([points for (points, _), _ in sets])
         weights = np.concatenate([sign * weights for (_, weights), sign in sets])
@@ -287,14 +283,14 @@ def measured_with_another_seed(a: Surface, b: Surface, order: float) -> Truth | 
     return Truth(found["distance"].item(), found["error"].item())
 
 
-def _spheres_alone(a: Surface, b: Surface, orders: Sequence[float]) -> tuple[Reals, Reals]:
-    """Return the contribution of the spheres alone to the squared distance, and its size."""
+def _spheres_alone(a: Surface, b: Surface, orders: Sequence[float]) -> Reals:
+    """Return the contribution of the spheres alone to the squared distance."""
     alone = np.zeros(len(orders))
     for surface in (a, b):
         if isinstance(surface, Sphere):
             pole = np.add(surface.center, [[0.0, 0.0, surface.radius]])
             alone += [surface.area * sphere_potential(surface, pole, -order).item() for order in orders]
-    return alone, alone
+    return alone
 
 
 def _of_spheres(signed: Sequence[tuple[Surface, float]], points: Reals, powers: Sequence[float]) -> Reals:

@@ -9,15 +9,19 @@ import json
 import os
 import signal
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
 
 VARIABLE = "FATAL_MOMENT"
+_FUNCTIONS: dict[str, tuple[type, str]] = {
+    "field": (Store, "write_field"),
+    "rename": (Path, "replace"),
+    "record": (Store, "write_record"),
+    "recorded": (Store, "write_record"),
+}
 
 
 @dataclass(frozen=True)
@@ -57,31 +61,21 @@ class Moment:
             signal.pthread_kill(threading.get_ident(), self.number)
             return
 
-    def before(self, function: Callable[..., Any], concerns: Callable[..., bool]) -> Callable[..., Any]:
-        def wrapped(*arguments: Any, **options: Any) -> Any:
-            if concerns(*arguments):
-                self.strike()
-            return function(*arguments, **options)
-
-        return wrapped
-
 
 def dask_setup(worker: object) -> None:
     """What Dask calls in a worker that has this for a preload."""
     moment = Moment(**json.loads(os.environ[VARIABLE]))
-    write_record = Store.write_record
-    if moment.what == "field":
-        Store.write_field = moment.before(Store.write_field, lambda store, row, *_: row == moment.row)  # type: ignore[method-assign]
-    elif moment.what == "rename":
-        part = f"fourier/fourier/c/{moment.row}/"
-        Path.replace = moment.before(Path.replace, lambda path, *_: part in str(path))  # type: ignore[method-assign]
-    elif moment.what == "record":
-        Store.write_record = moment.before(write_record, lambda store, row, *_: row == moment.row)  # type: ignore[method-assign]
-    elif moment.what == "recorded":
+    owner, name = _FUNCTIONS[moment.what]
+    function = getattr(owner, name)
 
-        def write_and_end(store: Store, row: int, record: Record | None) -> None:
-            write_record(store, row, record)
-            if row == moment.row:
-                moment.strike()
+    def wrapped(*arguments: Any, **options: Any) -> Any:
+        place = f"fourier/fourier/c/{moment.row}/"
+        concerned = place in str(arguments[0]) if owner is Path else arguments[1] == moment.row
+        if concerned and moment.what != "recorded":
+            moment.strike()
+        returned = function(*arguments, **options)
+        if concerned and moment.what == "recorded":
+            moment.strike()
+        return returned
 
-        Store.write_record = write_and_end  # type: ignore[method-assign, assignment]
+    setattr(owner, name, wrapped)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,22 +18,13 @@ from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, locked
 from sobolev_batch.batch.store.store import Store
 from tests.faults.fatal import Moment
-from tests.support.commands import TOML
+from tests.support.commands import TOML, started
 from tests.support.processes import PATIENCE_SECONDS, tcp_cluster, wait_until
 from tests.support.shapes import TETRAHEDRON_TRIANGLES, TETRAHEDRON_VERTICES
 from tests.support.stores import assert_same_results, contents
 
 # Moved by so much, the mesh is another one, of equal size in the store.
 SHIFT = 0.125
-
-DRIVER = """
-import sys
-import sobolev_batch as sb
-from distributed import Client
-if __name__ == "__main__":
-    with Client(sys.argv[1]) as client:
-        sb.run(sb.Study.from_toml(sys.argv[2]), sys.argv[3], client)
-"""
 
 
 def write_part(folder: Path, shift: float) -> None:
@@ -54,11 +43,10 @@ def test_a_worker_that_goes_on_after_another_run_writes_nothing(
     write_part(tmp_path, 0.0)
     moment = strike(what, 0, number=signal.SIGSTOP)
     with tcp_cluster([]) as (address, (_, worker)):
-        driver = subprocess.Popen([sys.executable, "-c", DRIVER, address, str(study), str(store)])
-        wait_until(lambda: moment.pids and psutil.Process(worker.pid).status() == psutil.STATUS_STOPPED)
-        assert driver.poll() is None
-        driver.kill()
-        driver.wait()
+        with started("run", study, "--store", store, "--scheduler", address) as driver:
+            wait_until(lambda: moment.pids and psutil.Process(worker.pid).status() == psutil.STATUS_STOPPED)
+            assert driver.poll() is None
+        # The driver was killed.
         write_part(tmp_path, SHIFT)
         assert run(Study.from_toml(study), store, workers=1).failed == {}
         before = contents(store)

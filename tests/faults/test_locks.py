@@ -32,6 +32,13 @@ from tests.support.processes import PATIENCE_SECONDS
 from tests.support.stores import full_disk
 from tests.support.studies import small_table
 
+ELSEWHERE = Lock("r", "h", "process 12 on far.example", "2026-01-01T00:00:00Z", "another boot/pid:[1]/12@34")
+
+
+@pytest.fixture
+def location(store_path: Path) -> Location:
+    return Location.parse(store_path)
+
 
 @contextmanager
 def driving(store: Path, client: Client, go_on: Callable[[], object] = lambda: None) -> Iterator[Future[Summary]]:
@@ -92,16 +99,16 @@ def test_a_run_whose_store_was_released_ends(
 
 @pytest.mark.slow
 def test_a_run_that_loses_its_store_while_it_plans_leaves_it_alone(
-    study: Study, store_path: Path, monkeypatch: pytest.MonkeyPatch, threads: Client
+    study: Study, location: Location, store_path: Path, monkeypatch: pytest.MonkeyPatch, threads: Client
 ) -> None:
     run(study, store_path, threads)
-    other = Lock("r", "h", "process 12 on far.example", utc_now())
+    other = replace(ELSEWHERE, since=utc_now())
     under_way = store_path / f"zarr.json.{uuid4().hex}.partial"
 
     def plan_slowly(*arguments: Any) -> Plan:
         planned = make_plan(*arguments)
         release(store_path, force=True)
-        acquire(Location.parse(store_path), other)
+        acquire(location, other)
         under_way.write_text("what the other run is writing")
         return planned
 
@@ -109,21 +116,41 @@ def test_a_run_that_loses_its_store_while_it_plans_leaves_it_alone(
     with pytest.raises(LockError, match="the store was released"):
         run(study, store_path, threads)
     assert under_way.exists()
-    assert Lock.read(Location.parse(store_path)) == other
+    assert Lock.read(location) == other
 
 
 @pytest.mark.slow
 def test_the_lock_of_another_machine_is_released_by_hand(
-    study: Study, store_path: Path, caplog: pytest.LogCaptureFixture, threads: Client
+    study: Study, location: Location, store_path: Path, threads: Client
 ) -> None:
     run(study, store_path, threads)
-    elsewhere = Lock("r", "h", "process 12 on far.example", "2026-01-01T00:00:00Z", "another boot/pid:[1]/12@34")
-    assert Location.parse(store_path).create(LOCK_KEY, elsewhere.to_json())
+    location.create(LOCK_KEY, ELSEWHERE.to_json())
     with pytest.raises(LockError, match=r"process 12 on far\.example, since 2026-01-01"):
         run(study, store_path, threads)
-    assert release(store_path) == elsewhere
+    assert release(store_path) == ELSEWHERE
     assert release(store_path) is None
     assert len(run(study, store_path, threads).reused) == 5
+
+
+@pytest.mark.slow
+def test_a_run_elsewhere_that_gave_a_sign_of_life_is_left_alone(
+    study: Study, location: Location, store_path: Path, threads: Client
+) -> None:
+    run(study, store_path, threads)
+    there = Store.open(store_path)
+    latest = there.read_run()
+    assert latest is not None
+    location.create(LOCK_KEY, ELSEWHERE.to_json())
+    there.write_run(replace(latest, driver="process 12 on far.example, cluster c", state="running", seen=utc_now()))
+    with pytest.raises(LockError, match=r"process 12 on far\.example was alive \d+ s ago"):
+        release(store_path)
+    assert release(store_path, force=True) == ELSEWHERE
+    # A lock that was just taken, before any sign of life; a store that cannot be read.
+    (store_path / "zarr.json").write_text("")
+    location.create(LOCK_KEY, replace(ELSEWHERE, since=utc_now()).to_json())
+    with pytest.raises(LockError, match="was alive"):
+        release(store_path)
+    assert release(store_path, force=True) is not None
 
 
 LOCKING = """
@@ -137,21 +164,19 @@ sys.stdin.read()
 
 
 @pytest.mark.process
-def test_only_the_dead_of_this_machine_are_taken_over(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", LOCKING, str(tmp_path / "store")]
-    child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    assert child.stdout is not None
-    assert child.stdout.readline() == "taken\n"
-    location = Location.parse(tmp_path / "store")
-    with pytest.raises(LockError, match=f"process {child.pid} on"):
-        acquire(location, Lock.of_this_process())
-    child.kill()
-    # It has ended, and its parent has not asked how; then it is no more.
-    os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
-    left = Lock.read(location)
-    assert left is not None
-    assert left.holder_is_gone
-    child.communicate()
+def test_only_the_dead_of_this_machine_are_taken_over(location: Location, store_path: Path) -> None:
+    command = [sys.executable, "-c", LOCKING, str(store_path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == "taken\n"
+        with pytest.raises(LockError, match=f"process {child.pid} on"):
+            acquire(location, Lock.of_this_process())
+        child.kill()
+        # It has ended, and its parent has not asked how; then it is no more.
+        os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
+        left = Lock.read(location)
+        assert left is not None
+        assert left.holder_is_gone
     assert left.holder_is_gone
     # The same number is another process if it was started at another time.
     here = Lock.of_this_process()
@@ -159,7 +184,7 @@ def test_only_the_dead_of_this_machine_are_taken_over(tmp_path: Path) -> None:
     assert replace(here, process=here.process + "1").holder_is_gone
     with locked(location, here):
         assert here.is_held(location)
-    assert not (tmp_path / "store").exists()
+    assert not store_path.exists()
 
 
 @pytest.mark.parametrize("before", [None, "dead"])
@@ -187,46 +212,23 @@ def test_of_many_at_once_one_has_it(place: str, before: str | None, tmp_path: Pa
 
 
 @pytest.mark.parametrize("text", [b"", b"{", b"[1]", b'{"run": 3}', b'{"nothing": "known"}'])
-def test_a_lock_that_cannot_be_read_is_one(text: bytes, tmp_path: Path) -> None:
-    location = Location.parse(tmp_path / "store")
+def test_a_lock_that_cannot_be_read_is_one(text: bytes, location: Location) -> None:
     location.create(LOCK_KEY, text)
     with pytest.raises(LockError, match="a process that has not written its name"):
         acquire(location, Lock.of_this_process())
 
 
-@pytest.mark.slow
-def test_a_run_elsewhere_that_gave_a_sign_of_life_is_left_alone(
-    study: Study, store_path: Path, threads: Client
-) -> None:
-    run(study, store_path, threads)
-    there = Store.open(store_path)
-    latest = there.read_run()
-    assert latest is not None
-    elsewhere = Lock("r", "h", "process 12 on far.example", "2026-01-01T00:00:00Z")
-    Location.parse(store_path).create(LOCK_KEY, elsewhere.to_json())
-    there.write_run(replace(latest, driver="process 12 on far.example, cluster c", state="running", seen=utc_now()))
-    with pytest.raises(LockError, match=r"process 12 on far\.example was alive \d+ s ago"):
-        release(store_path)
-    assert release(store_path, force=True) == elsewhere
-    # A lock that was just taken, before any sign of life; a store that cannot be read.
-    (store_path / "zarr.json").write_text("")
-    Location.parse(store_path).create(LOCK_KEY, replace(elsewhere, since=utc_now()).to_json())
-    with pytest.raises(LockError, match="was alive"):
-        release(store_path)
-    assert release(store_path, force=True) is not None
-
-
-def test_a_full_disk_leaves_no_lock(tmp_path: Path) -> None:
+def test_a_full_disk_leaves_no_lock(location: Location) -> None:
     with full_disk(10), pytest.raises(StoreError, match="File too large"):
-        acquire(Location.parse(tmp_path / "store"), Lock.of_this_process())
-    assert Lock.read(Location.parse(tmp_path / "store")) is None
+        acquire(location, Lock.of_this_process())
+    assert Lock.read(location) is None
 
 
-def test_a_folder_of_the_users_stays(tmp_path: Path) -> None:
-    (tmp_path / "mine").mkdir()
-    with locked(Location.parse(tmp_path / "mine"), Lock.of_this_process()):
+def test_a_folder_of_the_users_stays(location: Location, store_path: Path) -> None:
+    store_path.mkdir()
+    with locked(location, Lock.of_this_process()):
         pass
-    assert (tmp_path / "mine").is_dir()
+    assert store_path.is_dir()
 
 
 def test_nothing_is_left_where_nothing_was_begun(tmp_path: Path) -> None:

@@ -31,11 +31,7 @@ _PASSED = (0, 5)
 class Guard(NamedTuple):
     """A condition that ends in an exception, or a call that may raise one and does nothing else.
 
-    Attributes:
-        path: Path of the module, from the root of the repository.
-        line: Its line.
-        text: Its condition or call.
-        without: The source of the module without it.
+    `path` is that of the module, from the root of the repository, and `without` its source without the guard.
     """
 
     path: str

@@ -51,15 +51,7 @@ class Strike:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a sequence of strikes.
-
-    Attributes:
-        strikes: The strikes that came before the run had ended.
-        seconds: Seconds until the run had ended.
-        commands: Number of times that the command was given.
-        failures: Number of failed requests to the storage, by kind.
-        differences: Differences from the store of an undisturbed run; there should be none.
-    """
+    """The strikes that came before a run had ended, and how its store then differs from that of an undisturbed run."""
 
     strikes: tuple[Strike, ...]
     seconds: float
@@ -121,10 +113,7 @@ def _strike(struck: _Run, clean: Location, seed: int, strikes: tuple[Strike, ...
 class _Run:
     """A scheduler, workers with nannies, and the command that carries out the study on them, all of them processes.
 
-    Attributes:
-        store: Location of the store.
-        is_done: True once the study is computed, and verified.
-        commands: Number of times that the command was given.
+    It is done once the study is computed, and verified.
     """
 
     def __init__(self, study: Path, store: Location, folder: Path) -> None:

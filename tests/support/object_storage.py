@@ -67,14 +67,7 @@ class Request(NamedTuple):
 
 
 class Server:
-    """A server whose requests fail by a rule that may change at any time; healthy at first.
-
-    Args:
-        seed: Seed of the failures.
-
-    Attributes:
-        url: Endpoint.
-    """
+    """A server whose requests fail by a rule that may change at any time; healthy at first."""
 
     def __init__(self, seed: int = 0) -> None:
         # Imported late, as below: they take a second each.

@@ -11,10 +11,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import TypeVar
 
-import dask as dask_settings
 import psutil
 from distributed import Client
-from distributed.utils import get_mp_context
 
 T = TypeVar("T")
 
@@ -72,18 +70,7 @@ def listening(*pids: int) -> set[tuple[str, int]]:
 
 def scheduler_address(scheduler: subprocess.Popen[str]) -> str:
     assert scheduler.stderr is not None
-    return next(match[0] for line in scheduler.stderr if (match := re.search(r"tcp://127\.0\.0\.1:\d+", line)))
-
-
-@contextmanager
-def forked_workers() -> Iterator[None]:
-    """Have workers of local clusters forked from one process that has imported everything, five times as fast.
-
-    They have the environment of that process: what a test changes there does not reach them.
-    """
-    with dask_settings.config.set({"distributed.worker.multiprocessing-method": "forkserver"}):
-        get_mp_context().set_forkserver_preload(["sobolev_batch.batch.run"])
-        yield
+    return next(match[0] for line in scheduler.stderr if (match := re.search(r"(?:tcp|tls)://127\.0\.0\.1:\d+", line)))
 
 
 @contextmanager
