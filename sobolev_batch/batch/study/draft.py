@@ -17,7 +17,7 @@ from sobolev_batch.batch.study.schema import RESERVED
 from sobolev_batch.batch.study.study import METHOD, OBJECT, REFERENCE_LABEL, Study, StudyCollection, is_collection
 from sobolev_batch.errors import MeshError, StudyError
 from sobolev_batch.surfaces.formats.readers import expected_size, is_mesh_name, mesh_stem, read_mesh
-from sobolev_batch.surfaces.sources.files import MOST_MESHES, FileMember, FileSource, matching_files
+from sobolev_batch.surfaces.sources.files import MOST_MESHES, matching_files
 from sobolev_batch.surfaces.sources.names import caseless_key, label_problem, name_problem, natural_key, quoted
 from sobolev_batch.visible import reasons, table_html, visible
 
@@ -162,7 +162,7 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
         sections, summary = _sections_of_one(reference, sizes, base, prefix)
     else:
         references, methods = several
-        sections, summary = _sections_of_several(references, methods, base, prefix)
+        sections, summary = _sections_of_several(references, methods, prefix)
         used = {*references.values(), *(path for paths in methods.values() for path in paths)}
         left_out |= {str(path): "its name is that of no object" for path in sizes if path not in used}
     text = f"{_HEAD.format(name=_toml(_free_name(folder.resolve().name, fallback='study')))}{sections}{_TAIL}"
@@ -264,11 +264,6 @@ def _free_name(wanted: str, taken: Iterable[str] = (), fallback: str = "meshes")
     known = {caseless_key(other) for other in (*taken, REFERENCE_LABEL)}
     numbered = [name, *(f"{name} {number}" for number in range(2, len(known) + 3))]
     return next(candidate for candidate in numbered if caseless_key(candidate) not in known)
-
-
-def _with_any_size(stem: str) -> str:
-    """Return the stem of a file with a wildcard for the number at its end."""
-    return _SIZE.sub(lambda size: f"{size['separator']}*", stem)
 
 
 def _without_size(stem: str) -> str:
@@ -377,50 +372,24 @@ def _sections_of_one(
 
 
 def _sections_of_several(
-    references: Mapping[str, PurePosixPath], methods: _Methods, base: Path, prefix: str
+    references: Mapping[str, PurePosixPath], methods: _Methods, prefix: str
 ) -> tuple[str, tuple[str, ...]]:
-    """Return the sections of a study of several objects, and what they hold."""
-    wanted = {(name, REFERENCE_LABEL): {f"{prefix}{path}"} for name, path in references.items()}
-    wanted |= {key: {f"{prefix}{path}" for path in paths} for key, paths in methods.items()}
-    templates = {prefix + _replaced(str(path), name, OBJECT) for name, path in references.items()}
-    sections = _REFERENCE_SECTION.format(remark="of each object", paths=_paths(sorted(templates)))
-    templates = {prefix + _template(path, *key) for key, paths in methods.items() for path in paths}
+    """Return the section of a study of several objects, which lists their meshes, and what it holds."""
+    listed = [(name, REFERENCE_LABEL, path) for name, path in references.items()]
     counts: dict[str, int] = {}
-    for (_, method), paths in methods.items():
+    for (name, method), paths in methods.items():
+        listed += [(name, method, path) for path in paths]
         counts[method] = counts.get(method, 0) + len(paths)
-    sections += _FAMILY_SECTION.format(
-        name=_toml(METHOD), paths=_paths(sorted(templates), _count(sum(counts.values())))
+    rows = (
+        f"    {{ object = {_toml(name)}, method = {_toml(method)}, path = {_toml(f'{prefix}{path}')} }},\n"
+        for name, method, path in listed
     )
-    if _named_files(_HEAD.format(name='"draft"') + sections, base) != wanted:
-        rows = [
-            f"    {{ object = {_toml(name)}, method = {_toml(method)}, path = {_toml(path)} }},\n"
-            for (name, method), paths in wanted.items()
-            for path in sorted(paths)
-        ]
-        sections = f"[objects]\nmeshes = [\n{''.join(rows)}]\n"
     names = list(references)
     more = f" and {len(names) - _MOST_OBJECTS} more" if len(names) > _MOST_OBJECTS else ""
-    return sections, (
+    return f"[objects]\nmeshes = [\n{''.join(rows)}]\n", (
         f"{len(names)} objects: {', '.join(names[:_MOST_OBJECTS])}{more}",
         *(f"method {method}: {_count(count)}" for method, count in counts.items()),
     )
-
-
-def _named_files(text: str, base: Path) -> dict[tuple[str, str], set[str]]:
-    """Return the files of each object and method of a study of several objects; none if it is not valid."""
-    files: dict[tuple[str, str], set[str]] = {}
-    try:
-        collection = StudyCollection.from_table(tomllib.loads(text), folder=base)
-        for name, study in collection.studies.items():
-            sources = {REFERENCE_LABEL: study.reference, **{family.name: family.source for family in study.families}}
-            for method, source in sources.items():
-                members = source.members(base) if isinstance(source, FileSource) else ()
-                paths = (member.path for member in members if isinstance(member, FileMember))
-                files[name, method] = _relative(paths, base)
-    except (StudyError, re.error):
-        # Names with wildcards or braces stand for others in a template.
-        return {}
-    return files
 
 
 def _entries(paths: Sequence[str], base: Path) -> list[str]:
@@ -430,29 +399,18 @@ def _entries(paths: Sequence[str], base: Path) -> list[str]:
         kinds.setdefault((path.parent, path.name.removeprefix(mesh_stem(Path(path)))), []).append(str(path))
     entries: list[str] = []
     for (folder, ending), alike in kinds.items():
-        stems = {"*", _with_any_size(mesh_stem(Path(alike[0])))} if len(alike) > 1 else set()
+        stems = (
+            {"*", _SIZE.sub(lambda size: f"{size['separator']}*", mesh_stem(Path(alike[0])))}
+            if len(alike) > 1
+            else set()
+        )
         globs = [str(folder / f"{stem}{ending}") for stem in sorted(stems) if "*" in stem]
-        entries += [glob for glob in globs if _relative(matching_files(base, glob), base) == set(alike)][:1] or alike
+        entries += [glob for glob in globs if _named(glob, base) == set(alike)][:1] or alike
     return entries
 
 
-def _relative(paths: Iterable[Path], base: Path) -> set[str]:
-    return {Path(os.path.relpath(path, base)).as_posix() for path in paths}
-
-
-def _template(path: PurePosixPath, name: str, method: str) -> str:
-    """Return the path of a file with placeholders for object and method, and a wildcard for its size."""
-    path = PurePosixPath(_replaced(_replaced(str(path), name, OBJECT), method, METHOD))
-    stem = _stem(path)
-    return str(path.with_name(_with_any_size(stem) + path.name.removeprefix(stem)))
-
-
-def _replaced(path: str, name: str, placeholder: str) -> str:
-    """Return a path with a placeholder for a name: in place of whole folders, and of a whole word of the last part."""
-    *folders, last = path.split("/")
-    word = rf"(?<![^\W_]){re.escape(name)}(?![^\W_])"
-    last = re.sub(word, lambda _: placeholder, last, count=1)
-    return "/".join([*(placeholder if part == name else part for part in folders), last])
+def _named(glob: str, base: Path) -> set[str]:
+    return {Path(os.path.relpath(path, base)).as_posix() for path in matching_files(base, glob)}
 
 
 def _paths(entries: Iterable[str], remark: str = "") -> str:
