@@ -27,7 +27,7 @@ from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.values import SurfaceSize
 from sobolev_batch.spectral.transform.transform import field_seconds, slowness
 from sobolev_batch.surfaces.shapes.surface import Similarity, placement_doubt
-from sobolev_batch.visible import table_html, visible
+from sobolev_batch.visible import reasons, table_html, visible
 
 # Time to describe and record a surface, and that of each of its triangles.
 _ROW_SECONDS, _TRIANGLE_SECONDS = 0.1, 5e-6
@@ -90,8 +90,6 @@ def _row_seconds(plan: Plan, row: Row) -> float:
 
 
 DEFAULT_FOLDER = Path("storage")
-# More would hide the rest of a plan.
-_MOST_DOUBTS = 10
 
 
 @dataclass(frozen=True)
@@ -212,10 +210,8 @@ def _task_lines(
     if plan.study.pairs == "all":
         driver_bytes = pairs_bytes(len(plan.rows), len(plan.study.orders))
         yield "", f"{format_bytes(driver_bytes)} in the driver, for distances of all pairs"
-    yield from (("refused", f"{label}: {reason}") for label, reason in refused.items())
-    yield from (("doubtful", f"{label}: {reason}") for label, reason in list(doubtful.items())[:_MOST_DOUBTS])
-    if len(doubtful) > _MOST_DOUBTS:
-        yield "doubtful", f"and {len(doubtful) - _MOST_DOUBTS} more"
+    yield from reasons("refused", refused)
+    yield from reasons("doubtful", doubtful)
 
 
 @dataclass(frozen=True)

@@ -159,8 +159,8 @@ LEAGUE = Plot(draw_league, lambda leagues: leagues, 3.6)
 
 # Smaller fractions are not written into their cells.
 _SMALLEST_SHARE = 0.005
-# Points of the largest font of labels and of shares, and of the smallest that can be read.
-_LABEL_POINTS, _SHARE_POINTS, _SMALLEST_POINTS = 7.5, 7.0, 4.0
+# Points of the largest font of labels and of shares.
+_LABEL_POINTS, _SHARE_POINTS = 7.5, 7.0
 
 
 def draw_spectrum(selection: Selection, order: float, axes: Axes) -> None:
@@ -176,8 +176,10 @@ def draw_spectrum(selection: Selection, order: float, axes: Axes) -> None:
         if np.isnan(fractions).all():
             middle = (len(fractions) - 1) / 2
             axes.text(middle, i, "equal to the reference", ha="center", va="center", fontsize=font)
-        elif font >= _SMALLEST_POINTS:
-            _write_shares(axes, i, fractions, 0.6 * np.nanmax(shares), font)
+        for column, fraction in enumerate(fractions):
+            if fraction >= _SMALLEST_SHARE:
+                color = "white" if fraction > 0.6 * np.nanmax(shares) else "black"
+                axes.text(column, i, f"{fraction:.0%}", ha="center", va="center", fontsize=font, color=color)
     axes.set_xticks(
         range(len(spectra.bands)),
         spectra.bands,
@@ -191,14 +193,6 @@ def draw_spectrum(selection: Selection, order: float, axes: Axes) -> None:
     axes.set_xlabel("wavelength in the study's unit")
     set_title(axes, f"differences by wavelength, order {order:g}", spectra.omission)
     hide_frame(axes)
-
-
-def _write_shares(axes: Axes, row: int, fractions: Reals, dark: float, font: float) -> None:
-    """Write fractions into their cells; those above a limit are on dark cells."""
-    for column, fraction in enumerate(fractions):
-        if fraction >= _SMALLEST_SHARE:
-            color = "white" if fraction > dark else "black"
-            axes.text(column, row, f"{fraction:.0%}", ha="center", va="center", fontsize=font, color=color)
 
 
 def draw_energy(selection: Selection, _item: object, axes: Axes) -> None:

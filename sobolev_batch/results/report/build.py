@@ -268,9 +268,6 @@ def chart_omissions(
         yield f"witness functions: only {len(views)} of {compared:,} meshes are drawn; --witness chooses them"
     for label, reason in missing.items():
         yield f"the witness function of {label}: {reason}"
-    for view in views:
-        if len(view.triangles) < view.original_triangles:
-            yield f"triangles: {view.label} is drawn with {len(view.triangles):,} of {view.original_triangles:,}"
 
 
 def _convergence(tree: xr.DataTree, orders: list[float], most: int) -> list[list[Json]]:

@@ -11,7 +11,7 @@ import pandas as pd
 from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.errors import InputError
 from sobolev_batch.results.open import open_store
-from sobolev_batch.results.report.content import PageTable, Row, common_content, common_settings
+from sobolev_batch.results.report.content import PageTable, Row, common_content
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables.convergence import tables_of
 from sobolev_batch.results.tables.league import (
@@ -63,7 +63,6 @@ def league_content(collection: CollectionStore, status: Status) -> dict[str, Any
     versions = open_store(collection.location.below(next(iter(tables)))).attrs["versions"]
     return {
         **common_content(collection.title, collection.table, tables, status, status.failed, versions),
-        "settings": dict(common_settings(collection.table)),
         "leagues": leagues,
         "no_league": no_league,
         "sentences": tuple(map(sentence_of, leagues)) or (_NO_LEAGUE,) * len(orders),

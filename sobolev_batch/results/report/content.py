@@ -9,7 +9,6 @@ from typing import Any
 import pandas as pd
 import xarray as xr
 
-from sobolev_batch.batch.study.study import REFERENCE_LABEL
 from sobolev_batch.results.figures.selection import spread
 from sobolev_batch.results.open import finished_group, has_proximity, placement_doubts
 from sobolev_batch.results.status import Status
@@ -19,7 +18,6 @@ from sobolev_batch.spectral.lattice import Lattice
 
 # Rows of all convergence tables together, of the table of meshes, and of reasons; browsers become slow beyond.
 MOST_CONVERGENCE_ROWS, MOST_MESH_ROWS, _MOST_REASONS = 10_000, 5_000, 2_000
-_LONGEST_VALUE = 300
 
 # A row of a table: a record of a frame. It may also have its "order"; a "mark", a short remark about its marked number;
 # the number of its "color"; and the text "absent" in place of all numbers, with the section "reasons" that explains it.
@@ -122,31 +120,6 @@ def _without_nulls(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: _without_nulls(entry) for key, entry in value.items() if entry is not None}
     return [_without_nulls(entry) for entry in value] if isinstance(value, list) else value
-
-
-def common_settings(study: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield what the file of a study or collection says of families, reference and accuracy, by keyword."""
-    for family in study.get("family", ()):
-        yield f"family {family['name']}", _source_text(family)
-    if "reference" in study:
-        yield "reference", _source_text(study["reference"])
-    if "accuracy" in study:
-        yield "accuracy", f"rtol {study['accuracy']['rtol']:g} of every distance to the reference"
-
-
-def _source_text(entry: Mapping[str, Any]) -> str:
-    """Return a source and its parameters on one line."""
-    parameters = [f"{key} {_value_text(value)}" for key, value in entry.items() if key not in ("name", "source")]
-    text = ", ".join([str(entry.get("source", "")), *parameters])
-    return text if len(text) <= _LONGEST_VALUE else text[: _LONGEST_VALUE - 1] + "…"
-
-
-def _value_text(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return f"({_source_text(value)})"
-    if isinstance(value, list):
-        return ", ".join(map(_value_text, value))
-    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _run_facts(status: Status) -> Iterator[tuple[str, str]]:
@@ -381,11 +354,9 @@ def _failures(meshes: xr.Dataset) -> dict[str, str]:
 
 
 def _settings(attributes: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    study, table = attributes["study"], attributes["study"]["table"]
+    study = attributes["study"]
     lattice = Lattice(**study["lattice"])
-    yield from common_settings(table)
-    if study["reference"] != REFERENCE_LABEL:
-        yield "reference mesh", study["reference"]
+    yield "reference", study["reference"]
     for reason in (study.get("choice") or {}).get("reasons", ()):
         yield "chosen", reason
     yield (
@@ -401,8 +372,6 @@ def _settings(attributes: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
             f"{len(octaves['octaves'])} beyond the lattice, at random frequencies up to {highest:.4g} cycles per unit "
             f"length: wavelengths down to {1 / highest:.4g} units",
         )
-    if table.get("proximity") is not None:
-        yield "proximity", "Hausdorff and Chamfer distances of every mesh to the reference"
     dtype = {"complex128": "double", "complex64": "single"}[study["dtype"]]
     eps = "" if study["eps"] is None else f", nonuniform FFT accurate to {study['eps']:g}"
     yield "arithmetic", f"{dtype} precision{eps}"
