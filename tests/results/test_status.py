@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import os
 import pty
-import subprocess
-import sys
 import time
+from contextlib import redirect_stdout
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from distributed import Client
 
 import sobolev_batch as sb
 from sobolev_batch.batch.store.records import Record, RunRecord
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.cli import cli
+from sobolev_batch.cli.common import replace_line
 from sobolev_batch.results.status import Status
 from tests.support.studies import small_table
 
@@ -35,14 +33,6 @@ def store() -> Store:
     """Return a store with the five rows of a study that has been run."""
     sb.run(sb.Study.from_table(small_table()), "memory://status.zarr", workers=1)
     return Store.open("memory://status.zarr")
-
-
-@pytest.fixture(scope="module")
-def path(tmp_path_factory: pytest.TempPathFactory, threads: Client) -> Path:
-    """Return the path of such a store, for commands."""
-    path = tmp_path_factory.mktemp("status") / "s.zarr"
-    sb.run(sb.Study.from_table(small_table()), path, threads)
-    return path
 
 
 def running(store: Store, *finished: float, begun: float = 0.0, state: str = "running") -> Status:
@@ -75,62 +65,27 @@ def test_what_cannot_be_told_is_not(store: Store) -> None:
 
 
 @pytest.mark.slow
-def test_a_moment_between_two_objects_is_not_the_end(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_has_a_line_for_each_change_and_a_moment_between_two_objects_is_not_the_end(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
     ended = replace(Status.from_store(store.path), run_store="object")
-    goes_on = replace(running(store), run_store="object")
-    looks = [goes_on, ended, goes_on, goes_on, ended, ended]
+    one, two = (replace(running(store, *finished), run_store="object") for finished in ((), (0,)))
+    looks = [one, ended, one, two, ended, ended]
     monkeypatch.setattr("sobolev_batch.results.status.status", lambda place: looks.pop(0))
     monkeypatch.setattr("sobolev_batch.cli.stores._FOLLOW_SECONDS", 0)
     done = CliRunner().invoke(cli, ["status", store.path, "--follow"])
     assert done.exit_code == 0
     assert not looks
+    assert done.stdout.splitlines() == [one.progress, two.progress, *str(ended).splitlines()]
 
 
-# Follows a store that says three times that its run goes on, and then that it is done.
-FOLLOWING = """
-import sys
-from dataclasses import replace
-import sobolev_batch.cli as line
-import sobolev_batch.cli.stores as stores
-import sobolev_batch.results.status as module
-
-found = module.Status.from_store(sys.argv[2])
-left = [4, 4, 3]
-
-def status(store):
-    if not left:
-        return replace(found, run=replace(found.run, state="done"))
-    return replace(found, complete=5 - left.pop(), run=replace(found.run, state="running"))
-
-module.status, stores._FOLLOW_SECONDS = status, 0
-line.main()
-"""
-
-
-@pytest.mark.process
-@pytest.mark.parametrize("on_terminal", [True, False])
-def test_a_terminal_has_one_line_and_a_file_one_for_each_change(on_terminal: bool, path: Path) -> None:
-    arguments = [sys.executable, "-c", FOLLOWING, "status", str(path), "--follow"]
-    if not on_terminal:
-        done = subprocess.run(arguments, capture_output=True, text=True, check=False)
-        lines = done.stdout.splitlines()
-        assert [line[:13] for line in lines[:2]] == ["2 of 5 done, ", "1 of 5 done, "]
-        assert "\x1b" not in done.stdout
-        assert lines[2].endswith(": 5 of 5 complete, 0 failed, 0 to go")
-        assert done.returncode == 0
-        return
+def test_a_terminal_has_one_line_that_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "30")
     main, worker = pty.openpty()
-    process = subprocess.Popen(arguments, stdout=worker, stderr=worker, env={**os.environ, "COLUMNS": "30"})
-    os.close(worker)
-    shown = b""
-    while process.poll() is None or not shown.endswith(b"Z\r\n"):
-        try:
-            shown += os.read(main, 4096)
-        except OSError:  # the other end was closed
-            break
+    with os.fdopen(worker, "w") as terminal, redirect_stdout(terminal):
+        shown = ""
+        for text in (f"2 of 5 done, {'x' * 40}", "1 of 5 done", ""):
+            shown = replace_line(text, shown)
+        terminal.flush()
+        assert os.read(main, 4096).decode().split("\r\x1b[K") == ["", f"2 of 5 done, {'x' * 16}", "1 of 5 done", ""]
     os.close(main)
-    assert process.wait(60) == 0
-    updates = shown.decode().split("\r\x1b[K")
-    assert [update[:13] for update in updates[1:4]] == ["2 of 5 done, ", "1 of 5 done, ", "1 of 5 done, "]
-    assert all("\n" not in update and len(update) < 30 for update in updates[:4])
-    assert ": 5 of 5 complete, 0 failed, 0 to go" in updates[4]
