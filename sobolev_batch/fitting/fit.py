@@ -191,13 +191,7 @@ def fitted_mesh(mesh: Mesh, target: Operand, settings: FitSettings, execution: E
 
 
 class FitRun:
-    """A fit that is under way.
-
-    Attributes:
-        vertices: Positions (n, 3) after the last step, in units of length.
-        taken: Number of steps so far.
-        end: Why the last descent ended.
-    """
+    """A fit that is under way: its positions (n, 3) in units of length, steps taken, and why the last descent ended."""
 
     def __init__(self, problem: FitProblem, notify: Notify | None = None) -> None:
         self.problem, self.notify, self.free = problem, notify, problem.free_vertices

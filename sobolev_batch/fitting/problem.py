@@ -58,13 +58,7 @@ _LEAST_ERRORS = 5.0
 
 @dataclass(frozen=True)
 class FitSettings:
-    """Settings of a fit.
-
-    Attributes:
-        order: Order s of the distance.
-        steps: Largest number of steps.
-        smoothing: Weight λ of the mesh's Laplacian in steps.
-        keep_boundary: True if vertices of open boundaries stay where they are.
+    """Settings of a fit; see `fit`.
 
     Raises:
         OrderError: The order is not below -1/2.

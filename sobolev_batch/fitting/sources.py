@@ -41,17 +41,13 @@ _fits: dict[str, Mesh] = {}
 
 
 class FitSource(NestedSource):
-    """Meshes of another source, each with its vertices moved nearer to a surface: see `fit`.
+    """Meshes of another source, each with its vertices moved nearer to a surface: see `fit`, also for the settings.
 
     Distances are those in the unit ball of the target, as in a study that is scaled by its reference.
 
     Attributes:
         mesh: Table of the source of the meshes to start from.
         target: Table of a source with one surface; the study's reference if left out.
-        order: Order s of the distance to lower.
-        steps: Largest number of steps.
-        smoothing: Smoothing of the steps.
-        keep_boundary: True if vertices of open boundaries stay where they are.
     """
 
     target: OtherSource | None = None
@@ -114,14 +110,7 @@ class RefineSource(FitSource):
 
 @dataclass(frozen=True)
 class FittedMember(Member):
-    """A mesh with its vertices moved, and refined if a number of triangles is given.
-
-    Attributes:
-        start: Member of the mesh to start from.
-        target: Member of the surface to come nearer to.
-        settings: Settings of the fit.
-        triangles: Number of triangles to reach; None to keep those of the start.
-    """
+    """A mesh with its vertices moved towards a target, and refined if a number of triangles is given."""
 
     start: Member
     target: Member

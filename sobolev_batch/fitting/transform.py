@@ -109,11 +109,8 @@ class MeshTransform:
         """Return the derivative of Re Σ conj(c(ξ)) μ^(ξ) over the half lattice with respect to the vertices, (n, 3).
 
         It is that of the sum over quadrature nodes x_j with weights a_j, at any number of nodes. The function
-        w(x) = Re Σ c(ξ) exp(+2πi ξ·x) and its gradient at the nodes give Σ_j (w(x_j) da_j + a_j ∇w(x_j) · dx_j).
-
-        Args:
-            vertices: Positions (n, 3).
-            coefficients: c, complex128 on the half lattice.
+        w(x) = Re Σ c(ξ) exp(+2πi ξ·x) and its gradient at the nodes give Σ_j (w(x_j) da_j + a_j ∇w(x_j) · dx_j). The
+        coefficients c are complex128 on the half lattice.
         """
         nodes = self.nodes(vertices)
         values, slopes = self._evaluated(nodes, coefficients)
