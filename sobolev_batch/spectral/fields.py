@@ -109,12 +109,7 @@ class Quality:
 
 @dataclass(frozen=True, eq=False)
 class Field(Transformed):
-    """The whole field of a surface.
-
-    Attributes:
-        quality: Area, extent and probe, from which errors follow.
-        settings: Settings that it was computed with.
-    """
+    """The whole field of a surface, with the quality that errors follow from, and the settings it was computed with."""
 
     quality: Quality
     settings: TransformSettings

@@ -33,12 +33,7 @@ Axes = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class Block:
-    """A rectangular block of the half lattice, in units of the spacing.
-
-    Attributes:
-        start: Lowest index k along each axis; may be negative in x and y.
-        shape: Number of samples along each axis.
-    """
+    """A rectangular block of the half lattice: its lowest index k along each axis, maybe negative, and its shape."""
 
     start: tuple[int, int, int]
     shape: tuple[int, int, int]

@@ -55,12 +55,7 @@ class Draws:
 
 @dataclass(frozen=True)
 class Probe:
-    """Estimate of the sums of |computed - exact|² over the shells |k|² of the half lattice.
-
-    Attributes:
-        shells: Shell |k|² of each draw.
-        sums: Contribution of each draw to the sum of its shell.
-    """
+    """Estimate of the sums of |computed - exact|² over the shells |k|² of the half lattice: the share of each draw."""
 
     shells: tuple[int, ...] = ()
     sums: tuple[float, ...] = ()
@@ -159,12 +154,7 @@ def _draw_point(lattice: Lattice, shell: int, rng: np.random.Generator) -> NDArr
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Exact transform of a surface at drawn frequencies.
-
-    Attributes:
-        draws: Frequencies of the sample.
-        exact: Exact values, complex128 (P,).
-    """
+    """Exact transform of a surface at drawn frequencies, complex128 (P,)."""
 
     draws: Draws
     exact: NDArray[np.complex128]

@@ -55,12 +55,7 @@ _POINTS_OF_SCALES = 64
 
 @dataclass(frozen=True, eq=False)
 class Measure:
-    """Values of a signed sum of surfaces.
-
-    Attributes:
-        lattice: Values on the half lattice, complex.
-        octaves: Values at the samples of each octave, complex.
-    """
+    """Values of a signed sum of surfaces: complex ones on the half lattice, and at the samples of each octave."""
 
     lattice: Complexes
     octaves: tuple[Complexes, ...]

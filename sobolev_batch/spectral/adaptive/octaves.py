@@ -72,7 +72,7 @@ class Core:
     Attributes:
         lattice: Lattice of the fields.
         fields: Fields of the surfaces.
-        squares: Squared norm of their difference under the step for each order (orders,).
+        squares: Squared norm of their difference under the step (orders,).
         images: Bound on the change of the squares by the lattice's spacing (orders,).
         errors: Norms of the fields' own errors (orders,).
         energy: Energy ∫_{|ξ|=r} |field|² dS in the last octave below ξ_max.
@@ -110,12 +110,7 @@ class Core:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredOctave:
-    """An octave: where it was sampled, the surfaces' values there, and their integrals.
-
-    Attributes:
-        values: Values of each surface.
-        sums: Integrals of the squared difference.
-    """
+    """An octave with the values of each surface there, and the integrals of the squared difference."""
 
     values: tuple[OctaveValues, ...]
     sums: OctaveSums

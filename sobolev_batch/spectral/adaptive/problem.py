@@ -204,12 +204,7 @@ def centering(surfaces: Sequence[Surface]) -> Similarity:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceValues:
-    """Values of a surface at some frequencies.
-
-    Attributes:
-        field: Field on the lattice.
-        octaves: Values in the octaves beyond it.
-    """
+    """Values of a surface at some frequencies: its field on a lattice, and in the octaves beyond it."""
 
     field: Field
     octaves: tuple[OctaveValues, ...] = ()

@@ -224,9 +224,8 @@ def _estimate(weights: SobolevWeights, sums: Reals, fields: Sequence[xr.DataArra
 
 def _widths(fields: Sequence[xr.DataArray]) -> Reals:
     """Return the widths of the surfaces of some fields together, see `Support`; zero where they are unknown."""
-    qualities = [quality for quality in map(quality_of, fields) if quality is not None]
-    is_complete = len(qualities) == len(fields)
-    return Extent.union([one.extent for one in qualities]).widths if is_complete else np.zeros(len(DIRECTIONS))
+    extents = [quality.extent for quality in map(quality_of, fields) if quality is not None]
+    return Extent.union(extents).widths if len(extents) == len(fields) else np.zeros(len(DIRECTIONS))
 
 
 def _spheres(*operands: OperandLike, lattice: Lattice | None) -> tuple[Sphere, ...]:

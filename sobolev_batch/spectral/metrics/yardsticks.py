@@ -135,14 +135,9 @@ def _curves(
 
 @dataclass(frozen=True, eq=False)
 class _Curve:
-    """Distances to the reference by the amount of a change, each computed once.
+    """Distances (orders,) to the reference by the amount of a change, each computed once.
 
-    Attributes:
-        distances: Function of the amount that returns distances (orders,).
-        start: Amount to begin with.
-        bounds: Least and largest amount.
-        slope: Power of the amount that the distance usually grows with.
-        known: Distances that are computed, by their amounts.
+    The search begins with a start between bounds. The distance usually grows like the amount to the power of the slope.
     """
 
     distances: Callable[[float], Reals]

@@ -173,16 +173,9 @@ def _power_integral(lowest: float, order: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Kernel:
-    """The kernel K of an order beyond a cutoff, in tables over equal steps of `_scale`.
+    """The kernel K of an order beyond a cutoff, up to a reach, in tables over equal steps of `_scale` from a start on.
 
-    Attributes:
-        cutoff: The cutoff.
-        reach: Distance at which the tables end.
-        start: Least value of the scale.
-        step: Step of the scale.
-        total: M(0).
-        drops: M(0) - M(d), (n,).
-        values: K(d), (n,).
+    The total is M(0); drops are M(0) - M(d) and values K(d), (n,) each.
     """
 
     cutoff: float

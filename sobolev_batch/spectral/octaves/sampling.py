@@ -35,12 +35,7 @@ _NOWHERE: Indices = np.zeros(0, dtype=np.int64)
 
 @dataclass(frozen=True)
 class Octave:
-    """A smooth shell of frequencies around an innermost ball.
-
-    Attributes:
-        cutoff: Radius at which the ball's `smooth_step` ends, in cycles per unit length.
-        index: Number of the octave, from 1.
-    """
+    """A smooth shell of frequencies around an innermost ball, whose `smooth_step` ends at a cutoff; counted from 1."""
 
     cutoff: float
     index: int

@@ -152,13 +152,7 @@ def _compared(
 
 @dataclass(frozen=True)
 class SurfaceSize:
-    """Size of a surface, on which the processor time of its transforms depends.
-
-    Attributes:
-        triangles: Number of triangles; zero for a surface that is no mesh.
-        area: Area, in squared units of length.
-        is_closed_form: True for a surface whose transform is a formula.
-    """
+    """Size of a surface, on which the processor time of its transforms depends: area in squared units of length."""
 
     triangles: int
     area: float
@@ -235,12 +229,7 @@ class OctaveSums:
 
 @dataclass(frozen=True, eq=False)
 class OctaveWeights:
-    """Weights of the samples of an octave for some orders.
-
-    Attributes:
-        sampling: Samples of the octave.
-        orders: Orders s.
-    """
+    """Weights of the samples of an octave for some orders s."""
 
     sampling: OctaveSampling
     orders: tuple[float, ...]

@@ -39,11 +39,9 @@ _BITS = 63
 
 @dataclass(frozen=True)
 class WeightedPoints:
-    """A sum of Dirac masses, in arrays of one backend.
+    """A sum of Dirac masses in arrays of one backend.
 
-    Attributes:
-        coordinates: float64 (3, n), one contiguous row per axis, in units of length.
-        weights: float64 (n,), in squared units of length.
+    Coordinates are float64 (3, n), one contiguous row per axis, in units of length; weights (n,) in squared units.
     """
 
     coordinates: Array

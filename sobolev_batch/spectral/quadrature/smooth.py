@@ -7,7 +7,6 @@ the change on doubling them is the error of the fewer ones to all its digits.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from functools import lru_cache
 
 import numpy as np
@@ -111,12 +110,13 @@ def _refined(surface: Smooth, highest: float, tolerance: float, most: int) -> tu
     frequencies = highest * _unit_frequencies()
     values = direct_transform(surface, counts, frequencies)
     while True:
-        finer = [direct_transform(surface, more, frequencies) for more in _finer(counts)]
+        twice = doubled(counts)
+        along = (twice[0], counts[1]), (counts[0], twice[1])
+        finer = [direct_transform(surface, more, frequencies) for more in along]
         changes = [float(np.abs(more - values).max()) / surface.area for more in finer]
         if sum(changes) <= tolerance:
             return counts, sum(changes)
         coarse = [change > tolerance / 2 for change in changes]
-        twice = doubled(counts)
         larger = (twice[0] if coarse[0] else counts[0], twice[1] if coarse[1] else counts[1])
         if _too_many(surface, larger, most):
             return counts, sum(changes)
@@ -127,12 +127,6 @@ def _refined(surface: Smooth, highest: float, tolerance: float, most: int) -> tu
 def _too_many(surface: Smooth, counts: Counts, most: int) -> bool:
     along = zip(surface.intervals, counts, strict=True)
     return math.prod(counts) > most or any(n > MOST_GAUSS_NODES and not interval.periodic for interval, n in along)
-
-
-def _finer(counts: Counts) -> Iterator[Counts]:
-    more = doubled(counts)
-    yield more[0], counts[1]
-    yield counts[0], more[1]
 
 
 def _first_counts(surface: Smooth, highest: float) -> Counts:

@@ -119,12 +119,7 @@ _SINGLE_ROUNDING = 3e-7
 
 @dataclass(frozen=True)
 class ErrorTarget:
-    """Largest permitted norms of a field's own error.
-
-    Attributes:
-        orders: Orders s.
-        norms: Largest ||computed - exact||_s for each of them.
-    """
+    """Largest permitted norms ||computed - exact||_s of a field's own error, one for each order s."""
 
     orders: tuple[float, ...]
     norms: tuple[float, ...]

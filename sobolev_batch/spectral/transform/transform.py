@@ -52,13 +52,9 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Transformed:
-    """A block of a field.
+    """A block of a field: its values, the number of quadrature points (0 for a closed form), and the library.
 
-    Attributes:
-        values: Complex array (block.shape).
-        points: Number of quadrature points; 0 for a closed form.
-        backend: Library that computed it, and the reason if another one failed before; "closed form" if none
-            was needed.
+    The library is "closed form" if none was needed, and comes with the reason if another one failed before.
     """
 
     values: Complexes
