@@ -75,9 +75,10 @@ def glb_of(vertices: Any, indices: Any, **nodes: Any) -> bytes:
     return Gltf([[(vertices, indices, None)]], **{"nodes": [{"mesh": 0}], **nodes}).glb()
 
 
-def glb_count(accessor: int, count: int) -> bytes:
+def glb_with(accessor: int | None = None, **entries: Any) -> bytes:
+    """A scene with other entries in an accessor, or in the document itself."""
     scene = box_scene()
-    scene.tree["accessors"][accessor]["count"] = count
+    (scene.tree if accessor is None else scene.tree["accessors"][accessor]).update(entries)
     return scene.glb()
 
 
@@ -137,9 +138,12 @@ BAD: dict[str, dict[str, bytes]] = {
     },
     ".glb": {
         **{
-            f"{count} of accessor {accessor}": glb_count(accessor, count)
+            f"{count} of accessor {accessor}": glb_with(accessor, count=count)
             for accessor, count in ((1, 39), (1, 35), (0, 9), (0, 7))
         },
+        "sparse": glb_with(0, sparse={"count": 1}),
+        "normalized": glb_with(0, normalized=True),
+        "compressed": glb_with(extensionsRequired=["KHR_draco_mesh_compression"]),
         "no nodes": glb_of(BOX_VERTICES, BOX_TRIANGLES, nodes=[]),
         "points alone": Gltf([[(BOX_VERTICES, None, 0)]], [{"mesh": 0}]).glb(),
         "a node that is its own child": glb_of(
@@ -152,6 +156,7 @@ BAD: dict[str, dict[str, bytes]] = {
         "a buffer that is not there": box_scene().gltf("missing.bin"),
         "a buffer that is shorter than announced": re.sub(rb"base64,[^\"]{40}", b"base64,", GLTF_BOX),
         "cut": GLTF_BOX[:-5],
+        "no JSON": b"not JSON",
         "an empty document": b"{}",
         "a list": b"[]",
     },
@@ -189,6 +194,14 @@ BAD: dict[str, dict[str, bytes]] = {
         "text": b"#!ascii version of lh.pial\n",
     },
 }
+ZIPPED = gzip.compress(PLY_BOX, mtime=0)
+BAD[".ply.gz"] = {
+    "not zipped": PLY_BOX,
+    "checksum": ZIPPED[:-8] + bytes([ZIPPED[-8] ^ 1]) + ZIPPED[-7:],
+    "length": ZIPPED[:-4] + bytes([ZIPPED[-4] ^ 1]) + ZIPPED[-3:],
+    "trailing bytes": ZIPPED + b"more",
+    "inside": ZIPPED[:40] + bytes([ZIPPED[40] ^ 255]) + ZIPPED[41:],
+}
 for form in ("ply ascii", "ply little", "ply big", "off"):
     BAD[form] |= {
         f"{more[0]:+} vertices, {more[1]:+} faces": WRITERS[form][1](
@@ -207,10 +220,8 @@ for form in ("ply ascii", "off"):
 CASES = [(form, name) for form, cases in BAD.items() for name in cases]
 
 
-@pytest.mark.parametrize(("form", "name"), CASES)
-def test_bad_files_are_refused_by_name(tmp_path: Path, form: str, name: str) -> None:
-    path = tmp_path / f"scan{WRITERS[form][0] if form in WRITERS else form}"
-    path.write_bytes(BAD[form][name])
+def refusal(path: Path) -> str:
+    """The reason that follows the path in the error of reading a file."""
     with pytest.raises(MeshError) as caught:
         read_mesh(path)
     message = str(caught.value)
@@ -218,6 +229,14 @@ def test_bad_files_are_refused_by_name(tmp_path: Path, form: str, name: str) -> 
     assert message.count(str(path)) == 1
     assert len(message) < len(str(path)) + 400
     assert str(pickle.loads(pickle.dumps(caught.value))) == message
+    return message.removeprefix(f"{path}: ")
+
+
+@pytest.mark.parametrize(("form", "name"), CASES)
+def test_bad_files_are_refused_by_name(tmp_path: Path, form: str, name: str) -> None:
+    path = tmp_path / f"scan{WRITERS[form][0] if form in WRITERS else form}"
+    path.write_bytes(BAD[form][name])
+    assert refusal(path)
 
 
 # Formats whose vertices and triangles keep their numbers.
@@ -226,8 +245,7 @@ def test_bad_files_are_refused_by_name(tmp_path: Path, form: str, name: str) -> 
 def test_bad_entries_are_numbered_also_in_zipped_files(tmp_path: Path, form: str, name: str, entry: str) -> None:
     path = tmp_path / f"scan{WRITERS[form][0]}.gz"
     path.write_bytes(gzip.compress(BAD[form][name]))
-    with pytest.raises(MeshError, match=f"{re.escape(path.name)}: 1 of .*{entry}"):
-        read_mesh(path)
+    assert re.match(f"1 of .*{entry}", refusal(path))
 
 
 NO_MESHES = [b"\0", b"\n", bytes(range(256)) * 8, b"\xff\xfe\0\0" * 100, b"solid", b"ply", b"OFF", b"glTF", b"<"]
@@ -242,22 +260,19 @@ def test_content_that_is_no_mesh_or_that_of_another_format_is_refused(tmp_path: 
     path = tmp_path / f"scan{ending}"
     for content in (*NO_MESHES, *others, *zipped):
         path.write_bytes(content)
-        with pytest.raises(MeshError, match=re.escape(f"{path}: ")):
-            read_mesh(path)
+        assert refusal(path)
 
 
-@pytest.mark.parametrize("ending", [*FORMATS, ".ply.gz", ".off.gz"])
-def test_empty_and_missing_files_are_told_apart(tmp_path: Path, ending: str) -> None:
+@pytest.mark.parametrize("ending", [*FORMATS, ".ply.gz"])
+def test_empty_and_missing_files_and_folders_are_told_apart(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"scan{ending}"
-    with pytest.raises(MeshError, match=re.escape(f"{path}: cannot be read: No such file or directory")):
-        read_mesh(path)
-    path.touch()
-    with pytest.raises(MeshError, match=re.escape(f"{path}: the file is empty")):
-        read_mesh(path)
-    if ending.endswith(".gz"):
-        path.write_bytes(gzip.compress(b""))
-        with pytest.raises(MeshError, match=re.escape(f"{path}: the file is empty")):
-            read_mesh(path)
+    assert refusal(path) == "cannot be read: No such file or directory"
+    path.mkdir()
+    assert refusal(path) == "cannot be read: Is a directory"
+    path.rmdir()
+    for content in (b"", gzip.compress(b""))[: 1 + ending.endswith(".gz")]:
+        path.write_bytes(content)
+        assert refusal(path) == "the file is empty"
 
 
 @pytest.mark.parametrize(
@@ -266,33 +281,7 @@ def test_empty_and_missing_files_are_told_apart(tmp_path: Path, ending: str) -> 
 )
 def test_names_without_a_known_format_are_refused_with_the_page_that_converts(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(PLY_BOX)
-    with pytest.raises(MeshError, match=r"known are \.ply, .*docs/formats\.md") as caught:
-        read_mesh(tmp_path / name)
-    assert str(caught.value).startswith(f"{tmp_path / name}: ")
-
-
-def test_folders_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "scan.ply"
-    path.mkdir()
-    for bad in (path, path / "missing" / "scan.ply"):
-        with pytest.raises(MeshError, match=re.escape(f"{bad}: cannot be read: ")):
-            read_mesh(bad)
-
-
-def test_damaged_gzip_files_are_refused(tmp_path: Path) -> None:
-    whole = gzip.compress(PLY_BOX, mtime=0)
-    damaged = {
-        "not zipped": PLY_BOX,
-        "checksum": whole[:-8] + bytes([whole[-8] ^ 1]) + whole[-7:],
-        "length": whole[:-4] + bytes([whole[-4] ^ 1]) + whole[-3:],
-        "trailing bytes": whole + b"more",
-        "inside": whole[:40] + bytes([whole[40] ^ 255]) + whole[41:],
-    }
-    for name, content in damaged.items():
-        path = tmp_path / f"{name}.ply.gz"
-        path.write_bytes(content)
-        with pytest.raises(MeshError, match=re.escape(f"{path}: cannot be read: ")):
-            read_mesh(path)
+    assert re.search(r"known are \.ply, .*docs/formats\.md", refusal(tmp_path / name))
 
 
 # Forms in which a cut shows wherever it falls, and how many bytes at the end mean nothing.

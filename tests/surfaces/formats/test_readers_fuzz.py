@@ -108,8 +108,14 @@ def _damaged(content: bytes, random: Random) -> bytes:
     return content
 
 
-def _made_up(start: bytes, random: Random) -> bytes:
-    """The beginning of a file, and bytes, tokens or words and numbers behind it."""
+def _made_up(ending: str, random: Random) -> bytes:
+    """The beginning of a file, perhaps a header that lies, and bytes, tokens or words and numbers behind it."""
+    start = random.choice(_STARTS[ending])
+    if ending == ".ply" and random.randrange(2):
+        vertices, faces, kind = random.choice(_NUMBERS), random.choice(_NUMBERS), random.choice(["ascii", LITTLE])
+        lines = ["ply", f"format {kind} 1.0", f"element vertex {vertices}", *[f"property float {x}" for x in "xyz"]]
+        lines += [f"element face {faces}", "property list uchar int vertex_indices", "end_header", ""]
+        start = "\n".join(lines).encode()
     match random.randrange(3):
         case 0:
             return start + random.randbytes(random.randrange(300))
@@ -117,13 +123,6 @@ def _made_up(start: bytes, random: Random) -> bytes:
             return start + b" ".join(random.choices(_TOKENS, k=random.randrange(30)))
         case _:
             return start + " ".join(random.choices(_WORDS, k=random.randrange(40))).encode()
-
-
-def _lying_header(random: Random) -> bytes:
-    vertices, faces, kind = random.choice(_NUMBERS), random.choice(_NUMBERS), random.choice(["ascii", LITTLE])
-    lines = ["ply", f"format {kind} 1.0", f"element vertex {vertices}", *[f"property float {axis}" for axis in "xyz"]]
-    lines += [f"element face {faces}", "property list uchar int vertex_indices", "end_header", ""]
-    return "\n".join(lines).encode() + random.randbytes(random.randrange(100))
 
 
 EXAMPLES = pytest.mark.parametrize("examples", [15, pytest.param(300, marks=pytest.mark.all)])
@@ -145,11 +144,4 @@ def test_damaged_files_end_in_a_mesh_or_a_mesh_error(tmp_path: Path, name: str, 
 def test_any_bytes_end_in_a_mesh_or_a_mesh_error(tmp_path: Path, ending: str, examples: int) -> None:
     random = Random(ending)
     for _ in range(examples):
-        _ends_well(tmp_path / f"scan{ending}", _made_up(random.choice(_STARTS[ending]), random))
-
-
-@EXAMPLES
-def test_headers_that_lie_claim_no_more_than_the_file_holds(tmp_path: Path, examples: int) -> None:
-    random = Random(0)
-    for _ in range(examples):
-        _ends_well(tmp_path / "scan.ply", _lying_header(random))
+        _ends_well(tmp_path / f"scan{ending}", _made_up(ending, random))
