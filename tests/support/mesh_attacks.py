@@ -20,16 +20,13 @@ from typing import Any
 import numpy as np
 
 from tests.support.mesh_files import (
-    BIG,
     LITTLE,
     Gltf,
     box_scene,
-    freesurfer,
     gifti,
     obj,
     off,
     ply,
-    stl_binary,
     stl_text,
 )
 from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES
@@ -73,10 +70,6 @@ def _lying_list(kind: str, length: bytes, items: str = "double") -> bytes:
     return header + bytes(36) + length + bytes(64)
 
 
-def _real_faces(face: list[float]) -> bytes:
-    return ply(BOX_VERTICES, [face], LITTLE, index="float")  # type: ignore[list-item]
-
-
 def _wide_rows(encoding: str, kind: str) -> bytes:
     """Rows of 900 properties announced, in a file that holds a byte or two of each."""
     wide = [f"property {kind} p{i}" for i in range(900)]
@@ -87,37 +80,28 @@ def _wide_rows(encoding: str, kind: str) -> bytes:
 
 def _sharing_parts(parts: int, nodes: int) -> bytes:
     """A scene in which so many parts of so many nodes are one and the same large array."""
-    scene = Gltf([[(np.zeros((20_000, 3)), None, None)]], [{"mesh": 0}] * nodes, range(nodes))
-    scene.tree["accessors"][0]["count"] = 19_998
+    scene = Gltf([[(np.zeros((19_998, 3)), None, None)]], [{"mesh": 0}] * nodes, range(nodes))
     scene.tree["meshes"][0]["primitives"] *= parts
     return scene.glb()
 
 
-def _gltf(change: Callable[[dict[str, Any]], object]) -> bytes:
+def _scene(part: str, **entries: Any) -> bytes:
+    """A scene with other entries in the first node, accessor or view of a buffer."""
     scene = box_scene()
-    change(scene.tree)
+    scene.tree[part][0].update(entries)
     return scene.glb()
 
 
-def _overlapping(stride: int, count: int) -> bytes:
-    def change(tree: dict[str, Any]) -> None:
-        tree["bufferViews"][0]["byteStride"] = stride
-        tree["accessors"][0]["count"] = count
-
-    return _gltf(change)
+def _entities() -> bytes:
+    """XML whose entities contain each other, ten levels deep."""
+    lines = ['<!ENTITY a0 "boom">', *(f'<!ENTITY a{i} "{f"&a{i - 1};" * 10}">' for i in range(1, 10))]
+    return f'<?xml version="1.0"?>\n<!DOCTYPE GIFTI [{"".join(lines)}]>\n<GIFTI>&a9;</GIFTI>'.encode()
 
 
-def _entities(kinds: int, each: str) -> bytes:
-    """XML whose entities contain each other."""
-    lines = ['<!ENTITY a0 "boom">']
-    lines += [f'<!ENTITY a{i} "{each.format(i - 1) * 10}">' for i in range(1, kinds)]
-    return f'<?xml version="1.0"?>\n<!DOCTYPE GIFTI [{"".join(lines)}]>\n<GIFTI>&a{kinds - 1};</GIFTI>'.encode()
-
-
-def _gifti_data(data: bytes, start: bytes = b"") -> bytes:
+def _gifti_data(data: bytes) -> bytes:
     """The box with other bytes in place of its coordinates."""
     before, _, rest = _GIFTI.partition(b"<Data>")
-    return start + before + b"<Data>" + data + b"</Data>" + rest.partition(b"</Data>")[2]
+    return before + b"<Data>" + data + b"</Data>" + rest.partition(b"</Data>")[2]
 
 
 @cache
@@ -128,14 +112,13 @@ def _bomb(content: bytes) -> bytes:
     return b"".join([*(packer.compress(megabyte) for _ in range(200)), packer.flush()])
 
 
-@cache
-def _packed_zeros(size: int) -> bytes:
-    return base64.b64encode(zlib.compress(bytes(size), 9))
+def _packed_zeros(megabytes: int) -> bytes:
+    return base64.b64encode(zlib.compress(bytes(megabytes * _MEGABYTE), 9))
 
 
-def _gzipped(content: Callable[[], bytes]) -> Callable[[], bytes]:
+def _packed(ending: str, content: Callable[[], bytes]) -> Attack:
     """A packed file that unpacks to no more than the harmless size, or to less than a hundredfold."""
-    return lambda: gzip.compress(content(), 6, mtime=0)
+    return _file(f"{ending}.gz", lambda: gzip.compress(content(), 6, mtime=0))
 
 
 def _with_noise(start: bytes, end: bytes) -> bytes:
@@ -144,12 +127,12 @@ def _with_noise(start: bytes, end: bytes) -> bytes:
     return start + b"1" * (100 * _MEGABYTE) + end + noise
 
 
-def _sparse(ending: str, start: bytes, size: int) -> Attack:
-    """A file that seems large and takes no room on the disk."""
+def _sparse(ending: str, start: bytes) -> Attack:
+    """A file that seems to have a terabyte and takes no room on the disk."""
 
     def make(path: Path) -> None:
         path.write_bytes(start)
-        os.truncate(path, size)
+        os.truncate(path, 1 << 40)
 
     return _special(ending, make)
 
@@ -167,15 +150,12 @@ ATTACKS: dict[str, Attack] = {
     # What is no file.
     **{f"FIFO {ending}": _special(ending, os.mkfifo) for ending in (*_FORMATS, ".ply.gz")},
     **{f"endless device {ending}": _link(ending, "/dev/zero") for ending in (*_FORMATS, ".ply.gz")},
-    "terminal": _link(".ply", "/dev/tty"),
     "link to itself": _link(".ply", "scan.ply"),
     "NUL in the name": lambda folder: folder / "a\0b.ply",
-    "name too long": lambda folder: folder / f"{'x' * 300}.ply",
     # Packed.
     **{f"bomb {ending}.gz": _file(f"{ending}.gz", partial(_bomb, b"\0")) for ending in _FORMATS},
     "bomb of newlines .obj.gz": _file(".obj.gz", partial(_bomb, b"\n")),
     "many empty gzip members": _file(".ply.gz", gzip.compress(b"") * 20_000),
-    "zip": _file(".ply", b"PK\x03\x04" + bytes(100)),
     # One line, many lines, many digits.
     **{f"one long line {ending}": _file(ending, b"1 " * _MEGABYTE) for ending in _FORMATS},
     **{f"one long word {ending}": _file(ending, b"9" * 2 * _MEGABYTE) for ending in _FORMATS},
@@ -183,30 +163,19 @@ ATTACKS: dict[str, Attack] = {
     "obj, face of many corners": _file(".obj", b"v 0 0 0\nv 1 0 0\nf" + b" 1" * _MEGABYTE + b" 0\n"),
     "obj, continued lines": _file(".obj", b"v 0 0 0\nf 1 \\\n" + b"1 \\\n" * 500_000),
     "obj, long index": _file(".obj", _OBJ + b"f 1 2 " + _DIGITS + b"\n"),
-    "obj, long index of few digits": _file(".obj", _OBJ + b"f 1 2 " + b"9" * 4000 + b"\n"),
     "obj, huge index": _file(".obj", _OBJ + b"f 1 2 9223372036854775808\n"),
     "obj, huge coordinate": _file(".obj", obj(BOX_VERTICES * 1e300, BOX_TRIANGLES)),
-    "obj, overflowing coordinate": _file(".obj", _OBJ + b"v 1e999 0 0\n"),
-    "obj, long coordinate": _file(".obj", b"v " + _DIGITS + b" 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
     "obj, one wide character": _file(".obj", "\U0001f600\n".encode() + b"#" * 2 * _MEGABYTE),
     "off, long counts": _file(".off", b"OFF\n" + _DIGITS + b" 1 0\n0 0 0\n3 0 0 0\n"),
     "off, other digits": _file(".off", "OFF\n² 1 0\n0 0 0\n".encode()),
-    "off, long length": _file(".off", _OFF.replace(b"3 4 6 7", b"9" * 4000 + b" 4 6 7")),
-    "off, huge index": _file(".off", _changed(_OFF, b"3 4 6 7", b"3 4 6 99999999999999999999")),
     "stl ascii, long name": _file(".stl", stl_text(BOX_VERTICES * 1e300, BOX_TRIANGLES, "x" * _MEGABYTE)),
     "stl ascii, unknown long word": _file(".stl", b"solid\n" + b"y" * _MEGABYTE),
-    "stl, huge coordinates": _file(".stl", stl_binary(BOX_VERTICES * 1e37, BOX_TRIANGLES, count=13)),
-    "stl, sparse": _sparse(".stl", b"\0" * 84, 1 << 40),
+    "stl, sparse": _sparse(".stl", b"\0" * 84),
     # PLY.
     "ply, many digits": _file(".ply", _ply_header(f"element vertex {'9' * 5000}", "element face 1")),
-    "ply, digits that overflow a float": _file(".ply", _ply_header(f"element vertex {'9' * 400}", "element face 1")),
-    "ply, vertices without end": _file(".ply", ply(BOX_VERTICES, BOX_TRIANGLES, LITTLE, vertex_count=10**18)),
-    "ply, faces without end": _file(".ply", ply(BOX_VERTICES, BOX_TRIANGLES, BIG, face_count=10**18)),
     "ply, list of 2^32 - 1": _file(".ply", _lying_list("uint", b"\xff" * 4)),
-    "ply, list of 2^31 - 1": _file(".ply", _lying_list("int", b"\xff\xff\xff\x7f")),
     "ply, list of -1": _file(".ply", _lying_list("int", b"\xff" * 4)),
     "ply, list of NaN": _file(".ply", _lying_list("float", b"\xff" * 4)),
-    "ply, list of infinity": _file(".ply", _lying_list("float", b"\0\0\x80\x7f")),
     **{
         f"ply {encoding}, wide rows of {kind}": _file(".ply", partial(_wide_rows, encoding, kind))
         for encoding in ("ascii", LITTLE)
@@ -220,55 +189,37 @@ ATTACKS: dict[str, Attack] = {
             *_vertices(0), *[f"property char p{i}" for i in range(100_000)], "element face 0", encoding="ascii"
         ),
     ),
-    "ply, long name": _file(".ply", _ply_header(*_vertices(3), "element face 1", f"element {'e' * 60_000} 1")),
-    "ply, sparse": _sparse(".ply", _ply_header(*_vertices(10**9), "element face 0"), 1 << 40),
+    "ply, sparse": _sparse(".ply", _ply_header(*_vertices(10**9), "element face 0")),
     "ply ascii, float overflow": _file(".ply", ply(BOX_VERTICES * 1e300, BOX_TRIANGLES)),
     "ply ascii, index that overflows": _file(".ply", _changed(_PLY, b"3 4 6 7", b"3 4 6 99999999999")),
-    "ply, indices with fractions": _file(".ply", _real_faces([0, 1, 2.5])),
-    "ply, indices that are NaN": _file(".ply", _real_faces([0, 1, float("nan")])),
+    "ply, indices with fractions": _file(".ply", ply(BOX_VERTICES, [[0, 1, 2.5]], LITTLE, index="float")),  # type: ignore[list-item]
     # glTF.
     "gltf, deep lists": _file(".gltf", b"[" * 200_000),
-    "gltf, deep objects": _file(".gltf", b'{"a":' * 200_000),
-    "gltf, long integer": _file(".gltf", b'{"nodes": [' + _DIGITS + b"]}"),
     "gltf, many nodes in a row": _file(
         ".gltf", json.dumps({"nodes": [{"children": [i + 1]} for i in range(30_000)]}).encode()
     ),
-    "glb, stride 0": _file(".glb", _overlapping(0, 10**9)),
-    "glb, stride 1": _file(".glb", _overlapping(1, 80)),
-    "glb, count of many digits": _file(".glb", _overlapping(0, 10**400)),
+    "glb, stride 0": _file(".glb", _scene("bufferViews", byteStride=0)),
+    "glb, count of many digits": _file(".glb", _scene("accessors", count=10**400)),
     "glb, one array in many parts": _file(".glb", partial(_sharing_parts, 10_000, 1)),
     "glb, one part in many nodes": _file(".glb", partial(_sharing_parts, 1, 10_000)),
-    "glb, many parts in many nodes": _file(".glb", partial(_sharing_parts, 1000, 1000)),
-    "glb, huge matrix": _file(".glb", _gltf(lambda tree: tree["nodes"][0].update(scale=[1e308, 1e308, 1e308]))),
-    "glb, infinite matrix": _file(".glb", _gltf(lambda tree: tree["nodes"][0].update(matrix=[float("inf")] * 16))),
-    "glb, rotation of strings": _file(".glb", _gltf(lambda tree: tree["nodes"][0].update(rotation=["1"] * 4))),
+    "glb, huge matrix": _file(".glb", _scene("nodes", scale=[1e308, 1e308, 1e308])),
+    "glb, rotation of strings": _file(".glb", _scene("nodes", rotation=["1"] * 4)),
     "glb, chunk that lies": _file(".glb", struct.pack("<4sIIII", b"glTF", 2, 20, 2**32 - 1, 0)),
     **{
         f"gltf, buffer {uri}": _file(".gltf", box_scene().gltf(uri))
-        for uri in (
-            "data.bin",
-            "../data.bin",
-            "%2e%2e/data.bin",
-            "/dev/zero",
-            "http://127.0.0.1:9/data.bin",
-            "a%00b.bin",
-        )
+        for uri in ("data.bin", "../data.bin", "/dev/zero", "http://127.0.0.1:9/data.bin", "a%00b.bin")
     },
     # GIFTI.
-    "gifti, a billion laughs": _file(".gii", _entities(10, "&a{};")),
-    "gifti, quadratic entities": _file(
-        ".gii", b'<!DOCTYPE GIFTI [<!ENTITY a "' + b"a" * 50_000 + b'">]><GIFTI>' + b"&a;" * 50_000 + b"</GIFTI>"
-    ),
+    "gifti, a billion laughs": _file(".gii", _entities()),
     "gifti, entity of a file": _file(
         ".gii", b'<!DOCTYPE GIFTI [<!ENTITY a SYSTEM "file:///etc/hostname">]>' + _gifti_data(b"&a;")[21:]
     ),
-    "gifti, entities in UTF-16": _file(".gii", _entities(10, "&a{};").decode().encode("utf-16")),
-    "gifti, bomb": _file(".gii", lambda: _gifti_data(_packed_zeros(200 * _MEGABYTE))),
+    "gifti, entities in UTF-16": _file(".gii", _entities().decode().encode("utf-16")),
+    "gifti, bomb": _file(".gii", lambda: _gifti_data(_packed_zeros(200))),
     "gifti, bomb that is announced": _file(
         ".gii",
-        lambda: _changed(_gifti_data(_packed_zeros(240 * _MEGABYTE)), b'Dim0="8"', b'Dim0="%d"' % (20 * _MEGABYTE)),
+        lambda: _changed(_gifti_data(_packed_zeros(240)), b'Dim0="8"', b'Dim0="%d"' % (20 * _MEGABYTE)),
     ),
-    "gifti, data without end": _file(".gii", _gifti_data(b"A" * 3 * _MEGABYTE)),
     "gifti, text without end": _file(
         ".gii",
         gifti(BOX_VERTICES, _INT_TRIANGLES, "GIFTI_ENCODING_ASCII").replace(
@@ -277,7 +228,6 @@ ATTACKS: dict[str, Attack] = {
     ),
     "gifti, many dimensions": _file(".gii", _changed(_GIFTI, b'Dimensionality="2"', b'Dimensionality="99999999"')),
     "gifti, dimensions that overflow": _file(".gii", _changed(_GIFTI, b'Dim0="8"', b'Dim0="' + b"9" * 4000 + b'"')),
-    "gifti, negative dimension": _file(".gii", _changed(_GIFTI, b'Dim0="8"', b'Dim0="-8"')),
     "gifti, deep elements": _file(".gii", b"<GIFTI>" + b"<MetaData>" * 100_000),
     "gifti, long attribute": _file(".gii", b'<GIFTI Version="' + b"1" * 2 * _MEGABYTE + b'">'),
     "gifti, data of another file": _file(
@@ -287,39 +237,31 @@ ATTACKS: dict[str, Attack] = {
         ),
     ),
     # Small on the disk, and long once they are unpacked.
-    "gifti, long attribute unpacked": _file(".gii.gz", _gzipped(lambda: _with_noise(b'<GIFTI Version="', b'">'))),
-    "gifti, long name unpacked": _file(".gii.gz", _gzipped(lambda: _with_noise(b"<GIFTI", b">"))),
-    "gifti, long comment unpacked": _file(".gii.gz", _gzipped(lambda: _with_noise(b"<GIFTI><!--", b"-->"))),
-    "gifti, deep elements unpacked": _file(".gii.gz", _gzipped(lambda: b"<GIFTI>" + b"<a>" * 5 * _MEGABYTE)),
-    "gifti, many elements unpacked": _file(
-        ".gii.gz", _gzipped(lambda: _GIFTI.replace(b"<DataArray", b"<MD/>" * 3 * _MEGABYTE + b"<DataArray", 1))
+    "gifti, long attribute unpacked": _packed(".gii", lambda: _with_noise(b'<GIFTI Version="', b'">')),
+    "gifti, long comment unpacked": _packed(".gii", lambda: _with_noise(b"<GIFTI><!--", b"-->")),
+    "gifti, deep elements unpacked": _packed(".gii", lambda: b"<GIFTI>" + b"<a>" * 5 * _MEGABYTE),
+    "gifti, many elements unpacked": _packed(
+        ".gii", lambda: _GIFTI.replace(b"<DataArray", b"<MD/>" * 3 * _MEGABYTE + b"<DataArray", 1)
     ),
-    "obj, short lines unpacked": _file(".obj.gz", _gzipped(lambda: b"v\n" * 7 * _MEGABYTE)),
-    "obj, long line unpacked": _file(".obj.gz", _gzipped(lambda: b"f" + b" 11" * 5 * _MEGABYTE + b"\n")),
-    "obj, continued lines unpacked": _file(".obj.gz", _gzipped(lambda: b"f" + b" 11\\\n" * 3 * _MEGABYTE)),
-    "obj, faces unpacked": _file(".obj.gz", _gzipped(lambda: b"v 0 0 0\n" + b"f 1 1 1\n" * (3 * _MEGABYTE // 2))),
-    "off, short lines unpacked": _file(".off.gz", _gzipped(lambda: b"OFF\n" + b"1\n" * 7 * _MEGABYTE)),
-    "stl ascii, short lines unpacked": _file(".stl.gz", _gzipped(lambda: b"solid\n" + b"facet\n" * 2 * _MEGABYTE)),
-    "ply ascii, short lines unpacked": _file(
-        ".ply.gz",
-        _gzipped(lambda: _ply_header(*_vertices(3), "element face 1", encoding="ascii") + b"1\n" * 7 * _MEGABYTE),
+    "obj, short lines unpacked": _packed(".obj", lambda: b"v\n" * 7 * _MEGABYTE),
+    "obj, long line unpacked": _packed(".obj", lambda: b"f" + b" 11" * 5 * _MEGABYTE + b"\n"),
+    "obj, continued lines unpacked": _packed(".obj", lambda: b"f" + b" 11\\\n" * 3 * _MEGABYTE),
+    "obj, faces unpacked": _packed(".obj", lambda: b"v 0 0 0\n" + b"f 1 1 1\n" * (3 * _MEGABYTE // 2)),
+    "off, short lines unpacked": _packed(".off", lambda: b"OFF\n" + b"1\n" * 7 * _MEGABYTE),
+    "stl ascii, short lines unpacked": _packed(".stl", lambda: b"solid\n" + b"facet\n" * 2 * _MEGABYTE),
+    "ply ascii, short lines unpacked": _packed(
+        ".ply", lambda: _ply_header(*_vertices(3), "element face 1", encoding="ascii") + b"1\n" * 7 * _MEGABYTE
     ),
-    "ply ascii, long line unpacked": _file(
-        ".ply.gz",
-        _gzipped(
-            lambda: (
-                _ply_header("element vertex 1", "property list uint uchar x", "element face 1", encoding="ascii")
-                + b"5242880"
-                + b" 11" * 5 * _MEGABYTE
-                + b"\n1\n"
-            )
+    "ply ascii, long line unpacked": _packed(
+        ".ply",
+        lambda: (
+            _ply_header("element vertex 1", "property list uint uchar x", "element face 1", encoding="ascii")
+            + b"5242880"
+            + b" 11" * 5 * _MEGABYTE
+            + b"\n1\n"
         ),
     ),
     # FreeSurfer.
-    "freesurfer, triangles without end": _file(
-        "_lh.pial", freesurfer(BOX_VERTICES, BOX_TRIANGLES, counts=(8, 2**31 - 1))
-    ),
-    "freesurfer, negative triangles": _file("_lh.pial", freesurfer(BOX_VERTICES, BOX_TRIANGLES, counts=(21, -1))),
     "freesurfer, endless line": _file("_lh.pial", b"\xff\xff\xfe" + b"x" * 2 * _MEGABYTE),
-    "freesurfer, sparse": _sparse("_lh.pial", b"\xff\xff\xfe\n\n" + b"\x7f\xff\xff\xff" * 2, 1 << 40),
+    "freesurfer, sparse": _sparse("_lh.pial", b"\xff\xff\xfe\n\n" + b"\x7f\xff\xff\xff" * 2),
 }

@@ -19,7 +19,6 @@ import pytest
 from sobolev_batch import MeshError, read_mesh
 from sobolev_batch.surfaces.formats import parsing
 from sobolev_batch.surfaces.formats.readers import expected_size
-from sobolev_batch.surfaces.sources.files import FileMember
 from tests.support.mesh_attacks import ATTACKS
 from tests.support.mesh_files import LITTLE, gifti, ply
 from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES
@@ -74,20 +73,14 @@ def main(folder: Path) -> None:
         path = attack(place)
         Path("/proc/self/clear_refs").write_text("5")
         before, start = _peak_bytes(), time.process_time()
-        outcomes = [_outcome(path, use) for use in ("load", "fingerprint", "expected_size")]
+        try:
+            read_mesh(path)
+            outcome = "it is read"
+        except BaseException as error:
+            outcome = f"{type(error).__name__} {error}"
         seconds = time.process_time() - start
-        sys.stdout.write(json.dumps([name, outcomes, seconds, _peak_bytes() - before]) + "\n")
+        sys.stdout.write(json.dumps([name, outcome, seconds, _peak_bytes() - before]) + "\n")
         sys.stdout.flush()
-
-
-def _outcome(path: Path, use: str) -> str:
-    try:
-        getattr(FileMember("scan", -1, path), use)()
-    except MeshError as error:
-        return f"MeshError {error}"
-    except BaseException as error:
-        return f"{type(error).__name__} {error}"
-    return "returned"
 
 
 def _peak_bytes() -> int:
@@ -114,13 +107,11 @@ def test_attacks_are_refused_in_bounded_time_and_memory(tmp_path: Path) -> None:
     results = [json.loads(line) for line in found.stdout.splitlines()]
     assert [name for name, *_ in results] == list(ATTACKS)
     wrong = []
-    for number, (name, outcomes, seconds, memory_bytes) in enumerate(results):
+    for number, (name, outcome, seconds, memory_bytes) in enumerate(results):
         allowed_bytes = _SPARE_BYTES + _BYTES_PER_BYTE * disk_bytes(tmp_path / str(number))
-        loaded, fingerprint, size = outcomes
-        refused = loaded.startswith("MeshError ") and len(loaded) < 900 and "Warning" not in loaded
-        orderly = fingerprint.startswith(("MeshError ", "returned")) and size == "returned"
-        if not (refused and orderly and seconds < _LONGEST_SECONDS and memory_bytes < allowed_bytes):
-            wrong.append(f"{name}: {outcomes}, {seconds:.1f} s, {memory_bytes >> 20} of {allowed_bytes >> 20} MiB")
+        is_refused = outcome.startswith("MeshError ") and len(outcome) < 900 and "Warning" not in outcome
+        if not (is_refused and seconds < _LONGEST_SECONDS and memory_bytes < allowed_bytes):
+            wrong.append(f"{name}: {outcome}, {seconds:.1f} s, {memory_bytes >> 20} of {allowed_bytes >> 20} MiB")
     assert not wrong, "\n".join(wrong)
 
 
@@ -147,15 +138,11 @@ def test_files_beyond_the_bound_are_refused_unread(tmp_path: Path, ending: str, 
         read_mesh(path)
 
 
-@pytest.fixture
-def little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A machine of 4 GB."""
-    monkeypatch.setattr(parsing, "machine_memory", lambda: (4 * 10**9, "all of this machine"))
-
-
-@pytest.mark.usefixtures("little_memory")
 @pytest.mark.parametrize("ending", [".ply", ".obj", ".stl", ".off", ".glb", ".gii", "_lh.pial"])
-def test_files_beyond_the_memory_are_refused_unread(tmp_path: Path, ending: str) -> None:
+def test_files_beyond_the_memory_are_refused_unread(
+    tmp_path: Path, ending: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(parsing, "machine_memory", lambda: (4 * 10**9, "all of this machine"))
     path = tmp_path / f"scan{ending}"
     # What it announces fits its length, and nothing of it is on the disk.
     path.write_bytes(BINARY_PLY if ending == ".ply" else b"")
