@@ -57,11 +57,7 @@ class CollectionStore:
 
     @classmethod
     def prepared(cls, location: Location, collection: StudyCollection) -> CollectionStore:
-        """Write down at a location which objects a collection has, and return its store.
-
-        Raises:
-            StoreError: The location holds something else, or cannot be written.
-        """
+        """Write down at a location which objects a collection has, and return its store."""
         present = cls.read(location)
         if present is None:
             location.require_free()

@@ -177,11 +177,7 @@ def _own_cluster(
 
 
 def _reusable_stores(locations: Iterable[Location]) -> list[tuple[str, Location]]:
-    """Return the stores at some locations with the names of their objects; that of a single study has no name.
-
-    Raises:
-        StoreError: One of them does not exist or cannot be read.
-    """
+    """Return the stores at some locations with the names of their objects; that of a single study has no name."""
     reusable: list[tuple[str, Location]] = []
     for location in locations:
         collection = CollectionStore.read(location)

@@ -119,12 +119,6 @@ def drive(table: Mapping[str, Any], folder: str, store: str, run: str) -> None:
     """Run a study from a worker of the cluster that computes it, with the lock of its submission.
 
     This does not raise: the store says what went wrong, and trying again would not help.
-
-    Args:
-        table: Study as a table.
-        folder: Folder that paths in the study are relative to.
-        store: Path or URL of the store.
-        run: Run that the store is locked for.
     """
     location = Location.parse(store)
     lock = Lock.of_this_process(run, outlives_process=True)

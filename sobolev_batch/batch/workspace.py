@@ -107,12 +107,7 @@ def complete_records(records: Sequence[Record | None]) -> dict[int, Record]:
 
 
 def failed_proximities(labels: Mapping[int, str], records: Mapping[int, Record]) -> dict[str, str]:
-    """Return why distances could not be measured, by the labels of the meshes.
-
-    Args:
-        labels: Label of each mesh by its row.
-        records: Records of meshes with fields, by their rows.
-    """
+    """Return why distances could not be measured, by the labels of the meshes."""
     return {
         labels[row]: f"no proximity: {record.proximity.reason}"
         for row, record in records.items()

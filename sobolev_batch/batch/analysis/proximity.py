@@ -48,12 +48,7 @@ def have_proximities(workspace: Workspace) -> bool:
 
 
 def measure_proximities(cluster: Cluster, workspace: Workspace) -> None:
-    """Measure the distances that the records lack, and write their table, or remove one that nobody requests.
-
-    Raises:
-        StoreError: The store could not be read or written.
-        ClusterError: The scheduler was lost.
-    """
+    """Measure the distances that the records lack, and write their table, or remove one that nobody requests."""
     pending = _pending(workspace)
     if pending:
         _measure(cluster, workspace, pending)

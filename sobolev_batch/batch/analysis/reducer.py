@@ -174,16 +174,7 @@ class Reducer:
         reference: int,
         compared_with: int | None = None,
     ) -> Self:
-        """Return the reducer of the rows whose records are complete.
-
-        Args:
-            store: Store of the fields.
-            choice: Lattice of the fields, with the octaves beside them.
-            orders: Sobolev orders s.
-            records: Record of each row; None without one.
-            reference: Row of the study's reference.
-            compared_with: Row to which distances are measured; by default the reference.
-        """
+        """Return the reducer of the rows whose records are complete; distances are to the reference, or another row."""
         complete = complete_records(records)
         areas, errors = np.full(len(records), np.nan), np.full((len(orders), len(records)), np.nan)
         weights = SobolevWeights(choice.lattice, orders, None if choice.tail is None else choice.tail.cutoff)
@@ -317,12 +308,7 @@ class Reducer:
         return norms, Tail.stacked(differences), np.stack(products, axis=-1), Tail.stacked([of_reference])
 
     def tile(self, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
-        """Return distances of rows to other rows, over (orders, rows, others).
-
-        Args:
-            rows: Rows of one side.
-            others: Rows of the other side; they either begin with all of the rows or have none of them.
-        """
+        """Return distances over (orders, rows, others); the others begin with all of the rows, or have none of them."""
         shared = len(rows) if tuple(others[: len(rows)]) == tuple(rows) else 0
         if self._capacity < _FEWEST_ROWS:
             sums = Sums.zeros(len(self.orders), len(rows), len(others))

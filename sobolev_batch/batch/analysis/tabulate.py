@@ -51,13 +51,7 @@ _MOST_OF_ONE_SIZE = 10
 
 
 def tabulate_fields(cluster: Cluster, workspace: Workspace) -> NormEstimate | None:
-    """Write the tables, and return the distances to the reference, or None where the tables were there.
-
-    Raises:
-        DamageError: A field is not what was stored; it names its row.
-        StoreError: The store cannot be read or written.
-        ClusterError: The scheduler was lost, or no worker survives a task.
-    """
+    """Write the tables, and return the distances to the reference, or None where the tables were there."""
     if are_tabulated(workspace):
         return None
     plan, threads = workspace.plan, cluster.workers.threads
@@ -122,11 +116,7 @@ class Results:
 
     @classmethod
     def computed(cls, reducer: Reducer, meshes: xr.Dataset, reference: str, every_pair: bool) -> Self:
-        """Compute norms and distances in this process, with the memory of one task.
-
-        Raises:
-            DamageError: A field is not what was stored.
-        """
+        """Compute norms and distances in this process, with the memory of one task."""
         results = cls.empty(meshes, reference, reducer.orders, every_pair)
         complete = [row for row in reducer.checksums if row in results._places]
         for rows in reducer.row_batches(complete, 1):
@@ -185,11 +175,7 @@ class Results:
         return describe(table.assign_coords(other=("other", others)))
 
     def convergence_table(self, accuracy: Accuracy | None) -> xr.Dataset:
-        """Return distances to the reference, relative ones and their decomposition, and observed orders of convergence.
-
-        Args:
-            accuracy: Accuracy that the study requests, if any.
-        """
+        """Return distances to the reference, relative ones and their parts, and observed orders of convergence."""
         to_reference = NormEstimate(*self.to_reference)
         sizes, reference = self.meshes["edge_length_mean"].to_numpy(), self._reference_place
         distances, errors = to_reference.values, to_reference.errors

@@ -124,11 +124,7 @@ def _shielded_from_interrupts() -> Iterator[Callable[[], None]]:
 
 @contextmanager
 def thread_client(workers: int | None = None) -> Iterator[Client]:
-    """Give a client of a new cluster of threads of this process, for a store that no other process can see.
-
-    Args:
-        workers: Number of threads; by default one for each core that this process may use.
-    """
+    """Give a client of a new cluster of threads of this process, for a store that no other process can see."""
     # The protocol opens no port, but the web pages of scheduler and worker would be open to every interface,
     # and the link would name one of them.
     with (
@@ -152,15 +148,7 @@ def thread_client(workers: int | None = None) -> Iterator[Client]:
 
 
 def memory_limit(memory: float | str, workers: int) -> int:
-    """Return the memory of a worker in bytes.
-
-    Args:
-        memory: Memory of each worker, in bytes or as a text such as "4GB".
-        workers: Number of workers.
-
-    Raises:
-        InputError: The memory is not a size, too little for a worker, or more than there is for all of them.
-    """
+    """Return the memory of each worker in bytes; refuse too little for one, or more than there is for all."""
     limit = byte_count(memory)
     if limit < _LEAST_BYTES:
         raise InputError(
@@ -202,17 +190,7 @@ def remote_client(address: str, trust_network: bool = False) -> Iterator[Client]
 
 
 def require_private(name: str, who: str, trust_network: bool = False) -> None:
-    """Check that nobody else reaches an address: it demands certificates, or is on loopback.
-
-    Args:
-        name: Address, such as tls://host:8786; without a scheme, Dask's default is meant.
-        who: Process that listens there, for the message.
-        trust_network: True where others may reach it.
-
-    Raises:
-        InputError: The address is malformed, or others may reach it.
-        ClusterError: The host does not exist.
-    """
+    """Check that nobody else reaches an address: it demands certificates, or is on loopback."""
     scheme, _ = parse_address(name)
     if scheme == "inproc":
         return
@@ -242,9 +220,6 @@ def check_connection(address: str, seconds: float) -> None:
     """Shake hands with the scheduler at an address once.
 
     Dask's client waits for ever where something listens that is no scheduler.
-
-    Raises:
-        ClusterError: Nothing answers in time, or certificates and configuration do not fit.
     """
     try:
         arguments = Security().get_connection_args("client")

@@ -83,11 +83,7 @@ class WorkerInfo:
 
 
 def allowed_bytes(limit: float | None) -> float:
-    """Return the memory that tasks of a worker may take together.
-
-    Args:
-        limit: Memory limit of the worker; without one, the machine's memory, which no limit can exceed.
-    """
+    """Return the memory that tasks of a worker may take together, by its limit; without one, by the machine's."""
     total = machine_memory()[0]
     return _ALLOWED_FRACTION * min(limit or total, total) - _IDLE_BYTES
 
@@ -120,11 +116,7 @@ class Workers:
         return max(member.allowed_bytes for member in self.members)
 
     def require_memory(self, projected_bytes: float) -> None:
-        """Check that a task fits into a worker.
-
-        Raises:
-            ClusterError: No worker has the memory.
-        """
+        """Check that a task fits into a worker."""
         if projected_bytes > self.largest_allowed_bytes:
             raise ClusterError(
                 f"it takes about {format_bytes(projected_bytes)} in one task, and no worker has more than "
@@ -133,11 +125,7 @@ class Workers:
             )
 
     def require_accuracy(self, accuracy: Accuracy | None) -> None:
-        """Check that the workers have the memory that a study allows for a transform.
-
-        Raises:
-            InputError: The largest worker has less, in all.
-        """
+        """Check that the workers have the memory that a study allows for a transform."""
         largest = max(self.members, key=lambda member: member.allowed_bytes)
         limit = (largest.allowed_bytes + _IDLE_BYTES) / _ALLOWED_FRACTION
         if accuracy is not None and accuracy.asks_for_memory and accuracy.allowed_bytes > limit:
@@ -147,11 +135,7 @@ class Workers:
             )
 
     def with_backend(self, backend: Backends) -> Workers:
-        """Return the workers that can serve a study with this backend.
-
-        Raises:
-            ClusterError: The study requests a GPU, and no worker has one.
-        """
+        """Return the workers that can serve a study with this backend."""
         if backend != "gpu":
             return self
         members = tuple(member for member in self.members if member.backend == "gpu")
@@ -236,15 +220,7 @@ class BackendPlugin(WorkerPlugin):  # type: ignore[misc]  # distributed has no t
 
 
 def prepare_workers(client: Client, libraries: Iterable[str] = ()) -> Workers:
-    """Install the plugin on the workers of a cluster, also on those that join later, and return what they offer.
-
-    Args:
-        client: Client of the cluster.
-        libraries: Names of distributions that the study takes besides what this package requires.
-
-    Raises:
-        ClusterError: The cluster has no workers, or their versions differ from those here.
-    """
+    """Install the plugin on the workers of a cluster, also on those that join later, and return what they offer."""
     require_same_versions(client, libraries)
     client.register_plugin(BackendPlugin(), name=_NAME)
     answers = client.run(_describe, on_error="return")
@@ -286,15 +262,7 @@ def _declares_gpu(worker: Worker) -> bool:
 
 
 def require_same_versions(client: Client, libraries: Iterable[str] = ()) -> None:
-    """Check that the scheduler and all workers have installed what this process has.
-
-    Args:
-        client: Client of the cluster.
-        libraries: Names of distributions that the study takes besides what this package requires.
-
-    Raises:
-        ClusterError: They differ; the message names the processes and both versions.
-    """
+    """Check that the scheduler and all workers have installed what this process has."""
     required = ("python", *_OF_DASK, *_OF_NUMBERS, *libraries)
     # Dask answers this itself: code of ours would not run where the package is missing.
     answers = client.get_versions(packages=[*required[1:], *_OF_EXTRAS])
@@ -343,9 +311,6 @@ def lock_gpu(devices: Sequence[str]) -> str | None:
     Containers share it if they share the network of the host. A file would not serve others better, since they have
     temporary folders of their own.
 
-    Args:
-        devices: UUIDs of the devices.
-
     Returns:
         UUID of the device, or None where all are locked or this process has one already.
     """
@@ -374,9 +339,6 @@ def visible_devices() -> tuple[str, ...]:
     """Return the UUIDs of the GPUs that this process may use: those of CUDA_VISIBLE_DEVICES, or all of the host.
 
     CUDA itself is not started: it would settle on its devices for good.
-
-    Raises:
-        BackendError: The host has none, or they cannot be listed.
     """
     try:
         import pynvml
@@ -399,12 +361,7 @@ def visible_devices() -> tuple[str, ...]:
 
 
 def chosen_devices(visible: str, uuids: Sequence[str]) -> tuple[str, ...]:
-    """Return the devices that a value of CUDA_VISIBLE_DEVICES names, up to the first entry that is no device.
-
-    Args:
-        visible: Indices, UUIDs or unique beginnings of them, or names of MIG instances, separated by commas.
-        uuids: UUIDs of the host's devices, in the order of their indices.
-    """
+    """Return the devices that a value of CUDA_VISIBLE_DEVICES names, up to the first entry that is no device."""
     chosen: list[str] = []
     for entry in map(str.strip, visible.split(",")):
         if entry.isdecimal() and int(entry) < len(uuids):

@@ -47,9 +47,6 @@ def copy_fields(workspace: Workspace, others: Sequence[Location]) -> list[int]:
 
     The key of a field is a digest of all that it depends on. So it is the same field, whatever the other study calls
     the mesh. Each is checked as it is read.
-
-    Raises:
-        StoreError: A location has no store of a study, or cannot be read or written.
     """
     return [i for location in others for i in _copy_from(Store.open(location), workspace)]
 
@@ -161,11 +158,7 @@ class TaskSizes:
 
 
 def size_rows(plan: Plan, rows: Sequence[Row], workers: Workers) -> tuple[dict[str, TaskSizes], dict[str, str]]:
-    """Return the tasks of rows by their labels, and the reason for each row that fits into no worker.
-
-    Raises:
-        ClusterError: The lattice itself fits into no worker, whatever the mesh.
-    """
+    """Return the tasks of rows by their labels, and the reason for each row that fits into no worker."""
     octaves = _octave_memory(plan)
 
     def sizes_for(size: ExpectedSize) -> TaskSizes:
@@ -220,9 +213,6 @@ def size_tasks(
         workers: Workers of the cluster.
         rows: Number of rows that are to be computed.
         octaves: Largest block that octaves transform, and the bytes that they hold; None without octaves.
-
-    Raises:
-        ClusterError: No worker has the memory.
     """
     block, octave_bytes = (blocks[0], 0.0) if octaves is None else octaves
     block_bytes = float(block.size * np.dtype(transform.dtype).itemsize)

@@ -105,26 +105,11 @@ class Location:
         return Location(f"{self.name}/{name}" if self.scheme else str(Path(self.name) / name))
 
     def zarr_store(self, largest_bytes: int = 0) -> FolderStore | RemoteStore:
-        """Return the store that zarr and xarray take to read and write here.
-
-        Args:
-            largest_bytes: Largest size of one key.
-
-        Raises:
-            StoreError: The scheme is unknown, or its driver is not installed.
-        """
+        """Return the store that zarr and xarray take to read and write here."""
         return _remote_store(self.name, self.scheme, largest_bytes) if self.scheme else FolderStore(self.name)
 
     def read(self, key: str, most_bytes: int | None = None) -> bytes | None:
-        """Return the bytes of a key, or None if it does not exist.
-
-        Args:
-            key: Key below this location.
-            most_bytes: Largest size that a file may have.
-
-        Raises:
-            StoreError: The location cannot be read, does not answer within seconds, or the key is too large.
-        """
+        """Return the bytes of a key, or None if it does not exist."""
         with self.access("read"):
             if most_bytes is not None and not self.scheme:
                 self._require_size(key, most_bytes)
@@ -150,9 +135,6 @@ class Location:
 
         Of several processes that try, one succeeds. Storage without conditional writes lets the last one win:
         read the key again later.
-
-        Raises:
-            StoreError: The location cannot be written.
         """
         with self.access("written"):
             sync(self.zarr_store().set_if_not_exists(key, _buffer(document)))
@@ -199,14 +181,7 @@ class Location:
             return sync(self.zarr_store().names())
 
     def require_free(self, besides: Collection[str] = ()) -> None:
-        """Check that a store may be created here, without writing.
-
-        Args:
-            besides: Names that may exist already.
-
-        Raises:
-            StoreError: The location holds something else, cannot be read, or has no parent folder.
-        """
+        """Check that a store may be created here, without writing."""
         if not self.scheme:
             path = Path(self.name)
             if path.exists() and not path.is_dir():
@@ -289,11 +264,7 @@ def _require_no_credentials(scheme: str, rest: str) -> None:
 
 
 def path_in(root: str | Path, key: str) -> Path:
-    """Return the path of a key of a store in a folder. The folder itself may be reached by a link.
-
-    Raises:
-        StoreError: The key leads out of the folder, or its path holds a link or a special file.
-    """
+    """Return the path of a key of a store in a folder. The folder itself may be reached by a link."""
     if key.startswith("/") or ".." in key.split("/"):
         raise StoreError(f"{root}: {key} leads out of the store")
     path = os.fspath(root)

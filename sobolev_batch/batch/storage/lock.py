@@ -113,21 +113,13 @@ class Lock:
         return current is not None and current.holder == self.holder
 
     def require(self, location: Location) -> None:
-        """Check that its holder still has the store.
-
-        Raises:
-            LockError: The store was released, or another run has it.
-        """
+        """Check that its holder still has the store."""
         if not self.is_held(location):
             raise LockError(f"{location}: the store was released, or removed, and is no longer that of this process")
 
 
 def _require_run(run: str, location: Location) -> None:
-    """Check that a run still has the store.
-
-    Raises:
-        LockError: The run is over, its store was released, or another run has it.
-    """
+    """Check that a run still has the store."""
     lock = Lock.read(location)
     if lock is None or lock.run != run:
         others = "the store was released, or its run is over" if lock is None else f"{lock.driver} has it now"

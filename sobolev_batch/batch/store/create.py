@@ -44,11 +44,7 @@ _RECORDED_VERSIONS = ("sobolev-batch", "finufft", "modepy", "numpy", "scipy", "x
 
 
 def require_usable(location: Location) -> None:
-    """Check, without writing, that a store exists or may be created at a location.
-
-    Raises:
-        StoreError: The location cannot be read, or holds something else.
-    """
+    """Check, without writing, that a store exists or may be created at a location."""
     store = Store(location)
     # Damaged metadata are made again.
     with suppress(DamageError):
@@ -239,9 +235,6 @@ def _require_same_samples(store: Store, plan: Plan, *, is_trusted: bool) -> None
     """Check that octaves were sampled at the frequencies that this program draws.
 
     Where coordinates may be damaged, and are not trusted, one axis of three is enough.
-
-    Raises:
-        StoreError: They were sampled at others.
     """
     agree = []
     for name, expected in zip(AXES, () if plan.tail is None else plan.tail.frequencies.T, strict=False):

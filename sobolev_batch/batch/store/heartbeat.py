@@ -81,11 +81,7 @@ class Heartbeat:
         return self._writing
 
     def require_lock(self) -> None:
-        """Check that the run still held the store at the latest beat.
-
-        Raises:
-            LockError: The store was released, or another run has it.
-        """
+        """Check that the run still held the store at the latest beat."""
         if self._is_lost:
             raise LockError(
                 f"{self._store.path}: the store was released while this run was going on, and is no longer its own; "

@@ -39,11 +39,7 @@ _OCTAVES = "octaves/octaves"
 
 
 def check_documents(store: str, documents: Mapping[str, Any]) -> None:
-    """Check metadata documents of a store, by the paths of their nodes; the root's path is empty.
-
-    Raises:
-        StoreError: A document has what this package does not write; the message names the node and what was found.
-    """
+    """Check metadata documents of a store, by the paths of their nodes; the root's path is empty."""
     for name, document in documents.items():
         problem = _problem(name, document)
         if problem:

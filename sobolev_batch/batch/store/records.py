@@ -27,11 +27,7 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
 
 
 def record_from_table(kind: type[Kind], table: Any, name: str) -> Kind:
-    """Return the record that a table holds.
-
-    Raises:
-        DamageError: The table is not such a record; the message begins with the name.
-    """
+    """Return the record that a table holds."""
     try:
         record: Kind = _adapter(cast(Hashable, kind)).validate_python(table)
     except ValidationError as error:

@@ -87,11 +87,7 @@ class Store:
 
     @classmethod
     def open(cls, store: str | Path | Location) -> Self:
-        """Open a store that exists.
-
-        Raises:
-            StoreError: There is none, it cannot be read, or it has another schema.
-        """
+        """Open a store that exists."""
         opened = cls(store)
         opened.attributes()
         return opened
@@ -102,11 +98,7 @@ class Store:
         return self.location.name
 
     def exists(self) -> bool:
-        """Return whether a zarr hierarchy exists.
-
-        Raises:
-            DamageError: The metadata at its root cannot be read.
-        """
+        """Return whether a zarr hierarchy exists."""
         if "" not in self.documents:
             root = self._read_document("")
             if root is None:
@@ -119,11 +111,7 @@ class Store:
         return True
 
     def attributes(self) -> dict[str, Any]:
-        """Return the attributes of the root: title, study, similarity, versions.
-
-        Raises:
-            StoreError: No store of this package's schema exists.
-        """
+        """Return the attributes of the root: title, study, similarity, versions."""
         if not self.exists() or self.documents[""].get("node_type") != "group":
             raise StoreError(f"{self.path}: it holds no store of a study")
         attributes: dict[str, Any] = self.documents[""].get("attributes", {})
@@ -165,11 +153,7 @@ class Store:
     # Nodes
 
     def document(self, name: str) -> Document:
-        """Return the metadata document of a node.
-
-        Raises:
-            StoreError: The root does not list the node.
-        """
+        """Return the metadata document of a node."""
         if name not in self.documents and not (self.exists() and name in self.documents):
             raise StoreError(
                 f"{self.path}: the store is incomplete: it has no {name}; remove it and run the study again"
@@ -337,11 +321,7 @@ class Store:
         self.write(RECORD, row, "" if record is None else record.to_json(row))
 
     def read_run(self) -> RunRecord | None:
-        """Return the record of the latest run, or None before the first one.
-
-        Raises:
-            DamageError: It cannot be read.
-        """
+        """Return the record of the latest run, or None before the first one."""
         document = self._read_document(RECORDS)
         if document is None:
             raise DamageError(f"{self.path}: {RECORDS}/{ROOT} is missing; run the study again", "it is not there")
@@ -468,9 +448,6 @@ def stored_choice(store: str | Path | Location) -> LatticeChoice | None:
     """Return the lattice that was chosen for a store; None without one, or if its study gave the lattice.
 
     From damaged metadata it is None.
-
-    Raises:
-        StoreError: The location cannot be read, or holds something else.
     """
     existing = Store(store)
     with suppress(DamageError):

@@ -255,13 +255,6 @@ def choose_lattice(
     lattice would be large, octaves follow a small one. Surfaces that cannot be read, or reach much farther than the
     reference, have no say. For a best effort, neither have pairs that cannot have the accuracy, as long as others can.
 
-    Args:
-        study: Study.
-        accuracy: Accuracy that it requests.
-        similarity: Similarity transform to the study's unit.
-        reference: Reference in this unit.
-        members: Other surfaces of the study.
-
     Raises:
         AccuracyError: A pilot shows that the accuracy cannot be met within the memory, and it is no best effort.
         StudyError: No pilot could be made.

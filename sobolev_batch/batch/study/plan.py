@@ -125,10 +125,6 @@ def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan
     The reference is loaded, since the similarity depends on it, and a few pilots if an accuracy is requested. No
     other surface is loaded.
 
-    Args:
-        study: Study to carry out.
-        earlier_choice: Choice of an earlier plan. It is kept if it was made from the same data.
-
     Raises:
         StudyError: Labels are not unique, or sources make no surface.
         MeshError: The reference cannot be read.
@@ -180,11 +176,7 @@ def _lattice_choice(
 
 
 def members_of(study: Study) -> dict[str, tuple[str, Member]]:
-    """Return family and member of each surface of a study, by label. No surface is made.
-
-    Raises:
-        StudyError: Labels are not unique, or sources make no surface.
-    """
+    """Return family and member of each surface of a study, by label. No surface is made."""
     members: dict[str, tuple[str, Member]] = {}
     for family in study.families:
         try:

@@ -296,11 +296,7 @@ def is_collection(table: Mapping[str, Any]) -> bool:
 
 
 def read_study(path: str | Path) -> Study | StudyCollection:
-    """Read a study file, of one object or of several.
-
-    Raises:
-        StudyError: See `Study.from_toml`.
-    """
+    """Read a study file, of one object or of several."""
 
     def parse(table: Mapping[str, Any], folder: Path) -> Study | StudyCollection:
         return (StudyCollection if is_collection(table) else Study).from_table(table, folder=folder)
