@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from distributed import Client
@@ -19,12 +20,12 @@ from sobolev_batch.batch.cluster.execution import Cluster, Notify, Progress
 from sobolev_batch.batch.cluster.watch import Watch
 from sobolev_batch.batch.cluster.workers import require_store_access
 from sobolev_batch.batch.collection_store import CollectionStore, for_each_object, labelled
-from sobolev_batch.batch.fields.compute import compute_fields, copy_fields
+from sobolev_batch.batch.fields.compute import compute_fields
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, locked
 from sobolev_batch.batch.store.create import require_usable
 from sobolev_batch.batch.store.heartbeat import Heartbeat
-from sobolev_batch.batch.store.store import Store, stored_choice
+from sobolev_batch.batch.store.store import stored_choice
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.batch.study.study import Study, StudyCollection
 from sobolev_batch.batch.verify import damaged_rows
@@ -92,7 +93,6 @@ def run(
     workers: int | None = None,
     memory: float | str | None = None,
     on_progress: Notify | None = None,
-    reuse: Sequence[str | Path | Location] = (),
 ) -> Summary:
     """Compute the fields that a store lacks of a study, then norms, distances and convergence tables.
 
@@ -105,9 +105,6 @@ def run(
         workers: Number of these processes; by default one for each core.
         memory: Memory of each of them, in bytes or as a text such as "4GB"; by default equal parts of the machine's.
         on_progress: Callback for each step; it is called in this thread.
-        reuse: Paths or URLs of other stores. Their fields of the same surface, reference, scaling, accuracy and lattice
-            are copied, whatever the mesh is called there; from the store of a collection, those of the same object. If
-            the study requests an accuracy, a new store takes the lattice of the first one.
 
     Returns:
         Meshes that were computed, that were reused, and that failed. A mesh that fails does not raise. In a collection,
@@ -135,7 +132,7 @@ def run(
     >>> sb.run(study, "memory://run-example.zarr").reused
     ('ball/sphere', 'reference')
     """
-    location, reusable = Location.parse(store), _reusable_stores(map(Location.parse, reuse))
+    location = Location.parse(store)
     if client is not None:
         location = location.absolute()
     notify = on_progress or _ignore
@@ -144,18 +141,18 @@ def run(
         own = nullcontext(client) if client is not None else _own_cluster(study, location, workers, memory)
         start = cache(lambda: stack.enter_context(own))
 
-        def run_study(study: Study, location: Location, others: Sequence[Location], notify: Notify) -> Summary:
+        def run_study(study: Study, location: Location, notify: Notify) -> Summary:
             lock = Lock.of_this_process()
             require_usable(location)
             with locked(location, lock):
                 if client is not None:
                     with Watch(client).kept():
                         require_store_access(client, location, lock)
-                return carry_out(study, location, lock, start, notify, others)
+                return carry_out(study, location, lock, start, notify)
 
         if isinstance(study, Study):
-            return run_study(study, location, [place for _, place in reusable], notify)
-        return _run_collection(study, location, run_study, notify, reusable)
+            return run_study(study, location, notify)
+        return _run_collection(study, location, run_study, notify)
 
 
 def _ignore(progress: Progress) -> None:
@@ -176,23 +173,11 @@ def _own_cluster(
     return thread_client(workers) if location.is_in_memory else local_client(workers, memory)
 
 
-def _reusable_stores(locations: Iterable[Location]) -> list[tuple[str, Location]]:
-    """Return the stores at some locations with the names of their objects; that of a single study has no name."""
-    reusable: list[tuple[str, Location]] = []
-    for location in locations:
-        collection = CollectionStore.read(location)
-        reusable += [("", location)] if collection is None else collection.existing_stores.items()
-    for _, place in reusable:
-        Store.open(place)
-    return reusable
-
-
 def _run_collection(
     collection: StudyCollection,
     location: Location,
-    run_study: Callable[[Study, Location, Sequence[Location], Notify], Summary],
+    run_study: Callable[[Study, Location, Notify], Summary],
     notify: Notify,
-    reusable: Sequence[tuple[str, Location]],
 ) -> Summary:
     """Run the study of each object of a collection."""
     CollectionStore.prepared(location, collection)
@@ -200,26 +185,20 @@ def _run_collection(
 
     def run_object(name: str, study: Study, place: Location) -> Summary:
         part = f"{name}, {names.index(name) + 1} of {len(names)}"
-        others = [other for owner, other in reusable if owner in ("", name)]
         try:
-            return run_study(study, place, others, lambda progress: notify(replace(progress, part=part)))
+            return run_study(study, place, lambda progress: notify(replace(progress, part=part)))
         except InputError as error:
             _log.error("%s: %s", name, error)
             raise
 
     summaries, refused = for_each_object(collection, location, run_object)
 
-    def of_all(part: Callable[[Summary], Iterable[str]]) -> tuple[str, ...]:
-        return tuple(f"{name}/{label}" for name, summary in summaries.items() for label in part(summary))
+    def of_all(part: str) -> dict[str, Any]:
+        entries = {name: getattr(summary, part) for name, summary in summaries.items()}
+        return labelled({name: dict.fromkeys(own) if isinstance(own, tuple) else own for name, own in entries.items()})
 
-    return Summary(
-        str(location),
-        of_all(lambda summary: summary.computed),
-        of_all(lambda summary: summary.reused),
-        refused | labelled({name: summary.failed for name, summary in summaries.items()}),
-        labelled({name: summary.not_compared for name, summary in summaries.items()}),
-        labelled({name: summary.imprecise for name, summary in summaries.items()}),
-    )
+    computed, reused, failed = of_all("computed"), of_all("reused"), refused | of_all("failed")
+    return Summary(str(location), (*computed,), (*reused,), failed, of_all("not_compared"), of_all("imprecise"))
 
 
 def carry_out(
@@ -228,20 +207,17 @@ def carry_out(
     lock: Lock,
     start: Callable[[], Client],
     notify: Notify = _ignore,
-    others: Sequence[Location] = (),
 ) -> Summary:
-    """Run a study in a store that this process has locked; fields of other stores are copied.
+    """Run a study in a store that this process has locked.
 
     The client of the cluster is requested if anything is missing.
     """
-    plan = make_plan(study, next(filter(None, map(stored_choice, [location, *others])), None))
+    plan = make_plan(study, stored_choice(location))
     # Planning may take minutes.
     lock.require(location)
     workspace = Workspace.prepared(location.fenced(lock.fence), plan)
     with Heartbeat(workspace.store, lock) as heartbeat:
         workspace.withdraw_lost_fields()
-        if others:
-            workspace.withdraw_results_of(copy_fields(workspace, others))
         if not workspace.pending and are_tabulated(workspace) and have_proximities(workspace):
             return _summary(workspace, set())
         client = start()

@@ -17,7 +17,6 @@ from sobolev_batch.cli.common import (
     cli,
     echo,
     echo_lines,
-    location,
     memory_option,
     progress_reports,
     store_option,
@@ -71,13 +70,6 @@ def init_command(folder: Path, output: Path) -> None:
 )
 @memory_option("Limit the memory of each process, such as 4GB. [default: equal parts]")
 @best_effort_option
-@click.option(
-    "--reuse",
-    type=location,
-    multiple=True,
-    metavar="STORE",
-    help="Copy fields of this store that the study would compute again; may be repeated.",
-)
 @click.pass_context
 def run_command(
     context: click.Context,
@@ -88,7 +80,6 @@ def run_command(
     workers: int | None,
     memory: int | None,
     best_effort: bool,
-    reuse: tuple[Location, ...],
 ) -> None:
     """Compute what is missing of STUDY and print its tables.
 
@@ -112,10 +103,10 @@ def run_command(
     with progress_reports() as show:
         if scheduler:
             with remote_client(scheduler, trust_network) as client:
-                summary = run(parsed, place, client, on_progress=show, reuse=reuse)
+                summary = run(parsed, place, client, on_progress=show)
         else:
             limit = None if memory is None else f"{memory}B"
-            summary = run(parsed, place, workers=workers, memory=limit, on_progress=show, reuse=reuse)
+            summary = run(parsed, place, workers=workers, memory=limit, on_progress=show)
     if isinstance(parsed, Study):
         echo_lines(format_table(open_store(place)))
     else:

@@ -168,13 +168,6 @@ def test_the_run_of_a_collection_is_the_one_that_did_not_end_well(store: Path, t
     assert status.lost == (state == "running")
 
 
-def test_fields_of_another_collection_are_taken_over_by_object(store: Path, tmp_path: Path, client: Client) -> None:
-    summary = sb.run(collection(balls(a=1.0, b=1.1), "again"), tmp_path / "again.zarr", client, reuse=[store])
-    assert summary.computed == ()
-    assert len(summary.reused) == 10
-    assert sb.table(tmp_path / "again.zarr/b")["distance"].equals(sb.table(store / "b")["distance"])
-
-
 def test_a_second_run_computes_what_is_new(store: Path, client: Client) -> None:
     summary = sb.run(collection(balls(a=1.0, b=1.1, c=1.2)), store, client)
     assert set(summary.computed) == {f"c/{label}" for label in labels()}

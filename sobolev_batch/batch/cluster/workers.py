@@ -16,6 +16,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import takewhile
 from threading import Lock as ThreadLock
 from typing import Any
 
@@ -362,18 +363,10 @@ def visible_devices() -> tuple[str, ...]:
 
 def chosen_devices(visible: str, uuids: Sequence[str]) -> tuple[str, ...]:
     """Return the devices that a value of CUDA_VISIBLE_DEVICES names, up to the first entry that is no device."""
-    chosen: list[str] = []
-    for entry in map(str.strip, visible.split(",")):
-        if entry.isdecimal() and int(entry) < len(uuids):
-            chosen.append(uuids[int(entry)])
-        elif entry.startswith("MIG-"):
-            chosen.append(entry)
-        else:
-            matching = [uuid for uuid in uuids if entry and uuid.startswith(entry)]
-            if len(matching) != 1:
-                break
-            chosen += matching
-    return tuple(dict.fromkeys(chosen))
+    known = {**{str(number): uuid for number, uuid in enumerate(uuids)}, **{uuid: uuid for uuid in uuids}}
+    entries = map(str.strip, visible.split(","))
+    named = (known.get(entry, entry if entry.startswith("MIG-") else "") for entry in entries)
+    return tuple(dict.fromkeys(takewhile(bool, named)))
 
 
 def require_store_access(client: Client, location: Location, lock: Lock) -> None:

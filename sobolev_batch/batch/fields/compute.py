@@ -1,11 +1,10 @@
-"""The fields that a store lacks: copied from other stores, or computed as tasks that fit into the workers' memory."""
+"""The fields that a store lacks, computed as tasks that fit into the workers' memory."""
 
 from __future__ import annotations
 
 import logging
 import math
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -14,13 +13,11 @@ import numpy as np
 from sobolev_batch.batch.cluster.execution import Cluster, Task, describe_failure
 from sobolev_batch.batch.cluster.workers import Workers
 from sobolev_batch.batch.fields.tasks import Job, compute_mesh, compute_parts, finish_mesh
-from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import utc_now
 from sobolev_batch.batch.store.records import Record
-from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import Plan, Row
-from sobolev_batch.batch.workspace import Workspace, complete_records
-from sobolev_batch.errors import ClusterError, DamageError, StoreError
+from sobolev_batch.batch.workspace import Workspace
+from sobolev_batch.errors import ClusterError
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.spectral.transform.transform import projected_bytes
@@ -28,8 +25,6 @@ from sobolev_batch.surfaces.sources.registry import ExpectedSize
 
 _log = logging.getLogger(__name__)
 
-# Most of the time of a copy is spent waiting for disks or object storage.
-_THREADS = 4
 # Measured peak of describing a mesh and moving it to the study's unit, for each triangle.
 MESH_BYTES = 100.0
 # With less, the batches of points of a transform become so small that it is slow.
@@ -40,45 +35,6 @@ _CHOICE_BYTES = 100.0
 _SAMPLE_BYTES = 150.0
 # Every task of a study with octaves loads the reference too, but for a larger one.
 _LARGEST_REFERENCE = 3 << 20
-
-
-def copy_fields(workspace: Workspace, others: Sequence[Location]) -> list[int]:
-    """Copy the fields that a workspace lacks from other stores that have them, and return their rows.
-
-    The key of a field is a digest of all that it depends on. So it is the same field, whatever the other study calls
-    the mesh. Each is checked as it is read.
-    """
-    return [i for location in others for i in _copy_from(Store.open(location), workspace)]
-
-
-def _copy_from(other: Store, workspace: Workspace) -> list[int]:
-    stored = {record.key: (row, record) for row, record in complete_records(other.records()).items()}
-    matches = {i: stored[key] for i in workspace.pending if (key := workspace.rows[i].key) in stored}
-    with ThreadPoolExecutor(_THREADS) as pool:
-        outcomes = pool.map(lambda i: _copy_field(other, *matches[i], workspace.store, i), matches)
-        copied = [i for i, is_copied in zip(matches, outcomes, strict=True) if is_copied]
-    for i in copied:
-        _, workspace.records[i] = matches[i]
-    _log.info("%s: %d fields copied from %s", workspace.store.path, len(copied), other.path)
-    return copied
-
-
-def _copy_field(source: Store, row: int, record: Record, store: Store, target_row: int) -> bool:
-    """Copy a field with its record into a row of another store; return False where the field is damaged."""
-    places = source.places()
-    if places != store.places() or len(record.checksums) != len(places):
-        raise StoreError(
-            f"{source.path}: it cuts fields into other blocks than {store.path}; run the study without it, or make "
-            "both stores by one version of this program"
-        )
-    try:
-        for place, checksum in zip(places, record.checksums, strict=True):
-            store.write_field(target_row, place, source.read_fields([row], place, [checksum])[0])
-    except DamageError as error:
-        _log.warning("%s; it is computed here", error)
-        return False
-    store.write_record(target_row, record)
-    return True
 
 
 def compute_fields(cluster: Cluster, workspace: Workspace, pending: Sequence[int]) -> None:

@@ -22,8 +22,7 @@ HOST = ("GPU-aaaa-1", "GPU-aabb-2", "GPU-cccc-3")
         ("2,0", (HOST[2], HOST[0])),
         ("1,1", HOST[1:2]),
         ("GPU-cccc-3", HOST[2:]),
-        ("GPU-cc, 0", (HOST[2], HOST[0])),
-        ("GPU-aa,0", ()),  # ambiguous
+        ("GPU-cccc-3, 0", (HOST[2], HOST[0])),
         ("MIG-7d-5", ("MIG-7d-5",)),
         ("1,7,0", HOST[1:2]),  # ends at what is no device
         ("1,-1,0", HOST[1:2]),
