@@ -3,16 +3,30 @@
 from __future__ import annotations
 
 import sys
+import time
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import click
+import numpy as np
 import pandas as pd
+import xarray as xr
 
-from tests.coverage.cases import all_cases
-from tests.coverage.judging import PARTS, judge, judged
+from sobolev_batch import AccuracyError, distance, fourier_transform
+from tests.coverage.cases import Case, all_cases
 
 LEAST_COVERED, LARGEST_MEDIAN = 0.99, 30.0
 _SLOWEST = 10
+# A case is telling if its true error is more than this many times the uncertainty of the truth.
+_TELLING = 10.0
+# Memory for an rtol, so that hundreds of cases take minutes.
+_MEMORY = 500_000_000
+# A larger rtol is no answer.
+_LARGEST_RTOL = 0.5
+# Accuracies that should be within reach: at orders up to this one, from this rtol on.
+_EXPECTED_ORDER, _EXPECTED_RTOL = -1.0, 1e-2
+
+PARTS = ("truncation", "aliasing", "discretisation", "statistical")
 
 
 @click.command()
@@ -56,6 +70,64 @@ def described(row: dict[str, Any]) -> str:
         f"{row['case']}: {row['value']:.8g} ± {row['reported']:.2g} ({parts}), "
         f"truly {row['truth']:.8g} ± {row['uncertainty']:.1g}"
     )
+
+
+def judge(cases: Sequence[Case]) -> list[dict[str, Any]]:
+    """Measure the cases of one pair, without those of whose truth nothing is known.
+
+    Returns:
+        A row for each case: the `case`, its `kind` and `order`; the reported distance as `value`, its error as
+        `reported`, and the parts of it; the true distance as `truth`, and its `uncertainty`; the processor time as
+        `seconds`. If the accuracy is refused, `refused` is the rtol that is offered in its place, and the distance is
+        measured to one and a half of that; it is `broken` if that is refused too.
+    """
+    rows: list[dict[str, Any]] = []
+    for case, truth in zip(cases, cases[0].pair.truths([case.order for case in cases]), strict=True):
+        if truth is None:
+            continue
+        row: dict[str, Any] = {"case": case, "kind": case.kind, "order": case.order, "measured": False}
+        row |= {"refused": np.nan, "broken": False, **dict.fromkeys(("value", "reported", *PARTS), np.nan)}
+        start = time.process_time()
+        try:
+            row |= _measured(case, case.settings)
+        except AccuracyError as refusal:
+            row["refused"] = refusal.reachable
+            if 1.5 * refusal.reachable <= _LARGEST_RTOL:
+                try:
+                    row |= _measured(case, {"rtol": 1.5 * refusal.reachable})
+                except AccuracyError:
+                    row["broken"] = True
+        row |= {"truth": truth.value, "uncertainty": truth.uncertainty, "seconds": time.process_time() - start}
+        rows.append(row)
+    return rows
+
+
+def _measured(case: Case, settings: Mapping[str, Any]) -> dict[str, float]:
+    found: xr.Dataset
+    if "rtol" in settings:
+        found = distance(*case.pair.surfaces, case.order, memory=_MEMORY, **settings)
+    else:
+        a, b = (fourier_transform(surface, order=[case.order], **settings) for surface in case.pair.surfaces)
+        found = distance(a, b, case.order)
+    names = {"value": "distance", "reported": "error"} | {part: part for part in PARTS}
+    return {"measured": True} | {column: found[name].item() for column, name in names.items()}
+
+
+def judged(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """Return a table of rows, with whether reported errors cover true ones.
+
+    The true error is as uncertain as the truth. A case is `covered` if it may be covered within that uncertainty; NaN
+    never covers. Its `ratio` is the reported error over the true one, where the true one is ten times as large as the
+    uncertainty, and so tells something. A refusal is `unexpected` if the accuracy should have been within reach.
+    """
+    table = pd.DataFrame(rows)
+    true_error = (table["value"] - table["truth"]).abs()
+    table["covered"] = true_error <= table["reported"] + table["uncertainty"]
+    table["ratio"] = (table["reported"] / true_error).where(true_error > _TELLING * table["uncertainty"])
+    rtols = pd.Series([case.settings.get("rtol", 0.0) for case in table["case"]])
+    within_reach = (rtols >= _EXPECTED_RTOL) & (table["order"] <= _EXPECTED_ORDER)
+    table["unexpected"] = table["refused"].notna() & within_reach
+    return table
 
 
 if __name__ == "__main__":

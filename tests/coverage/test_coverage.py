@@ -12,10 +12,9 @@ from scipy.special import gamma, kv
 
 from sobolev_batch import Mesh, Sphere, distance, icosphere
 from sobolev_batch.surfaces.shapes.surface import Surface
-from tests.coverage.__main__ import described, show
+from tests.coverage.__main__ import PARTS as PARTS_OF_ERRORS
+from tests.coverage.__main__ import described, judge, judged, show
 from tests.coverage.cases import KINDS, cases_of
-from tests.coverage.judging import PARTS as PARTS_OF_ERRORS
-from tests.coverage.judging import judge, judged
 from tests.coverage.matern import kernel, radial_integral
 from tests.coverage.parts import PARTS
 from tests.coverage.truth import (

@@ -21,12 +21,13 @@ def blocks(path: str, language: str) -> list[str]:
 
 
 def imported(path: Path) -> set[str]:
+    """The names that a module imports, with those of their modules, inside of functions too."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            names.add(node.module or "")
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
     return names
 
 

@@ -1,0 +1,253 @@
+"""Processes that are killed: workers, drivers and writers, and tasks that outlive their run."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+from distributed import Client, wait
+
+from sobolev_batch import LockError, Mesh, Study, open_store, run, verify, write_mesh
+from sobolev_batch.batch.cluster.clients import local_client
+from sobolev_batch.batch.storage.location import Location
+from sobolev_batch.batch.storage.lock import Lock, locked
+from sobolev_batch.batch.store.create import prepare_store
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.study.plan import make_plan
+from tests.faults.conftest import LABELS
+from tests.faults.fatal import Moment
+from tests.support.commands import TOML, call, command, finished, read_until, started, write_toml
+from tests.support.processes import PATIENCE_SECONDS, tcp_cluster, wait_until
+from tests.support.shapes import TETRAHEDRON_TRIANGLES, TETRAHEDRON_VERTICES
+from tests.support.stores import assert_same_results, contents
+from tests.support.studies import small_table, variable
+
+
+@pytest.mark.parametrize(
+    "what", ["record", *(pytest.param(what, marks=pytest.mark.all) for what in ("field", "rename", "recorded"))]
+)
+def test_the_result_is_that_of_a_clean_run(
+    what: str, study: Study, store_path: Path, finished_store: Path, strike: Callable[..., Moment], threads: Client
+) -> None:
+    moment = strike(what, 2)
+    with local_client(2) as client:
+        summary = run(study, store_path, client)
+    assert len(moment.pids) == 1
+    assert (summary.computed, summary.failed) == (LABELS, {})
+    assert_same_results(store_path, finished_store)
+    strays = list(store_path.rglob("*.partial"))
+    assert len(strays) == (what == "rename")
+    # The next run sweeps them.
+    run(study, store_path, threads)
+    assert list(store_path.rglob("*.partial")) == []
+
+
+@pytest.mark.all
+def test_a_mesh_that_kills_every_worker_is_blamed_and_no_other(
+    study: Study, store_path: Path, finished_store: Path, tmp_path: Path, strike: Callable[..., Moment], threads: Client
+) -> None:
+    moment = strike("field", 2, times=99)
+    done = command("run", write_toml(tmp_path), "--store", store_path, "--workers", "2")
+    assert done.returncode == 3, done.stderr
+    # Twice beside others, twice alone.
+    assert len(moment.pids) == 4
+    assert "ico/2 is failed: its tasks ended the worker that they ran on again and again" in done.stdout
+    assert "Traceback" not in done.stderr
+    records = Store.open(store_path).records()
+    assert [record.status for record in records if record] == ["complete", "complete", "failed", "complete", "complete"]
+    assert variable(open_store(store_path), "convergence", "distance").sel(mesh="ico/2").isnull().all()
+    # Without what kills its workers, it is computed and nothing else is.
+    assert run(study, store_path, threads).computed == ("ico/2",)
+    assert_same_results(store_path, finished_store)
+
+
+@pytest.mark.parametrize(
+    "line", ["[2/5]", *(pytest.param(line, marks=pytest.mark.all) for line in ("dashboard:", "tables reduced"))]
+)
+def test_the_next_run_computes_what_has_no_record(
+    line: str, store_path: Path, finished_store: Path, tmp_path: Path
+) -> None:
+    study = write_toml(tmp_path)
+    with started("run", study, "--store", store_path, "--workers", "1") as driver:
+        read_until(driver, line)
+        os.kill(driver.pid, signal.SIGKILL)
+        driver.wait()
+        # Its workers end with it: what they were writing is then written or never will be.
+        assert driver.stdout is not None
+        driver.stdout.read()
+    complete = [record is not None for record in Store.open(store_path).records()].count(True)
+    assert complete >= {"dashboard:": 0, "[2/5]": 2, "tables reduced": 5}[line]
+    # The process is known to be gone, so that its claim keeps nobody out.
+    again = call("run", study, "--store", store_path, "--workers", "1")
+    assert again.returncode == 0, again.stderr
+    assert "taken over from process" in again.stderr
+    assert again.stderr.count("complete, ") == 5 - complete
+    assert f"{5 - complete} computed, {complete} reused" in again.stdout
+    assert_same_results(store_path, finished_store)
+
+
+KILLS = 20
+
+
+def outcome(script: str, store: Path) -> Any:
+    """What a script prints that kills children of its own."""
+    done = finished(sys.executable, "-c", STORES + script, store, timeout=PATIENCE_SECONDS)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+# Of scripts whose children start within milliseconds, without imports.
+STORES = """
+import json, os, signal, sys
+from pathlib import Path
+import numpy as np
+from sobolev_batch import Study
+from sobolev_batch.batch.study.plan import make_plan
+from sobolev_batch.batch.store.create import prepare_store
+from sobolev_batch.batch.store.records import Record
+from tests.support.studies import small_table
+
+path = Path(sys.argv[1])
+"""
+# Each child writes one value after the other, and says so before each.
+KILLED_WRITERS = """
+plan = make_plan(Study.from_table(small_table(lattice={"xi_max": 3.0, "M": 64})))
+store = prepare_store(path, plan)
+(place,) = store.places()
+shape = [part.stop for part in place]
+chunk = path / "fourier/fourier/c/0/0/0/0"
+chunk.parent.mkdir(parents=True)
+rng = np.random.default_rng(7)
+found = {"torn": 0, "strays": 0, "unfounded": 0, "values": 0, "swept": True}
+for kill in range(%d):
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        for number in range(1000 * kill + 1, 1000 * (kill + 1)):
+            os.write(writer, b"x")
+            checksum = store.write_field(0, place, np.full(shape, number, dtype=complex))
+            store.write_record(0, Record(str(number), "complete", checksums=(checksum,)))
+        os._exit(1)
+    for _ in range(int(rng.integers(1, 12))):
+        os.read(reader, 1)
+    # Where in the write it is by now is up to chance; every other time, there is a file without its name yet.
+    while kill %% 2 and not any(name.endswith(".partial") for name in os.listdir(chunk.parent)):
+        pass
+    os.kill(child, signal.SIGKILL)
+    assert os.waitpid(child, 0)[1] == signal.SIGKILL
+    os.close(reader)
+    os.close(writer)
+    values = store.read_fields([0], place)[0]
+    written = not np.isnan(values).all()
+    found["values"] += written
+    found["torn"] += written and not (values == values.flat[0]).all()
+    found["strays"] += len(list(path.rglob("*.partial")))
+    record = store.read_record(0)
+    # The field is never older than its record.
+    found["unfounded"] += record is not None and not int(record.key) <= values.flat[0].real
+    # What every run does first.
+    store.location.remove_partial_files()
+    found["swept"] &= not list(path.rglob("*.partial"))
+print(json.dumps(found, default=int))
+"""
+
+
+@pytest.mark.process
+def test_a_field_is_the_old_one_or_the_new_one(store_path: Path) -> None:
+    found = outcome(KILLED_WRITERS % KILLS, store_path)
+    assert (found["torn"], found["unfounded"], found["swept"]) == (0, 0, True)
+    # Kills did meet writes, and some came after one.
+    assert found["strays"] > 0
+    assert found["values"] > KILLS // 2
+
+
+# Killed before every key that is put in place, until the layout is done without.
+KILLED_LAYOUTS = """
+plan = make_plan(Study.from_table(small_table()))
+replace, left = Path.replace, 0
+
+def counted(self, target):
+    global left
+    if left == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    left -= 1
+    return replace(self, target)
+
+for deaths in range(100):
+    child = os.fork()
+    if child == 0:
+        Path.replace, left = counted, deaths
+        prepare_store(path, plan)
+        os._exit(0)
+    status = os.waitpid(child, 0)[1]
+    if status == 0:
+        break
+    assert status == signal.SIGKILL
+print(json.dumps(deaths))
+"""
+
+
+@pytest.mark.all
+def test_a_layout_that_was_interrupted_is_begun_anew(store_path: Path) -> None:
+    assert outcome(KILLED_LAYOUTS, store_path) > 5
+    store = prepare_store(store_path, make_plan(Study.from_table(small_table())))
+    assert store.labels() == ("ico/0", "ico/1", "ico/2", "ico/3", "reference")
+    assert store.records() == (None,) * 5
+
+
+# Moved by so much, the mesh is another one, of equal size in the store.
+SHIFT = 0.125
+
+
+def write_part(folder: Path, shift: float) -> None:
+    write_mesh(Mesh(np.add(TETRAHEDRON_VERTICES, (shift, 0, 0)), TETRAHEDRON_TRIANGLES), folder / "part.ply")
+
+
+@pytest.mark.all
+@pytest.mark.parametrize("what", ["field", "rename", "record"])
+def test_a_worker_that_goes_on_after_another_run_writes_nothing(
+    what: str, tmp_path: Path, strike: Callable[..., Moment]
+) -> None:
+    """Its worker is stopped, its driver killed, the mesh changed, another run done, and the worker continued."""
+    study, store, undisturbed = tmp_path / "study.toml", tmp_path / "store.zarr", tmp_path / "undisturbed.zarr"
+    family = '[[family]]\nname = "file"\nsource = "files"\npaths = ["part.ply"]\n'
+    study.write_text(TOML.partition("[[family]]")[0] + family)
+    write_part(tmp_path, 0.0)
+    moment = strike(what, 0, number=signal.SIGSTOP)
+    with tcp_cluster([]) as (address, (_, worker)):
+        with started("run", study, "--store", store, "--scheduler", address) as driver:
+            wait_until(lambda: moment.pids and psutil.Process(worker.pid).status() == psutil.STATUS_STOPPED)
+            assert driver.poll() is None
+        # The driver was killed.
+        write_part(tmp_path, SHIFT)
+        assert run(Study.from_toml(study), store, workers=1).failed == {}
+        before = contents(store)
+        os.kill(worker.pid, signal.SIGCONT)
+        with Client(address) as client:
+            # The worker has one thread: it has ended its task when it does another.
+            wait(client.submit(os.getpid), timeout=PATIENCE_SECONDS)
+    assert contents(store) == before
+    assert verify(store).is_sound
+    run(Study.from_toml(study), undisturbed, workers=1)
+    assert_same_results(store, undisturbed)
+
+
+def test_only_the_run_that_has_the_store_writes(store_path: Path, finished_store: Path) -> None:
+    location, lock = Location(str(finished_store)), Lock.of_this_process()
+    store = Store(location.fenced(lock.fence))
+    record = store.read_record(0)
+    with pytest.raises(LockError, match="the store was released, or its run is over"):
+        store.write_record(0, record)
+    with locked(location, lock):
+        store.write_record(0, record)
+        with pytest.raises(LockError, match=r"no longer has the store: process \d+ on .* has it now"):
+            Store(location.fenced(Lock.of_this_process().fence)).write_record(0, record)
+    assert json.loads(record.to_json(0) if record else "{}")["row"] == 0
