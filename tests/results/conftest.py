@@ -19,39 +19,37 @@ def tree() -> xr.DataTree:
     """Two levels, a failed one, and the reference; distances 0.4 and 0.1 at edge lengths 0.2 and 0.1."""
     distance = np.array([[0.4, 0.8], [0.1, 0.2], [np.nan, np.nan], [0.0, 0.0]])
     rate = np.array([[np.nan, np.nan], [2.0, 2.0], [np.nan, np.nan], [np.nan, np.nan]])
+    columns = {
+        "distance": distance,
+        **dict.fromkeys(("error", "truncation"), distance / 1000),
+        **dict.fromkeys(("aliasing", "discretisation", "statistical"), 0 * distance),
+        "relative": distance / 4,
+        "relative_error": distance / 4000,
+        "area_part": 0.6 * distance,
+        "shape_part": 0.8 * distance,
+        "rate": rate,
+        "rate_error": 0.01 * rate,
+        "resolved": np.array([[True, True], [True, False], [False, False], [False, False]]),
+        "within": np.array([[True, False], [True, False], [False, False], [True, True]]),
+    }
     convergence = xr.Dataset(
-        {
-            "distance": (("mesh", "order"), distance),
-            **dict.fromkeys(("error", "truncation"), (("mesh", "order"), distance / 1000)),
-            **dict.fromkeys(("aliasing", "discretisation", "statistical"), (("mesh", "order"), 0 * distance)),
-            "relative": (("mesh", "order"), distance / 4),
-            "relative_error": (("mesh", "order"), distance / 4000),
-            "area_part": (("mesh", "order"), 0.6 * distance),
-            "shape_part": (("mesh", "order"), 0.8 * distance),
-            "rate": (("mesh", "order"), rate),
-            "rate_error": (("mesh", "order"), 0.01 * rate),
-            "resolved": (("mesh", "order"), np.array([[True, True], [True, False], [False, False], [False, False]])),
-            "within": (("mesh", "order"), np.array([[True, False], [True, False], [False, False], [True, True]])),
-            "edge_length": ("mesh", [0.2, 0.1, np.nan, np.nan]),
-        },
+        {name: (("mesh", "order"), values) for name, values in columns.items()},
         coords={"mesh": MESHES, "order": [-10.0, -2.5]},
         attrs={"reference": "reference"},
-    )
-    meshes = xr.Dataset(
-        {
-            "family": ("mesh", ["f_1", "f_1", "f_1", "reference"]),
-            "name": ("mesh", ["0", "1", "2", "reference"]),
-            "level": ("mesh", [0, 1, 2, -1]),
-            "ordered_by": ("mesh", ["level"] * 4),
-            "row": ("mesh", [0, 1, 2, 3]),
-            "status": ("mesh", ["complete", "complete", "failed", "complete"]),
-            "reason": ("mesh", ["", "", "no 50% of it | is <there>", ""]),
-            "triangles": ("mesh", [20, 1280, 0, 0]),
-            "vertices": ("mesh", [12, 642, 0, 0]),
-            "seconds": ("mesh", [0.25, 2.0, 0.5, 0.125]),
-        },
-        coords={"mesh": MESHES},
-    )
+    ).assign(edge_length=("mesh", [0.2, 0.1, np.nan, np.nan]))
+    about = {
+        "family": ["f_1", "f_1", "f_1", "reference"],
+        "name": ["0", "1", "2", "reference"],
+        "level": [0, 1, 2, -1],
+        "ordered_by": ["level"] * 4,
+        "row": [0, 1, 2, 3],
+        "status": ["complete", "complete", "failed", "complete"],
+        "reason": ["", "", "no 50% of it | is <there>", ""],
+        "triangles": [20, 1280, 0, 0],
+        "vertices": [12, 642, 0, 0],
+        "seconds": [0.25, 2.0, 0.5, 0.125],
+    }
+    meshes = xr.Dataset({name: ("mesh", values) for name, values in about.items()}, coords={"mesh": MESHES})
     axis = np.linspace(-2, 2, 5)
     values = np.arange(4 * 5 * 5 * 3).reshape(4, 5, 5, 3) + 0j
     fourier = xr.Dataset(

@@ -11,7 +11,6 @@ from typing import Any
 
 import pandas as pd
 import pytest
-import xarray as xr
 from click.testing import CliRunner
 
 import sobolev_batch as sb
@@ -246,12 +245,6 @@ def test_only_meshes_that_were_computed_are_shown(store: str, folder: Path) -> N
     assert (view.values < 0).all()
     _, elsewhere = make_views(tree, folder / "results.zarr", ["files/good"])
     assert "cannot be listed here" in elsewhere["files/good"]
-    study = tree.attrs["study"]["table"]
-    changed = {**study, "family": [study["family"][0], {**study["family"][1], "source": "icosphere", "levels": [1]}]}
-    changed["family"][1].pop("paths")
-    tree.attrs = {**tree.attrs, "study": {**tree.attrs["study"], "table": changed}}
-    _, renamed = make_views(tree, folder, [f"{FAMILY}/0", "files/good"])
-    assert list(renamed) == ["files/good"]
     with pytest.raises(InputError, match="no mesh 'nobody'"):
         make_views(tree, folder, ["nobody"])
 
@@ -294,16 +287,6 @@ def test_lacking_comparisons_have_a_section(store: str, folder: Path, monkeypatc
     assert "no proximity: &lt;i&gt;changed&lt;/i&gt;" in text
 
 
-@pytest.mark.slow
-def test_damaged_fields_are_named_as_such(store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def damaged(*_: object, **__: object) -> None:
-        raise ValueError("Stored and computed checksum do not match.")
-
-    monkeypatch.setattr(Spectra, "from_tree", damaged)
-    with pytest.raises(DamageError, match=r"memory://hostile.zarr: a field is damaged.*verify"):
-        make_report(store)
-
-
 @pytest.mark.all
 def test_a_page_shows_one_state_of_a_store(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def make_views_while_a_run_begins(*arguments: Any, **options: Any) -> Any:
@@ -318,20 +301,20 @@ def test_a_page_shows_one_state_of_a_store(copy: Path, tmp_path: Path, monkeypat
     assert not page.exists()
 
 
-def test_places_that_cannot_be_read_or_written(store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.slow
+def test_what_is_missing_or_damaged_is_said(store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def damaged(*_: object, **__: object) -> None:
+        raise ValueError("Stored and computed checksum do not match.")
+
     with pytest.raises(StoreError, match="it holds no store of a study"):
         make_report(tmp_path)
-    monkeypatch.setattr(build, "make_report", lambda *_, **__: ("", ()))
-    with pytest.raises(StoreError, match="cannot be written there"):
-        sb.report(store, tmp_path / "nowhere" / "a.html")
-
-
-def test_what_is_missing_is_said(store: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    empty = xr.DataTree()
-    empty.attrs = open_store(store).attrs
     with monkeypatch.context() as patch:
-        patch.setattr(build, "as_tree", lambda store: empty)
-        with pytest.raises(InputError, match="no tables yet: run the study to its end"):
+        patch.setattr(build, "make_report", lambda *_, **__: ("", ()))
+        with pytest.raises(StoreError, match="cannot be written there"):
+            sb.report(store, tmp_path / "nowhere" / "a.html")
+    with monkeypatch.context() as patch:
+        patch.setattr(Spectra, "from_tree", damaged)
+        with pytest.raises(DamageError, match=r"memory://hostile.zarr: a field is damaged.*verify"):
             make_report(store)
     monkeypatch.setitem(sys.modules, "plotly", None)
     with pytest.raises(InputError, match=r"library plotly.*pip install 'sobolev-batch\[report\]'"):

@@ -134,18 +134,19 @@ def test_meshes_of_nearly_one_size_are_compared_and_have_no_rate() -> None:
 
 
 def test_objects_are_named_with_the_orders_that_leave_them_out() -> None:
-    plain = of_powers({"a": 1, "b": 2}, 1.0)
     exact = method_rows({"a": dict.fromkeys(SIZES, 1e-8), "b": {n: 1.0 / n for n in SIZES}})
-    every, some = ranked({"x": plain, "box": plain}), ranked({"x": plain, "box": exact})
+    every, some = ranked({"x": POWERS, "box": POWERS}), ranked({"x": POWERS, "box": exact})
     assert "box is left out at order -2: a reproduced it" in format_league([every, some])
     assert "box is left out: a reproduced it" in format_league([some, some])
 
 
 def test_few_objects_are_said_to_be_too_few() -> None:
-    plain = of_powers({"a": 1, "b": 2}, 1.0)
-    five, six = (ranked({f"{i}": plain for i in range(count)}) for count in (5, 6))
+    one, five, six = (ranked({f"{i}": POWERS for i in range(count)}) for count in (1, 5, 6))
     assert "The test cannot tell 2 methods from chance with 5 objects; take 6 or more." in format_league([five])
     assert "a is 2 times nearer than b" in format_league([six])
+    assert one.table[["low", "high"]].isna().all(axis=None)
+    assert one.table[["rank", "last_rank"]].to_numpy().tolist() == [[1, 2], [1, 2]]
+    assert one.pairs["nearer"].item() == ""
 
 
 def test_nothing_is_extrapolated_from_two_meshes_of_about_one_size() -> None:
@@ -156,17 +157,10 @@ def test_nothing_is_extrapolated_from_two_meshes_of_about_one_size() -> None:
 
 def test_meshes_of_one_size_all_count() -> None:
     tables = method_rows({"a": {1000: 0.01}, "b": {1000: 0.015}})
-    more = [tables[tables["family"] == "a"].assign(relative=relative) for relative in (0.03, 0.03)]
+    more = [tables[tables["family"] == "a"].assign(relative=0.03)] * 2
     made = ranked(dict.fromkeys("stuvwxyz", pd.concat([tables, *more], ignore_index=True)))
     assert made.table["method"].tolist() == ["b", "a"]
     assert made.table["relative"].iloc[1] == pytest.approx((0.01 * 0.03 * 0.03) ** (1 / 3))
-
-
-def test_one_object_has_no_intervals_and_no_ranks() -> None:
-    made = ranked({"x": of_powers({"a": 1, "b": 2}, 1.0)})
-    assert made.table[["low", "high"]].isna().all(axis=None)
-    assert made.table[["rank", "last_rank"]].to_numpy().tolist() == [[1, 2], [1, 2]]
-    assert made.pairs["nearer"].item() == ""
 
 
 def test_intervals_are_those_of_student() -> None:
