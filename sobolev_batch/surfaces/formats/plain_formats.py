@@ -75,9 +75,8 @@ def announced_sizes(header: bytes) -> tuple[int, int, bool]:
 def parse_obj(data: bytes) -> Raw:
     """Return the vertices (n, 3) and triangles (m, 3) of an OBJ file, all its objects and groups together."""
     vertices, corners, sizes = array("d"), array("q"), array("q")
-    last = ""
-    for last in _joined_lines(data):
-        words = last.partition("#")[0].split()
+    for line in _joined_lines(data):
+        words = line.partition("#")[0].split()
         if not words:
             continue
         if words[0] == "v":
@@ -88,9 +87,6 @@ def parse_obj(data: bytes) -> Raw:
         elif words[0] == "f":
             corners.extend(_obj_corner(word, len(vertices) // 3, len(sizes) + 1) for word in words[1:])
             sizes.append(len(words) - 1)
-    # Without a line end, the last corner may have lost digits: then it seldom has as many slashes as the others.
-    if last.startswith("f ") and last[-1] != "\n" and len({word.count("/") for word in last.split()[1:]}) > 1:
-        raise MeshError("the OBJ file breaks off in its last line")
     return np.array(vertices).reshape(-1, 3), triangle_fans(np.array(corners), np.array(sizes))
 
 

@@ -145,22 +145,17 @@ def _checked_table(table: Mapping[str, Any]) -> MeshTable:
         if not is_finite_number(time):
             raise ValueError(f"{quoted(path)} has the time {quoted(time)}; a time is a number")
         checked["time"] = float(time)
-    return checked | {_checked_key(key): _checked_value(path, key, value) for key, value in known.items()}
-
-
-def _checked_key(key: object) -> str:
-    problem = name_problem(key, 100, "/\\") if isinstance(key, str) else "it is no text"
-    if problem is not None:
-        raise ValueError(f"{quoted(key)} cannot name metadata: {problem}")
-    return str(key)
-
-
-def _checked_value(path: str, key: str, value: object) -> float | str:
-    if isinstance(value, Real) and is_finite_number(value):
-        return float(value)
-    if not isinstance(value, str) or name_problem(value, _LONGEST_TEXT) is not None:
-        raise ValueError(f"{key} of {quoted(path)} must be a number or a line of text, found {quoted(value)}")
-    return value
+    for key, value in known.items():
+        problem = name_problem(key, 100, "/\\") if isinstance(key, str) else "it is no text"
+        if problem is not None:
+            raise ValueError(f"{quoted(key)} cannot name metadata: {problem}")
+        if isinstance(value, Real) and is_finite_number(value):
+            checked[key] = float(value)
+        elif isinstance(value, str) and name_problem(value, _LONGEST_TEXT) is None:
+            checked[key] = value
+        else:
+            raise ValueError(f"{key} of {quoted(path)} must be a number or a line of text, found {quoted(value)}")
+    return checked
 
 
 def _is_nothing(value: object) -> bool:

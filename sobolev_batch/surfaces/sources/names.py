@@ -15,11 +15,6 @@ _LONGEST_LABEL = 1000
 # Short enough for every file system, with a number before it and a suffix after it.
 _LONGEST_STEM = 60
 _NUMBER = re.compile(r"\d+(?:\.\d+)?(?:[eE][+-]?\d+)?")
-# Printable to Python, yet invisible: joiners, fillers, variation selectors, the empty Braille cell.
-_INVISIBLE = frozenset(
-    "\u034f\u115f\u1160\u17b4\u17b5\u2800\u3164\uffa0"
-    + "".join(map(chr, (*range(0x180B, 0x1810), *range(0xFE00, 0xFE10), *range(0xE0100, 0xE01F0))))
-)
 
 
 def quoted(value: object, longest: int = 80) -> str:
@@ -48,9 +43,9 @@ def name_problem(text: str, longest: int, forbidden: str = "") -> str | None:
         return "it is empty"
     if len(text) > longest:
         return f"it has {len(text)} characters, {longest} are allowed"
-    invisible = next((c for c in text if not c.isprintable() or c in _INVISIBLE), None)
+    invisible = next((c for c in text if not c.isprintable()), None)
     if invisible is not None:
-        return f"it holds the invisible character {_code(invisible)}"
+        return f"it holds the invisible character U+{ord(invisible):04X} {unicodedata.name(invisible, '')}".rstrip()
     barred = next((c for c in text if c in forbidden), None)
     if barred is not None:
         return f"it holds {barred!r}"
@@ -92,8 +87,3 @@ def duplicate_names(names: Iterable[str]) -> list[list[str]]:
     for name in names:
         groups.setdefault(caseless_key(name), []).append(name)
     return [group for group in groups.values() if len(group) > 1]
-
-
-def _code(character: str) -> str:
-    name = unicodedata.name(character, "")
-    return f"U+{ord(character):04X}" + (f" ({name})" if name else "")

@@ -131,7 +131,7 @@ def test_all_problems_are_listed_at_once_up_to_ten() -> None:
     assert many.endswith("; and 90 more")
 
 
-@pytest.mark.parametrize("name", ["a\nb", "a\x1b[31mb", "a\xa0b", "a\u202eb", "a\u200bb", "a\ud800b", "\u2800", " a"])
+@pytest.mark.parametrize("name", ["a\nb", "a\x1b[31mb", "a\xa0b", "a\u202eb", "a\u200bb", "a\ud800b", " a"])
 def test_names_and_titles_hold_nothing_unseen(name: str) -> None:
     for key in ("study.name", "family.0.name", "study.title"):
         assert re.search(r"it holds the invisible character U\+|begins or ends with", refusal(changed(key, name)))

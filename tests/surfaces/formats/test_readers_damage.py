@@ -120,7 +120,6 @@ BAD: dict[str, dict[str, bytes]] = {
             OBJ_BOX, (b"v 0.0 2.0 4.0\n", b"v 0.0 2.0\n"), (b"v 1.0 0.0 0.0\n", b"v 1.0 0.0 0.0 1.0\n")
         ),
         "two coordinates": b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n",
-        "cut in a corner": OBJ_BOX + b"f 1//2 2//3 8",
         "cut in a face": OBJ_BOX[:-3],
         "no vertices": b"f 1 2 3\n",
     },

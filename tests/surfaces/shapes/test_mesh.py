@@ -100,13 +100,6 @@ def test_a_total_area_of_zero_is_refused(vertices: Any) -> None:
         Mesh(vertices, [[0, 1, 2], [0, 0, 1]])
 
 
-@pytest.mark.skipif(np.finfo(np.longdouble).maxexp == 1024, reason="needs numbers wider than double precision")
-def test_coordinates_beyond_double_precision_are_refused() -> None:
-    wide = np.array([[0, 0, 0], [np.longdouble("1e400"), 0, 0], [0, 1, 0]], dtype=np.longdouble)
-    with pytest.raises(MeshError, match="coordinates"):
-        Mesh(wide, TRIANGLES)
-
-
 @pytest.mark.parametrize(
     ("extra_vertices", "triangles", "counts"),
     [
@@ -144,15 +137,6 @@ def test_what_counts_as_zero_area_does_not_depend_on_the_unit(scale: float) -> N
     assert mesh.areas[0] == pytest.approx(0.5e-13 * scale**2)
 
 
-def test_areas_and_lengths_of_a_right_triangle() -> None:
-    mesh = Mesh(VERTICES, TRIANGLES)
-    assert mesh.areas.tolist() == [6.0]
-    assert mesh.area == 6.0
-    assert mesh.edge_lengths.tolist() == [[3.0, 5.0, 4.0]]
-    # The centroid is (1, 4/3, 0), the farthest corner (0, 4, 0).
-    assert mesh.centroid_radii == pytest.approx([np.hypot(1, 8 / 3)])
-
-
 def test_areas_and_lengths_of_solids() -> None:
     assert box().area == BOX_AREA
     assert sorted(box().areas) == [1.0] * 4 + [2.0] * 4 + [4.0] * 4
@@ -162,6 +146,8 @@ def test_areas_and_lengths_of_solids() -> None:
     slanted = tetrahedron().edge_lengths[2]
     assert slanted == pytest.approx([np.sqrt(2)] * 3, rel=1e-15)
     assert tetrahedron().centroid_radii[2] == pytest.approx(np.sqrt(2 / 3), rel=1e-15)
+    # The centroid is (1, 4/3, 0), the farthest corner (0, 4, 0).
+    assert Mesh(VERTICES, TRIANGLES).centroid_radii == pytest.approx([np.hypot(1, 8 / 3)])
 
 
 @pytest.mark.slow
@@ -275,31 +261,18 @@ def test_the_digest_changes_with_every_array(vertices: Any, triangles: Any) -> N
 
 @pytest.mark.slow
 @seeded
-@given(meshes(), st.randoms(use_true_random=False))
-def test_the_order_of_vertices_and_triangles_does_not_matter(mesh: Mesh, random: Any) -> None:
-    order = list(range(len(mesh.vertices)))
-    random.shuffle(order)
-    place = np.argsort(order)
-    rows = list(range(len(mesh.triangles)))
-    random.shuffle(rows)
-    shuffled = Mesh(mesh.vertices[order], place[mesh.triangles][rows])
-    assert np.array_equal(shuffled.areas, mesh.areas[rows])
-    assert shuffled.area == pytest.approx(mesh.area, rel=1e-14)
-    assert shuffled.counts == mesh.counts
+@given(meshes(), st.integers(0, 2**32 - 1), st.permutations([0, 1, 2]))
+def test_the_order_of_vertices_triangles_and_corners_does_not_matter(mesh: Mesh, seed: int, corners: list[int]) -> None:
+    rng = np.random.default_rng(seed)
+    order, rows = rng.permutation(len(mesh.vertices)), rng.permutation(len(mesh.triangles))
+    shuffled = Mesh(mesh.vertices[order], np.argsort(order)[mesh.triangles][rows][:, corners])
+    assert shuffled.areas == pytest.approx(mesh.areas[rows], rel=1e-12, abs=1e-13)
+    assert shuffled.area == pytest.approx(mesh.area, rel=1e-12)
+    assert np.sort(shuffled.edge_lengths, axis=1) == pytest.approx(np.sort(mesh.edge_lengths[rows], axis=1), rel=1e-15)
+    # Whether rounding hides that an area is zero may depend on the order of corners.
+    for name in ("duplicate_triangles", "boundary_edges", "nonmanifold_edges"):
+        assert shuffled.counts[name] == mesh.counts[name]
     assert np.array_equal(shuffled.bounds, mesh.bounds)
-
-
-@pytest.mark.slow
-@seeded
-@given(meshes(), st.permutations([0, 1, 2]))
-def test_the_order_of_corners_does_not_matter(mesh: Mesh, order: list[int]) -> None:
-    turned = Mesh(mesh.vertices, mesh.triangles[:, order])
-    assert turned.areas == pytest.approx(mesh.areas, rel=1e-12, abs=1e-13)
-    assert np.sort(turned.edge_lengths, axis=1) == pytest.approx(np.sort(mesh.edge_lengths, axis=1), rel=1e-15)
-    assert (turned.counts["duplicate_triangles"], turned.counts["boundary_edges"]) == (
-        mesh.counts["duplicate_triangles"],
-        mesh.counts["boundary_edges"],
-    )
 
 
 @pytest.mark.slow
@@ -311,16 +284,3 @@ def test_rigid_motions_keep_areas_and_lengths(mesh: Mesh, shift: tuple[float, ..
     assert moved.areas == pytest.approx(mesh.areas, rel=1e-11, abs=1e-11)
     assert moved.edge_lengths == pytest.approx(mesh.edge_lengths, rel=1e-12, abs=1e-12)
     assert moved.centroid_radii == pytest.approx(mesh.centroid_radii, rel=1e-12, abs=1e-12)
-
-
-@pytest.mark.slow
-@seeded
-@given(meshes(), st.tuples(st.floats(0.05, 1), st.floats(0.05, 1), st.floats(0.05, 1)))
-def test_splitting_a_triangle_keeps_the_area(mesh: Mesh, weights: tuple[float, float, float]) -> None:
-    a, b, c = mesh.triangles[0]
-    inner = np.average(mesh.vertices[[a, b, c]], axis=0, weights=weights)
-    new = len(mesh.vertices)
-    triangles = np.concatenate([[[a, b, new], [b, c, new], [c, a, new]], mesh.triangles[1:]])
-    split = Mesh(np.vstack([mesh.vertices, inner]), triangles)
-    assert split.areas[:3].sum() == pytest.approx(mesh.areas[0], rel=1e-13)
-    assert split.area == pytest.approx(mesh.area, rel=1e-13)

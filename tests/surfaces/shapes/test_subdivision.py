@@ -54,15 +54,6 @@ def test_a_split_mesh_is_the_same_surface(mesh: sb.Mesh, share: float) -> None:
     assert np.count_nonzero(finer) == np.count_nonzero(boundary) + np.count_nonzero(boundary & marks)
 
 
-def test_all_edges_split_are_the_usual_subdivision() -> None:
-    ball = sb.icosphere(1)
-    edges = Edges.from_mesh(ball)
-    split = edges.split(np.ones(len(edges.ends), dtype=bool))
-    assert len(split.triangles) == 320
-    middles = np.asarray(ball.vertices)[edges.ends].mean(axis=1)
-    assert np.array_equal(np.asarray(split.vertices)[len(ball.vertices) :], middles)
-
-
 @pytest.mark.parametrize("wanted", [320, 321, 330, 500, 1000, 1279, 1280, 10_000])
 def test_the_best_triangles_are_as_many_as_fit(wanted: int) -> None:
     edges = Edges.from_mesh(sb.icosphere(2))

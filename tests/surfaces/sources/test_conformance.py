@@ -104,8 +104,6 @@ class Balls(Source):
                 raise KeyError("nothing")
             case "nothing":
                 return ()
-            case "no members":
-                return ["one"]
             case "computes":
                 return (BallMember(str(len(icosphere(0).triangles)), -1),)
             case "any order":
@@ -133,7 +131,6 @@ class CanBeChanged(Balls):
         (CanBeChanged(), "can be changed"),
         (Balls(fault="KeyError"), r"members\(\) raises KeyError: 'nothing'"),
         (Balls(fault="nothing"), r"returns \(\), expected a tuple"),
-        (Balls(fault="no members"), r"returns \['one'\], expected a tuple"),
         (Balls(fault="computes"), "makes a mesh; leave that to Member.load"),
         (Balls(fault="any order"), r"lists \[\('one', -1\), \('two', -1\)\] first"),
         (Balls(fault="names"), "'one', 'One', which are the same but for case"),
@@ -158,13 +155,3 @@ def test_broken_promises_are_named(folder: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.chdir(folder)
     with pytest.raises(AssertionError, match=rf"^{type(source).__name__} breaks (.|\n)*{problem}"):
         check_source(source, folder)
-
-
-@pytest.mark.parametrize("error", [MeshError, StudyError, ValueError])
-def test_errors_are_problems(error: type[Exception]) -> None:
-    class Failing(Balls):
-        def members(self, folder: Path) -> Any:
-            raise error("not today")
-
-    with pytest.raises(AssertionError, match=f"members\\(\\) raises {error.__name__}: not today"):
-        check_source(Failing())
