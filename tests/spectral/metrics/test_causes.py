@@ -25,8 +25,7 @@ from sobolev_batch.spectral import fields
 from sobolev_batch.spectral.backends import NufftSpec
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.metrics import causes
-from sobolev_batch.spectral.quadrature.meshes import WeightedPoints
-from sobolev_batch.spectral.transform.nufft import evaluate_at, transform_points
+from sobolev_batch.spectral.transform.nufft import evaluate_at
 from tests.support.oracles import full_lattice_norm
 from tests.support.shapes import CENTRED_BOX as BOX
 
@@ -215,16 +214,6 @@ def test_blocks_batches_and_parts_add_up(monkeypatch: pytest.MonkeyPatch) -> Non
         for spec in (NufftSpec(block.shape, 1e-13), NufftSpec((2, 3, 3), 1e-13, oversampling=2.0, batch=7))
     )
     assert many == pytest.approx(one, rel=0, abs=1e-11 * np.abs(one).max())
-
-
-def test_evaluation_is_the_adjoint_of_the_transform() -> None:
-    rng = np.random.default_rng(5)
-    block = Block((-6, -2, 1), (7, 6, 4))
-    points, weights = rng.uniform(-1, 1, (3, 40)), rng.standard_normal(40)
-    coefficients = rng.standard_normal((1, *block.shape)) + 1j * rng.standard_normal((1, *block.shape))
-    transformed, _ = transform_points([WeightedPoints(points, weights)], RANDOM, block, NufftSpec(block.shape, 1e-13))
-    (values,) = evaluate_at(points, coefficients, RANDOM, block, NufftSpec(block.shape, 1e-13))
-    assert weights @ values == pytest.approx(np.vdot(transformed, coefficients).real, rel=1e-11)
 
 
 def test_is_positive_where_the_first_has_more() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -72,28 +73,27 @@ def test_the_sphere_as_a_parametrised_surface_is_the_closed_form() -> None:
         assert (distance(field, exact, orders)["distance"] < 1e-12 * norm(exact, orders)["norm"]).all()
 
 
-def test_a_torus_is_its_bessel_integral() -> None:
-    torus = Torus(1.0, 0.4)
-    points = frequencies()
-    exact = [torus_value(1.0, 0.4, math.hypot(x, y), z) for x, y, z in points]
-    assert exact_values(torus, points) == pytest.approx(np.array(exact), abs=1e-12 * torus.area)
-    assert exact[0] == pytest.approx(torus.area, rel=1e-13)
-    # On the lattice, through the NUFFT: along x, where the tube's two sides interfere.
-    values = half_values(torus)
-    for k in (0, 5, 16):
-        value = torus_value(1.0, 0.4, k * LATTICE.spacing, 0.0)
-        assert values[16 + k, 16, 0] == pytest.approx(value, abs=1e-12 * torus.area)
+# Surfaces, and their transforms at any frequency: integrals of Bessel functions. Ellipsoids with another axis as the
+# pole's have other nodes.
+INTEGRALS: dict[str, tuple[Smooth, Callable[[float, float, float], float]]] = {
+    "torus": (Torus(1.0, 0.4), lambda x, y, z: torus_value(1.0, 0.4, math.hypot(x, y), z)),
+    "oblate": (Ellipsoid((1.0, 1.0, 0.4)), lambda x, y, z: spheroid_value(1.0, 0.4, math.hypot(x, y), z)),
+    "prolate": (Ellipsoid((0.4, 0.4, 1.0)), lambda x, y, z: spheroid_value(0.4, 1.0, math.hypot(x, y), z)),
+    "lying": (Ellipsoid((0.4, 1.0, 1.0)), lambda x, y, z: spheroid_value(1.0, 0.4, math.hypot(y, z), x)),
+}
 
 
-@pytest.mark.parametrize(("a", "c"), [(1.0, 0.4), (0.4, 1.0)])
-def test_a_spheroid_is_its_bessel_integral(a: float, c: float) -> None:
-    spheroid = Ellipsoid((a, a, c))
+@pytest.mark.parametrize("name", INTEGRALS)
+def test_solids_of_revolution_are_their_bessel_integrals(name: str) -> None:
+    surface, exact = INTEGRALS[name]
     points = frequencies()
-    exact = np.array([spheroid_value(a, c, math.hypot(x, y), z) for x, y, z in points])
-    assert exact_values(spheroid, points) == pytest.approx(exact, abs=1e-12 * spheroid.area)
-    # With another axis as the pole's, the nodes are others.
-    lying = Ellipsoid((c, a, a))
-    assert exact_values(lying, points[:, [2, 0, 1]]) == pytest.approx(exact, abs=1e-12 * spheroid.area)
+    expected = np.array([exact(*point) for point in points.tolist()])
+    assert exact_values(surface, points) == pytest.approx(expected, abs=1e-12 * surface.area)
+    assert expected[0] == pytest.approx(surface.area, rel=1e-13)
+    # On the lattice, through the NUFFT: along x, where the two sides of a tube interfere.
+    found = half_values(surface)[[16, 21, 32], 16, 0]
+    along_x = [exact(k * LATTICE.spacing, 0.0, 0.0) for k in (0, 5, 16)]
+    assert found == pytest.approx(np.array(along_x), abs=1e-12 * surface.area)
 
 
 def test_an_ellipsoid_on_its_axes_is_an_integral_of_elliptic_integrals() -> None:
