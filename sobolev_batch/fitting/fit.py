@@ -184,10 +184,16 @@ def fit(
     return conclude(mesh, before, FitRun(problem, notify).finish())
 
 
-def fitted_mesh(mesh: Mesh, target: Operand, settings: FitSettings, execution: Execution) -> Mesh:
-    """Return the mesh that `fit` finds, without measures of its distance."""
-    problem = FitProblem.for_target(mesh, target, None, settings, execution)
-    return problem.given_mesh(FitRun(problem).finish().mesh)
+def fitted_mesh(
+    mesh: Mesh, target: Operand, settings: FitSettings, execution: Execution, triangles: int | None = None
+) -> Mesh:
+    """Return the mesh that `fit` finds, or `refine` for a number of triangles, without measures of its distance."""
+    make = partial(FitProblem.for_target, target=target, lattice=None, settings=settings, execution=execution)
+    if triangles is None:
+        run = FitRun(make(mesh)).finish()
+    else:
+        run = _refine(_first_problem(mesh, triangles, make), triangles, make)
+    return run.problem.given_mesh(run.mesh)
 
 
 class FitRun:
@@ -384,13 +390,6 @@ def refine(
         return refined
     remark = f"it has {count:,} triangles instead of {triangles:,}, as splits come in groups"
     return replace(refined, remarks=(*refined.remarks, remark))
-
-
-def refined_mesh(mesh: Mesh, target: Operand, triangles: int, settings: FitSettings, execution: Execution) -> Mesh:
-    """Return the mesh that `refine` finds, without measures of its distance."""
-    make = partial(FitProblem.for_target, target=target, lattice=None, settings=settings, execution=execution)
-    last = _refine(_first_problem(mesh, triangles, make), triangles, make)
-    return last.problem.given_mesh(last.mesh)
 
 
 def _first_problem(mesh: Mesh, goal: int, make: Make) -> FitProblem:

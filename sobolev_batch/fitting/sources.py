@@ -11,7 +11,7 @@ from pydantic import Field
 
 from sobolev_batch.errors import InputError, MeshError, StudyError
 from sobolev_batch.fitting import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS
-from sobolev_batch.fitting.fit import MOST_TRIANGLES, fitted_mesh, largest_while_refining, refined_mesh
+from sobolev_batch.fitting.fit import MOST_TRIANGLES, fitted_mesh, largest_while_refining
 from sobolev_batch.fitting.problem import FitSettings
 from sobolev_batch.spectral.transform.settings import Execution
 from sobolev_batch.surfaces.shapes.mesh import Mesh
@@ -135,11 +135,8 @@ class FittedMember(Member):
         similarity = Similarity.to_unit_ball(target)
         try:
             # The result must not depend on the worker, so one thread it is.
-            pair, settings, execution = (similarity.apply(start), similarity.apply(target)), self.settings, Execution()
-            if self.triangles is None:
-                fitted = fitted_mesh(*pair, settings, execution)
-            else:
-                fitted = refined_mesh(*pair, self.triangles, settings, execution)
+            pair = similarity.apply(start), similarity.apply(target)
+            fitted = fitted_mesh(*pair, self.settings, Execution(), self.triangles)
         except InputError as error:
             raise MeshError(f"{self.start.name} cannot be fitted to {self.target.name}: {error}") from error
         vertices = np.asarray(fitted.vertices) / similarity.scale + np.asarray(similarity.origin)
