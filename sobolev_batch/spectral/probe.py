@@ -36,12 +36,9 @@ _BANDS = 8
 
 @dataclass(frozen=True)
 class Draws:
-    """Random frequencies of the half lattice.
+    """Random frequencies ξ = h k of the half lattice, float64 (P, 3), and the lattice indices k, int64 (P, 3).
 
-    Attributes:
-        indices: Lattice indices k, int64 (P, 3).
-        frequencies: ξ = h k, float64 (P, 3), in cycles per unit length.
-        scales: Trapezoidal weight / (P p), the factor of a squared error, float64 (P,).
+    The scales (P,) are trapezoidal weight / (P p), the factor of a squared error.
     """
 
     indices: NDArray[np.int64]

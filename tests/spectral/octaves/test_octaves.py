@@ -23,9 +23,11 @@ from sobolev_batch.spectral.octaves.values import (
     statistical_errors,
 )
 from sobolev_batch.spectral.shells import smooth_step
+from sobolev_batch.spectral.spheres import sphere_transform
 from sobolev_batch.spectral.transform.settings import ErrorTarget
 from sobolev_batch.spectral.triangles import exact_transform
 from sobolev_batch.surfaces.shapes.surface import Surface
+from tests.support.oracles import torus_value
 from tests.support.rectangles import Rectangles
 
 Reals = NDArray[np.float64]
@@ -78,26 +80,12 @@ def test_values_on_a_random_lattice_are_those_at_its_frequencies(surface: Surfac
     frequencies = sampling.frequencies[chosen]
     if isinstance(surface, Mesh):
         expected = exact_transform(surface, frequencies)
+    elif isinstance(surface, Sphere):
+        expected = sphere_transform(surface, frequencies)
     else:
-        nodes, weights = surface_nodes(surface)
-        expected = np.asarray(np.exp(-2j * np.pi * frequencies @ nodes) @ weights, np.complex128)
+        expected = np.array([torus_value(0.8, 0.3, float(np.hypot(x, y)), float(z)) + 0j for x, y, z in frequencies])
     assert np.abs(values.values[chosen] - expected).max() < 1e-4 * surface.area
     assert (values.error_norms(ORDERS) <= 10 * np.array(TARGET.norms)).all()
-
-
-def surface_nodes(surface: Surface) -> tuple[Reals, Reals]:
-    """Nodes (3, n) and weights of a sphere or torus, by rules of their angles."""
-    turns = 2 * np.pi * np.arange(200) / 200
-    if isinstance(surface, Torus):
-        u, v = (angles.ravel() for angles in np.meshgrid(turns, turns))
-        ring = 0.8 + 0.3 * np.cos(v)
-        nodes = np.stack([ring * np.cos(u), ring * np.sin(u), 0.3 * np.sin(v)])
-        return nodes, 0.3 * ring * (2 * np.pi / 200) ** 2
-    heights, weights = np.polynomial.legendre.leggauss(100)
-    z, u = (angles.ravel() for angles in np.meshgrid(heights, turns))
-    across = np.sqrt(1 - z**2)
-    nodes = 0.8 * np.stack([across * np.cos(u), across * np.sin(u), z]) + np.array([[0.1], [0.2], [-0.4]])
-    return nodes, 0.64 * np.tile(weights, (200, 1)).ravel() * 2 * np.pi / 200
 
 
 @pytest.mark.parametrize(("intervals", "draws"), [(8, 0), (12, 0), (0, 400), (8, 300)])
