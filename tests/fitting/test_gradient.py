@@ -89,7 +89,6 @@ def moved(mesh: sb.Mesh, *by: float) -> sb.Mesh:
 MESHES = {
     "ball": sb.icosphere(0),
     "wrinkled": wrinkled(1),
-    "open": sb.Mesh(sb.icosphere(0).vertices, sb.icosphere(0).triangles[:7]),
     "a single triangle": sb.Mesh([[0.0, 0, 0], [2.0, 0, 0], [0.0, 1.5, 0.5]], [[0, 1, 2]]),
     "slivers": sb.Mesh([[0.0, 0, 0], [1.0, 0, 0], [2.0, 1e-6, 0], [1.0, 1e-3, 1]], [[0, 1, 2], [0, 2, 3], [1, 2, 3]]),
     "three at an edge": sb.Mesh(
@@ -101,9 +100,8 @@ MESHES = {
         np.concatenate([3 * tetrahedron().vertices - 1, 1e-3 * tetrahedron().vertices]),
         np.concatenate([tetrahedron().triangles, tetrahedron().triangles + 4]),
     ),
-    "stray vertices": sb.Mesh(
-        np.concatenate([tetrahedron().vertices, [[50.0, 0, 0]]]),
-        [[0, 2, 1], [0, 1, 3], [1, 2, 3]],
+    "open, with a stray vertex": sb.Mesh(
+        np.concatenate([tetrahedron().vertices, [[50.0, 0, 0]]]), [[0, 2, 1], [0, 1, 3], [1, 2, 3]]
     ),
 }
 

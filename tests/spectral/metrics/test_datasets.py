@@ -9,7 +9,6 @@ import pytest
 import xarray as xr
 
 from sobolev_batch import (
-    InputError,
     Lattice,
     Sphere,
     distance,
@@ -50,11 +49,6 @@ def test_settings_of_an_accuracy_are_attributes_and_closed_forms_have_none() -> 
     assert dataset["within"].attrs["long_name"]
     chosen = {"kernel", "rtol", "xi_max", "M", "octaves", "highest_frequency", "seed"}
     assert chosen | {"dtype", "eps", "tolerance", "points"} == set(dataset.attrs)
-
-
-def test_parts_of_fields_are_no_fields() -> None:
-    with pytest.raises(InputError, match="a Fourier field has complex values, found float64"):
-        distance(fourier_transform(icosphere(0), Lattice(2.0, 16)).real, Sphere(), -2.0)
 
 
 def test_witness_keeps_the_points() -> None:

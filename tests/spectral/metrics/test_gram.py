@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Sphere, distance, fourier_transform, icosphere
-from sobolev_batch.spectral.budget import Sums, add_sums, sums_of_shells
+from sobolev_batch.spectral.budget import add_sums, sums_of_shells
 from sobolev_batch.spectral.metrics.gram import Arrangement, differences
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.surfaces.shapes.surface import Surface
@@ -71,18 +71,3 @@ def test_outer_energies_of_near_twins_are_those_of_their_difference() -> None:
     sums, _ = differences(arrangement.products(pair, pair), squares, squares)
     expected = arrangement.squares((twin - one)[arrangement.order][None])
     assert sums.outer[:, 0, 1] == pytest.approx(expected.outer[:, 0], rel=1e-9)
-
-
-def single(value: float, *shape: int) -> Sums:
-    """Return sums of one order with all of the square in the first residue."""
-    squares = np.zeros((1, 4, *shape))
-    squares[0, 0] = value
-    return Sums(squares, np.zeros((2, *shape)))
-
-
-def test_near_twins_are_reported() -> None:
-    _, cancelled = differences(single(4.0 - 1e-7, 1, 1), single(4.0, 1), single(4.0, 1))
-    assert cancelled[0, 0]
-    sums, cancelled = differences(single(3.9, 1, 1), single(4.0, 1), single(4.0, 1))
-    assert not cancelled[0, 0]
-    assert sums.squares.sum() == pytest.approx(0.2)
