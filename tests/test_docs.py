@@ -125,14 +125,10 @@ def test_every_command_is_listed_with_its_functions() -> None:
 def test_the_citation_is_of_this_version() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert citation["cff-version"] == "1.2.0"
-    assert citation["message"]
-    assert citation["title"] == project["name"]
-    assert citation["version"] == project["version"]
-    assert citation["license"] == project["license"]
-    assert citation["authors"] == project["authors"]
+    assert [citation[key] for key in ("title", "version", "license", "authors")] == [
+        project[key] for key in ("name", "version", "license", "authors")
+    ]
     (paper,) = citation["references"]
-    assert {"type", "title", "authors"} <= paper.keys()
     assert paper["authors"][0]["family-names"] == "Koga"
     numerics = (ROOT / "docs" / "numerics.md").read_text(encoding="utf-8")
     assert paper["title"] in " ".join(numerics.split())
