@@ -179,11 +179,6 @@ def chosen_orders(dataset: xr.Dataset, order: Orders | None) -> list[float]:
     return chosen
 
 
-def chosen_order(tree: xr.DataTree, order: float | None) -> float:
-    """Return one of the orders of an open store, default its first; InputError as of `chosen_orders`."""
-    return chosen_orders(finished_group(tree, "convergence", load=False), order)[0]
-
-
 def has_proximity(tree: xr.DataTree) -> bool:
     """Return True if the store has Hausdorff and Chamfer distances."""
     return "proximity" in tree.children

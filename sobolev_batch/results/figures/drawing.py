@@ -306,7 +306,7 @@ def _orders_if(has: Callable[[Selection], object]) -> Callable[[Selection], Sequ
 PLOTS: dict[str, Plot] = {
     "convergence": Plot(draw_convergence, lambda selection: selection.orders, 3.6),
     "over-time": Plot(draw_evolution, _orders_if(moving_families), 3.6),
-    "matrix": Plot(draw_matrix, _orders_if(has_pairs), 5.6, "compressed"),
+    "matrix": Plot(draw_matrix, _orders_if(has_pairs), 5.6),
     "spectrum": Plot(draw_spectrum, _orders_if(lambda selection: selection.has_spectra), 4.0),
     "energy": Plot(draw_energy, lambda selection: (None,) if selection.has_spectra else (), 3.6),
 }

@@ -170,11 +170,7 @@ def exported(
 ) -> tuple[StudyMeshes, tuple[str, ...], tuple[float, ...]]:
     """Return the meshes of a store, with the labels and the orders whose witness functions are to be written.
 
-    Args:
-        store: Path, URL or opened DataTree of the store.
-        meshes: Labels, or patterns such as "scans/*"; by default all computed ones with triangles but the reference.
-        order: One order below -1/2, or several; by default those of the study.
-        folder: Folder where relative paths in the study start.
+    By default these are all computed meshes with triangles but the reference, and the orders of the study.
 
     Raises:
         InputError: The store has no tables yet, no field of its reference or no such label, or the label is that of the
@@ -251,14 +247,8 @@ def write_vertex_values(
 ) -> None:
     """Write a mesh with its witness function, in the format of the path's suffix, one of `SUFFIXES`.
 
-    Args:
-        path: File to write.
-        mesh: Mesh in its own unit of length.
-        values: Witness function (orders, vertices) in 1 / unit length of the context.
-        orders: Orders s.
-        title: What was compared with what.
-        unit: Unit of length of the context, in that of the mesh.
-        context: Where the mesh was compared: a "study" or a "comparison".
+    The mesh is in its own unit of length; the values (orders, vertices) are in 1 / unit length of the context, a
+    "study" or a "comparison", whose unit is given in that of the mesh. The title says what was compared with what.
 
     Raises:
         InputError: The library that writes the format is not installed.

@@ -26,8 +26,6 @@ from sobolev_batch.visible import visible
 Reals = NDArray[np.float64]
 # Width and height in inches.
 Size = tuple[float, float]
-# Layouts that leave room for labels and legends; the latter is for axes of a fixed aspect, such as images.
-Layout = Literal["constrained", "compressed"]
 PictureFormat = Literal["png", "svg", "pdf"]
 
 WIDTH_INCHES = 6.4
@@ -80,19 +78,17 @@ class Plot:
         draw: Function that draws an item of the subject on axes.
         items: Function that returns the items, such as orders; none where the subject has nothing to draw.
         height: Height of a panel in inches.
-        layout: Layout of the figure.
     """
 
     draw: Callable[[Any, Any, Axes], None]
     items: Callable[[Any], Sequence[Any]]
     height: float
-    layout: Layout = "constrained"
 
     def figure(self, subject: Any, items: Sequence[Any] | None = None, size: Size | None = None) -> Figure:
         """Return a figure with a panel of a size for each item, default all, below each other, and one legend."""
         items = self.items(subject) if items is None else items
         width, height = size or (WIDTH_INCHES, self.height)
-        figure = Figure(figsize=(width, height * len(items)), layout=self.layout)
+        figure = Figure(figsize=(width, height * len(items)), layout="constrained")
         for item, axes in zip(items, figure.subplots(len(items), 1, squeeze=False)[:, 0], strict=True):
             self.draw(subject, item, axes)
         _add_legend(figure)
@@ -129,9 +125,7 @@ def _add_legend(figure: Figure) -> None:
     place: Literal["outside right upper", "outside lower center"] = (
         "outside right upper" if is_beside else "outside lower center"
     )
-    figure.legend(
-        list(entries.values()), list(entries), loc=place, ncols=columns, fontsize="small", frameon=False
-    )  # fmt: skip
+    figure.legend([*entries.values()], [*entries], loc=place, ncols=columns, fontsize="small", frameon=False)
 
 
 def hide_frame(axes: Axes) -> None:

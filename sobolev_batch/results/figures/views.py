@@ -37,7 +37,7 @@ from sobolev_batch.results.open import (
     Families,
     as_tree,
     chosen_families,
-    chosen_order,
+    chosen_orders,
     fields_read,
     finished_group,
 )
@@ -161,15 +161,8 @@ def make_views(
 ) -> tuple[list[MeshView], dict[str, str]]:
     """Make a few meshes of a store again, by its study, and evaluate their witness functions on them.
 
-    Args:
-        tree: Open store.
-        folder: Folder where relative paths in the study start.
-        meshes: Labels, or patterns such as "scans/*"; by default the closest mesh of each chosen family at the first
-            order, and the farthest ones.
-        limits: Numbers of meshes, of triangles of each, and of values of all of them at most.
-        up: Axis that points upwards in the meshes' own coordinates.
-        orders: Orders s of the witness functions; default the store's.
-        family: Families to choose from, by names or globs; default all.
+    Without labels or patterns of meshes, they are the closest mesh of each chosen family at the first order, and the
+    farthest ones. The limits are those of `PAGE_LIMITS`, and the folder is where relative paths in the study start.
 
     Returns:
         Views in the order of the study, and the reason for each requested mesh without a view, by its label.
@@ -305,7 +298,7 @@ def plot_witness(
     >>> ax = sb.plot_witness("storage/icosphere.zarr", "icosphere/1", order=-4)  # doctest: +SKIP
     """
     tree = as_tree(store)
-    order = chosen_order(tree, order)
+    (order, *_) = chosen_orders(finished_group(tree, "convergence"), order)
     with fields_read(store):
         views, missing = make_views(tree, folder, [mesh], PICTURE_LIMITS, up, [order])
     if len(views) + len(missing) > 1:
@@ -332,16 +325,7 @@ def write_witness_plots(
     """Draw meshes of an open store, coloured by their witness functions, into a folder.
 
     Each mesh gets a file witness-* with colours and a view of its own; several are also drawn beside each other in the
-    file witness, seen from the front and on one scale of colours, at the first order.
-
-    Args:
-        selection: Store, orders, and families to choose from.
-        output_folder: Folder of the pictures.
-        folder: Folder where relative paths in the study start.
-        meshes: Labels, or patterns such as "scans/*"; by default those that `make_views` chooses.
-        up: Axis that points upwards in the meshes' own coordinates.
-        formats: Formats of each picture.
-        size: Width and height of each picture in inches; default those of the plots.
+    file witness, seen from the front and on one scale of colours, at the first order. See `make_views` for the rest.
 
     Returns:
         Paths of the pictures, and the reason for each mesh without one.

@@ -57,8 +57,8 @@ def league_content(collection: CollectionStore, status: Status) -> dict[str, Any
     except InputError as error:
         leagues, no_league = (), str(error)
     orders = list(dict.fromkeys(float(s) for frame in tables.values() for s in frame["order"]))
-    objects = [row for s in orders for row in _object_rows(tables, s, _at(leagues, s))]
-    at_orders = [league.order for league in leagues]
+    by_order = {league.order: league for league in leagues}
+    objects = [row for s in orders for row in _object_rows(tables, s, by_order.get(s))]
     ranked, pairs = ([row for league in leagues for row in _rows(league, name)] for name in ("table", "pairs"))
     versions = open_store(collection.location.below(next(iter(tables)))).attrs["versions"]
     return {
@@ -68,15 +68,11 @@ def league_content(collection: CollectionStore, status: Status) -> dict[str, Any
         "sentences": tuple(map(sentence_of, leagues)) or (_NO_LEAGUE,) * len(orders),
         "differences": tuple(tuple(pair_lines(one)) for one in leagues),
         "note": LEAGUE_NOTE.format(x=leagues[0].x).replace("\n", " ") if leagues else "",
-        "league": PageTable("league", _LEAGUE_COLUMNS, ranked, at_orders),
-        "pairs": PageTable("pairs", PAIR_COLUMNS, pairs, at_orders) if pairs else None,
+        "league": PageTable("league", _LEAGUE_COLUMNS, ranked, [*by_order]),
+        "pairs": PageTable("pairs", PAIR_COLUMNS, pairs, [*by_order]) if pairs else None,
         "objects": PageTable("objects", _OBJECT_COLUMNS, objects, orders),
         "omissions": tuple(_omissions(collection, leagues)),
     }
-
-
-def _at(leagues: Sequence[League], order: float) -> League | None:
-    return next((one for one in leagues if one.order == order), None)
 
 
 def sentence_of(league: League) -> str:

@@ -53,14 +53,14 @@ AnyCollection = str | Path | Location | Mapping[str, AnyStore]
 _KEYS = ["order", "mesh"]
 
 
-def percent_text(value: float) -> str:
-    """Return a fraction in per cent, with ? for one that nothing bounds."""
-    return "" if math.isnan(value) else "?" if math.isinf(value) else f"{100 * value:.3g} %"
-
-
-def number_text(value: float) -> str:
+def number_text(value: float, unit: str = "") -> str:
     """Return a number with three digits, with ? for one that nothing bounds."""
-    return "" if math.isnan(value) else "?" if math.isinf(value) else f"{value:.3g}"
+    return "" if math.isnan(value) else "?" if math.isinf(value) else f"{value:.3g}{unit}"
+
+
+def percent_text(value: float) -> str:
+    """Return the same of a fraction in per cent."""
+    return number_text(100 * value, " %")
 
 
 def _interval(shown: Callable[[float], str]) -> Callable[[float, float], str]:

@@ -38,17 +38,10 @@ _NOTE = "Errors are meant as bounds. The columns have the numbers of the rows; t
 def pairs_of(
     tree: xr.DataTree, order: float, most: int | None = None, among: Collection[str] | None = None
 ) -> xr.Dataset | None:
-    """Return the distances of one order between all meshes that are computed, and their errors.
+    """Return `distance` and `error` of one order between the computed meshes, over `mesh` and `other`, symmetric.
 
-    Args:
-        tree: Open store.
-        order: One of its orders.
-        most: Number of meshes to keep: the first ones and the reference; default all.
-        among: Labels to keep beside the reference; default all.
-
-    Returns:
-        The variables `distance` and `error` over `mesh` and `other`, symmetric; None where the study requests
-        distances to the reference alone.
+    They may be limited to a number of meshes, the first ones and the reference, and to some labels beside it. None
+    where the study requests distances to the reference alone.
     """
     distances = finished_group(tree, "distances", load=False)
     (order,) = chosen_orders(distances, order)

@@ -138,13 +138,9 @@ def middle_cut(label: str, longest: int) -> str:
 
 
 def answer(name: str, reference: str, result: xr.Dataset | Mapping[str, float], area_change: float) -> str:
-    """Return a sentence that says how much a surface differs from the reference at one order.
+    """Return a sentence that says how much a surface differs from the reference, from `distance` at one order.
 
-    Args:
-        name: Name of the surface.
-        reference: Name of the reference.
-        result: Variables of `distance` at one order, and the order.
-        area_change: Area of the surface over that of the reference, minus one.
+    The change of area is the area of the surface over that of the reference, minus one.
     """
     numbers = {key: float(result[key]) for key in ("distance", "error", "relative", "relative_error")}
     at_order = f"at order {float(result['order']):g}"
@@ -161,12 +157,7 @@ def answer(name: str, reference: str, result: xr.Dataset | Mapping[str, float], 
 
 
 def likeness(name: str, reference: str, result: xr.Dataset | Mapping[str, float]) -> str:
-    """Return a sentence that says which changes of the reference bring it as far from itself as a surface is.
-
-    Args:
-        name: Name of the surface.
-        reference: Name of the reference.
-        result: Variables of `yardsticks` at one order, and the order.
+    """Return a sentence about changes that bring the reference as far from itself, from `yardsticks` at one order.
 
     >>> amounts = {"order": -2.0, "moved": 0.0081, "noise": 0.0032, "decimated": 2312.0}
     >>> errors = {"moved_error": 1e-4, "noise_error": 1e-4, "decimated_error": 40.0}
