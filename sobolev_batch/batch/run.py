@@ -30,10 +30,11 @@ from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.batch.study.study import Study, StudyCollection
 from sobolev_batch.batch.verify import damaged_rows
 from sobolev_batch.batch.workspace import Workspace, failed_proximities
-from sobolev_batch.errors import DamageError, InputError
+from sobolev_batch.errors import DamageError, InputError, StudyError
 from sobolev_batch.parameters import available_cores, require_machine_memory
 from sobolev_batch.spectral.adaptive.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.spectral.budget import NormEstimate
+from sobolev_batch.surfaces.sources.mesh_cache import MeshCache
 from sobolev_batch.visible import reasons, table_html
 
 _log = logging.getLogger(__name__)
@@ -41,6 +42,8 @@ _log = logging.getLogger(__name__)
 # A study whose distances miss the accuracy requested is computed again on a larger lattice,
 # this often in all.
 _MOST_ROUNDS = 3
+# Folder beside a store for the meshes that its study makes, and commands that a refusal lists.
+_MADE_MESHES, _MOST_COMMANDS = "made-meshes", 3
 # Fields that turn out damaged are computed again; where that goes on, something destroys them.
 _MOST_REPAIRS = 3
 
@@ -93,6 +96,7 @@ def run(
     workers: int | None = None,
     memory: float | str | None = None,
     on_progress: Notify | None = None,
+    allow_commands: bool = False,
 ) -> Summary:
     """Compute the fields that a store lacks of a study, then norms, distances and convergence tables.
 
@@ -105,13 +109,14 @@ def run(
         workers: Number of these processes; by default one for each core.
         memory: Memory of each of them, in bytes or as a text such as "4GB"; by default equal parts of the machine's.
         on_progress: Callback for each step; it is called in this thread.
+        allow_commands: True if the study may run its commands on the workers and here: you trust its file.
 
     Returns:
         Meshes that were computed, that were reused, and that failed. A mesh that fails does not raise. In a collection,
         neither does an object whose study cannot be carried out; labels begin with the name of the object.
 
     Raises:
-        StudyError, MeshError, LatticeError: The study cannot be carried out.
+        StudyError, MeshError, LatticeError: The study cannot be carried out, or runs commands and may not.
         AccuracyError: The accuracy that the study requests is out of reach; nothing was computed.
         StoreError: The store cannot be reached or written, belongs to another study, or is being written by another run
             (LockError).
@@ -135,6 +140,8 @@ def run(
     location = Location.parse(store)
     if client is not None:
         location = location.absolute()
+    require_permission(study, allow_commands)
+    study = study.with_cache(mesh_cache(location, may_run=True))
     notify = on_progress or _ignore
     with ExitStack() as stack:
         # One cluster serves all studies, and none is started where nothing is missing.
@@ -157,6 +164,24 @@ def run(
 
 def _ignore(progress: Progress) -> None:
     """Report a step of a run to nobody."""
+
+
+def require_permission(study: Study | StudyCollection, allow_commands: bool) -> None:
+    """Refuse a study that runs commands and may not.
+
+    Raises:
+        StudyError: It does.
+    """
+    if study.commands and not allow_commands:
+        raise StudyError(
+            f"the study runs commands: {', '.join(study.commands[:_MOST_COMMANDS])}; if you trust it, allow them by "
+            "--allow-commands (in Python: allow_commands=True)"
+        )
+
+
+def mesh_cache(location: Location, may_run: bool) -> MeshCache:
+    """Return the place beside a store where its study keeps the meshes that it makes; stores there share it."""
+    return MeshCache(location.absolute().beside(_MADE_MESHES), may_run)
 
 
 def _own_cluster(

@@ -6,9 +6,8 @@ import logging
 import time
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 from uuid import uuid4
 
 from distributed import Client, Future, Status, fire_and_forget, get_worker, worker_client
@@ -16,7 +15,7 @@ from distributed import Client, Future, Status, fire_and_forget, get_worker, wor
 from sobolev_batch.batch.cluster.watch import Watch
 from sobolev_batch.batch.cluster.workers import prepare_workers, require_store_access
 from sobolev_batch.batch.collection_store import CollectionStore, for_each_object
-from sobolev_batch.batch.run import carry_out
+from sobolev_batch.batch.run import carry_out, mesh_cache, require_permission
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, acquire, release
 from sobolev_batch.batch.store.create import require_usable
@@ -58,7 +57,9 @@ class Submission:
     refused: Mapping[str, str] = field(default_factory=dict)
 
 
-def submit(study: Study | StudyCollection, store: str | Path | Location, client: Client) -> Submission:
+def submit(
+    study: Study | StudyCollection, store: str | Path | Location, client: Client, *, allow_commands: bool = False
+) -> Submission:
     """Hand a study over to a cluster and return; it goes on without this process.
 
     One of the workers drives it, in a thread besides those for tasks; should that worker be lost,
@@ -69,6 +70,7 @@ def submit(study: Study | StudyCollection, store: str | Path | Location, client:
         study: Study to carry out, of one object or of several.
         store: Path or URL of a new or existing store, which this process and all workers reach under this name.
         client: Client of the cluster; it may be closed afterwards.
+        allow_commands: True if the study may run its commands on the workers and here: you trust its file.
 
     Raises:
         StudyError, MeshError, LatticeError, AccuracyError, StoreError: See `run`; nothing was handed over.
@@ -80,6 +82,8 @@ def submit(study: Study | StudyCollection, store: str | Path | Location, client:
     2
     """
     location = Location.parse(store).absolute()
+    require_permission(study, allow_commands)
+    study = study.with_cache(mesh_cache(location, may_run=True))
     if isinstance(study, Study):
         return _submit(study, location, client)
     CollectionStore.prepared(location, study)
@@ -104,7 +108,7 @@ def _submit(study: Study, location: Location, client: Client) -> Submission:
         heartbeat = Heartbeat(workspace.store, lock)
         heartbeat.cluster = client.scheduler.address
         heartbeat.write("submitted")
-        arguments = dict(study.table), str(study.folder.absolute()), workspace.store.path, lock.run
+        arguments = replace(study, folder=study.folder.absolute()), workspace.store.path, lock.run
         # Before all tasks of other studies, from which it takes no thread: it leaves its own at once.
         future = client.submit(drive, *arguments, key=f"sobolev-batch-drive-{uuid4().hex}", pure=False, priority=1)
         fire_and_forget(future)
@@ -115,7 +119,7 @@ def _submit(study: Study, location: Location, client: Client) -> Submission:
     return Submission(workspace.store.path, len(plan.rows), len(workspace.pending))
 
 
-def drive(table: Mapping[str, Any], folder: str, store: str, run: str) -> None:
+def drive(study: Study, store: str, run: str) -> None:
     """Run a study from a worker of the cluster that computes it, with the lock of its submission.
 
     This does not raise: the store says what went wrong, and trying again would not help.
@@ -129,7 +133,6 @@ def drive(table: Mapping[str, Any], folder: str, store: str, run: str) -> None:
             return
         acquire(location, lock)
         with worker_client() as client:
-            study = Study.from_table(table, folder=folder)
             carry_out(study, location, lock, lambda: client)
     except Exception as error:
         if get_worker().status != Status.running:

@@ -138,6 +138,9 @@ best_effort_option = click.option(
     is_flag=True,
     help="Take the nearest attainable accuracy where the requested one is out of reach, and mark it.",
 )
+allow_commands_option = click.option(
+    "--allow-commands", is_flag=True, help="Let the commands of STUDY run, which make its meshes: you trust its file."
+)
 trust_option = click.option(
     "--trust-network",
     is_flag=True,

@@ -13,6 +13,7 @@ import click
 from sobolev_batch.cli.common import (
     EXIT_SOME_FAILED,
     PATH,
+    allow_commands_option,
     best_effort_option,
     cli,
     echo,
@@ -70,6 +71,7 @@ def init_command(folder: Path, output: Path) -> None:
 )
 @memory_option("Limit the memory of each process, such as 4GB. [default: equal parts]")
 @best_effort_option
+@allow_commands_option
 @click.pass_context
 def run_command(
     context: click.Context,
@@ -80,6 +82,7 @@ def run_command(
     workers: int | None,
     memory: int | None,
     best_effort: bool,
+    allow_commands: bool,
 ) -> None:
     """Compute what is missing of STUDY and print its tables.
 
@@ -103,10 +106,10 @@ def run_command(
     with progress_reports() as show:
         if scheduler:
             with remote_client(scheduler, trust_network) as client:
-                summary = run(parsed, place, client, on_progress=show)
+                summary = run(parsed, place, client, on_progress=show, allow_commands=allow_commands)
         else:
             limit = None if memory is None else f"{memory}B"
-            summary = run(parsed, place, workers=workers, memory=limit, on_progress=show)
+            summary = run(parsed, place, workers=workers, memory=limit, on_progress=show, allow_commands=allow_commands)
     if isinstance(parsed, Study):
         echo_lines(format_table(open_store(place)))
     else:
@@ -138,6 +141,7 @@ def run_command(
 @trust_option
 @store_option
 @best_effort_option
+@allow_commands_option
 @click.pass_context
 def submit_command(
     context: click.Context,
@@ -146,6 +150,7 @@ def submit_command(
     trust_network: bool,
     store: Location | None,
     best_effort: bool,
+    allow_commands: bool,
 ) -> None:
     """Hand STUDY over to a cluster and return.
 
@@ -158,7 +163,7 @@ def submit_command(
     parsed = _parsed(study, best_effort=best_effort)
     location = (store or _made_default_store(parsed)).absolute()
     with remote_client(scheduler, trust_network) as client:
-        submission = submit(parsed, location, client)
+        submission = submit(parsed, location, client, allow_commands=allow_commands)
 
     def show(one: Submission) -> None:
         echo(f"{one.missing} of {one.surfaces} surfaces to be computed by the cluster at {scheduler}")
@@ -182,6 +187,7 @@ def submit_command(
 )
 @trust_option
 @best_effort_option
+@allow_commands_option
 @click.pass_context
 def plan_command(
     context: click.Context,
@@ -190,6 +196,7 @@ def plan_command(
     scheduler: str | None,
     trust_network: bool,
     best_effort: bool,
+    allow_commands: bool,
 ) -> None:
     """Show what running STUDY would do.
 
@@ -203,9 +210,9 @@ def plan_command(
     parsed = _parsed(study, best_effort=best_effort)
     with remote_client(scheduler, trust_network) if scheduler else nullcontext() as client:
         if isinstance(parsed, Study):
-            echo_lines(plan(parsed, store, client))
+            echo_lines(plan(parsed, store, client, allow_commands=allow_commands))
             return
-        made = plan(parsed, store, client)
+        made = plan(parsed, store, client, allow_commands=allow_commands)
     _show_objects(parsed, made.objects, made.refused, echo_lines, "planned")
     echo(made.total)
     if made.refused:

@@ -14,6 +14,7 @@ from sobolev_batch.batch.analysis.tabulate import pairs_bytes
 from sobolev_batch.batch.cluster.workers import Workers, prepare_workers, worker_slowness
 from sobolev_batch.batch.collection_store import for_each_object
 from sobolev_batch.batch.fields.compute import TaskSizes, size_rows
+from sobolev_batch.batch.run import mesh_cache, require_permission
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store, stored_choice
@@ -185,6 +186,9 @@ def _study_lines(plan: Plan) -> Iterator[tuple[str, str]]:
         yield from (("chosen", reason) for reason in plan.choice.reasons)
         yield "transform", f"{plan.choice.dtype}, eps and quadrature for each surface from its distance"
     yield "backend", study.backend
+    yield from (("command", command) for command in study.commands)
+    if study.commands:
+        yield "", "they run only with --allow-commands (in Python: allow_commands=True)"
     if study.proximity is not None:
         yield "proximity", f"Hausdorff and Chamfer distances, from {study.proximity:,} points on each mesh"
 
@@ -258,13 +262,21 @@ class CollectionPlan:
 
 @overload
 def plan(
-    study: StudyCollection, store: str | Path | Location | None = None, client: Client | None = None
+    study: StudyCollection,
+    store: str | Path | Location | None = None,
+    client: Client | None = None,
+    *,
+    allow_commands: bool = False,
 ) -> CollectionPlan: ...
 
 
 @overload
 def plan(
-    study: Study | str | Path, store: str | Path | Location | None = None, client: Client | None = None
+    study: Study | str | Path,
+    store: str | Path | Location | None = None,
+    client: Client | None = None,
+    *,
+    allow_commands: bool = False,
 ) -> StudyPlan: ...
 
 
@@ -272,6 +284,8 @@ def plan(
     study: Study | StudyCollection | str | Path,
     store: str | Path | Location | None = None,
     client: Client | None = None,
+    *,
+    allow_commands: bool = False,
 ) -> StudyPlan | CollectionPlan:
     """Return what running a study would do, without computing anything.
 
@@ -282,6 +296,7 @@ def plan(
         study: Study of one object or of several, or the path of a study file of one object.
         store: Path or URL of a new or existing store; default storage/NAME.zarr.
         client: Client of the cluster to plan for; default processes on this machine, one per core.
+        allow_commands: True if the commands of the study may run here, which make the few surfaces that are loaded.
 
     Raises:
         StudyError, MeshError, LatticeError: The study cannot be carried out.
@@ -301,6 +316,7 @@ def plan(
     """
     study = study if isinstance(study, Study | StudyCollection) else Study.from_toml(study)
     location = default_store(study) if store is None else Location.parse(store)
+    study = study.with_cache(mesh_cache(location, allow_commands))
     if isinstance(study, StudyCollection):
         return CollectionPlan(*for_each_object(study, location, lambda _, part, place: _plan(part, place, client)))
     return _plan(study, location, client)
@@ -310,6 +326,9 @@ def _plan(study: Study, location: Location, client: Client | None) -> StudyPlan:
     workers = Workers.of_this_machine(available_cores()) if client is None else prepare_workers(client, study.libraries)
     workers.require_accuracy(study.accuracy)
     earlier_choice, started = stored_choice(location), time.process_time()
+    if study.accuracy is not None and earlier_choice is None and not (study.cache and study.cache.may_run):
+        # A few meshes decide on the lattice.
+        require_permission(study, allow_commands=False)
     study_plan = make_plan(study, earlier_choice)
     planning_seconds = 0.0 if study_plan.choice is earlier_choice else time.process_time() - started
     sizes, refused = size_rows(study_plan, study_plan.rows, workers.with_backend(study.backend))

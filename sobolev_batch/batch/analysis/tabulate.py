@@ -29,6 +29,7 @@ from sobolev_batch.errors import DamageError
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.budget import NormEstimate
 from sobolev_batch.spectral.metrics.datasets import describe, observed_rates
+from sobolev_batch.surfaces.sources.mesh_cache import Cost
 from sobolev_batch.surfaces.sources.names import natural_key
 
 # Raise it whenever tables hold something that those of older versions lack: they are then made again.
@@ -36,6 +37,8 @@ TABLES_VERSION = 7
 
 # Columns of the table of meshes that all tables have as coordinates, besides times and other metadata.
 _COORDINATES = ("family", "name", "level", "status", "vertices", "triangles", "edge_length_mean", "seconds")
+# Those that only some studies have.
+_SOME = {"time", *(item.name for item in fields(Cost))}
 # Numbers in the driver's memory for each pair and order, as measured: results, and copies of a table that is written.
 _NUMBERS_OF_A_PAIR = 10
 
@@ -214,7 +217,7 @@ class Results:
     def _table(self, columns: Mapping[str, NDArray[Any]], *dimensions: str) -> xr.Dataset:
         """Return values (orders, ...) as variables whose last dimension is the order."""
         variables = {name: ((*dimensions, "order"), np.moveaxis(values, 0, -1)) for name, values in columns.items()}
-        names = [*_COORDINATES, *({"time"} & self.meshes.coords.keys()), *self.meshes.attrs.get("metadata", ())]
+        names = [*_COORDINATES, *(_SOME & self.meshes.coords.keys()), *self.meshes.attrs.get("metadata", ())]
         coordinates = self.meshes.reset_coords()[names].rename(edge_length_mean="edge_length")
         orders = np.array(self.orders, dtype=np.float64)
         return describe(xr.Dataset(variables, coords={**coordinates.variables, "order": ("order", orders)}))
@@ -308,6 +311,9 @@ def _meshes_table(workspace: Workspace) -> xr.Dataset:
         # Nothing is known of a mesh that failed, which is not zero.
         numbers_or_texts = _strings(values) if isinstance(item.default, str) else np.where(is_complete, values, np.nan)
         columns[item.name] = numbers_or_texts
+    if any(record.cost for record in filled):
+        costs = [record.cost or Cost() for record in filled]
+        columns |= {item.name: np.array([getattr(cost, item.name) for cost in costs]) for item in fields(Cost)}
     columns["seconds"] = np.array([record.seconds for record in filled])
     for name in ("worker", "backend", "finished", "key"):
         columns[name] = _strings([getattr(record, name) for record in filled])
@@ -319,7 +325,7 @@ def _meshes_table(workspace: Workspace) -> xr.Dataset:
     table = xr.Dataset(variables, attrs={"metadata": list(metadata)})
     # Texts have no missing value, which `where` needs of variables that are no coordinates.
     texts = [name for name, values in columns.items() if values.dtype == object]
-    return describe(table.set_coords([*texts, *_COORDINATES, *({"time"} & columns.keys()), *metadata]))
+    return describe(table.set_coords([*texts, *_COORDINATES, *(_SOME & columns.keys()), *metadata]))
 
 
 def _metadata(rows: Sequence[Row]) -> dict[str, NDArray[np.generic]]:

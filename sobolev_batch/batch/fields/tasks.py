@@ -271,6 +271,7 @@ def _finished(job: Job, stored: Sequence[StoredBlocks]) -> Record:
         worker=_worker_address(),
         backend=", ".join(backends),
         finished=utc_now(),
+        cost=job.row.member.cost(),
     )
     if errors := [blocks.error for blocks in stored if blocks.error]:
         record = replace(record, status="failed", reason=errors[0])

@@ -100,6 +100,10 @@ class Location:
         """Return the same location for writers that have to stop once a condition fails."""
         return replace(self, fence=fence)
 
+    def beside(self, name: str) -> Location:
+        """Return the location of a name in the folder of this one."""
+        return Location(f"{self.name.rpartition('/')[0]}/{name}" if self.scheme else str(Path(self.name).parent / name))
+
     def below(self, name: str) -> Location:
         """Return the location of a name below this one."""
         return Location(f"{self.name}/{name}" if self.scheme else str(Path(self.name) / name))

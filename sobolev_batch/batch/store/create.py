@@ -314,6 +314,7 @@ def _attributes(plan: Plan, labels: Sequence[str]) -> dict[str, Any]:
             "orders": list(study.orders),
             "reference": plan.reference,
             "table": dict(study.table),
+            "mesh_cache": str(study.cache.folder) if study.cache else None,
         },
         REMOVED: [label for label in labels if label not in planned],
         "similarity": _similarity_entry(plan.similarity),

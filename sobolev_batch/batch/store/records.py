@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Literal, Self, TypeVar, cast
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from sobolev_batch.errors import DamageError
+from sobolev_batch.surfaces.sources.mesh_cache import Cost
 
 Status = Literal["complete", "failed"]
 RunState = Literal["submitted", "running", "done", "failed"]
@@ -109,6 +110,7 @@ class Record:
         backend: Backend of the transform.
         finished: Time at which it was finished, in UTC.
         proximity: Hausdorff and Chamfer distances from the reference, where the study requests them.
+        cost: What making the surface took, where that is known.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
@@ -124,6 +126,7 @@ class Record:
     backend: str = ""
     finished: str = ""
     proximity: ProximityRecord | None = None
+    cost: Cost | None = None
 
     def completes(self, key: str) -> bool:
         """Return whether the field with this key exists already."""

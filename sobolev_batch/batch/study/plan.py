@@ -26,6 +26,7 @@ from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.spectral.transform.transform import NUMERICS_VERSION, require_inside
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Extent, Similarity, Surface
+from sobolev_batch.surfaces.sources.command import RemeshedMember
 from sobolev_batch.surfaces.sources.names import quoted
 from sobolev_batch.surfaces.sources.registry import Member, single_member
 
@@ -187,6 +188,10 @@ def members_of(study: Study) -> dict[str, tuple[str, Member]]:
             label = f"{family.name}/{member.name}"
             if label in members:
                 raise StudyError(f"two surfaces of the study have the label {label!r}")
+            if isinstance(member, RemeshedMember):
+                # What was wanted, beside what came of it.
+                named = ((f"target_{name}" if name in VARIABLES else name, value) for name, value in member.metadata)
+                member = replace(member, metadata=tuple(named))
             taken = next((name for name, _ in member.metadata if name in VARIABLES), None)
             if taken is not None:
                 raise StudyError(

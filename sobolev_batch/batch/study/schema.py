@@ -40,6 +40,7 @@ from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.surfaces.formats.parsing import open_regular
 from sobolev_batch.surfaces.proximity import DEFAULT_POINTS, MOST_POINTS
 from sobolev_batch.surfaces.shapes.surface import Similarity
+from sobolev_batch.surfaces.sources.command import function_version
 from sobolev_batch.surfaces.sources.files import MeshTable, checked_list
 from sobolev_batch.surfaces.sources.names import name_problem, quoted
 from sobolev_batch.surfaces.sources.registry import Source, at_most, parse_source, source_type_of
@@ -357,6 +358,10 @@ def _plain(value: Any, key: tuple[object, ...]) -> Any:
     if isinstance(value, Mapping):
         if not all(isinstance(name, str) for name in value):
             raise StudyError(f"{_dotted(key)}: keys must be strings")
+        if callable(value.get("source")):
+            function = value["source"]
+            known = {} if "version" in value else {"version": function_version(function)}
+            value = {**known, **value, "source": "function", "function": function}
         return {name: _plain(entry, (*key, name)) for name, entry in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(entry, (*key, number)) for number, entry in enumerate(value)]

@@ -33,7 +33,9 @@ from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.shells import check_orders
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.surfaces.shapes.surface import Similarity
+from sobolev_batch.surfaces.sources.command import function_name
 from sobolev_batch.surfaces.sources.files import MeshTable, matching_files, number_as_text, read_mesh_list
+from sobolev_batch.surfaces.sources.mesh_cache import MeshCache
 from sobolev_batch.surfaces.sources.names import caseless_key, duplicate_names, natural_key, quoted
 from sobolev_batch.surfaces.sources.registry import Source
 
@@ -72,6 +74,7 @@ class Study:
         folder: Folder in which relative paths start.
         table: The study as it was written.
         largest_chunk_bytes: Size above which a stored field is split into blocks, one chunk each.
+        cache: Where meshes are kept that take long to make; None if the study makes none, or has no store yet.
 
     >>> import sobolev_batch as sb
     >>> study = sb.Study.from_table({
@@ -102,6 +105,7 @@ class Study:
     table: Mapping[str, Any]
     largest_chunk_bytes: int = 256 << 20
     octaves: int = 0
+    cache: MeshCache | None = None
 
     def __post_init__(self) -> None:
         check_orders(self.orders)
@@ -109,11 +113,18 @@ class Study:
     @property
     def libraries(self) -> tuple[str, ...]:
         """Distributions that its surfaces need besides those that this package requires."""
-        sources = [family.source for family in self.families]
-        if isinstance(self.reference, Source):
-            sources.append(self.reference)
         own = () if self.proximity is None else ("vtk",)
-        return tuple(sorted({*own, *(library for source in sources for library in source.libraries)}))
+        return tuple(sorted({*own, *(library for source in self._sources for library in source.libraries)}))
+
+    @property
+    def commands(self) -> tuple[str, ...]:
+        """Commands that it runs to make its meshes, as a shell would have them, each once."""
+        return tuple(dict.fromkeys(command for source in self._sources for command in source.commands))
+
+    @property
+    def _sources(self) -> list[Source]:
+        own = [self.reference] if isinstance(self.reference, Source) else []
+        return [*(family.source for family in self.families), *own]
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Self:
@@ -174,8 +185,16 @@ class Study:
             proximity=None if document.proximity is None else document.proximity.points,
             folder=Path(folder),
             octaves=document.lattice.octaves if document.lattice else 0,
-            table=json.loads(json.dumps(values, default=str)),
+            table=_as_written(values),
         )
+
+    def with_cache(self, cache: MeshCache) -> Self:
+        """Return the study with the place where its meshes are kept that take long to make."""
+        if not any(source.keeps_meshes for source in self._sources):
+            return self
+        families = tuple(f.model_copy(update={"source": f.source.with_cache(cache)}) for f in self.families)
+        reference = self.reference.with_cache(cache) if isinstance(self.reference, Source) else self.reference
+        return replace(self, families=families, reference=reference, cache=cache)
 
     def with_best_effort(self) -> Study:
         """Return the study with the key ``best_effort`` of its accuracy set.
@@ -187,6 +206,14 @@ class Study:
             raise StudyError("a best effort is made for an [accuracy]; this study has a [lattice]")
         table = {**self.table, "accuracy": {**self.table["accuracy"], "best_effort": True}}
         return replace(self, accuracy=replace(self.accuracy, best_effort=True), table=table)
+
+
+def _as_written(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the tables of a study as JSON holds them, functions by their names."""
+    written: dict[str, Any] = json.loads(
+        json.dumps(values, default=lambda value: function_name(value) if callable(value) else str(value))
+    )
+    return written
 
 
 def _require_distinct(families: Sequence[str]) -> None:
@@ -276,7 +303,16 @@ class StudyCollection:
         lacking = {name: tuple(method for method in methods if method not in own[name]) for name in own}
         lacking = {name: missing for name, missing in lacking.items() if missing}
         title = document.study.title or document.study.name
-        return cls(document.study.name, title, studies, lacking, json.loads(json.dumps(written, default=str)))
+        return cls(document.study.name, title, studies, lacking, _as_written(written))
+
+    @property
+    def commands(self) -> tuple[str, ...]:
+        """Commands that its studies run, as a shell would have them, each once."""
+        return tuple(dict.fromkeys(command for study in self.studies.values() for command in study.commands))
+
+    def with_cache(self, cache: MeshCache) -> Self:
+        """Return the collection with the place where its meshes are kept that take long to make."""
+        return replace(self, studies={name: study.with_cache(cache) for name, study in self.studies.items()})
 
     def with_best_effort(self) -> Self:
         """Return the collection with the key ``best_effort`` of its accuracy set.

@@ -16,6 +16,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 
+from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.study.plan import members_of
 from sobolev_batch.batch.study.study import Study
 from sobolev_batch.errors import InputError, SobolevBatchError, StoreError
@@ -25,6 +26,7 @@ from sobolev_batch.spectral.metrics.causes import witness
 from sobolev_batch.spectral.shells import Orders, check_orders
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Similarity
+from sobolev_batch.surfaces.sources.mesh_cache import MeshCache
 from sobolev_batch.surfaces.sources.names import file_stem
 from sobolev_batch.surfaces.sources.registry import Member
 
@@ -60,7 +62,10 @@ class StudyMeshes:
         """
         table = finished_group(tree, "meshes")
         try:
-            members = members_of(Study.from_table(tree.attrs["study"]["table"], folder=folder))
+            study = Study.from_table(tree.attrs["study"]["table"], folder=folder)
+            if tree.attrs["study"].get("mesh_cache"):
+                study = study.with_cache(MeshCache(Location.parse(tree.attrs["study"]["mesh_cache"])))
+            members = members_of(study)
         except SobolevBatchError as error:
             raise InputError(f"the study's meshes cannot be listed here: {error}") from error
         similarity = tree.attrs["similarity"]

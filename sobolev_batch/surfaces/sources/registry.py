@@ -25,20 +25,23 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, SerializeAsA
 from sobolev_batch.errors import MeshError, StudyError
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Surface, is_finite_number
+from sobolev_batch.surfaces.sources.mesh_cache import Cost, MeshCache
 from sobolev_batch.surfaces.sources.names import quoted
 
 # Levels, or triangle counts of one mesh, that one source takes; and times.
-_MOST_ENTRIES, _MOST_TIMES = 1000, 100_000
+MOST_ENTRIES, _MOST_TIMES = 1000, 100_000
 
 _GROUP = "sobolev_batch.sources"
 _HERE = "sobolev_batch.surfaces.sources"
 # The package's own sources, by name.
 _OWN = {
+    "command": f"{_HERE}.command:CommandSource",
     "decimate": f"{_HERE}.derived:DecimateSource",
     "ellipsoid": f"{_HERE}.generated:EllipsoidSource",
     "files": f"{_HERE}.files:FileSource",
     "fit": "sobolev_batch.fitting.sources:FitSource",
     "flow": f"{_HERE}.derived:FlowSource",
+    "function": f"{_HERE}.command:FunctionSource",
     "icosphere": f"{_HERE}.generated:IcosphereSource",
     "moved": f"{_HERE}.derived:MovedSource",
     "noisy": f"{_HERE}.derived:NoisySource",
@@ -82,6 +85,24 @@ class Source(BaseModel, ABC):
     def libraries(self) -> tuple[str, ...]:
         """Distributions that the surfaces need, besides those that sobolev-batch requires."""
         return ()
+
+    @property
+    def commands(self) -> tuple[str, ...]:
+        """Commands that making the surfaces runs, as a shell would have them."""
+        return ()
+
+    @property
+    def keeps_meshes(self) -> bool:
+        """True if making the surfaces takes long, so that they are kept."""
+        return False
+
+    def with_cache(self, cache: MeshCache) -> Self:
+        """Return the source with the place where meshes are kept that take long to make.
+
+        Args:
+            cache: The place; it also says whether commands may run.
+        """
+        return self
 
     def with_reference(self, reference: Source) -> Source:
         """Return the source for a study with a reference. Override it if the surfaces depend on that.
@@ -198,6 +219,10 @@ class Member(ABC):
         """
         return ExpectedSize()
 
+    def cost(self) -> Cost | None:
+        """Return what making the surface took, where that is recorded."""
+        return None
+
 
 @dataclass(frozen=True)
 class SurfaceMember(Member):
@@ -285,7 +310,7 @@ def at_most(count: int) -> BeforeValidator:
 
 _Entry = TypeVar("_Entry")
 # One or several numbers that each make a surface.
-Several = Annotated[tuple[_Entry, ...], Field(min_length=1, strict=False), at_most(_MOST_ENTRIES)]
+Several = Annotated[tuple[_Entry, ...], Field(min_length=1, strict=False), at_most(MOST_ENTRIES)]
 
 
 def checked_times(value: object) -> tuple[float, ...]:
@@ -354,6 +379,20 @@ class NestedSource(Source):
     def libraries(self) -> tuple[str, ...]:
         """Distributions that the other sources need."""
         return tuple(library for source in self._nested().values() for library in source.libraries)
+
+    @property
+    def commands(self) -> tuple[str, ...]:
+        """Commands that the other sources run."""
+        return tuple(command for source in self._nested().values() for command in source.commands)
+
+    @property
+    def keeps_meshes(self) -> bool:
+        """True if one of the other sources keeps its meshes."""
+        return any(source.keeps_meshes for source in self._nested().values())
+
+    def with_cache(self, cache: MeshCache) -> Self:
+        """Return the source with the place of kept meshes handed to the other sources."""
+        return self.model_copy(update={name: source.with_cache(cache) for name, source in self._nested().items()})
 
     def with_reference(self, reference: Source) -> Self:
         """Return the source with the study's reference handed to the other sources."""

@@ -47,7 +47,7 @@ def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         f"cubes = {__name__}:Cubes\n"
         "absent-module = no_such_module_anywhere:Cubes\n"
         f"absent-class = {__name__}:NoSuchClass\n"
-        f"function = {__name__}:members\n"
+        f"a-function = {__name__}:members\n"
         f"other-class = {__name__}:Path\n"
     )
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -70,7 +70,7 @@ def test_names_of_sources_must_be_exact(name: object) -> None:
 @pytest.mark.usefixtures("plugin")
 def test_other_packages_add_sources() -> None:
     assert listed(members({"source": "cubes", "count": 2})) == [("3", 3), ("3", 3)]
-    with pytest.raises(StudyError, match="known are absent-class, absent-module, cubes, decimate"):
+    with pytest.raises(StudyError, match="known are absent-class, absent-module, command, cubes"):
         parse_source({"source": "nothing"})
     with pytest.raises(ValidationError, match="count"):
         parse_source({"source": "cubes"})
@@ -82,7 +82,7 @@ def test_other_packages_add_sources() -> None:
     [
         ("absent-module", "'absent-module' cannot be loaded: .*no_such_module"),
         ("absent-class", "'absent-class' cannot be loaded: .*NoSuchClass"),
-        ("function", f"'function' is not a subclass of Source: {__name__}:members"),
+        ("a-function", f"'a-function' is not a subclass of Source: {__name__}:members"),
         ("other-class", f"'other-class' is not a subclass of Source: {__name__}:Path"),
     ],
 )

@@ -1,0 +1,377 @@
+"""The sources `command` and `function`: meshes that a program, or a function of yours, makes of another mesh.
+
+Such a mesh may take long, so it is kept in a `MeshCache`. Nothing runs without one that permits it: a study file may
+come from somebody else.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import re
+import shlex
+import subprocess
+import time
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+import pandas as pd
+from pydantic import BeforeValidator, ConfigDict, Field, PrivateAttr, model_validator
+
+from sobolev_batch.errors import InputError, MeshError, StudyError, one_line
+from sobolev_batch.parameters import byte_count
+from sobolev_batch.surfaces.formats.readers import as_mesh
+from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.sources.files import file_digest, number_as_text
+from sobolev_batch.surfaces.sources.mesh_cache import Cost, MeshCache, Outcome
+from sobolev_batch.surfaces.sources.names import label_problem, quoted
+from sobolev_batch.surfaces.sources.program import INPUT, OUTPUT, PLACEHOLDER, run_command
+from sobolev_batch.surfaces.sources.registry import (
+    MOST_ENTRIES,
+    ExpectedSize,
+    Fingerprint,
+    Member,
+    NestedSource,
+    load_mesh,
+    single_member,
+)
+
+Parameter = str | int | float | bool
+
+# The placeholder for the folder of the study.
+_FOLDER = "folder"
+_VERSION_SECONDS = 60.0
+
+
+def _seconds(value: object) -> float:
+    """Return a time, given in seconds or as a text such as "10 min"."""
+    try:
+        seconds = value if isinstance(value, int | float) else pd.Timedelta(str(value)).total_seconds()
+        if not isinstance(value, bool) and 0 < seconds < float("inf"):
+            return float(seconds)
+    except ValueError:
+        pass
+    raise ValueError("must be a number of seconds, or a time such as '10 min' or '2 h'")
+
+
+def _bytes(value: object) -> int:
+    try:
+        return byte_count(value)  # type: ignore[arg-type]
+    except InputError as error:
+        raise ValueError(str(error)) from error
+
+
+def _file_suffix(value: object) -> str:
+    if not isinstance(value, str) or not re.fullmatch(r"\.[A-Za-z0-9]+", value):
+        raise ValueError("must be the suffix of a mesh format, such as '.ply'")
+    return value.lower()
+
+
+Seconds = Annotated[float, BeforeValidator(_seconds)]
+Bytes = Annotated[int, BeforeValidator(_bytes)]
+FileSuffix = Annotated[str, BeforeValidator(_file_suffix)]
+Words = Annotated[tuple[str, ...], Field(min_length=1, strict=False)]
+
+
+class RemesherSource(NestedSource):
+    """Meshes that something of yours makes of one other mesh.
+
+    Keys that are not listed here are its parameters: numbers, texts or truth values. A list of them is swept: each
+    value makes a mesh, and several lists make one for each combination.
+
+    Attributes:
+        mesh: Table of a source with one member, or the name of a mesh: the mesh to start from.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="allow", strict=True)
+    _cache: MeshCache | None = PrivateAttr(None)
+
+    @property
+    def keeps_meshes(self) -> bool:
+        """True: every mesh is kept."""
+        return True
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Parameters by name; a list stands for its values."""
+        return dict(self.model_extra or {})
+
+    @model_validator(mode="after")
+    def _check_parameters(self) -> Self:
+        count = 1
+        for name, value in self.parameters.items():
+            values = value if isinstance(value, list | tuple) else [value]
+            if not values or not all(isinstance(entry, Parameter) for entry in values):
+                raise ValueError(
+                    f"{name} must be a number, a text, true, false or a list of them, found {quoted(value)}"
+                )
+            count *= len(values)
+        if count > MOST_ENTRIES:
+            raise ValueError(f"at most {MOST_ENTRIES} meshes are allowed, and its lists make {count}")
+        return self
+
+    def with_cache(self, cache: MeshCache) -> Self:
+        """Return the source with the place where its meshes are kept."""
+        source = super().with_cache(cache)
+        source = source.model_copy()
+        source._cache = cache
+        return source
+
+    def members(self, folder: Path) -> tuple[Member, ...]:
+        """Return one member for each combination of parameters, in the order of the lists."""
+        original = single_member(self.mesh, folder)
+        return tuple(
+            self._member(name, parameters, original, folder) for name, parameters in self._swept(original.name)
+        )
+
+    def _swept(self, alone: str) -> Iterator[tuple[str, dict[str, Parameter]]]:
+        """Yield a name and the parameters of each mesh."""
+        lists = {name: value for name, value in self.parameters.items() if isinstance(value, list | tuple)}
+        for values in product(*lists.values()):
+            texts = list(map(_as_text, values))
+            named = [f"{key}={text}" for key, text in zip(lists, texts, strict=True)]
+            name = texts[0] if len(texts) == 1 else ",".join(named) or alone
+            problem = label_problem(name)
+            if problem is not None:
+                raise StudyError(f"the parameters {quoted(name)} are no label: {problem}")
+            yield name, {**self.parameters, **dict(zip(lists, values, strict=True))}
+
+    @abstractmethod
+    def _member(self, name: str, parameters: dict[str, Parameter], original: Member, folder: Path) -> Member:
+        """Return the member with some parameters."""
+
+
+class CommandSource(RemesherSource):
+    """Meshes that a program makes of one other mesh.
+
+    The program gets a folder of its own, and no shell. ``{input}`` and ``{output}`` in the command stand for its files,
+    ``{folder}`` for the folder of the study, and ``{NAME}`` for a parameter.
+
+    Attributes:
+        command: Program and arguments.
+        input, output: Suffixes of the files that it reads and writes; formats that this package lacks, such as Medit's
+            .mesh, go through the library meshio.
+        timeout: Time after which the program is ended, in seconds or as a text such as "10 min".
+        largest_output: Bytes that it may write, such as "2 GB".
+        version: Command that prints the program's version. It is part of the fingerprint.
+    """
+
+    command: Words
+    input: FileSuffix = ".ply"
+    output: FileSuffix = ".ply"
+    timeout: Seconds = 3600.0
+    largest_output: Bytes = 4_000_000_000
+    version: Words | None = None
+
+    @property
+    def commands(self) -> tuple[str, ...]:
+        """The command and that of the version, as a shell would have them; and those of other sources."""
+        own = [self.command, *([self.version] if self.version else [])]
+        return (*map(shlex.join, own), *super().commands)
+
+    @model_validator(mode="after")
+    def _check_command(self) -> Self:
+        asked = {name for word in self.command for name in PLACEHOLDER.findall(word)}
+        known = {INPUT, OUTPUT, _FOLDER, *self.parameters}
+        if unknown := sorted(asked - known):
+            raise ValueError(f"the command has {{{unknown[0]}}}, and no parameter has this name")
+        if unused := sorted(known - asked - {_FOLDER, INPUT, OUTPUT}):
+            keys = ", ".join(name for name in type(self).model_fields)
+            raise ValueError(
+                f"{unused[0]} is unknown: it is no key ({keys}), and the command has no {{{unused[0]}}} for it"
+            )
+        if OUTPUT not in asked:
+            raise ValueError("the command has no {output}, the file that it has to write")
+        return self
+
+    def _member(self, name: str, parameters: dict[str, Parameter], original: Member, folder: Path) -> Member:
+        words = [self._filled(word, parameters, folder) for word in self.command]
+        files = {
+            word: Path(self._filled(found[0], {}, folder))
+            for word in self.command
+            if (found := re.search(r"\{folder\}/.+", word))
+        }
+        settings = {"command": list(self.command), "parameters": parameters, "input": self.input, "output": self.output}
+        return RemeshedMember(
+            name,
+            -1,
+            metadata=_metadata(parameters),
+            make=partial(
+                run_command,
+                words=words,
+                suffixes=(self.input, self.output),
+                timeout=self.timeout,
+                largest_output=self.largest_output,
+            ),
+            identity={"remesher": settings, "version": self._found_version(folder)},
+            original=original,
+            files=files,
+            cache=self._cache,
+        )
+
+    @staticmethod
+    def _filled(word: str, parameters: Mapping[str, Parameter], folder: Path) -> str:
+        """Return a word of a command with its parameters and the folder of the study."""
+        values = {_FOLDER: str(folder.absolute()), **{key: _as_text(value) for key, value in parameters.items()}}
+        return PLACEHOLDER.sub(lambda found: values.get(found[1], found[0]), word)
+
+    def _found_version(self, folder: Path) -> str | None:
+        """Return what the version's command prints, or printed last where it may not run."""
+        if self.version is None or self._cache is None:
+            return None
+        key = f"version-{hashlib.sha256(shlex.join(self.version).encode()).hexdigest()}.txt"
+        known = (self._cache.folder.read(key) or b"").decode() or None
+        if not self._cache.may_run:
+            return known
+        words = [self._filled(word, {}, folder) for word in self.version]
+        try:
+            done = subprocess.run(  # noqa: S603 -- the user permitted it
+                words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+                timeout=_VERSION_SECONDS, check=True,
+            )  # fmt: skip
+        except (OSError, subprocess.SubprocessError) as error:
+            raise StudyError(f"version: {shlex.join(words)}: {one_line(error)}") from error
+        found = done.stdout.decode(errors="replace").strip()
+        if found != known:
+            self._cache.folder.write({key: found.encode()})
+        return found
+
+
+class FunctionSource(RemesherSource):
+    """Meshes that a function of Python makes of one other mesh.
+
+    The table of a family in Python names it as its source: ``{"source": remesh, "mesh": ..., "triangles": [500]}`` has
+    ``remesh(mesh, triangles=500)`` called, which returns a mesh or anything that `as_mesh` takes. Dask takes the
+    function to the workers.
+
+    Attributes:
+        function: The function; in a store its name alone, with which no mesh can be made.
+        version: Text that changes whenever the function makes other meshes; by default a digest of its source.
+    """
+
+    function: Callable[..., Any] | str
+    version: str | None = None
+
+    def _member(self, name: str, parameters: dict[str, Parameter], original: Member, folder: Path) -> Member:
+        return RemeshedMember(
+            name,
+            -1,
+            metadata=_metadata(parameters),
+            make=partial(call_function, function=self.function, parameters=parameters),
+            identity={
+                "remesher": {"function": function_name(self.function), "parameters": parameters},
+                "version": self.version or function_version(self.function),
+            },
+            original=original,
+            files={},
+            cache=self._cache,
+        )
+
+
+@dataclass(frozen=True)
+class RemeshedMember(Member):
+    """A mesh that a remesher makes, unless it is kept.
+
+    Attributes:
+        make: Function that makes it of the original.
+        identity: The remesher, its parameters and its version.
+        original: Mesh to start from.
+        files: Files that the remesher reads besides, by their names in the command.
+        cache: Where it is kept; None if nothing may run.
+    """
+
+    make: Callable[[Mesh], Outcome]
+    identity: Fingerprint
+    original: Member
+    files: Mapping[str, Path]
+    cache: MeshCache | None
+
+    def load(self) -> Mesh:
+        """Return the mesh that is kept, or make it and keep it.
+
+        Raises:
+            MeshError: The remesher failed, or is not permitted to run.
+        """
+        if self.cache is None:
+            raise MeshError("no remesher may run here, and none of its meshes is kept; run a study with it")
+        digest = self.fingerprint_digest()
+        mesh = self.cache.read(digest)
+        if mesh is not None:
+            return mesh
+        if not self.cache.may_run:
+            raise MeshError(
+                f"the remesher may not run, and its mesh is not kept in {self.cache.folder}; run the study with "
+                "--allow-commands (in Python: allow_commands=True) if you trust it"
+            )
+        outcome = self.make(load_mesh(self.original))
+        self.cache.write(digest, outcome, {"made by": self.identity, "of": self.original.name})
+        if outcome.mesh is None:
+            raise MeshError(outcome.reason)
+        return outcome.mesh
+
+    def cost(self) -> Cost | None:
+        """Return what making it took the last time."""
+        with suppress(MeshError):
+            return None if self.cache is None else self.cache.cost(self.fingerprint_digest())
+        return None
+
+    def fingerprint(self) -> Fingerprint:
+        """Return the identity, the digests of files and the fingerprint of the original."""
+        files = {name: file_digest(path) for name, path in self.files.items()}
+        return {**self.identity, "files": files, "of": dict(self.original.fingerprint())}
+
+    def expected_size(self) -> ExpectedSize:
+        """Return the size of the original, since nothing is known of the result."""
+        return self.original.expected_size()
+
+
+def call_function(mesh: Mesh, function: Callable[..., Any] | str, parameters: Mapping[str, Parameter]) -> Outcome:
+    """Call a function that makes a mesh of another one; see `FunctionSource`."""
+    if isinstance(function, str):
+        return Outcome(Cost(), reason=f"the function {function} is not at hand; run the study from Python with it")
+    started, processor = time.perf_counter(), time.thread_time()
+    made, reason = None, ""
+    try:
+        made = as_mesh(function(mesh, **parameters))
+    except Exception as error:
+        reason = f"{function_name(function)}: {type(error).__name__}: {one_line(error)}"
+    return Outcome(Cost(time.perf_counter() - started, time.thread_time() - processor), made, reason)
+
+
+def function_name(function: Callable[..., Any] | str) -> str:
+    """Return the name of a function, with that of its module."""
+    if isinstance(function, str):
+        return function
+    return f"{getattr(function, '__module__', '')}.{getattr(function, '__qualname__', type(function).__name__)}"
+
+
+def function_version(function: Callable[..., Any] | str) -> str:
+    """Return a digest of a function's source.
+
+    Raises:
+        StudyError: It has none.
+    """
+    try:
+        return hashlib.sha256(inspect.getsource(function).encode()).hexdigest()  # type: ignore[arg-type]
+    except (OSError, TypeError) as error:
+        raise StudyError(
+            f'the source of {function_name(function)} is not at hand; give "version", a text that changes whenever it '
+            "makes other meshes"
+        ) from error
+
+
+def _as_text(value: Parameter) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return number_as_text(value) if isinstance(value, float) else str(value)
+
+
+def _metadata(parameters: Mapping[str, Parameter]) -> tuple[tuple[str, float | str], ...]:
+    numbers = {key: value for key, value in parameters.items() if not isinstance(value, bool | str)}
+    return tuple((key, float(numbers[key]) if key in numbers else _as_text(value)) for key, value in parameters.items())
