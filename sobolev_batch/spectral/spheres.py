@@ -20,14 +20,10 @@ _NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(14)
 
 
 def sphere_transform(sphere: Sphere, frequencies: NDArray[np.float64]) -> NDArray[np.complex128]:
-    """Return the transform ∫ exp(-2πi ξ·x) dσ(x) of a sphere's area measure.
+    """Return the transform ∫ exp(-2πi ξ·x) dσ(x) of the area measure of a sphere of radius R and centre c.
 
-    Args:
-        sphere: Sphere of radius R and centre c, in units of length.
-        frequencies: ξ, float64 (..., 3), in cycles per unit length.
-
-    Returns:
-        complex128 (...): 4πR² sinc(2R|ξ|) exp(-2πi ξ·c) with sinc(t) = sin(πt)/(πt).
+    For ξ, float64 (..., 3), in cycles per unit length, it is 4πR² sinc(2R|ξ|) exp(-2πi ξ·c) with sinc(t) =
+    sin(πt)/(πt), complex128 (...).
     """
     lengths = np.sqrt(np.einsum("...i,...i->...", frequencies, frequencies))
     phases = np.exp(-2j * np.pi * (frequencies @ np.asarray(sphere.center)))

@@ -71,15 +71,10 @@ def exact_transform(mesh: Mesh, frequencies: Reals) -> Complexes:
 
 
 def second_difference(ab: Reals, ac: Reals) -> Complexes:
-    """Return the second divided difference of exp at three imaginary nodes iα, iβ, iγ whose mean is zero.
+    """Return the second divided difference of exp at imaginary nodes iα, iβ, iγ whose mean is zero, complex128 (n,).
 
-    Args:
-        ab: Gap β - α in radians (n,). Form gaps from edge vectors: differences of phases have lost the digits that
-            the phases share.
-        ac: Gap γ - α, likewise.
-
-    Returns:
-        complex128 (n,); 1/2 if the three nodes coincide.
+    The gaps are β - α and γ - α in radians (n,). Form them from edge vectors: differences of phases have lost the
+    digits that the phases share. If the three nodes coincide, the value is 1/2.
     """
     widest = np.maximum(np.maximum(np.abs(ab), np.abs(ac)), np.abs(ac - ab))
     close = widest < _SERIES_GAP

@@ -242,11 +242,8 @@ class State:
 def solve_in_octaves(problem: Problem, seed: int, aim: float = 1.0, for_others: bool = False) -> Solution:
     """Compute a norm or a distance to an accuracy, with its tail measured in octaves.
 
-    Args:
-        problem: Surfaces, orders and accuracy.
-        seed: Seed of the random frequencies. The same seed gives the same result.
-        aim: Fraction of the rtol to aim at.
-        for_others: Reach farther, for other pairs whose part beyond the octaves is known less well.
+    The same seed gives the same random frequencies and result. The aim is a fraction of the rtol. Octaves reach farther
+    for others: pairs whose part beyond the octaves is known less well.
 
     Returns:
         The first solution that meets the aim; else the last one that can be sampled in some minutes.

@@ -86,13 +86,9 @@ class Arrangement:
     def products(self, first: Complexes, second: Complexes) -> Sums:
         """Return the contributions of this block to the inner products Re <a_i, b_j>_s of fields.
 
-        Args:
-            first: Fields a, complex128 (m, block.size), arranged, each row contiguous.
-            second: Fields b, complex128 (n, block.size), likewise; preferably the fewer ones.
-
-        Returns:
-            Inner products in the form that `Sums` has for squares: (orders, 4, m, n) and (2, m, n). The
-            contributions of all blocks of the half lattice add up to the whole.
+        The fields are complex128 (m, block.size) and (n, block.size), arranged, each row contiguous; preferably the
+        second ones are fewer. The inner products are (orders, 4, m, n) and (2, m, n), as `Sums` has squares. The
+        contributions of all blocks of the half lattice add up to the whole.
         """
         m, n = len(first), len(second)
         left, right = first.view(np.float64), second.view(np.float64)

@@ -121,13 +121,8 @@ def remainder(
 ) -> Remainder:
     """Estimate what lies beyond a cutoff in the norm of a signed sum of surfaces, in units of length.
 
-    Args:
-        surfaces: Surfaces, in units of length.
-        signs: Sign of each.
-        cutoff: |ξ| at which the `smooth_step` ends, in cycles per unit length.
-        orders: Orders s; by default enough of them to interpolate between.
-        points: Number of random points; by default as many as take about a second, at most 256.
-        seed: Seed of the points.
+    The cutoff is the |ξ| at which the `smooth_step` ends, in cycles per unit length. By default there are enough orders
+    to interpolate between, and as many random points as take about a second, at most 256.
     """
     known = tuple(sorted({max(order, LOWEST_ORDER) for order in orders or _USUAL_ORDERS}, reverse=True))
     reach = float(np.interp(known[-1], *_REACHES)) / cutoff

@@ -92,15 +92,11 @@ def gauss_rule(points: int = 8) -> TriangleRule:
 
 @lru_cache(maxsize=64)
 def rule_ranges(tolerance: float) -> tuple[tuple[TriangleRule, ...], Reals]:
-    """Return the rules that are worth using at a tolerance, and the range of each.
+    """Return the rules of increasing cost that are worth using at a tolerance, and the range of each.
 
-    Args:
-        tolerance: Largest error on one triangle, relative to its area, at every frequency.
-
-    Returns:
-        Rules of increasing cost, and for each the largest 2π|ξ|ρ (radians; ρ is the distance from a triangle's
-        centroid to its farthest corner) up to which it keeps the tolerance for every shape of triangle and
-        direction of ξ. Rules with a smaller range than a cheaper one are left out.
+    The tolerance is the largest error on one triangle, relative to its area, at every frequency. The range is the
+    largest 2π|ξ|ρ (radians; ρ is the distance from a triangle's centroid to its farthest corner) up to which a rule
+    keeps it for every shape of triangle and direction of ξ. Rules with a smaller range than a cheaper one are left out.
     """
     tolerance = max(tolerance, FINEST_TOLERANCE)
     rules: list[TriangleRule] = []
@@ -119,13 +115,11 @@ def rule_ranges(tolerance: float) -> tuple[tuple[TriangleRule, ...], Reals]:
 
 
 def typical_errors(rule: TriangleRule) -> tuple[Reals, Reals, Reals]:
-    """Return the root mean square of a candidate's error on one triangle over all directions of ξ.
+    """Return sizes 2π|ξ|ρ (radians), and the rms errors of a candidate on one triangle there over all directions of ξ.
 
-    Returns:
-        Sizes 2π|ξ|ρ (radians), and at each the even and the odd part of the error, relative to the area. The even
-        part (real, seen from the centroid) adds up over neighbouring triangles. The odd part changes sign between
-        neighbours that point opposite ways, and mostly cancels. Each is the larger one of the equilateral and the
-        flat triangle.
+    The even part (real, seen from the centroid) adds up over neighbouring triangles. The odd part changes sign between
+    neighbours that point opposite ways, and mostly cancels. Both are relative to the area, and each is the larger one
+    of the equilateral and the flat triangle.
     """
     stored, row = measured_errors(), candidate_rules().index(rule)
     return _SIZES_ON_AVERAGE, stored["even"][row], stored["odd"][row]

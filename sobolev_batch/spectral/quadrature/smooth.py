@@ -101,8 +101,7 @@ def _exact_counts(surface: Smooth, highest: float) -> Counts:
 def _refined(surface: Smooth, highest: float, tolerance: float, most: int) -> tuple[Counts, float]:
     """Double the nodes along each parameter that needs it, until the change is small or the nodes are too many.
 
-    Returns:
-        What `resolution_of` does; the change is infinite if even the first nodes are too many.
+    Returns what `resolution_of` does; the change is infinite if even the first nodes are too many.
     """
     counts = _first_counts(surface, highest)
     if _too_many(surface, counts, most):

@@ -60,14 +60,16 @@ def test_sums_are_those_of_shells(intervals: int) -> None:
     assert squares.outer == pytest.approx(expected.outer, rel=1e-13 if intervals == 2 else 0.15)
 
 
-def test_outer_energies_of_near_twins_are_those_of_their_difference() -> None:
+@pytest.mark.parametrize(("apart", "lost"), [(1e-2, False), (1e-4, True)])
+def test_near_twins_have_the_outer_energies_of_their_difference_and_are_reported(apart: float, lost: bool) -> None:
     # They come from the same samples as the squares, so that what cancels leaves no noise behind.
     lattice = Lattice(4.0, 40)
     one, two = random_fields(2, lattice)
-    twin = one + 1e-2 * two
+    twin = one + apart * two
     arrangement = Arrangement.for_block(SobolevWeights(lattice, ORDERS), lattice.half)
     pair = np.stack([one[arrangement.order], twin[arrangement.order]])
     squares = arrangement.squares(pair)
-    sums, _ = differences(arrangement.products(pair, pair), squares, squares)
+    sums, cancelled = differences(arrangement.products(pair, pair), squares, squares)
+    assert cancelled[0, 1] == lost
     expected = arrangement.squares((twin - one)[arrangement.order][None])
-    assert sums.outer[:, 0, 1] == pytest.approx(expected.outer[:, 0], rel=1e-9)
+    assert sums.outer[:, 0, 1] == pytest.approx(expected.outer[:, 0], rel=1e-13 / apart**2)
