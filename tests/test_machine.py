@@ -110,14 +110,7 @@ def test_no_function_believes_more_than_there_is(name: str) -> None:
 
 
 def test_every_function_with_a_memory_is_asked() -> None:
-    public = {name: getattr(sb, name) for name in sb.__all__}
-    methods = {
-        f"{name}.{own}": value
-        for name, kind in public.items()
-        if inspect.isclass(kind)
-        for own, value in vars(kind).items()
-    }
-    functions = {name: value for name, value in (public | methods).items() if inspect.isfunction(value)}
+    functions = {name: value for name in sb.__all__ if inspect.isfunction(value := getattr(sb, name))}
     assert {name for name, one in functions.items() if "memory" in inspect.signature(one).parameters} == set(ASKING)
 
 

@@ -9,7 +9,7 @@ import json
 import operator
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import reduce
 from pathlib import Path
 
@@ -22,40 +22,17 @@ from sobolev_batch import DamageError, StoreError, Study, norm, open_store, run,
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.store_accessor import StoreAccessor
-from tests.faults.conftest import FIELD, LABELS
+from tests.faults.conftest import LABELS
 from tests.support.commands import call, write_toml
-from tests.support.stores import contents, put_back
+from tests.support.stores import assert_same_results, contents, delete, empty, flip, put_back, truncate
 from tests.support.studies import small_table, variable
 
-RECORD = "records/record/c/{row}"
-
-
-def truncate(chunk: Path) -> None:
-    chunk.write_bytes(chunk.read_bytes()[:-10])
-
-
-def empty(chunk: Path) -> None:
-    chunk.write_bytes(b"")
-
-
-def flip(chunk: Path) -> None:
-    data = bytearray(chunk.read_bytes())
-    data[len(data) // 3] ^= 1
-    chunk.write_bytes(data)
-
-
-def delete(chunk: Path) -> None:
-    chunk.unlink()
+FIELD, RECORD = "fourier/fourier/c/{row}/0/0/0", "records/record/c/{row}"
 
 
 def swap(chunk: Path) -> None:
     """Another mesh's field: its own checksum is right."""
     shutil.copy(chunk.parents[3] / "0/0/0/0", chunk)
-
-
-def swap_octaves(chunk: Path) -> None:
-    """Another mesh's values in octaves: their own checksum is right."""
-    shutil.copy(chunk.parents[1] / "0/0", chunk)
 
 
 Damage = Callable[[Path], None]
@@ -134,11 +111,36 @@ GROUPS: dict[str, list[tuple[Change, tuple[str, ...], set[str] | None]]] = {
 
 
 @pytest.fixture(scope="module")
+def sound(finished_store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return Path(shutil.copytree(finished_store, tmp_path_factory.mktemp("damage") / "results.zarr"))
+
+
+@pytest.fixture
+def store(sound: Path) -> Iterator[Path]:
+    """A finished store, whose files are put back after the test."""
+    with put_back(sound):
+        yield sound
+
+
+@pytest.fixture(scope="module")
 def earlier(sound: Path, threads: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same store before its fields were computed again, with other keys."""
     path = Path(shutil.copytree(sound, tmp_path_factory.mktemp("earlier") / "results.zarr"))
     run(Study.from_table(small_table(transform={"eps": 1e-7})), path, threads)
     return path
+
+
+@pytest.fixture
+def mended(store: Path, study: Study, finished_store: Path, threads: Client) -> Callable[..., None]:
+    """A check that a run computes the given meshes of the store again, and leaves nothing damaged."""
+
+    def check(*computed: str) -> None:
+        assert sorted(run(study, store, threads).computed) == sorted(computed)
+        assert verify(store).is_sound
+        assert status(store).lost_records == ()
+        assert_same_results(store, finished_store)
+
+    return check
 
 
 @pytest.mark.parametrize("group", GROUPS)

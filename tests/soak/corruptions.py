@@ -51,14 +51,10 @@ def finished_stores(folder: Path) -> dict[str, Path]:
 
 
 class Corruption(NamedTuple):
-    """A store of which a file was damaged.
+    """What was done to files of a store, by their keys, and which of `ANSWERS` each way to read it then gave.
 
-    Attributes:
-        kind: What was done to it.
-        keys: Keys of the files whose content changed.
-        answers: What each way to read the store that was tried then did, one of `ANSWERS`: a number differs without a
-            word where it is silent, only `verify` has said so where it is verified, and an exception was not one of
-            this package where it is unnamed.
+    A number differs without a word where it is silent, only `verify` has said so where it is verified, and an exception
+    was not one of this package where it is unnamed.
     """
 
     kind: str

@@ -38,15 +38,10 @@ _ANSWERS: dict[str, tuple[str, bytes]] = {
 
 @dataclass(frozen=True)
 class Rule:
-    """Rule by which requests fail.
+    """The probability that a request fails, if it has the method, and a part in its path and query.
 
-    Attributes:
-        rate: Probability of a failure.
-        kinds: Kinds of failures, the rarest first. Only answers to GET can be truncated, and only keys that are to be
-            removed can be kept, in an otherwise good answer.
-        method: Method that may fail; all if empty.
-        most: Number of failures after which nothing fails any more.
-        part: Text in the path and query of requests that may fail.
+    The rarest kinds come first. Only answers to GET can be truncated, and only keys that are to be removed can be kept,
+    in an otherwise good answer. After `most` failures nothing fails any more.
     """
 
     rate: float

@@ -1,4 +1,4 @@
-"""Comparison of stores."""
+"""Comparison of stores, and damage to their files."""
 
 from __future__ import annotations
 
@@ -101,3 +101,21 @@ def put_back(store: Path) -> Iterator[Path]:
         if not path.exists() or path.stat().st_size != len(content) or path.read_bytes() != content:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(content)
+
+
+def truncate(chunk: Path) -> None:
+    chunk.write_bytes(chunk.read_bytes()[:-10])
+
+
+def empty(chunk: Path) -> None:
+    chunk.write_bytes(b"")
+
+
+def flip(chunk: Path) -> None:
+    data = bytearray(chunk.read_bytes())
+    data[len(data) // 3] ^= 1
+    chunk.write_bytes(data)
+
+
+def delete(chunk: Path) -> None:
+    chunk.unlink()
