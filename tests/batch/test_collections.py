@@ -77,17 +77,6 @@ def test_what_is_damaged_is_named_with_its_object(store: Path, tmp_path: Path) -
     assert lines[-1] == "1 surfaces and 0 arrays of tables are damaged; run the study again to repair it"
 
 
-def test_plots_of_a_collection_are_those_of_its_league(store: Path, tmp_path: Path) -> None:
-    done = call("plot", store, "--output", tmp_path, "--order", "-3", "--format", "svg")
-    assert done.stdout.split() == [str(tmp_path / "league.svg")]
-    text = (tmp_path / "league.svg").read_text(encoding="utf-8")
-    assert "order -3, mean of 2 objects" in text
-    assert "order -10" not in text
-    refused = call("plot", store, "--witness", "ico/1")
-    assert refused.returncode == 2
-    assert "--witness draws meshes of one object" in refused.stderr
-
-
 def test_tables_of_a_collection_are_those_of_its_objects(store: Path) -> None:
     joined = sb.table(store, -3)
     assert joined.columns[0] == "object"
@@ -188,25 +177,6 @@ def test_a_league_needs_no_more_than_the_store(store: Path) -> None:
         sb.league(store / "a")
     with pytest.raises(sb.StoreError, match="nowhere"):
         sb.league({"a": store / "a", "b": store / "nowhere"})
-
-
-@pytest.mark.all
-def test_a_study_against_another_finds_what_became_farther(tmp_path: Path, client: Client) -> None:
-    radii = {f"o{i}": 1 + i / 100 for i in range(7)}
-    new, old = tmp_path / "new.zarr", tmp_path / "old.zarr"
-    studies = {
-        new: [{"name": "egg", "source": "ellipsoid", "axes": [1.0, 1.0, 0.7], "levels": [2]}],
-        old: [{"name": "egg", "source": "ellipsoid", "axes": [1.0, 1.0, 0.8], "levels": [2]}],
-    }
-    for path, family in studies.items():
-        lattice = {"xi_max": 4.0, "M": 32}
-        table = small_table(object=balls(**radii), family=family, lattice=lattice)
-        sb.run(sb.StudyCollection.from_table(table), path, client)
-    change = sb.compare_studies(new, old, -3).to_dict("records")[0]
-    assert change["verdict"] == "farther"
-    assert (change["objects"], change["meshes"]) == (7, 7)
-    assert change["low"] > 1
-    assert change["worst"].endswith("/egg/2")
 
 
 @pytest.mark.parametrize(

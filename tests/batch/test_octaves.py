@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import xarray as xr
 from distributed import Client
-from matplotlib.collections import LineCollection
 from numpy.typing import NDArray
 from scipy.special import erfc
 
@@ -87,29 +86,6 @@ def test_norms_pairs_and_parts_agree_with_closed_forms(octave_store: Path) -> No
     found = tree["convergence"].to_dataset().sel(mesh="ball/sphere")
     assert found["area_part"].values == pytest.approx(area, rel=0.05)
     assert (found["area_part"] ** 2 + found["shape_part"] ** 2).values == pytest.approx(found["distance"].values ** 2)
-
-
-def test_the_plot_of_energies_shows_those_of_closed_forms_and_their_limit(octave_store: Path) -> None:
-    axes = sb.plot(octave_store, "energy")
-    (legend,) = axes.figure.legends
-    assert [text.get_text() for text in legend.get_texts()] == ["limit", "ico", "ball"]
-    energies = np.asarray(axes.lines[-1].get_xydata())[:, 1]
-    radii = np.linspace(0, 200, 200_001)[1:]
-    difference = 2 / radii * (np.sin(2 * np.pi * radii) - BALL.radius * np.sin(2 * np.pi * BALL.radius * radii))
-    exact = 4 * np.pi * radii**2 * difference**2 / (8 * np.pi * (1 + BALL.radius**2))
-    octaves = sb.open_store(octave_store).attrs["study"]["octaves"]
-    ends = octaves["cutoff"] * 2.0 ** (np.arange(len(energies)) - (len(energies) - 1 - len(octaves["octaves"])))
-    inner = np.zeros_like(radii)
-    for end, energy in zip(ends, energies, strict=True):
-        outer = step_down(radii / end)
-        assert energy == pytest.approx(np.average(exact, weights=outer - inner), rel=0.15)
-        inner = outer
-    drawn = axes.collections[-1]
-    assert isinstance(drawn, LineCollection)
-    bars = np.array([np.ptp(segment[:, 1]) for segment in drawn.get_segments()])
-    assert (bars[: -len(octaves["octaves"])] == 0).all()
-    assert (bars[-len(octaves["octaves"]) :] > 0).all()
-    assert energies[-1] == pytest.approx(1, abs=0.3)
 
 
 def step_down(fractions: Reals) -> Reals:

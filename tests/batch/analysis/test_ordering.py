@@ -76,13 +76,6 @@ def test_copies_with_noise_are_no_sequence(tmp_path: Path) -> None:
     assert table(tmp_path)["rate"].notna().any()
 
 
-def test_equal_triangle_counts_are_ordered_by_name(tmp_path: Path) -> None:
-    for name in ("x10", "x9"):
-        sb.write_mesh(sb.icosphere(0), tmp_path / f"{name}.ply")
-    run(tmp_path)
-    assert names(tmp_path) == ["x9", "x10"]
-
-
 def test_removed_meshes_leave_the_tables_and_come_back_without_computation(folder: Path) -> None:
     run(folder)
     path, away = folder / "a10.ply", folder / "a10.away"

@@ -15,21 +15,8 @@ from sobolev_batch.batch.analysis.tabulate import Results, pairs_bytes
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store import tables
 from sobolev_batch.batch.store.store import Store
-from sobolev_batch.spectral.budget import NormEstimate
 from tests.support.stores import assert_same_results
 from tests.support.studies import small_table
-
-
-def test_tiles_enter_the_order_of_tables_without_a_copy() -> None:
-    meshes = xr.Dataset({"row": ("mesh", [7, 3, 5])}, coords={"mesh": ["a", "b", "c"]})
-    results = Results.empty(meshes, "a", (-2.0, -1.0), every_pair=True)
-    whole = results.distances
-    pairs = np.random.default_rng(0).uniform(size=(5, 2, 2, 1))
-    results.enter_tile(NormEstimate(*pairs), [5, 7], [3])
-    assert results.distances is whole
-    np.testing.assert_array_equal(whole[..., [2, 0], :][..., [1]], pairs)
-    np.testing.assert_array_equal(whole[..., 1, [2, 0]], pairs[..., 0])
-    assert np.isnan(whole[..., [0, 1, 2], [0, 1, 2]]).all()
 
 
 def test_a_table_of_all_pairs_is_written_array_by_array_within_the_memory_that_a_plan_counts(

@@ -82,14 +82,6 @@ def test_tiles_cover_every_pair_once(reducer: Reducer, count: int, workers: int)
     assert [row for batch in reducer.row_batches(rows, workers) for row in batch] == rows
 
 
-def test_many_workers_get_smaller_tiles(reducer: Reducer) -> None:
-    reducer = replace(reducer, tile_bytes=1 << 30)
-    rows = range(500)
-    assert [len(batch) for batch in reducer.row_batches(rows, 2)] == [125] * 4
-    assert len(list(reducer.tiles(rows, 2))) == 4
-    assert len(list(reducer.tiles(rows, 8))) >= 16
-
-
 def test_tiles_measure_as_pairs_do(reducer: Reducer, fields: NDArray[np.complex128]) -> None:
     found = np.full((2, ROWS, ROWS), np.nan)
     for rows, others in reducer.tiles(list(range(ROWS)), 1):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from sobolev_batch import ClusterError, Study, open_store, run
+from sobolev_batch import Study, open_store, run
 from sobolev_batch.batch.cluster.clients import remote_client
 from sobolev_batch.batch.cluster.workers import GPU, prepare_workers
 from tests.support.processes import tcp_cluster
@@ -69,23 +69,3 @@ def test_one_device_serves_one_worker_and_studies_use_what_there_is(
     for name in ("gpu", "auto", "cpu"):
         found = variable(open_store(tmp_path / f"{name}.zarr"), "fourier", "fourier").sel(mesh=expected["mesh"])
         assert np.abs(found.values - expected.values).max() < 5e-9 * 4 * np.pi
-
-
-def test_a_gpu_without_memory_leaves_its_work_to_the_processor(
-    device: str, store_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("PRETEND_GPU_BYTES", "1e5")
-    with tcp_cluster(PRETEND) as (address, _), remote_client(address) as client:
-        assert not run(study_on("gpu"), store_path, client).failed
-    told = set(meshes(store_path)["backend"].values.tolist())
-    assert all(backend.startswith("finufft after cufinufft: ") for backend in told), told
-
-
-def test_a_store_that_a_gpu_filled_is_taken_over_by_any_backend(device: str, store_path: Path) -> None:
-    with tcp_cluster(PRETEND) as (address, _), remote_client(address) as client:
-        run(study_on("gpu"), store_path, client)
-    with tcp_cluster([]) as (address, _), remote_client(address) as client:
-        again = run(study_on("cpu"), store_path, client)
-        assert (again.computed, len(again.reused)) == ((), 6)
-        with pytest.raises(ClusterError, match="requests backend 'gpu'"):
-            run(study_on("gpu", norm={"orders": [-4.0]}), store_path, client)

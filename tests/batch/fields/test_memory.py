@@ -66,16 +66,19 @@ def test_blocks_of_a_few_meshes_are_spread_over_threads_those_of_many_stay_toget
 
 
 @pytest.mark.parametrize(
-    ("size", "needed"), [(ExpectedSize(1000, 9e9), r"9\.0GB"), (ExpectedSize(60_000_000, 0), r"12\.3GB")]
+    ("blocks", "size", "gigabytes", "numbers"),
+    [
+        (ONE_CHUNK, ExpectedSize(1000, 9e9), (3.1, 2.0), ("9.0GB", "3.1GB")),
+        (ONE_CHUNK, ExpectedSize(60_000_000, 0), (3.1, 2.0), ("12.3GB", "3.1GB")),
+        (LARGE, ExpectedSize(), (0.4,), ("690.5MB", "400.0MB")),
+    ],
 )
-def test_what_fits_into_no_worker_is_refused_with_both_numbers(size: ExpectedSize, needed: str) -> None:
-    with pytest.raises(ClusterError, match=rf"takes about {needed} in one task, and no worker has more than 3\.1GB"):
-        size_tasks(ONE_CHUNK, TRANSFORM, size, workers_with(3.1, 2.0), rows=1)
-
-
-def test_a_block_that_fits_into_no_worker_is_refused() -> None:
-    with pytest.raises(ClusterError, match=r"690\.5MB in one task, and no worker has more than 400\.0MB"):
-        size_tasks(LARGE, TRANSFORM, ExpectedSize(), workers_with(0.4), rows=1)
+def test_what_fits_into_no_worker_is_refused_with_both_numbers(
+    blocks: tuple[Block, ...], size: ExpectedSize, gigabytes: tuple[float, ...], numbers: tuple[str, str]
+) -> None:
+    needed, most = map(re.escape, numbers)
+    with pytest.raises(ClusterError, match=rf"takes about {needed} in one task, and no worker has more than {most}"):
+        size_tasks(blocks, TRANSFORM, size, workers_with(*gigabytes), rows=1)
 
 
 @pytest.mark.process

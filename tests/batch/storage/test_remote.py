@@ -8,7 +8,6 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 from distributed import Client
 from zarr.buffer.cpu import Buffer
@@ -20,9 +19,7 @@ from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.storage import location as locations
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.store.store import Store
-from sobolev_batch.batch.study.plan import make_plan
 from tests.support.commands import STUDY, command
 from tests.support.object_storage import (
     BUCKET,
@@ -181,18 +178,6 @@ def test_a_run_whose_store_fails_for_good_ends_and_is_resumed(
     again = go()
     assert again.returncode == 0, again.stderr
     assert "2 computed, 1 reused, 0 failed" in again.stdout
-
-
-def test_a_field_that_finds_no_room_leaves_nothing(store_path: Path) -> None:
-    plan = make_plan(Study.from_table(small_table()))
-    store = prepare_store(store_path, plan)
-    before = sorted(path for path in store_path.rglob("*") if path.is_file())
-    place = plan.lattice.place(plan.blocks[0])
-    with full_disk(1000), pytest.raises(StoreError, match=f"{store_path}: the store cannot be written: File too large"):
-        store.write_field(1, place, np.ones(plan.lattice.shape, dtype=complex))
-    assert sorted(path for path in store_path.rglob("*") if path.is_file()) == before
-    assert np.isnan(store.read_fields([1], place)).all()
-    assert store.records() == (None,) * 5
 
 
 @pytest.mark.slow

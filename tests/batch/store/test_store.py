@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -78,15 +77,6 @@ def test_opening_what_is_no_store_or_a_newer_one(store_path: Path) -> None:
     zarr.open_group(str(store_path), mode="r+").attrs["schema_version"] = 99
     with pytest.raises(StoreError, match="its schema has version 99, this program reads"):
         Store.open(store_path)
-
-
-def test_every_array_carries_a_checksum(store_path: Path) -> None:
-    prepare_store(store_path, small_plan())
-    metadata = [json.loads(path.read_text()) for path in store_path.rglob("zarr.json")]
-    arrays = [entry for entry in metadata if entry["node_type"] == "array"]
-    assert len(arrays) >= 6
-    for entry in arrays:
-        assert entry["codecs"][-1]["name"] == "crc32c"
 
 
 def test_plain_xarray_reads_everything_without_this_package(finished_store: Path, tmp_path: Path) -> None:

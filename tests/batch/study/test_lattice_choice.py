@@ -77,32 +77,6 @@ def test_a_period_beyond_a_small_lattice_leads_to_octaves(tmp_path: Path) -> Non
     assert make_plan(study).choice.tail is not None
 
 
-@pytest.mark.all
-def test_another_accuracy_is_another_choice(client: Client, store_path: Path) -> None:
-    sb.run(asking(), store_path, client)
-    first = stored_choice(store_path)
-    summary = sb.run(asking(1e-4), store_path, client)
-    second = stored_choice(store_path)
-    assert first is not None
-    assert second is not None
-    assert len(summary.computed) == 5
-    assert second.lattice.xi_max > first.lattice.xi_max
-    assert variable(sb.open_store(store_path), "fourier", "fourier").shape[1:] == second.lattice.shape
-    assert variable(sb.open_store(store_path), "convergence", "within").all()
-
-
-def test_a_coarse_accuracy_of_a_far_mesh_needs_no_octaves(client: Client, store_path: Path) -> None:
-    family = [{"name": "ico", "source": "icosphere", "levels": [0]}]
-    sb.run(asking(0.1, norm={"orders": [-2.0]}, family=family), store_path, client)
-    choice = stored_choice(store_path)
-    assert choice is not None
-    assert choice.tail is None
-    found = sb.open_store(store_path)["convergence"].to_dataset().sel(mesh="ico/0", order=-2.0)
-    truth = sb.distance(sb.icosphere(0), sb.Sphere(), -2.0, rtol=1e-3)
-    assert found["within"]
-    assert abs(found["distance"] - truth["distance"].item()) <= found["error"] + truth["error"].item()
-
-
 def test_a_lattice_that_turns_out_too_small_grows(
     client: Client, store_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

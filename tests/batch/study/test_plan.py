@@ -40,6 +40,8 @@ def test_the_similarity_takes_the_reference_to_the_unit_sphere(box_file: Path) -
     plan = plan_of(reference={"source": "files", "paths": ["box.off"]}, folder=box_file.parent)
     assert plan.similarity.scale == pytest.approx(1 / 3)
     assert plan.similarity.origin == pytest.approx((10.0, 0.0, 0.0))
+    ring = plan_of(reference={"source": "torus", "R": 2.0, "r": 0.8, "center": [5.0, 0.0, 1.0]}, scaling={})
+    assert (ring.similarity.scale, ring.similarity.origin) == (1 / 2.8, (5.0, 0.0, 1.0))
 
 
 def test_scaling_can_be_fixed_or_left_out() -> None:

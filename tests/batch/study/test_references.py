@@ -70,18 +70,6 @@ def test_refinements_converge_with_second_order(
 
 
 @pytest.mark.slow
-def test_a_study_to_an_accuracy(threads: Client, store_path: Path) -> None:
-    family = [{"name": "grid", "source": "torus", **RING, "levels": [1, 2]}]
-    table = torus_table(accuracy={"rtol": 1e-2}, lattice=None, norm={"orders": [-4.0]}, family=family)
-    summary = sb.run(sb.Study.from_table(table), store_path, threads)
-    assert not summary.failed
-    found = sb.open_store(store_path)["convergence"].to_dataset().isel(order=0)
-    assert found["within"].values[:2].all()
-    assert (found["error"].values[:2] <= 1e-2 * found["distance"].values[:2]).all()
-    assert found["distance"].values[0] / found["distance"].values[1] == pytest.approx(4.0, rel=0.05)
-
-
-@pytest.mark.slow
 def test_blocks_of_a_smooth_surface_make_the_same_store(threads: Client, tmp_path: Path) -> None:
     family = [{"name": "grid", "source": "torus", **RING, "levels": [1]}]
     study = sb.Study.from_table(torus_table(family=family))
@@ -108,9 +96,3 @@ def test_a_reference_that_does_not_settle_is_a_failed_row(
     summary = sb.run(study, store_path, threads)
     assert set(summary.failed) == {"reference"}
     assert "not settled to 1e-09 of its area with 16384 nodes" in summary.failed["reference"]
-
-
-def test_the_bounding_sphere_of_the_reference_becomes_the_unit_sphere() -> None:
-    similarity = make_plan(sb.Study.from_table(torus_table())).similarity
-    assert (similarity.scale, similarity.origin) == (1 / 2.8, (5.0, 0.0, 1.0))
-    assert make_plan(sb.Study.from_table(egg_table())).similarity.scale == 0.5
