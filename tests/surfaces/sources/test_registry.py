@@ -70,7 +70,7 @@ def test_names_of_sources_must_be_exact(name: object) -> None:
 @pytest.mark.usefixtures("plugin")
 def test_other_packages_add_sources() -> None:
     assert listed(members({"source": "cubes", "count": 2})) == [("3", 3), ("3", 3)]
-    with pytest.raises(StudyError, match="known are absent-class, absent-module, command, cubes"):
+    with pytest.raises(StudyError, match="known are a-function, absent-class, absent-module, command, cubes"):
         parse_source({"source": "nothing"})
     with pytest.raises(ValidationError, match="count"):
         parse_source({"source": "cubes"})
