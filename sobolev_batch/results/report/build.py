@@ -47,11 +47,8 @@ from sobolev_batch.results.tables.matrix import pairs_of
 from sobolev_batch.results.tables.text import minus
 from sobolev_batch.visible import visible
 
-_FOLDER = "page"
 # Of the extra.
 _LIBRARIES = ("jinja2", "plotly", "tomli_w")
-
-
 # Points of all convergence charts together, and numbers of all matrices: 10 bytes each, on a page of up to 15 MB.
 MOST_POINTS, MOST_NUMBERS = 50_000, 400_000
 
@@ -200,7 +197,7 @@ def _shown_data(value: Any) -> Any:
 
 
 def _page_file(name: str) -> str:
-    return (resources.files("sobolev_batch.results.report") / _FOLDER / name).read_text(encoding="utf-8")
+    return (resources.files("sobolev_batch.results.report") / "page" / name).read_text(encoding="utf-8")
 
 
 def _digest(script: str) -> str:
