@@ -97,22 +97,18 @@ def test_meshes_of_a_collection_are_shown_by_the_report_of_an_object(store: str)
         make_report(store, witnesses=["ico/1"])
 
 
+SEPARATED = "a is nearest to the references over 8 objects at order −2: it differs by 0.5 %."
+OPEN = "The intervals do not separate {} over {} objects at order −2. a has the smallest mean, 0.5 %."
+
+
 @pytest.mark.parametrize(
     ("factors", "objects", "sentence"),
     [
-        ({"b": 2.0, "a": 1.0}, 8, "a is nearest to the references over 8 objects at order −2: it differs by 0.5 %."),
+        ({"b": 2.0, "a": 1.0}, 8, SEPARATED),
         ({"a": 1.0}, 2, "a differs from the references by 0.5 % over 2 objects at order −2."),
         ({"b": 2.0, "a": 1.0}, 1, "a is nearest on o0 at order −2: it differs by 0.5 %. One object ranks no methods."),
-        (
-            {"a": 1.0, "b": 1.0, "c": 2.0},
-            8,
-            "The intervals do not separate a and b over 8 objects at order −2. a has the smallest mean, 0.5 %.",
-        ),
-        (
-            dict.fromkeys("abcde", 1.0),
-            2,
-            "The intervals do not separate 5 of 5 methods over 2 objects at order −2. a has the smallest mean, 0.5 %.",
-        ),
+        ({"a": 1.0, "b": 1.0, "c": 2.0}, 8, OPEN.format("a and b", 8)),
+        (dict.fromkeys("abcde", 1.0), 2, OPEN.format("5 of 5 methods", 2)),
     ],
 )
 def test_a_sentence_says_which_method_is_nearest(factors: dict[str, float], objects: int, sentence: str) -> None:

@@ -47,8 +47,8 @@ def test_text_fits_a_terminal() -> None:
     assert max(map(len, lines)) <= 100
     assert lines[0] == "Sobolev distances of order -4, in the square root of a unit length"
     assert "Sobolev distances of order -2, in the square root of a unit length" in lines
-    row = next(line.split() for line in lines if line.startswith("4 f/3"))
-    assert row == ["4", "f/3", "3.00", "±", "0.03", "missing", "1.00", "±", "0.01"]
+    row = next(line for line in lines if line.startswith("4 f/3"))
+    assert " ".join(row.split()) == "4 f/3 3.00 ± 0.03 missing 1.00 ± 0.01"
 
 
 @pytest.mark.parametrize("style", ["text", "markdown", "latex"])
@@ -70,13 +70,8 @@ def test_programs_get_lines_of_pairs() -> None:
     assert len(lines) == 1 + 2 * 4 * 4
     assert "-4.0,f/0,f/1,,,,,," in lines
     records = json.loads(format_matrix(made(3), "json", [-4.0]))
-    assert records[2] == {
-        "order": -4.0,
-        "mesh": "f/0",
-        "other": "f/2",
-        "distance": 2.0,
-        **dict.fromkeys(ERRORS, 0.02),
-    }
+    pair = {"order": -4.0, "mesh": "f/0", "other": "f/2"}
+    assert records[2] == {**pair, "distance": 2.0, **dict.fromkeys(ERRORS, 0.02)}
     assert records[1]["distance"] is None
 
 
@@ -90,14 +85,7 @@ def test_distances_to_the_reference_alone() -> None:
     tree = made(4)
     tree["distances"] = xr.DataTree(tree["distances"].to_dataset().sel(other=["reference"]))
     assert len(matrix_frame(distances_at(tree, None), -4.0)) == 5
-    text = format_matrix(tree, "text", [-4.0])
-    assert next(line.split() for line in text.splitlines() if line.startswith("3 f/2")) == [
-        "3",
-        "f/2",
-        "3.00",
-        "±",
-        "0.03",
-    ]
+    assert "\n3 f/2        3.00 ± 0.03\n" in format_matrix(tree, "text", [-4.0])
     assert pairs_of(tree, -4.0) is None
 
 

@@ -95,20 +95,13 @@ def test_shares_of_area(changes: dict[str, float], area_change: float, share: st
     assert said(area_change, **changes) == f"a.obj differs from b.obj by 1.02 % ± 0.01 % at order -2{share}."
 
 
-def test_distances_that_cannot_be_told_from_zero() -> None:
-    assert (
-        said(distance=2e-4, relative=1e-4) == "a.obj differs from b.obj by less than 0.020 % at order -2: not resolved."
-    )
+def test_distances_that_cannot_be_told_from_zero_and_unknown_errors() -> None:
+    near = "a.obj differs from b.obj by less than 0.020 % at order -2: not resolved."
+    assert said(distance=2e-4, relative=1e-4) == near
     equal = "a.obj and b.obj are equal up to rounding at order -2: they differ by less than 2.1 × 10⁻¹¹ %."
     assert said(distance=1e-14, error=2e-13, relative=1e-14, relative_error=2e-13) == equal
     zero = dict.fromkeys(NUMBERS, 0.0)
     assert said(**zero, **UNKNOWN) == "a.obj and b.obj are identical: they have the same triangles."
-
-
-def test_unknown_errors() -> None:
-    nan = float("nan")
-    assert "by 1.020 % ± ? at order -2" in said(relative_error=nan)
-    assert (
-        said(error=nan, relative_error=nan)
-        == "a.obj differs from b.obj by an unknown amount at order -2: not resolved."
-    )
+    assert "by 1.020 % ± ? at order -2" in said(relative_error=_NAN)
+    unknown = "a.obj differs from b.obj by an unknown amount at order -2: not resolved."
+    assert said(error=_NAN, relative_error=_NAN) == unknown
