@@ -13,7 +13,7 @@ from distributed import Client
 from sobolev_batch.batch.analysis.tabulate import pairs_bytes
 from sobolev_batch.batch.cluster.workers import Workers, prepare_workers, worker_slowness
 from sobolev_batch.batch.collection_store import for_each_object
-from sobolev_batch.batch.fields.compute import TaskSizes, size_rows
+from sobolev_batch.batch.fields.compute import Sizes, size_rows
 from sobolev_batch.batch.run import mesh_cache, require_permission
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.records import Record
@@ -196,7 +196,7 @@ def _study_lines(plan: Plan) -> Iterator[tuple[str, str]]:
 def _task_lines(
     plan: Plan,
     workers: Workers,
-    sizes: Mapping[str, TaskSizes],
+    sizes: Mapping[str, Sizes],
     refused: Mapping[str, str],
     doubtful: Mapping[str, str],
 ) -> Iterator[tuple[str, str]]:
@@ -206,11 +206,11 @@ def _task_lines(
         f"{len(workers.members)}, with {workers.threads} threads and {gpus} GPUs together; for tasks, "
         f"{format_bytes(workers.allowed_bytes_per_task)} or more of memory a thread",
     )
-    tasks = sum(size.task_count for size in sizes.values())
+    tasks = sum(len(groups) for groups, *_ in sizes.values())
     yield "tasks", f"{tasks} for {len(sizes)} surfaces; chunks of the lattice: {len(plan.blocks)}"
     if sizes:
-        largest, size = max(sizes.items(), key=lambda item: item[1].projected_bytes)
-        yield "memory", f"up to {format_bytes(size.projected_bytes)} in a task, of {largest}"
+        largest, (*_, task_bytes) = max(sizes.items(), key=lambda item: item[1][-1])
+        yield "memory", f"up to {format_bytes(task_bytes)} in a task, of {largest}"
     if plan.study.pairs == "all":
         driver_bytes = pairs_bytes(len(plan.rows), len(plan.study.orders))
         yield "", f"{format_bytes(driver_bytes)} in the driver, for distances of all pairs"
@@ -363,7 +363,7 @@ def _plan(study: Study, location: Location, client: Client | None) -> StudyPlan:
         dtype=study_plan.choice.dtype,
         similarity=study_plan.similarity,
         field_bytes=study_plan.field_bytes,
-        memory_bytes={label: size.projected_bytes for label, size in sizes.items()},
+        memory_bytes={label: task_bytes for label, (*_, task_bytes) in sizes.items()},
         seconds=seconds,
         processor_seconds=processor_seconds,
         lines=tuple(lines),

@@ -294,12 +294,11 @@ def _inner_bands(reducer: Reducer, rows: list[int]) -> list[Band]:
 
 def _octaves(reducer: Reducer, rows: list[int]) -> list[Band]:
     """Return the same of each octave beyond the lattice."""
-    tails = reducer.tails
-    if tails is None:
+    if reducer.sampling is None:
         return []
-    values = [tails.read(row) for row in rows]
-    sums = tails.sums(values[0] - values[1] if len(rows) > 1 else values[0])
+    values = [reducer.read_octaves(row) for row in rows]
+    sums = reducer.octave_sums(values[0] - values[1] if len(rows) > 1 else values[0])
     return [
         (sampling.octave.highest, one.squares, one.energy, one.energy_deviation)
-        for sampling, one in zip(tails.sampling.octaves, sums, strict=True)
+        for sampling, one in zip(reducer.sampling.octaves, sums, strict=True)
     ]

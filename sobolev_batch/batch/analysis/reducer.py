@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass, field, fields
 from functools import cached_property
 from typing import Any, Self
 
@@ -54,86 +54,6 @@ _SAMPLE_BYTES = 200.0
 
 
 @dataclass(frozen=True, eq=False)
-class TailReducer:
-    """Tails of norms and distances from stored values in octaves.
-
-    Attributes:
-        store: Store of the values.
-        sampling: Samples of the octaves.
-        orders: Sobolev orders s.
-        reference: Row of the reference, or None if it has no values.
-        qualities: Quality of each row's values.
-        checksums: Checksum of each row's values.
-    """
-
-    store: Store
-    sampling: TailSampling
-    orders: tuple[float, ...]
-    reference: int | None
-    qualities: Mapping[int, TailQuality]
-    checksums: Mapping[int, int]
-
-    @cached_property
-    def weights(self) -> tuple[OctaveWeights, ...]:
-        """Weights of the samples of each octave."""
-        return tuple(OctaveWeights(octave, self.orders) for octave in self.sampling.octaves)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "weights"}
-
-    @property
-    def task_bytes(self) -> float:
-        """Memory that a task takes at most."""
-        return _HELD_BYTES + (_SAMPLE_BYTES + 8 * len(self.orders)) * self.sampling.size
-
-    def read(self, row: int) -> NDArray[np.complexfloating]:
-        """Return the values of a row (n,), and check them against its record."""
-        place = (slice(0, self.sampling.size),)
-        values: NDArray[np.complexfloating] = self.store.read_fields([row], place, [self.checksums[row]])[0]
-        return values
-
-    def sums(self, values: NDArray[np.complexfloating]) -> list[OctaveSums]:
-        """Return the integrals of |values|² over each octave, from those at all samples (n,)."""
-        parts = self.sampling.split(squared_moduli(values))
-        return [weights.sums(squares) for weights, squares in zip(self.weights, parts, strict=True)]
-
-    def of_norm(self, row: int, values: NDArray[np.complexfloating]) -> Tail:
-        """Return the tail of a squared norm."""
-        return Tail.from_sums(self.sums(values), *self.qualities[row].own.at(self.orders))
-
-    def of_pair(self, row: int, other: int, difference: NDArray[np.complexfloating]) -> Tail:
-        """Return the tail of a squared distance."""
-        sums = self.sums(difference)
-        return Tail.from_sums(sums, *self._remainder(row, other, sums[-1].energy).at(self.orders))
-
-    def of_pairs(self, rows: Sequence[int], others: Sequence[int], shared: int) -> Tail:
-        """Return the tails of squared distances (orders, rows, others); the first ``shared`` others are the rows."""
-        parts = np.zeros((len(fields(Tail)), len(self.orders), len(rows), len(others)))
-        size = max(1, _HELD_BYTES // (16 * self.sampling.size))
-        for first in range(0, len(rows), size):
-            held = {i: self.read(rows[i]) for i in range(first, min(first + size, len(rows)))}
-            for j in range(min(first, shared), len(others)):
-                values = held[j] if j < shared and j in held else self.read(others[j])
-                for i, own in held.items():
-                    if i < j or j >= shared:
-                        parts[..., i, j] = astuple(self.of_pair(rows[i], others[j], own - values))
-        if shared:
-            parts[..., :shared] += np.swapaxes(np.triu(parts[..., :shared], 1), -1, -2)
-        return Tail(*parts)
-
-    def _remainder(self, row: int, other: int, last_energy: float) -> Remainder:
-        """Return what lies beyond the octaves in a distance: known to the reference, else between bounds."""
-        for first, second in ((row, other), (other, row)):
-            known = self.qualities[first].difference
-            if second == self.reference and known is not None:
-                return known
-        parts = [self.qualities[number].own for number in (row, other)]
-        # Equal meshes have equal values.
-        highest = sum(max(part.energies) for part in parts) if last_energy else 0.0
-        return Remainder.between(min(_LEAST_LIMIT * last_energy, highest), highest, parts[0].cutoff)
-
-
-@dataclass(frozen=True, eq=False)
 class Reducer:
     """The input that all tiles of one reduction share.
 
@@ -146,8 +66,10 @@ class Reducer:
         areas: Area of every row's surface (rows,), NaN without a field.
         errors: Norms of the fields' own errors (orders, rows), likewise.
         widths: Widths of all surfaces together (13,), see `Extent`.
-        checksums: Checksums of the blocks of each field, by its row.
-        tails: Tails from values in octaves; None where the fields are all there is.
+        checksums: Checksums of the blocks of each field, by its row, and of its values in octaves.
+        sampling: Samples of the octaves; None where the fields are all there is.
+        qualities: Quality of each row's values in octaves.
+        known_reference: Row of the study's reference, which the qualities know; None if it has no field.
         tile_bytes: Bytes of fields that a task holds at a time, in all: the rows of a tile, a group of the others,
             and fields as they are read.
     """
@@ -161,7 +83,9 @@ class Reducer:
     errors: Reals
     widths: Reals
     checksums: Mapping[int, tuple[int, ...]]
-    tails: TailReducer | None = None
+    sampling: TailSampling | None = None
+    qualities: Mapping[int, TailQuality] = field(default_factory=dict)
+    known_reference: int | None = None
     tile_bytes: int = 384 << 20
 
     @classmethod
@@ -181,11 +105,7 @@ class Reducer:
         qualities = {row: Quality.from_json(record.quality) for row, record in complete.items()}
         for row, quality in qualities.items():
             areas[row], errors[:, row] = quality.area, quality.error_norms(weights)
-        known, tails = reference if reference in complete else None, None
-        if choice.tail is not None:
-            of_tails = {row: quality.tail for row, quality in qualities.items() if quality.tail is not None}
-            checksums = {row: record.checksums[-1] for row, record in complete.items()}
-            tails = TailReducer(store, choice.tail, orders, known, of_tails, checksums)
+        known = reference if reference in complete else None
         extents = [quality.extent for quality in qualities.values()]
         return cls(
             store=store,
@@ -197,13 +117,24 @@ class Reducer:
             errors=errors,
             widths=Extent.union(extents).widths if extents else np.zeros(len(DIRECTIONS)),
             checksums={row: record.checksums for row, record in complete.items()},
-            tails=tails,
+            sampling=choice.tail,
+            qualities={row: quality.tail for row, quality in qualities.items() if quality.tail is not None},
+            known_reference=known,
         )
 
     @property
     def weights(self) -> SobolevWeights:
         """Weights of the orders on the lattice, with a step where octaves follow."""
-        return SobolevWeights(self.lattice, self.orders, None if self.tails is None else self.tails.sampling.cutoff)
+        return SobolevWeights(self.lattice, self.orders, None if self.sampling is None else self.sampling.cutoff)
+
+    @cached_property
+    def octave_weights(self) -> tuple[OctaveWeights, ...]:
+        """Weights of the samples of each octave."""
+        octaves = () if self.sampling is None else self.sampling.octaves
+        return tuple(OctaveWeights(octave, self.orders) for octave in octaves)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "octave_weights"}
 
     def tiles(self, rows: Sequence[int], workers: int) -> Iterator[tuple[Sequence[int], Sequence[int]]]:
         """Yield rows and others of tiles that cover every pair once, fit into a task's memory and occupy the workers.
@@ -225,7 +156,9 @@ class Reducer:
     def task_bytes(self) -> float:
         """Memory that a task takes at most, as measured: the fields that it holds, and temporaries."""
         block_bytes = 16.0 * self.blocks[0].size
-        tail_bytes = 0.0 if self.tails is None else self.tails.task_bytes
+        tail_bytes = 0.0
+        if self.sampling is not None:
+            tail_bytes = _HELD_BYTES + (_SAMPLE_BYTES + 8 * len(self.orders)) * self.sampling.size
         return max(5 * block_bytes, self.tile_bytes + 4 * block_bytes) + tail_bytes
 
     @property
@@ -248,7 +181,7 @@ class Reducer:
         """
         rows = list(rows)
         sums, differences, products, reference = self._sums(rows)
-        tails = None if self.tails is None else self._tails(self.tails, rows)
+        tails = None if self.sampling is None else self._tails(self.sampling, rows)
         own = self._estimate(sums, None if tails is None else tails[0], self.areas[rows], self.errors[:, rows])
         beyond = np.zeros_like(own.values) if tails is None else tails[0].beyond
         if self.reference is None:
@@ -289,22 +222,22 @@ class Reducer:
                     products[batch] += shell_sums(values, np.broadcast_to(reference, values.shape), self.lattice, block)
         return [sums_of_shells(shells, self.weights) for shells in (own, differences, products, reference_sums)]
 
-    def _tails(self, tails: TailReducer, rows: Sequence[int]) -> tuple[Tail, Tail, Reals, Tail]:
+    def _tails(self, sampling: TailSampling, rows: Sequence[int]) -> tuple[Tail, Tail, Reals, Tail]:
         """Return the same beyond the lattice; those of the rows stand for the others without the reference."""
-        reference = None if self.reference is None else tails.read(self.reference)
+        reference = None if self.reference is None else self.read_octaves(self.reference)
         own, differences, products = [], [], []
         for row in rows:
-            values = tails.read(row)
-            own.append(tails.of_norm(row, values))
+            values = self.read_octaves(row)
+            own.append(self._tail_of_norm(row, values))
             if reference is not None and self.reference is not None:
                 difference = values - reference
-                differences.append(tails.of_pair(row, self.reference, difference))
-                parts = tails.sampling.split((difference * reference.conj()).real.astype(np.float64))
-                products.append(sum(one.integrals(part) for one, part in zip(tails.weights, parts, strict=True)))
+                differences.append(self._tail_of_pair(row, self.reference, difference))
+                parts = sampling.split((difference * reference.conj()).real.astype(np.float64))
+                products.append(sum(one.integrals(part) for one, part in zip(self.octave_weights, parts, strict=True)))
         norms = Tail.stacked(own)
         if reference is None or self.reference is None:
             return norms, norms, norms.beyond, norms
-        of_reference = tails.of_norm(self.reference, reference)
+        of_reference = self._tail_of_norm(self.reference, reference)
         return norms, Tail.stacked(differences), np.stack(products, axis=-1), Tail.stacked([of_reference])
 
     def tile(self, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
@@ -326,7 +259,7 @@ class Reducer:
         unequal = np.array([[row != other for other in others] for row in rows], dtype=np.float64)
         areas = self.areas[list(rows)][:, None] + self.areas[list(others)]
         errors = self.errors[:, list(rows)][:, :, None] + self.errors[:, list(others)][:, None, :]
-        tail = None if self.tails is None else self.tails.of_pairs(rows, others, shared)
+        tail = None if self.sampling is None else self._tails_of_pairs(self.sampling, rows, others, shared)
         return self._estimate(sums, tail, areas, errors, unequal)
 
     def _estimate(
@@ -380,6 +313,49 @@ class Reducer:
         """Read one block of fields, and check it against their records."""
         expected = [self.checksums[row][number] for row in rows]
         return self.store.read_fields(rows, self.lattice.place(self.blocks[number]), expected)
+
+    def read_octaves(self, row: int) -> NDArray[np.complexfloating]:
+        """Return the values of a row at all samples of octaves (n,), and check them against its record."""
+        place = (slice(0, 0 if self.sampling is None else self.sampling.size),)
+        values: NDArray[np.complexfloating] = self.store.read_fields([row], place, [self.checksums[row][-1]])[0]
+        return values
+
+    def octave_sums(self, values: NDArray[np.complexfloating]) -> list[OctaveSums]:
+        """Return the integrals of |values|² over each octave, from those at all samples (n,)."""
+        parts = () if self.sampling is None else self.sampling.split(squared_moduli(values))
+        return [weights.sums(squares) for weights, squares in zip(self.octave_weights, parts, strict=True)]
+
+    def _tail_of_norm(self, row: int, values: NDArray[np.complexfloating]) -> Tail:
+        return Tail.from_sums(self.octave_sums(values), *self.qualities[row].own.at(self.orders))
+
+    def _tail_of_pair(self, row: int, other: int, difference: NDArray[np.complexfloating]) -> Tail:
+        sums = self.octave_sums(difference)
+        return Tail.from_sums(sums, *self._remainder(row, other, sums[-1].energy).at(self.orders))
+
+    def _tails_of_pairs(self, sampling: TailSampling, rows: Sequence[int], others: Sequence[int], shared: int) -> Tail:
+        """Return the tails of squared distances (orders, rows, others); the first ``shared`` others are the rows."""
+        parts = np.zeros((len(fields(Tail)), len(self.orders), len(rows), len(others)))
+        for batch in _slices(len(rows), max(1, _HELD_BYTES // (16 * sampling.size))):
+            held = {i: self.read_octaves(rows[i]) for i in range(batch.start, batch.stop)}
+            for j in range(min(batch.start, shared), len(others)):
+                values = held[j] if j < shared and j in held else self.read_octaves(others[j])
+                for i, own in held.items():
+                    if i < j or j >= shared:
+                        parts[..., i, j] = astuple(self._tail_of_pair(rows[i], others[j], own - values))
+        if shared:
+            parts[..., :shared] += np.swapaxes(np.triu(parts[..., :shared], 1), -1, -2)
+        return Tail(*parts)
+
+    def _remainder(self, row: int, other: int, last_energy: float) -> Remainder:
+        """Return what lies beyond the octaves in a distance: known to the reference, else between bounds."""
+        for first, second in ((row, other), (other, row)):
+            known = self.qualities[first].difference
+            if second == self.known_reference and known is not None:
+                return known
+        parts = [self.qualities[number].own for number in (row, other)]
+        # Equal meshes have equal values.
+        highest = sum(max(part.energies) for part in parts) if last_energy else 0.0
+        return Remainder.between(min(_LEAST_LIMIT * last_energy, highest), highest, parts[0].cutoff)
 
     def _direct(self, row: int, other: int) -> Sums:
         """Return the sums of one pair, from the difference of its fields."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -33,6 +32,10 @@ LEAST_TRANSFORM_BYTES = 256e6
 _CHOICE_BYTES = 100.0
 # Of a sample of octaves: its frequency, weight, place and value, and what makes them.
 _SAMPLE_BYTES = 150.0
+# Groups of blocks of the lattice. The blocks of a group are computed in one task.
+_Groups = tuple[tuple[Block, ...], ...]
+# The groups of a row, the memory that one transform may take besides mesh and block, and that of a task.
+Sizes = tuple[_Groups, float, float]
 # Every task of a study with octaves loads the reference too, but for a larger one.
 _LARGEST_REFERENCE = 3 << 20
 
@@ -68,10 +71,10 @@ def compute_fields(cluster: Cluster, workspace: Workspace, pending: Sequence[int
         for i in pending:
             row = rows[i]
             if row.label in sizes:
-                job = Job.for_row(plan, row, store, i, sizes[row.label].allowed_bytes, reference)
-                yield _field_task(job, sizes[row.label])
+                groups, allowed_bytes, task_bytes = sizes[row.label]
+                yield _field_task(Job.for_row(plan, row, store, i, allowed_bytes, reference), groups, task_bytes)
 
-    projected_bytes = max((size.projected_bytes for size in sizes.values()), default=0.0)
+    projected_bytes = max((task_bytes for *_, task_bytes in sizes.values()), default=0.0)
     for task, outcome in cluster.run(tasks(), projected_bytes):
         if isinstance(outcome, Record):
             take(task.row, outcome)
@@ -79,45 +82,21 @@ def compute_fields(cluster: Cluster, workspace: Workspace, pending: Sequence[int
             give_up(task.row, describe_failure(outcome))
 
 
-def _field_task(job: Job, sizes: TaskSizes) -> Task:
+def _field_task(job: Job, groups: _Groups, projected_bytes: float) -> Task:
     """Return the task that computes and stores a field, after those that it depends on; it gives the record."""
     needs_gpu = job.backend == "gpu"
-    if len(sizes.block_groups) == 1:
-        (blocks,) = sizes.block_groups
-        return Task(compute_mesh, (job, blocks), sizes.projected_bytes, needs_gpu, job.index, job.row.label)
-    parts = [(blocks, False) for blocks in sizes.block_groups] + [((), True)] * (job.tail is not None)
-    groups = [Task(compute_parts, (job, *part), sizes.projected_bytes, needs_gpu) for part in parts]
-    return Task(finish_mesh, (job, groups), row=job.index, label=job.row.label)
+    if len(groups) == 1:
+        return Task(compute_mesh, (job, *groups), projected_bytes, needs_gpu, job.index, job.row.label)
+    parts = [(blocks, False) for blocks in groups] + [((), True)] * (job.tail is not None)
+    tasks = [Task(compute_parts, (job, *part), projected_bytes, needs_gpu) for part in parts]
+    return Task(finish_mesh, (job, tasks), row=job.index, label=job.row.label)
 
 
-@dataclass(frozen=True)
-class TaskSizes:
-    """The tasks of one row.
-
-    Attributes:
-        block_groups: Groups of blocks of the lattice. The blocks of a group are computed in one task.
-        allowed_bytes: Memory that one transform may take besides its mesh and its block.
-        projected_bytes: Projected memory of a task.
-        octave_tasks: Number of tasks of their own for octaves, where the field has more than one task.
-    """
-
-    block_groups: tuple[tuple[Block, ...], ...]
-    allowed_bytes: float
-    projected_bytes: float
-    octave_tasks: int = 0
-
-    @property
-    def task_count(self) -> int:
-        """Number of tasks."""
-        # Several groups have a task for the record too.
-        return 1 if len(self.block_groups) == 1 else len(self.block_groups) + 1 + self.octave_tasks
-
-
-def size_rows(plan: Plan, rows: Sequence[Row], workers: Workers) -> tuple[dict[str, TaskSizes], dict[str, str]]:
+def size_rows(plan: Plan, rows: Sequence[Row], workers: Workers) -> tuple[dict[str, Sizes], dict[str, str]]:
     """Return the tasks of rows by their labels, and the reason for each row that fits into no worker."""
     octaves = _octave_memory(plan)
 
-    def sizes_for(size: ExpectedSize) -> TaskSizes:
+    def sizes_for(size: ExpectedSize) -> Sizes:
         return size_tasks(plan.blocks, plan.transform, size, workers, len(rows), octaves)
 
     sizes_for(ExpectedSize())
@@ -155,7 +134,7 @@ def size_tasks(
     workers: Workers,
     rows: int,
     octaves: tuple[Block, float] | None = None,
-) -> TaskSizes:
+) -> Sizes:
     """Fit a row's tasks into the memory of workers.
 
     Each task holds the mesh. Its transform adds up batches of points, as large as the memory allows. Every task is kept
@@ -186,4 +165,4 @@ def size_tasks(
     count = min(len(blocks), max(1, math.ceil(2 * workers.threads / max(rows, 1))))
     ends = [len(blocks) * k // count for k in range(count + 1)]
     groups = tuple(tuple(blocks[first:last]) for first, last in pairwise(ends))
-    return TaskSizes(groups, allowed_bytes, max(loading_bytes, computing_bytes), int(octaves is not None))
+    return groups, allowed_bytes, max(loading_bytes, computing_bytes)

@@ -31,36 +31,39 @@ def workers_with(*gigabytes: float, threads: int = 1) -> Workers:
 
 
 def test_a_usual_mesh_is_one_task_with_all_the_memory_it_can_use() -> None:
-    sizes = size_tasks(ONE_CHUNK, TRANSFORM, ExpectedSize(20_000, 1e7), workers_with(8, 8), rows=100)
-    assert (sizes.task_count, sizes.block_groups) == (1, (ONE_CHUNK,))
+    groups, allowed, projected = size_tasks(
+        ONE_CHUNK, TRANSFORM, ExpectedSize(20_000, 1e7), workers_with(8, 8), rows=100
+    )
+    assert groups == (ONE_CHUNK,)
     # It claims what it is going to use, and may use what there is.
-    assert sizes.allowed_bytes == pytest.approx(8e9, rel=0.01)
-    assert projected_bytes(ONE_CHUNK[0], TRANSFORM, triangles=20_000) < sizes.projected_bytes < 0.4e9
+    assert allowed == pytest.approx(8e9, rel=0.01)
+    assert projected_bytes(ONE_CHUNK[0], TRANSFORM, triangles=20_000) < projected < 0.4e9
 
 
 def test_a_transform_gets_what_its_thread_has_and_no_less_than_it_can_work_in() -> None:
-    tight = size_tasks(LARGE, TRANSFORM, ExpectedSize(1000, 0), workers_with(1.5), rows=10)
-    assert tight.allowed_bytes < projected_bytes(LARGE[0], TRANSFORM) - LARGE[0].size * 16
-    assert tight.projected_bytes == pytest.approx(1.5e9)
+    _, allowed, projected = size_tasks(LARGE, TRANSFORM, ExpectedSize(1000, 0), workers_with(1.5), rows=10)
+    assert allowed < projected_bytes(LARGE[0], TRANSFORM) - LARGE[0].size * 16
+    assert projected == pytest.approx(1.5e9)
     # Four at once would leave nothing to each: such tasks run beside fewer others.
-    crowded = size_tasks(LARGE, TRANSFORM, ExpectedSize(1000, 0), workers_with(2.25, threads=4), rows=10)
-    assert crowded.allowed_bytes == pytest.approx(256e6, rel=1e-2)
-    assert 2.25e9 / 4 < crowded.projected_bytes <= 2.25e9
+    _, allowed, projected = size_tasks(LARGE, TRANSFORM, ExpectedSize(1000, 0), workers_with(2.25, threads=4), rows=10)
+    assert allowed == pytest.approx(256e6, rel=1e-2)
+    assert 2.25e9 / 4 < projected <= 2.25e9
 
 
 @pytest.mark.parametrize("triangles", [2_500_000, 3_000_000, 20_000_000])
 @pytest.mark.parametrize("blocks", [ONE_CHUNK, LARGE])
 @pytest.mark.parametrize("threads", [4, 8])
 def test_a_transform_can_always_work_in_what_it_gets(triangles: int, blocks: tuple[Block, ...], threads: int) -> None:
-    sizes = size_tasks(blocks, TRANSFORM, ExpectedSize(triangles, 0), workers_with(5, threads=threads), rows=1)
+    workers = workers_with(5, threads=threads)
+    _, allowed, projected = size_tasks(blocks, TRANSFORM, ExpectedSize(triangles, 0), workers, rows=1)
     workload = Workload(triangles * 3, triangles * 12, triangles)
-    fastest_spec(NufftSpec(blocks[0].shape, 1e-9), workload, CPU_COSTS, sizes.allowed_bytes)
-    assert sizes.projected_bytes <= 5e9
+    fastest_spec(NufftSpec(blocks[0].shape, 1e-9), workload, CPU_COSTS, allowed)
+    assert projected <= 5e9
 
 
 @pytest.mark.parametrize(("rows", "groups"), [(1, 4), (2, 2), (4, 1), (1000, 1)])
 def test_blocks_of_a_few_meshes_are_spread_over_threads_those_of_many_stay_together(rows: int, groups: int) -> None:
-    found = size_tasks(LARGE, TRANSFORM, ExpectedSize(1000, 0), workers_with(8, 8), rows).block_groups
+    found, *_ = size_tasks(LARGE, TRANSFORM, ExpectedSize(1000, 0), workers_with(8, 8), rows)
     assert len(found) == min(groups, len(LARGE))
     assert tuple(block for group in found for block in group) == LARGE
 
