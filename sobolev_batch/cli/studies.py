@@ -13,8 +13,8 @@ import click
 from sobolev_batch.cli.common import (
     EXIT_SOME_FAILED,
     PATH,
+    Command,
     allow_commands_option,
-    best_effort_option,
     cli,
     echo,
     echo_lines,
@@ -33,6 +33,11 @@ Result = TypeVar("Result")
 
 # Lines about distances that are less accurate than requested.
 _MOST_IMPRECISE = 10
+
+
+def _scheduler_option(*, required: bool = False) -> Callable[[Command], Command]:
+    text = "Take the workers of this Dask scheduler, such as tls://host:8786."
+    return click.option("--scheduler", metavar="ADDRESS", required=required, help=text)
 
 
 @cli.command("init", short_help="Write a study file for a folder of meshes.")
@@ -59,9 +64,7 @@ def init_command(folder: Path, output: Path) -> None:
 @cli.command("run")
 @study_argument
 @store_option
-@click.option(
-    "--scheduler", metavar="ADDRESS", help="Compute on the workers of this Dask scheduler, such as tls://host:8786."
-)
+@_scheduler_option()
 @trust_option
 @click.option(
     "--workers",
@@ -70,7 +73,6 @@ def init_command(folder: Path, output: Path) -> None:
     help="Start N processes on this machine. [default: one per core]",
 )
 @memory_option("Limit the memory of each process, such as 4GB. [default: equal parts]")
-@best_effort_option
 @allow_commands_option
 @click.pass_context
 def run_command(
@@ -81,7 +83,6 @@ def run_command(
     trust_network: bool,
     workers: int | None,
     memory: int | None,
-    best_effort: bool,
     allow_commands: bool,
 ) -> None:
     """Compute what is missing of STUDY and print its tables.
@@ -93,7 +94,7 @@ def run_command(
     """
     from sobolev_batch.batch.cluster.clients import remote_client
     from sobolev_batch.batch.run import run
-    from sobolev_batch.batch.study.study import Study
+    from sobolev_batch.batch.study.study import Study, read_study
     from sobolev_batch.results.open import open_store
     from sobolev_batch.results.tables.convergence import format_table
 
@@ -101,7 +102,7 @@ def run_command(
         raise click.UsageError(
             "--workers and --memory are for a cluster on this machine; the workers of a scheduler have their own"
         )
-    parsed = _parsed(study, best_effort=best_effort)
+    parsed = read_study(study)
     place = store or _made_default_store(parsed)
     with progress_reports() as show:
         if scheduler:
@@ -132,15 +133,9 @@ def run_command(
 
 @cli.command("submit")
 @study_argument
-@click.option(
-    "--scheduler",
-    metavar="ADDRESS",
-    required=True,
-    help="Compute on the workers of this Dask scheduler, such as tls://host:8786.",
-)
+@_scheduler_option(required=True)
 @trust_option
 @store_option
-@best_effort_option
 @allow_commands_option
 @click.pass_context
 def submit_command(
@@ -149,7 +144,6 @@ def submit_command(
     scheduler: str,
     trust_network: bool,
     store: Location | None,
-    best_effort: bool,
     allow_commands: bool,
 ) -> None:
     """Hand STUDY over to a cluster and return.
@@ -157,10 +151,10 @@ def submit_command(
     The cluster computes it without this process. The objects of a study are handed over one after another.
     """
     from sobolev_batch.batch.cluster.clients import remote_client
-    from sobolev_batch.batch.study.study import Study
+    from sobolev_batch.batch.study.study import Study, read_study
     from sobolev_batch.batch.submit import Submission, submit
 
-    parsed = _parsed(study, best_effort=best_effort)
+    parsed = read_study(study)
     location = (store or _made_default_store(parsed)).absolute()
     with remote_client(scheduler, trust_network) as client:
         submission = submit(parsed, location, client, allow_commands=allow_commands)
@@ -180,13 +174,8 @@ def submit_command(
 @cli.command("plan")
 @study_argument
 @store_option
-@click.option(
-    "--scheduler",
-    metavar="ADDRESS",
-    help="Plan for the workers of this scheduler. [default: processes on this machine]",
-)
+@_scheduler_option()
 @trust_option
-@best_effort_option
 @allow_commands_option
 @click.pass_context
 def plan_command(
@@ -195,7 +184,6 @@ def plan_command(
     store: Location | None,
     scheduler: str | None,
     trust_network: bool,
-    best_effort: bool,
     allow_commands: bool,
 ) -> None:
     """Show what running STUDY would do.
@@ -204,10 +192,10 @@ def plan_command(
     stored, and the number of surfaces that the store has already.
     """
     from sobolev_batch.batch.cluster.clients import remote_client
-    from sobolev_batch.batch.study.study import Study
+    from sobolev_batch.batch.study.study import Study, read_study
     from sobolev_batch.results.plan import plan
 
-    parsed = _parsed(study, best_effort=best_effort)
+    parsed = read_study(study)
     with remote_client(scheduler, trust_network) if scheduler else nullcontext() as client:
         if isinstance(parsed, Study):
             echo_lines(plan(parsed, store, client, allow_commands=allow_commands))
@@ -217,13 +205,6 @@ def plan_command(
     echo(made.total)
     if made.refused:
         context.exit(EXIT_SOME_FAILED)
-
-
-def _parsed(path: Path, *, best_effort: bool) -> Study | StudyCollection:
-    from sobolev_batch.batch.study.study import read_study
-
-    study = read_study(path)
-    return study.with_best_effort() if best_effort else study
 
 
 def _is_best_effort(study: Study | StudyCollection) -> bool:

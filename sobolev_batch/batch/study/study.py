@@ -196,17 +196,6 @@ class Study:
         reference = self.reference.with_cache(cache) if isinstance(self.reference, Source) else self.reference
         return replace(self, families=families, reference=reference, cache=cache)
 
-    def with_best_effort(self) -> Study:
-        """Return the study with the key ``best_effort`` of its accuracy set.
-
-        Raises:
-            StudyError: It has a lattice instead of an accuracy.
-        """
-        if self.accuracy is None:
-            raise StudyError("a best effort is made for an [accuracy]; this study has a [lattice]")
-        table = {**self.table, "accuracy": {**self.table["accuracy"], "best_effort": True}}
-        return replace(self, accuracy=replace(self.accuracy, best_effort=True), table=table)
-
 
 def _as_written(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the tables of a study as JSON holds them, functions by their names."""
@@ -313,16 +302,6 @@ class StudyCollection:
     def with_cache(self, cache: MeshCache) -> Self:
         """Return the collection with the place where its meshes are kept that take long to make."""
         return replace(self, studies={name: study.with_cache(cache) for name, study in self.studies.items()})
-
-    def with_best_effort(self) -> Self:
-        """Return the collection with the key ``best_effort`` of its accuracy set.
-
-        Raises:
-            StudyError: It has a lattice instead of an accuracy.
-        """
-        studies = {name: study.with_best_effort() for name, study in self.studies.items()}
-        accuracy = {**self.table["accuracy"], "best_effort": True}
-        return replace(self, studies=studies, table={**self.table, "accuracy": accuracy})
 
 
 def is_collection(table: Mapping[str, Any]) -> bool:

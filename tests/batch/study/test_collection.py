@@ -86,13 +86,6 @@ def test_files_of_longer_names_alone_are_no_files(folder: Path) -> None:
         sb.StudyCollection.from_table(table(object=[{"name": "horse"}], family=family), folder=folder)
 
 
-def test_the_best_effort_of_a_collection_is_in_its_table() -> None:
-    accuracy = {"accuracy": {"rtol": 1e-2}, "lattice": None}
-    own = table(**accuracy, object=[{"name": "ball"}], reference={"source": "sphere"}, family=ICO)
-    best = sb.StudyCollection.from_table(own).with_best_effort()
-    assert best.table["accuracy"] == best.studies["ball"].table["accuracy"] == {"rtol": 1e-2, "best_effort": True}
-
-
 def test_objects_can_be_listed_with_references_and_scalings_of_their_own(folder: Path) -> None:
     objects = [
         {"name": "cow"},
