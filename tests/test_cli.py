@@ -133,7 +133,20 @@ PICTURES = ["convergence", "matrix", "spectrum", "energy", "witness-0001-ico-1"]
 
 
 def test_plot_draws_every_picture(folder: Path) -> None:
-    options = ("--format", "svg,png", "--family", "i*", "--x", "vertices", "--order", "-3", "--size", "84x60mm")
+    options = (
+        "--format",
+        "svg",
+        "--format",
+        "png",
+        "--family",
+        "i*",
+        "--x",
+        "vertices",
+        "--order",
+        "-3",
+        "--size",
+        "84x60mm",
+    )
     done = call("plot", STORE, "--output", "pictures", "--witness", "ico/1", *options, folder=folder)
     assert (done.returncode, done.stderr) == (0, "")
     paths = [folder / line for line in done.stdout.split()]
@@ -292,7 +305,7 @@ MISUSED = [
     (f"table {STORE} --order -3;-10", "'-3;-10' is neither a number nor a list of numbers"),
     (f"table {STORE} --below 1% --matrix", "--matrix, --over-time and --below"),
     (f"table {STORE} --factor 3", "--factor belongs to --over-time"),
-    (f"plot {STORE} --format png,gif", "'gif' is none of png, svg, pdf"),
+    (f"plot {STORE} --format gif", "'gif' is not one of 'png', 'svg', 'pdf'"),
     ("compare 1.off 3.off --rtol 1e-3 --M 64", "--rtol chooses the lattice"),
     ("compare 1.off 3.off --below 0.1 --proximity --rtol 0.1", "leave out --proximity, --rtol"),
     ("compare 1.off 3.off --below 0.1 --order -2,-4", "--below takes one --order"),

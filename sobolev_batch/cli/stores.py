@@ -36,16 +36,6 @@ if TYPE_CHECKING:
     from sobolev_batch.results.figures.views import Axis
 
 _FOLLOW_SECONDS = 2.0
-_PICTURE_FORMATS = ("png", "svg", "pdf")
-
-
-def _formats(given: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the formats that are listed, each once."""
-    formats = tuple(dict.fromkeys(part.strip().lower() for text in given for part in text.split(",")))
-    for name in formats:
-        if name not in _PICTURE_FORMATS:
-            raise click.BadParameter(f"{name!r} is none of {', '.join(_PICTURE_FORMATS)}")
-    return formats
 
 
 def _require_folder(path: Path) -> None:
@@ -214,10 +204,11 @@ def table_command(
 @output_option("Write the pictures into this folder.", ".")
 @click.option(
     *("--format", "formats"),
+    type=click.Choice(["png", "svg", "pdf"]),
     multiple=True,
-    metavar="png|svg|pdf",
-    callback=lambda _context, _option, given: _formats(given),
-    help="Write this format; may be repeated, or a list such as pdf,png. [default: png]",
+    default=["png"],
+    show_default=True,
+    help="Write this format; may be repeated.",
 )
 @click.option(
     "--size",
@@ -267,7 +258,7 @@ def plot_command(
     from sobolev_batch.results.open import EDGE_LENGTH, fields_read
     from sobolev_batch.results.tables.league import league
 
-    formats, panel = formats or ("png",), None if size is None else parse_size(size)
+    panel = None if size is None else parse_size(size)
     _require_folder(output)
     if CollectionStore.read(store) is not None:
         if meshes:
@@ -288,11 +279,8 @@ def plot_command(
     for name, notes in omissions.items():
         echo(f"{name}: {'; '.join(notes)}", err=True)
     if missing:
-        labels_by_reason: dict[str, list[str]] = {}
         for label, reason in missing.items():
-            labels_by_reason.setdefault(reason, []).append(label)
-        parts = "; ".join(f"{', '.join(labels)}: {reason}" for reason, labels in labels_by_reason.items())
-        echo(f"not drawn with their witness functions: {parts}", err=True)
+            echo(f"{label}: not drawn with its witness function: {reason}", err=True)
         if meshes:
             context.exit(EXIT_SOME_FAILED)
 

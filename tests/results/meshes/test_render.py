@@ -103,7 +103,7 @@ def test_plot_draws_the_meshes_that_are_asked_for(spheres: Spheres, tmp_path: Pa
     assert done.exit_code == 3
     assert done.stderr == (
         "convergence: not drawn: 1 not computed, 1 without edges; families not drawn: closed\n"
-        "not drawn with their witness functions: closed/sphere: a surface that is no mesh has no triangles\n"
+        "closed/sphere: not drawn with its witness function: a surface that is no mesh has no triangles\n"
     )
     (path,) = tmp_path.glob("witness-*")
     assert path == Path(done.stdout.splitlines()[-1]) == tmp_path / "witness-0002-files-beside.png"
