@@ -17,7 +17,7 @@ from scipy.sparse.linalg import splu
 
 from sobolev_batch.errors import LatticeError
 from sobolev_batch.fitting.gradient import SquaredDistance
-from sobolev_batch.fitting.transform import normals
+from sobolev_batch.fitting.transform import area_derivatives, normals
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 Reals = NDArray[np.float64]
@@ -215,13 +215,9 @@ def shape_penalty(vertices: Reals, triangles: Indices, references: Reals) -> tup
     lacks = 1 - qualities[bad] / references[bad]
     gradient = np.zeros_like(vertices)
     corners = [vertices[corner] for corner in triangles[bad].T]
-    doubled = normals(vertices, triangles[bad])
-    units = doubled / np.maximum(np.linalg.norm(doubled, axis=1), 1e-300)[:, None]
     squares = _squared_edges(*corners)[:, None]
-    for corner in range(3):
-        this, following, previous = corners[corner], corners[corner - 2], corners[corner - 1]
-        of_area = np.cross(units, previous - following) / 2
-        of_squares = 2 * (2 * this - following - previous)
+    for corner, of_area in enumerate(area_derivatives(vertices, triangles[bad])):
+        of_squares = 2 * (2 * corners[corner] - corners[corner - 2] - corners[corner - 1])
         slopes = (_EQUILATERAL * of_area - qualities[bad, None] * of_squares) / squares
         np.add.at(gradient, triangles[bad, corner], (-2 * lacks / references[bad])[:, None] * slopes)
     return float(np.sum(lacks**2)), gradient

