@@ -105,39 +105,8 @@ def test_members_are_in_the_order_of_their_times() -> None:
     assert [member.time for member in found] == [0.0, 0.25, 1.5]
 
 
-WRONG: list[tuple[dict[str, Any], str, list[Any]]] = [
-    (MOVED, "distances", [[], [0.0]]),
-    (MOVED, "direction", [[0, 0, 0], [1, 2]]),
-    (NOISY, "amplitudes", [[-0.1], "many"]),
-    (NOISY, "seed", [-1, 0.5]),
-    (FLOW, "times", [[], "0, 1", [0.0, True], [1.0, 2.0, 1.0], [float("nan")]]),
-    (FLOW, "period", [0.0]),
-    (FLOW, "strength", [float("inf")]),
-]
-
-
-@pytest.mark.parametrize(("table", "key", "values"), WRONG)
-def test_wrong_parameters_are_refused(table: dict[str, Any], key: str, values: list[Any]) -> None:
-    for value in values:
-        with pytest.raises(ValueError, match=key):
-            parse_source({**table, key: value})
-
-
 LEVELS: dict[str, Any] = {"source": "spherical-levels", "mesh": BALL, "sphere": BALL, "levels": [1]}
 COARSER = {"source": "icosphere", "levels": [2]}
-
-
-@pytest.mark.parametrize(
-    ("table", "changes"),
-    [
-        (FLOW, [{"times": [0.5]}, {"strength": 1.0}, {"period": 4.0}]),
-        (LEVELS, [{"levels": [2]}, {"sphere": COARSER}, {"mesh": COARSER}]),
-    ],
-)
-def test_what_the_vertices_depend_on_is_in_the_fingerprint(table: dict[str, Any], changes: list[Any]) -> None:
-    found = [members({**table, **change})[0].fingerprint_digest() for change in ({}, *changes)]
-    assert len(set(found)) == len(found)
-    assert members(table)[0].fingerprint_digest() == found[0]
 
 
 def test_a_vertex_at_the_centre_stays() -> None:
