@@ -13,14 +13,13 @@ import time
 import warnings
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from sobolev_batch import MeshError, read_mesh
 from sobolev_batch.surfaces.formats import parsing
 from sobolev_batch.surfaces.formats.readers import expected_size
 from tests.support.mesh_attacks import ATTACKS
-from tests.support.mesh_files import LITTLE, gifti, ply
+from tests.support.mesh_files import LITTLE, ply
 from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="memory is measured by Linux's /proc")
@@ -36,18 +35,13 @@ _ADDRESS_BYTES = 8 << 30
 # Why some are refused, where they could be refused for less.
 REASONS = {
     "FIFO .ply": "it is a pipe",
-    "endless device .obj": "it is a pipe, a socket or a device",
-    **{
-        name: "is a file of its own; export the scene as one file"
-        for name in ATTACKS
-        if name.startswith("gltf, buffer")
-    },
+    "gltf, buffer ../data.bin": "is a file of its own; export the scene as one file",
     "bomb .ply.gz": "no mesh file shrinks that far",
     "gifti, bomb": "unpacks to more than the 96 bytes announced",
     "gifti, bomb that is announced": "no mesh file shrinks that far",
     "gifti, a billion laughs": "declares the entity",
-    "gifti, entities in UTF-16": "declares the entity",
     "gifti, data of another file": "its data lie in another file",
+    "gifti, long attribute": r"goes on at byte \d{5};",
     "gifti, deep elements unpacked": "at the depth 101",
     "gifti, many elements unpacked": "element 100001",
     "obj, continued lines unpacked": "goes on for more than",
@@ -161,14 +155,3 @@ def test_packed_files_are_refused_as_soon_as_they_exceed_the_memory(
     monkeypatch.setattr(parsing, "machine_memory", lambda: (200_000_000, "all of this machine"))
     with pytest.raises(MeshError, match=r"scan\.obj\.gz: takes up to 15\d\.\dMB of memory to read, and may take 75% "):
         read_mesh(tmp_path / "scan.obj.gz")
-
-
-@pytest.mark.parametrize("markup", [b"<!--%b-->", b"<?x %b?>", b'<MD a="%b"/>', b"<M%b/>"])
-def test_long_markup_is_refused_after_a_look_at_little_of_it(tmp_path: Path, markup: bytes) -> None:
-    content = gifti(BOX_VERTICES, np.array(BOX_TRIANGLES, dtype=np.int32))
-    before, element, after = content.partition(b"<DataArray")
-    (tmp_path / "scan.gii").write_bytes(before + markup % (b"x" * (8 << 20)) + element + after)
-    with pytest.raises(MeshError, match=r"scan\.gii: .* goes on at byte \d+") as caught:
-        read_mesh(tmp_path / "scan.gii")
-    # A parser goes through the part that it holds again with each further part, so all of it would take for ever.
-    assert int(re.findall(r"goes on at byte (\d+)", str(caught.value))[0]) < 1 << 17

@@ -32,40 +32,28 @@ VERTICES: list[list[float]] = [[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 4.0, 0.0]
 TRIANGLES = [[0, 1, 2]]
 
 
-def with_entry(row: int, column: int, value: float) -> Reals:
-    vertices = np.array(VERTICES)
-    vertices[row, column] = value
-    return vertices
-
-
 @pytest.mark.parametrize(
     ("vertices", "triangles", "message"),
     [
-        (with_entry(1, 2, np.nan), TRIANGLES, "1 of 3 vertices have NaN or infinite coordinates: #1 = [3.0, 0.0, nan]"),
-        (with_entry(0, 1, -np.inf), TRIANGLES, "#0 = [0.0, -inf, 0.0]"),
+        (
+            [[0, 0, 0], [3, 0, np.nan], [0, 4, 0]],
+            TRIANGLES,
+            "1 of 3 vertices have NaN or infinite coordinates: #1",
+        ),
         # Also where no triangle uses it.
         (np.vstack([VERTICES, [np.nan, 0.0, 0.0]]), TRIANGLES, "1 of 4 vertices"),
         (np.array(VERTICES)[:, :2], TRIANGLES, "vertices must have shape (n, 3), found (3, 2)"),
-        (np.zeros(9), TRIANGLES, "found (9,)"),
         (np.array(VERTICES) * 1j, TRIANGLES, "vertices must be real numbers, found dtype complex128"),
-        (np.array(VERTICES).astype(str), TRIANGLES, "vertices must be real numbers"),
         (np.array(VERTICES).astype(bool), TRIANGLES, "vertices must be real numbers"),
-        (None, TRIANGLES, "vertices must be real numbers"),
         ([[0, 0, 0], [1, 0], [0, 1, 0]], TRIANGLES, "vertices"),
         (np.array(VERTICES) * 1e200, TRIANGLES, "largest absolute coordinate 4e+200; rescale it"),
-        (np.array(VERTICES) * 4e307, TRIANGLES, "largest absolute coordinate 1.6e+308; rescale it"),
         (VERTICES, [[0, 1, 2], [0, -1, 2]], "1 of 2 triangles have indices outside 0..2: #1 = [0, -1, 2]"),
-        (VERTICES, [[0, 1, 3]], "1 of 1 triangles have indices outside 0..2: #0 = [0, 1, 3]"),
         (VERTICES, np.array([[0, 1, 2**63]], dtype=np.uint64), "#0 = [0, 1, 9223372036854775808]"),
-        (np.zeros((0, 3)), TRIANGLES, "#0 = [0, 1, 2]"),
         (VERTICES, np.array([[0.0, 1.0, 2.0]]), "triangles must be integer indices, found dtype float64"),
         (VERTICES, np.array([[False, True, True]]), "triangles must be integer indices, found dtype bool"),
-        (VERTICES, np.array([[0, 1, 2]], dtype=object), "triangles must be integer indices"),
         (VERTICES, [[0, 1, 2], [0, 1]], "triangles"),
-        (VERTICES, [0, 1, 2], "triangles must have shape (m, 3), found (3,)"),
         (VERTICES, [[0, 1, 2, 0]], "triangles must have shape (m, 3), found (1, 4)"),
         (VERTICES, [], "no triangles"),
-        (VERTICES, None, "triangles must be integer indices"),
         (
             [*VERTICES, [0.0, 0.0, 0.0], [1e200, 0.0, 0.0], [0.0, 1e-200, 0.0]],
             [[0, 1, 2], [3, 4, 5]],
