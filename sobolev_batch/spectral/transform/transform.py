@@ -86,7 +86,7 @@ def transform_block(
         return Transformed(_closed_form(kind, lattice, block, settings.dtype), 0, "closed form")
     plan = plan or settings.plan(surface, lattice)
     whole = NufftSpec(block.shape, settings.eps, settings.dtype, threads=execution.threads, batch=execution.batch)
-    low, high = surface.bounds
+    low, high = surface.extent.box
     fill = min(1.0, float(np.prod((high - low) / (2 * lattice.half_period))))
 
     def fitting(costs: Costs, allowed_bytes: float) -> tuple[NufftSpec, int]:
@@ -227,7 +227,7 @@ def require_inside(surface: Surface, lattice: Lattice) -> None:
         LatticeError: Some |coordinate| is not below 1/(2h).
     """
     kind = "mesh" if kind_of(surface).triangles else "surface"
-    require_points_inside(np.stack(surface.bounds), lattice, f"the {kind} reaches", "it")
+    require_points_inside(np.stack(surface.extent.box), lattice, f"the {kind} reaches", "it")
 
 
 def require_points_inside(

@@ -70,11 +70,6 @@ class Sphere:
         return Extent(tuple((along - self.radius).tolist()), tuple((along + self.radius).tolist()))
 
     @property
-    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lower and upper corner of the bounding box, (3,) each, in units of length."""
-        return self.extent.box
-
-    @property
     def bounding_sphere(self) -> tuple[Point, float]:
         """Centre and radius of the sphere."""
         return self.center, self.radius

@@ -117,12 +117,6 @@ class Mesh:
         return self._per_triangle(_centroid_radii)
 
     @cached_property
-    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lower and upper corner of the bounding box of the `used_coordinates`, (3,) each."""
-        coordinates = self.used_coordinates
-        return _frozen(coordinates.min(axis=1)), _frozen(coordinates.max(axis=1))
-
-    @cached_property
     def extent(self) -> Extent:
         """Extent of the `used_coordinates` along `DIRECTIONS`."""
         return Extent.of_points(self.used_coordinates)
@@ -130,7 +124,7 @@ class Mesh:
     @property
     def bounding_sphere(self) -> tuple[Point, float]:
         """Centre of the bounding box, and distance from it to the farthest of the `used_vertices`."""
-        lower, upper = self.bounds
+        lower, upper = self.extent.box
         center = lower + (upper - lower) / 2
         radius = float(np.linalg.norm(self.vertices[self.used_vertices] - center, axis=1).max())
         return (float(center[0]), float(center[1]), float(center[2])), radius

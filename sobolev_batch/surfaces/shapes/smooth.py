@@ -211,12 +211,6 @@ class Smooth(ABC):
         return self._greatest(heights, len(directions))
 
     @cached_property
-    def bounds(self) -> tuple[Reals, Reals]:
-        """Lower and upper corner of the bounding box, (3,) each, in units of length."""
-        highest = self.highest_along(np.concatenate([-np.eye(3), np.eye(3)]))
-        return -highest[:3], highest[3:]
-
-    @cached_property
     def extent(self) -> Extent:
         """Extent along `DIRECTIONS`."""
         lowest, highest = -self.highest_along(-DIRECTIONS), self.highest_along(DIRECTIONS)
@@ -225,7 +219,7 @@ class Smooth(ABC):
     @property
     def bounding_sphere(self) -> tuple[Point, float]:
         """Centre of the bounding box, and radius of the smallest sphere around it that holds the surface."""
-        lower, upper = self.bounds
+        lower, upper = self.extent.box
         center = lower + (upper - lower) / 2
 
         def distances(points: Reals) -> Reals:
@@ -322,7 +316,7 @@ class ParametrisedSurface(Smooth):
         return replace(self, scale=scale * self.scale, origin=(x, y, z))
 
     def _check_closed(self) -> None:
-        size = float(np.subtract(*self.bounds[::-1]).max())
+        size = float(np.ptp(self.extent.box, axis=0).max())
         along_u, along_v = (np.linspace(interval.low, interval.high, _CHECKS) for interval in self.intervals)
         for name, interval, other in (("u", self.u, along_v), ("v", self.v, along_u)):
             if not interval.periodic:

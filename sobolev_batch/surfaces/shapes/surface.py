@@ -99,10 +99,6 @@ class Surface(Protocol):
         """Extent along `DIRECTIONS`."""
 
     @property
-    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lower and upper corner of the bounding box, (3,) each, in units of length."""
-
-    @property
     def bounding_sphere(self) -> tuple[Point, float]:
         """Centre of the bounding box, and radius of the smallest sphere around it that holds the surface."""
 

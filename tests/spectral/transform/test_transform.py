@@ -116,7 +116,7 @@ from sobolev_batch.spectral.transform.settings import Execution, TransformSettin
 from sobolev_batch.spectral.transform.transform import projected_bytes, transform_block
 
 mesh, lattice, settings = sb.icosphere(5), sb.Lattice(5.0, {intervals}), TransformSettings()
-mesh.areas, mesh.centroid_radii, mesh.bounds
+mesh.areas, mesh.centroid_radii, mesh.extent
 settings.plan(mesh, lattice).lowest_degree
 unit = 1 if sys.platform == "darwin" else 1024
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit

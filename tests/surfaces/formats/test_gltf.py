@@ -47,7 +47,7 @@ def test_gltf_nodes_place_their_meshes(read: Read, name: str) -> None:
         scene.tree["cameras"] = [{"type": "perspective", "perspective": {"yfov": 1, "znear": 0.1, "aspectRatio": 1}}]
     mesh = read(".glb", scene.glb())
     assert mesh.area == pytest.approx(area, rel=1e-14)
-    assert mesh.bounds[1] == pytest.approx(upper, abs=1e-14)
+    assert mesh.extent.box[1] == pytest.approx(upper, abs=1e-14)
     embedded = read(".gltf", scene.gltf())
     assert soup(embedded) == soup(mesh)
 

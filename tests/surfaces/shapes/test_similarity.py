@@ -64,7 +64,7 @@ def test_every_mesh_touches_the_unit_sphere_from_inside(mesh: Mesh) -> None:
     ball = similarity.apply(mesh)
     assert np.linalg.norm(ball.vertices[np.unique(mesh.triangles)], axis=1).max() == pytest.approx(1, rel=1e-14)
     assert ball.area == pytest.approx(similarity.scale**2 * mesh.area, rel=1e-12)
-    lower, upper = ball.bounds
+    lower, upper = ball.extent.box
     assert lower + upper == pytest.approx(np.zeros(3), abs=1e-14)
     assert type(similarity.scale) is float
     assert [type(x) for x in similarity.origin] == [float] * 3

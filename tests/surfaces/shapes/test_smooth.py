@@ -25,7 +25,7 @@ from tests.support.shapes import (
 def test_a_sphere_in_its_angles() -> None:
     surface = angular_ball()
     assert surface.area == pytest.approx(4 * math.pi, rel=1e-13)
-    lower, upper = surface.bounds
+    lower, upper = surface.extent.box
     assert lower == pytest.approx(-np.ones(3), abs=1e-12)
     assert upper == pytest.approx(np.ones(3), abs=1e-12)
     assert Similarity.to_unit_ball(surface).scale == pytest.approx(1, rel=1e-12)
@@ -34,7 +34,7 @@ def test_a_sphere_in_its_angles() -> None:
 def test_numbers_stand_for_constant_coordinates() -> None:
     surface = ParametrisedSurface(plate, Interval(-1.0, 2.0), Interval(0.0, 0.5))
     assert surface.area == pytest.approx(1.5, rel=1e-14)
-    lower, upper = surface.bounds
+    lower, upper = surface.extent.box
     assert (lower.tolist(), upper.tolist()) == ([-1.0, 0.0, 0.0], [2.0, 0.5, 0.0])
     center, radius = surface.bounding_sphere
     assert center == (0.5, 0.25, 0.0)
@@ -44,7 +44,7 @@ def test_numbers_stand_for_constant_coordinates() -> None:
 def test_extents_of_a_torus_that_lies_askew() -> None:
     torus = Torus(1.0, 0.4)
     surface = turned_torus(torus)
-    _, upper = surface.bounds
+    _, upper = surface.extent.box
     # Along an axis it reaches as far as the torus does along that axis turned back.
     assert upper == pytest.approx(torus.highest_along(ROTATION), abs=1e-11)
     assert surface.area == pytest.approx(torus.area, rel=1e-12)

@@ -50,20 +50,12 @@ def test_tables_of_a_study_keep_their_order(tmp_path: Path) -> None:
         ([{"path": "a.ply", "a/b": 1}], "'a/b' cannot name metadata: it holds '/'"),
         ([], "must be the path of a CSV file"),
         (["a.ply"], "must be the path of a CSV file"),
-        (3, "must be the path of a CSV file"),
     ],
 )
 def test_refused_lists_say_what_was_found(meshes: Any, message: str) -> None:
     table = small_table(family=[{"name": "f", "source": "files", "meshes": meshes}])
     with pytest.raises(StudyError, match=message):
         sb.Study.from_table(table)
-
-
-def test_paths_and_a_list_are_not_given_together() -> None:
-    both = {"name": "f", "source": "files", "meshes": [{"path": "a.ply"}], "paths": ["b.ply"]}
-    for family in (both, {"name": "f", "source": "files"}):
-        with pytest.raises(StudyError, match=r"either paths, such as .* or a list of meshes is needed, and not both"):
-            sb.Study.from_table(small_table(family=[family]))
 
 
 @pytest.mark.parametrize(
