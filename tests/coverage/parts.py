@@ -99,8 +99,7 @@ def distant_parts(rng: np.random.Generator) -> Pair:
 def tapered_plates(rng: np.random.Generator) -> Pair:
     """Return a stack of squares, smaller towards both ends, and the same moved along it by part of its pitch."""
     count, half = int(rng.integers(8, 41)), float(rng.uniform(0.1, 0.4))
-    amount = 0.5 if rng.random() < 0.5 else float(rng.uniform(0.05, 0.5))
-
+    amount = _part_of_pitch(rng)
     return pair_of(rng, *(Rectangles.tapered(count, 1 / count, half, offset) for offset in (0.0, amount)))
 
 
@@ -113,17 +112,14 @@ def strips(rng: np.random.Generator) -> Pair:
         return Rectangles.from_corners(*(((x, -length / 2, 0), (x + filled / count, length / 2, 0)) for x in lefts))
 
     if rng.random() < 0.7:
-        return pair_of(rng, grid(0.0, count), grid(0.5 if rng.random() < 0.5 else float(rng.uniform(0.05, 0.5)), count))
+        return pair_of(rng, grid(0.0, count), grid(_part_of_pitch(rng), count))
     return pair_of(rng, grid(0.0, count), grid(0.0, int(rng.integers(5, 31))))
 
 
 def layers(rng: np.random.Generator) -> Pair:
     """Return sheets at a small gap against fewer of them, or at another gap."""
-    sides, gaps, counts = (
-        rng.uniform(0.3, 1.0, size=2),
-        10.0 ** rng.uniform(-4, -1.3, size=2),
-        rng.integers(1, 5, size=2),
-    )
+    sides, gaps = rng.uniform(0.3, 1.0, size=2), 10.0 ** rng.uniform(-4, -1.3, size=2)
+    counts = rng.integers(1, 5, size=2)
 
     def sheets(count: int, gap: float, height: float) -> Rectangles:
         low, high = -sides / 2, sides / 2
@@ -146,7 +142,7 @@ def woven(rng: np.random.Generator) -> Pair:
                 corners += [((x, start, z), (x + 0.5 / count, end, z)), ((start, x, -z), (end, x + 0.5 / count, -z))]
         return Rectangles.from_corners(*corners)
 
-    return pair_of(rng, cloth(0.0), cloth(0.5 if rng.random() < 0.5 else float(rng.uniform(0.05, 0.5))))
+    return pair_of(rng, cloth(0.0), cloth(_part_of_pitch(rng)))
 
 
 def corrugations(rng: np.random.Generator) -> Pair:
@@ -162,6 +158,10 @@ def corrugations(rng: np.random.Generator) -> Pair:
         return Rectangles.from_corners(*flat, *(((x, 0, low), (x, width, high)) for x, low, high in pairs))
 
     return pair_of(rng, sheet(1.0), sheet(-1.0))
+
+
+def _part_of_pitch(rng: np.random.Generator) -> float:
+    return 0.5 if rng.random() < 0.5 else float(rng.uniform(0.05, 0.5))
 
 
 def _box(sides: Reals) -> Rectangles:

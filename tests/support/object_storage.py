@@ -117,13 +117,8 @@ class Server:
         """Return a client of the server that shares nothing with the code under test."""
         import boto3
 
-        return boto3.client(
-            service,
-            endpoint_url=self.url,
-            aws_access_key_id="tester",
-            aws_secret_access_key=SECRET,
-            region_name="us-east-1",
-        )
+        keys = {"aws_access_key_id": "tester", "aws_secret_access_key": SECRET}
+        return boto3.client(service, endpoint_url=self.url, region_name="us-east-1", **keys)
 
     def keys(self, prefix: str) -> list[str]:
         pages = self.client().get_paginator("list_objects_v2").paginate(Bucket=BUCKET, Prefix=prefix)
