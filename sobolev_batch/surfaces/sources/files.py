@@ -173,16 +173,11 @@ def _checked_times(value: object) -> tuple[float, ...] | Literal["names"] | None
 
 
 class FileSource(Source):
-    """Mesh files.
+    """Mesh files: their paths and globs, those of an installed distribution, or a list of what is known of them.
 
-    Attributes:
-        paths: Paths or globs (``**`` crosses folders), relative to the study file. The file of a path must exist when
-            its mesh is computed; a glob must match a file at once.
-        meshes: Instead of paths, a list of meshes with what is known of them: a CSV file, or tables of the study.
-        distribution: Installed Python distribution. Paths are then those of files that it recorded at its
-            installation, without wildcards. It is not imported.
-        times: Times of the meshes if they are states of one that moves: a list with one for each file, in the order of
-            the numbers in their names, or "names" for the last number in the name of each file.
+    The file of a path must exist when its mesh is computed; a glob must match a file at once. Files of a distribution
+    are those that it recorded at its installation, without wildcards; it is not imported. Times make states of one
+    mesh that moves: one for each file, in the order of the numbers in their names, or "names" for the last of these.
     """
 
     paths: (

@@ -42,7 +42,7 @@ Levels = Several[Level]
 
 
 class ClosedFormSource(Source, ABC):
-    """A source of one surface in closed form."""
+    """A source of one surface in closed form, or of its triangulations where a subclass has levels."""
 
     label: ClassVar[str]
 
@@ -60,8 +60,15 @@ class ClosedFormSource(Source, ABC):
         return self
 
     def members(self, folder: Path) -> tuple[Member, ...]:
-        """Return the one surface, with its parameters as its fingerprint."""
-        return (SurfaceMember(self.label, -1, self.shape, {self.label: _parameters(self.shape)}),)
+        """Return the one surface, or a triangulation for each level, coarse to fine."""
+        identity = {self.label: np.hstack(astuple(self.shape)).tolist()}
+        if (levels := getattr(self, "levels", None)) is None:
+            return (SurfaceMember(self.label, -1, self.shape, identity),)
+        return tuple(self.triangulation(level, identity) for level in sorted(set(levels)))
+
+    def triangulation(self, level: int, identity: Fingerprint) -> Member:
+        """Return the triangulation of a level, for surfaces that have them, from the fingerprint of the surface."""
+        raise NotImplementedError
 
 
 class SphereSource(ClosedFormSource):
@@ -92,17 +99,10 @@ class EllipsoidSource(ClosedFormSource):
         """The ellipsoid."""
         return Ellipsoid(self.axes, self.center)
 
-    def members(self, folder: Path) -> tuple[Member, ...]:
-        """Return the ellipsoid, or one member per level, coarse to fine."""
-        if self.levels is None:
-            return super().members(folder)
-        identity = {"ellipsoid": _parameters(self.shape)}
-        return tuple(
-            _triangulation(
-                level, Ellipsoid.mesh, (self.shape, level), {"ellipsoid level": level, **identity}, 20 << 2 * level
-            )
-            for level in sorted(set(self.levels))
-        )
+    def triangulation(self, level: int, identity: Fingerprint) -> Member:
+        """Return the icosphere of a level, moved onto the ellipsoid."""
+        own = {"ellipsoid level": level, **identity}
+        return _triangulation(level, Ellipsoid.mesh, (self.shape, level), own, 20 << 2 * level)
 
 
 class TorusSource(ClosedFormSource):
@@ -136,16 +136,11 @@ class TorusSource(ClosedFormSource):
         """The torus."""
         return Torus(self.R, self.r, self.center)
 
-    def members(self, folder: Path) -> tuple[Member, ...]:
-        """Return the torus, or one member per level, coarse to fine."""
-        if self.levels is None:
-            return super().members(folder)
-        members = []
-        for level in sorted(set(self.levels)):
-            cells = self.around << level, self.across << level
-            identity = {"torus grid": list(cells), "torus": _parameters(self.shape)}
-            members.append(_triangulation(level, Torus.mesh, (self.shape, *cells), identity, 2 * cells[0] * cells[1]))
-        return tuple(members)
+    def triangulation(self, level: int, identity: Fingerprint) -> Member:
+        """Return the grid of a level."""
+        around, across = self.around << level, self.across << level
+        own = {"torus grid": [around, across], **identity}
+        return _triangulation(level, Torus.mesh, (self.shape, around, across), own, 2 * around * across)
 
 
 class IcosphereSource(Source):
@@ -168,9 +163,3 @@ def _triangulation(
     return MadeMember(
         str(level), level, make, identity, arguments, triangles=triangles, triangle_bytes=_SUBDIVISION_BYTES
     )
-
-
-def _parameters(shape: ClosedForm) -> list[float]:
-    """Return the parameters of a surface, in the order of its fields."""
-    values: list[float] = np.hstack(astuple(shape)).tolist()
-    return values

@@ -86,11 +86,6 @@ def test_nothing_is_shared_with_other_libraries(name: str) -> None:
     assert type(made).__module__.startswith(name)
 
 
-def test_single_precision_is_widened() -> None:
-    made = pyvista.PolyData(VERTICES.astype(np.float32), np.insert(TRIANGLES, 0, 3, axis=1).ravel())
-    assert (sb.as_mesh(made).vertices == VERTICES.astype(np.float32)).all()
-
-
 def two_parts() -> Any:
     made = scene()
     made.add_geometry(trimesh.creation.box())
@@ -132,17 +127,12 @@ BALL = sb.icosphere(0)
 # Every function that takes a mesh; the target is a field, since closeness to a surface takes longer.
 USES: dict[str, Callable[[Any, xr.DataArray], Any]] = {
     "distance": lambda mesh, target: sb.distance(mesh, target, -2.0)["distance"].item(),
-    "distance from": lambda mesh, _: sb.distance(BALL, mesh, -4.0, rtol=0.5)["distance"].item(),
     "norm": lambda mesh, _: sb.norm(mesh, -4.0, rtol=0.5)["norm"].item(),
     "spectrum": lambda mesh, _: sb.spectrum(mesh, None, -2.0, lattice=LATTICE)["total"].item(),
     "witness": lambda mesh, target: sb.witness(mesh, target, -2.0, [[0, 0, 0]]).item(),
     "fourier_transform": lambda mesh, _: abs(sb.fourier_transform(mesh, LATTICE)).sum().item(),
-    "accessor": lambda mesh, target: target.sobolev.distance(mesh, -2.0)["distance"].item(),
     "proximity": lambda mesh, _: sb.proximity(mesh, BALL, points=10).hausdorff,
     "gradient": lambda mesh, target: sb.gradient(mesh, target, -2.0, threads=1)["squared_distance"].item(),
-    "objective": lambda mesh, target: sb.SquaredDistance.for_mesh(mesh, target, -2.0, threads=1).value(
-        1.1 * BALL.vertices
-    ),
     "target": lambda mesh, _: sb.SquaredDistance.for_mesh(BALL, mesh, -2.0, lattice=LATTICE).value(BALL.vertices),
     "fit": lambda mesh, target: sb.fit(mesh, target, -4.0, steps=1, threads=1).mesh.area,
     "refine": lambda mesh, target: sb.refine(mesh, target, -4.0, triangles=21, steps=1, threads=1).mesh.area,

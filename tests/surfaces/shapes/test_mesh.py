@@ -261,14 +261,3 @@ def test_the_order_of_vertices_triangles_and_corners_does_not_matter(mesh: Mesh,
     for name in ("duplicate_triangles", "boundary_edges", "nonmanifold_edges"):
         assert shuffled.counts[name] == mesh.counts[name]
     assert np.array_equal(shuffled.extent.box, mesh.extent.box)
-
-
-@pytest.mark.slow
-@seeded
-@given(meshes(), st.tuples(*[st.floats(-100, 100)] * 3), st.integers(0, 2**32 - 1))
-def test_rigid_motions_keep_areas_and_lengths(mesh: Mesh, shift: tuple[float, ...], seed: int) -> None:
-    rotation, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
-    moved = Mesh(mesh.vertices @ rotation + np.array(shift), mesh.triangles)
-    assert moved.areas == pytest.approx(mesh.areas, rel=1e-11, abs=1e-11)
-    assert moved.edge_lengths == pytest.approx(mesh.edge_lengths, rel=1e-12, abs=1e-12)
-    assert moved.centroid_radii == pytest.approx(mesh.centroid_radii, rel=1e-12, abs=1e-12)
