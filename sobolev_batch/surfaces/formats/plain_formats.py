@@ -105,11 +105,16 @@ def parse_off(data: bytes) -> Raw:
     found = 0
     for found, words in enumerate(lines, 1):
         if found <= vertex_count:
-            vertices.extend(_off_vertex(words, found, 3 + _OFF_EXTRAS[kind[1]]))
-        else:
-            polygon = _off_polygon(words, found - vertex_count)
-            corners.extend(polygon)
-            sizes.append(len(polygon))
+            if len(words) != 3 + _OFF_EXTRAS[kind[1]]:
+                raise MeshError(f"vertex {found} has {len(words)} numbers, expected {3 + _OFF_EXTRAS[kind[1]]}")
+            vertices.extend(_parsed_numbers(words, f"vertex {found}")[:3])
+            continue
+        face = f"face {found - vertex_count}"
+        size = _integer(words[0], face)
+        if size < 0 or len(words) - 1 - size not in _OFF_FACE_EXTRAS:
+            raise MeshError(f"{face} announces {size} corners, but {len(words) - 1} numbers follow")
+        corners.extend(_integer(word, face) for word in words[1 : 1 + size])
+        sizes.append(size)
     if vertex_count + face_count != found:
         raise MeshError(
             f"the OFF header announces {vertex_count + face_count} lines, {vertex_count} for vertices and "
@@ -220,12 +225,14 @@ def _parsed_numbers(words: list[str], owner: str) -> list[float]:
 
 
 def _integer(word: str, owner: str) -> int:
-    if len(word) > _MOST_DIGITS or "_" in word:
-        raise MeshError(f"{owner} has an index that is no integer of up to {_MOST_DIGITS} digits: {word[:80]!r}")
     try:
+        if len(word) > _MOST_DIGITS or "_" in word:
+            raise ValueError("too long, or Python's spelling")
         return int(word)
     except ValueError as error:
-        raise MeshError(f"{owner} has an index that is not an integer: {word[:80]!r}") from error
+        raise MeshError(
+            f"{owner} has an index that is no integer of up to {_MOST_DIGITS} digits: {word[:80]!r}"
+        ) from error
 
 
 def _obj_corner(word: str, vertices_so_far: int, face: int) -> int:
@@ -238,19 +245,6 @@ def _obj_corner(word: str, vertices_so_far: int, face: int) -> int:
     if index < -vertices_so_far:
         raise MeshError(f"face {face} counts {-index} vertices back, but only {vertices_so_far} stand before it")
     return vertices_so_far + index
-
-
-def _off_vertex(words: list[str], number: int, expected: int) -> list[float]:
-    if len(words) != expected:
-        raise MeshError(f"vertex {number} has {len(words)} numbers, expected {expected}")
-    return _parsed_numbers(words, f"vertex {number}")[:3]
-
-
-def _off_polygon(words: list[str], number: int) -> list[int]:
-    size = _integer(words[0], f"face {number}")
-    if size < 0 or len(words) - 1 - size not in _OFF_FACE_EXTRAS:
-        raise MeshError(f"face {number} announces {size} corners, but {len(words) - 1} numbers follow")
-    return [_integer(word, f"face {number}") for word in words[1 : 1 + size]]
 
 
 def _stl_text_corners(data: bytes) -> NDArray[np.float64]:

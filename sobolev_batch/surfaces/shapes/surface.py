@@ -28,10 +28,6 @@ _BATCH = 1 << 14
 _AXES = [int(np.argmax(np.abs(DIRECTIONS[:, axis]))) for axis in range(3)]
 SurfaceType = TypeVar("SurfaceType", bound="Surface")
 
-# Factors between units that people mix up: cm and mm, inches and mm, m and cm, m and mm.
-_UNITS = (10.0, 25.4, 100.0, 1000.0)
-# Sizes of one surface in two units differ by such a factor within this fraction, as meshes are not the same.
-_UNIT_MARGIN = 0.2
 # Surfaces whose sizes differ by more are hardly the same object.
 _MOST_RATIO = 4.0
 # Of the smaller box, the fraction that overlaps with the other one at least.
@@ -181,10 +177,8 @@ def placement_doubt(extent: Extent, reference: Extent) -> str | None:
     ratio = size / reference_size
     factor = max(ratio, 1 / ratio)
     if factor > _MOST_RATIO:
-        near = [unit for unit in _UNITS if abs(factor / unit - 1) <= _UNIT_MARGIN]
-        shown = f"about {near[0]:g}" if near and abs(factor / near[0] - 1) > 1e-3 else f"{factor:.3g}"
         word = "large" if ratio > 1 else "small"
-        return f"it is {shown} times as {word} as the reference: are both in the same unit of length?"
+        return f"it is {factor:.3g} times as {word} as the reference: are both in the same unit of length?"
     (low, high), (other_low, other_high) = extent.box, reference.box
     # Flat surfaces have boxes without a volume.
     margin = _MARGIN * min(size, reference_size)

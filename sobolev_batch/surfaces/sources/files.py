@@ -162,12 +162,10 @@ def _is_nothing(value: object) -> bool:
     return value is None or value == "" or (isinstance(value, float) and math.isnan(value))
 
 
-def _checked_times(value: object) -> tuple[float, ...] | Literal["names"] | None:
-    if value is None:
-        return None
+def _checked_times(value: Any) -> Any:
+    if value is None or value == "names":
+        return value
     if isinstance(value, str):
-        if value == "names":
-            return "names"
         raise ValueError('must be a list of numbers, or "names" for the numbers in the names of the files')
     return checked_times(value)
 

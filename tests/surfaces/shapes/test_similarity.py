@@ -84,7 +84,7 @@ def placed(scale: float = 1.0, x: float = 0.0, y: float = 0.0, z: float = 0.0) -
     [
         (placed(1000.0), "1e+03 times as large"),
         (placed(1 / 25.4), "25.4 times as small"),
-        (placed(0.11), "about 10 times as small"),
+        (placed(0.11), "9.09 times as small"),
         (placed(6.0), "6 times as large"),
         (placed(1.0, 1.6, 0.8), "hardly overlaps"),
         (placed(1.0, 0.0, 0.0, 5.0), "hardly overlaps"),
