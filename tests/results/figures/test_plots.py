@@ -6,6 +6,7 @@ import struct
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -56,19 +57,20 @@ def test_plots_take_the_axes_of_a_caller_and_leave_pyplot_alone(tree: xr.DataTre
     assert done.returncode == 0, done.stderr
 
 
-def test_what_cannot_be_plotted(tree: xr.DataTree) -> None:
-    with pytest.raises(sb.InputError, match="no order -3, only -10"):
-        sb.plot(tree, order=-3)
-    with pytest.raises(sb.InputError, match=r"one of convergence, .*, energy, found 'transform'"):
-        sb.plot(tree, "transform")
-    with pytest.raises(sb.InputError, match="the study has no family 'g\\*', only f_1, reference"):
-        sb.plot(tree, family="g*")
-    with pytest.raises(sb.InputError, match="no size of meshes is named 'weight'; known are edge_length, triangles"):
-        sb.plot(tree, x="weight")
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"order": -3}, "no order -3, only -10"),
+        ({"kind": "transform"}, r"one of convergence, .*, energy, found 'transform'"),
+        ({"family": "g*"}, "the study has no family 'g\\*', only f_1, reference"),
+        ({"x": "weight"}, "no size of meshes is named 'weight'; known are edge_length, triangles"),
+        ({"kind": "matrix"}, "distances to the reference alone; set pairs"),
+    ],
+)
+def test_what_cannot_be_plotted(tree: xr.DataTree, arguments: dict[str, Any], message: str) -> None:
     nearest = tree["convergence"].to_dataset()[["distance"]].expand_dims(other=["reference"])
-    alone = xr.DataTree.from_dict({**tree.to_dict(), "/distances": nearest})
-    with pytest.raises(sb.InputError, match="distances to the reference alone; set pairs"):
-        sb.plot(alone, "matrix")
+    with pytest.raises(sb.InputError, match=message):
+        sb.plot(xr.DataTree.from_dict({**tree.to_dict(), "/distances": nearest}), **arguments)
 
 
 def lines(_subject: object, count: int, axes: Axes) -> None:
@@ -190,24 +192,18 @@ def test_whatever_is_not_drawn_is_counted_and_named(tree: xr.DataTree) -> None:
     assert "families" not in nameless.get_title()
 
 
-def store_of(points: np.ndarray) -> xr.DataTree:
-    """A store whose meshes are points, in ten families; the first is the reference."""
-    return tree_of(points, ["reference", *(f"f{i % 10}/mesh {i}" for i in range(1, len(points)))], {-2.0: 1.0})
-
-
 def test_few_outliers_do_not_take_the_colours_of_a_matrix() -> None:
     points = np.random.default_rng(6).normal(size=(40, 3))
     points[1] = points[2] + 1e-12
-    figure = sb.plot(store_of(points), "matrix").figure
-    image, bar = figure.axes[0].images[0], figure.axes[1]
-    assert image.get_clim()[0] > 1e-3
-    assert image.colorbar is not None
-    assert image.colorbar.extend == "min"
-    assert bar.get_ylabel() == "distance in the study's unit"
-    even = sb.plot(store_of(points[2:]), "matrix").images[0]
-    assert even.colorbar is not None
-    assert even.colorbar.extend == "neither"
-    assert even.get_clim()[1] == cdist(points[2:], points[2:]).max()
+    for chosen, extend in ((points, "min"), (points[2:], "neither")):
+        labels = ["reference", *(f"f{i % 10}/mesh {i}" for i in range(1, len(chosen)))]
+        axes = sb.plot(tree_of(chosen, labels, {-2.0: 1.0}), "matrix")
+        (image,), (_, bar) = axes.images, axes.figure.axes
+        assert image.get_clim()[0] > 1e-3
+        assert image.get_clim()[1] == cdist(chosen, chosen).max()
+        assert image.colorbar is not None
+        assert image.colorbar.extend == extend
+        assert bar.get_ylabel() == "distance in the study's unit"
 
 
 def test_groups_stand_together() -> None:

@@ -140,12 +140,9 @@ def test_the_worst_place_is_in_front_whatever_the_orientation(sign: int) -> None
         assert (eye == FRONT).all() or eye @ place > 0.85
 
 
-def test_nothing_turns_what_is_the_same_all_around() -> None:
-    assert (turned(np.ones(len(SPHERE.vertices))).eye == FRONT).all()
-    assert (turned(np.zeros(len(SPHERE.vertices))).eye == FRONT).all()
-
-
-def test_single_vertices_do_not_take_the_colours() -> None:
+def test_nothing_turns_what_is_the_same_all_around_and_single_vertices_do_not_take_the_colours() -> None:
+    for constant in (1.0, 0.0):
+        assert (turned(np.full(len(SPHERE.vertices), constant)).eye == FRONT).all()
     values = SPHERE.vertices[:, 0].copy()
     assert turned(values).color_limits == np.abs(values).max()
     values[:5] = 1e6

@@ -77,13 +77,15 @@ def test_the_nearest_mesh_of_each_size_and_the_smallest_below_bounds() -> None:
     assert omitted == ""
 
 
-def test_few_meshes() -> None:
+def test_few_meshes_and_surfaces_without_triangles() -> None:
     sentence, rows, _ = verdict_on(frame([("a", 100, 0.2)]))
     assert sentence == "a/100 differs from the reference by 20.00\xa0%\xa0±\xa00.02\xa0% at order −2."
     assert rows["nearest of all"] == ["a/100", "20.00 % ± 0.02 %", "100", ""]
-    # One family has no sizes.
+    # One family has no sizes, and what has no triangles has none.
     _, rows, _ = verdict_on(frame([("a", 100, 0.2), ("a", 105, 0.04)]))
     assert list(rows) == ["nearest of all", "below 5 %: a", "below 1 %: a"]
+    _, rows, _ = verdict_on(frame([("a", 0, 0.1), ("b", 0, 0.2)]))
+    assert rows == {"nearest of all": ["a/0", "10.00 % ± 0.01 %", "", "2 times nearer than b/0"]}
 
 
 def test_errors_that_leave_a_place_open_are_said() -> None:
@@ -104,11 +106,6 @@ def test_failures_only() -> None:
     sentence, rows, _ = verdict_on(made, {f"a/{i}": "no triangles" for i in range(5)})
     assert sentence == "No mesh could be compared with the reference."
     assert rows == {"nearest of all": ["no distance is known"], "missing": ["a/0, a/1, a/2 and 2 more"]}
-
-
-def test_surfaces_without_triangles_have_no_sizes() -> None:
-    _, rows, _ = verdict_on(frame([("a", 0, 0.1), ("b", 0, 0.2)]))
-    assert rows == {"nearest of all": ["a/0", "10.00 % ± 0.01 %", "", "2 times nearer than b/0"]}
 
 
 def test_hundreds_of_meshes_are_summed_up() -> None:

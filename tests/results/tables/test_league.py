@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import permutations, product
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from scipy import stats
 
 import sobolev_batch as sb
 from sobolev_batch.results.tables.league import League, format_league, leagues_of
-from sobolev_batch.results.tables.statistics import Interval, adjusted, sign_flip_test, within_objects
+from sobolev_batch.results.tables.statistics import Interval, sign_flip_test, within_objects
 from tests.support.studies import method_rows
 
 SIZES = (100, 400, 1600)
@@ -190,13 +190,6 @@ def test_errors_make_p_the_largest_that_they_allow() -> None:
 def test_many_objects_are_tried_at_random_and_p_is_never_zero() -> None:
     p = sign_flip_test(np.ones(40), np.zeros(40))
     assert 0 < p < 1e-3
-
-
-def test_adjusted_p_values_keep_their_order_and_do_not_exceed_one() -> None:
-    for values in permutations((0.01, 0.03, 0.4)):
-        expected = {0.01: 0.03, 0.03: 0.06, 0.4: 0.4}
-        np.testing.assert_allclose(adjusted(np.array(values)), [expected[value] for value in values])
-    assert adjusted(np.array([0.9, 0.8])).tolist() == [1.0, 1.0]
 
 
 def test_what_objects_differ_by_does_not_widen_intervals() -> None:
