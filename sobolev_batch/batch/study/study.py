@@ -275,7 +275,10 @@ class StudyCollection:
         # Objects and lists may bring references and families.
         written = plain_tables(table)
         values = {"reference": None, "family": [], **written}
-        document = StudyDocument.from_tables(values)
+        # A family may be of the mesh that has the name of the object: any will do to check it.
+        names = [section.get("name") for section in values.get("object") or [] if isinstance(section, dict)]
+        checked = _filled(values["family"], OBJECT, names[0]) if names and names[0] else values["family"]
+        document = StudyDocument.from_tables({**values, "family": checked})
         listed = _listed_meshes(document.objects.get("meshes", ()), folder)
         objects = _objects(document, values, list(dict.fromkeys(name for name, _ in listed)), folder)
         families = [_families(family, [section.name for section in objects], folder) for family in values["family"]]

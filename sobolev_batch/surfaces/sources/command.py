@@ -31,7 +31,7 @@ from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.sources.files import file_digest, number_as_text
 from sobolev_batch.surfaces.sources.mesh_cache import Cost, MeshCache, Outcome
 from sobolev_batch.surfaces.sources.names import label_problem, quoted
-from sobolev_batch.surfaces.sources.program import INPUT, OUTPUT, PLACEHOLDER, run_command
+from sobolev_batch.surfaces.sources.program import INPUT, OUTPUT, PLACEHOLDER, environment, run_command
 from sobolev_batch.surfaces.sources.registry import (
     MOST_ENTRIES,
     ExpectedSize,
@@ -232,9 +232,14 @@ class CommandSource(RemesherSource):
         words = [self._filled(word, {}, folder) for word in self.version]
         try:
             done = subprocess.run(  # noqa: S603 -- the user permitted it
-                words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-                timeout=_VERSION_SECONDS, check=True,
-            )  # fmt: skip
+                words,
+                env=environment(),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                timeout=_VERSION_SECONDS,
+                check=True,
+            )
         except (OSError, subprocess.SubprocessError) as error:
             raise StudyError(f"version: {shlex.join(words)}: {one_line(error)}") from error
         found = done.stdout.decode(errors="replace").strip()

@@ -6,6 +6,7 @@ import os
 import re
 import signal
 import subprocess
+import sys
 import tempfile
 import time
 from contextlib import suppress
@@ -27,6 +28,12 @@ PLACEHOLDER = re.compile(r"\{(\w+)\}")
 _LONGEST_TAIL = 300
 # Seconds between looks at a program that runs: at first, and at most.
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.005, 0.1
+
+
+def environment() -> dict[str, str]:
+    """Return the environment of programs: ``python`` is the one that runs this, with its libraries."""
+    own = str(Path(sys.executable).parent)
+    return {**os.environ, "PATH": os.pathsep.join(filter(None, (own, os.environ.get("PATH"))))}
 
 
 def run_command(
@@ -57,7 +64,13 @@ def run_command(
         with said[0].open("wb") as out, said[1].open("wb") as err:
             try:
                 process = subprocess.Popen(  # noqa: S603 -- the user permitted it
-                    filled, cwd=folder, stdin=subprocess.DEVNULL, stdout=out, stderr=err, start_new_session=True
+                    filled,
+                    cwd=folder,
+                    env=environment(),
+                    stdin=subprocess.DEVNULL,
+                    stdout=out,
+                    stderr=err,
+                    start_new_session=True,
                 )
             except (OSError, ValueError) as error:
                 return Outcome(Cost(), reason=f"{words[0]} cannot be started on this machine: {one_line(error)}")

@@ -199,3 +199,17 @@ def test_placeholders_take_as_much_as_they_can(tmp_path: Path, template: str, pa
         table(reference={"source": "files", "paths": [template]}, family=ICO), folder=tmp_path
     )
     assert list(found.studies) == [name]
+
+
+def test_a_family_may_be_of_the_mesh_with_the_name_of_the_object() -> None:
+    table = {
+        **small_table(reference=None),
+        "mesh": {"ball": {"source": "icosphere", "levels": [2]}, "egg": {"source": "ellipsoid", "axes": [2, 1, 1]}},
+        "object": [{"name": "ball", "reference": "ball"}, {"name": "egg", "reference": "egg"}],
+        "family": [{"name": "moved", "source": "moved", "mesh": "{object}", "distances": [0.1]}],
+    }
+    studies = sb.StudyCollection.from_table(table).studies
+    assert {name: study.table["family"][0]["mesh"] for name, study in studies.items()} == {"ball": "ball", "egg": "egg"}
+    table["family"][0]["mesh"] = "{object}s"
+    with pytest.raises(sb.StudyError, match="no mesh is named 'balls'; did you mean ball"):
+        sb.StudyCollection.from_table(table)
