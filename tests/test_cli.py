@@ -116,20 +116,8 @@ def test_meshes_by_patterns(folder: Path, tmp_path: Path) -> None:
 
 
 def test_plot_draws_every_picture(folder: Path) -> None:
-    options = (
-        "--format",
-        "svg",
-        "--format",
-        "png",
-        "--family",
-        "i*",
-        "--x",
-        "vertices",
-        "--order",
-        "-3",
-        "--size",
-        "84x60mm",
-    )
+    formats = ("--format", "svg", "--format", "png")
+    options = (*formats, "--family", "i*", "--x", "vertices", "--order", "-3", "--size", "84x60mm")
     done = call("plot", STORE, "--output", "pictures", "--witness", "ico/1", *options, folder=folder)
     assert (done.returncode, done.stderr) == (0, "")
     paths = [folder / line for line in done.stdout.split()]

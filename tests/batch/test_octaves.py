@@ -118,6 +118,9 @@ def test_plain_xarray_integrates_over_all_frequencies(octave_store: Path) -> Non
 
 def test_a_run_reuses_octaves_and_a_new_mesh_gets_the_same_frequencies(store: Path, client: Client) -> None:
     before = sb.open_store(store)["octaves"].to_dataset().load()
+    plan = sb.plan(sb.Study.from_table(asking()), store)
+    assert (plan.octaves, len(plan.stored)) == (before["octave"].max(), 4)
+    assert f"{before.sizes['sample']:,} samples" in str(plan)
     summary = sb.run(sb.Study.from_table(asking()), store, client)
     assert summary.computed == ()
     more = asking()
@@ -220,20 +223,6 @@ def test_fields_in_blocks_and_octaves_in_a_task_of_their_own_are_the_same(client
         found, expected = (variable(tree, group, name).values for tree in (blocks, whole))
         assert found == pytest.approx(expected, rel=1e-8, nan_ok=True)
     assert sb.verify(tmp_path / "blocks.zarr").is_sound
-
-
-def test_a_plan_and_a_report_show_octaves(octave_store: Path, tmp_path: Path) -> None:
-    found = sb.plan(sb.Study.from_table(asking()), octave_store)
-    text = str(found)
-    samples = sb.open_store(octave_store)["octaves"].sizes["sample"]
-    assert found.octaves == len(sb.open_store(octave_store).attrs["study"]["octaves"]["octaves"])
-    assert f"octaves:       {found.octaves} beyond the lattice" in text
-    assert f"{samples:,} samples" in text
-    assert "nothing is missing" in text
-    assert found.field_bytes == found.lattice.half.size * 8 + samples * 8 or found.dtype == "complex128"
-    assert len(found.stored) == 4
-    page = sb.report(octave_store, tmp_path / "report.html").read_text(encoding="utf-8")
-    assert f"{found.octaves} beyond the lattice, at random frequencies" in page
 
 
 def test_an_open_store_gives_any_order_from_its_octaves(octave_store: Path) -> None:

@@ -7,15 +7,12 @@ from __future__ import annotations
 
 import os
 import subprocess
-import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
-from distributed import Client, Worker
+from distributed import Client
 
 from sobolev_batch import Study, icosphere, run, write_mesh
 from sobolev_batch.batch.cluster.execution import Progress
@@ -74,27 +71,20 @@ class Gate:
             os.close(self.writer)
 
 
-@pytest.mark.parametrize("way", ["retired", "at the end of its lifetime"])
 def test_a_worker_that_leaves_hands_on_the_task_that_it_is_in(
-    way: str, cluster: Cluster, client: Client, study: Study, store_path: Path, tmp_path: Path
+    cluster: Cluster, client: Client, study: Study, store_path: Path, tmp_path: Path
 ) -> None:
     address, processes = cluster
     leaving = processes[1]
-    left = threading.Event()
     gates: list[Gate] = []
-    with Client(address) as ours, following(ours, "remove-worker", left), ThreadPoolExecutor(1) as pool:
+    with Client(address) as ours, ThreadPoolExecutor(1) as pool:
         (first,) = ours.scheduler_info()["workers"]
 
         def replace() -> None:
             gates[0].await_one()
-            if way == "retired":
-                processes.append(dask("worker", address, *WORKER, *GATED))
-                ours.wait_for_workers(2, timeout=PATIENCE_SECONDS)
-                ours.retire_workers([first])
-            else:
-                ours.run(end_lifetime)
-                assert left.wait(timeout=PATIENCE_SECONDS)
-                processes.append(dask("worker", address, *WORKER, *GATED))
+            processes.append(dask("worker", address, *WORKER, *GATED))
+            ours.wait_for_workers(2, timeout=PATIENCE_SECONDS)
+            ours.retire_workers([first])
 
         def disturb(progress: Progress) -> None:
             if progress.stage == "cluster":
@@ -110,23 +100,3 @@ def test_a_worker_that_leaves_hands_on_the_task_that_it_is_in(
     run(study, tmp_path / "undisturbed.zarr", client)
     assert [record.status for record in Store.open(store_path).records() if record] == ["complete"] * 5
     assert_same_results(store_path, tmp_path / "undisturbed.zarr")
-
-
-def end_lifetime(dask_worker: Worker) -> None:
-    """Do what the worker does by itself at the end of its lifetime."""
-    dask_worker.io_loop.add_callback(dask_worker.close_gracefully, reason="worker-lifetime-reached")
-
-
-@contextmanager
-def following(client: Client, action: str, happened: threading.Event) -> Iterator[None]:
-    """Set an event when the scheduler does something."""
-
-    def look(event: tuple[float, Any]) -> None:
-        if isinstance(event[1], dict) and event[1].get("action") == action:
-            happened.set()
-
-    client.subscribe_topic("all", look)
-    try:
-        yield
-    finally:
-        client.unsubscribe_topic("all")
