@@ -18,15 +18,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class CollectionStore:
-    """The stores of the objects of a collection, below one location.
-
-    Attributes:
-        location: Location of them all.
-        title: Title of the collection.
-        name: Name of the collection.
-        objects: Names of the objects.
-        table: Collection as it was written.
-    """
+    """The stores of the objects of a collection, below one location."""
 
     location: Location
     title: str

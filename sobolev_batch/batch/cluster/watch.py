@@ -40,10 +40,6 @@ _Silence = tuple[object, str, float]
 class Watch:
     """A watch over the cluster of a run, in a thread of its own.
 
-    Args:
-        client: Client of the cluster.
-        needs_gpu: True if the run waits for a worker with a GPU.
-
     Attributes:
         obstacle: What keeps the run from going on, for people; empty if nothing does.
     """
@@ -143,11 +139,7 @@ class Watch:
         self._client.scheduler_comm.comm.abort()
 
     def _ask(self, operation: str, **arguments: Any) -> Any:
-        """Return what the scheduler answers.
-
-        Raises:
-            TimeoutError: It does not answer in time.
-        """
+        """Return what the scheduler answers within some seconds."""
         return self._client.sync(
             getattr(self._client.scheduler, operation), callback_timeout=_POLL_SECONDS, **arguments
         )

@@ -64,16 +64,7 @@ _OF_EXTRAS = ("pyacvd", "vtk")
 
 @dataclass(frozen=True)
 class WorkerInfo:
-    """One worker.
-
-    Attributes:
-        address: Address of the worker.
-        threads: Number of tasks that it runs at once.
-        allowed_bytes: Memory that all its tasks together may take.
-        backend: "cpu" or "gpu".
-        note: Name of the GPU, or the reason why the worker computes on the CPU.
-        declares_gpu: True where the worker was started with a resource GPU.
-    """
+    """One worker; the note is the name of its GPU, or the reason why it computes on the CPU."""
 
     address: str
     threads: int
@@ -157,11 +148,6 @@ class BackendPlugin(WorkerPlugin):  # type: ignore[misc]  # distributed has no t
     """Plugin that finds a worker's backend when it starts, and declares its memory and its GPU to the scheduler.
 
     A worker takes at most one GPU, and only one that no other worker of its host has.
-
-    Attributes:
-        backend: Backend that the worker's tasks compute with.
-        note: Name of the GPU, or the reason why there is none.
-        allowed_bytes: Memory for all its tasks together.
     """
 
     idempotent = True
@@ -312,8 +298,7 @@ def lock_gpu(devices: Sequence[str]) -> str | None:
     Containers share it if they share the network of the host. A file would not serve others better, since they have
     temporary folders of their own.
 
-    Returns:
-        UUID of the device, or None where all are locked or this process has one already.
+    Return None where all are locked or this process has one already.
     """
     if not sys.platform.startswith("linux"):
         return None

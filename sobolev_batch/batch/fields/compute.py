@@ -140,14 +140,7 @@ def size_tasks(
     Each task holds the mesh. Its transform adds up batches of points, as large as the memory allows. Every task is kept
     within what a worker has for each of its threads, as long as that leaves a transform enough to work in; a task that
     takes more runs beside fewer others.
-
-    Args:
-        blocks: Blocks of the lattice, all but the last of equal size.
-        transform: Settings of the fields.
-        size: Size of the row's surface.
-        workers: Workers of the cluster.
-        rows: Number of rows that are to be computed.
-        octaves: Largest block that octaves transform, and the bytes that they hold; None without octaves.
+    Octaves are given by the largest block that they transform, and the bytes that they hold.
     """
     block, octave_bytes = (blocks[0], 0.0) if octaves is None else octaves
     block_bytes = float(block.size * np.dtype(transform.dtype).itemsize)

@@ -38,13 +38,7 @@ def checksum_of(values: NDArray[Any]) -> int:
 
 
 class CheckedStore(WrapperStore[ZarrStore]):
-    """zarr's store whose chunks are checked as they are read.
-
-    Args:
-        store: Store to read from.
-        name: Path or URL of the store, for messages.
-        documents: Metadata documents of its arrays, by their paths.
-    """
+    """zarr's store whose chunks are checked as they are read, by the metadata documents of its arrays."""
 
     def __init__(self, store: ZarrStore, name: str, documents: Mapping[str, Mapping[str, Any]]) -> None:
         super().__init__(store)

@@ -31,10 +31,6 @@ LOST_AFTER_SECONDS = 6 * HEARTBEAT_SECONDS
 class Heartbeat:
     """Record in a store that says where a run goes on, and how it ended.
 
-    Args:
-        store: Store of the run.
-        lock: Lock that the run holds.
-
     Attributes:
         cluster: Address of the scheduler, once there is one.
         stage: Current stage.

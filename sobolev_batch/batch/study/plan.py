@@ -54,17 +54,9 @@ class Row:
 
 @dataclass(frozen=True)
 class Plan:
-    """Plan of a run.
+    """Plan of a run: all surfaces in the order of the study, the label of the reference, the lattice of all fields.
 
-    Attributes:
-        study: Study to carry out.
-        similarity: Similarity transform of all surfaces.
-        rows: All surfaces, the reference among them, in the order of the study.
-        reference: Label of the reference's row.
-        choice: Lattice and dtype of all fields.
-        reference_area: Area of the reference, in squared units of length.
-        reference_extent: Extent of the reference, in units of length.
-        sample: Sample of the reference, if an accuracy is requested.
+    Area and extent of the reference are in the study's unit of length. It has a sample if an accuracy is requested.
     """
 
     study: Study
