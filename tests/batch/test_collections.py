@@ -47,9 +47,6 @@ def test_each_object_has_a_store_of_its_own(store: Path, client: Client, tmp_pat
     assert sb.table(store / "b").equals(
         sb.table(tmp_path / "alone.zarr").assign(seconds=sb.table(store / "b")["seconds"])
     )
-
-
-def test_xarray_reads_all_objects_at_once(store: Path) -> None:
     tree = xr.open_datatree(store, engine="zarr", consolidated=False)
     assert tree["a/convergence"]["distance"].sizes == {"mesh": 5, "order": 2}
     assert tree.attrs["collection"]["objects"] == ["a", "gone", "b"]

@@ -7,16 +7,15 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from zarr.core.buffer import default_buffer_prototype
 from zarr.core.sync import sync
 
-from sobolev_batch import StoreError, Study, open_store, run
+from sobolev_batch import StoreError, Study, run
 from sobolev_batch.batch.storage.location import Location, path_in
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.status import Status
-from tests.support.studies import small_table, variable
+from tests.support.studies import small_table
 
 
 def lead_away(path: Path, target: str | Path) -> None:
@@ -34,15 +33,6 @@ def test_what_lies_elsewhere_is_not_read(copy: Path, key: str) -> None:
     lead_away(copy / key, "/dev/zero")
     with pytest.raises(StoreError, match=f"{key}: a link, which may lead out of the store"):
         Status.from_store(copy)
-
-
-def test_a_field_that_lies_elsewhere_is_not_read(copy: Path, tmp_path: Path) -> None:
-    chunks = copy / "fourier" / "fourier" / "c"
-    shutil.copytree(chunks, tmp_path / "elsewhere")
-    lead_away(chunks, tmp_path / "elsewhere")
-    tree = open_store(copy)
-    with pytest.raises(StoreError, match="a link, which may lead out of the store"):
-        np.asarray(variable(tree, "fourier", "fourier").values)
 
 
 def test_nothing_is_written_or_removed_elsewhere(copy: Path, tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -80,11 +79,6 @@ def test_documents_of_a_folder_and_of_a_url(tmp_path: Path) -> None:
         location.remove("nothing")
         assert location.read("b/c") is None
         assert location.read("d") == b"3"
-
-
-def test_a_store_that_is_only_read_gives_large_keys_as_much_time() -> None:
-    store: Any = Location.parse("memory://large").zarr_store(1 << 28)
-    assert store.with_read_only(True).largest_bytes == 1 << 28
 
 
 @pytest.mark.parametrize(

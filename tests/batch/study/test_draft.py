@@ -139,17 +139,6 @@ def test_meshes_of_no_method(tmp_path: Path, template: str) -> None:
     assert draft.summary == ("2 objects: big cow, cow", f"method {method}: 2 meshes")
 
 
-def test_large_files_do_not_keep_small_ones_from_being_read(tmp_path: Path) -> None:
-    write(tmp_path / "a.stl", 1)
-    with (tmp_path / "a.stl").open("r+b") as file:
-        file.truncate(40 << 20)
-    write(tmp_path / "b.stl", 1)
-    with (tmp_path / "b.stl").open("r+b") as file:
-        file.truncate(1000)
-    write(tmp_path / "c.stl", 1)
-    assert "b.stl" in sb.init_study(tmp_path, tmp_path / "study.toml").left_out
-
-
 def test_links_to_files_count_and_those_to_folders_do_not(tmp_path: Path) -> None:
     write(tmp_path / "elsewhere" / "far.ply", 1)
     write(tmp_path / "in" / "original.ply", 2)
