@@ -258,10 +258,12 @@ def _digest(workspace: Workspace) -> str:
     plan = workspace.plan
     shown = [(workspace.rows[i], workspace.records[i]) for i, _, _ in table_order(workspace)]
     rows = [
-        [row.label, row.family, *((record.key, record.status, record.reason) if record else ("", "", ""))]
+        [
+            *(row.label, row.family, row.member.time, row.member.metadata),
+            *((record.key, record.status, record.reason) if record else ("", "", "")),
+        ]
         for row, record in shown
     ]
-    times, metadata = ([getattr(row.member, name) for row, _ in shown] for name in ("time", "metadata"))
     inputs = {
         "version": TABLES_VERSION,
         "rows": rows,
@@ -269,9 +271,6 @@ def _digest(workspace: Workspace) -> str:
         "pairs": plan.study.pairs,
         "reference": plan.reference,
         "order_by": {family.name: family.order_by for family in plan.study.families},
-        # Left out where there are none, as in stores that know none.
-        **({} if all(time is None for time in times) else {"times": times}),
-        **({"metadata": metadata} if any(metadata) else {}),
     }
     return hashlib.sha256(json.dumps(inputs).encode()).hexdigest()
 

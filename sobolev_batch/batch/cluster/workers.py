@@ -71,7 +71,6 @@ class WorkerInfo:
     allowed_bytes: float
     backend: str
     note: str
-    declares_gpu: bool = False
 
 
 def allowed_bytes(limit: float | None) -> float:
@@ -132,10 +131,7 @@ class Workers:
             return self
         members = tuple(member for member in self.members if member.backend == "gpu")
         if not members:
-            reasons = "; ".join(
-                f"{member.address}{' (declares a GPU)' if member.declares_gpu else ''}: {member.note}"
-                for member in self.members[:_MOST_NAMED]
-            )
+            reasons = "; ".join(f"{member.address}: {member.note}" for member in self.members[:_MOST_NAMED])
             raise ClusterError(
                 f"the study requests backend 'gpu', and none of the {len(self.members)} workers can compute on one. "
                 f"{reasons}{'; ...' if len(self.members) > _MOST_NAMED else ''}. "
@@ -169,8 +165,6 @@ class BackendPlugin(WorkerPlugin):  # type: ignore[misc]  # distributed has no t
         self.allowed_bytes = allowed_bytes(worker.memory_manager.memory_limit)
         await asyncio.to_thread(self._find_backend)
         has_gpu = self.backend.name == "gpu"
-        if _declares_gpu(worker) and not has_gpu:
-            _log.warning("%s declares a GPU but computes on its CPU: %s", worker.address, self.note)
         await worker.set_resources(**{MEMORY: self.allowed_bytes}, **({GPU: 1} if has_gpu else {}))
         if worker.status == Status.running:
             # The scheduler looks for tasks that wait for resources only when a worker begins to run.
@@ -183,8 +177,7 @@ class BackendPlugin(WorkerPlugin):  # type: ignore[misc]  # distributed has no t
         while self._ready is None:
             await asyncio.sleep(_SETUP_SECONDS)
         await self._ready.wait()
-        threads, backend = worker.state.nthreads, self.backend.name
-        return WorkerInfo(worker.address, threads, self.allowed_bytes, backend, self.note, _declares_gpu(worker))
+        return WorkerInfo(worker.address, worker.state.nthreads, self.allowed_bytes, self.backend.name, self.note)
 
     def teardown(self, worker: Worker) -> None:
         """Release the GPU."""
@@ -242,10 +235,6 @@ async def _describe(dask_worker: Worker) -> WorkerInfo | None:
 async def _slowness(dask_worker: Worker) -> float:
     # In a thread, or the worker would not answer meanwhile.
     return await asyncio.to_thread(slowness, dask_worker.plugins[_NAME].backend)
-
-
-def _declares_gpu(worker: Worker) -> bool:
-    return any(name.upper() == "GPU" for name in worker.state.total_resources)
 
 
 def require_same_versions(client: Client, libraries: Iterable[str] = ()) -> None:

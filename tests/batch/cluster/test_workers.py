@@ -26,13 +26,12 @@ def study_on(backend: str) -> Study:
 def test_a_gpu_that_no_worker_has_is_refused_at_once_and_auto_computes_without(
     store_path: Path,
 ) -> None:
-    # One of the workers declares a GPU that it does not have.
+    # One of the workers declares a resource that it does not have.
     with tcp_cluster([], ["--resources", "GPU=1"]) as (address, _), remote_client(address) as client:
         with pytest.raises(ClusterError) as caught:
             run(study_on("gpu"), store_path, client)
         message = str(caught.value)
         assert "the study requests backend 'gpu', and none of the 2 workers can compute on one" in message
-        assert message.count("(declares a GPU)") == 1
         assert "ask for backend 'auto'" in message
         summary = run(study_on("auto"), store_path, client)
     assert len(summary.computed) == 5
