@@ -28,12 +28,6 @@ PLACED: dict[str, tuple[list[dict[str, Any]], list[int] | None, float, list[floa
     # Column by column: the same rotation, with lengths doubled and a shift.
     "matrix": ([{"mesh": 0, "matrix": [0, 2, 0, 0, -2, 0, 0, 0, 0, 0, 2, 0, 9, 0, 0, 1]}], None, 4 * 28, [9, 2, 8]),
     "child": ([{"children": [1], "scale": [2, 2, 2]}, {"mesh": 0, "translation": [1, 0, 0]}], [0], 4 * 28, [4, 4, 8]),
-    "two of a name": (
-        [{"mesh": 0, "name": "a"}, {"mesh": 0, "name": "a", "translation": [9, 0, 0]}],
-        None,
-        2 * 28,
-        [10, 2, 4],
-    ),
     "outside the scene": ([{"mesh": 0}, {"mesh": 0, "scale": [2, 2, 2]}], [0], 28, [1, 2, 4]),
     "below a camera": ([{"camera": 0, "children": [1], "translation": [9, 0, 0]}, {"mesh": 0}], [0], 28, [10, 2, 4]),
 }

@@ -96,7 +96,6 @@ QUADS = np.insert(np.array(BOX_QUADS), 0, 4, axis=1).ravel()
 WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "number": (lambda: 7, "expected a Mesh, the path of a mesh file, a pair .* or Open3D; found int"),
     "three": (lambda: (1, 2, 3), "found tuple"),
-    "path of trimesh": (lambda: trimesh.path.Path3D(), "found trimesh.Path3D"),
     "quadrilaterals": (
         lambda: pyvista.PolyData(BOX_VERTICES, QUADS),
         r"PolyData is no mesh .*; pass mesh\.triangulate",
@@ -110,8 +109,6 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
         r"shape \(n, 3\), found \(8, 2\)",
     ),
     "two parts": (two_parts, r"it holds 2 parts, .* as scene\.to_mesh\(\)"),
-    "NaN": (lambda: (np.full((3, 3), np.nan), [[0, 1, 2]]), "NaN or infinite"),
-    "texts": (lambda: ("a", "b"), "vertices must be real numbers"),
 }
 
 

@@ -274,16 +274,8 @@ def test_names_without_a_known_format_are_refused_with_the_page_that_converts(tm
 
 # Forms in which a cut shows wherever it falls, and how many bytes at the end mean nothing.
 # The last line of text may lose its end, but no corner.
-SPARE = {
-    "ply little": 0,
-    "stl binary": 0,
-    "stl ascii": 5,
-    "ply ascii": 1,
-    "off": 1,
-    "glb": 0,
-    "gifti": 0,
-    "freesurfer": 0,
-}
+SPARE = dict.fromkeys(("ply little", "stl binary", "glb", "gifti", "freesurfer"), 0)
+SPARE |= {"stl ascii": 5, "ply ascii": 1, "off": 1}
 TETRAHEDRON = TETRAHEDRON_VERTICES, TETRAHEDRON_TRIANGLES
 CUTTABLE: dict[str, tuple[str, bytes, int]] = {
     **{name: (WRITERS[name][0], WRITERS[name][1](*TETRAHEDRON), spare) for name, spare in SPARE.items()},

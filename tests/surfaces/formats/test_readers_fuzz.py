@@ -82,29 +82,22 @@ def _ends_well(path: Path, content: bytes) -> None:
 def _damaged(content: bytes, random: Random) -> bytes:
     """A valid file after a few accidents."""
     for _ in range(random.randint(1, 4)):
-        size = len(content)
-        place, other = random.randint(0, size), random.randint(0, size)
-        accident = random.choice(["flip", "cut", "insert", "repeat", "drop", "number", "number", "word"])
-        if accident == "flip" and place < size:
-            flipped = content[place] ^ (1 << random.randint(0, 7))
-            content = content[:place] + bytes([flipped]) + content[place + 1 :]
+        start, end = random.randint(0, len(content)), random.randint(0, len(content))
+        new = random.choice([b"", *_TOKENS, random.randbytes(random.randint(0, 12))])
+        accident = random.choice(["flip", "cut", "insert", "splice", "number", "number", "word"])
+        if accident == "flip":
+            end, new = start + 1, bytes(byte ^ (1 << random.randint(0, 7)) for byte in content[start : start + 1])
         elif accident == "cut":
-            content = content[:place]
+            end, new = len(content), b""
         elif accident == "insert":
-            inserted = random.choice([*_TOKENS, random.randbytes(random.randint(0, 12))])
-            content = content[:place] + inserted + content[place:]
-        elif accident == "repeat":
-            content = content[: max(place, other)] + content[min(place, other) :]
-        elif accident == "drop":
-            content = content[: min(place, other)] + content[max(place, other) :]
-        else:
+            end = start
+        elif accident != "splice":
             pattern = rb"-?\d+(?:\.\d+)?" if accident == "number" else rb"[A-Za-z_]+"
-            found = list(re.finditer(pattern, content))
-            if found:
-                match = random.choice(found[:40])
-                word = random.randbytes(random.randint(0, 8))
-                new = random.choice(_NUMBERS).encode() if accident == "number" else word
-                content = content[: match.start()] + new + content[match.end() :]
+            found = [match.span() for match in re.finditer(pattern, content)]
+            start, end = random.choice(found[:40] or [(0, 0)])
+            new = random.choice(_NUMBERS).encode() if accident == "number" else random.randbytes(random.randint(0, 8))
+        # The end may come before the start: then a part is repeated.
+        content = content[:start] + new + content[end:]
     return content
 
 

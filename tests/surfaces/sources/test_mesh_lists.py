@@ -38,6 +38,9 @@ def test_a_csv_file_gives_paths_names_times_and_metadata(tmp_path: Path) -> None
 def test_tables_of_a_study_keep_their_order(tmp_path: Path) -> None:
     found = members([{"path": "b.ply", "seconds_of_method": 2}, {"path": "a.ply", "name": "x"}], tmp_path)
     assert [(member.name, member.metadata) for member in found] == [("b", (("seconds_of_method", 2.0),)), ("x", ())]
+    for second in ({"path": "b.ply", "name": "a"}, {"path": "a.ply", "tool": 2}):
+        with pytest.raises(StudyError, match="several are named 'a'"):
+            members([{"path": "a.ply", "tool": 1}, second], tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -75,12 +78,6 @@ def test_csv_files_that_are_no_lists_are_refused_by_name(tmp_path: Path, text: s
     (tmp_path / "meshes.csv").write_text(text)
     with pytest.raises(StudyError, match=f"'meshes.csv'.*{message}"):
         read_mesh_list(tmp_path / "meshes.csv")
-
-
-def test_two_meshes_of_one_name_are_refused(tmp_path: Path) -> None:
-    for second in ({"path": "b.ply", "name": "a"}, {"path": "a.ply", "tool": 2}):
-        with pytest.raises(StudyError, match="several are named 'a'"):
-            members([{"path": "a.ply", "tool": 1}, second], tmp_path)
 
 
 def test_a_frame_loses_nothing() -> None:
