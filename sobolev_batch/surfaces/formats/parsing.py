@@ -76,12 +76,7 @@ def require_memory_to_read(needed_bytes: float) -> None:
 
 
 def read_unpacked(path: Path, factor: float) -> bytes:
-    """Return the bytes of a regular file, unpacked if its name ends in .gz.
-
-    Args:
-        path: Path of the file.
-        factor: Bytes of memory that reading takes for each byte, unpacked.
-    """
+    """Return the bytes of a regular file, unpacked if its name ends in .gz, at a factor of memory for each byte."""
     try:
         with open_regular(path) as file:
             length = checked_length(file)

@@ -112,13 +112,7 @@ def _values(array: Any) -> NDArray[Any]:
 
 
 def _triangles(kinds: Indices, corners: Indices, offsets: Indices) -> Indices:
-    """Return the triangles (m, 3) of cells.
-
-    Args:
-        kinds: VTK's number for the type of each cell.
-        corners: Vertex indices of all cells, one after the other.
-        offsets: Place of each cell's first corner, and the end of the last one.
-    """
+    """Return the triangles (m, 3) of cells of some types, from the corners of all and the places where each begins."""
     sizes = np.diff(offsets)
     if len(sizes) != len(kinds) or (sizes < 0).any() or sizes.sum() != len(corners):
         raise MeshError(f"the offsets of its {len(kinds)} cells do not run from 0 up to their {len(corners)} corners")

@@ -160,10 +160,6 @@ class Similarity:
 def placement_doubt(extent: Extent, reference: Extent) -> str | None:
     """Return what makes one doubt that a surface can be compared with a reference, as a question; None if nothing does.
 
-    Args:
-        extent: Extent of the surface.
-        reference: Extent of the reference, in the same unit of length.
-
     >>> from sobolev_batch import Sphere
     >>> placement_doubt(Sphere(25.4).extent, Sphere().extent)
     'it is 25.4 times as large as the reference: are both in the same unit of length?'

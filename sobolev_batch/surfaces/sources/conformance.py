@@ -22,7 +22,6 @@ from sobolev_batch.surfaces.sources.registry import Member, Source
 _MOST_MEMBER_BYTES = 1 << 20
 # Smaller meshes need no prediction of their size; for larger ones it may be too low by this factor.
 _SMALL_TRIANGLES, _FACTOR = 10_000, 10
-_UNKNOWN_KEY = "a_key_that_no_source_has"
 
 
 def check_source(source: Source, folder: str | Path = ".") -> None:
@@ -55,7 +54,8 @@ def check_source(source: Source, folder: str | Path = ".") -> None:
     - the member 'ball' has the fingerprint of 'ball' and another surface; add what tells them apart
     """
     folder = Path(folder).absolute()
-    problems = [*_parameter_problems(source), *_attempted("members()", _member_problems(source, folder))]
+    problems = [*_attempted("a parameter", _parameter_problems(source))]
+    problems += _attempted("members()", _member_problems(source, folder))
     if problems:
         count = f"{len(problems)} promise{'s' if len(problems) > 1 else ''}"
         lines = "".join(f"\n- {problem}" for problem in problems)
@@ -72,7 +72,7 @@ def _attempted(action: str, problems: Iterable[str]) -> Iterator[str]:
 
 def _parameter_problems(source: Source) -> Iterator[str]:
     try:
-        type(source).model_validate({_UNKNOWN_KEY: 1})
+        type(source).model_validate({"a_key_that_no_source_has": 1})
         errors: list[str] = []
     except ValidationError as error:
         errors = [item["type"] for item in error.errors()]
@@ -80,10 +80,7 @@ def _parameter_problems(source: Source) -> Iterator[str]:
         yield "it takes unknown keys; keep extra='forbid' in its model_config"
     if not source.model_config.get("frozen"):
         yield "it can be changed; keep frozen=True in its model_config"
-    try:
-        source.model_dump_json()
-    except Exception as error:
-        yield f"model_dump_json() raises {type(error).__name__}: {error}"
+    source.model_dump_json()
 
 
 def _member_problems(source: Source, folder: Path) -> Iterator[str]:
@@ -116,12 +113,9 @@ def _refuse_mesh(*_: object, **__: object) -> NoReturn:
 
 
 def _own_problems(member: Member, twin: Member, first_of: dict[str, tuple[str, object]]) -> Iterator[str]:
-    """Yield what is wrong with a member.
+    """Yield what is wrong with a member, which its source listed a second time as a twin.
 
-    Args:
-        member: Member to look at.
-        twin: The same, as its source lists it a second time.
-        first_of: Name and identity of the first member with each fingerprint, to which this one is added.
+    Name and identity of the first member with each fingerprint are kept.
     """
     problem = label_problem(member.name)
     if problem is not None:

@@ -284,12 +284,8 @@ def _noisy(mesh: Mesh, amount: float, seed: int) -> Mesh:
 def with_noise(mesh: Mesh, amplitude: float, seed: int) -> Mesh:
     """Return a mesh whose vertices are displaced along its normals by independent Gaussian numbers.
 
-    Vertices at the same place are displaced together, so that no cracks open.
-
-    Args:
-        mesh: Mesh with m vertices.
-        amplitude: Standard deviation of the displacements, in units of length.
-        seed: Seed of the random numbers.
+    Vertices at the same place are displaced together, so that no cracks open. The amplitude is the standard deviation,
+    in units of length.
     """
     places, place_of_vertex = np.unique(mesh.vertices, axis=0, return_inverse=True)
     place_of_vertex = place_of_vertex.reshape(-1)

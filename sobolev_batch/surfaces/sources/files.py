@@ -44,7 +44,6 @@ from sobolev_batch.surfaces.sources.registry import (
 )
 
 MOST_MESHES = 100_000
-_MOST_COLUMNS = 100
 _LONGEST_TEXT = 1000
 _LARGEST_FILE_BYTES = 64 << 20
 # What a list says of a mesh: its path, and perhaps a name, a time and metadata.
@@ -121,9 +120,6 @@ def number_as_text(number: float) -> str:
 def _listed(tables: Any) -> tuple[MeshTable, ...]:
     if len(tables) > MOST_MESHES:
         raise ValueError(f"at most {MOST_MESHES} meshes are allowed, found {len(tables)}")
-    widest = max(map(len, tables))
-    if widest > _MOST_COLUMNS:
-        raise ValueError(f"at most {_MOST_COLUMNS} columns are allowed, found {widest}")
     return tuple(map(_checked_table, tables))
 
 

@@ -104,10 +104,7 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "no faces": (lambda: pyvista.PolyData(BOX_VERTICES), r"the pyvista\.PolyData is no mesh .*no triangles"),
     "grid": (lambda: box().to_pyvista().cast_to_unstructured_grid(), "found pyvista.UnstructuredGrid"),
     "tetrahedra": (lambda: meshio.Mesh(BOX_VERTICES, [("tetra", [[0, 1, 2, 4]])]), "cells of the type tetra"),
-    "flat": (
-        lambda: meshio.Mesh(BOX_VERTICES[:, :2], [("triangle", BOX_TRIANGLES)]),
-        r"shape \(n, 3\), found \(8, 2\)",
-    ),
+    "flat": (lambda: meshio.Mesh(BOX_VERTICES[:, :2], [("triangle", BOX_TRIANGLES)]), r"\(n, 3\), found \(8, 2\)"),
     "two parts": (two_parts, r"it holds 2 parts, .* as scene\.to_mesh\(\)"),
 }
 

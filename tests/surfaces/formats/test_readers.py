@@ -77,9 +77,8 @@ def test_every_digit_of_a_file_is_kept(read: Read, name: str, options: dict[str,
         assert mesh.triangles.tolist() == BOX_TRIANGLES
 
 
-# A house in the plane z = 0: a pentagon of area 3 on a rectangle of area 2, with a buttress of area 1/2.
-# The numbers of corners, 4, 3 and 5, have the mean of the first, so that a reader which takes all
-# faces to be like the first one finds as many bytes as it expects.
+# A house in the plane z = 0: a pentagon of area 3 on a rectangle of area 2, with a buttress of area 1/2. It has as many
+# corners as three faces like the first one.
 HOUSE_VERTICES: Reals = np.array(
     [(0, 0, 0), (2, 0, 0), (2, 1, 0), (1, 2, 0), (0, 1, 0), (0, -1, 0), (2, -1, 0), (3, 0, 0)], dtype=np.float64
 )
