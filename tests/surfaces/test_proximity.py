@@ -70,7 +70,6 @@ def test_distances_of_vertices_as_another_search_finds_them() -> None:
         _, distances, _ = trimesh.proximity.closest_point_naive(surface, on_mesh)
         farthest = max(farthest, float(distances.max()))
     found = proximity(a, b, points=2000)
-    # Corners of triangles are often, but not always, their farthest points.
     assert farthest - 1e-12 <= found.hausdorff < 1.3 * farthest
 
 

@@ -96,10 +96,7 @@ QUADS = np.insert(np.array(BOX_QUADS), 0, 4, axis=1).ravel()
 WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "number": (lambda: 7, "expected a Mesh, the path of a mesh file, a pair .* or Open3D; found int"),
     "three": (lambda: (1, 2, 3), "found tuple"),
-    "quadrilaterals": (
-        lambda: pyvista.PolyData(BOX_VERTICES, QUADS),
-        r"PolyData is no mesh .*; pass mesh\.triangulate",
-    ),
+    "quadrilaterals": (lambda: pyvista.PolyData(BOX_VERTICES, QUADS), r"PolyData is no mesh .* mesh\.triangulate"),
     "strips": (lambda: pyvista.Sphere().strip(), "it has polygons or strips"),
     "no faces": (lambda: pyvista.PolyData(BOX_VERTICES), r"the pyvista\.PolyData is no mesh .*no triangles"),
     "grid": (lambda: box().to_pyvista().cast_to_unstructured_grid(), "found pyvista.UnstructuredGrid"),

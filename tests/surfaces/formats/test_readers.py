@@ -88,7 +88,6 @@ POLYGON_WRITERS: dict[str, tuple[str, Callable[[Any, Any], bytes]]] = {
     **{name: WRITERS[name] for name in ("ply ascii", "ply little", "ply big", "obj", "off")},
     "ply little bytes": (".ply", lambda v, f: ply(v, f, LITTLE, index="uchar")),
     "obj with texture": (".obj", lambda v, f: b"vt 0 0\n" + obj(v, f, lambda vertex, _: f"{vertex}/1")),
-    "obj with normals": (".obj", lambda v, f: b"vn 0 0 1\n" + obj(v, f, lambda vertex, _: f"{vertex}//1")),
 }
 
 

@@ -160,10 +160,6 @@ BAD: dict[str, dict[str, bytes]] = {
                 (b'NumberOfDataArrays="2"', b'NumberOfDataArrays="3"'),
             )
         },
-        "text, a triangle too many": changed(
-            gifti(BOX_VERTICES, INT_TRIANGLES, "GIFTI_ENCODING_ASCII"), (b'Dim0="12"', b'Dim0="13"')
-        ),
-        "pairs of indices": gifti(BOX_VERTICES, INT_TRIANGLES.reshape(-1, 2)),
         "no triangles": gifti(BOX_VERTICES, None),
         "no points": gifti(None, INT_TRIANGLES),
         "two point sets": gifti(BOX_VERTICES, INT_TRIANGLES, points=2),
