@@ -102,15 +102,18 @@ def test_harmful_characters_are_escapes_and_others_stay() -> None:
     text = "Ärger, 日本, שלום, 👩‍🚀, \u00a0 and \\x1b"
     assert visible(text) == text
     assert visible_lines("a\nb\rc") == "a\nb\\rc"
+    record = VisibleRecord("a", logging.ERROR, "b", 1, "%s: %d", (HOSTILE, 2), (OSError, OSError(HOSTILE), None))
+    text = logging.Formatter("%(message)s").format(record)
+    assert text.splitlines()[0] == f"{SHOWN}: 2"
+    assert not harmful(text)
 
 
 def test_a_process_shows_names_and_reasons_of_its_workers_too(folder: Path) -> None:
     # What is listed and not there is logged by the driver; a worker cannot read what is broken.
     listed = TOML.replace('"*/*.obj"', f'"*/*.obj", {json.dumps(LABEL + "/gone.obj")}')
     (folder / "study.toml").write_text(listed)
-    done = subprocess.run(
-        [*COMMAND, "run", "study.toml", "--workers", "1"], capture_output=True, cwd=folder, check=False
-    )
+    command = [*COMMAND, "run", "study.toml", "--workers", "1"]
+    done = subprocess.run(command, capture_output=True, cwd=folder, check=False)
     output, errors = (part.decode("utf-8", "surrogateescape") for part in (done.stdout, done.stderr))
     assert done.returncode == 3
     assert not harmful(output + errors)
@@ -119,31 +122,25 @@ def test_a_process_shows_names_and_reasons_of_its_workers_too(folder: Path) -> N
     assert f"WARNING sobolev_batch.batch.study.plan: files/gone: {folder}/{SHOWN_LABEL}/gone.obj: " in errors
 
 
+WORK = """
+import logging, warnings
+from sobolev_batch.batch.cluster.clients import local_client
+def work(text):
+    logging.getLogger("sobolev_batch").error("says %s", text)
+    warnings.warn(text)
+if __name__ == "__main__":
+    with local_client(1) as client:
+        client.submit(work, {}).result()
+"""
+
+
 def test_messages_of_workers_reach_the_terminal_as_escapes(folder: Path) -> None:
-    script = (
-        "import logging, warnings\n"
-        "from sobolev_batch.batch.cluster.clients import local_client\n"
-        "def work(text):\n"
-        "    logging.getLogger('sobolev_batch').error('says %s', text)\n"
-        "    warnings.warn(text)\n"
-        "if __name__ == '__main__':\n"
-        "    with local_client(1) as client:\n"
-        f"        client.submit(work, {HOSTILE!r}).result()\n"
-    )
-    (folder / "work.py").write_text(script)
+    (folder / "work.py").write_text(WORK.format(repr(HOSTILE)))
     done = subprocess.run([COMMAND[0], "work.py"], capture_output=True, cwd=folder, check=True)
     errors = done.stderr.decode("utf-8", "surrogateescape")
     assert f"says {SHOWN}\n" in errors
     assert f"UserWarning: {SHOWN}\n" in errors
     assert not harmful(errors)
-
-
-def test_log_records_are_one_line_and_tracebacks_are_visible() -> None:
-    error = OSError(HOSTILE)
-    record = VisibleRecord("a", logging.ERROR, "b", 1, "%s: %d", (HOSTILE, 2), (OSError, error, None))
-    text = logging.Formatter("%(message)s").format(record)
-    assert text.splitlines()[0] == f"{SHOWN}: 2"
-    assert not harmful(text)
 
 
 def test_commands_show_names_of_files(folder: Path) -> None:
