@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -57,6 +57,7 @@ def league_content(collection: CollectionStore, status: Status) -> dict[str, Any
     except InputError as error:
         leagues, no_league = (), str(error)
     orders = list(dict.fromkeys(float(s) for frame in tables.values() for s in frame["order"]))
+    one = collection.location.below(collection.objects[0])
     by_order = {league.order: league for league in leagues}
     objects = [row for s in orders for row in _object_rows(tables, s, by_order.get(s))]
     ranked, pairs = ([row for league in leagues for row in _rows(league, name)] for name in ("table", "pairs"))
@@ -71,7 +72,10 @@ def league_content(collection: CollectionStore, status: Status) -> dict[str, Any
         "league": PageTable("league", _LEAGUE_COLUMNS, ranked, [*by_order]),
         "pairs": PageTable("pairs", PAIR_COLUMNS, pairs, [*by_order]) if pairs else None,
         "objects": PageTable("objects", _OBJECT_COLUMNS, objects, orders),
-        "omissions": tuple(_omissions(collection, leagues)),
+        "omissions": [
+            f"single meshes: each object has a report of its own, such as that of {one}",
+            *(f"{name}, from the league{where}: {why}" for name, where, why in left_out(leagues)),
+        ],
     }
 
 
@@ -140,9 +144,3 @@ def _best(league: League, number: int) -> Row:
         "ratio": float(np.exp(values[second] - values[first])),
         "mark": "within errors" if is_open else "",
     }
-
-
-def _omissions(collection: CollectionStore, leagues: Sequence[League]) -> Iterator[str]:
-    one = collection.location.below(collection.objects[0])
-    yield f"single meshes: each object has a report of its own, such as that of {one}"
-    yield from (f"{name}, from the league{where}: {why}" for name, where, why in left_out(leagues))

@@ -375,12 +375,5 @@ def _settings(attributes: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     dtype = {"complex128": "double", "complex64": "single"}[study["dtype"]]
     eps = "" if study["eps"] is None else f", nonuniform FFT accurate to {study['eps']:g}"
     yield "arithmetic", f"{dtype} precision{eps}"
-    yield "similarity", _similarity_text(attributes["similarity"])
-
-
-def _similarity_text(similarity: Mapping[str, Any]) -> str:
-    scale, origin = similarity["scale"], similarity["origin"]
-    if scale == 1 and not any(origin):
-        return "none: lengths are in the meshes' own unit"
-    point = ", ".join(f"{x:.6g}" for x in origin)
-    return minus(f"x ↦ {scale:.6g} (x - ({point})): one unit of length is {1 / scale:.6g} of the meshes' own")
+    scale, origin = attributes["similarity"]["scale"], attributes["similarity"]["origin"]
+    yield "similarity", f"scale {scale:.6g}, origin {' '.join(f'{x:.6g}' for x in origin)}"
