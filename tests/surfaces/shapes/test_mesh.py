@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sobolev_batch import Mesh, MeshError
+from sobolev_batch.surfaces.shapes.mesh import shared_triangles
 from tests.support.shapes import (
     BOX_AREA,
     TETRAHEDRON_AREA,
@@ -250,3 +251,10 @@ def test_the_order_of_vertices_triangles_and_corners_does_not_matter(mesh: Mesh,
     for name in ("duplicate_triangles", "boundary_edges", "nonmanifold_edges"):
         assert shuffled.counts[name] == mesh.counts[name]
     assert np.array_equal(shuffled.extent.box, mesh.extent.box)
+
+
+def test_triangles_are_shared_in_any_orientation_and_as_often_as_in_both() -> None:
+    corners = np.stack(tetrahedron().corners(), axis=1)
+    mine, others = corners[[0, 1, 1, 2]], np.concatenate([corners[[1, 0]][:, [2, 1, 0]], -corners[3:]])
+    in_mine, in_others = shared_triangles(mine, others)
+    assert (in_mine.tolist(), in_others.tolist()) == ([True, True, False, False], [True, True, False])
