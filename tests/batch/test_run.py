@@ -129,7 +129,7 @@ def test_a_bad_mesh_is_recorded_and_stops_nothing(client: Client, tmp_path: Path
 
 
 def test_distances_to_the_reference_alone(client: Client, finished_store: Path, store_path: Path) -> None:
-    table = small_table(norm={"orders": [-10.0, -3.0], "pairs": "reference"})
+    table = small_table(compare=None)
     sb.run(sb.Study.from_table(table), store_path, client)
     found = variable(sb.open_store(store_path), "distances", "distance")
     assert found["other"].values.tolist() == ["reference"]

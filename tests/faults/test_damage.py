@@ -185,7 +185,7 @@ def test_a_reduction_names_the_mesh_and_computes_it_again(
 ) -> None:
     damage(store / FIELD.format(row=row))
     # New orders need all fields and no transform.
-    study = Study.from_table(small_table(norm={"orders": [-4.0], "pairs": pairs}))
+    study = Study.from_table(small_table(norm={"orders": [-4.0]}, compare={"pairs": pairs}))
     assert run(study, store, threads).computed == (LABELS[row],)
     assert f"the field of {LABELS[row]} is damaged" in caplog.text
     assert np.isfinite(variable(open_store(store), "convergence", "distance").values).all()

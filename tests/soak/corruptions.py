@@ -38,7 +38,7 @@ def finished_stores(folder: Path) -> dict[str, Path]:
     """Compute a whole store, one of an earlier state before a mesh changed, and a foreign one of other meshes."""
     stores = {name: folder / f"{name}.zarr" for name in ("whole", "earlier", "foreign")}
     study = folder / "study.toml"
-    octaves, all_pairs = ("M = 24", "M = 10\noctaves = 1"), ('pairs = "reference"', 'pairs = "all"')
+    octaves, all_pairs = ("M = 24", "M = 10\noctaves = 1"), ("[reference]", '[compare]\npairs = "all"\n[reference]')
     study.write_text(STUDY.replace(*octaves).replace(*all_pairs) + _SPHERES)
     chance = np.random.default_rng(0)
     with local_client(1) as client:

@@ -17,7 +17,6 @@ xi_max = 2.0
 M = 24
 [norm]
 orders = [-4.0, -2.0]
-pairs = "reference"
 [reference]
 source = "sphere"
 [[family]]

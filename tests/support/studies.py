@@ -21,6 +21,7 @@ def small_table(**changes: Any) -> dict[str, Any]:
         "study": {"name": "small"},
         "lattice": {"xi_max": SMALL_LATTICE.xi_max, "M": SMALL_LATTICE.M},
         "norm": {"orders": [-10.0, -3.0]},
+        "compare": {"pairs": "all"},
         "reference": {"source": "sphere"},
         "family": [{"name": "ico", "source": "icosphere", "levels": [0, 1, 2, 3]}],
     }

@@ -55,6 +55,9 @@ orders = [-2.0, -4.0]      # -2 weighs details, -4 the overall form; -1.5 sees f
 _TAIL = """
 # More to ask for: remove the # in front of the lines.
 
+# [compare]
+# pairs = "all"            # the distance of every mesh to every other, not to the reference alone
+
 # [proximity]              # Hausdorff and Chamfer distances beside ours; needs the extra "vtk"
 # points = 10000
 """

@@ -146,11 +146,14 @@ class _AccuracySection(Section):
 
 class _NormSection(Section):
     orders: Annotated[tuple[Number, ...], Field(min_length=1, strict=False), at_most(_MOST_ORDERS)]
-    pairs: Literal["all", "reference"] = "all"
 
     def settings(self) -> tuple[float, ...]:
         """Return the orders, each once."""
         return tuple(dict.fromkeys(check_orders(self.orders)))
+
+
+class _CompareSection(Section):
+    pairs: Literal["all", "reference"] = "reference"
 
 
 class _TransformSection(Section):
@@ -280,6 +283,7 @@ class StudyDocument(Section):
     lattice: _LatticeSection | None = None
     accuracy: _AccuracySection | None = None
     norm: _NormSection
+    compare: _CompareSection = _CompareSection()
     transform: _TransformSection = _TransformSection()
     reference: Annotated[FamilyReference | SerializeAsAny[Source] | None, BeforeValidator(_reference)]
     family: list[Family]

@@ -65,7 +65,7 @@ class Study:
         dtype: Dtype that was requested, if any.
         backend: Backend of the transforms; "auto" leaves it to each worker.
         orders: Sobolev orders s < -1/2.
-        pairs: "all" for the distances of all pairs of meshes, "reference" for those to the reference alone.
+        pairs: "reference" for the distances to the reference alone, "all" for those of all pairs of meshes.
         families: Families of surfaces to compare.
         reference: Surface that they are compared with.
         scaling: Similarity transform of all surfaces; None takes the reference's bounding sphere to the unit sphere.
@@ -85,7 +85,7 @@ class Study:
     ...     "family": [{"name": "ico", "source": "icosphere", "levels": [0, 1]}],
     ... })
     >>> study.orders, study.lattice, study.pairs
-    ((-2.0,), Lattice(xi_max=2.0, M=8), 'all')
+    ((-2.0,), Lattice(xi_max=2.0, M=8), 'reference')
     """
 
     name: str
@@ -178,7 +178,7 @@ class Study:
             dtype=document.transform.dtype,
             backend=document.transform.backend,
             orders=document.norm.settings(),
-            pairs=document.norm.pairs,
+            pairs=document.compare.pairs,
             families=tuple(families),
             reference=reference,
             scaling=document.scaling.settings(),

@@ -244,7 +244,7 @@ def draw_matrix(selection: Selection, order: float, axes: Axes) -> None:
     pairs = pairs_of(tree, order, MOST_MESHES, complete)
     if pairs is None:
         raise InputError(
-            'the store has distances to the reference alone; set pairs = "all" in [norm] and run the study again'
+            'the store has distances to the reference alone; set pairs = "all" in [compare] and run the study again'
         )
     distances, meshes = pairs["distance"].values, pairs["mesh"].values.tolist()
     omission = f"the first {len(meshes)} of {len(complete)} meshes" if len(meshes) < len(complete) else ""

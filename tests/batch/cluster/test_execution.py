@@ -120,7 +120,7 @@ def test_failures_of_the_store_end_all(cluster: Cluster) -> None:
 @pytest.mark.process
 def test_a_lost_scheduler_ends_the_run_and_blames_no_mesh(store_path: Path, threads: Client) -> None:
     family = [{"name": f"ball{i}", "source": "sphere", "radius": 0.5 + 0.001 * i} for i in range(200)]
-    study = Study.from_table(small_table(family=family, norm={"orders": [-3.0], "pairs": "reference"}))
+    study = Study.from_table(small_table(family=family, norm={"orders": [-3.0]}, compare=None))
     with tcp_cluster([]) as (address, (scheduler, _)):
 
         def end(progress: Progress) -> None:

@@ -42,10 +42,10 @@ DECIMATED = {"name": "d", "source": "decimate", "triangles": [9]}
 SENTENCES = [
     ("norm.orders", -4.0, "[norm]: orders must be a list, found -4.0"),
     ("norm.orders", [-2.0, "-6"], "[norm]: entry 2 of orders must be a number, found '-6'"),
-    ("norm.pairs", "refrence", "[norm]: pairs must be 'all' or 'reference', found 'refrence'"),
+    ("compare.pairs", "refrence", "[compare]: pairs must be 'all' or 'reference', found 'refrence'"),
     ("norm.orders", [], "[norm]: orders must have at least 1 item, found []"),
     ("norm.order", [-2.0], "[norm]: order is unknown; did you mean orders?"),
-    ("norm.width", 1, "[norm]: width is unknown; known are orders, pairs"),
+    ("norm.width", 1, "[norm]: width is unknown; known are orders"),
     ("lattice", {"xi_max": 5.0}, "[lattice]: M is missing"),
     ("norm", [-2.0], "[norm] must be a table, found [-2.0]"),
     ("accurracy", {}, "[accurracy] is unknown; did you mean accuracy?"),
@@ -119,11 +119,11 @@ def test_several_changes_are_refused_likewise(changes: dict[str, Any], part: str
 
 def test_all_problems_are_listed_at_once_up_to_ten() -> None:
     table = changed("lattice.M", "x")
-    table["norm"]["pairs"] = 3
+    table["compare"]["pairs"] = 3
     table["family"][0]["name"] = ""
     del table["reference"]
     message = refusal(table)
-    for part in ("[lattice]: M ", "[norm]: pairs ", "[reference] is missing", "[[family]] 1 (named ''): name"):
+    for part in ("[lattice]: M ", "[compare]: pairs ", "[reference] is missing", "[[family]] 1 (named ''): name"):
         assert part in message
     many = refusal(changed("norm.orders", ["x"] * 100))
     assert many.count("must be a number") == 10

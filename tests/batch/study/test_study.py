@@ -29,7 +29,9 @@ xi_max = 4
 M = 32
 [norm]
 orders = [-2, -3.5, -2]
-pairs = "reference"
+
+[compare]
+pairs = "all"
 [transform]
 eps = 1e-6
 dtype = "complex64"
@@ -60,7 +62,7 @@ def test_reads_every_key(tmp_path: Path) -> None:
     assert (study.name, study.title) == ("two words", "A title")
     assert study.lattice == Lattice(4.0, 32)
     assert study.orders == (-2.0, -3.5)
-    assert study.pairs == "reference"
+    assert study.pairs == "all"
     assert (study.transform.eps, study.transform.dtype) == (1e-6, "complex64")
     assert study.transform.quadrature == 5
     assert study.scaling == Similarity(0.5)

@@ -37,7 +37,7 @@ def store(client: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
         {"name": "true", **carried(4, [0.0, 0.4, 0.8])},
         {"name": "still", **SHAPE, "levels": [1]},
     ]
-    norm = {"orders": [-2.0, -4.0], "pairs": "reference"}
+    norm = {"orders": [-2.0, -4.0]}
     lattice = {"xi_max": LATTICE.xi_max, "M": LATTICE.M}
     study = small_table(lattice=lattice, scaling={"mode": "none"}, norm=norm, reference=SHAPE, family=family)
     sb.run(sb.Study.from_table(study), folder / "moving.zarr", client)
