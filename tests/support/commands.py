@@ -27,6 +27,8 @@ xi_max = 3.0
 M = 16
 [norm]
 orders = [-10.0, -3.0]
+[compare]
+pairs = "all"
 [reference]
 source = "sphere"
 [[family]]

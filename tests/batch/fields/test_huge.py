@@ -119,7 +119,8 @@ def test_a_lattice_of_512_intervals_on_a_worker_of_three_gigabytes(store_path: P
     lattice = Lattice(20.0, 512)
     table = small_table(
         lattice={"xi_max": lattice.xi_max, "M": lattice.M},
-        norm={"orders": [-2.0]}, compare=None,
+        norm={"orders": [-2.0]},
+        compare=None,
         family=[{"name": "ico", "source": "icosphere", "levels": [4]}],
     )
     study = Study.from_table(table)
