@@ -85,10 +85,14 @@ def test_a_best_effort_serves_the_meshes_that_can_be_served(client: Client, fold
     table["accuracy"]["best_effort"] = True
     best = sb.Study.from_table(table, folder=folder)
     assert sb.run(best, folder / "best.zarr", client).failed == {}
-    within = sb.table(folder / "best.zarr").set_index("mesh")["within"]
-    assert within["f/z"]
-    assert within["f/x"]
-    assert not within["f/near"]
+    found = sb.table(folder / "best.zarr").set_index("mesh")
+    assert found["within"][["f/z", "f/x", "f/near"]].all()
+    # The lattice shows next to nothing of the third: close points do.
+    exact = sb.distance(twin, near, -0.7, rtol=0.02)
+    difference = abs(found["distance"]["f/near"] - exact["distance"].item())
+    assert difference <= found["error"]["f/near"] + exact["error"].item()
+    # The last one is the reference itself.
+    assert found["distance"]["f/y"] <= found["error"]["f/y"]
 
 
 def test_units_are_doubted_where_numbers_are_shown(client: Client, folder: Path) -> None:
