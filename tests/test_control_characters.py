@@ -40,6 +40,7 @@ FAMILY = "=1+1|`id` <img src=x> $x_1$ %&#~^{} [a](b) *_b_*"
 TOML = f"""
 lattice = {{ xi_max = 3.0, M = 16 }}
 norm.orders = [-10.0]
+compare.pairs = "all"
 reference.source = "sphere"
 [study]
 name = "hostile"

@@ -49,6 +49,7 @@ def table(folder: Path) -> dict[str, Any]:
         "study": {"name": "hostile", "title": f"Title {SCRIPT}{IMAGE}"},
         "lattice": {"xi_max": 3.0, "M": 16},
         "norm": {"orders": [-10.0, -3.0]},
+        "compare": {"pairs": "all"},
         "reference": {"source": "sphere"},
         "family": [
             {"name": FAMILY, "source": "icosphere", "levels": [0, 1, 2]},
