@@ -31,7 +31,7 @@ from sobolev_batch.spectral.budget import (
 )
 from sobolev_batch.spectral.fields import field_for
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.octaves.remainder import remainder
+from sobolev_batch.spectral.octaves.remainder import mean_sinc, remainder
 from sobolev_batch.spectral.octaves.sampling import OctaveSampling
 from sobolev_batch.spectral.octaves.values import (
     OctaveSums,
@@ -108,6 +108,11 @@ class Frequencies:
     def _octave_weights(self) -> tuple[OctaveWeights, ...]:
         return tuple(OctaveWeights(octave, self.orders) for octave in self.octaves)
 
+    @property
+    def _cutoff(self) -> float:
+        """Highest frequency, beyond which the tail lies."""
+        return self.octaves[-1].octave.highest if self.octaves else self.lattice.xi_max
+
     def values(self, surface: Surface, target: ErrorTarget, execution: Execution) -> SurfaceValues:
         """Return the values of a surface, with an error within a target.
 
@@ -137,7 +142,8 @@ class Frequencies:
             factors = 2 - 2 * np.sinc(2 * weights.sampling.radii * length)
             squares = squares + weights.integrals(squared_moduli(octave) * factors)
         if self.has_tail:
-            squares = squares + 2 * self.tail(own, [surface], [1]).beyond
+            means = np.array([mean_sinc(self._cutoff, order, length) for order in self.orders])
+            squares = squares + (2 - 2 * means) * self.tail(own, [surface], [1]).beyond
         return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
 
     def errors(self, values: Sequence[SurfaceValues]) -> Reals:
@@ -168,10 +174,9 @@ class Frequencies:
 
     def tail(self, measure: Measure, surfaces: Sequence[Surface], signs: Sequence[int]) -> Tail:
         """Return the tail from the octaves, and what is known to lie beyond them."""
-        cutoff = self.octaves[-1].octave.highest if self.octaves else self.lattice.xi_max
         # Norms of single surfaces serve as scales.
         points = _POINTS_OF_SCALES if len(surfaces) == 1 else None
-        beyond = remainder(surfaces, signs, cutoff, self.orders, points)
+        beyond = remainder(surfaces, signs, self._cutoff, self.orders, points)
         return Tail.from_sums(self.octave_sums(measure, measure), *beyond.at(self.orders))
 
 

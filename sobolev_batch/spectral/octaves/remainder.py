@@ -51,8 +51,8 @@ _REACHES = (-4.0, -3.0, -2.0, -1.0), (12.0, 10.0, 8.0, 6.0)
 # Entries of a table, how many times as many are interpolated, and the distance in wavelengths where they begin to be in
 # equal steps.
 _ENTRIES, _DENSER, _LINEAR_FROM = 1500, 8, 0.3
-# Cycles after which a cosine counts as averaged out, and nodes for each octave of frequencies.
-_CYCLES, _NODES = 32.0, leggauss(48)
+# Cycles after which a cosine and a sinc count as averaged out, and nodes for each octave of frequencies.
+_CYCLES, _SINC_CYCLES, _NODES = 32.0, 8.0, leggauss(48)
 # Degrees of the rules for triangles that are smaller than these fractions of their distance, and of 1/X.
 _RULES = (12, 0.6, 1.1), (4, 0.5, 0.5), (2, 0.2, 0.1)
 # Nodes along an edge: near the foot of the point, and farther out.
@@ -157,6 +157,18 @@ def tail_integral(cutoff: float, order: float) -> float:
     radii = cutoff * (0.75 + 0.25 * _NODES[0])
     on_step = float(0.25 * cutoff * _NODES[1] @ ((1 - smooth_step(radii, cutoff)) * (1 + radii**2) ** order))
     return on_step + _power_integral(cutoff, order)
+
+
+def mean_sinc(cutoff: float, order: float, length: float) -> float:
+    """Return the mean of sinc(2 r length) beyond a cutoff, weighted by (1 - step(r)) (1+r²)^s: 1 for a short length."""
+    integral, low = 0.0, cutoff / 2
+    # Farther out it averages to nothing.
+    while low * length < _SINC_CYCLES:
+        radii, weights = low * (1.5 + 0.5 * _NODES[0]), 0.5 * low * _NODES[1]
+        terms = weights * (1 - smooth_step(radii, cutoff)) * (1 + radii**2) ** order
+        integral += float(terms @ np.sinc(2 * radii * length))
+        low *= 2
+    return integral / tail_integral(cutoff, order)
 
 
 def _power_integral(lowest: float, order: float) -> float:

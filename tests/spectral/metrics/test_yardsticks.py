@@ -79,3 +79,12 @@ def test_what_is_like_nothing() -> None:
         yardsticks(Sphere(), BALL, -2.0, lattice=LATTICE)
     with pytest.raises(InputError, match="seed must be a whole number from 0 on, found -1"):
         yardsticks(moved(0.1), BALL, -2.0, lattice=LATTICE, seed=-1)
+
+
+@pytest.mark.slow
+def test_a_move_is_as_far_beyond_all_frequencies_too() -> None:
+    part = Mesh(BALL.vertices, BALL.triangles[:-40])
+    found = yardsticks(part, BALL, -2.0, rtol=0.02)
+    direct = distance(moved(found["moved"].item()), BALL, -2.0, rtol=0.01)
+    share = found["moved_error"].item() / found["moved"].item()
+    assert direct["distance"].item() == pytest.approx(found["distance"].item(), rel=share + 0.01)
