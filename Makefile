@@ -27,7 +27,7 @@ test: $(READY)  ## the tests: what must pass before a change is trusted, some fi
 test-fast: $(READY)  ## those that start no process and take less than a second, a minute
 	$(PYTEST) -n 2 -m "not (all or process or slow)"
 
-test-all: $(READY)  ## all tests, before a release: whole studies, clusters, browsers, kills, huge meshes; an hour
+test-all: $(READY)  ## all tests, before a release: whole studies, clusters, browsers, kills, huge meshes; a quarter of an hour
 	$(PYTEST) -n 3
 
 durations: $(READY)  ## run the tests and record the seconds of each file in tests/durations.tsv

@@ -34,6 +34,7 @@ PAGES = {
                 "commands",
                 "studies",
                 "leagues",
+                "remeshers",
                 "formats",
                 "surfaces",
                 "fitting",
