@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -106,3 +107,12 @@ def test_zarr_and_numpy_alone_compute_norms_and_distances(octaves: int, store_pa
             squared = names["squared_norm"](store, row, reference, order) + distance["beyond"].item()
             assert squared == pytest.approx(distance["distance"].item() ** 2, rel=1e-13)
     assert (norms["beyond"] > 0).all() == (convergence["beyond"].drop_sel(mesh="reference") > 0).all() == bool(octaves)
+
+
+def test_every_array_carries_a_checksum(store_path: Path) -> None:
+    prepare_store(store_path, small_plan())
+    metadata = [json.loads(path.read_text()) for path in store_path.rglob("zarr.json")]
+    arrays = [entry for entry in metadata if entry["node_type"] == "array"]
+    assert len(arrays) >= 6
+    for entry in arrays:
+        assert entry["codecs"][-1]["name"] == "crc32c"

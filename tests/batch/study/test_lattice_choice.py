@@ -140,3 +140,17 @@ def test_the_reference_may_be_a_mesh_of_a_family(client: Client, store_path: Pat
     convergence = sb.open_store(store_path)["convergence"].to_dataset()
     assert convergence["within"].sel(mesh=["ico/0", "ico/1", "ico/2"]).all()
     assert (convergence["distance"].sel(mesh="ico/3") == 0).all()
+
+
+@pytest.mark.all
+def test_another_accuracy_is_another_choice(client: Client, store_path: Path) -> None:
+    sb.run(asking(), store_path, client)
+    first = stored_choice(store_path)
+    summary = sb.run(asking(1e-4), store_path, client)
+    second = stored_choice(store_path)
+    assert first is not None
+    assert second is not None
+    assert len(summary.computed) == 5
+    assert second.lattice.xi_max > first.lattice.xi_max
+    assert variable(sb.open_store(store_path), "fourier", "fourier").shape[1:] == second.lattice.shape
+    assert variable(sb.open_store(store_path), "convergence", "within").all()

@@ -96,3 +96,9 @@ def test_a_reference_that_does_not_settle_is_a_failed_row(
     summary = sb.run(study, store_path, threads)
     assert set(summary.failed) == {"reference"}
     assert "not settled to 1e-09 of its area with 16384 nodes" in summary.failed["reference"]
+
+
+def test_the_bounding_sphere_of_the_reference_becomes_the_unit_sphere() -> None:
+    similarity = make_plan(sb.Study.from_table(torus_table())).similarity
+    assert (similarity.scale, similarity.origin) == (1 / 2.8, (5.0, 0.0, 1.0))
+    assert make_plan(sb.Study.from_table(egg_table())).similarity.scale == 0.5
