@@ -136,6 +136,7 @@ def test_a_list_gives_objects_methods_references_and_metadata(folder: Path) -> N
         ({"object": [{"name": "cow", "colour": 1}]}, r"\[\[object\]\] 1 \(named 'cow'\): colour is unknown"),
         ({"objects": {"meshes": [{"path": "a.ply", "object": "cow"}]}}, "'a.ply' has no method"),
         ({"reference": {"source": "files", "paths": ["none/{object}.ply"]}}, "matches no file"),
+        ({"reference": {"source": "files", "paths": ["{object}/{object}.ply"]}}, "one name; it stands for a part"),
         ({"norm": {"orders": [0.0]}}, r"^\[norm\]: the norm of a surface"),
         ({"object": [{"name": "cow", "scaling": {"mode": 1}}]}, r"^object 'cow': \[scaling\]: mode must be"),
         ({"objects": {"meshes": [{"path": "a.ply", "object": "a/b", "method": "m"}]}}, "named 'a/b'.*without / and"),

@@ -113,6 +113,7 @@ BAD: dict[str, dict[str, bytes]] = {
         "index beyond the line it stands on": b"v 0 0 0\nv 1 0 0\nf -1 -2 -3\nv 0 1 0\nv 0 0 1\n",
         "cut in a face": OBJ_BOX[:-3],
         "no vertices": b"f 1 2 3\n",
+        "a vertex of five numbers": OBJ_BOX + b"v 0 0 0 1 1\n",
     },
     ".off": {
         "homogeneous coordinates": b"4OFF\n3 1 0\n0 0 0 2\n2 0 0 2\n0 2 0 2\n3 0 1 2\n",

@@ -156,6 +156,11 @@ def test_bad_parameters_are_refused_where_they_stand(table: dict[str, Any], plac
     [
         ({"source": "files"}, "either paths, such as .* or a list of meshes is needed, and not both"),
         ({"source": "files", "paths": ["a.ply"], "meshes": "list.csv"}, "and not both"),
+        ({"source": "files", "meshes": "list.csv", "times": [1.0]}, "distribution and times belong to paths"),
+        (
+            {"source": "files", "meshes": "list.csv", "distribution": "nilearn"},
+            "distribution and times belong to paths",
+        ),
         ({"source": "ellipsoid", "axes": [1.0, 1.0, 1e200]}, "three numbers between 1e-150"),
         ({"source": "torus", "R": 1.0, "r": 1.0}, "0 < r < R"),
         (
