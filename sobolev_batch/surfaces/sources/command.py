@@ -51,12 +51,10 @@ _VERSION_SECONDS = 60.0
 
 def _seconds(value: object) -> float:
     """Return a time, given in seconds or as a text such as "10 min"."""
-    try:
+    with suppress(ValueError):
         seconds = value if isinstance(value, int | float) else pd.Timedelta(str(value)).total_seconds()
         if not isinstance(value, bool) and 0 < seconds < float("inf"):
             return float(seconds)
-    except ValueError:
-        pass
     raise ValueError("must be a number of seconds, or a time such as '10 min' or '2 h'")
 
 
@@ -119,15 +117,24 @@ class RemesherSource(NestedSource):
     def with_cache(self, cache: MeshCache) -> Self:
         """Return the source with the place where its meshes are kept."""
         source = super().with_cache(cache)
-        source = source.model_copy()
         source._cache = cache
         return source
 
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member for each combination of parameters, in the order of the lists."""
-        original = single_member(self.mesh, folder)
+        original, version = single_member(self.mesh, folder), self._found_version(folder)
         return tuple(
-            self._member(name, parameters, original, folder) for name, parameters in self._swept(original.name)
+            RemeshedMember(
+                name,
+                -1,
+                metadata=_metadata(parameters),
+                make=self._maker(parameters, folder),
+                identity={"remesher": self._settings(parameters), "version": version},
+                original=original,
+                files=self._files(folder),
+                cache=self._cache,
+            )
+            for name, parameters in self._swept(original.name)
         )
 
     def _swept(self, alone: str) -> Iterator[tuple[str, dict[str, Parameter]]]:
@@ -143,8 +150,20 @@ class RemesherSource(NestedSource):
             yield name, {**self.parameters, **dict(zip(lists, values, strict=True))}
 
     @abstractmethod
-    def _member(self, name: str, parameters: dict[str, Parameter], original: Member, folder: Path) -> Member:
-        """Return the member with some parameters."""
+    def _maker(self, parameters: dict[str, Parameter], folder: Path) -> Callable[[Mesh], Outcome]:
+        """Return a function that makes the mesh of some parameters."""
+
+    @abstractmethod
+    def _settings(self, parameters: dict[str, Parameter]) -> dict[str, Any]:
+        """Return what a fingerprint holds of the remesher and its parameters."""
+
+    @abstractmethod
+    def _found_version(self, folder: Path) -> str | None:
+        """Return the version of the remesher."""
+
+    def _files(self, folder: Path) -> dict[str, Path]:
+        """Return files that the remesher reads besides, by their names in the command."""
+        return {}
 
 
 class CommandSource(RemesherSource):
@@ -190,30 +209,21 @@ class CommandSource(RemesherSource):
             raise ValueError("the command has no {output}, the file that it has to write")
         return self
 
-    def _member(self, name: str, parameters: dict[str, Parameter], original: Member, folder: Path) -> Member:
-        words = [self._filled(word, parameters, folder) for word in self.command]
-        files = {
-            word: Path(self._filled(found[0], {}, folder))
-            for word in self.command
-            if (found := re.search(r"\{folder\}/.+", word))
-        }
-        settings = {"command": list(self.command), "parameters": parameters, "input": self.input, "output": self.output}
-        return RemeshedMember(
-            name,
-            -1,
-            metadata=_metadata(parameters),
-            make=partial(
-                run_command,
-                words=words,
-                suffixes=(self.input, self.output),
-                timeout=self.timeout,
-                largest_output=self.largest_output,
-            ),
-            identity={"remesher": settings, "version": self._found_version(folder)},
-            original=original,
-            files=files,
-            cache=self._cache,
+    def _maker(self, parameters: dict[str, Parameter], folder: Path) -> Callable[[Mesh], Outcome]:
+        return partial(
+            run_command,
+            words=[self._filled(word, parameters, folder) for word in self.command],
+            suffixes=(self.input, self.output),
+            timeout=self.timeout,
+            largest_output=self.largest_output,
         )
+
+    def _settings(self, parameters: dict[str, Parameter]) -> dict[str, Any]:
+        return {"command": list(self.command), "parameters": parameters, "input": self.input, "output": self.output}
+
+    def _files(self, folder: Path) -> dict[str, Path]:
+        found = {word: re.search(r"\{folder\}/.+", word) for word in self.command}
+        return {word: Path(self._filled(match[0], {}, folder)) for word, match in found.items() if match}
 
     @staticmethod
     def _filled(word: str, parameters: Mapping[str, Parameter], folder: Path) -> str:
@@ -263,20 +273,14 @@ class FunctionSource(RemesherSource):
     function: Callable[..., Any] | str
     version: str | None = None
 
-    def _member(self, name: str, parameters: dict[str, Parameter], original: Member, folder: Path) -> Member:
-        return RemeshedMember(
-            name,
-            -1,
-            metadata=_metadata(parameters),
-            make=partial(call_function, function=self.function, parameters=parameters),
-            identity={
-                "remesher": {"function": function_name(self.function), "parameters": parameters},
-                "version": self.version or function_version(self.function),
-            },
-            original=original,
-            files={},
-            cache=self._cache,
-        )
+    def _maker(self, parameters: dict[str, Parameter], folder: Path) -> Callable[[Mesh], Outcome]:
+        return partial(call_function, function=self.function, parameters=parameters)
+
+    def _settings(self, parameters: dict[str, Parameter]) -> dict[str, Any]:
+        return {"function": function_name(self.function), "parameters": parameters}
+
+    def _found_version(self, folder: Path) -> str | None:
+        return self.version or function_version(self.function)
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ class Folder(Protocol):
 
 @dataclass(frozen=True)
 class Cost:
-    """What it took to make a mesh; NaN where it is not known.
+    """Time, memory and exit status of making a mesh; NaN where they are not known.
 
     Attributes:
         make_seconds: Time from the start to the end.
@@ -58,7 +58,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class MeshCache:
-    """Where meshes are kept that programs or functions make, and whether those may run.
+    """A folder of meshes that programs or functions made, and whether these may run.
 
     A mesh is the file DIGEST.ply; DIGEST.json beside it says what made it and what that took.
 

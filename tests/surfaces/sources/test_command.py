@@ -104,6 +104,11 @@ def test_all_that_a_mesh_depends_on_is_in_its_fingerprint(tmp_path: Path) -> Non
         digest(output=".off"),
         digest(command=[*table["command"], "{output}"]),
     }
+    # It is found once for all meshes of a family.
+    log = tmp_path / "versions"
+    asking = {**COPY, "command": ["cp", "{input}", "{output}", "{n}"], "n": [1, 2, 3]}
+    made({**asking, "version": ["sh", "-c", f"echo >> {log}"]}, tmp_path / "kept")
+    assert len(log.read_text()) == 1
     # Readers know the version that was found last.
     reader = made(table, tmp_path / "kept", may_run=False, folder=tmp_path)[0]
     assert reader.fingerprint_digest() == first
