@@ -104,6 +104,7 @@ def run_command(
         )
     parsed = read_study(study)
     place = store or _made_default_store(parsed)
+    _echo_warnings(parsed, place)
     with progress_reports() as show:
         if scheduler:
             with remote_client(scheduler, trust_network) as client:
@@ -156,6 +157,7 @@ def submit_command(
 
     parsed = read_study(study)
     location = (store or _made_default_store(parsed)).absolute()
+    _echo_warnings(parsed, location)
     with remote_client(scheduler, trust_network) as client:
         submission = submit(parsed, location, client, allow_commands=allow_commands)
 
@@ -202,9 +204,18 @@ def plan_command(
             return
         made = plan(parsed, store, client, allow_commands=allow_commands)
     _show_objects(parsed, made.objects, made.refused, echo_lines, "planned")
+    for text in made.warnings:
+        echo(f"warning: {text}", err=True)
     echo(made.total)
     if made.refused:
         context.exit(EXIT_SOME_FAILED)
+
+
+def _echo_warnings(study: Study | StudyCollection, place: Location) -> None:
+    from sobolev_batch.results.plan import warnings_of
+
+    for text in warnings_of(study, place):
+        echo(f"warning: {text}", err=True)
 
 
 def _is_best_effort(study: Study | StudyCollection) -> bool:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+import shutil
 import time
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import overload
 
+import numpy as np
 from distributed import Client
 
 from sobolev_batch.batch.analysis.tabulate import pairs_bytes
@@ -19,15 +23,19 @@ from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store, stored_choice
 from sobolev_batch.batch.study.lattice_choice import look_at_extents
-from sobolev_batch.batch.study.plan import Plan, Row, make_plan
-from sobolev_batch.batch.study.study import Study, StudyCollection
+from sobolev_batch.batch.study.plan import Plan, Row, make_plan, members_of
+from sobolev_batch.batch.study.study import REFERENCE_LABEL, Study, StudyCollection
 from sobolev_batch.batch.workspace import complete_records
+from sobolev_batch.errors import InputError
 from sobolev_batch.parameters import available_cores, format_bytes
+from sobolev_batch.results.tables.league import gap_of
+from sobolev_batch.results.tables.statistics import Curve, common_sizes, least_objects
 from sobolev_batch.results.tables.text import duration
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.values import SurfaceSize
 from sobolev_batch.spectral.transform.transform import field_seconds, slowness
 from sobolev_batch.surfaces.shapes.surface import Similarity, placement_doubt
+from sobolev_batch.surfaces.sources.registry import ExpectedSize, Member
 from sobolev_batch.visible import reasons, table_html, visible
 
 # Time to describe and record a surface, and that of each of its triangles.
@@ -36,6 +44,8 @@ _ROW_SECONDS, _TRIANGLE_SECONDS = 0.1, 5e-6
 _PROCESS_SECONDS, _CLUSTER_SECONDS = 4.0, 6.0
 # Stored fields tell the speed if there are as many.
 _FEWEST_RECORDS = 3
+# Of the distance of a pair at one order: the number, its error and four parts, as stored.
+_PAIR_BYTES = 6 * 8
 
 
 def forecast(
@@ -116,6 +126,7 @@ class StudyPlan:
             Hausdorff and Chamfer distances, and distances of very many pairs.
         processor_seconds: Processor time that a run will take, that of starting processes included.
         lines: What is shown: name and text of each line; an empty name goes on with the line before.
+        warnings: What would make a run useless or end it, see `warnings_of`.
 
     >>> import sobolev_batch as sb
     >>> study = sb.Study.from_table({
@@ -146,6 +157,7 @@ class StudyPlan:
     seconds: float
     processor_seconds: float
     lines: tuple[tuple[str, str], ...] = field(repr=False)
+    warnings: tuple[str, ...] = ()
 
     @property
     def total_bytes(self) -> int:
@@ -153,10 +165,14 @@ class StudyPlan:
         return self.field_bytes * len(self.labels)
 
     def __str__(self) -> str:
-        return "\n".join(visible(f"{name + ':' * bool(name):<14} {text}") for name, text in self.lines)
+        return "\n".join(visible(f"{name + ':' * bool(name):<14} {text}") for name, text in self._shown)
+
+    @property
+    def _shown(self) -> tuple[tuple[str, str], ...]:
+        return (*self.lines, *(("warning", text) for text in self.warnings))
 
     def _repr_html_(self) -> str:
-        return table_html("Plan", self.lines)
+        return table_html("Plan", self._shown)
 
 
 def _study_lines(plan: Plan) -> Iterator[tuple[str, str]]:
@@ -225,6 +241,7 @@ class CollectionPlan:
     Attributes:
         objects: Plan of each object that can be carried out, by its name.
         refused: Reason for each other object, by its name.
+        warnings: What would make a run useless or end it, see `warnings_of`.
 
     >>> import sobolev_batch as sb
     >>> plan = sb.CollectionPlan({}, {"cow": "the reference cannot be made: cow.ply: it is empty"})
@@ -235,6 +252,7 @@ class CollectionPlan:
 
     objects: Mapping[str, StudyPlan]
     refused: Mapping[str, str]
+    warnings: tuple[str, ...] = ()
 
     @property
     def seconds(self) -> float:
@@ -257,6 +275,7 @@ class CollectionPlan:
     def __str__(self) -> str:
         lines = [f"{visible(name)}:\n{one}" for name, one in self.objects.items()]
         lines += [visible(f"{name}: {reason}") for name, reason in self.refused.items()]
+        lines += [visible(f"warning: {text}") for text in self.warnings]
         return "\n".join([*lines, self.total])
 
 
@@ -318,8 +337,98 @@ def plan(
     location = default_store(study) if store is None else Location.parse(store)
     study = study.with_cache(mesh_cache(location, allow_commands))
     if isinstance(study, StudyCollection):
-        return CollectionPlan(*for_each_object(study, location, lambda _, part, place: _plan(part, place, client)))
-    return _plan(study, location, client)
+        plans, refused = for_each_object(study, location, lambda _, part, place: _plan(part, place, client))
+        return CollectionPlan(plans, refused, warnings_of(study, location))
+    return replace(_plan(study, location, client), warnings=warnings_of(study, location))
+
+
+def warnings_of(study: Study | StudyCollection, store: Location) -> tuple[str, ...]:
+    """Return a line for each thing that would make a run of a study fail late, or useless. No surface is made.
+
+    They are sizes without a common range, too few objects for the test of a league, and distances of all pairs for
+    which the disk has no place.
+    """
+    if isinstance(study, Study) and study.pairs != "all" and len(study.families) == 1:
+        return ()
+    collection = study if isinstance(study, StudyCollection) else None
+    studies = {"": study} if isinstance(study, Study) else study.studies
+    members: dict[str, dict[str, tuple[str, Member]]] = {}
+    for name, one in studies.items():
+        # The run reports what cannot be listed.
+        with suppress(InputError):
+            members[name] = members_of(one)
+    gaps = {name: _gap_in_sizes(listed.values(), alone=collection is None) for name, listed in members.items()}
+    gaps = {name: gap for name, gap in gaps.items() if gap}
+    warnings = []
+    if gaps:
+        first, gap = next(iter(gaps.items()))
+        where = f" for {len(gaps)} of {len(studies)} objects, such as {first}" if first else ""
+        warnings.append(f"{gap}; methods cannot be ranked at equal triangles{where}; add meshes of sizes that all have")
+    if collection is not None:
+        useful = [name for name in members if name not in gaps and name not in collection.lacking]
+        warnings += _test_warnings(collection, len(useful))
+    matrix_bytes = {
+        name: _PAIR_BYTES * len(studies[name].orders) * len(listed) ** 2
+        for name, listed in members.items()
+        if studies[name].pairs == "all"
+    }
+    return (*warnings, *_space_warnings(matrix_bytes, store))
+
+
+def _gap_in_sizes(members: Iterable[tuple[str, Member]], *, alone: bool) -> str:
+    """Return which families have no range of sizes in common; nothing where they have one, or might.
+
+    Where an object is alone, only families of several sizes count: others need not be meant for a comparison by size.
+    """
+    sizes: dict[str, list[ExpectedSize]] = {}
+    for family, member in members:
+        if family != REFERENCE_LABEL and member.time is None:
+            sizes.setdefault(family, []).append(member.expected_size())
+    known = {
+        family: [(size.triangles, size.factor) for size in listed]
+        for family, listed in sizes.items()
+        if all(size.triangles > 0 and math.isfinite(size.factor) for size in listed)
+        and len({size.triangles for size in listed}) > alone
+    }
+    likely = {family: _range_of(count for count, _ in listed) for family, listed in known.items()}
+    largest = [_range_of(end for count, by in listed for end in (count / by, count * by)) for listed in known.values()]
+    return gap_of(likely) if known and common_sizes(largest) is None else ""
+
+
+def _range_of(sizes: Iterable[float]) -> Curve:
+    """Return a curve without distances over the range of some sizes."""
+    logarithms = np.log(sorted(sizes))[[0, -1]]
+    return Curve(logarithms, np.zeros(2), np.zeros(2))
+
+
+def _test_warnings(collection: StudyCollection, objects: int) -> Iterator[str]:
+    """Yield what makes a league useless whose test can tell no two methods apart."""
+    methods = {family.name for study in collection.studies.values() for family in study.families}
+    pairs, count = math.comb(len(methods), 2), len(collection.studies)
+    if pairs and objects < (least := least_objects(pairs)):
+        shown = f"{count} object{'s' * (count != 1)}"
+        shown = shown if objects == count else f"{objects} of {shown} that have all methods at common sizes"
+        yield (
+            f"the test of a league cannot tell {len(methods)} methods from chance with {shown}; "
+            f"take {least} objects or more, or compare fewer methods (league --method)"
+        )
+
+
+def _space_warnings(matrix_bytes: Mapping[str, int], store: Location) -> Iterator[str]:
+    """Yield the need for space of the distances of all pairs, by object, where a disk does not have it."""
+    if store.scheme or not matrix_bytes:
+        return
+    places = [store.below(name) if name else store for name in matrix_bytes]
+    stored = sum(size for place in places for size in place.sizes("distances").values())
+    needed, folder = sum(matrix_bytes.values()), Path(str(store)).absolute()
+    disk = shutil.disk_usage(next(one for one in (folder, *folder.parents) if one.exists()))
+    # Some file systems do not say how large they are.
+    if disk.total and needed - stored > disk.free:
+        yield (
+            f'pairs = "all": the distances of all pairs take {format_bytes(needed)} on disk, and '
+            f"{format_bytes(disk.free)} are free at {store}; "
+            'set pairs = "reference" in [compare], or choose another place with --store'
+        )
 
 
 def _plan(study: Study, location: Location, client: Client | None) -> StudyPlan:

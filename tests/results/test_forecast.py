@@ -3,20 +3,29 @@
 from __future__ import annotations
 
 import re
+import shutil
+from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+import tomli_w
 from distributed import Client
 
 import sobolev_batch as sb
 from sobolev_batch.batch.cluster.workers import Workers
+from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.study.plan import Plan, make_plan
-from sobolev_batch.results.plan import forecast
+from sobolev_batch.results.plan import forecast, warnings_of
 from sobolev_batch.spectral.transform.settings import TransformSettings
 from sobolev_batch.spectral.transform.transform import expected_points, field_seconds, transform_block
-from tests.support.studies import small_table
+from sobolev_batch.surfaces.formats.readers import write_mesh
+from tests.support.commands import call
+from tests.support.studies import balls, methods_of, small_table
 
 
 @pytest.fixture
@@ -89,3 +98,87 @@ def test_workers_of_a_cluster_are_tried(client: Client, plan: Plan) -> None:
     assert re.fullmatch(r"time: +about \d+(\.\d+)? s for 5 missing fields, with 2 tasks at once", first)
     assert second.endswith("the speed is that of a transform on a worker")
     assert "4.0KB in the driver, for distances of all pairs" in str(found)
+
+
+def made_of(**families: Mapping[str, Any] | list[int]) -> list[dict[str, Any]]:
+    """Return families by name: icospheres of some levels, or sources."""
+    return [
+        {"name": name, **(source if isinstance(source, Mapping) else {"source": "icosphere", "levels": source})}
+        for name, source in families.items()
+    ]
+
+
+def files(*names: str) -> dict[str, Any]:
+    return {"source": "files", "paths": [*names]}
+
+
+COMMAND = {
+    "source": "command",
+    "mesh": {"source": "icosphere", "levels": [0]},
+    "command": ["cp", "{input}", "{output}"],
+}
+SIX, FIVE = (balls(**{f"ball{i}": 1.0 for i in range(count)}) for count in (6, 5))
+APART = "no common range of sizes: fine begins at 1,280, coarse ends at 80; methods cannot be ranked at equal triangles"
+FEW = "the test of a league cannot tell 2 methods from chance with"
+
+
+@pytest.mark.parametrize(
+    ("table", "expected"),
+    [
+        (small_table(), []),
+        (small_table(family=made_of(coarse=[0, 1], fine=[1, 2])), []),
+        # 80 and 320 triangles, and the rest.
+        (small_table(family=made_of(coarse=[0, 1], fine=[3, 4])), [APART]),
+        (
+            small_table(object=SIX, family=made_of(coarse=[1], fine=[3])),
+            [f"{APART} for 6 of 6 objects, such as ball0", FEW],
+        ),
+        # Not meant for a comparison by size, or not known.
+        (small_table(family=made_of(coarse=[1], fine=[3])), []),
+        (small_table(object=SIX, family=made_of(coarse=COMMAND, fine=[3])), []),
+        (small_table(object=SIX, family=made_of(coarse=files("80.ply"), fine=[3])), [APART, FEW]),
+        # The length of a file only suggests how many triangles it has.
+        (small_table(object=SIX, family=made_of(coarse=files("80.off"), fine=[2])), []),
+        (small_table(object=SIX, family=made_of(coarse=files("80.off"), fine=[5])), ["no common range", FEW]),
+        (small_table(object=SIX, family=methods_of()), []),
+        (small_table(object=FIVE, family=methods_of()), [f"{FEW} 5 objects; take 6 objects or more"]),
+        (small_table(object=FIVE, family=made_of(coarse=[1, 2])), []),
+    ],
+)
+def test_what_would_make_a_run_useless_is_told_before_it(
+    table: dict[str, Any], expected: list[str], tmp_path: Path
+) -> None:
+    for suffix in ("ply", "off"):
+        write_mesh(sb.icosphere(1), tmp_path / f"80.{suffix}")
+    made = (sb.StudyCollection if "object" in table else sb.Study).from_table(table, folder=tmp_path)
+    found = warnings_of(made, Location.parse(tmp_path / "s.zarr"))
+    assert len(found) == len(expected)
+    for line, beginning in zip(found, expected, strict=True):
+        assert line.startswith(beginning)
+        assert "\n" not in line
+
+
+def test_pairs_that_the_disk_has_no_place_for_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    place = Location.parse(tmp_path / "not" / "yet.zarr")
+    needed = 5**2 * 2 * 6 * 8
+
+    def found(free: int, **changes: Any) -> tuple[str, ...]:
+        monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=free, total=1))
+        return warnings_of(sb.Study.from_table(small_table(**changes)), place)
+
+    assert found(needed) == ()
+    (line,) = found(needed - 1)
+    assert f'2.4KB on disk, and 2.4KB are free at {place}; set pairs = "reference"' in line
+    assert found(0, compare=None) == ()
+    place.write({"distances/c/0": bytes(needed)})
+    assert found(0) == ()
+
+
+def test_commands_print_warnings_first(tmp_path: Path) -> None:
+    path = tmp_path / "study.toml"
+    path.write_text(tomli_w.dumps(small_table(object=balls(a=1.0), family=methods_of())))
+    plan, run = (call(word, path, "--store", f"memory://warnings-{word}") for word in ("plan", "run"))
+    assert plan.stderr.startswith(f"warning: {FEW} 1 object; ")
+    assert run.stderr.startswith(plan.stderr)
+    made = sb.plan(sb.StudyCollection.from_toml(path), "memory://warnings-python")
+    assert f"warning: {made.warnings[0]}" in str(made)

@@ -282,7 +282,7 @@ def _league(
         elif exact:
             left_out[name] = f"{', '.join(exact)} reproduced it, up to rounding"
         elif common is None:
-            left_out[name] = _gap(curves)
+            left_out[name] = gap_of(curves)
         else:
             values, errors = zip(*(curve.at(common) for curve in curves.values()), strict=True)
             slopes = [curve.slope() for curve in _curves(at_order, EDGE_LENGTH, methods).values()]
@@ -302,7 +302,7 @@ def _curves(frame: pd.DataFrame, x: str, methods: Sequence[str]) -> dict[str, Cu
     return {method: curve for method, curve in curves.items() if curve is not None}
 
 
-def _gap(curves: Mapping[str, Curve]) -> str:
+def gap_of(curves: Mapping[str, Curve]) -> str:
     """Return which methods have no range of sizes in common."""
     first = max(curves, key=lambda method: curves[method].sizes[0])
     last = min(curves, key=lambda method: curves[method].sizes[-1])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import inspect
+import math
 import re
 import shlex
 import subprocess
@@ -15,7 +16,7 @@ import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -337,7 +338,7 @@ class RemeshedMember(Member):
 
     def expected_size(self) -> ExpectedSize:
         """Return the size of the original, since nothing is known of the result."""
-        return self.original.expected_size()
+        return replace(self.original.expected_size(), factor=math.inf)
 
 
 def call_function(mesh: Mesh, function: Callable[..., Any] | str, parameters: Mapping[str, Parameter]) -> Outcome:

@@ -46,6 +46,8 @@ from sobolev_batch.surfaces.sources.registry import (
 MOST_MESHES = 100_000
 _LONGEST_TEXT = 1000
 _LARGEST_FILE_BYTES = 64 << 20
+# By how much the length of a file may mislead about its triangles: it may have normals, colours or few digits.
+_LENGTH_FACTOR = 4.0
 # What a list says of a mesh: its path, and perhaps a name, a time and metadata.
 MeshTable = dict[str, Any]
 # Columns of names, which may look like numbers.
@@ -229,7 +231,8 @@ class FileMember(Member):
 
     def expected_size(self) -> ExpectedSize:
         """Return the size that the header announces, or that the length of the file suggests."""
-        return ExpectedSize(*expected_size(self.path))
+        factor = 1.0 if mesh_format(self.path) == ".ply" else _LENGTH_FACTOR
+        return ExpectedSize(*expected_size(self.path), factor=factor)
 
 
 def _listed_members(meshes: str | tuple[MeshTable, ...], folder: Path) -> tuple[Member, ...]:

@@ -135,6 +135,7 @@ class ExpectedSize:
         triangles: Approximate number of triangles; 0 for a closed form.
         projected_bytes: Approximate peak of the memory that `Member.load` takes.
         seconds: Approximate processor time that `Member.load` takes, where it does more than read or tile.
+        factor: Factor by which the number of triangles may be wrong, either way; infinite where nothing is known of it.
 
     >>> import sobolev_batch as sb
     >>> sb.ExpectedSize(triangles=20_480, projected_bytes=3e6).triangles
@@ -144,6 +145,7 @@ class ExpectedSize:
     triangles: int = 0
     projected_bytes: float = 0.0
     seconds: float = 0.0
+    factor: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -294,6 +296,7 @@ class MadeMember(Member):
             size.triangles if self.triangles is None else self.triangles,
             max(size.projected_bytes, float(self.triangle_bytes * size.triangles)),
             size.seconds,
+            size.factor if self.triangles is None else 1.0,
         )
 
 
