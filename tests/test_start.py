@@ -9,8 +9,8 @@ import pytest
 
 # Packages that take 50 ms or more to load and that a first field does without.
 HEAVY = {
-    *("bokeh", "distributed", "fast_simplification", "fsspec", "matplotlib", "nibabel", "networkx"),
-    *("pyvista", "tabulate", "trimesh", "vtkmodules", "zarr"),
+    *("bokeh", "cuda", "cufinufft", "cupy", "distributed", "fast_simplification", "fsspec", "matplotlib", "nibabel"),
+    *("networkx", "pyvista", "tabulate", "trimesh", "vtkmodules", "zarr"),
 }
 LIBRARIES = HEAVY | {"dask", "finufft", "numpy", "pandas", "pydantic", "scipy", "xarray"}
 FIRST_FIELD = """

@@ -5,17 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sobolev_batch import (
-    Ellipsoid,
-    Lattice,
-    Mesh,
-    Sphere,
-    Torus,
-    distance,
-    fourier_transform,
-    icosphere,
-    norm,
-)
+from sobolev_batch import Ellipsoid, Lattice, Mesh, Sphere, Torus, distance, fourier_transform, icosphere, norm
 from sobolev_batch.spectral.fields import PROBED_ORDERS, Quality
 from sobolev_batch.spectral.probe import Sample, draw, estimate, measure
 from sobolev_batch.spectral.shells import SobolevWeights

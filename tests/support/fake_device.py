@@ -40,6 +40,9 @@ OPTIONS = {
     "gpu_maxbatchsize", "gpu_device_id", "gpu_stream", "modeord", "gpu_np", "debug",
 }  # fmt: skip
 
+# Whose defaults are others than FINUFFT's, or name a device and a stream that may not be the current ones.
+_REQUIRED = {"gpu_method", "gpu_sort", "gpu_device_id", "gpu_stream"}
+
 _MEMORY_ALLOCATION = 2  # of cudaError_t
 _MESSAGES = {"plan": "creating plan", "setpts": "setting non-uniform points", "execute": "executing plan"}
 
@@ -224,8 +227,7 @@ class _Plan:
 
     def __init__(self, nufft_type: int, n_modes: tuple[int, int, int], **options: Any) -> None:
         self._plan, self._size, self._dtype = None, 0, np.dtype(options["dtype"])
-        if not options.keys() <= OPTIONS | {"n_trans", "eps", "isign", "dtype"}:
-            raise TypeError(f"Invalid options among {options}")
+        assert _REQUIRED <= options.keys() <= OPTIONS | {"n_trans", "eps", "isign", "dtype"}, options
         self.device.options.append({"n_modes": n_modes, **options})
         self._plan, sigma = ctypes.c_void_p(None), options["upsampfac"]
         # An error of an earlier plan passes for its own.

@@ -1,4 +1,4 @@
-"""Transforms of ellipsoids and tori as integrals over one variable of Bessel functions and elliptic integrals."""
+"""Transforms of spheroids and tori as integrals of Bessel functions; norms as sums over the whole cube."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 from scipy.integrate import quad
-from scipy.special import ellipe, j0
+from scipy.special import j0
 
 from sobolev_batch import Lattice
 
@@ -34,17 +34,6 @@ def spheroid_value(a: float, c: float, across: float, along: float) -> float:
         return length * math.cos(2 * math.pi * along * c * cosine)
 
     return 2 * integral(ring, 0.0, math.pi / 2)
-
-
-def ellipsoid_value_along_c(a: float, b: float, c: float, along: float) -> float:
-    """Return the transform of an ellipsoid on the axis of c: an elliptic integral over each section."""
-
-    def section(t: float) -> float:
-        first = c**2 * (1 - t * t) * b**2 + (a * b * t) ** 2
-        second = c**2 * (1 - t * t) * a**2 + (a * b * t) ** 2
-        return 4 * math.sqrt(first) * float(ellipe(1 - second / first)) * math.cos(2 * math.pi * along * c * t)
-
-    return 2 * integral(section, 0.0, 1.0)
 
 
 def integral(function: Callable[[float], float], low: float, high: float) -> float:

@@ -164,11 +164,9 @@ def random_pair(seed: int) -> tuple[Complexes, Complexes]:
     rng = np.random.default_rng(seed)
     fields: list[Complexes] = []
     for _ in range(2):
-        points, weights = rng.uniform(-0.9, 0.9, (7, 3)), rng.uniform(0, 1, 7)
-        x, y, z = RANDOM.axes
-        phases = np.multiply.outer(x, points[:, 0])[:, None, None] + np.multiply.outer(y, points[:, 1])[:, None]
-        turns = np.exp(-2j * np.pi * (phases + np.multiply.outer(z, points[:, 2])))
-        fields.append(np.asarray(turns @ weights, dtype=np.complex128))
+        points, weights = rng.uniform(-0.9, 0.9, (3, 7)), rng.uniform(0, 1, 7)
+        turns = [np.exp(-2j * np.pi * np.outer(*pair)) for pair in zip(RANDOM.axes, points, strict=True)]
+        fields.append(np.einsum("xp,yp,zp,p->xyz", *turns, weights))
     return fields[0], fields[1]
 
 

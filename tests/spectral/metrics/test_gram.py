@@ -46,20 +46,6 @@ def random_fields(count: int, lattice: Lattice) -> NDArray[np.complex128]:
     return rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
 
 
-@pytest.mark.parametrize("intervals", [2, 24, 40])
-def test_sums_are_those_of_shells(intervals: int) -> None:
-    lattice = Lattice(4.0, intervals)
-    fields = random_fields(3, lattice)
-    arrangement = Arrangement.for_block(SobolevWeights(lattice, ORDERS), lattice.half)
-    squares = arrangement.squares(np.take(fields, arrangement.order, axis=1))
-    expected = sums_of_shells(
-        shell_sums(fields.reshape(3, *lattice.shape), None, lattice, lattice.half), SobolevWeights(lattice, ORDERS)
-    )
-    assert squares.squares == pytest.approx(expected.squares, rel=1e-13)
-    # Of noise, the mean of n samples is known to 1/√n, and n is 1024 or more in each window.
-    assert squares.outer == pytest.approx(expected.outer, rel=1e-13 if intervals == 2 else 0.15)
-
-
 @pytest.mark.parametrize(("apart", "lost"), [(1e-2, False), (1e-4, True)])
 def test_near_twins_have_the_outer_energies_of_their_difference_and_are_reported(apart: float, lost: bool) -> None:
     # They come from the same samples as the squares, so that what cancels leaves no noise behind.

@@ -62,18 +62,6 @@ def test_periods_beyond_the_cutoff_are_seen(order: float) -> None:
         assert abs(value - square.item()) < error < 0.1 * value
 
 
-def test_three_layers_against_one_are_no_single_sheet() -> None:
-    def sheets(count: int, height: float) -> Mesh:
-        return Rectangles.from_corners(
-            *(((-0.5, -0.5, height + 1e-3 * i), (0.5, 0.5, height + 1e-3 * i)) for i in range(count))
-        ).mesh()
-
-    pair = [sheets(3, 0.0), sheets(1, 5e-3)]
-    # Below the inverse gap three layers count as one of three times the density, which has nine times the energy.
-    assert np.allclose(remainder(pair, [1, -1], 5.0, (-2.0,)).energies, 2 * (3 - 1) ** 2, rtol=0.2)
-    assert np.allclose(remainder(pair, [1, -1], 5000.0, (-2.0,)).energies, 2 * (3 + 1), rtol=0.1)
-
-
 @pytest.mark.slow
 def test_errors_cover_what_more_points_show() -> None:
     pair: list[Surface] = [sb.icosphere(3), Sphere()]

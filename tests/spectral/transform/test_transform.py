@@ -11,10 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from sobolev_batch import InputError, Lattice, LatticeError, Mesh, Sphere, fourier_transform, icosphere
-from sobolev_batch.spectral.backends import ComplexDtype, NufftSpec
+from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.lattice import Block
-from sobolev_batch.spectral.quadrature.meshes import WeightedPoints
-from sobolev_batch.spectral.transform.nufft import transform_points
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.spectral.transform.transform import projected_bytes, transform_block
 from sobolev_batch.spectral.triangles import exact_transform
@@ -134,44 +132,6 @@ print(after - before, said, values.nbytes)
     if memory is not None:
         assert said <= memory + result
         assert taken > 0.3 * said  # an estimate far too high would divide what fits
-
-
-def test_weighted_points_against_the_direct_sum() -> None:
-    rng = np.random.default_rng(23)
-    lattice = Lattice(3.0, 12)
-    points = WeightedPoints(rng.uniform(-0.9, 0.9, size=(3, 200)), rng.normal(size=200))
-    found, _ = transform_points([points], lattice, lattice.half, NufftSpec(lattice.shape, 1e-13))
-    x, y, z = (
-        np.exp(-2j * np.pi * np.outer(axis, row)) for axis, row in zip(lattice.axes, points.coordinates, strict=True)
-    )
-    direct = np.einsum("ap,bp,cp,p->abc", x, y, z, points.weights)
-    assert np.abs(found - direct).max() < 1e-11 * np.abs(points.weights).sum()
-    assert not transform_points([], lattice, lattice.half, NufftSpec(lattice.shape, 1e-6))[0].any()
-
-
-def test_translation_rotation_order_and_subdivision() -> None:
-    rng = np.random.default_rng(29)
-    lattice, mesh = Lattice(2.0, 24), BOX
-    field = fourier_transform(mesh, lattice, 1e-12)
-    shift = np.array([0.1, -0.2, 0.05])
-    x, y, z = lattice.axes
-    phase = np.exp(-2j * np.pi * (x[:, None, None] * shift[0] + y[:, None] * shift[1] + z * shift[2]))
-    moved = fourier_transform(Mesh(mesh.vertices + shift, mesh.triangles), lattice, 1e-12)
-    assert np.abs(moved - field * phase).max() < 1e-11 * mesh.area
-
-    # A quarter turn about z maps the lattice onto itself: (x, y) -> (-y, x).
-    turned_vertices = mesh.vertices[:, [1, 0, 2]] * np.array([-1.0, 1.0, 1.0])
-    turned = fourier_transform(Mesh(turned_vertices, mesh.triangles), lattice, 1e-12)
-    assert np.abs(turned.values - field.values[:, ::-1].swapaxes(0, 1)).max() < 1e-11 * mesh.area
-
-    order = rng.permutation(len(mesh.triangles))
-    shuffled = Mesh(mesh.vertices, rng.permuted(mesh.triangles[order], axis=1))
-    assert np.abs(fourier_transform(shuffled, lattice, 1e-12) - field).max() < 1e-11 * mesh.area
-
-    middle = mesh.vertices[mesh.triangles[0]].mean(axis=0)
-    a, b, c = mesh.triangles[0]
-    split = Mesh(np.vstack([mesh.vertices, middle]), np.vstack([mesh.triangles[1:], [[a, b, 8], [b, c, 8], [c, a, 8]]]))
-    assert np.abs(fourier_transform(split, lattice, 1e-12) - field).max() < 1e-11 * mesh.area
 
 
 @pytest.mark.slow
