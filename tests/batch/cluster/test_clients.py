@@ -1,16 +1,17 @@
-"""Real schedulers and workers, as users start them, and the ports that a local cluster opens."""
+"""Addresses of schedulers, real schedulers and workers, and the ports that a local cluster opens."""
 
 from __future__ import annotations
 
 import os
 import socket
 from pathlib import Path
+from typing import Any
 
 import pytest
 from distributed import Client, LocalCluster
 
 from sobolev_batch import ClusterError, InputError, Study, run
-from sobolev_batch.batch.cluster.clients import remote_client
+from sobolev_batch.batch.cluster.clients import remote_client, require_private
 from sobolev_batch.batch.cluster.execution import Progress
 from tests.support.commands import call
 from tests.support.processes import PATIENCE_SECONDS, WORKER, dask, listening, tcp_cluster
@@ -22,9 +23,8 @@ def test_a_scheduler_without_workers() -> None:
     with (
         LocalCluster(n_workers=0, host="127.0.0.1", dashboard_address="127.0.0.1:0") as cluster,
         pytest.raises(ClusterError, match="has no workers; start some with: dask worker"),
-        remote_client(cluster.scheduler_address),
     ):
-        pass
+        remote_client(cluster.scheduler_address).__enter__()
 
 
 @pytest.mark.all
@@ -50,11 +50,8 @@ def test_a_worker_that_others_could_reach_counts_too() -> None:
         processes.append(dask("worker", address, *WORKER[2:], *listening))
         with Client(address) as client:
             client.wait_for_workers(1, timeout=PATIENCE_SECONDS)
-        with (
-            pytest.raises(InputError, match=rf"a worker at tcp://0\.0\.0\.0:{port} is neither"),
-            remote_client(address),
-        ):
-            pass
+        with pytest.raises(InputError, match=rf"a worker at tcp://0\.0\.0\.0:{port} is neither"):
+            remote_client(address).__enter__()
         with remote_client(address, trust_network=True) as client:
             assert client.submit(abs, -1).result() == 1
 
@@ -77,3 +74,44 @@ def test_every_port_of_a_run_is_on_loopback(store: str, least: int, study: Study
     assert {ip for ip, _ in found} <= {"127.0.0.1", "::1"}, found
     assert len(found) >= least, found
     assert links[0] in {f"http://{ip}:{port}/status" for ip, port in found}
+
+
+MALFORMED = ["", "tcp://host", "host", "http://host:80", "tcp://host:port", "tcp://:8786", "tcp://host:0"]
+MALFORMED += ["tcp://host:99999", "tcp://::1:8786", "tcp://[::1:8786", "a://b://c:1"]
+
+
+@pytest.mark.parametrize("name", MALFORMED)
+def test_malformed(name: str) -> None:
+    with pytest.raises(InputError, match="is not the address of a scheduler"):
+        remote_client(name, True).__enter__()
+
+
+PRIVATE = ["tls://example.invalid:1", "wss://192.0.2.1:1", "inproc://192.0.2.1/1/2", "tcp://127.0.0.1:1"]
+PRIVATE += ["127.9.9.9:1", "tcp://[::1]:1", "ws://localhost:1", "tcp://[::ffff:127.0.0.1]:1"]
+
+
+def test_private_addresses_and_those_that_are_open_to_others() -> None:
+    for name in PRIVATE:
+        require_private(name, "the scheduler")
+    for name in ("tcp://192.0.2.1:1", "192.0.2.1:1", "ws://[2001:db8::1]:1", "tcp://0.0.0.0:1"):
+        with pytest.raises(InputError, match="is neither encrypted nor on loopback"):
+            remote_client(name).__enter__()
+
+
+def test_all_that_a_name_stands_for_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    places = ["127.0.0.1", "::1"]
+
+    def look_up(host: str, port: int, **options: Any) -> list[tuple[Any, ...]]:
+        return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", (place, port)) for place in places]
+
+    monkeypatch.setattr(socket, "getaddrinfo", look_up)
+    require_private("tcp://scheduler:8786", "the scheduler")
+    places.append("192.0.2.1")
+    with pytest.raises(InputError, match=r"\(192\.0\.2\.1\)"):
+        require_private("tcp://scheduler:8786", "the scheduler")
+
+
+def test_a_host_that_is_not_there_is_no_wrong_input() -> None:
+    with pytest.raises(ClusterError, match=r"there is no host 'example\.invalid'") as caught:
+        require_private("tcp://example.invalid:1", "the scheduler")
+    assert not isinstance(caught.value, InputError)
