@@ -67,6 +67,9 @@ def is_gzipped(path: Path) -> bool:
 
 def require_memory_to_read(needed_bytes: float) -> None:
     """Refuse a file, before it is read, that takes more memory than reading may."""
+    if needed_bytes <= _HARMLESS_BYTES:
+        # To look at the limits takes longer than to read a small file.
+        return
     most, source = machine_memory()
     if needed_bytes > _MEMORY_PART * most:
         raise MeshError(

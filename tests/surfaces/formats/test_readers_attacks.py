@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sobolev_batch import MeshError, read_mesh
+from sobolev_batch import MeshError, icosphere, read_mesh, write_mesh
 from sobolev_batch.surfaces.formats import parsing
 from sobolev_batch.surfaces.formats.readers import expected_size
 from tests.support.mesh_attacks import ATTACKS
@@ -102,6 +102,13 @@ def test_files_beyond_the_memory_are_refused_unread(
     with pytest.raises(MeshError, match=expected):
         read_mesh(path)
     assert time.process_time() - before < 1
+
+
+def test_a_small_file_is_read_without_a_look_at_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Control groups are a dozen files: among thousands of tiny meshes, most of the time would go there.
+    monkeypatch.setattr(parsing, "machine_memory", lambda: pytest.fail("looked at the limits"))
+    write_mesh(icosphere(0), tmp_path / "scan.ply")
+    assert len(read_mesh(tmp_path / "scan.ply").triangles) == 20
 
 
 def test_packed_files_are_refused_as_soon_as_they_exceed_the_memory(
