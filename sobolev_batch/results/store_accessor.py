@@ -8,14 +8,16 @@ import numpy as np
 import xarray as xr
 
 from sobolev_batch.batch.analysis.reducer import Reducer
+from sobolev_batch.batch.analysis.spectra import spectrum_keys, stale_chunks
 from sobolev_batch.batch.analysis.tabulate import Results
-from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.store.store import QUALITY, Store
 from sobolev_batch.batch.store.tables import rows_unlike_tables
 from sobolev_batch.batch.workspace import complete_records
 from sobolev_batch.errors import DamageError, InputError
 from sobolev_batch.results.open import finished_group, location_of, reference_of, require_unchanged
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.budget import NormEstimate
+from sobolev_batch.spectral.fields import Quality
 from sobolev_batch.spectral.metrics.causes import band_coordinates
 from sobolev_batch.spectral.metrics.datasets import (
     AREA,
@@ -180,8 +182,31 @@ def stored_reducer(tree: xr.DataTree, order: Orders, *meshes: str) -> tuple[Redu
         if mesh not in labels or labels.index(mesh) not in complete_records(records):
             raise InputError(f"{store.path}: no mesh {quoted(mesh)} with a field; its labels begin {labels[:3]}")
     rows, reference = [labels.index(mesh) for mesh in meshes], labels.index(store.attributes()["study"]["reference"])
+    complete = complete_records(records)
+    qualities = {row: Quality.from_json(record.quality) for row, record in complete.items()}
+    checksums = {row: record.checksums for row, record in complete.items()}
     compared_with = rows[-1] if rows else None
-    return Reducer.for_records(store, store.choice(), orders, records, reference, compared_with), rows
+    return Reducer.for_fields(store, store.choice(), orders, qualities, checksums, reference, compared_with), rows
+
+
+def _spectra_reducer(tree: xr.DataTree, orders: tuple[float, ...]) -> Reducer:
+    """Return the reducer of an open store for any orders, and for what follows from stored spectra alone.
+
+    Raises:
+        DamageError: Spectra are not those of the fields that the tables were made from.
+    """
+    store = Store.open(location_of(tree))
+    meshes = finished_group(tree, "meshes", load=False)
+    columns = (meshes[name].values.tolist() for name in ("mesh", "row", "status", "key"))
+    complete = {row: (label, key) for label, row, status, key in zip(*columns, strict=True) if status == "complete"}
+    texts, reference = store.read_strings(QUALITY), reference_of(tree)
+    row_of_reference = next((row for row, (label, _) in complete.items() if label == reference), -1)
+    keys = spectrum_keys({row: key for row, (_, key) in complete.items()}, row_of_reference)
+    if stale_chunks(store, keys):
+        problem = "they are not those of the stored fields"
+        raise DamageError(f"{store.path}: radial spectra are damaged ({problem}); run the study again", problem)
+    qualities = {row: Quality.from_json(texts[row]) for row in complete}
+    return Reducer.for_fields(store, store.choice(), orders, qualities, {}, row_of_reference)
 
 
 def convergence_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
@@ -202,7 +227,7 @@ def convergence_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
     chosen, others = _divided(stored, order)
     if not others:
         return stored.sel(order=chosen)
-    results = _computed(tree, others, every_pair=False)
+    results = _computed(tree, _spectra_reducer(tree, others), every_pair=False)
     accuracy = Accuracy(stored.attrs["rtol"]) if "rtol" in stored.attrs else None
     return _joined(stored, results.convergence_table(accuracy), chosen)
 
@@ -213,7 +238,9 @@ def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
     chosen, others = _divided(stored, order)
     if not others:
         return stored.sel(order=chosen)
-    results = _computed(tree, others, every_pair=stored.sizes["other"] == stored.sizes["mesh"])
+    every_pair = stored.sizes["other"] == stored.sizes["mesh"]
+    reducer = stored_reducer(tree, others)[0] if every_pair else _spectra_reducer(tree, others)
+    results = _computed(tree, reducer, every_pair=every_pair)
     return _joined(stored, results.distances_table(), chosen)
 
 
@@ -238,10 +265,9 @@ def order_note(tree: xr.DataTree, orders: Sequence[float]) -> list[str]:
     ]
 
 
-def _computed(tree: xr.DataTree, orders: tuple[float, ...], *, every_pair: bool) -> Results:
+def _computed(tree: xr.DataTree, reducer: Reducer, *, every_pair: bool) -> Results:
     """Return the norms and distances of an open store at other orders than its own."""
-    (reducer, _), meshes = stored_reducer(tree, orders), finished_group(tree, "meshes")
-    results = Results.computed(reducer, meshes, reference_of(tree), every_pair)
+    results = Results.computed(reducer, finished_group(tree, "meshes"), reference_of(tree), every_pair)
     require_unchanged(tree)
     return results
 

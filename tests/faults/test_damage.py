@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from distributed import Client
 
-from sobolev_batch import DamageError, StoreError, Study, norm, open_store, run, status, table, verify
+from sobolev_batch import DamageError, StoreError, Study, matrix, norm, open_store, run, status, verify
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.store_accessor import StoreAccessor
@@ -264,7 +264,7 @@ def test_an_earlier_field_with_its_record(store: Path, earlier: Path, mended: Ca
     assert status(store).lost_records == ("ico/1",)
     tree = open_store(store)
     with pytest.raises(DamageError, match="the field of ico/1 is damaged"):
-        table(tree, -3.5)
+        matrix(tree, -3.5)
     fields = StoreAccessor(tree)
     with pytest.raises(DamageError, match="the field of ico/1 is damaged"):
         fields.distance("ico/1", "reference", -3.0)

@@ -61,7 +61,7 @@ import xarray
 tree = xarray.open_datatree(sys.argv[1], engine="zarr")
 for node in tree.subtree:
     node.to_dataset().load()
-assert sorted(tree.children) == ["convergence", "distances", "fourier", "meshes", "norms", "records"]
+assert sorted(tree.children) == ["convergence", "distances", "fourier", "meshes", "norms", "records", "spectra"]
 assert tree["fourier"]["fourier"].dims == ("mesh", "xi_x", "xi_y", "xi_z")
 assert str(tree["convergence"]["distance"].sel(mesh="ico/2", order=-3.0).dims) == "()"
 print(float(tree["convergence"]["relative"].sel(mesh="ico/3", order=-10.0)))

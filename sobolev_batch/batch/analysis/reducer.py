@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass, field, fields
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import astuple, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.batch.store.records import Record
-from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.store.store import FIELD, Store
 from sobolev_batch.batch.study.lattice_choice import LatticeChoice
-from sobolev_batch.batch.workspace import complete_records
 from sobolev_batch.spectral.budget import (
     NormEstimate,
     Sums,
@@ -31,6 +29,7 @@ from sobolev_batch.spectral.octaves.remainder import Remainder
 from sobolev_batch.spectral.octaves.sampling import TailSampling
 from sobolev_batch.spectral.octaves.values import OctaveSums, OctaveWeights, Tail, squared_moduli
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
+from sobolev_batch.spectral.spectra import ComparedSpectra, RadialAxis, Spectra
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent
 
 Reals = NDArray[np.float64]
@@ -49,8 +48,11 @@ _TILE_LENGTH = 4
 _LEAST_LIMIT = 0.7
 # Rows of a tile whose values in octaves are held at a time take this many bytes.
 _HELD_BYTES = 128 << 20
-# Of a sample of octaves: its frequency, weight and place, and values of three fields with their squares.
-_SAMPLE_BYTES = 200.0
+# Of a sample of octaves: its frequency, weight and place, values of three fields with their squares, and what moves
+# them to the radii of spectra.
+_SAMPLE_BYTES = 400.0
+# Of a sample of a row while its spectra are computed.
+_SPECTRUM_BYTES = 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,23 +91,26 @@ class Reducer:
     tile_bytes: int = 384 << 20
 
     @classmethod
-    def for_records(
+    def for_fields(
         cls,
         store: Store,
         choice: LatticeChoice,
         orders: tuple[float, ...],
-        records: Sequence[Record | None],
+        qualities: Mapping[int, Quality],
+        checksums: Mapping[int, tuple[int, ...]],
         reference: int,
         compared_with: int | None = None,
     ) -> Self:
-        """Return the reducer of the rows whose records are complete; distances are to the reference, or another row."""
-        complete = complete_records(records)
-        areas, errors = np.full(len(records), np.nan), np.full((len(orders), len(records)), np.nan)
+        """Return the reducer of the rows whose qualities are known; distances are to the reference, or another row.
+
+        Spectra that are stored need no checksums.
+        """
+        count = store.document(FIELD)["shape"][0]
+        areas, errors = np.full(count, np.nan), np.full((len(orders), count), np.nan)
         weights = SobolevWeights(choice.lattice, orders, None if choice.tail is None else choice.tail.cutoff)
-        qualities = {row: Quality.from_json(record.quality) for row, record in complete.items()}
         for row, quality in qualities.items():
             areas[row], errors[:, row] = quality.area, quality.error_norms(weights)
-        known = reference if reference in complete else None
+        known = reference if reference in qualities else None
         extents = [quality.extent for quality in qualities.values()]
         return cls(
             store=store,
@@ -116,11 +121,16 @@ class Reducer:
             areas=areas,
             errors=errors,
             widths=Extent.union(extents).widths if extents else np.zeros(len(DIRECTIONS)),
-            checksums={row: record.checksums for row, record in complete.items()},
+            checksums=checksums,
             sampling=choice.tail,
             qualities={row: quality.tail for row, quality in qualities.items() if quality.tail is not None},
             known_reference=known,
         )
+
+    @property
+    def complete(self) -> list[int]:
+        """Rows with a field."""
+        return np.flatnonzero(~np.isnan(self.areas)).tolist()
 
     @property
     def weights(self) -> SobolevWeights:
@@ -133,8 +143,13 @@ class Reducer:
         octaves = () if self.sampling is None else self.sampling.octaves
         return tuple(OctaveWeights(octave, self.orders) for octave in octaves)
 
+    @cached_property
+    def axis(self) -> RadialAxis:
+        """Radii of the spectra of fields."""
+        return RadialAxis(self.lattice, self.sampling)
+
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "octave_weights"}
+        return {name: value for name, value in self.__dict__.items() if name not in ("octave_weights", "axis")}
 
     def tiles(self, rows: Sequence[int], workers: int) -> Iterator[tuple[Sequence[int], Sequence[int]]]:
         """Yield rows and others of tiles that cover every pair once, fit into a task's memory and occupy the workers.
@@ -174,45 +189,72 @@ class Reducer:
         return max(1, min(_READ_AT_ONCE, self._capacity // 16))
 
     def norms(self, rows: Sequence[int]) -> tuple[NormEstimate, NormEstimate, Reals]:
+        """Return the norms of rows, and their distances to the reference, from their fields; see `norms_of`."""
+        reference = None if self.reference is None else self.spectra([self.reference]).norm
+        return self.norms_of(rows, self.spectra(rows), reference)
+
+    def norms_of(
+        self, rows: Sequence[int], spectra: ComparedSpectra, reference: Spectra | None
+    ) -> tuple[NormEstimate, NormEstimate, Reals]:
         """Return norms of rows, distances to the reference, and parts of both, each over (orders, rows).
 
         The four parts are the distance's area part and shape part, see `area_and_shape`, and what lies beyond the last
         octave in the squared norm and in the squared distance. Without the reference's field, distances are NaN.
+
+        Args:
+            rows: Rows.
+            spectra: Their spectra.
+            reference: Spectrum of the norm of the reference, (1, radii); None without its field.
         """
-        rows = list(rows)
-        sums, differences, products, reference = self._sums(rows)
-        tails = None if self.sampling is None else self._tails(self.sampling, rows)
-        own = self._estimate(sums, None if tails is None else tails[0], self.areas[rows], self.errors[:, rows])
-        beyond = np.zeros_like(own.values) if tails is None else tails[0].beyond
-        if self.reference is None:
+        rows, has_octaves = list(rows), self.sampling is not None
+        own_tail = self._tail(spectra.norm, [self.qualities[row].own for row in rows]) if has_octaves else None
+        own = self._estimate(self._sums(spectra.norm), own_tail, self.areas[rows], self.errors[:, rows])
+        beyond = np.zeros_like(own.values) if own_tail is None else own_tail.beyond
+        if self.reference is None or reference is None:
             unknown = np.full_like(own.values, np.nan)
             return own, NormEstimate(*[unknown] * 5), np.stack([unknown, unknown, beyond, unknown])
         # The reference's distance to itself is zero, and nothing is uncertain about that.
         apart = np.array([row != self.reference for row in rows], dtype=np.float64)
         areas, errors = self.areas[rows] + self.areas[self.reference], self.errors[:, rows]
         errors = errors + self.errors[:, [self.reference]]
-        distances = self._estimate(differences, None if tails is None else tails[1], areas, errors, apart)
-        product, square, beyond_difference = products.totals, reference.totals, np.zeros_like(beyond)
-        if tails is not None:
-            _, tail_difference, tail_product, tail_reference = tails
-            beyond_difference = tail_difference.beyond * apart
+        tail, product, square = None, self._sums(spectra.product).totals, self._sums(reference).totals
+        beyond_difference = np.zeros_like(beyond)
+        if has_octaves:
+            energies = self.axis.last_energies(spectra.distance)
+            remainders = [self._remainder(row, self.reference, it) for row, it in zip(rows, energies, strict=True)]
+            tail = self._tail(spectra.distance, remainders)
+            of_reference = self._tail(reference, [self.qualities[self.reference].own])
+            beyond_difference = tail.beyond * apart
             # Beyond the octaves ||a||² - ||b||² - ||a - b||² is twice the product <a - b, b>.
-            product = product + tail_product + (beyond - tail_reference.beyond - beyond_difference) / 2 * apart
-            square = square + tail_reference.squares
+            product = product + self.axis.octave_integrals(spectra.product, self.orders)
+            product = product + (beyond - of_reference.beyond - beyond_difference) / 2 * apart
+            square = square + of_reference.squares
+        distances = self._estimate(self._sums(spectra.distance), tail, areas, errors, apart)
         area, shape = area_and_shape(distances.values**2, product, square[:, 0])
         return own, distances, np.stack([area, shape, beyond, beyond_difference])
 
-    def _sums(self, rows: Sequence[int]) -> list[Sums]:
-        """Return sums over the lattice: of rows, differences from the reference, their products with it, and itself.
+    def _sums(self, spectra: Spectra) -> Sums:
+        return sums_of_shells(spectra.sums[:, : self.lattice.shell_count], self.weights)
 
-        Without the reference, all but the first are zero.
-        """
+    def _tail(self, spectra: Spectra, remainders: Sequence[Remainder]) -> Tail:
+        """Return the tails of squared norms (orders, fields), from what lies beyond the octaves of each field."""
+        beyond = np.array([remainder.at(self.orders) for remainder in remainders])
+        octaves = self.axis.octave_integrals(spectra, self.orders)
+        return Tail(octaves, self.axis.statistical_errors(spectra, self.orders), *np.moveaxis(beyond, 0, -1))
+
+    def for_spectra(self, rows: Iterable[int]) -> Self:
+        """Return what is needed for the spectra of some rows alone: of many rows, the rest is much to send."""
+        needed = {*rows} if self.reference is None else {*rows, self.reference}
+        checksums = {row: self.checksums[row] for row in sorted(needed & self.checksums.keys())}
+        return replace(self, checksums=checksums, qualities={}, areas=np.empty(0), errors=np.empty((0, 0)))
+
+    def spectra(self, rows: Sequence[int]) -> ComparedSpectra:
+        """Return the spectra of rows, from their fields. Without the reference's field, those of distances are NaN."""
+        rows = list(rows)
         own = np.zeros((len(rows), self.lattice.shell_count))
-        differences, products, reference_sums = np.zeros_like(own), np.zeros_like(own), np.zeros_like(own[:1])
+        differences, products = (np.zeros_like(own) if self.reference is not None else own * np.nan for _ in range(2))
         for number, block in enumerate(self.blocks):
             reference = None if self.reference is None else self.read([self.reference], number)
-            if reference is not None:
-                reference_sums += shell_sums(reference, None, self.lattice, block)
             for batch in _slices(len(rows), self._read_at_once):
                 values = self.read(rows[batch], number)
                 own[batch] += shell_sums(values, None, self.lattice, block)
@@ -220,25 +262,19 @@ class Reducer:
                     values -= reference
                     differences[batch] += shell_sums(values, None, self.lattice, block)
                     products[batch] += shell_sums(values, np.broadcast_to(reference, values.shape), self.lattice, block)
-        return [sums_of_shells(shells, self.weights) for shells in (own, differences, products, reference_sums)]
-
-    def _tails(self, sampling: TailSampling, rows: Sequence[int]) -> tuple[Tail, Tail, Reals, Tail]:
-        """Return the same beyond the lattice; those of the rows stand for the others without the reference."""
-        reference = None if self.reference is None else self.read_octaves(self.reference)
-        own, differences, products = [], [], []
-        for row in rows:
-            values = self.read_octaves(row)
-            own.append(self._tail_of_norm(row, values))
-            if reference is not None and self.reference is not None:
-                difference = values - reference
-                differences.append(self._tail_of_pair(row, self.reference, difference))
-                parts = sampling.split((difference * reference.conj()).real.astype(np.float64))
-                products.append(sum(one.integrals(part) for one, part in zip(self.octave_weights, parts, strict=True)))
-        norms = Tail.stacked(own)
-        if reference is None or self.reference is None:
-            return norms, norms, norms.beyond, norms
-        of_reference = self._tail_of_norm(self.reference, reference)
-        return norms, Tail.stacked(differences), np.stack(products, axis=-1), Tail.stacked([of_reference])
+        samples = 0 if self.sampling is None else self.sampling.size
+        reference_octaves = np.full(samples, np.nan, dtype=np.complex128)
+        if self.reference is not None:
+            reference_octaves[:] = self.read_octaves(self.reference)
+        parts = []
+        for batch in _slices(len(rows), max(1, int(_HELD_BYTES // (_SPECTRUM_BYTES * max(samples, 1))))):
+            octaves = np.stack([self.read_octaves(row) for row in rows[batch]]).astype(np.complex128)
+            norms = self.axis.spectra(own[batch], squared_moduli(octaves))
+            octaves -= reference_octaves
+            distances = self.axis.spectra(differences[batch], squared_moduli(octaves))
+            inner = (octaves * reference_octaves.conj()).real
+            parts.append(ComparedSpectra(norms, distances, self.axis.spectra(products[batch], inner, is_square=False)))
+        return ComparedSpectra.joined(parts)
 
     def tile(self, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
         """Return distances over (orders, rows, others); the others begin with all of the rows, or have none of them."""
@@ -316,7 +352,9 @@ class Reducer:
 
     def read_octaves(self, row: int) -> NDArray[np.complexfloating]:
         """Return the values of a row at all samples of octaves (n,), and check them against its record."""
-        place = (slice(0, 0 if self.sampling is None else self.sampling.size),)
+        if self.sampling is None:
+            return np.zeros(0, dtype=np.complex128)
+        place = (slice(0, self.sampling.size),)
         values: NDArray[np.complexfloating] = self.store.read_fields([row], place, [self.checksums[row][-1]])[0]
         return values
 
@@ -324,9 +362,6 @@ class Reducer:
         """Return the integrals of |values|² over each octave, from those at all samples (n,)."""
         parts = () if self.sampling is None else self.sampling.split(squared_moduli(values))
         return [weights.sums(squares) for weights, squares in zip(self.octave_weights, parts, strict=True)]
-
-    def _tail_of_norm(self, row: int, values: NDArray[np.complexfloating]) -> Tail:
-        return Tail.from_sums(self.octave_sums(values), *self.qualities[row].own.at(self.orders))
 
     def _tail_of_pair(self, row: int, other: int, difference: NDArray[np.complexfloating]) -> Tail:
         sums = self.octave_sums(difference)

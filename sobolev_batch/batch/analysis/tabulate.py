@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, Literal, Self
@@ -18,6 +18,13 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sobolev_batch.batch.analysis.reducer import Reducer
+from sobolev_batch.batch.analysis.spectra import (
+    chunks_of_spectra,
+    fill_chunk,
+    read_spectra,
+    spectrum_keys,
+    stale_chunks,
+)
 from sobolev_batch.batch.cluster.execution import Cluster, Task
 from sobolev_batch.batch.store.records import Facts, Record
 from sobolev_batch.batch.store.store import QUALITY
@@ -28,6 +35,7 @@ from sobolev_batch.batch.workspace import Workspace
 from sobolev_batch.errors import DamageError
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.budget import NormEstimate
+from sobolev_batch.spectral.fields import Quality
 from sobolev_batch.spectral.metrics.datasets import describe, observed_rates
 from sobolev_batch.surfaces.sources.mesh_cache import Cost
 from sobolev_batch.surfaces.sources.names import natural_key
@@ -57,26 +65,39 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> NormEstimate | No
     """Write the tables, and return the distances to the reference, or None where the tables were there."""
     if are_tabulated(workspace):
         return None
-    plan, threads = workspace.plan, cluster.workers.threads
-    records = [record if i in workspace.rows else None for i, record in enumerate(workspace.records)]
-    reducer = Reducer.for_records(workspace.store, plan.choice, plan.study.orders, records, workspace.reference)
-    results = Results.empty(_meshes_table(workspace), plan.reference, plan.study.orders, plan.study.pairs == "all")
+    plan, threads, complete = workspace.plan, cluster.workers.threads, workspace.complete
+    qualities = {row: Quality.from_json(record.quality) for row, record in complete.items()}
+    checksums = {row: record.checksums for row, record in complete.items()}
+    reducer = Reducer.for_fields(
+        workspace.store, plan.choice, plan.study.orders, qualities, checksums, workspace.reference
+    )
     # A larger task is tried all the same, with nothing beside it.
     projected_bytes = min(reducer.task_bytes, cluster.workers.largest_allowed_bytes)
-    complete = list(workspace.complete)
-    tasks = [Task(reducer.norms, (rows,), projected_bytes) for rows in reducer.row_batches(complete, threads)]
-    if results.has_every_pair:
-        tasks += [Task(reducer.tile, tile, projected_bytes) for tile in reducer.tiles(complete, threads)]
+    keys = _spectrum_keys(workspace)
+    tasks = [
+        Task(
+            fill_chunk,
+            (reducer.for_spectra(rows), rows, {row: keys[row] for row in rows if row in keys}),
+            projected_bytes,
+        )
+        for rows in stale_chunks(workspace.store, keys)
+    ]
+    every_pair = plan.study.pairs == "all"
+    if every_pair:
+        tasks += [Task(reducer.tile, tile, projected_bytes) for tile in reducer.tiles(list(complete), threads)]
     advance = cluster.count_steps("reduction", len(tasks))
+    results = Results.empty(_meshes_table(workspace), plan.reference, plan.study.orders, every_pair)
     for task, outcome in cluster.results(tasks, projected_bytes):
-        if task.function == reducer.norms:
-            results.enter_norms(outcome, *task.arguments)
-        else:
+        if task.function == reducer.tile:
             results.enter_tile(outcome, *task.arguments)
         advance("", None)
-    results.enter_reference()
+    results.enter_spectra(reducer, complete)
     _write_tables(workspace, results)
     return NormEstimate(*results.to_reference)
+
+
+def _spectrum_keys(workspace: Workspace) -> dict[int, str]:
+    return spectrum_keys({row: record.key for row, record in workspace.complete.items()}, workspace.reference)
 
 
 def pairs_bytes(meshes: int, orders: int) -> float:
@@ -119,14 +140,12 @@ class Results:
 
     @classmethod
     def computed(cls, reducer: Reducer, meshes: xr.Dataset, reference: str, every_pair: bool) -> Self:
-        """Compute norms and distances in this process, with the memory of one task."""
+        """Compute norms and distances in this process: from spectra, and those of all pairs from fields."""
         results = cls.empty(meshes, reference, reducer.orders, every_pair)
-        complete = [row for row in reducer.checksums if row in results._places]
-        for rows in reducer.row_batches(complete, 1):
-            results.enter_norms(reducer.norms(rows), rows)
+        complete = [row for row in reducer.complete if row in results._places]
         for tile in reducer.tiles(complete, 1) if every_pair else ():
             results.enter_tile(reducer.tile(*tile), *tile)
-        results.enter_reference()
+        results.enter_spectra(reducer, complete)
         return results
 
     @property
@@ -143,13 +162,24 @@ class Results:
     def _reference_place(self) -> int:
         return int(self.meshes.indexes["mesh"].get_loc(self.reference))
 
-    def enter_norms(self, outcome: tuple[NormEstimate, NormEstimate, Reals], rows: Sequence[int]) -> None:
-        """Enter the outcome of `Reducer.norms` for some rows."""
-        norms, to_reference, parts = outcome
-        places = [self._places[row] for row in rows]
-        self.norms[..., places] = np.stack(list(norms))
-        self.to_reference[..., places] = np.stack(list(to_reference))
-        self.parts[..., places] = parts
+    def enter_spectra(self, reducer: Reducer, rows: Collection[int]) -> None:
+        """Enter norms of rows, and distances to the reference, from the spectra that the reducer's store holds."""
+        reference = None if reducer.reference is None else read_spectra(reducer.store, [reducer.reference]).norm
+        for chunk in chunks_of_spectra(reducer.store):
+            of_chunk = [row for row in chunk if row in rows]
+            if of_chunk:
+                spectra = read_spectra(reducer.store, of_chunk)
+                norms, to_reference, parts = reducer.norms_of(of_chunk, spectra, reference)
+                places = [self._places[row] for row in of_chunk]
+                self.norms[..., places] = np.stack(list(norms))
+                self.to_reference[..., places] = np.stack(list(to_reference))
+                self.parts[..., places] = parts
+        if self.has_every_pair:
+            # The direct sums are the more exact ones, and the same numbers in both tables.
+            place = self._reference_place
+            self.distances[..., place] = self.distances[..., place, :] = self.to_reference
+        else:
+            self.distances[..., 0] = self.to_reference
 
     def enter_tile(self, outcome: NormEstimate, rows: Sequence[int], others: Sequence[int]) -> None:
         """Enter the outcome of `Reducer.tile` for pairs of rows and others."""
@@ -157,15 +187,6 @@ class Results:
         i, j = (np.array([self._places[row] for row in side]) for side in (rows, others))
         self.distances[..., i[:, None], j] = pairs
         self.distances[..., j[:, None], i] = np.swapaxes(pairs, -1, -2)
-
-    def enter_reference(self) -> None:
-        """Enter the distances to the reference among those of pairs, once all others are entered."""
-        if self.has_every_pair:
-            # The direct sums are the more exact ones, and the same numbers in both tables.
-            place = self._reference_place
-            self.distances[..., place] = self.distances[..., place, :] = self.to_reference
-        else:
-            self.distances[..., 0] = self.to_reference
 
     def norms_table(self) -> xr.Dataset:
         """Return `norm` (mesh, order) with its error."""
@@ -242,6 +263,8 @@ def are_tabulated(workspace: Workspace) -> bool:
     """Return True where the tables of a store belong to its fields and to the plan."""
     attributes = table_attributes(workspace.store, "convergence")
     if attributes is None or attributes.get("digest") != _digest(workspace):
+        return False
+    if stale_chunks(workspace.store, _spectrum_keys(workspace)):
         return False
     try:
         return list(workspace.store.read_strings(QUALITY)) == _qualities(workspace)

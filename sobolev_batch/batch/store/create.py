@@ -27,6 +27,8 @@ from sobolev_batch.batch.store.store import (
     RECORD,
     REMOVED,
     ROOT,
+    SPECTRA_GROUP,
+    SPECTRUM_KEY,
     UNFINISHED,
     Store,
 )
@@ -36,10 +38,13 @@ from sobolev_batch.errors import DamageError, StoreError
 from sobolev_batch.spectral.lattice import AXES
 from sobolev_batch.spectral.octaves.sampling import TailSampling
 from sobolev_batch.spectral.shells import smooth_step
+from sobolev_batch.spectral.spectra import RadialAxis
 from sobolev_batch.surfaces.shapes.surface import Similarity
 
 _log = logging.getLogger(__name__)
 
+# Of a chunk of spectra: its rows are one task, and small ones would be many keys.
+_SPECTRA_BYTES, _MOST_SPECTRA = 2 << 20, 512
 _RECORDED_VERSIONS = ("sobolev-batch", "finufft", "modepy", "numpy", "scipy", "xarray", "zarr")
 
 
@@ -191,8 +196,29 @@ def _lay_out(store: Store, plan: Plan, labels: Sequence[str], qualities: Sequenc
             description="the sum of weight (1 + |xi|²)^s |octaves|² is the tail of a squared norm to the last octave",
         )
         keys |= dataset_keys(OCTAVES_GROUP, xr.Dataset(coords={**_sample_columns(plan.tail), "mesh": mesh}))
-    store.publish(keys)
+    store.publish(keys | _spectra_keys(plan, mesh))
     store.documents[""] = _root(_attributes(plan, labels))
+
+
+def _spectra_keys(plan: Plan, mesh: NDArray[Any]) -> dict[str, bytes]:
+    """Return the keys of the radial spectra of all rows, without their chunks."""
+    axis, rows = RadialAxis(plan.lattice, plan.tail), len(mesh)
+    step = min(max(1, _SPECTRA_BYTES // (8 * len(axis))), _MOST_SPECTRA)
+    columns = {
+        "radius": ("shell", axis.radii, {"units": "cycles per unit length"}),
+        "weight": ("shell", axis.weights, {"long_name": "factor of an entry in the squared value"}),
+        "octave": ("shell", axis.labels()["octave"], {"long_name": "number of the octave, 0 for the lattice"}),
+        "lattice": ("shell", axis.labels()["lattice"], {"long_name": "lattice in the octave, -1 for drawn samples"}),
+    }
+    keys = {
+        **dataset_keys(SPECTRA_GROUP, xr.Dataset(coords={**columns, "mesh": mesh})),
+        **array_keys(SPECTRUM_KEY, str, (rows,), (step,), ("mesh",)),
+    }
+    for name, (width, dimension, meaning) in axis.arrays().items():
+        keys |= array_keys(
+            f"{SPECTRA_GROUP}/{name}", "float64", (rows, width), (step, width), ("mesh", dimension), long_name=meaning
+        )
+    return keys
 
 
 def _weight_columns(plan: Plan) -> dict[str, tuple[str, NDArray[np.float64], dict[str, str]]]:

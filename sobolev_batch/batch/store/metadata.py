@@ -15,7 +15,7 @@ from typing import Any, TypeGuard
 from sobolev_batch.errors import StoreError
 
 # Version of the layout that docs/store.md describes.
-SCHEMA_VERSION = 8
+SCHEMA_VERSION = 9
 
 Document = dict[str, Any]
 
@@ -34,8 +34,8 @@ _CODECS = ("bytes", "crc32c", "vlen-utf8")
 # is read. Arrays with one axis are read when a store is opened, tables with two for a report, all others on demand.
 _MOST_ELEMENTS = {0: 1, 1: 10**7, 2: 10**8}
 _LONGEST_AXIS = 2**40
-# Values of all meshes at all samples of octaves, which are read mesh by mesh.
-_OCTAVES = "octaves/octaves"
+# Values of all meshes at all samples of octaves, and their spectra, which are read a few meshes at a time.
+_OF_MESHES = re.compile("octaves/octaves|spectra/.*")
 
 
 def check_documents(store: str, documents: Mapping[str, Any]) -> None:
@@ -90,7 +90,7 @@ def _problem_of_array(node: str, document: Document) -> str:
     shape, chunk = document.get("shape"), (document["chunk_grid"].get("configuration") or {}).get("chunk_shape")
     if not _is_shape(shape, 0) or not _is_shape(chunk, 1) or len(shape) != len(chunk):
         return f"{node} has the shape {_shown(shape)} in chunks of {_shown(chunk)}"
-    most = math.inf if node == _OCTAVES else _MOST_ELEMENTS.get(len(shape), math.inf)
+    most = math.inf if len(shape) > 1 and _OF_MESHES.fullmatch(node) else _MOST_ELEMENTS.get(len(shape), math.inf)
     if math.prod(shape) > most or max(shape, default=0) > _LONGEST_AXIS:
         return f"{node} has the shape {_shown(shape)}"
     return ""

@@ -54,12 +54,17 @@ OCTAVES_GROUP = "octaves"
 OCTAVES = "octaves/octaves"
 RECORDS = "records"
 RECORD = "records/record"
+# Radial spectra, see `sobolev_batch.spectral.spectra`: of norms, of distances from the reference, and of products.
+SPECTRA_GROUP = "spectra"
+SPECTRUM_KEY = "spectra/key"
 # Attributes of the root: the digest of tables and metadata; true while the store is being created; the objects of a
 # collection; the labels of meshes that the study has lost.
 DIGEST, UNFINISHED, COLLECTION, REMOVED = "digest", "unfinished", "collection", "removed"
 _RUN = "run"
 # Written by tasks, and by themselves: the digest leaves them out. Qualities are a copy of what records have.
 _BESIDE_DIGEST = (FIELD, OCTAVES, RECORD, QUALITY)
+# What tasks need of the metadata: tables have fifty times as much.
+_OF_TASKS = (FIELD, OCTAVES, RECORD)
 _REQUESTS_AT_ONCE = 64
 
 
@@ -81,8 +86,8 @@ class Store:
         self._hashes: dict[str, str] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        # Tasks need only these; tables have fifty times as much.
-        carried = {name: document for name, document in self.documents.items() if name in (FIELD, OCTAVES, RECORD)}
+        names = [*_OF_TASKS, *self.spectra]
+        carried = {name: document for name, document in self.documents.items() if name in names}
         return {"location": self.location, "documents": carried, "_hashes": {}}
 
     @classmethod
@@ -164,6 +169,12 @@ class Store:
         """Return whether the root lists an array of this name."""
         return self.documents.get(name, {}).get("node_type") == "array"
 
+    @property
+    def spectra(self) -> list[str]:
+        """Names of the arrays of spectra, whose chunks of rows tasks write, and of their keys."""
+        in_group = [name for name in self.documents if name.startswith(f"{SPECTRA_GROUP}/")]
+        return [name for name in in_group if name == SPECTRUM_KEY or len(self.documents[name]["shape"]) > 1]
+
     def array(self, name: str) -> zarr.Array[Any]:
         """Return an array, for reading and writing."""
         # The values of fields are compared with their records, which does more.
@@ -240,7 +251,7 @@ class Store:
         # The group of records has the state of the latest run.
         keys = {f"{name}/{ROOT}": MOST_BYTES for name in self.documents if name not in ("", RECORDS)}
         for name in filter(self.is_array, self.documents):
-            if name not in _BESIDE_DIGEST:
+            if name not in (*_BESIDE_DIGEST, *self.spectra):
                 keys |= dict.fromkeys(self.chunk_keys(name), largest_chunk_bytes(self.documents[name]))
         unknown = {key: keys[key] for key in sorted(keys.keys() - self._hashes.keys())}
         with ThreadPoolExecutor(_REQUESTS_AT_ONCE) as pool:

@@ -17,11 +17,21 @@ from zarr.codecs import Crc32cCodec
 from zarr.storage import MemoryStore
 
 from sobolev_batch.batch.store.records import Record
-from sobolev_batch.batch.store.store import FIELD, OCTAVES, OCTAVES_GROUP, QUALITY, RECORD, RECORDS, ROOT, Store
+from sobolev_batch.batch.store.store import (
+    FIELD,
+    OCTAVES,
+    OCTAVES_GROUP,
+    QUALITY,
+    RECORD,
+    RECORDS,
+    ROOT,
+    SPECTRA_GROUP,
+    Store,
+)
 from sobolev_batch.errors import DamageError
 
 # All other groups are tables.
-_GROUPS_OF_TASKS = ("fourier", OCTAVES_GROUP, RECORDS)
+_GROUPS_OF_TASKS = ("fourier", OCTAVES_GROUP, SPECTRA_GROUP, RECORDS)
 # By the kind of a dtype: of strings, complex and real numbers.
 _FILL_VALUES: dict[str, Any] = {"U": "", "c": complex(np.nan, np.nan), "f": np.nan}
 # Of an array of a table in memory: distances of all pairs of many meshes are cut along the first axis.
@@ -107,18 +117,19 @@ def table_names(store: Store) -> list[str]:
 def lost_tables(store: Store) -> list[str]:
     """Return the arrays of tables with missing chunks. No chunk is read."""
     names = table_names(store)
-    # Errors of norms need the qualities, which are written with the tables.
-    return _incomplete(store, [*names, QUALITY] if names else [])
+    # Errors of norms need the qualities, which are written with the tables, as spectra are.
+    return _incomplete(store, [*names, QUALITY, *store.spectra] if names else [])
 
 
 def damaged_tables(store: Store) -> dict[str, str]:
     """Return the damage of each small array, of tables and coordinates, that cannot be read."""
-    names = [name for name in filter(store.is_array, store.documents) if name not in (FIELD, OCTAVES, RECORD)]
-    if not table_names(store):
-        names.remove(QUALITY)
-    damage = dict.fromkeys(_incomplete(store, names), "it is not there, or not all of it")
-    for name in names:
-        if name not in damage:
+    written_with_tables = [QUALITY, *store.spectra]
+    others = {FIELD, OCTAVES, RECORD, *written_with_tables}
+    names = [name for name in filter(store.is_array, store.documents) if name not in others]
+    expected = [*names, *written_with_tables] if table_names(store) else names
+    damage = dict.fromkeys(_incomplete(store, expected), "it is not there, or not all of it")
+    for name in expected:
+        if name not in damage and name not in store.spectra:
             try:
                 store.read(name)
             except DamageError as error:

@@ -277,10 +277,7 @@ def squared_moduli(values: NDArray[np.complexfloating]) -> Reals:
 
 
 def statistical_errors(octaves: Iterable[OctaveSums]) -> Reals:
-    """Return how far off the sum of integrals over several octaves may be (orders,), at 99 %.
-
-    It is Student's quantile for the degrees of freedom of the sum (F. E. Satterthwaite 1946, doi:10.2307/3002019).
-    """
+    """Return how far off the sum of integrals over several octaves may be (orders,), at 99 %."""
     parts = [
         part
         for octave in octaves
@@ -290,10 +287,17 @@ def statistical_errors(octaves: Iterable[OctaveSums]) -> Reals:
         )
     ]
     # Few sublattices stay few beside many draws.
-    variances, degrees = np.array([variance for variance, _ in parts]), np.array([count for _, count in parts])
-    total = variances.sum(axis=0)
-    tiny = np.finfo(np.float64).tiny
-    effective = total**2 / np.maximum(np.sum(variances**2 / np.maximum(degrees, 1)[:, None], axis=0), tiny)
+    return quantile_of_sum(np.array([variance for variance, _ in parts]), np.array([count for _, count in parts]))
+
+
+def quantile_of_sum(variances: Reals, degrees: NDArray[np.int64]) -> Reals:
+    """Return how far off a sum may be at 99 %, from the variances of its parts (parts, ...) and their degrees.
+
+    It is Student's quantile for the degrees of freedom of the sum (F. E. Satterthwaite 1946, doi:10.2307/3002019).
+    """
+    total, tiny = variances.sum(axis=0), np.finfo(np.float64).tiny
+    shares = variances**2 / np.maximum(degrees, 1).reshape(-1, *[1] * (variances.ndim - 1))
+    effective = total**2 / np.maximum(np.sum(shares, axis=0), tiny)
     return np.asarray(np.sqrt(total) * stdtrit(np.maximum(effective, 1.0), (1 + _CONFIDENCE) / 2))
 
 
@@ -319,12 +323,6 @@ class Tail:
         none = np.zeros(len(beyond))
         measured = np.sum([octave.squares for octave in sums], axis=0) if sums else none
         return cls(measured, statistical_errors(sums) if sums else none, beyond, uncertainty)
-
-    @classmethod
-    def stacked(cls, tails: Sequence[Tail]) -> Self:
-        """Return the tails of several fields as one, (orders, fields)."""
-        parts = ([getattr(tail, field.name) for tail in tails] for field in fields(cls))
-        return cls(*(np.stack(arrays, axis=-1) for arrays in parts))
 
     def scaled(self, factors: Reals) -> Tail:
         """Return the tails of several fields, (orders, fields), each times a factor."""

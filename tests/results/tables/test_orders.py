@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 import sobolev_batch as sb
-from sobolev_batch.batch.analysis.reducer import Reducer
+from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.tables.convergence import format_table
 from sobolev_batch.results.tables.matrix import format_matrix
 from tests.support.studies import small_table
@@ -65,12 +65,16 @@ def test_matrices_of_any_order(stores: tuple[str, str]) -> None:
 
 
 @pytest.mark.slow
-def test_stored_orders_read_no_field(stores: tuple[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delattr(Reducer, "norms")
-    assert set(sb.table(stores[0])["order"]) == {-10.0, -3.0}
+def test_tables_of_any_order_read_no_field_and_no_record(
+    stores: tuple[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(Store, "read_fields")
+    assert set(sb.table(stores[0], -3.7)["order"]) == {-3.7}
     assert sb.matrix(stores[0], -3).attrs["order"] == -3.0
-    with pytest.raises(AttributeError, match="norms"):
-        sb.table(stores[0], -3.7)
+    with pytest.raises(AttributeError, match="read_fields"):
+        sb.matrix(stores[0], -3.7)
+    monkeypatch.delattr(Store, "examine_records")
+    assert set(sb.table(stores[0], [-10, -3.7])["order"]) == {-10.0, -3.7}
 
 
 @pytest.mark.slow

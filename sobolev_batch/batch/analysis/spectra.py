@@ -1,0 +1,109 @@
+"""Radial spectra in the store: computed from fields by tasks, one chunk of rows each, and read for any order."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+
+import numpy as np
+
+from sobolev_batch.batch.analysis.reducer import Reducer
+from sobolev_batch.batch.store.store import SPECTRA_GROUP, SPECTRUM_KEY, Store
+from sobolev_batch.errors import DamageError
+from sobolev_batch.spectral.spectra import ComparedSpectra
+
+
+def spectrum_keys(keys: Mapping[int, str], reference: int) -> dict[int, str]:
+    """Return what tells which fields a row's spectra were computed from, by the keys of all rows with a field."""
+    of_reference = keys.get(reference, "")
+    return {row: hashlib.sha256(f"{key} {of_reference}".encode()).hexdigest()[:32] for row, key in keys.items()}
+
+
+def chunks_of_spectra(store: Store) -> Iterator[range]:
+    """Yield the rows of each chunk of spectra."""
+    document = store.document(SPECTRUM_KEY)
+    (count,), (step,) = document["shape"], document["chunk_grid"]["configuration"]["chunk_shape"]
+    for first in range(0, count, step):
+        yield range(first, min(first + step, count))
+
+
+def stale_chunks(store: Store, keys: Mapping[int, str]) -> list[range]:
+    """Return the chunks that are not there as a whole, or lack spectra of rows with these keys; no spectrum is read."""
+    sizes = store.location.sizes(SPECTRA_GROUP)
+    missing = {index[0] for name in store.spectra for index in store.incomplete_chunks(name, sizes)}
+    stale = []
+    for number, rows in enumerate(chunks_of_spectra(store)):
+        expected = {row: keys[row] for row in rows if row in keys}
+        if number in missing or not expected.items() <= _stored_keys(store, rows).items():
+            stale.append(rows)
+    return stale
+
+
+def _stored_keys(store: Store, rows: range) -> dict[int, str]:
+    """Return the keys of the rows of a chunk that have spectra; none if the chunk is damaged."""
+    with suppress(DamageError):
+        stored = np.asarray(store.read(SPECTRUM_KEY, slice(rows.start, rows.stop))).tolist()
+        return {row: key for row, key in zip(rows, stored, strict=True) if key}
+    return {}
+
+
+def fill_chunk(reducer: Reducer, rows: range, keys: Mapping[int, str]) -> None:
+    """Compute the spectra of a chunk's rows, but for those that it has with these keys, and write the chunk.
+
+    Raises:
+        DamageError: The field of a row is not what was stored.
+        StoreError: The store cannot be read or written.
+    """
+    store, place = reducer.store, slice(rows.start, rows.stop)
+    arrays = {name: np.full((len(rows), width), np.nan) for name, (width, *_) in reducer.axis.arrays().items()}
+    kept = {row for row, key in _stored_keys(store, rows).items() if keys.get(row) == key}
+    try:
+        for name, values in _read(store, sorted(kept)).items() if kept else ():
+            arrays[name][_places(kept, rows)] = values
+    except DamageError:
+        kept = set()
+    missing = {row for row in rows if row in keys} - kept
+    for name, values in reducer.spectra(sorted(missing)).to_arrays().items() if missing else ():
+        arrays[name][_places(missing, rows)] = values
+
+    def write_keys(of: set[int]) -> None:
+        store.write(SPECTRUM_KEY, place, np.array([keys[row] if row in of else "" for row in rows], dtype=object))
+
+    # Should this be interrupted, no old key may stand for new values.
+    write_keys(kept)
+    for name, values in arrays.items():
+        store.write(f"{SPECTRA_GROUP}/{name}", place, values)
+    write_keys(kept | missing)
+
+
+def _places(of: set[int], rows: range) -> list[int]:
+    return [row - rows.start for row in sorted(of)]
+
+
+def read_spectra(store: Store, rows: Sequence[int]) -> ComparedSpectra:
+    """Return the spectra of rows of one chunk, in ascending order; a damaged chunk raises a `DamageError`."""
+    return ComparedSpectra.from_arrays(_read(store, rows))
+
+
+def _read(store: Store, rows: Sequence[int]) -> dict[str, np.ndarray]:
+    place, chosen = slice(rows[0], rows[-1] + 1), [row - rows[0] for row in rows]
+    names = [name for name in store.spectra if name != SPECTRUM_KEY]
+    return {name.removeprefix(f"{SPECTRA_GROUP}/"): np.asarray(store.read(name, place))[chosen] for name in names}
+
+
+def damaged_chunks(store: Store) -> dict[tuple[int, int], str]:
+    """Return the damage of each chunk that cannot be read, by its first and last row."""
+    damage = {}
+    for rows in chunks_of_spectra(store):
+        try:
+            for name in store.spectra:
+                store.read(name, slice(rows.start, rows.stop))
+        except DamageError as error:
+            damage[rows[0], rows[-1]] = error.what
+    return damage
+
+
+def withdraw_chunk(store: Store, first: int, last: int) -> None:
+    """Erase the keys of a chunk whose spectra are damaged: the next run computes them again."""
+    store.write(SPECTRUM_KEY, slice(first, last + 1), np.array([""] * (last + 1 - first), dtype=object))
