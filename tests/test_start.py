@@ -29,7 +29,7 @@ PARTS_OF_SCIPY = {"fft", "fftpack", "linalg", "sparse", "special", "version"}
         # Help texts appear before anything computes.
         ("import sobolev_batch.cli", LIBRARIES),
         # Every session of pytest loads it.
-        ("import sobolev_batch.testing.pytest_plugin", LIBRARIES),
+        ("import sobolev_batch.testing.pytest_plugin", LIBRARIES | {"click"}),
         (FIRST_FIELD, HEAVY),
     ],
 )

@@ -24,10 +24,7 @@ def figures(shape: str) -> list[float]:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("shape", "surface", "mesh"),
-    [
-        ("torus", TORUS, lambda level: TORUS.mesh(12 << level, 6 << level)),
-        ("ellipsoid", ELLIPSOID, ELLIPSOID.mesh),
-    ],
+    [("torus", TORUS, lambda level: TORUS.mesh(12 << level, 6 << level)), ("ellipsoid", ELLIPSOID, ELLIPSOID.mesh)],
 )
 def test_refinements_converge_with_second_order(
     shape: str, surface: Torus | Ellipsoid, mesh: Callable[[int], Mesh]
