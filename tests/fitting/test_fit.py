@@ -71,14 +71,6 @@ def test_it_keeps_the_triangles_turns_none_over_and_reports_distances_of_points(
     assert fitted.remarks == ()
 
 
-@pytest.mark.all
-def test_a_ball_becomes_something_else() -> None:
-    ball = sb.icosphere(2)
-    fitted = sb.fit(sb.Mesh(0.5 * ball.vertices, ball.triangles), TARGET, -2.0, steps=80)
-    assert fitted.after.distance < fitted.before.distance / 15
-    assert fitted.after.chamfer < fitted.before.chamfer / 5
-
-
 @pytest.mark.slow
 def test_moving_both_moves_the_result() -> None:
     by = np.array([30.0, -5.0, 7.0])
@@ -165,6 +157,7 @@ def test_what_one_should_know_is_remarked(monkeypatch: pytest.MonkeyPatch, after
     assert remark in fitted.remarks[0]
     moved = np.abs(fitted.mesh.vertices - START.vertices).max() > 1e-6
     assert moved == ("this is the start" not in remark)
+    assert moved or fitted.after == fitted.before
     assert (fitted.end == "it was interrupted") == (after is KeyboardInterrupt)
 
 

@@ -140,18 +140,6 @@ def test_the_value_is_the_squared_distance_whether_vertices_are_flat_or_not() ->
     np.testing.assert_array_equal(flat, gradient.ravel())
 
 
-@pytest.mark.slow
-def test_two_meshes_that_move_together_keep_their_distance() -> None:
-    a, b, lattice = wrinkled(2), moved(wrinkled(3), 0.3, 0, 0.1), sb.Lattice(3.0, 40)
-    of_a, of_b = (sb.gradient(*pair, -3.0, lattice=lattice, eps=1e-11) for pair in ((a, b), (b, a)))
-    first, second = of_a["gradient"].values, of_b["gradient"].values
-    scale = np.abs(first).sum()
-    assert np.abs(first.sum(axis=0) + second.sum(axis=0)).max() < 1e-9 * scale
-    # Turned together, they do so up to what the cube leaves out: its corners turn.
-    torque = np.cross(a.vertices, first).sum(axis=0) + np.cross(b.vertices, second).sum(axis=0)
-    assert np.abs(torque).max() < 5 * (of_a["error"].item() + of_b["error"].item())
-
-
 ORDERS = [-1.5, -2.0, -4.0]
 
 
@@ -233,9 +221,6 @@ def test_positions_are_checked() -> None:
         sb.gradient(sb.icosphere(0), SPHERE, -2.0)
     with pytest.raises(sb.InputError, match="one order is needed, found 2"):
         sb.SquaredDistance.for_mesh(sb.icosphere(0), SPHERE, [-2.0, -3.0], lattice=SMALL)  # type: ignore[arg-type]
-
-
-# Both libraries are large, and no extra of `all` has them.
 
 
 @pytest.fixture(scope="module")

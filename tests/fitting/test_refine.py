@@ -10,20 +10,11 @@ import pytest
 import sobolev_batch as sb
 from sobolev_batch.fitting import fit as module
 from sobolev_batch.surfaces.shapes.subdivision import Edges
-from tests.support.members import loaded, members
 
 # A ball with a sharp bump at its top: most triangles belong there.
 BALL = sb.icosphere(5)
 BUMP = 1 + 0.5 * np.exp(-200 * (1 - np.asarray(BALL.vertices)[:, 2:]))
 TARGET = sb.Mesh(np.asarray(BALL.vertices) * BUMP, BALL.triangles)
-
-
-@pytest.mark.all
-def test_edges_are_split_where_the_surface_is_not_met() -> None:
-    start = sb.icosphere(3)
-    added = np.asarray(sb.refine(start, TARGET, -2.0, triangles=1400, steps=10).mesh.vertices)[len(start.vertices) :]
-    # The bump has a twentieth of the directions.
-    assert (added[:, 2] > 0.9 * np.linalg.norm(added, axis=1)).mean() > 0.5
 
 
 @pytest.mark.all
@@ -99,26 +90,3 @@ def test_vertices_at_one_place_become_one_and_boundaries_stay() -> None:
 def test_goals_that_cannot_be_reached_are_refused(goal: Any, message: str) -> None:
     with pytest.raises(sb.InputError, match=message):
         sb.refine(sb.icosphere(0), sb.Sphere(), -4.0, triangles=goal)
-
-
-@pytest.mark.slow
-def test_a_member_is_the_refinement_in_the_unit_ball_of_its_target() -> None:
-    table: dict[str, Any] = {
-        "source": "refine",
-        "mesh": {"source": "ellipsoid", "axes": [30, 28, 27], "center": [100, 0, 0], "levels": [1]},
-        "target": {"source": "sphere", "radius": 30.0, "center": [100.0, 0.0, 0.0]},
-        "steps": 5,
-        "triangles": [200, 120],
-    }
-    coarse, fine = members(table)
-    assert [(member.name, member.level) for member in (coarse, fine)] == [("120", 0), ("200", 1)]
-    start = loaded(members(table["mesh"])[0])
-    scaled = sb.Mesh((np.asarray(start.vertices) - [100, 0, 0]) / 30, start.triangles)
-    expected = sb.refine(scaled, sb.Sphere(), triangles=120, steps=5, threads=1).mesh
-    found = loaded(coarse)
-    assert np.array_equal(found.triangles, expected.triangles)
-    np.testing.assert_allclose((found.vertices - [100, 0, 0]) / 30, expected.vertices, rtol=0, atol=1e-9)
-    assert 100 < len(found.triangles) <= 120 < len(loaded(fine).triangles)
-    (too_many,) = members({**table, "triangles": [60]})
-    with pytest.raises(sb.MeshError, match="cannot be fitted to sphere: the mesh has 80 triangles already"):
-        too_many.load()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,12 @@ from distributed import Client
 import sobolev_batch as sb
 from sobolev_batch.fitting import sources
 from sobolev_batch.surfaces.sources.registry import parse_source
-from tests.support.members import loaded, members
+from tests.support.members import listed, loaded, members
 
 SPHERE: dict[str, Any] = {"source": "sphere", "radius": 30.0, "center": [100.0, 0.0, 0.0]}
 STARTS: dict[str, Any] = {"source": "ellipsoid", "axes": [30, 28, 27], "center": [100, 0, 0], "levels": [1, 2]}
 FIT: dict[str, Any] = {"source": "fit", "mesh": STARTS, "steps": 15}
+REFINE: dict[str, Any] = {"source": "refine", "mesh": {**STARTS, "levels": [1]}, "steps": 5, "triangles": [200, 120]}
 
 
 def table(**fit: Any) -> dict[str, Any]:
@@ -47,12 +49,27 @@ def test_a_study_fits_to_its_reference_and_reuses_what_it_has(client: Client, tm
 
 
 @pytest.mark.slow
-def test_a_member_is_the_fit_in_the_unit_ball_of_its_target() -> None:
-    _, member = members({**FIT, "target": SPHERE})
-    start, found = loaded(members(STARTS)[1]), loaded(member)
-    scaled = sb.Mesh((start.vertices - [100, 0, 0]) / 30, start.triangles)
-    expected = sb.fit(scaled, sb.Sphere(), steps=15, threads=1).mesh
+@pytest.mark.parametrize(
+    ("table", "make"),
+    [
+        (FIT, lambda mesh: sb.fit(mesh, sb.Sphere(), steps=15, threads=1)),
+        (REFINE, lambda mesh: sb.refine(mesh, sb.Sphere(), triangles=120, steps=5, threads=1)),
+    ],
+)
+def test_a_member_is_the_fit_in_the_unit_ball_of_its_target(
+    table: dict[str, Any], make: Callable[[sb.Mesh], sb.Fit]
+) -> None:
+    start, found = loaded(members(table["mesh"])[0]), loaded(members({**table, "target": SPHERE})[0])
+    expected = make(sb.Mesh((start.vertices - [100, 0, 0]) / 30, start.triangles)).mesh
+    assert np.array_equal(found.triangles, expected.triangles)
     np.testing.assert_allclose((found.vertices - [100, 0, 0]) / 30, expected.vertices, rtol=0, atol=1e-9)
+
+
+def test_refined_members_have_levels_and_more_triangles_than_their_start() -> None:
+    assert listed(members({**REFINE, "target": SPHERE})) == [("120", 0), ("200", 1)]
+    (too_many,) = members({**REFINE, "target": SPHERE, "triangles": [60]})
+    with pytest.raises(sb.MeshError, match="cannot be fitted to sphere: the mesh has 80 triangles already"):
+        too_many.load()
 
 
 @pytest.mark.process
@@ -70,13 +87,6 @@ def test_one_process_fits_once(monkeypatch: pytest.MonkeyPatch) -> None:
     first = member.load()
     monkeypatch.setattr(sources, "fitted_mesh", None)
     assert pickle.loads(pickle.dumps(member)).load() is first
-
-
-def test_the_settings_are_part_of_the_fingerprint() -> None:
-    changes: list[dict[str, Any]] = [{}, {"order": -3.0}, {"steps": 16}, {"smoothing": 1.0}, {"keep_boundary": True}]
-    found = {members({**FIT, "target": SPHERE, **change})[0].fingerprint_digest() for change in changes}
-    found.add(members({**FIT, "target": {**SPHERE, "radius": 31.0}})[0].fingerprint_digest())
-    assert len(found) == len(changes) + 1
 
 
 def test_the_reference_is_handed_down_to_nested_sources() -> None:

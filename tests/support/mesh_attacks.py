@@ -19,16 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.support.mesh_files import (
-    LITTLE,
-    Gltf,
-    box_scene,
-    gifti,
-    obj,
-    off,
-    ply,
-    stl_text,
-)
+from tests.support.mesh_files import LITTLE, Gltf, box_scene, gifti, obj, off, ply, stl_text
 from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES
 
 # Writes an attack into a folder, and returns the path of the file to read.
@@ -86,7 +77,6 @@ def _sharing_parts(parts: int, nodes: int) -> bytes:
 
 
 def _scene(part: str, **entries: Any) -> bytes:
-    """A scene with other entries in the first node, accessor or view of a buffer."""
     scene = box_scene()
     scene.tree[part][0].update(entries)
     return scene.glb()
@@ -217,8 +207,7 @@ ATTACKS: dict[str, Attack] = {
     "gifti, entities in UTF-16": _file(".gii", _entities().decode().encode("utf-16")),
     "gifti, bomb": _file(".gii", lambda: _gifti_data(_packed_zeros(200))),
     "gifti, bomb that is announced": _file(
-        ".gii",
-        lambda: _changed(_gifti_data(_packed_zeros(240)), b'Dim0="8"', b'Dim0="%d"' % (20 * _MEGABYTE)),
+        ".gii", lambda: _changed(_gifti_data(_packed_zeros(240)), b'Dim0="8"', b'Dim0="%d"' % (20 * _MEGABYTE))
     ),
     "gifti, text without end": _file(
         ".gii",

@@ -87,7 +87,6 @@ def off(
     vertex_count: int | None = None,
     face_count: int | None = None,
 ) -> bytes:
-    """Return an OFF file."""
     rows = np.asarray(vertices)
     counts = (len(rows) if vertex_count is None else vertex_count, len(faces) if face_count is None else face_count)
     lines = [f"{counts[0]} {counts[1]} 0", *[numbers(row) for row in rows]]
@@ -96,7 +95,6 @@ def off(
 
 
 def stl_text(vertices: ArrayLike, faces: Faces, name: str = "box") -> bytes:
-    """Return an ASCII STL file."""
     rows = np.asarray(vertices)
     facets = [
         "facet normal 0 0 0\nouter loop\n"
@@ -108,7 +106,6 @@ def stl_text(vertices: ArrayLike, faces: Faces, name: str = "box") -> bytes:
 
 
 def stl_binary(vertices: ArrayLike, faces: Faces, start: bytes = b"box", *, count: int | None = None) -> bytes:
-    """Return a binary STL file."""
     rows = np.asarray(vertices, dtype=np.float64)
     facets = [struct.pack("<12fH", 0, 0, 0, *rows[list(face)].ravel(), 0) for face in faces]
     return start.ljust(80, b"\0") + struct.pack("<I", len(facets) if count is None else count) + b"".join(facets)
@@ -174,7 +171,6 @@ class Gltf:
         return primitive
 
     def glb(self) -> bytes:
-        """Return the binary form."""
         self.tree["buffers"][0]["byteLength"] = len(self.blob)
         document = json.dumps(self.tree).encode()
         document += b" " * (-len(document) % 4)
@@ -211,7 +207,6 @@ def gifti(
 def freesurfer(
     vertices: ArrayLike, triangles: ArrayLike, volume: bytes = b"", *, counts: tuple[int, int] | None = None
 ) -> bytes:
-    """Return a surface of FreeSurfer's."""
     rows, corners = np.asarray(vertices), np.asarray(triangles)
     header = b"\xff\xff\xfecreated by somebody on a Monday\n\n"
     header += struct.pack(">2i", *(counts or (len(rows), len(corners))))
@@ -232,6 +227,7 @@ def box_scene() -> Gltf:
     return Gltf([[(BOX_VERTICES, BOX_TRIANGLES, None)]], [{"mesh": 0}])
 
 
+OFF_BOX = off(BOX_VERTICES, BOX_TRIANGLES)
 BOXES: dict[str, Content] = {
     "ply ascii float": (".ply", ply(BOX_VERTICES, BOX_TRIANGLES)),
     "ply ascii double": (".ply", ply(BOX_VERTICES, BOX_TRIANGLES, real="double")),
@@ -240,7 +236,7 @@ BOXES: dict[str, Content] = {
     "ply big float": (".ply", ply(BOX_VERTICES, BOX_TRIANGLES, BIG, index="ushort")),
     "ply big double": (".ply", ply(BOX_VERTICES, BOX_TRIANGLES, BIG, real="double", length="int")),
     "obj": (".obj", obj(BOX_VERTICES, BOX_TRIANGLES)),
-    "off": (".off", off(BOX_VERTICES, BOX_TRIANGLES)),
+    "off": (".off", OFF_BOX),
     "stl ascii": (".stl", stl_text(BOX_VERTICES, BOX_TRIANGLES)),
     "stl binary": (".stl", stl_binary(BOX_VERTICES, BOX_TRIANGLES)),
     "stl binary that starts with solid": (".stl", stl_binary(BOX_VERTICES, BOX_TRIANGLES, b"solid box")),

@@ -1,4 +1,4 @@
-"""Small surfaces whose areas are known, random ones, and parametrisations, which survive pickling."""
+"""Small surfaces whose areas are known, and parametrisations, which survive pickling."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as arrays
 from numpy.typing import NDArray
 
 from sobolev_batch import Interval, Mesh, ParametrisedSurface, Torus
@@ -56,18 +54,6 @@ def soup(mesh: Mesh) -> list[list[tuple[float, ...]]]:
     return sorted(sorted(tuple(corner) for corner in triangle) for triangle in mesh.vertices[mesh.triangles].tolist())
 
 
-@st.composite
-def meshes(draw: st.DrawFn) -> Mesh:
-    """Draw random triangles on shared vertices: mostly non-manifold, always with an area above zero."""
-    vertex_count = draw(st.integers(3, 8))
-    coordinates = st.floats(-10, 10, width=32).map(lambda x: round(x, 3))
-    vertices = draw(arrays.arrays(np.float64, (vertex_count, 3), elements=coordinates))
-    # A triangle whose area is at least 1/2 wherever the others fall.
-    vertices[:3] = draw(st.sampled_from([1.0, 3.0, 7.5])) * np.eye(3)
-    more = draw(arrays.arrays(np.int64, (draw(st.integers(0, 10)), 3), elements=st.integers(0, vertex_count - 1)))
-    return Mesh(vertices, np.concatenate([[[0, 1, 2]], more]))
-
-
 # Around the origin, with no two sides equal.
 CENTRED_BOX = Mesh(
     np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.6, 0.6) for z in (-0.7, 0.7)]),
@@ -86,28 +72,22 @@ def ball(u: Reals, v: Reals) -> tuple[Reals, Reals, Reals]:
 
 
 def plate(u: Reals, v: Reals) -> tuple[Reals, Reals, float]:
-    """A flat rectangle."""
     return u, v, 0.0
 
 
 @dataclass(frozen=True)
 class Turned:
-    """The points of a torus, turned about its centre."""
-
     torus: Torus
 
     def __call__(self, u: Reals, v: Reals) -> Reals:
-        """The positions (3, ...)."""
         return np.asarray(np.tensordot(ROTATION, self.torus.positions(u, v), axes=1))
 
 
 def turned_torus(torus: Torus) -> ParametrisedSurface:
-    """Return a torus turned about its centre."""
     return ParametrisedSurface(Turned(torus), TURN, TURN)
 
 
 def angular_ball() -> ParametrisedSurface:
-    """Return the unit sphere in its two angles."""
     return ParametrisedSurface(ball, HALF_TURN, TURN)
 
 
@@ -120,19 +100,15 @@ class Roof(Smooth):
 
     @property
     def intervals(self) -> tuple[Interval, Interval]:
-        """The same twice, with the ridge off the middle."""
         return Interval(-0.9, 1.0), Interval(-0.9, 1.0)
 
     def positions(self, u: Reals, v: Reals) -> Reals:
-        """The positions (3, ...)."""
         return np.asarray(self.scale * (np.stack([u, v, -np.abs(u)]) - np.reshape(self.origin, (3, *[1] * u.ndim))))
 
     def tangents(self, u: Reals, v: Reals) -> tuple[Reals, Reals]:
-        """The exact derivatives (3, ...)."""
         one, zero = np.full_like(u, self.scale), np.zeros_like(u)
         return np.stack([one, zero, -self.scale * np.sign(u)]), np.stack([zero, one, zero])
 
     def moved(self, scale: float, origin: Point) -> Roof:
-        """The roof after x -> scale * (x - origin)."""
         x, y, z = (old + shift / self.scale for old, shift in zip(self.origin, origin, strict=True))
         return Roof(scale * self.scale, (x, y, z))

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
 
 from sobolev_batch import MeshError, icosphere
 from tests.support.mesh_files import Gltf, Read, box_scene
@@ -82,12 +81,3 @@ def test_gltf_vertices_may_be_interleaved_with_others(read: Read) -> None:
     scene.tree["accessors"][position]["count"] = 8
     scene.tree["meshes"][0]["primitives"][0]["attributes"]["POSITION"] = position
     assert soup(read(".glb", scene.glb())) == soup(box())
-
-
-def test_scenes_of_trimesh_are_read(read: Read) -> None:
-    scene = trimesh.Scene()
-    scene.add_geometry(trimesh.creation.box((1, 2, 4)), transform=trimesh.transformations.scale_matrix(2))
-    scene.add_geometry(trimesh.creation.icosphere(2), transform=trimesh.transformations.translation_matrix((9, 9, 9)))
-    mesh = read(".glb", scene.export(file_type="glb"))
-    assert mesh.area == pytest.approx(4 * BOX_AREA + icosphere(2).area, rel=1e-6)
-    assert mesh.counts == CLOSED

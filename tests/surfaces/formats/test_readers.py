@@ -6,7 +6,6 @@ import codecs
 import gzip
 import os
 import re
-import resource
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,17 +18,7 @@ import trimesh
 import sobolev_batch as sb
 from sobolev_batch import Mesh, icosphere, read_mesh
 from sobolev_batch.surfaces.formats.readers import mesh_format, mesh_stem
-from tests.support.mesh_files import (
-    BIG,
-    BOXES,
-    LITTLE,
-    WRITERS,
-    Read,
-    obj,
-    off,
-    ply,
-    stl_text,
-)
+from tests.support.mesh_files import BIG, BOXES, LITTLE, OFF_BOX, WRITERS, Read, obj, off, ply, stl_text
 from tests.support.shapes import (
     AWKWARD_VERTICES,
     BOX_AREA,
@@ -43,6 +32,7 @@ from tests.support.shapes import (
     mesh_counts,
     soup,
 )
+from tests.support.stores import full_disk
 
 # Digits at both ends of the range, and vertices that no triangle uses.
 VERTICES = np.array([[0.1, -2 / 3, 1e-300], [1e6 + 1 / 3, 3.0, np.pi], [0.0, 7.0, -1e-9], [5.0, 5.0, 5.0]])
@@ -112,9 +102,6 @@ def test_polygons_of_all_sizes_are_cut_into_fans(
     assert mesh.counts == mesh_counts(0, 0, boundary, 0)
 
 
-# What the formats allow beside plain lists of vertices and faces.
-
-
 def insert(content: bytes, before: bytes, line: bytes) -> bytes:
     assert content.count(before) == 1
     return content.replace(before, line + before)
@@ -131,14 +118,12 @@ def test_ply_vertices_may_have_more_properties(read: Read, encoding: str, more: 
 
 
 def with_colors() -> bytes:
-    """A PLY file whose faces have more properties behind their corners."""
     colors = b"property uchar red\nproperty uchar green\nproperty uchar blue\n"
     lines = insert(ply(BOX_VERTICES, BOX_TRIANGLES), b"end_header\n", colors).splitlines()
     return b"\n".join([*lines[:-12], *[line + b" 255 0 7" for line in lines[-12:]], b""])
 
 
 def with_edges(encoding: str) -> bytes:
-    """A PLY file with another element behind its faces."""
     header = b"element edge 2\nproperty int vertex1\nproperty int vertex2\n"
     content = insert(ply(BOX_VERTICES, BOX_TRIANGLES, encoding), b"end_header\n", header)
     return content + (b"0 1\n1 2\n" if encoding == "ascii" else np.array([0, 1, 1, 2], dtype="<i4").tobytes())
@@ -157,7 +142,7 @@ def test_obj_corners_may_count_backwards_from_the_line_they_stand_on(read: Read)
     assert mesh.areas.tolist() == [0.5, 2.0]
 
 
-OBJ_BOX, OFF_BOX = obj(BOX_VERTICES, BOX_TRIANGLES), off(BOX_VERTICES, BOX_TRIANGLES)
+OBJ_BOX = obj(BOX_VERTICES, BOX_TRIANGLES)
 STL_BOX = stl_text(BOX_VERTICES, BOX_TRIANGLES)
 VARIANTS: dict[str, dict[str, bytes]] = {
     ".ply": {
@@ -248,9 +233,6 @@ def test_names_tell_formats_and_labels(name: str, form: str, stem: str) -> None:
     assert (mesh_format(Path(name)), mesh_stem(Path(name))) == (form, stem)
 
 
-# Files of other writers.
-
-
 def test_files_of_nibabel_are_read(tmp_path: Path) -> None:
     ball = icosphere(3)
     nibabel.freesurfer.write_geometry(tmp_path / "lh.white", ball.vertices, ball.triangles, "a ball")
@@ -312,12 +294,11 @@ def test_what_cannot_be_written_is_named(tmp_path: Path, name: str, error: type[
 def test_an_old_file_stays_until_the_new_one_is_whole(tmp_path: Path) -> None:
     path = tmp_path / "mesh.ply"
     sb.write_mesh(sb.icosphere(0), path)
-    before, limits = path.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before), limits[1]))
-    try:
-        with pytest.raises(sb.MeshError, match=r"mesh\.ply: the mesh cannot be written there: File too large"):
-            sb.write_mesh(sb.icosphere(3), path)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    before = path.read_bytes()
+    with (
+        full_disk(len(before)),
+        pytest.raises(sb.MeshError, match=r"mesh\.ply: .* cannot be written .*: File too large"),
+    ):
+        sb.write_mesh(sb.icosphere(3), path)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]

@@ -1,4 +1,4 @@
-"""Readers under random bytes and random damage: they end in a mesh or a MeshError, in silence and in time."""
+"""Readers under random damage: they end in a mesh or a MeshError, in silence and in time."""
 
 from __future__ import annotations
 
@@ -25,26 +25,13 @@ _KINDS: dict[str, Content] = {
     "ply little polygons": (".ply", ply(BOX_VERTICES, BOX_MIXED, LITTLE)),
     "ply gzipped": (".ply.gz", gzip.compress(BOXES["ply ascii float"][1], mtime=0)),
 }
-_PLY_HEADERS = [
-    content[: content.index(b"end_header\n") + len(b"end_header\n")] for end, content in BOXES.values() if end == ".ply"
-]
-# What a format begins with, so that random bytes get past the first look.
-_STARTS: dict[str, tuple[bytes, ...]] = {
-    ".ply": (b"", *_PLY_HEADERS),
-    ".obj": (b"", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf "),
-    ".off": (b"", b"OFF\n", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n"),
-    ".stl": (b"", b"solid\n", b"solid\nfacet normal 0 0 0\nouter loop\nvertex ", bytes(80) + b"\1\0\0\0"),
-    ".gltf": (b"", b"{", b'{"nodes": [{"mesh": 0}], "meshes": '),
-    ".glb": (b"", BOXES["glb"][1][:20]),
-    ".gii": (b"", b"<GIFTI>", BOXES["gifti ascii"][1].partition(b"<Data>")[0] + b"<Data>"),
-    "_lh.pial": (b"", b"\xff\xff\xfe", b"\xff\xff\xff", b"\xff\xff\xfed\n\n\0\0\0\3\0\0\0\1"),
-    ".ply.gz": (b"", b"\x1f\x8b", gzip.compress(b"", mtime=0)),
-}
+
+
 # Numbers that have broken readers before.
 _NUMBERS = ["-1", "0", "1", "2", "7", "8", "9", "255", "256", "65536", "-2147483648", "2147483648", "4294967295"]
 _NUMBERS += ["9223372036854775807", "18446744073709551616", "9" * 40, "9" * 400, "9" * 5000, "1e300", "1e999", "nan"]
 _NUMBERS += ["-inf", "1_0", "0x10", "1.5", "", "-", "²", "１"]
-_WORDS = [*_NUMBERS, "v", "f", "facet", "vertex", "endloop", "solid", "3", "0 1 2", "\n", "\n3 "]
+
 _TOKENS = [b"\0", b"\n", b" ", b'"', b"\xff", b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\0\0\xc0\x7f", b"[", b"{}"]
 _TOKENS += [b"end_header\n", b"element face 9\n", b"property list int double vertex_indices\n", b"f 1 2 3 4 5\n", b"#"]
 _TOKENS += [b"<", b"null", b'"byteStride":0,', b"<Data>", b"</DataArray>", b"&a;", b'Dim0="99"', b"\xf0\x9f\x98\x80"]
@@ -101,40 +88,11 @@ def _damaged(content: bytes, random: Random) -> bytes:
     return content
 
 
-def _made_up(ending: str, random: Random) -> bytes:
-    """The beginning of a file, perhaps a header that lies, and bytes, tokens or words and numbers behind it."""
-    start = random.choice(_STARTS[ending])
-    if ending == ".ply" and random.randrange(2):
-        vertices, faces, kind = random.choice(_NUMBERS), random.choice(_NUMBERS), random.choice(["ascii", LITTLE])
-        lines = ["ply", f"format {kind} 1.0", f"element vertex {vertices}", *[f"property float {x}" for x in "xyz"]]
-        lines += [f"element face {faces}", "property list uchar int vertex_indices", "end_header", ""]
-        start = "\n".join(lines).encode()
-    match random.randrange(3):
-        case 0:
-            return start + random.randbytes(random.randrange(300))
-        case 1:
-            return start + b" ".join(random.choices(_TOKENS, k=random.randrange(30)))
-        case _:
-            return start + " ".join(random.choices(_WORDS, k=random.randrange(40))).encode()
-
-
-EXAMPLES = pytest.mark.parametrize("examples", [15, pytest.param(300, marks=pytest.mark.all)])
-
-
 @pytest.mark.slow
-@EXAMPLES
+@pytest.mark.parametrize("examples", [15, pytest.param(300, marks=pytest.mark.all)])
 @pytest.mark.parametrize("name", _KINDS)
 def test_damaged_files_end_in_a_mesh_or_a_mesh_error(tmp_path: Path, name: str, examples: int) -> None:
     ending, content = _KINDS[name]
     random = Random(name)
     for _ in range(examples):
         _ends_well(tmp_path / f"scan{ending}", _damaged(content, random))
-
-
-@pytest.mark.slow
-@EXAMPLES
-@pytest.mark.parametrize("ending", _STARTS)
-def test_any_bytes_end_in_a_mesh_or_a_mesh_error(tmp_path: Path, ending: str, examples: int) -> None:
-    random = Random(ending)
-    for _ in range(examples):
-        _ends_well(tmp_path / f"scan{ending}", _made_up(ending, random))

@@ -11,63 +11,40 @@ import pytest
 from scipy.special import eval_legendre
 
 from sobolev_batch import InputError, Interval, ParametrisedSurface, Similarity, Torus
-from tests.support.shapes import (
-    HALF_TURN,
-    ROTATION,
-    TURN,
-    angular_ball,
-    ball,
-    plate,
-    turned_torus,
+from tests.support.shapes import HALF_TURN, ROTATION, TURN, angular_ball, ball, plate, turned_torus
+
+TORUS = Torus(1.0, 0.4)
+PLATE = ParametrisedSurface(plate, Interval(-1.0, 2.0), Interval(0.0, 0.5))
+
+
+@pytest.mark.parametrize(
+    ("surface", "area", "lower", "upper", "radius"),
+    [
+        (angular_ball(), 4 * math.pi, -np.ones(3), np.ones(3), 1.0),
+        # Its height is a number, which stands for a constant coordinate.
+        (PLATE, 1.5, [-1.0, 0.0, 0.0], [2.0, 0.5, 0.0], math.hypot(1.5, 0.25)),
+        # Along an axis it reaches as far as the torus does along that axis turned back.
+        (turned_torus(TORUS), TORUS.area, -TORUS.highest_along(ROTATION), TORUS.highest_along(ROTATION), 1.4),
+    ],
+    ids=["ball", "plate", "torus"],
 )
+def test_areas_boxes_and_bounding_spheres(surface: Any, area: float, lower: Any, upper: Any, radius: float) -> None:
+    assert surface.area == pytest.approx(area, rel=1e-12)
+    np.testing.assert_allclose(surface.extent.box, [lower, upper], rtol=0, atol=1e-11)
+    middle = np.add(lower, upper) / 2
+    assert surface.bounding_sphere == (pytest.approx(middle, abs=1e-11), pytest.approx(radius, rel=1e-11))
 
 
-def test_a_sphere_in_its_angles() -> None:
-    surface = angular_ball()
-    assert surface.area == pytest.approx(4 * math.pi, rel=1e-13)
-    lower, upper = surface.extent.box
-    assert lower == pytest.approx(-np.ones(3), abs=1e-12)
-    assert upper == pytest.approx(np.ones(3), abs=1e-12)
-    assert Similarity.to_unit_ball(surface).scale == pytest.approx(1, rel=1e-12)
-
-
-def test_numbers_stand_for_constant_coordinates() -> None:
-    surface = ParametrisedSurface(plate, Interval(-1.0, 2.0), Interval(0.0, 0.5))
-    assert surface.area == pytest.approx(1.5, rel=1e-14)
-    lower, upper = surface.extent.box
-    assert (lower.tolist(), upper.tolist()) == ([-1.0, 0.0, 0.0], [2.0, 0.5, 0.0])
-    center, radius = surface.bounding_sphere
-    assert center == (0.5, 0.25, 0.0)
-    assert radius == pytest.approx(math.hypot(1.5, 0.25), rel=1e-12)
-
-
-def test_extents_of_a_torus_that_lies_askew() -> None:
-    torus = Torus(1.0, 0.4)
-    surface = turned_torus(torus)
-    _, upper = surface.extent.box
-    # Along an axis it reaches as far as the torus does along that axis turned back.
-    assert upper == pytest.approx(torus.highest_along(ROTATION), abs=1e-11)
-    assert surface.area == pytest.approx(torus.area, rel=1e-12)
-
-
-def test_similarities_follow_each_other() -> None:
-    surface = turned_torus(Torus(1.0, 0.4))
+def test_similarities_follow_each_other_and_survive_pickling() -> None:
+    surface = turned_torus(TORUS)
     first, second = Similarity(2.0, (1.0, 2.0, 3.0)), Similarity(0.3, (-1.0, 0.5, 0.0))
-    moved = second.apply(first.apply(surface))
+    moved = pickle.loads(pickle.dumps(second.apply(first.apply(surface))))
     u, v = np.random.default_rng(8).uniform(0, 6, (2, 5))
     once = 2.0 * (surface.positions(u, v) - np.reshape((1.0, 2.0, 3.0), (3, 1)))
     twice = 0.3 * (once - np.reshape((-1.0, 0.5, 0.0), (3, 1)))
     assert isinstance(moved, ParametrisedSurface)
     assert moved.positions(u, v) == pytest.approx(twice, abs=1e-13)
     assert moved.area == pytest.approx(0.36 * surface.area, rel=1e-12)
-
-
-def test_surfaces_of_picklable_functions_are_picklable() -> None:
-    surface = Similarity(0.5, (1.0, 0.0, 0.0)).apply(turned_torus(Torus(1.0, 0.3)))
-    again = pickle.loads(pickle.dumps(surface))
-    u, v = np.random.default_rng(8).uniform(0, 6, (2, 5))
-    assert np.array_equal(again.positions(u, v), surface.positions(u, v))
-    assert again.area == surface.area
 
 
 SIDE, HALF = Interval(0.0, 1.0), Interval(0.0, math.pi, periodic=True)

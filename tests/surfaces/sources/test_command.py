@@ -23,7 +23,6 @@ COUNTED = {**COPY, "command": ["sh", "-c", "echo >> {log}; cp {input} {output}"]
 
 
 def halved(mesh: sb.Mesh, size: float = 0.5, *, flip: bool = False) -> Any:
-    """Return a smaller copy, as a pair of arrays."""
     return size * mesh.vertices, mesh.triangles[:, ::-1] if flip else mesh.triangles
 
 

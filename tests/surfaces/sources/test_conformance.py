@@ -13,10 +13,8 @@ from pydantic import ConfigDict
 from sobolev_batch import ExpectedSize, Member, Mesh, Source, Sphere, check_source, icosphere
 from sobolev_batch.surfaces.sources.registry import parse_source
 from tests.support.members import KINDS
-from tests.support.mesh_files import off
-from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES
+from tests.support.mesh_files import OFF_BOX
 
-OFF_BOX = off(BOX_VERTICES, BOX_TRIANGLES)
 FINE: dict[str, Any] = {"source": "icosphere", "levels": [5]}
 
 
@@ -71,8 +69,6 @@ class BallMember(Member):
 
 
 class Balls(Source):
-    """A source that keeps its promises, unless it has a fault."""
-
     fault: str = ""
     calls: ClassVar[list[int]] = []
 
@@ -124,10 +120,7 @@ class CanBeChanged(Balls):
         (Balls(fault="array"), "makes a ndarray, expected a Mesh"),
         (Balls(fault="random"), "another surface or fingerprint after pickling"),
         (Balls(fault="large"), "predicts 0 triangles and 0 bytes, and makes a mesh of 20480"),
-        (
-            Balls(fault="large and light"),
-            "triangles and 1000 bytes, and makes a mesh of 20480 and 737328",
-        ),
+        (Balls(fault="large and light"), "triangles and 1000 bytes, and makes a mesh of 20480 and 737328"),
     ],
     ids=lambda value: value.fault or type(value).__name__ if isinstance(value, Balls) else "",
 )

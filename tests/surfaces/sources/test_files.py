@@ -14,10 +14,8 @@ from pydantic import ValidationError
 from sobolev_batch import MeshError, StudyError
 from sobolev_batch.surfaces.sources.names import caseless_key
 from tests.support.members import listed, loaded, members
-from tests.support.mesh_files import off
-from tests.support.shapes import BOX_AREA, BOX_TRIANGLES, BOX_VERTICES
-
-OFF_BOX = off(BOX_VERTICES, BOX_TRIANGLES)
+from tests.support.mesh_files import OFF_BOX
+from tests.support.shapes import BOX_AREA
 
 
 def names_of(folder: Path, *paths: str) -> list[str]:

@@ -16,12 +16,8 @@ from sobolev_batch import Ellipsoid, Mesh, Sphere, StudyError, Torus, icosphere
 from sobolev_batch.surfaces.sources import registry as sources
 from sobolev_batch.surfaces.sources.registry import ExpectedSize, Member, Source, parse_source
 from tests.support.members import BALL, KINDS, listed, loaded, members
-from tests.support.mesh_files import off
-from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES
+from tests.support.mesh_files import OFF_BOX
 
-OFF_BOX = off(BOX_VERTICES, BOX_TRIANGLES)
-
-# The registry.
 COARSER = {"source": "icosphere", "levels": [2]}
 SPHERE: dict[str, Any] = {"source": "sphere", "radius": 2, "center": [1, 2.5, -3]}
 EGG: dict[str, Any] = {"source": "ellipsoid", "axes": [3, 2, 1], "center": [0.0, 0.5, 0.0]}
@@ -81,8 +77,6 @@ def test_entry_points_that_are_no_sources_are_named(name: str, problem: str) -> 
         parse_source({"source": name})
 
 
-# Parameters.
-
 NO_LEVELS: dict[str, list[Any]] = {
     "levels": [None, [], 3],
     "levels.0": [["3"], [1.0], [-1]],
@@ -126,11 +120,7 @@ BAD: list[tuple[str, dict[str, Any], dict[str, list[Any]]]] = [
         {"mesh": BALL, "distances": [0.1]},
         {"distances": [[]], "distances.0": [[0.0]], "direction": [[0, 0, 0]]},
     ),
-    (
-        "noisy",
-        {"mesh": BALL, "amplitudes": [0.1]},
-        {"amplitudes.0": [[-0.1]], "seed": [-1, 0.5]},
-    ),
+    ("noisy", {"mesh": BALL, "amplitudes": [0.1]}, {"amplitudes.0": [[-0.1]], "seed": [-1, 0.5]}),
     ("flow", {"mesh": BALL, "times": [0.0]}, {"times": [[], [0.0, True], [1.0, 1.0]], "period": [0.0]}),
 ]
 
@@ -163,10 +153,7 @@ def test_bad_parameters_are_refused_where_they_stand(table: dict[str, Any], plac
         ),
         ({"source": "ellipsoid", "axes": [1.0, 1.0, 1e200]}, "three numbers between 1e-150"),
         ({"source": "torus", "R": 1.0, "r": 1.0}, "0 < r < R"),
-        (
-            {"source": "torus", "R": 1.0, "r": 0.4, "levels": [0, 12]},
-            "level 12 of 12 x 6 cells has 2415919104",
-        ),
+        ({"source": "torus", "R": 1.0, "r": 0.4, "levels": [0, 12]}, "level 12 of 12 x 6 cells has 2415919104"),
     ],
 )
 def test_parameters_that_do_not_fit_each_other_are_refused(table: dict[str, Any], message: str) -> None:
@@ -189,9 +176,6 @@ def test_nested_sources_must_be_named_and_exist(name: str, mesh: dict[str, Any],
     for table in (mesh, {"source": name, "mesh": mesh, "triangles": [80]}):
         with pytest.raises(StudyError, match=message):
             parse_source(table)
-
-
-# All sources.
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -248,6 +232,10 @@ def test_levels_go_from_coarse_to_fine_and_once_each() -> None:
         (KINDS["moved"], [{"distances": [0.1]}, {"direction": [0, 1, 0]}, {"mesh": COARSER}]),
         (KINDS["noisy"], [{"amplitudes": [0.1]}, {"seed": 4}, {"mesh": COARSER}]),
         (KINDS["decimate"], [{"triangles": [81]}, {"mesh": COARSER}]),
+        (
+            KINDS["fit"],
+            [{"order": -3.0}, {"steps": 4}, {"smoothing": 1.0}, {"keep_boundary": True}, {"target": SPHERE}],
+        ),
     ],
     ids=str,
 )
