@@ -64,7 +64,6 @@ def show(table: pd.DataFrame) -> bool:
 
 
 def described(row: dict[str, Any]) -> str:
-    """Return a line that identifies a case and what came of it."""
     parts = ", ".join(f"{name} {row[name]:.2g}" for name in PARTS)
     return (
         f"{row['case']}: {row['value']:.8g} ± {row['reported']:.2g} ({parts}), "

@@ -93,7 +93,6 @@ def _near_boxes(rng: np.random.Generator) -> Surfaces:
 
 
 def _icosphere_and_sphere(rng: np.random.Generator) -> Surfaces:
-    """Return an icosphere and the sphere that it approximates, or another one."""
     level, sphere = int(rng.integers(0, 5)), random_sphere(rng)
     mesh = placed(icosphere(level), sphere, rotation(rng))
     return mesh, sphere if rng.random() < 0.6 else random_sphere(rng)
@@ -153,7 +152,6 @@ def _placed_ball(rng: np.random.Generator, level: int) -> Mesh:
 
 
 def _one_vertex_moved(rng: np.random.Generator) -> Surfaces:
-    """Return a mesh twice, once with one of its vertices moved."""
     choice = rng.random()
     mesh = random_box(rng) if choice < 0.3 else _placed_ball(rng, int(rng.integers(1, 4)))
     if choice > 0.7:

@@ -49,7 +49,6 @@ def perforated_plates(rng: np.random.Generator) -> Pair:
 
 
 def fins(rng: np.random.Generator) -> Pair:
-    """Return parallel fins and the same moved by part of their pitch, or another number of them."""
     count, width = int(rng.integers(4, 31)), float(rng.uniform(0.3, 1.0))
     stack = Rectangles.fins(count, width)
     if rng.random() < 0.7:
@@ -69,7 +68,6 @@ def crenellations(rng: np.random.Generator) -> Pair:
 
 
 def voxel_balls(rng: np.random.Generator) -> Pair:
-    """Return a ball of cubes and the same moved, or one of larger or smaller cubes."""
     count = int(rng.integers(4, 13))
     ball = _voxel_ball(count)
     if rng.random() < 0.5:
@@ -97,7 +95,6 @@ def distant_parts(rng: np.random.Generator) -> Pair:
 
 
 def tapered_plates(rng: np.random.Generator) -> Pair:
-    """Return a stack of squares, smaller towards both ends, and the same moved along it by part of its pitch."""
     count, half = int(rng.integers(8, 41)), float(rng.uniform(0.1, 0.4))
     amount = _part_of_pitch(rng)
     return pair_of(rng, *(Rectangles.tapered(count, 1 / count, half, offset) for offset in (0.0, amount)))
@@ -106,26 +103,17 @@ def tapered_plates(rng: np.random.Generator) -> Pair:
 def strips(rng: np.random.Generator) -> Pair:
     """Return long narrow strips in a plane, and the same moved across by part of their pitch, or strips of others."""
     count, length, filled = int(rng.integers(5, 31)), float(rng.uniform(0.3, 1.0)), float(rng.uniform(0.2, 0.7))
-
-    def grid(offset: float, count: int) -> Rectangles:
-        lefts = (np.arange(count) + offset) / count - 0.5
-        return Rectangles.from_corners(*(((x, -length / 2, 0), (x + filled / count, length / 2, 0)) for x in lefts))
-
+    grid = Rectangles.strips(count, 0.0, length, filled)
     if rng.random() < 0.7:
-        return pair_of(rng, grid(0.0, count), grid(_part_of_pitch(rng), count))
-    return pair_of(rng, grid(0.0, count), grid(0.0, int(rng.integers(5, 31))))
+        return pair_of(rng, grid, Rectangles.strips(count, _part_of_pitch(rng), length, filled))
+    return pair_of(rng, grid, Rectangles.strips(int(rng.integers(5, 31)), 0.0, length, filled))
 
 
 def layers(rng: np.random.Generator) -> Pair:
     """Return sheets at a small gap against fewer of them, or at another gap."""
     sides, gaps = rng.uniform(0.3, 1.0, size=2), 10.0 ** rng.uniform(-4, -1.3, size=2)
-    counts = rng.integers(1, 5, size=2)
-
-    def sheets(count: int, gap: float, height: float) -> Rectangles:
-        low, high = -sides / 2, sides / 2
-        return Rectangles.from_corners(*(((*low, height + i * gap), (*high, height + i * gap)) for i in range(count)))
-
-    return pair_of(rng, sheets(int(counts[0]), gaps[0], 0.0), sheets(int(counts[1]), gaps[1], float(gaps.min()) / 3))
+    counts, heights = rng.integers(1, 5, size=2), (0.0, float(gaps.min()) / 3)
+    return pair_of(rng, *(Rectangles.sheets(*each, sides) for each in zip(counts, gaps, heights, strict=True)))
 
 
 def woven(rng: np.random.Generator) -> Pair:

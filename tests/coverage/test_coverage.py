@@ -16,7 +16,6 @@ from tests.coverage.__main__ import PARTS as PARTS_OF_ERRORS
 from tests.coverage.__main__ import described, judge, judged, show
 from tests.coverage.cases import KINDS, cases_of
 from tests.coverage.matern import kernel, radial_integral
-from tests.coverage.parts import PARTS
 from tests.coverage.truth import (
     closed_within,
     on_fine_lattice,
@@ -163,15 +162,6 @@ def test_triangles_that_both_meshes_have_are_left_out() -> None:
     assert abs(whole[0].value - less[0].value) <= whole[0].uncertainty + less[0].uncertainty
     same, again = without_common_triangles(BOX, BOX)
     assert len(same.triangles) == len(again.triangles) == 1
-
-
-@pytest.mark.parametrize("name", PARTS)
-def test_turned_parts_are_those_of_the_heat_trace(name: str) -> None:
-    pair = PARTS[name](np.random.default_rng(3))
-    assert pair.rectangles is not None
-    for surface, rectangles in zip(pair.surfaces, pair.rectangles, strict=True):
-        assert isinstance(surface, Mesh)
-        assert surface.area == pytest.approx(rectangles.mesh().area, rel=1e-12)
 
 
 def test_the_report_lists_what_is_uncovered_and_refused(capsys: pytest.CaptureFixture[str]) -> None:

@@ -21,14 +21,7 @@ from scipy.special import erf
 
 from sobolev_batch import AccuracyError, Lattice, Mesh, Sphere, distance, fourier_transform
 from sobolev_batch.surfaces.shapes.surface import Extent, Surface
-from tests.coverage.matern import (
-    Sides,
-    divided_points,
-    double_sum,
-    graded_points,
-    mesh_potentials,
-    sphere_potential,
-)
+from tests.coverage.matern import Sides, divided_points, double_sum, graded_points, mesh_potentials, sphere_potential
 from tests.support.rectangles import TIMES, Rectangles, integrals_of_traces
 
 Reals = NDArray[np.float64]
@@ -178,7 +171,6 @@ def without_common_triangles(a: Mesh, b: Mesh) -> tuple[Mesh, Mesh]:
 
 
 def _most_certain(a: Surface, b: Surface, orders: Sequence[float], points: int) -> list[Truth | None]:
-    """Return the truths for some orders with kernels of one kind."""
     triangles = sum(len(surface.triangles) for surface in (a, b) if isinstance(surface, Mesh))
     singular, rough = max(orders) > _SINGULAR, max(orders) > _SMOOTH
     few = _FEW_BESSEL if max(orders) > _SUMMED else _FEW_SINGULAR if singular else _FEW
@@ -284,7 +276,6 @@ def measured_with_another_seed(a: Surface, b: Surface, order: float) -> Truth | 
 
 
 def _spheres_alone(a: Surface, b: Surface, orders: Sequence[float]) -> Reals:
-    """Return the contribution of the spheres alone to the squared distance."""
     alone = np.zeros(len(orders))
     for surface in (a, b):
         if isinstance(surface, Sphere):

@@ -52,19 +52,6 @@ def test_inner_products_against_the_radial_integral(first: Sphere, second: Spher
     assert sphere_inner_product(first, second, order) == pytest.approx(radial_integral(first, second, order), rel=1e-12)
 
 
-def test_transform_is_the_closed_form_at_every_frequency() -> None:
-    rng = np.random.default_rng(1)
-    sphere = Sphere(0.7, (0.1, -0.2, 0.3))
-    frequencies = np.vstack([np.zeros(3), rng.normal(size=(5, 3))])
-    values = sphere_transform(sphere, frequencies)
-    assert values[0] == pytest.approx(4 * math.pi * 0.49, rel=1e-15)
-    for value, frequency in zip(values[1:], frequencies[1:], strict=True):
-        length = 0.7 * np.linalg.norm(frequency)
-        unit = 2 * math.sin(2 * math.pi * length) / length
-        expected = 0.49 * unit * np.exp(-2j * np.pi * frequency @ np.array(sphere.center))
-        assert value == pytest.approx(expected, rel=1e-13)
-
-
 def test_block_and_pointwise_transform_agree() -> None:
     lattice, sphere = Lattice(2.0, 8), Sphere(0.7, (0.1, -0.2, 0.3))
     grid = np.stack(np.meshgrid(*lattice.axes, indexing="ij"), axis=-1)

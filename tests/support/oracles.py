@@ -42,12 +42,15 @@ def integral(function: Callable[[float], float], low: float, high: float) -> flo
     return math.fsum(quad(function, start, stop, epsabs=1e-15, epsrel=1e-13)[0] for start, stop in pairwise(edges))
 
 
-def full_lattice_norm(values: np.ndarray, lattice: Lattice, order: float) -> float:
-    """Return the norm by the trapezoidal rule on the whole cube, conjugate half included."""
-    mirrored = np.conj(values[::-1, ::-1, :0:-1])
-    whole = np.concatenate([mirrored, values], axis=2)
+def on_whole_cube(values: np.ndarray, lattice: Lattice, order: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return a field with its conjugate half, and the weights of the trapezoidal rule times (1 + |ξ|²)^s."""
+    whole = np.concatenate([np.conj(values[::-1, ::-1, :0:-1]), values], axis=2)
     axis = lattice.axes[0]
-    ends = np.where(np.abs(axis) == lattice.xi_max, 0.5, 1.0)
-    weights = ends[:, None, None] * ends[:, None] * ends * lattice.spacing**3
+    ends = np.where(np.abs(axis) == lattice.xi_max, 0.5, 1.0) * lattice.spacing
     squares = axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2
-    return float(np.sqrt(np.sum(weights * (1 + squares) ** order * np.abs(whole) ** 2)))
+    return whole, ends[:, None, None] * ends[:, None] * ends * (1 + squares) ** order
+
+
+def full_lattice_norm(values: np.ndarray, lattice: Lattice, order: float) -> float:
+    whole, weights = on_whole_cube(values, lattice, order)
+    return float(np.sqrt(np.sum(weights * np.abs(whole) ** 2)))

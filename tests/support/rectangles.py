@@ -13,7 +13,7 @@ from itertools import product
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import erf, gamma
 
 from sobolev_batch import Mesh
@@ -62,11 +62,22 @@ class Rectangles:
         return cls(np.concatenate(lows), np.concatenate(highs))
 
     @classmethod
+    def sheets(cls, count: int, gap: float, height: float, sides: ArrayLike = (1.0, 1.0)) -> Self:
+        """Return parallel rectangles at a gap, the lowest one at a height."""
+        low, high = -np.array(sides) / 2, np.array(sides) / 2
+        return cls.from_corners(*(((*low, z), (*high, z)) for z in height + gap * np.arange(count)))
+
+    @classmethod
     def fins(cls, count: int, width: float = 0.8) -> Self:
         """Return parallel squares, ``count`` of them over a unit of length."""
-        heights = np.arange(count) / count - 0.5
         half = width / 2
-        return cls.from_corners(*(((-half, -half, z), (half, half, z)) for z in heights))
+        return cls.from_corners(*(((-half, -half, z), (half, half, z)) for z in np.arange(count) / count - 0.5))
+
+    @classmethod
+    def strips(cls, count: int, offset: float, length: float, filled: float) -> Self:
+        """Return long strips over a unit of length, which fill a part of it, moved across by a part of their pitch."""
+        lefts = (np.arange(count) + offset) / count - 0.5
+        return cls.from_corners(*(((x, -length / 2, 0), (x + filled / count, length / 2, 0)) for x in lefts))
 
     @classmethod
     def tapered(cls, count: int, pitch: float, half: float, offset: float = 0.0) -> Self:
@@ -97,7 +108,6 @@ class Rectangles:
         return Rectangles(np.concatenate([self.low, other.low]), np.concatenate([self.high, other.high]))
 
     def mesh(self) -> Mesh:
-        """Return two triangles for each rectangle."""
         vertices = []
         for low, high in zip(self.low, self.high, strict=True):
             i, j = np.flatnonzero(high > low)
@@ -108,7 +118,6 @@ class Rectangles:
         return Mesh(np.concatenate(vertices), (first + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3))
 
     def distance(self, other: Rectangles, orders: Sequence[float]) -> Reals:
-        """Return the distances (orders,) of the two area measures."""
         return np.asarray(np.sqrt(self.squared_distance(other, orders)[0]))
 
     def squared_distance(self, other: Rectangles, orders: Sequence[float]) -> tuple[Reals, Reals]:

@@ -18,18 +18,6 @@ from tests.support.rectangles import Rectangles
 Pair = tuple[Rectangles, Rectangles]
 
 
-def strips(offset: float) -> Rectangles:
-    """Long strips at a pitch of 0.04, half as wide."""
-    lefts = 0.04 * np.arange(25) + offset
-    return Rectangles.from_corners(*(((x, -0.45, 0), (x + 0.02, 0.45, 0)) for x in lefts))
-
-
-def sheets(count: int, height: float) -> Rectangles:
-    """Unit squares at gaps of 0.001."""
-    heights = height + 1e-3 * np.arange(count)
-    return Rectangles.from_corners(*(((-0.5, -0.5, z), (0.5, 0.5, z)) for z in heights))
-
-
 BOX = Rectangles.box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
 MOVED_BOX = BOX, BOX.moved(0.01, 0.03, 0.02)
 PAIRS: dict[str, Callable[[], Pair]] = {
@@ -41,8 +29,8 @@ PAIRS: dict[str, Callable[[], Pair]] = {
     "plates": lambda: (Rectangles.tapered(40, 1 / 20, 0.2), Rectangles.tapered(40, 1 / 20, 0.2, 0.5)),
     "fine plates": lambda: (Rectangles.tapered(35, 1 / 35, 0.3), Rectangles.tapered(35, 1 / 35, 0.3, 0.5)),
     "fine fins": lambda: (Rectangles.fins(30), Rectangles.fins(30).moved(0, 0, 1 / 60)),
-    "strips": lambda: (strips(0.0), strips(0.02)),
-    "layers": lambda: (sheets(3, 0.0), sheets(1, 5e-3)),
+    "strips": lambda: (Rectangles.strips(25, 0.0, 0.9, 0.5), Rectangles.strips(25, 0.5, 0.9, 0.5)),
+    "layers": lambda: (Rectangles.sheets(3, 1e-3, 0.0), Rectangles.sheets(1, 1e-3, 5e-3)),
 }
 CASES = [
     *(

@@ -26,7 +26,7 @@ from sobolev_batch.spectral.backends import NufftSpec
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.metrics import causes
 from sobolev_batch.spectral.transform.nufft import evaluate_at
-from tests.support.oracles import full_lattice_norm
+from tests.support.oracles import full_lattice_norm, on_whole_cube
 from tests.support.shapes import CENTRED_BOX as BOX
 
 Reals = NDArray[np.float64]
@@ -46,9 +46,6 @@ def as_field(values: Complexes, lattice: Lattice) -> xr.DataArray:
 
 def random_values(rng: np.random.Generator) -> Complexes:
     return rng.standard_normal(SMALL.shape) + 1j * rng.standard_normal(SMALL.shape)
-
-
-# Area.
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -77,17 +74,6 @@ def test_near_twins_keep_their_digits() -> None:
     assert near["area_share"].item() == pytest.approx(larger["area_share"].item(), rel=1e-12)
 
 
-def test_blocks_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(10)
-    a, b = as_field(random_values(rng), SMALL), as_field(random_values(rng), SMALL)
-    whole, read = distance(a, b, SMALL_ORDERS), fields.read_blocks
-    monkeypatch.setattr(fields, "read_blocks", lambda lattice, *given: read(lattice, *given, largest=200))
-    xr.testing.assert_allclose(distance(a, b, SMALL_ORDERS), whole, rtol=1e-12)
-
-
-# Wavelengths.
-
-
 @pytest.mark.parametrize("bands", [None, 1, 7, 40])
 def test_bands_add_up_to_the_squared_distance(bands: int | None) -> None:
     a, b = fourier_transform(BOX, LATTICE), fourier_transform(Sphere(), LATTICE)
@@ -108,15 +94,14 @@ def test_bands_are_sums_over_the_whole_lattice() -> None:
     field = fourier_transform(Sphere(0.1), lattice).copy(data=values)
     edges = [0.0, 0.5, 0.8, 1.5, 2.1]  # the shells |k|² = 1 and 9 lie on edges, those beyond 17 in no band
     dataset = spectrum(field, None, -2.0, bands=edges)
-    x, y, z = np.meshgrid(*lattice.axes, indexing="ij")
-    ends = [np.where(np.abs(axis) == 1.5, 0.5, 1.0) for axis in (x, y, z)]
-    weights = 0.5**3 * ends[0] * ends[1] * ends[2] * np.where(z > 0, 2, 1)
-    radii = np.round(np.sqrt(x**2 + y**2 + z**2), 12)
+    whole, weights = on_whole_cube(values, lattice, 0.0)
+    squares = np.abs(whole) ** 2
+    radii = np.round(np.linalg.norm(np.meshgrid(*[lattice.axes[0]] * 3), axis=0), 12)
     for i in range(4):
         inside = (radii >= edges[i]) & (radii < edges[i + 1])
-        expected = np.sum((weights * (1 + radii**2) ** -2.0 * np.abs(values) ** 2)[inside])
+        expected = np.sum((weights * (1 + radii**2) ** -2.0 * squares)[inside])
         assert dataset["squared"].values[i] == pytest.approx(expected, rel=1e-12)
-        mean = np.average(np.abs(values[inside]) ** 2, weights=weights[inside])
+        mean = np.average(squares[inside], weights=weights[inside])
         assert dataset["mean_square"].values[i] == pytest.approx(mean, rel=1e-12)
     assert dataset["squared"].sum().item() < dataset["total"].item()
 
@@ -156,9 +141,6 @@ def test_refuses_bands(bands: object) -> None:
         spectrum(Sphere(), None, -2.0, lattice=LATTICE, bands=bands)  # type: ignore[arg-type]
 
 
-# Places.
-
-
 def random_pair(seed: int) -> tuple[Complexes, Complexes]:
     """Return two fields of random points: real measures that are not smooth."""
     rng = np.random.default_rng(seed)
@@ -172,12 +154,8 @@ def random_pair(seed: int) -> tuple[Complexes, Complexes]:
 
 def direct_sum(difference: Complexes, lattice: Lattice, order: float, points: Reals) -> Reals:
     """Return the witness function by the trapezoidal rule on the whole cube, conjugate half included."""
-    whole = np.concatenate([np.conj(difference[::-1, ::-1, :0:-1]), difference], axis=2)
-    axis = lattice.axes[0]
-    ends = np.where(np.abs(axis) == lattice.xi_max, 0.5, 1.0) * lattice.spacing
-    squares = axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2
-    weighted = whole * ends[:, None, None] * ends[:, None] * ends * (1 + squares) ** order
-    turns = [np.exp(2j * np.pi * np.multiply.outer(points[:, i], axis)) for i in range(3)]
+    weighted = np.multiply(*on_whole_cube(difference, lattice, order))
+    turns = [np.exp(2j * np.pi * np.multiply.outer(points[:, i], lattice.axes[0])) for i in range(3)]
     values = np.einsum("ijk,ni,nj,nk->n", weighted, *turns, optimize=True)
     assert np.abs(values.imag).max() < 1e-12 * np.abs(weighted).sum()
     return np.asarray(values.real)
@@ -197,14 +175,16 @@ def test_is_the_direct_sum_over_the_whole_lattice(seed: int) -> None:
 
 @pytest.mark.slow
 def test_blocks_batches_and_parts_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    a, b = random_pair(3)
+    a, b = (as_field(values, RANDOM) for values in random_pair(3))
     points = np.random.default_rng(3).uniform(-0.9, 0.9, (50, 3))
-    whole = witness(as_field(a, RANDOM), as_field(b, RANDOM), -2.0, points, eps=1e-13).values
+    whole, distances = witness(a, b, -2.0, points, eps=1e-13).values, distance(a, b, WITNESS_ORDERS)
     read = fields.read_blocks
-    monkeypatch.setattr(causes, "read_blocks", lambda lattice, *given: read(lattice, *given, largest=100))
+    for module in (fields, causes):
+        monkeypatch.setattr(module, "read_blocks", lambda lattice, *given: read(lattice, *given, largest=100))
     assert len(RANDOM.split(100)) > 10
-    in_blocks = witness(as_field(a, RANDOM), as_field(b, RANDOM), -2.0, points, eps=1e-13).values
+    in_blocks = witness(a, b, -2.0, points, eps=1e-13).values
     assert in_blocks == pytest.approx(whole, rel=0, abs=1e-11 * np.abs(whole).max())
+    xr.testing.assert_allclose(distance(a, b, WITNESS_ORDERS), distances, rtol=1e-12)
     block = Block((-3, 1, 2), (5, 4, 4))
     coefficients = np.random.default_rng(4).standard_normal((2, *block.shape)) + 1j
     one, many = (

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Sphere, distance, fourier_transform, icosphere
 from sobolev_batch.spectral.budget import add_sums, sums_of_shells
@@ -40,17 +39,11 @@ def test_blocks_of_products_give_every_distance() -> None:
     assert cancelled.diagonal().all()
 
 
-def random_fields(count: int, lattice: Lattice) -> NDArray[np.complex128]:
-    rng = np.random.default_rng(0)
-    shape = count, lattice.half.size
-    return rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
-
-
 @pytest.mark.parametrize(("apart", "lost"), [(1e-2, False), (1e-4, True)])
 def test_near_twins_have_the_outer_energies_of_their_difference_and_are_reported(apart: float, lost: bool) -> None:
     # They come from the same samples as the squares, so that what cancels leaves no noise behind.
     lattice = Lattice(4.0, 40)
-    one, two = random_fields(2, lattice)
+    one, two = np.random.default_rng(0).standard_normal((2, lattice.half.size, 2)) @ [1, 1j]
     twin = one + apart * two
     arrangement = Arrangement.for_block(SobolevWeights(lattice, ORDERS), lattice.half)
     pair = np.stack([one[arrangement.order], twin[arrangement.order]])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dask.array
 import numpy as np
 import pytest
-from scipy.special import gamma, kv
 
 from sobolev_batch import (
     InputError,
@@ -18,7 +17,6 @@ from sobolev_batch import (
     icosphere,
     norm,
 )
-from sobolev_batch.spectral.quadrature.kinds import kind_of
 from tests.support.oracles import full_lattice_norm
 from tests.support.shapes import CENTRED_BOX as BOX
 
@@ -32,35 +30,6 @@ def test_norm_is_the_trapezoidal_rule_over_the_whole_cube(order: float) -> None:
     assert norm(a, order)["norm"].item() == pytest.approx(full_lattice_norm(a.values, LATTICE, order), rel=1e-13)
     difference = full_lattice_norm((a - b).values, LATTICE, order)
     assert distance(a, b, order)["distance"].item() == pytest.approx(difference, rel=1e-13)
-
-
-@pytest.mark.slow
-def test_distance_against_the_matern_kernel_in_real_space() -> None:
-    # ||m||² = ∬ K(|x-y|) dm dm with K the Matérn kernel: no Fourier transform on that side.
-    order = -6.0
-    shrunk = type(BOX)(0.8 * BOX.vertices, BOX.triangles)
-    points, weights = [], []
-    for mesh, sign in ((BOX, 1.0), (shrunk, -1.0)):
-        for batch in kind_of(mesh).plan(1.0, 1e-9, 22).batches(1 << 20):
-            points.append(batch.coordinates.T)
-            weights.append(sign * batch.weights)
-    x, w = np.concatenate(points), np.concatenate(weights)
-    # The diagonal stands for r -> 0, where the kernel has a finite limit that r = 1e-4 has reached.
-    r = np.maximum(np.sqrt(np.sum((x[:, None] - x[None]) ** 2, axis=2)), 1e-4)
-    a = -order
-    kernel = 2 * np.pi**a / gamma(a) * r ** (a - 1.5) * kv(1.5 - a, 2 * np.pi * r)
-    in_space = np.sqrt(w @ kernel @ w)
-    lattice = Lattice(7.0, 112)
-    assert distance(BOX, shrunk, order, lattice=lattice)["distance"].item() == pytest.approx(in_space, rel=1e-7)
-
-
-def test_one_order_gives_a_number_and_several_an_axis() -> None:
-    one = norm(fourier_transform(Sphere(), LATTICE), -2)
-    assert one["norm"].dims == ()
-    assert one["order"].item() == -2.0
-    several = norm(fourier_transform(Sphere(), LATTICE), [-2, -3])
-    assert several["norm"].dims == ("order",)
-    assert several["norm"].sel(order=-2).item() == pytest.approx(one["norm"].item(), rel=1e-14)
 
 
 @pytest.mark.parametrize("order", [-0.5, -0.49, 0, 2, float("nan"), float("-inf"), [-2.0, -0.1], []])

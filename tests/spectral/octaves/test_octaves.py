@@ -173,9 +173,6 @@ def test_wrong_values_have_large_errors() -> None:
         assert 0.8 * np.sqrt(square) < norm < 4 * np.sqrt(square)
 
 
-# Samplings of all octaves of a study: joined from those of pilots, and refined.
-
-
 def sizes_of(sampling: TailSampling) -> list[int]:
     return [lattice.M for one in sampling.octaves for lattice in one.lattices]
 

@@ -63,18 +63,6 @@ def test_periods_beyond_the_cutoff_are_seen(order: float) -> None:
 
 
 @pytest.mark.slow
-def test_errors_cover_what_more_points_show() -> None:
-    pair: list[Surface] = [sb.icosphere(3), Sphere()]
-    many = remainder(pair, [1, -1], 20.0, ORDERS, points=3000, seed=1)
-    misses = 0
-    for seed in range(12):
-        few = remainder(pair, [1, -1], 20.0, ORDERS, points=100, seed=seed)
-        off = np.abs(np.array(few.energies) - many.energies)
-        misses += int(np.any(off > np.array(few.errors) + many.errors))
-    assert misses <= 1
-
-
-@pytest.mark.slow
 def test_lower_orders_are_bounded_by_the_lowest_one_that_is_computed() -> None:
     pair = [PLATES.mesh(), MOVED.mesh()]
     (value,), (error,) = remainder(pair, [1, -1], 12.0, [-6.0]).at([-6.0])

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sobolev_batch import InputError, Lattice, Mesh, Sphere, Torus, fourier_transform, icosphere
+from sobolev_batch import InputError, Lattice, Mesh, Torus, fourier_transform, icosphere
 from sobolev_batch.spectral.backends import CPU
 from sobolev_batch.spectral.fields import compute_field
 from sobolev_batch.spectral.quadrature import kinds, meshes
@@ -58,12 +58,6 @@ def test_the_size_is_known_before_the_points_are_made(surface: Surface, method: 
     count = sum(len(batch.weights) for batch in plan.batches(1 << 20))
     assert plan.expected_points == pytest.approx(count, rel=0.05)
     assert count <= plan.largest_points
-
-
-def test_a_closed_form_has_no_points() -> None:
-    plan = kind_of(Sphere()).plan(8.66, 1e-9)
-    assert (plan.expected_points, plan.largest_points, plan.lowest_degree) == (0.0, 0, 0)
-    assert not list(plan.batches(1 << 20))
 
 
 def test_an_unknown_kind_of_surface_is_refused_with_those_that_are_known() -> None:

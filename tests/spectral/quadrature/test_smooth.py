@@ -15,7 +15,6 @@ from sobolev_batch import (
     Lattice,
     Mesh,
     ParametrisedSurface,
-    Similarity,
     Sphere,
     Torus,
     distance,
@@ -51,7 +50,6 @@ def frequencies(count: int = 12, highest: float = 7.0) -> Reals:
 
 
 def half_values(surface: Smooth, eps: float = 1e-14) -> NDArray[np.complex128]:
-    """The field of a surface on the half lattice."""
     return np.asarray(fourier_transform(surface, LATTICE, eps, threads=1).values)
 
 
@@ -84,19 +82,6 @@ def test_solids_of_revolution_are_their_bessel_integrals(name: str) -> None:
     found = half_values(surface)[[16, 21, 32], 16, 0]
     along_x = [exact(k * LATTICE.spacing, 0.0, 0.0) for k in (0, 5, 16)]
     assert found == pytest.approx(np.array(along_x), abs=1e-12 * surface.area)
-
-
-@pytest.mark.parametrize("surface", SMOOTH, ids=lambda surface: type(surface).__name__)
-def test_a_similarity_turns_and_scales_the_transform(surface: Smooth) -> None:
-    scale, origin = 0.6, np.array([0.5, -0.3, 0.1])
-    moved = Similarity(scale, (0.5, -0.3, 0.1)).apply(surface)
-    assert isinstance(moved, Smooth)
-    points = frequencies()
-    expected = scale**2 * np.exp(2j * np.pi * scale * (points @ origin)) * exact_values(surface, scale * points)
-    assert exact_values(moved, points) == pytest.approx(expected, abs=1e-12 * moved.area)
-
-
-# The nodes.
 
 
 @pytest.mark.slow
@@ -137,9 +122,6 @@ def test_a_kink_is_refused_with_both_numbers(monkeypatch: pytest.MonkeyPatch) ->
         resolution_of(Torus(1.0, 0.4), 1e4, 1e-9)
     # Where less is asked for, it converges, if slowly.
     assert resolution_of(surface, 2.0, 1e-4)[1] <= 1e-4
-
-
-# What is said of the error.
 
 
 def test_too_few_nodes_are_found_out(monkeypatch: pytest.MonkeyPatch) -> None:

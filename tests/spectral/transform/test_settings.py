@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
 
 from sobolev_batch import InputError, Lattice, Mesh, Sphere, fourier_transform, icosphere, norm
 from sobolev_batch.spectral.backends import ComplexDtype
@@ -19,13 +18,12 @@ from sobolev_batch.spectral.transform.transform import transform_block
 from tests.support.shapes import CENTRED_BOX as BOX
 
 LATTICE = Lattice(3.0, 32)
-CYLINDER = trimesh.creation.cylinder(radius=0.4, height=1.2, sections=40)
+
 # One corner drawn out: triangles of very different sizes in one mesh.
 DRAWN = icosphere(3).vertices.copy()
 DRAWN[0] *= 1.9
 MESHES = {
     "box": BOX,
-    "cylinder": Mesh(CYLINDER.vertices, CYLINDER.faces),
     "icosphere": icosphere(4),
     "drawn": Mesh(0.6 * DRAWN, icosphere(3).triangles),
 }

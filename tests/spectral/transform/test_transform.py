@@ -134,15 +134,6 @@ print(after - before, said, values.nbytes)
         assert taken > 0.3 * said  # an estimate far too high would divide what fits
 
 
-@pytest.mark.slow
-def test_the_papers_quadrature_stays_available() -> None:
-    lattice, mesh = Lattice(5.0, 32), icosphere(4)
-    paper = fourier_transform(mesh, lattice, 1e-12, quadrature="gauss8")
-    assert np.abs(paper - fourier_transform(mesh, lattice, 1e-12)).max() < 1e-11 * mesh.area
-    settings = TransformSettings(1e-6, quadrature="gauss8")
-    assert transform_block(mesh, lattice, lattice.half, settings).points == 64 * 5120
-
-
 def test_refuses_meshes_that_would_fold() -> None:
     lattice = Lattice(5.0, 16)  # half period 0.8
     with pytest.raises(LatticeError, match=r"\|coordinate\| = 1, .* < 1/\(2h\) = 0.8; take M >= 22"):
