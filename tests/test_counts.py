@@ -6,6 +6,7 @@ A count is the same on each machine, where seconds are not. A change that raises
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import finufft
@@ -23,18 +24,6 @@ def run_study(store: str, *levels: int) -> None:
     """Run a study of some icospheres in threads of this process, where calls are counted."""
     family = [{"name": "ico", "source": "icosphere", "levels": list(levels)}]
     sb.run(sb.Study.from_table(small_table(family=family)), f"memory://counts-{store}")
-
-
-def first_run(store: str, *levels: int) -> Callable[[], object]:
-    return lambda: run_study(store, *levels)
-
-
-def norms(times: int) -> Callable[[], object]:
-    return lambda: [sb.norm(FINE, -4.0, lattice=SMALL_LATTICE) for _ in range(times)]
-
-
-def second_run() -> None:
-    run_study("second", 0, 1)
 
 
 # Each call, with the most NUFFTs, points in them and terms of exact transforms that it may take, and why it takes them.
@@ -90,17 +79,17 @@ WORK: dict[str, tuple[Callable[[], object], int, int, int, str]] = {
         "a rough norm of the reference, and the two fields on two lattices",
     ),
     "study of one mesh": (
-        first_run("one", 1),
+        partial(run_study, "one", 1),
         *(1, 10_400, 2_560),
         "its field, as for a distance; the reference is a sphere",
     ),
     "study of two meshes": (
-        first_run("two", 1, 2),
+        partial(run_study, "two", 1, 2),
         *(2, 31_840, 12_800),
         "one field of each mesh, whatever is compared with it",
     ),
     "second run of a study": (
-        second_run,
+        partial(run_study, "second", 0, 1),
         *(0, 0, 0),
         "its fields are stored, with their probes",
     ),
@@ -139,7 +128,7 @@ def work_of(call: Callable[[], object]) -> dict[str, int]:
 @pytest.mark.parametrize("name", WORK)
 def test_a_call_takes_no_more_work_than_its_row(name: str) -> None:
     call, *most, reason = WORK[name]
-    if call is second_run:
+    if name == "second run of a study":
         assert work_of(call)["transforms"] == 2
     work = work_of(call)
     assert all(count <= limit for count, limit in zip(work.values(), most, strict=True)), (work, most, reason)
@@ -147,6 +136,7 @@ def test_a_call_takes_no_more_work_than_its_row(name: str) -> None:
 
 def test_a_count_sees_each_transform() -> None:
     # Else all rows would hold of a count that sees nothing.
-    one, two = (work_of(norms(times)) for times in (1, 2))
+    norm = WORK["norm of a mesh"][0]
+    one, two = work_of(norm), work_of(lambda: (norm(), norm()))
     assert min(one.values()) > 0
     assert two == {name: 2 * count for name, count in one.items()}

@@ -30,7 +30,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def words(text: str) -> list[str]:
-    """Return the words of a text, without its markup."""
     return re.findall(r"\w+", html.unescape(re.sub("<[^>]+>", " ", text)))
 
 

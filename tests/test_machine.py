@@ -35,10 +35,7 @@ MEMORY: dict[str, tuple[str | None, dict[str, str], int | None]] = {
     "version 1": (V1, {"memory/jobs/7/memory.limit_in_bytes": "4000000"}, 4_000_000),
     "version 1, around": (
         V1,
-        {
-            "memory/jobs/7/memory.limit_in_bytes": "9223372036854771712",
-            "memory/jobs/memory.limit_in_bytes": "4500000",
-        },
+        {"memory/jobs/7/memory.limit_in_bytes": "9223372036854771712", "memory/jobs/memory.limit_in_bytes": "4500000"},
         4_500_000,
     ),
 }

@@ -10,25 +10,13 @@ import sobolev_batch as sb
 from tests.support.repository import PACKAGE, imported
 
 # Each may import those before it.
-LAYERS = (
-    "visible",
-    "errors",
-    "parameters",
-    "surfaces",
-    "spectral",
-    "fitting",
-    "batch",
-    "results",
-    "testing",
-    "cli",
-)
+LAYERS = ("visible", "errors", "parameters", "surfaces", "spectral", "fitting", "batch", "results", "testing", "cli")
 MOST_NAMES_OF_A_FOLDER = 20
 
 Path = tuple[str, ...]
 
 
 def modules() -> dict[str, Path]:
-    """The modules of the package by their dotted names, as paths from its root."""
     found = {}
     for file in PACKAGE.rglob("*.py"):
         parts = file.relative_to(PACKAGE).with_suffix("").parts

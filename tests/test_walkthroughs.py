@@ -43,17 +43,12 @@ def rough(mesh: sb.Mesh, share: float, seed: int = 0) -> sb.Mesh:
     return sb.Mesh(mesh.vertices + noise, mesh.triangles)
 
 
-def shrunk(mesh: sb.Mesh, factor: float) -> sb.Mesh:
-    return sb.Mesh(factor * mesh.vertices, mesh.triangles)
-
-
 def write(mesh: sb.Mesh, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     sb.write_mesh(mesh, path)
 
 
 def remeshers(folder: Path) -> None:
-    """Four objects, five methods, five sizes, and new meshes of one method."""
     ball = sb.icosphere(3)
     objects = {
         "egg": sb.Ellipsoid((1.0, 0.8, 0.6)).mesh(3),
@@ -66,7 +61,7 @@ def remeshers(folder: Path) -> None:
         "quick": lambda mesh, count: decimated(mesh, count, 9.0),
         "careful": lambda mesh, count: decimated(mesh, count, 3.0),
         "noisy": lambda mesh, count: rough(decimated(mesh, count), 0.03),
-        "shrinking": lambda mesh, count: shrunk(decimated(mesh, count), 0.97),
+        "shrinking": lambda mesh, count: decimated(mesh, count).moved(0.97, (0.0, 0.0, 0.0)),
     }
     for name, mesh in objects.items():
         write(mesh, folder / "remeshers" / "objects" / f"{name}.ply")
@@ -87,7 +82,6 @@ def brains(folder: Path) -> None:
 
 
 def scans(folder: Path) -> None:
-    """A part, two hundred scans of it, and ten more."""
     part = sb.Torus().mesh(24, 12)
     write(part, folder / "scans" / "part.ply")
     for number in range(210):
@@ -102,12 +96,11 @@ def statue(folder: Path) -> None:
 
 
 def part(folder: Path) -> None:
-    """A fine tessellation in millimetres, coarser ones, and one in inches."""
     ring = sb.Torus(40.0, 12.0)
     write(ring.mesh(144, 72), folder / "part" / "part.stl")
     for name, cells in (("rough", 16), ("middle", 32), ("fine", 96)):
         write(ring.mesh(cells, cells // 2), folder / "part" / "exported" / f"{name}.stl")
-    write(shrunk(ring.mesh(96, 48), 1 / 25.4), folder / "part" / "inches.stl")
+    write(ring.mesh(96, 48).moved(1 / 25.4, (0.0, 0.0, 0.0)), folder / "part" / "inches.stl")
 
 
 # What makes the files, and what the reader is told to look for, as regular expressions.

@@ -33,7 +33,6 @@ def main(sequences: int, meshes: int, strikes: int, rate: float, damaged: int, s
 
 
 def strike(folder: Path, seeds: range, meshes: int, count: int, rate: float) -> bool:
-    """Show what came of sequences of strikes, and return whether anything was lost."""
     found, is_bad = Counter[str](), False
     plans = {seed: strikes_of(seed, count, meshes) for seed in seeds}
     for seed, outcome in zip(seeds, strike_all(folder, plans, meshes, rate), strict=True):

@@ -63,7 +63,6 @@ class Corruption(NamedTuple):
 
 
 def corruptions(folder: Path, count: int, seed: int) -> Iterator[Corruption]:
-    """Yield a number of corruptions of one store."""
     stores = finished_stores(folder)
     store = stores["whole"]
     truths = {name: read(store) for name, read in WAYS.items()}

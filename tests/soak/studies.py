@@ -1,4 +1,4 @@
-"""A study of many small meshes, each a file of its own, and whether two stores of it hold the same."""
+"""A study of many small meshes, each a file of its own."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ import pytest
 
 from sobolev_batch import open_store
 from tests.soak.corruptions import BAD, answer_to, corruptions
-from tests.soak.strikes import EXCHANGED, ROLES, SIGNALS, Strike, strike_all, strikes_of
+from tests.soak.strikes import EXCHANGED, Strike, strike_all
 from tests.support.stores import differences
 
 pytestmark = pytest.mark.all
@@ -36,11 +36,6 @@ def test_nothing_is_lost_by_strikes_and_failing_requests_and_it_would_be_noticed
     found = list(differences(open_store(other), open_store(clean)))
     assert found[:3] == ["bumpy/000002: another field", "bumpy/000003: another field", "bumpy/000004: missing"]
     assert [difference.split(":")[0] for difference in found[3:]] == ["norms"]
-
-
-def test_strikes_are_of_all_kinds() -> None:
-    kinds = {(one.role, one.what) for seed in range(30) for one in strikes_of(seed, 5, 60)}
-    assert kinds == {(role, what) for role in ROLES for what in SIGNALS} | {EXCHANGED}
 
 
 def test_no_number_changes_without_a_word(tmp_path: Path) -> None:

@@ -24,7 +24,6 @@ class Browser:
         self.driver = driver
 
     def open(self, path: Path, *, width: int = 1100, height: int = 800) -> None:
-        """Load a page and wait for its pictures."""
         self.command(
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 500
         )

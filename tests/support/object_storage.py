@@ -152,7 +152,6 @@ class Server:
         return [answer[: len(answer) // 2] if kind == "truncated" else answer]
 
     def _draw(self, method: str, path: str) -> Kind | None:
-        """Return the kind of failure of a new request, if it is to fail."""
         with self._lock:
             if self._turn and self._turn[0][0] == method and self._turn[0][1] in path:
                 *_, rule = self._turn.pop()

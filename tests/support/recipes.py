@@ -42,7 +42,6 @@ def environment(home: Path, **variables: str) -> dict[str, str]:
 
 
 def run_recipe(folder: Path, *words: object, **variables: str) -> CompletedProcess[str]:
-    """Run a program to its end in a folder, which is its home too unless a variable names another one."""
     return finished(*words, cwd=folder, env=environment(folder, **variables))
 
 

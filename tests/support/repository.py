@@ -16,7 +16,6 @@ PACKAGE = Path(sb.__file__).parent
 
 
 def blocks(path: str, language: str) -> list[str]:
-    """The fenced blocks of a page that are in a language."""
     return re.findall(rf"^```{language}\n(.*?)^```", (ROOT / path).read_text(encoding="utf-8"), re.M | re.S)
 
 

@@ -44,7 +44,6 @@ def changed(path: str, value: Any) -> dict[str, Any]:
 
 
 def balls(**radii: float) -> list[dict[str, Any]]:
-    """Return objects of a collection whose references are spheres."""
     return [
         {"name": label, "reference": {"source": "sphere", "radius": radius}, "scaling": {"mode": "none"}}
         for label, radius in radii.items()
