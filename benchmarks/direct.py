@@ -3,7 +3,7 @@
 The transform of a triangle of area A is 2A times the second divided difference of exp at its three
 imaginary nodes. Quotients serve separated nodes, and a short series takes over where nodes meet,
 which keeps some eleven digits: enough for a contestant in speed, and the oracle is
-`sobolev_batch.spectral.triangles`.
+`sobolev_batch.spectral.exact`.
 """
 
 from __future__ import annotations

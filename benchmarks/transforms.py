@@ -14,9 +14,9 @@ from benchmarks.paper import Complexes, faster_upsampling, relative_distance, wh
 from benchmarks.table import Row, as_seconds, at_least, at_most
 from benchmarks.timing import Effort, take_turns
 from sobolev_batch.spectral.backends import ComplexDtype
+from sobolev_batch.spectral.exact import exact_transform
 from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, TransformSettings, choose_settings
 from sobolev_batch.spectral.transform.transform import transform_block
-from sobolev_batch.spectral.triangles import exact_transform
 
 ORDER = -10.0
 XI_MAX = 5.0

@@ -32,9 +32,9 @@ from .fitting.gradient import gradient as gradient
 from .fitting.gradient import jax_function as jax_function
 from .fitting.gradient import torch_function as torch_function
 from .results.accessor import SobolevAccessor as SobolevAccessor
+from .results.figures.drawing import plot as plot
+from .results.figures.drawing import plot_league as plot_league
 from .results.figures.meshes import write_witness as write_witness
-from .results.figures.plots import plot as plot
-from .results.figures.plots import plot_league as plot_league
 from .results.figures.views import plot_witness as plot_witness
 from .results.open import open_store as open_store
 from .results.plan import CollectionPlan as CollectionPlan

@@ -13,7 +13,7 @@ import finufft
 import pytest
 
 import sobolev_batch as sb
-from sobolev_batch.spectral import triangles
+from sobolev_batch.spectral import exact
 from sobolev_batch.spectral.quadrature import kinds
 from tests.support.studies import SMALL_LATTICE, small_table
 
@@ -119,7 +119,7 @@ def work_of(call: Callable[[], object]) -> dict[str, int]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(finufft, "Plan", Plan)
-        for module in (kinds, triangles):
+        for module in (kinds, exact):
             patch.setattr(module, "exact_transform", counting(module.exact_transform))
         call()
     return {name: sum(count for kind, count in events if kind == name) for name in ("transforms", "points", "exact")}

@@ -250,8 +250,7 @@ def plot_command(
     from the study; drawing needs the extra "vtk". By default a few are chosen by their distances.
     """
     from sobolev_batch.batch.collection_store import CollectionStore
-    from sobolev_batch.results.figures.drawing import LEAGUE
-    from sobolev_batch.results.figures.plots import write_plots
+    from sobolev_batch.results.figures.drawing import LEAGUE, write_plots
     from sobolev_batch.results.figures.selection import Selection
     from sobolev_batch.results.figures.style import drawing, parse_size, write_figures
     from sobolev_batch.results.figures.views import write_witness_plots

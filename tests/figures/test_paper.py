@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sobolev_batch import Lattice, Sphere, distance, fourier_transform, icosphere, norm
+from sobolev_batch.spectral.exact import sphere_block
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
-from sobolev_batch.spectral.spheres import sphere_block
 
 FIGURE_1B = {
     16: (2.755e00, 4.426e00),

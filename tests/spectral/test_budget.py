@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Mesh, Sphere, distance, fourier_transform, icosphere, norm
 from sobolev_batch.spectral.budget import NormEstimate, Sums, Support, truncated
+from sobolev_batch.spectral.exact import sphere_distance, sphere_inner_product
 from sobolev_batch.spectral.fields import Quality
 from sobolev_batch.spectral.shells import SobolevWeights
-from sobolev_batch.spectral.spheres import sphere_distance, sphere_inner_product
 from sobolev_batch.surfaces.shapes.surface import Surface
 from tests.support.shapes import CENTRED_BOX as BOX
 

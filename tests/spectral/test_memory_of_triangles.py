@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from sobolev_batch import Mesh, Similarity, icosphere
-from sobolev_batch.spectral.octaves.normals import FaceNormals
-from sobolev_batch.spectral.triangles import exact_transform, sampled_transform
+from sobolev_batch.spectral.exact import exact_transform, sampled_transform
+from sobolev_batch.spectral.octaves.sampling import FaceNormals
 from sobolev_batch.surfaces.shapes.mesh import shared_triangles
 
 # 327,680 triangles, of which whole arrays stand out from what the process takes anyway.

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sobolev_batch import Lattice, OrderError, Sphere, norm
-from sobolev_batch.spectral.spheres import sphere_block, sphere_inner_product, sphere_transform
+from sobolev_batch.spectral.exact import sphere_block, sphere_inner_product, sphere_transform
 
 
 @pytest.mark.parametrize(

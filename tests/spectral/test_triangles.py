@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sobolev_batch import Mesh, icosphere
-from sobolev_batch.spectral.triangles import exact_transform, sampled_transform
+from sobolev_batch.spectral.exact import exact_transform, sampled_transform
 from tests.support.shapes import box, tetrahedron
 
 Reals = NDArray[np.float64]

@@ -23,13 +23,12 @@ from sobolev_batch.errors import AccuracyError, InputError, MeshError, StudyErro
 from sobolev_batch.parameters import available_cores
 from sobolev_batch.spectral.adaptive.octaves import solve_in_octaves
 from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, error_target
-from sobolev_batch.spectral.adaptive.solve import Pilot, coarser_than, permits_octaves, prefers_octaves, run_pilot
+from sobolev_batch.spectral.adaptive.solve import coarser_than, permits_octaves, prefers_octaves, run_pilot
 from sobolev_batch.spectral.adaptive.tolerance import FINER_LATTICE, Accuracy, core_lattice, good_intervals, lattice_of
 from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.budget import NormEstimate, Support
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.octaves.normals import FaceNormals
-from sobolev_batch.spectral.octaves.sampling import OctaveSampling, TailSampling
+from sobolev_batch.spectral.octaves.sampling import FaceNormals, OctaveSampling, TailSampling
 from sobolev_batch.spectral.probe import estimate
 from sobolev_batch.surfaces.shapes.surface import Extent, Similarity, Surface
 from sobolev_batch.surfaces.sources.registry import Member
@@ -385,7 +384,7 @@ def _in_octaves(problems: _Problems, dtype: ComplexDtype | None, distances: Mapp
     surfaces = [*first.surfaces[1:], *(problem.surfaces[0] for problem in problems.values())]
     tail = TailSampling.joined(lattice.xi_max, samplings, FaceNormals.from_surfaces(surfaces))
     target = error_target(closest, first.orders, first.accuracy, first.area)
-    singles = (problem.dtype(lattice, target) == "complex64" for problem in problems.values())
+    dtypes = (problem.dtype(lattice, target) for problem in problems.values())
     reasons = [
         f"xi_max {lattice.xi_max:.4g}, spacing {lattice.spacing:.4g} for the innermost frequencies: the surfaces "
         f"reach over {first.support.widths.max():.4g} units of length"
@@ -395,12 +394,12 @@ def _in_octaves(problems: _Problems, dtype: ComplexDtype | None, distances: Mapp
             f"{len(tail.octaves)} octaves up to |xi| {tail.highest_frequency:.4g} for the tail, from the closest of "
             f"{len(problems)} pilot pairs: {', '.join(lattices)}"
         )
-    return _choice(lattice, dtype, singles, closest, reasons, first, tail if tail.octaves else None), shortfalls
+    return _choice(lattice, dtype, dtypes, closest, reasons, first, tail if tail.octaves else None), shortfalls
 
 
 def _on_one_lattice(problems: _Problems, dtype: ComplexDtype | None) -> _Outcome:
     """Choose a lattice that reaches far enough for every pair."""
-    pilots: dict[str, Pilot] = {}
+    pilots: dict[str, tuple[Reals, Lattice, ComplexDtype]] = {}
     shortfalls: dict[str, AccuracyError] = {}
     for label, problem in problems.items():
         try:
@@ -410,29 +409,29 @@ def _on_one_lattice(problems: _Problems, dtype: ComplexDtype | None) -> _Outcome
     if shortfalls:
         return None, shortfalls
     first = next(iter(problems.values()))
-    highest = max(pilots, key=lambda label: pilots[label].lattice.xi_max)
-    period = max(1 / pilot.lattice.spacing for pilot in pilots.values())
-    lattice = lattice_of(pilots[highest].lattice.xi_max, period, first.accuracy.largest_intervals)
-    closest = np.min([pilot.values for pilot in pilots.values()], axis=0)
+    distances, lattices, dtypes = zip(*pilots.values(), strict=True)
+    label, largest = max(zip(pilots, lattices, strict=True), key=lambda pilot: pilot[1].xi_max)
+    period = max(1 / lattice.spacing for lattice in lattices)
+    lattice = lattice_of(largest.xi_max, period, first.accuracy.largest_intervals)
     reasons = (
-        f"xi_max {lattice.xi_max:.4g} for truncation, which {highest} needs most of {len(pilots)} pilot pairs",
+        f"xi_max {lattice.xi_max:.4g} for truncation, which {label} needs most of {len(pilots)} pilot pairs",
         f"spacing {lattice.spacing:.4g} for aliasing: the surfaces reach over {first.support.widths.max():.4g} units "
         "of length",
     )
-    return _choice(lattice, dtype, (pilot.single for pilot in pilots.values()), closest, reasons, first, None), {}
+    return _choice(lattice, dtype, dtypes, np.min(distances, axis=0), reasons, first, None), {}
 
 
 def _choice(
     lattice: Lattice,
     dtype: ComplexDtype | None,
-    singles: Iterable[bool],
+    needed: Iterable[ComplexDtype],
     closest: Reals,
     reasons: Iterable[str],
     problem: Problem,
     tail: TailSampling | None,
 ) -> LatticeChoice:
-    """Return a choice in the dtype that was requested, or in single precision where that is enough for every pair."""
-    dtype = dtype or ("complex64" if all(singles) else "complex128")
+    """Return a choice in the dtype that was requested, or in single precision where no pair needs more."""
+    dtype = dtype or ("complex128" if "complex128" in needed else "complex64")
     distances = ", ".join(
         f"{value:.2g} at order {order:g}" for value, order in zip(closest.tolist(), problem.orders, strict=True)
     )

@@ -10,14 +10,20 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, Solution, SurfaceValues, error_target
+from sobolev_batch.spectral.adaptive.problem import (
+    ESTIMATE_CAUTION,
+    Problem,
+    Solution,
+    SurfaceValues,
+    error_target,
+    only_or_difference,
+)
 from sobolev_batch.spectral.adaptive.tolerance import FINER_LATTICE, core_lattice, good_intervals
 from sobolev_batch.spectral.budget import aliased, change_of_root, sums_of_shells
-from sobolev_batch.spectral.fields import Field, field_for
+from sobolev_batch.spectral.fields import Field
 from sobolev_batch.spectral.lattice import Lattice, OctaveLattice
-from sobolev_batch.spectral.octaves.normals import FaceNormals
 from sobolev_batch.spectral.octaves.remainder import Remainder, remainder, tail_integral
-from sobolev_batch.spectral.octaves.sampling import Octave, OctaveSampling
+from sobolev_batch.spectral.octaves.sampling import FaceNormals, Octave, OctaveSampling
 from sobolev_batch.spectral.octaves.values import (
     POINTS_PER_SQUARE,
     OctaveSums,
@@ -31,7 +37,6 @@ from sobolev_batch.spectral.octaves.values import (
 )
 from sobolev_batch.spectral.probe import estimate as estimate_from
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
-from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.surfaces.shapes.smooth import Smooth
 
 Reals = NDArray[np.float64]
@@ -95,13 +100,9 @@ class Core:
         target = error_target(values, problem.orders, problem.accuracy, problem.area).tightened(
             2 * problem.inexact_count
         )
-        settings = TransformSettings(dtype=problem.dtype(lattice, target))
-        fields = tuple(
-            field_for(surface, lattice, target, settings, Execution(threads=problem.threads), sample=sample)
-            for surface, sample in zip(problem.surfaces, samples, strict=True)
-        )
+        fields = problem.fields(lattice, samples, target, problem.dtype(lattice, target))
         weights = SobolevWeights(lattice, problem.orders, cutoff)
-        difference = _difference([field.values for field in fields])
+        difference = only_or_difference([field.values for field in fields])
         sums = sums_of_shells(shell_sums(difference, None, lattice, lattice.half), weights)
         errors = np.sum([field.quality.probe.norms(weights) for field in fields], axis=0)
         images = aliased(sums, weights, problem.support.widths)
@@ -339,7 +340,7 @@ def _measured(state: State, sampling: OctaveSampling, known: MeasuredOctave | No
         )
         for number, surface in enumerate(problem.surfaces)
     )
-    squares = squared_moduli(_difference([values.values for values in of_surfaces]))
+    squares = squared_moduli(only_or_difference([values.values for values in of_surfaces]))
     return MeasuredOctave(of_surfaces, OctaveWeights(sampling, problem.orders).sums(squares))
 
 
@@ -421,8 +422,3 @@ def _resolvable_frequency(problem: Problem) -> float:
     """Return the frequency up to which all surfaces can be transformed."""
     areas = [surface.area for surface in problem.surfaces if isinstance(surface, Smooth)]
     return float((_MOST_SMOOTH_NODES / (4 * POINTS_PER_SQUARE * max(areas))) ** 0.5) if areas else np.inf
-
-
-def _difference(values: Sequence[NDArray[np.complexfloating]]) -> NDArray[np.complexfloating]:
-    """Return the only field, or the difference of two."""
-    return values[0] if len(values) == 1 else values[0] - values[1]

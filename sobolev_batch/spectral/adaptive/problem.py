@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import AccuracyError
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy, unreachable
-from sobolev_batch.spectral.backends import ComplexDtype
+from sobolev_batch.spectral.backends import ComplexDtype, Complexes
 from sobolev_batch.spectral.budget import NormEstimate, Support
-from sobolev_batch.spectral.fields import USUAL_DEGREE, Field
+from sobolev_batch.spectral.fields import USUAL_DEGREE, Field, field_for
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.sampling import OctaveSampling
 from sobolev_batch.spectral.octaves.values import OctaveValues
@@ -115,6 +115,14 @@ class Problem:
         single = all(permits_single(surface, lattice, target) for surface in self.surfaces)
         return "complex64" if single else "complex128"
 
+    def fields(self, lattice: Lattice, samples: Samples, target: ErrorTarget, dtype: ComplexDtype) -> tuple[Field, ...]:
+        """Return the fields of all surfaces, each with an error within a target."""
+        settings, execution = TransformSettings(dtype=dtype), Execution(threads=self.threads)
+        return tuple(
+            field_for(surface, lattice, target, settings, execution, sample=sample)
+            for surface, sample in zip(self.surfaces, samples, strict=True)
+        )
+
     def require_above_rounding(self, values: Reals) -> None:
         """Refuse an accuracy of norms or distances (orders,) that lies below the rounding of fields.
 
@@ -157,6 +165,11 @@ def error_target(values: Reals, orders: tuple[float, ...], accuracy: Accuracy, a
 
 def _discretisation_parts(orders: Sequence[float], accuracy: Accuracy) -> Reals:
     return np.array([accuracy.discretisation_part(order) for order in orders])
+
+
+def only_or_difference(values: Sequence[Complexes]) -> Complexes:
+    """Return the only values, or the difference of two."""
+    return values[0] if len(values) == 1 else values[0] - values[1]
 
 
 def support_of(surfaces: Sequence[Surface]) -> Support:

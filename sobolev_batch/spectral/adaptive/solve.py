@@ -20,18 +20,19 @@ from sobolev_batch.spectral.adaptive.problem import (
     Solution,
     SurfaceValues,
     error_target,
+    only_or_difference,
 )
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy, first_lattice, larger_pilot, lattice_of, refined
 from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.budget import NormEstimate, Sums, estimate_norms, modulus_bound, sums_of_shells
-from sobolev_batch.spectral.fields import Field, field_for
+from sobolev_batch.spectral.fields import Field
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.octaves.normals import FaceNormals
 from sobolev_batch.spectral.octaves.remainder import LOWEST_ORDER, remainder
+from sobolev_batch.spectral.octaves.sampling import FaceNormals
 from sobolev_batch.spectral.probe import Sample, estimate
 from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
-from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, TransformSettings
+from sobolev_batch.spectral.transform.settings import ErrorTarget
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Surface
 
@@ -61,21 +62,6 @@ _PILOT_RTOL = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Pilot:
-    """Requirements of a pair of surfaces.
-
-    Attributes:
-        values: Rough distances (orders,).
-        lattice: Lattice that the accuracy needs.
-        single: True if single precision suffices.
-    """
-
-    values: Reals
-    lattice: Lattice
-    single: bool
-
-
-@dataclass(frozen=True, eq=False)
 class DistanceTarget:
     """Accuracy of the distance between a surface and a reference, for which the surface's field is computed.
 
@@ -100,14 +86,6 @@ class DistanceTarget:
         return error_target(values, self.orders, self.accuracy, surface.area).tightened(_PAIR)
 
 
-@dataclass(frozen=True)
-class _Step:
-    """A lattice to compute on, and True if it is a small one that only shows how large distances are."""
-
-    lattice: Lattice
-    is_pilot: bool
-
-
 def solve(problem: Problem, seed: int = 0) -> Solution:
     """Compute a norm or a distance to an accuracy.
 
@@ -127,11 +105,11 @@ def solve(problem: Problem, seed: int = 0) -> Solution:
     if not problem.surfaces:
         return Solution.zero(problem.orders)
     strict = replace(problem, accuracy=replace(problem.accuracy, best_effort=False))
-    step = _first_step(strict)
-    on_lattices, in_octaves = partial(_solve_on_lattices, strict, step), partial(solve_in_octaves, strict, seed)
+    first = first_lattice(problem.support, problem.orders, problem.accuracy)
+    on_lattices, in_octaves = partial(_solve_on_lattices, strict, *first), partial(solve_in_octaves, strict, seed)
     attempts = [on_lattices]
-    seem_equal = bool(_near_duplicates(problem, step.lattice).any())
-    if seem_equal and _differ_beyond(problem, step.lattice):
+    seem_equal = bool(_near_duplicates(problem, first[0]).any())
+    if seem_equal and _differ_beyond(problem, first[0]):
         # No lattice would show it.
         attempts = [in_octaves]
     elif permits_octaves(problem.accuracy):
@@ -152,7 +130,7 @@ def solve(problem: Problem, seed: int = 0) -> Solution:
         refusals.append(solution.shortfall)
     if not problem.accuracy.best_effort:
         raise min(refusals, key=attrgetter("reachable"))
-    nearest = nearest or [_solve_on_lattices(problem, step)]
+    nearest = nearest or [_solve_on_lattices(problem, *first)]
     if min(map(_largest_share, nearest)) > _OCTAVES_AT_ALL:
         nearest += _in_coarser_octaves(strict, seed)
     return min(nearest, key=_largest_share)
@@ -199,7 +177,9 @@ def prefers_octaves(problem: Problem) -> bool:
     """
     is_regular = max(problem.orders) < _LOW_ORDER or not FaceNormals.from_surfaces(problem.surfaces)
     least = _OCTAVES_FIRST if is_regular else _OCTAVES_AT_ALL
-    return problem.accuracy.rtol >= least and (not is_regular or _first_step(problem).is_pilot)
+    if problem.accuracy.rtol < least:
+        return False
+    return not is_regular or first_lattice(problem.support, problem.orders, problem.accuracy)[1]
 
 
 def permits_octaves(accuracy: Accuracy) -> bool:
@@ -210,7 +190,7 @@ def permits_octaves(accuracy: Accuracy) -> bool:
 def _near_duplicates(problem: Problem, lattice: Lattice) -> NDArray[np.bool_]:
     """Tell at which orders exact values differ by no more than rounding, (orders,)."""
     samples = problem.samples(lattice)
-    difference = samples[0].exact - (samples[1].exact if len(samples) > 1 else 0.0)
+    difference = only_or_difference([sample.exact for sample in samples])
     # In a large unit of length a small lattice holds next to nothing of a norm, whatever the difference.
     is_small = float(np.abs(difference).max()) <= problem.rounding
     return is_small & (estimate(samples, problem.orders) <= problem.rounding)
@@ -220,35 +200,37 @@ def _differ_beyond(problem: Problem, lattice: Lattice) -> bool:
     """Tell whether surfaces that agree on a lattice differ at higher frequencies, as two shifts of a fine grid do."""
     draws = problem.samples(lattice)[0].draws
     frequencies = np.concatenate([factor * draws.frequencies for factor in _BEYOND])
-    first, *others = (kind_of(surface).exact_values(frequencies) for surface in problem.surfaces)
-    difference = np.abs(first - others[0]) if others else np.abs(first)
+    difference = only_or_difference([kind_of(surface).exact_values(frequencies) for surface in problem.surfaces])
     # Rounding of coordinates turns the phases at high frequencies.
     phases = 2 * np.pi * problem.support.reach * np.linalg.norm(frequencies, axis=1)
-    return bool(np.any(difference > problem.rounding * (1 + phases)))
+    return bool(np.any(np.abs(difference) > problem.rounding * (1 + phases)))
 
 
-def _solve_on_lattices(problem: Problem, step: _Step, *, before_octaves: bool = False) -> Solution:
+def _solve_on_lattices(problem: Problem, lattice: Lattice, is_pilot: bool, *, before_octaves: bool = False) -> Solution:
     """Return the first solution that meets the accuracy, else the last of a few rounds or of the largest lattice.
+
+    A pilot is a small lattice that only shows how large distances are.
 
     Raises:
         AccuracyError: The accuracy is out of reach, and no best effort.
     """
     values: Reals | None = None
     # Their fields may differ by a little more.
-    equal = _near_duplicates(problem, step.lattice)
+    equal = _near_duplicates(problem, lattice)
     for rounds_left in reversed(range(_ROUNDS)):
-        samples = problem.samples(step.lattice)
+        samples = problem.samples(lattice)
         if values is None:
             values = ESTIMATE_CAUTION * estimate(samples, problem.orders)
         problem.require_above_rounding(values)
-        accuracy = _of_pilot(problem.accuracy) if step.is_pilot else problem.accuracy
+        accuracy = _of_pilot(problem.accuracy) if is_pilot else problem.accuracy
         target = error_target(values, problem.orders, accuracy, problem.area).tightened(problem.inexact_count)
-        solution, sums = _compute(problem, step.lattice, samples, target, problem.dtype(step.lattice, target))
+        solution, sums = _compute(problem, lattice, samples, target, problem.dtype(lattice, target))
         values = solution.estimate.values
         has_no_digit = equal | (values <= problem.rounding)
         is_met = bool(np.all(problem.accuracy.met(solution.estimate) | has_no_digit))
         if not is_met and rounds_left:
-            step, before = _next_step(problem, step, sums), step
+            step, before = _next_lattice(problem, lattice, sums), (lattice, is_pilot)
+            lattice, is_pilot = step
             if step == before and problem.accuracy.best_effort:
                 break
         elif not is_met or np.all(has_no_digit):
@@ -258,8 +240,8 @@ def _solve_on_lattices(problem: Problem, step: _Step, *, before_octaves: bool = 
             is_met = bool(np.all(problem.accuracy.met(solution.estimate) | has_no_digit))
             if is_met or larger is None or not rounds_left:
                 break
-            step = _Step(larger, is_pilot=False)
-    shortfall = None if is_met else problem.out_of_reach(solution.estimate, f"on a lattice of M = {step.lattice.M}")
+            lattice, is_pilot = larger, False
+    shortfall = None if is_met else problem.out_of_reach(solution.estimate, f"on a lattice of M = {lattice.M}")
     return _not_below_rounding(problem, replace(solution, shortfall=shortfall))
 
 
@@ -323,7 +305,7 @@ def _quick_intervals(problem: Problem) -> int:
 def _beyond_lattice(problem: Problem, solution: Solution) -> tuple[Reals, Reals]:
     """Return the squared norm beyond a solution's lattice (orders,) from close points, and how far off it may be."""
     lattice, fields = cast(Lattice, solution.lattice), [values.field for values in solution.values]
-    difference = fields[0].values if len(fields) == 1 else fields[0].values - fields[1].values
+    difference = only_or_difference([field.values for field in fields])
     known = tuple(max(order, LOWEST_ORDER) for order in problem.orders)
     # What the lattice shows of the range in which the step falls.
     shown = SobolevWeights(lattice, known).per_shell - SobolevWeights(lattice, known, lattice.xi_max).per_shell
@@ -341,63 +323,54 @@ def _not_below_rounding(problem: Problem, solution: Solution) -> Solution:
     return replace(solution, estimate=replace(found, discretisation=np.maximum(found.discretisation, rounding)))
 
 
-def run_pilot(problem: Problem) -> Pilot:
-    """Find out on a small lattice what a pair of surfaces needs for an accuracy.
+def run_pilot(problem: Problem) -> tuple[Reals, Lattice, ComplexDtype]:
+    """Return the rough distances (orders,) of a pair of surfaces, and the lattice and dtype that its accuracy needs.
 
     Raises:
         AccuracyError: The accuracy cannot be met within the memory.
     """
-    step = _first_step(problem)
+    lattice, is_pilot = first_lattice(problem.support, problem.orders, problem.accuracy)
     while True:
-        samples = problem.samples(step.lattice)
+        samples = problem.samples(lattice)
         values = estimate(samples, problem.orders)
         target = error_target(values, problem.orders, _of_pilot(problem.accuracy), problem.area).tightened(_PAIR)
-        solution, sums = _compute(problem, step.lattice, samples, target, "complex128")
+        solution, sums = _compute(problem, lattice, samples, target, "complex128")
         values = solution.estimate.values
         problem.require_above_rounding(values)
-        step = _next_step(problem, step, sums)
-        if not step.is_pilot:
+        lattice, is_pilot = _next_lattice(problem, lattice, sums)
+        if not is_pilot:
             break
     target = error_target(values, problem.orders, problem.accuracy, problem.area).tightened(_PAIR)
     for rounds_left in reversed(range(_ROUNDS)):
-        dtype = problem.dtype(step.lattice, target)
-        solution, _ = _compute(problem, step.lattice, problem.samples(step.lattice), target, dtype)
+        dtype = problem.dtype(lattice, target)
+        solution, _ = _compute(problem, lattice, problem.samples(lattice), target, dtype)
         solution, larger = _with_hidden_part(problem, solution, permits_octaves(problem.accuracy))
         allowed = problem.accuracy.rtol * problem.accuracy.scale(values)
         if np.all(solution.estimate.truncation <= allowed) or problem.accuracy.best_effort:
             break
         if larger is None or not rounds_left:
-            raise problem.out_of_reach(solution.estimate, f"on a lattice of M = {step.lattice.M}")
-        step = _Step(larger, is_pilot=False)
-    return Pilot(values, step.lattice, dtype == "complex64")
+            raise problem.out_of_reach(solution.estimate, f"on a lattice of M = {lattice.M}")
+        lattice = larger
+    return values, lattice, dtype
 
 
-def _first_step(problem: Problem) -> _Step:
-    return _Step(*first_lattice(problem.support, problem.orders, problem.accuracy))
-
-
-def _next_step(problem: Problem, step: _Step, sums: Sums) -> _Step:
-    """Return the step on the lattice that the sums of a step call for, or on a larger pilot's."""
-    weights = SobolevWeights(step.lattice, problem.orders)
+def _next_lattice(problem: Problem, lattice: Lattice, sums: Sums) -> tuple[Lattice, bool]:
+    """Return the lattice that the sums on a lattice call for, and False; or that of a larger pilot, and True."""
+    weights = SobolevWeights(lattice, problem.orders)
     try:
-        lattice = refined(sums, weights, problem.support, problem.accuracy, problem.label)
+        return refined(sums, weights, problem.support, problem.accuracy, problem.label), False
     except AccuracyError:
-        larger = larger_pilot(step.lattice, problem.accuracy)
+        larger = larger_pilot(lattice, problem.accuracy)
         if larger is None:
             raise
-        return _Step(larger, is_pilot=True)
-    return _Step(lattice, is_pilot=False)
+        return larger, True
 
 
 def _compute(
     problem: Problem, lattice: Lattice, samples: Samples, target: ErrorTarget, dtype: ComplexDtype
 ) -> tuple[Solution, Sums]:
     """Compute the norm or distance on a lattice, from fields with an error within a target."""
-    settings, execution = TransformSettings(dtype=dtype), Execution(threads=problem.threads)
-    fields = tuple(
-        field_for(surface, lattice, target, settings, execution, sample=sample)
-        for surface, sample in zip(problem.surfaces, samples, strict=True)
-    )
+    fields = problem.fields(lattice, samples, target, dtype)
     found, sums = difference_on(problem, lattice, fields)
     return Solution(found, lattice, tuple(map(SurfaceValues, fields))), sums
 
@@ -405,7 +378,7 @@ def _compute(
 def difference_on(problem: Problem, lattice: Lattice, fields: Sequence[Field]) -> tuple[NormEstimate, Sums]:
     """Return the norm of the only field, or of the difference of two, and the sums that it follows from."""
     weights = SobolevWeights(lattice, problem.orders)
-    difference = fields[0].values if len(fields) == 1 else fields[0].values - fields[1].values
+    difference = only_or_difference([field.values for field in fields])
     sums = sums_of_shells(shell_sums(difference, None, lattice, lattice.half), weights)
     errors = np.sum([field.quality.probe.norms(weights) for field in fields], axis=0)
     return estimate_norms(sums, weights, problem.support, errors), sums

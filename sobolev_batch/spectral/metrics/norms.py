@@ -26,6 +26,7 @@ from sobolev_batch.spectral.budget import (
     estimate_norms,
     sums_of_shells,
 )
+from sobolev_batch.spectral.exact import sphere_distance, sphere_inner_product, sphere_norm
 from sobolev_batch.spectral.fields import (
     OperandLike,
     as_operand,
@@ -38,7 +39,6 @@ from sobolev_batch.spectral.fields import (
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.datasets import VARIABLES, labelled, labelled_distances, lattice_attributes
 from sobolev_batch.spectral.shells import Orders, Reals, SobolevWeights, check_orders
-from sobolev_batch.spectral.spheres import sphere_distance, sphere_inner_product, sphere_norm
 from sobolev_batch.surfaces.formats.readers import as_surface
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent

@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 from scipy.special import beta, betainc, stdtrit
 
 from sobolev_batch.errors import InputError
+from sobolev_batch.spectral.quadrature.kinds import resolution_of
 from sobolev_batch.spectral.quadrature.rules import symmetric_rule
-from sobolev_batch.spectral.quadrature.smooth import resolution_of
 from sobolev_batch.spectral.shells import smooth_step
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.mesh import Mesh

@@ -10,7 +10,7 @@ import modepy
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.spectral.triangles import second_difference
+from sobolev_batch.spectral.exact import second_difference
 
 Reals = NDArray[np.float64]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,10 @@ from sobolev_batch.batch.study import lattice_choice as search_module
 from sobolev_batch.batch.study.lattice_choice import LatticeChoice
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.results.tables.convergence import format_table
+from sobolev_batch.spectral.adaptive.problem import Problem
 from sobolev_batch.spectral.adaptive.solve import run_pilot
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
+from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.budget import NormEstimate
 from tests.support.rectangles import Rectangles
 from tests.support.studies import small_table, variable
@@ -27,6 +29,16 @@ from tests.support.studies import small_table, variable
 # So high that one lattice is chosen, and no octaves.
 RTOL = 5e-4
 original = run_pilot
+
+
+def on_lattice(lattice: sb.Lattice) -> Callable[[Problem], tuple[Any, sb.Lattice, ComplexDtype]]:
+    """A pilot that finds another lattice."""
+
+    def run(problem: Problem) -> tuple[Any, sb.Lattice, ComplexDtype]:
+        distances, _, dtype = original(problem)
+        return distances, lattice, dtype
+
+    return run
 
 
 def asking(rtol: float = RTOL, **changes: Any) -> sb.Study:
@@ -82,7 +94,7 @@ def test_a_lattice_that_turns_out_too_small_grows(
 ) -> None:
     chosen = make_plan(asking()).choice
     small = sb.Lattice(0.6 * chosen.lattice.xi_max, chosen.lattice.M)
-    monkeypatch.setattr(search_module, "run_pilot", lambda *_, **__: replace(original(*_, **__), lattice=small))
+    monkeypatch.setattr(search_module, "run_pilot", on_lattice(small))
     summary = sb.run(asking(), store_path, client)
     grown = stored_choice(store_path)
     assert grown is not None
@@ -96,9 +108,7 @@ def test_what_falls_short_in_the_end_is_marked(
     client: Client, store_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run_module, "_MOST_ROUNDS", 1)
-    monkeypatch.setattr(
-        search_module, "run_pilot", lambda *_, **__: replace(original(*_, **__), lattice=sb.Lattice(1.2, 12))
-    )
+    monkeypatch.setattr(search_module, "run_pilot", on_lattice(sb.Lattice(1.2, 12)))
     sb.run(asking(), store_path, client)
     convergence = sb.open_store(store_path)["convergence"].to_dataset().sel(mesh="ico/1", order=-4.0)
     assert not convergence["within"].item()

@@ -17,8 +17,7 @@ from matplotlib.figure import Figure
 from scipy.spatial.distance import cdist
 
 import sobolev_batch as sb
-from sobolev_batch.results.figures.drawing import PLOTS, clustered_order
-from sobolev_batch.results.figures.plots import write_plots
+from sobolev_batch.results.figures.drawing import PLOTS, clustered_order, write_plots
 from sobolev_batch.results.figures.selection import Selection
 from sobolev_batch.results.figures.style import Plot, drawing, notes_of, parse_size, set_log_scale, style_of
 from tests.support.trees import distances_of, tree_of

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 
 from sobolev_batch import Mesh, Sphere, Torus, icosphere
-from sobolev_batch.spectral.octaves.normals import FaceNormals
-from sobolev_batch.spectral.octaves.sampling import Octave, OctaveSampling, TailSampling
+from sobolev_batch.spectral.exact import exact_transform, sphere_transform
+from sobolev_batch.spectral.octaves.sampling import FaceNormals, Octave, OctaveSampling, TailSampling
 from sobolev_batch.spectral.octaves.values import (
     OctaveSums,
     OctaveValues,
@@ -23,9 +23,7 @@ from sobolev_batch.spectral.octaves.values import (
     statistical_errors,
 )
 from sobolev_batch.spectral.shells import smooth_step
-from sobolev_batch.spectral.spheres import sphere_transform
 from sobolev_batch.spectral.transform.settings import ErrorTarget
-from sobolev_batch.spectral.triangles import exact_transform
 from sobolev_batch.surfaces.shapes.surface import Surface
 from tests.support.oracles import torus_value
 from tests.support.rectangles import Rectangles

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sobolev_batch import Mesh
+from sobolev_batch.spectral.exact import exact_transform
 from sobolev_batch.spectral.quadrature.rules import (
     HIGHEST_DEGREE,
     TriangleRule,
@@ -19,7 +20,6 @@ from sobolev_batch.spectral.quadrature.rules import (
     rule_ranges,
     symmetric_rule,
 )
-from sobolev_batch.spectral.triangles import exact_transform
 
 
 def monomial_error(rule: TriangleRule, degree: int) -> float:

@@ -23,8 +23,7 @@ from sobolev_batch import (
 )
 from sobolev_batch.spectral.backends import CPU
 from sobolev_batch.spectral.quadrature import kinds
-from sobolev_batch.spectral.quadrature import smooth as resolution
-from sobolev_batch.spectral.quadrature.smooth import direct_transform, exact_values, resolution_of
+from sobolev_batch.spectral.quadrature.kinds import direct_transform, exact_values, resolution_of
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.spectral.transform.transform import transform_block
 from sobolev_batch.surfaces.shapes.smooth import Smooth
@@ -111,7 +110,7 @@ def test_waves_that_the_first_nodes_cannot_see_are_seen_when_they_are_doubled() 
 
 
 def test_a_kink_is_refused_with_both_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(resolution, "MOST_NODES", 1 << 14)
+    monkeypatch.setattr(kinds, "MOST_NODES", 1 << 14)
     surface = Roof()
     with pytest.raises(
         InputError, match=r"not settled to 1e-09 of its area with 16384 nodes.* it still changes by .*kink"

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from sobolev_batch import InputError, Lattice, LatticeError, Mesh, Sphere, fourier_transform, icosphere
 from sobolev_batch.spectral.backends import ComplexDtype
+from sobolev_batch.spectral.exact import exact_transform
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
 from sobolev_batch.spectral.transform.transform import projected_bytes, transform_block
-from sobolev_batch.spectral.triangles import exact_transform
 from tests.support.shapes import CENTRED_BOX as BOX
 
 Reals = NDArray[np.float64]
