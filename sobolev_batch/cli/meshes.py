@@ -199,11 +199,7 @@ def _settings_text(attributes: Mapping[str, Any]) -> str:
 
 
 def _judge_files(context: click.Context, a: Path, b: Path, below: float) -> int:
-    """Print one line on whether two files hold the same surface, and return the exit status.
-
-    Raises:
-        click.UsageError: Other options request numbers, or there are several orders.
-    """
+    """Print one line on whether two files hold the same surface, and return the exit status."""
     from sobolev_batch.testing.verdict import same_surface
 
     given = {

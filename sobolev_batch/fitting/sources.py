@@ -67,11 +67,7 @@ class FitSource(NestedSource):
         return FitSettings(self.order, self.steps, self.smoothing, self.keep_boundary)
 
     def target_member(self, folder: Path) -> Member:
-        """Return the member of the target.
-
-        Raises:
-            StudyError: There is no target, or several.
-        """
+        """Return the member of the target; StudyError where there is none, or several."""
         if self.target is None:
             raise StudyError(
                 "there is nothing to fit to: in a reference, and where the reference is a member of a family, name a "
@@ -118,11 +114,7 @@ class FittedMember(Member):
     triangles: int | None = None
 
     def load(self) -> Surface:
-        """Return the fitted mesh, that of an earlier call in this process if there is one.
-
-        Raises:
-            MeshError: A mesh or the target cannot be made, or the one cannot be fitted to the other.
-        """
+        """Return the fitted mesh, that of an earlier call in this process if there is one; MeshError where it fails."""
         digest = self.fingerprint_digest()
         fitted = _fits.get(digest) or self._fit()
         _fits[digest] = fitted

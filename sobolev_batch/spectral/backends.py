@@ -323,11 +323,7 @@ class Gpu(Backend):
 
     @classmethod
     def load(cls) -> Self:
-        """Load all libraries and look for a device.
-
-        Raises:
-            BackendError: A library, the driver or the device is missing; the message says what to do.
-        """
+        """Load all libraries and look for a device; BackendError, with what to do, where one is missing."""
         pathfinder = _module("cuda.pathfinder", "cuda-pathfinder")
         runtime: Any = None
         for name, title in _LIBRARIES.items():
@@ -462,12 +458,7 @@ def gpu_backend() -> Gpu:
 
 
 def backend_named(name: str) -> Backend:
-    """Return the backend for "cpu", "gpu" or "auto" (a usable GPU, else the processor).
-
-    Raises:
-        BackendError: "gpu", and no GPU is usable.
-        InputError: Another name.
-    """
+    """Return the backend for "cpu", "gpu" (or BackendError), or "auto": a usable GPU, else the processor."""
     if name == "gpu":
         return gpu_backend()
     if name == "auto":
@@ -481,11 +472,7 @@ def backend_named(name: str) -> Backend:
 
 
 def try_out(backend: Gpu) -> None:
-    """Transform one point at the origin, which compiles a kernel and calls every library.
-
-    Raises:
-        BackendError: The transform fails, or its values are wrong.
-    """
+    """Transform one point at the origin, which calls every library; BackendError where that fails."""
     try:
         with backend.work():
             plan = backend.plan(NufftSpec((4, 6, 8), 1e-9, oversampling=2.0))

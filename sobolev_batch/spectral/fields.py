@@ -237,11 +237,7 @@ def field_for(
 
 
 def as_operand(a: OperandLike) -> Operand:
-    """Return a field as it is, and anything else as a surface.
-
-    Raises:
-        InputError: It is neither; or see `as_mesh`.
-    """
+    """Return a field as it is, and anything else as a surface; see `as_surface`."""
     return a if isinstance(a, xr.DataArray) else as_surface(a)
 
 
@@ -294,11 +290,7 @@ def pair_of(
 
 
 def common_lattice(operands: Sequence[OperandLike], lattice: Lattice | None) -> Lattice | None:
-    """Return the lattice of the fields among some operands, or the given one; None if there is neither.
-
-    Raises:
-        LatticeError: They differ.
-    """
+    """Return the lattice of the fields among operands, else the given one or None; LatticeError where they differ."""
     lattices = [Lattice.from_field(x) for x in operands if isinstance(x, xr.DataArray)]
     if lattice is not None:
         lattices.append(lattice)

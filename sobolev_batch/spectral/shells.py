@@ -63,11 +63,7 @@ def smooth_step(radii: Reals, cutoff: float) -> Reals:
 
 
 def check_orders(order: Orders) -> tuple[float, ...]:
-    """Return one or several orders as a tuple of floats.
-
-    Raises:
-        OrderError: No order is given, or one is no number between -100 and -1/2.
-    """
+    """Return one or several orders as floats; OrderError where one is not between -100 and -1/2, or none is given."""
     try:
         given = np.atleast_1d(np.asarray(order))
     except ValueError:

@@ -294,11 +294,7 @@ class StudyDocument(Section):
 
     @classmethod
     def from_tables(cls, values: Mapping[str, Any]) -> Self:
-        """Validate the tables of a study, as `plain_tables` gives them.
-
-        Raises:
-            StudyError: A message for each key that is wrong.
-        """
+        """Validate the tables of a study, as `plain_tables` gives them; StudyError with a message for each key."""
         meshes = values.get("mesh")
         try:
             return cls.model_validate(values, context=meshes if isinstance(meshes, dict) else {})
@@ -318,11 +314,7 @@ class StudyDocument(Section):
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Return the tables of a study file.
-
-    Raises:
-        StudyError: It cannot be read, is too large, or is not TOML. The message does not name it.
-    """
+    """Return the tables of a study file; StudyError, which does not name it, where it is no readable TOML."""
     try:
         with open_regular(path) as file:
             data = file.read(_LARGEST_FILE_BYTES + 1)

@@ -55,11 +55,7 @@ class StudyMeshes:
 
     @classmethod
     def from_tree(cls, tree: xr.DataTree, folder: str | Path) -> Self:
-        """List the meshes of an open store, whose study has relative paths that start in a folder.
-
-        Raises:
-            InputError: The study's meshes cannot be listed on this machine, or the store has no tables yet.
-        """
+        """List the meshes of an open store, with relative paths in a folder; InputError where that fails."""
         table = finished_group(tree, "meshes")
         try:
             study = Study.from_table(tree.attrs["study"]["table"], folder=folder)

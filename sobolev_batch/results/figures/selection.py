@@ -65,11 +65,7 @@ class Selection:
         x: str = EDGE_LENGTH,
         truth: str | None = None,
     ) -> Self:
-        """Choose orders, and families by names or globs; by default all of a store.
-
-        Raises:
-            InputError: The store has no tables yet, or lacks an order or a family.
-        """
+        """Choose orders, and families by names or globs, by default all; InputError where the store lacks one."""
         tree = as_tree(store)
         orders = chosen_orders(finished_group(tree, "convergence"), order)
         return cls(tree, tuple(orders), tuple(chosen_families(tree, family)), x, truth)

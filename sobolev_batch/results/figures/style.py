@@ -200,11 +200,7 @@ def drawing(size: Size | None) -> Iterator[None]:
 def write_figures(
     figures: Mapping[str, Figure], folder: str | Path, formats: Sequence[PictureFormat], size: Size | None
 ) -> tuple[Path, ...]:
-    """Write figures, made while `drawing` with a size of panels, into a new or old folder, and return the paths.
-
-    Raises:
-        StoreError: The folder cannot be written.
-    """
+    """Write figures, made while `drawing` with a size of panels, into a folder; StoreError where that fails."""
     folder, paths = Path(folder), []
     try:
         folder.mkdir(parents=True, exist_ok=True)

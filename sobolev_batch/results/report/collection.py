@@ -46,11 +46,7 @@ _MOST_NAMED = 3
 
 
 def league_content(collection: CollectionStore, status: Status) -> dict[str, Any]:
-    """Return the texts and tables of a collection that its template takes, none of them escaped.
-
-    Raises:
-        InputError: No object has tables yet.
-    """
+    """Return what the template of a collection takes, nothing escaped; InputError where no object has tables yet."""
     tables = tables_of(collection.existing_stores)
     try:
         leagues, no_league = leagues_of(tables, collection.objects), ""

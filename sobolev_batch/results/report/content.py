@@ -282,11 +282,7 @@ def _names(labels: Sequence[str]) -> str:
 
 
 def study_content(tree: xr.DataTree, status: Status) -> dict[str, Any]:
-    """Return the texts and tables of an open store that its template takes, none of them escaped.
-
-    Raises:
-        InputError: The store has no tables yet.
-    """
+    """Return what the template of an open store takes, nothing escaped; InputError where it has no tables yet."""
     meshes, convergence = finished_group(tree, "meshes"), finished_group(tree, "convergence")
     attributes: Mapping[str, Any] = {str(key): value for key, value in tree.attrs.items()}
     families = tuple(dict.fromkeys(meshes["family"].values.tolist()))

@@ -114,11 +114,7 @@ class Frequencies:
         return self.octaves[-1].octave.highest if self.octaves else self.lattice.xi_max
 
     def values(self, surface: Surface, target: ErrorTarget, execution: Execution) -> SurfaceValues:
-        """Return the values of a surface, with an error within a target.
-
-        Raises:
-            LatticeError: The surface extends beyond the lattice's half period.
-        """
+        """Return the values of a surface within an error target; LatticeError where it exceeds the half period."""
         single = permits_single(surface, self.lattice, target)
         settings = TransformSettings(dtype="complex64" if single else "complex128")
         field = field_for(surface, self.lattice, target, settings, Execution(threads=execution.threads))

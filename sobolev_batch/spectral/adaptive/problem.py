@@ -124,11 +124,7 @@ class Problem:
         )
 
     def require_above_rounding(self, values: Reals) -> None:
-        """Refuse an accuracy of norms or distances (orders,) that lies below the rounding of fields.
-
-        Raises:
-            AccuracyError: The accuracy lies below rounding, and is no best effort.
-        """
+        """Refuse an accuracy of norms (orders,) below the rounding of fields, unless it is a best effort."""
         if self.accuracy.best_effort:
             return
         parts, floor = _discretisation_parts(self.orders, self.accuracy), self.rounding

@@ -122,11 +122,7 @@ class Accuracy:
 
     @property
     def largest_intervals(self) -> int:
-        """Largest M for which two fields and the transform of one fit into the memory.
-
-        Raises:
-            InputError: Not even the smallest lattice fits.
-        """
+        """Largest M for which two fields and the transform of one fit into the memory; InputError where none does."""
         candidates = range(2, LARGEST_M + 1, 2)
         fitting = bisect_right(candidates, self.allowed_bytes, key=_projected_bytes)
         if not fitting:

@@ -267,11 +267,7 @@ def _block_values(
 
 
 def _coordinates(points: ArrayLike) -> Reals:
-    """Return points (n, 3) as one contiguous row per axis (3, n).
-
-    Raises:
-        InputError: The points are not real, finite or of that shape.
-    """
+    """Return points (n, 3) as one contiguous row per axis (3, n); InputError where they are not real and finite."""
     try:
         array = np.asarray(points, dtype=np.float64)
     except (TypeError, ValueError) as error:

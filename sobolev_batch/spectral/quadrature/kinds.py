@@ -369,11 +369,7 @@ _KINDS: Mapping[type, type[SurfaceKind]] = {Mesh: _Triangles, Smooth: _Parametri
 
 
 def kind_of(surface: object) -> SurfaceKind:
-    """Return a surface as transforms see it.
-
-    Raises:
-        InputError: It is no surface of a known kind.
-    """
+    """Return a surface as transforms see it; InputError where it is of no known kind."""
     for surface_type, kind in _KINDS.items():
         if isinstance(surface, surface_type):
             return kind(surface)

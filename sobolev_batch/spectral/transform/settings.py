@@ -73,11 +73,7 @@ class TransformSettings:
 
 
 def thread_count(threads: int | None) -> int:
-    """Return a number of threads, by default one per core.
-
-    Raises:
-        InputError: It is no whole number from 1 to 1,024.
-    """
+    """Return a number of threads, by default one per core; InputError where it is not from 1 to 1,024."""
     if threads is None:
         return available_cores()
     if not is_whole_number(threads) or not 1 <= threads <= _MOST_THREADS:

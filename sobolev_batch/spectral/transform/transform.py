@@ -124,11 +124,7 @@ def _on_gpu(
     fitting: Callable[[Costs, float], tuple[NufftSpec, int]],
     compute: Callable[[Backend, NufftSpec], Transformed],
 ) -> Transformed:
-    """Compute on a GPU; if memory is too little after all, try again with half as much.
-
-    Raises:
-        InputError: The memory is too little.
-    """
+    """Compute on a GPU, and try again with half the memory where it is too little after all; at last InputError."""
     allowed_bytes = _DEVICE_FRACTION * gpu.free_bytes - result_bytes
     for _ in range(_ATTEMPTS):
         spec, projected = fitting(gpu.costs, allowed_bytes)
@@ -221,11 +217,7 @@ def _closed_form(kind: SurfaceKind, lattice: FrequencyLattice, block: Block, dty
 
 
 def require_inside(surface: Surface, lattice: Lattice) -> None:
-    """Check that a surface lies within the lattice's period: points beyond it would be folded back.
-
-    Raises:
-        LatticeError: Some |coordinate| is not below 1/(2h).
-    """
+    """Check that a surface lies within the lattice's period, and would not be folded back; LatticeError otherwise."""
     kind = "mesh" if kind_of(surface).triangles else "surface"
     require_points_inside(np.stack(surface.extent.box), lattice, f"the {kind} reaches", "it")
 

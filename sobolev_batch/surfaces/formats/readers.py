@@ -263,12 +263,7 @@ def as_mesh(mesh: MeshLike) -> Mesh:
 
 
 def as_surface(surface: SurfaceLike) -> Surface:
-    """Return a surface in closed form as it is, and anything else as a mesh; see `as_mesh`.
-
-    Raises:
-        InputError: It is no surface of a known kind.
-        MeshError: See `as_mesh`.
-    """
+    """Return a surface in closed form as it is, and anything else as a mesh, or InputError; see `as_mesh`."""
     if isinstance(surface, SURFACE_KINDS):
         return surface
     return _converted(surface, f"{_EXPECTED}, {_SURFACES} or a Fourier field")
@@ -306,12 +301,7 @@ def write_mesh(mesh: MeshLike, path: str | Path) -> None:
 
 
 def require_writable(path: str | Path) -> Path:
-    """Return a path whose suffix names a format that can be written, in a folder that files can be made in.
-
-    Raises:
-        InputError: It is none, or the path is no file.
-        MeshError: No file can be made in its folder.
-    """
+    """Return a path that a mesh can be written to; InputError where its suffix or folder does not permit that."""
     path = Path(path)
     if path.suffix.lower() not in WRITERS:
         raise InputError(f"{path}: meshes are written as {', '.join(WRITERS)}; found the suffix {path.suffix!r}")
@@ -325,11 +315,7 @@ def require_writable(path: str | Path) -> Path:
 
 @contextmanager
 def _new_file_beside(path: Path) -> Iterator[IO[bytes]]:
-    """Open a new file that may take the place of another one; it is gone at the end unless it has.
-
-    Raises:
-        MeshError: It cannot be made or written.
-    """
+    """Open a file that may replace another one, and is gone at the end unless it has; MeshError where that fails."""
     place = path.parent / f".{uuid4().hex}{path.suffix}"
     try:
         with place.open("xb") as file:

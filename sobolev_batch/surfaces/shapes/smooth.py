@@ -174,11 +174,7 @@ class Smooth(ABC):
 
     @cached_property
     def area(self) -> float:
-        """Area, in squared units of length: by quadrature, doubled until it changes by a relative 1e-12 or less.
-
-        Raises:
-            InputError: The area is zero or does not settle.
-        """
+        """Area, in squared units of length: by quadrature, doubled until it settles to 1e-12, or InputError."""
         counts = _FIRST_NODES, _FIRST_NODES
         area = self._area(counts)
         change = math.inf

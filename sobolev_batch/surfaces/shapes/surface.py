@@ -195,11 +195,7 @@ def is_finite_number(value: object) -> bool:
 
 
 def checked_point(point: Sequence[float], label: str) -> Point:
-    """Return a point as three floats.
-
-    Raises:
-        InputError: Anything but three finite numbers; the message starts with the label.
-    """
+    """Return a point as three floats; InputError, which begins with the label, where it is not three finite numbers."""
     if len(point) != 3 or not all(map(is_finite_number, point)):
         raise InputError(f"{label} must be three finite numbers, found {point!r}")
     x, y, z = map(float, point)

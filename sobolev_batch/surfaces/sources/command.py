@@ -303,11 +303,7 @@ class RemeshedMember(Member):
     cache: MeshCache | None
 
     def load(self) -> Mesh:
-        """Return the mesh that is kept, or make it and keep it.
-
-        Raises:
-            MeshError: The remesher failed, or is not permitted to run.
-        """
+        """Return the mesh that is kept, or make it and keep it; MeshError where that failed, or is not permitted."""
         if self.cache is None:
             raise MeshError("no remesher may run here, and none of its meshes is kept; run a study with it")
         digest = self.fingerprint_digest()
@@ -362,11 +358,7 @@ def function_name(function: Callable[..., Any] | str) -> str:
 
 
 def function_version(function: Callable[..., Any] | str) -> str:
-    """Return a digest of a function's source.
-
-    Raises:
-        StudyError: It has none.
-    """
+    """Return a digest of a function's source; StudyError where it has none."""
     try:
         return hashlib.sha256(inspect.getsource(function).encode()).hexdigest()  # type: ignore[arg-type]
     except (OSError, TypeError) as error:

@@ -56,11 +56,7 @@ def decimated(mesh: Mesh, triangles: int) -> Mesh:
 
 
 def remeshed(mesh: Mesh, triangles: int) -> Mesh:
-    """Return a mesh of about a number of triangles around clusters of the vertices of another one.
-
-    Raises:
-        MeshError: The library is not installed.
-    """
+    """Return a mesh of about a number of triangles, around clusters of the vertices of another one."""
     try:
         import pyacvd
         import pyvista

@@ -56,11 +56,7 @@ _EXAMPLE = '{ path = "a.ply", method_seconds = 3.5 }'
 
 
 def checked_list(value: object) -> str | tuple[MeshTable, ...] | None:
-    """Return the key ``meshes`` of a study: the path of a CSV file, or a list of meshes.
-
-    Raises:
-        ValueError: It is neither.
-    """
+    """Return the key ``meshes`` of a study, path of a CSV file or list of meshes; ValueError where it is neither."""
     if value is None or (isinstance(value, str) and value):
         return value
     if not isinstance(value, list | tuple) or not value or not all(isinstance(table, Mapping) for table in value):
@@ -71,11 +67,7 @@ def checked_list(value: object) -> str | tuple[MeshTable, ...] | None:
 
 
 def read_mesh_list(path: Path) -> tuple[MeshTable, ...]:
-    """Return the meshes that a CSV file lists. Its first line has the names of the columns.
-
-    Raises:
-        StudyError: The file cannot be read, is no CSV file of this kind, or is too large.
-    """
+    """Return the meshes that a CSV file lists below the names of its columns; StudyError where it does not."""
     try:
         with open_regular(path) as file:
             length = os.fstat(file.fileno()).st_size
@@ -350,11 +342,7 @@ def _unique(names: list[str]) -> list[bool]:
 
 
 def file_digest(path: Path) -> str:
-    """Return the SHA-256 of a file's bytes, in hexadecimal.
-
-    Raises:
-        MeshError: The file cannot be read.
-    """
+    """Return the SHA-256 of a file's bytes, in hexadecimal; MeshError where it cannot be read."""
     try:
         with open_regular(path) as file:
             checked_length(file)

@@ -317,11 +317,7 @@ Several = Annotated[tuple[_Entry, ...], Field(min_length=1, strict=False), at_mo
 
 
 def checked_times(value: object) -> tuple[float, ...]:
-    """Return a list of different times as floats.
-
-    Raises:
-        ValueError: It is none.
-    """
+    """Return a list of different times as floats; ValueError where it is none."""
     if not isinstance(value, list | tuple) or not value:
         raise ValueError("must be a list of numbers, such as [0.0, 0.5, 1.0]")
     if len(value) > _MOST_TIMES:
@@ -341,15 +337,7 @@ Times = Annotated[tuple[float, ...], BeforeValidator(checked_times)]
 
 
 def parse_source(table: Mapping[str, Any]) -> Source:
-    """Return the source that the key ``source`` of a table names, with the other keys as its parameters.
-
-    Args:
-        table: Parameters of a family or reference, as read from TOML.
-
-    Raises:
-        StudyError: No source has this name, or it cannot be loaded.
-        pydantic.ValidationError: The source does not take these parameters.
-    """
+    """Return the source that the key ``source`` of a table names, with the other keys as its parameters."""
     if "source" not in table:
         raise StudyError('source is missing; add it, such as source = "files"')
     source_type = source_type_of(table["source"])
@@ -408,11 +396,7 @@ class NestedSource(Source):
 
 
 def source_type_of(name: object) -> type[Source]:
-    """Return the source of a name.
-
-    Raises:
-        StudyError: No source has this name, or it cannot be loaded.
-    """
+    """Return the source of a name; StudyError where there is none, or it cannot be loaded."""
     registry = _registry()
     if not isinstance(name, str) or name not in registry:
         message = f"no source is named {quoted(name)}; known are {', '.join(sorted(registry))}"
@@ -428,11 +412,7 @@ def source_type_of(name: object) -> type[Source]:
 
 
 def single_member(source: Source, folder: Path) -> Member:
-    """Return the member of a source that must have exactly one.
-
-    Raises:
-        StudyError: The source has none or several.
-    """
+    """Return the only member of a source; StudyError where it has none or several."""
     members = source.members(folder)
     if len(members) != 1:
         names = ", ".join(member.name for member in members[:5])
@@ -441,11 +421,7 @@ def single_member(source: Source, folder: Path) -> Member:
 
 
 def load_mesh(member: Member) -> Mesh:
-    """Return the surface of a member that must be a mesh.
-
-    Raises:
-        MeshError: The surface is no mesh, or cannot be made.
-    """
+    """Return the surface of a member that must be a mesh; MeshError where it is none, or cannot be made."""
     mesh = member.load()
     if not isinstance(mesh, Mesh):
         raise MeshError(f"{member.name} is no mesh; its triangles are needed, so take a source of meshes")
@@ -453,11 +429,7 @@ def load_mesh(member: Member) -> Mesh:
 
 
 def installed_version(distribution: str) -> str:
-    """Return the installed version of a library whose output is part of a surface.
-
-    Raises:
-        MeshError: The library is not installed.
-    """
+    """Return the version of a library whose output is part of a surface; MeshError where it is not installed."""
     try:
         return version(distribution)
     except PackageNotFoundError as error:
