@@ -9,7 +9,6 @@ from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import OptimizeResult, minimize
 from scipy.sparse import coo_array, csc_array, eye_array
 from scipy.sparse.csgraph import laplacian
@@ -19,9 +18,8 @@ from sobolev_batch.errors import LatticeError
 from sobolev_batch.fitting.gradient import SquaredDistance
 from sobolev_batch.fitting.transform import area_derivatives, normals
 from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.surface import Indices, Reals
 
-Reals = NDArray[np.float64]
-Indices = NDArray[np.int64]
 Notify = Callable[[Reals, float], None]
 
 # Pairs of steps and gradients that L-BFGS remembers.

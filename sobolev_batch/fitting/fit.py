@@ -9,7 +9,6 @@ from typing import Self
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from sobolev_batch.errors import AccuracyError, InputError
 from sobolev_batch.fitting import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS
@@ -24,8 +23,7 @@ from sobolev_batch.surfaces.formats.readers import MeshLike, as_mesh
 from sobolev_batch.surfaces.proximity import proximity
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.subdivision import Edges
-
-Reals = NDArray[np.float64]
+from sobolev_batch.surfaces.shapes.surface import Reals
 
 # Relative errors of distances that are requested, one after the other.
 _RTOLS = (0.02, 0.1)

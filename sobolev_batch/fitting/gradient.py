@@ -8,7 +8,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.fitting.transform import MeshTransform
@@ -30,9 +30,7 @@ from sobolev_batch.spectral.shells import Orders, SobolevWeights, check_orders, 
 from sobolev_batch.spectral.transform.settings import FINEST_EPS, Execution, TransformSettings, thread_count
 from sobolev_batch.surfaces.formats.readers import MeshLike, as_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.surface import Extent
-
-Reals = NDArray[np.float64]
+from sobolev_batch.surfaces.shapes.surface import Extent, Reals
 
 # The derivative is computed twice, the second time with an eps smaller by this factor, which is the one reported.
 _REFINEMENT = 30.0

@@ -34,9 +34,8 @@ from sobolev_batch.spectral.shells import SobolevWeights, single_order
 from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, TransformSettings, choose_settings
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.subdivision import Edges
-from sobolev_batch.surfaces.shapes.surface import Extent, Similarity, Surface, is_finite_number
+from sobolev_batch.surfaces.shapes.surface import Extent, Reals, Similarity, Surface, is_finite_number
 
-Reals = NDArray[np.float64]
 # Orders s, each with the weight of its squared distance in a sum.
 OrderWeights = tuple[tuple[float, float], ...]
 

@@ -19,9 +19,7 @@ from sobolev_batch.spectral.transform.nufft import transform_points
 from sobolev_batch.spectral.transform.settings import ON_CPU, Execution, TransformSettings
 from sobolev_batch.spectral.transform.transform import require_points_inside
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-
-Reals = NDArray[np.float64]
-Indices = NDArray[np.int64]
+from sobolev_batch.surfaces.shapes.surface import Indices, Reals
 
 # Fraction of eps that the coefficients which are left out may carry together.
 _NEGLIGIBLE = 0.1

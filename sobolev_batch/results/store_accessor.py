@@ -28,8 +28,8 @@ from sobolev_batch.spectral.metrics.datasets import (
     labelled,
     order_axis,
 )
-from sobolev_batch.spectral.shells import Orders, Reals, check_orders, shell_sums, smooth_step
-from sobolev_batch.surfaces.shapes.surface import Similarity
+from sobolev_batch.spectral.shells import Orders, check_orders, shell_sums, smooth_step
+from sobolev_batch.surfaces.shapes.surface import Reals, Similarity
 from sobolev_batch.surfaces.sources.names import quoted
 
 # The innermost octave has this many spacings of the lattice within it.

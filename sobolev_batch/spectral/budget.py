@@ -15,8 +15,8 @@ from typing import Self
 import numpy as np
 from scipy.special import exprel, gammaln, kve, zeta
 
-from sobolev_batch.spectral.shells import Reals, SobolevWeights
-from sobolev_batch.surfaces.shapes.surface import DIRECTIONS
+from sobolev_batch.spectral.shells import SobolevWeights
+from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Reals
 
 # Both laws were measured on spheres, boxes, sticks and icospheres, near and far: the truncation was
 # 0.5 to 8 times, the aliasing 0.25 to 2 times the true loss.

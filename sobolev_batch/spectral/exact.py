@@ -31,8 +31,8 @@ from sobolev_batch.spectral.backends import cosine_and_sine
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.mesh import Corners, Mesh
+from sobolev_batch.surfaces.shapes.surface import Reals
 
-Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 # A number as a rounded value and what it lacks.
 Pair = tuple[Reals, Reals]

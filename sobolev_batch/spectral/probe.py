@@ -21,9 +21,7 @@ from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.shells import SobolevWeights, shell_volumes
 from sobolev_batch.spectral.transform.settings import TransformSettings
-from sobolev_batch.surfaces.shapes.surface import Surface
-
-Reals = NDArray[np.float64]
+from sobolev_batch.surfaces.shapes.surface import Reals, Surface
 
 # Draws of a small mesh, of a huge one, and pairs of a triangle (or point) and a frequency in between.
 _MOST_DRAWS, _FEWEST_DRAWS, _PAIRS = 32, 8, 400_000

@@ -13,8 +13,8 @@ from scipy.special import erfc
 
 from sobolev_batch.errors import InputError, OrderError
 from sobolev_batch.spectral.lattice import Block, Lattice
+from sobolev_batch.surfaces.shapes.surface import Reals
 
-Reals = NDArray[np.float64]
 Complexes = NDArray[np.complexfloating[Any, Any]]
 Orders = float | Sequence[float]
 

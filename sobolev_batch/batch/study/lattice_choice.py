@@ -15,7 +15,6 @@ from functools import partial
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sobolev_batch.batch.study.schema import MOST_OCTAVES
 from sobolev_batch.batch.study.study import Study
@@ -30,10 +29,9 @@ from sobolev_batch.spectral.budget import NormEstimate, Support
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.sampling import FaceNormals, OctaveSampling, TailSampling
 from sobolev_batch.spectral.probe import estimate
-from sobolev_batch.surfaces.shapes.surface import Extent, Similarity, Surface
+from sobolev_batch.surfaces.shapes.surface import Extent, Reals, Similarity, Surface
 from sobolev_batch.surfaces.sources.registry import Member
 
-Reals = NDArray[np.float64]
 # Family and member of each surface, by label.
 Members = Mapping[str, tuple[str, Member]]
 

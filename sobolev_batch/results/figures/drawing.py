@@ -20,7 +20,6 @@ from sobolev_batch.results.figures.style import (
     EXTENDS,
     PictureFormat,
     Plot,
-    Reals,
     Size,
     draw_curve,
     drawing,
@@ -51,6 +50,7 @@ from sobolev_batch.results.tables.convergence import table
 from sobolev_batch.results.tables.evolution import evolution
 from sobolev_batch.results.tables.league import League
 from sobolev_batch.results.tables.matrix import pairs_of
+from sobolev_batch.surfaces.shapes.surface import Reals
 
 _MOST_NAMED = 3
 # By horizontal axis: what a mesh lacks that has no place on it, and the slope of second-order convergence.

@@ -13,7 +13,6 @@ from typing import Self
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 
 from sobolev_batch.batch.storage.location import Location
@@ -25,12 +24,10 @@ from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.metrics.causes import witness
 from sobolev_batch.spectral.shells import Orders, check_orders
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.surface import Similarity
+from sobolev_batch.surfaces.shapes.surface import Reals, Similarity
 from sobolev_batch.surfaces.sources.mesh_cache import MeshCache
 from sobolev_batch.surfaces.sources.names import file_stem
 from sobolev_batch.surfaces.sources.registry import Member
-
-Reals = NDArray[np.float64]
 
 SUFFIXES = (".ply", ".vtp")
 # Labels that a message lists as examples, and characters of a comment in a file.

@@ -9,7 +9,6 @@ from typing import Self, TypeVar
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.results.figures.style import Style, style_of
@@ -29,9 +28,9 @@ from sobolev_batch.results.open import (
 from sobolev_batch.results.store_accessor import StoreAccessor
 from sobolev_batch.spectral.metrics.causes import spectrum
 from sobolev_batch.spectral.shells import Orders
+from sobolev_batch.surfaces.shapes.surface import Reals
 
 Item = TypeVar("Item")
-Reals = NDArray[np.float64]
 
 # A field is read for each mesh; one of 17 MB takes about a quarter of a second.
 MOST_SPECTRA = 24

@@ -16,14 +16,13 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
-from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError, StoreError
 from sobolev_batch.results.tables.text import middle_cut
+from sobolev_batch.surfaces.shapes.surface import Reals
 from sobolev_batch.surfaces.sources.names import quoted
 from sobolev_batch.visible import visible
 
-Reals = NDArray[np.float64]
 # Width and height in inches.
 Size = tuple[float, float]
 PictureFormat = Literal["png", "svg", "pdf"]

@@ -45,9 +45,9 @@ from sobolev_batch.results.tables.convergence import table
 from sobolev_batch.spectral.metrics.causes import witness
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.subdivision import subdivided
+from sobolev_batch.surfaces.shapes.surface import Reals
 from sobolev_batch.surfaces.sources.names import file_stem
 
-Reals = NDArray[np.float64]
 Triangles = NDArray[np.int32]
 
 Axis = Literal["x", "y", "z"]

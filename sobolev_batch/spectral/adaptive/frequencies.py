@@ -44,9 +44,8 @@ from sobolev_batch.spectral.octaves.values import (
 )
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, TransformSettings, permits_single
-from sobolev_batch.surfaces.shapes.surface import Surface
+from sobolev_batch.surfaces.shapes.surface import Reals, Surface
 
-Reals = NDArray[np.float64]
 Complexes = NDArray[np.complexfloating]
 
 # Random points that show what lies beyond all frequencies in a norm that is a scale.

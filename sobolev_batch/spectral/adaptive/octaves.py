@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sobolev_batch.spectral.adaptive.problem import (
     ESTIMATE_CAUTION,
@@ -38,8 +37,7 @@ from sobolev_batch.spectral.octaves.values import (
 from sobolev_batch.spectral.probe import estimate as estimate_from
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.surfaces.shapes.smooth import Smooth
-
-Reals = NDArray[np.float64]
+from sobolev_batch.surfaces.shapes.surface import Reals
 
 _ROUNDS, _MOST_OCTAVES = 6, 24
 # Fraction of the tail's share of the accuracy that is left to what lies beyond the last octave.

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sobolev_batch.errors import AccuracyError
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy, unreachable
@@ -21,9 +20,8 @@ from sobolev_batch.spectral.probe import Sample, draws_for, needs_probe
 from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, TransformSettings, permits_single
 from sobolev_batch.surfaces.shapes.mesh import Mesh, shared_triangles
-from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent, Similarity, Surface
+from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent, Reals, Similarity, Surface
 
-Reals = NDArray[np.float64]
 Samples = tuple[Sample, ...]
 
 # A distance is first estimated from a few frequencies; it is seldom less than this fraction of the estimate.

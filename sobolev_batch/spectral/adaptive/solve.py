@@ -34,9 +34,7 @@ from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.spectral.transform.settings import ErrorTarget
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.surface import Surface
-
-Reals = NDArray[np.float64]
+from sobolev_batch.surfaces.shapes.surface import Reals, Surface
 
 _ROUNDS = 6
 # From this rtol on, octaves are cheaper than a larger lattice; below the other one they would take too many samples.

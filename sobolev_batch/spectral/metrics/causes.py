@@ -29,11 +29,11 @@ from sobolev_batch.spectral.metrics.datasets import (
     lattice_attributes,
     order_axis,
 )
-from sobolev_batch.spectral.shells import Orders, Reals, SobolevWeights, check_orders, shell_volumes
+from sobolev_batch.spectral.shells import Orders, SobolevWeights, check_orders, shell_volumes
 from sobolev_batch.spectral.transform.nufft import evaluate_at
 from sobolev_batch.spectral.transform.settings import TransformSettings, thread_count
 from sobolev_batch.spectral.transform.transform import require_points_inside
-from sobolev_batch.surfaces.shapes.surface import Similarity
+from sobolev_batch.surfaces.shapes.surface import Reals, Similarity
 
 # Shells this close to an edge, relative to it, lie on it.
 _ON_EDGE = 1e-12

@@ -10,7 +10,8 @@ import xarray as xr
 
 from sobolev_batch.spectral.budget import NormEstimate, ReferenceEstimate
 from sobolev_batch.spectral.lattice import AXES, Lattice
-from sobolev_batch.spectral.shells import Orders, Reals
+from sobolev_batch.spectral.shells import Orders
+from sobolev_batch.surfaces.shapes.surface import Reals
 
 KERNEL = "weight (1 + |xi|^2)^s, xi in cycles per unit length"
 LENGTH, AREA, FREQUENCY, NUMBER = "unit length", "unit length squared", "cycles per unit length", "1"

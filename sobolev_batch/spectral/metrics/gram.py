@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from sobolev_batch.spectral.budget import Sums, outer_windows
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.shells import SobolevWeights
+from sobolev_batch.surfaces.shapes.surface import Reals
 
-Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 Run = tuple[slice, int, int | None]
 

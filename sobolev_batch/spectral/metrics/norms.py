@@ -38,10 +38,10 @@ from sobolev_batch.spectral.fields import (
 )
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.datasets import VARIABLES, labelled, labelled_distances, lattice_attributes
-from sobolev_batch.spectral.shells import Orders, Reals, SobolevWeights, check_orders
+from sobolev_batch.spectral.shells import Orders, SobolevWeights, check_orders
 from sobolev_batch.surfaces.formats.readers import as_surface
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
-from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent
+from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent, Reals
 
 # Relative accuracy of the closed forms of spheres.
 _CLOSED_FORM_ACCURACY = 1e-13

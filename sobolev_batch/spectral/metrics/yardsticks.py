@@ -17,10 +17,11 @@ from sobolev_batch.spectral.adaptive.problem import SurfaceValues, support_of
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.datasets import labelled
 from sobolev_batch.spectral.metrics.norms import accuracy_of, distance, to_accuracy
-from sobolev_batch.spectral.shells import Orders, Reals, check_orders
+from sobolev_batch.spectral.shells import Orders, check_orders
 from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution
 from sobolev_batch.surfaces.formats.readers import MeshLike, as_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.surface import Reals
 from sobolev_batch.surfaces.sources.derived import decimated, with_noise
 
 # Error of the values of changed meshes, as a fraction of the distance.

@@ -24,7 +24,6 @@ from typing import Self
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
-from numpy.typing import NDArray
 from scipy.special import beta, betainc, stdtrit
 
 from sobolev_batch.errors import InputError
@@ -34,10 +33,7 @@ from sobolev_batch.spectral.shells import smooth_step
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.smooth import Interval, Smooth
-from sobolev_batch.surfaces.shapes.surface import Surface
-
-Reals = NDArray[np.float64]
-Indices = NDArray[np.int64]
+from sobolev_batch.surfaces.shapes.surface import Indices, Reals, Surface
 
 # Random points of the first estimate; pairs of a point and a triangle that it may take, and the fewest points.
 USUAL_POINTS, _FEWEST_POINTS, _USUAL_PAIRS = 256, 40, 150_000

@@ -22,9 +22,7 @@ from numpy.typing import NDArray
 from sobolev_batch.spectral.lattice import OctaveLattice
 from sobolev_batch.spectral.shells import STEP_START, smooth_step
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.surface import Surface
-
-Reals = NDArray[np.float64]
+from sobolev_batch.surfaces.shapes.surface import Indices, Reals, Surface
 
 # Normals whose entries agree to this many parts are one direction.
 _DIRECTION_PARTS = 500
@@ -143,8 +141,6 @@ def _keys(normals: Reals) -> NDArray[np.int32]:
     x, y, z = np.round(normals * _DIRECTION_PARTS).astype(np.int32).T
     return np.asarray((x * _KEYS_PER_AXIS + y) * _KEYS_PER_AXIS + z)
 
-
-Indices = NDArray[np.int64]
 
 # Samples along an axis of the lattice of each octave, and draws beside it where surfaces have flat faces.
 USUAL_M, _USUAL_DRAWS, _USUAL_UNIFORM = 64, 20_000, 0.1

@@ -27,9 +27,8 @@ from sobolev_batch.spectral.transform.settings import (
     permits_single,
 )
 from sobolev_batch.spectral.transform.transform import transform_block
-from sobolev_batch.surfaces.shapes.surface import Surface
+from sobolev_batch.surfaces.shapes.surface import Reals, Surface
 
-Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
 # Settings of the transform of a surface on a lattice.

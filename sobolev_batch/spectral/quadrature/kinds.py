@@ -31,9 +31,8 @@ from sobolev_batch.spectral.quadrature.meshes import (
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.smooth import MOST_GAUSS_NODES, MOST_NODES, Counts, Smooth, doubled
-from sobolev_batch.surfaces.shapes.surface import DIRECTIONS
+from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Reals
 
-Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
 # Less is rounding: of the transform, and of derivatives that come from an interpolant.

@@ -25,8 +25,8 @@ from sobolev_batch.spectral.quadrature.rules import (
     typical_errors,
 )
 from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.surface import Reals
 
-Reals = NDArray[np.float64]
 _Corners = tuple[Array, Array, Array]
 # Vertices (n, 3), triangles (m, 3) and areas (m,) of a mesh, as arrays of a backend.
 FaceArrays = tuple[Array, Array, Array]

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.spectral.exact import second_difference
-
-Reals = NDArray[np.float64]
+from sobolev_batch.surfaces.shapes.surface import Reals
 
 HIGHEST_DEGREE = 50
 # Below this, rounding hides the error of a rule.

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.parameters import available_cores, is_whole_number
@@ -102,8 +101,6 @@ class Execution:
 
 ON_CPU = Execution()
 
-
-Reals = NDArray[np.float64]
 
 # Fraction of a field's error that is left to the NUFFT.
 _NUFFT_FRACTION = 0.4

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.formats.parsing import Raw, triangle_fans, xml_events
-
-Indices = NDArray[np.int64]
+from sobolev_batch.surfaces.shapes.surface import Indices
 
 # VTK's numbers for types of cells: vertices and lines, then those with area, triangles, polygons and quadrilaterals.
 _WITHOUT_AREA, _TRIANGLE, _POLYGON, _QUAD = (1, 2, 3, 4), 5, 7, 9

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import elliprg
 
 from sobolev_batch.errors import InputError
@@ -20,12 +19,11 @@ from sobolev_batch.surfaces.shapes.surface import (
     LARGEST_LENGTH,
     Extent,
     Point,
+    Reals,
     checked_point,
     is_finite_number,
     moved_point,
 )
-
-Reals = NDArray[np.float64]
 
 _ANGLE = Interval(0.0, 2 * math.pi, periodic=True)
 # A larger grid is a typing error.

@@ -14,13 +14,11 @@ from functools import cached_property, lru_cache
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import roots_legendre
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent, Point, checked_point, is_finite_number
+from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent, Point, Reals, checked_point, is_finite_number
 
-Reals = NDArray[np.float64]
 Counts = tuple[int, int]
 
 # Nodes of any one rule: about 1,000 by 4,000.

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from sobolev_batch.errors import InputError
 from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.surface import Indices, Reals
 
-Reals = NDArray[np.float64]
-Indices = NDArray[np.int64]
 Marks = NDArray[np.bool_]
 
 # 20 * 4^12 is 335 million triangles, some 24 GB of indices and corners: a finer level is a typing error.

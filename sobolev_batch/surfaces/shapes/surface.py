@@ -16,6 +16,7 @@ from sobolev_batch.errors import InputError
 
 Point = tuple[float, float, float]
 Reals = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 # Squares of larger lengths overflow, squares of the reciprocal vanish.
 LARGEST_LENGTH = 1e150

@@ -18,7 +18,7 @@ from scipy.spatial import ConvexHull
 
 from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.surface import Point
+from sobolev_batch.surfaces.shapes.surface import Point, Reals
 from sobolev_batch.surfaces.sources.generated import Levels, Triple
 from sobolev_batch.surfaces.sources.registry import (
     MadeMember,
@@ -36,7 +36,6 @@ _REDUCING_BYTES = 450
 _MOST_TRIANGLES = 10**9
 # Even cells need several input vertices for each output vertex; pyacvd advises to subdivide until there are.
 _VERTICES_PER_CLUSTER = 10
-Reals = NDArray[np.float64]
 
 # Raise it whenever a mesh is displaced or carried in another way.
 _VERSION = 1
