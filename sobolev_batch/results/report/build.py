@@ -37,8 +37,7 @@ from sobolev_batch.results.open import (
     reference_of,
     require_unchanged,
 )
-from sobolev_batch.results.report.collection import league_content
-from sobolev_batch.results.report.content import PageTable, study_content, utc_text
+from sobolev_batch.results.report.content import PageTable, league_content, study_content, utc_text
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables.convergence import table
 from sobolev_batch.results.tables.evolution import evolution

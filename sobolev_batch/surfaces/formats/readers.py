@@ -20,8 +20,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sobolev_batch.errors import InputError, MeshError
-from sobolev_batch.surfaces.formats.gltf import parse_gltf
-from sobolev_batch.surfaces.formats.neuroimaging import is_freesurfer_name, parse_freesurfer, parse_gifti
 from sobolev_batch.surfaces.formats.parsing import (
     Raw,
     checked_length,
@@ -43,7 +41,13 @@ from sobolev_batch.surfaces.formats.plain_formats import (
     write_ply,
     write_stl,
 )
-from sobolev_batch.surfaces.formats.vtk import parse_vtk
+from sobolev_batch.surfaces.formats.read_only import (
+    is_freesurfer_name,
+    parse_freesurfer,
+    parse_gifti,
+    parse_gltf,
+    parse_vtk,
+)
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.smooth import Smooth

@@ -30,9 +30,17 @@ from sobolev_batch.parameters import byte_count
 from sobolev_batch.surfaces.formats.readers import as_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.sources.files import file_digest, number_as_text
-from sobolev_batch.surfaces.sources.mesh_cache import Cost, MeshCache, Outcome
+from sobolev_batch.surfaces.sources.mesh_cache import (
+    INPUT,
+    OUTPUT,
+    PLACEHOLDER,
+    Cost,
+    MeshCache,
+    Outcome,
+    environment,
+    run_command,
+)
 from sobolev_batch.surfaces.sources.names import label_problem, quoted
-from sobolev_batch.surfaces.sources.program import INPUT, OUTPUT, PLACEHOLDER, environment, run_command
 from sobolev_batch.surfaces.sources.registry import (
     MOST_ENTRIES,
     ExpectedSize,

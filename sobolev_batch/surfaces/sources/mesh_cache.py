@@ -1,14 +1,28 @@
-"""Meshes that took long to make, kept in a folder or in object storage under the digest of what they depend on."""
+"""A program that makes a mesh of another one, and a cache of meshes that took long to make."""
 
 from __future__ import annotations
 
 import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
-from sobolev_batch.errors import MeshError
+import numpy as np
+import psutil
+
+from sobolev_batch.errors import InputError, MeshError, one_line
+from sobolev_batch.parameters import format_bytes
 from sobolev_batch.surfaces.formats.plain_formats import parse_ply, write_ply
+from sobolev_batch.surfaces.formats.readers import WRITERS, as_mesh, is_mesh_name, read_mesh, write_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 
 _NOTHING_KNOWN = float("nan")
@@ -104,3 +118,167 @@ class MeshCache:
         except ValueError:
             return {}
         return entry if isinstance(entry, dict) else {}
+
+
+INPUT, OUTPUT = "input", "output"
+PLACEHOLDER = re.compile(r"\{(\w+)\}")
+# Characters of what a program said last, in the reason of its failure.
+_LONGEST_TAIL = 300
+# Seconds between looks at a program that runs: at first, and at most.
+_FIRST_PAUSE, _LONGEST_PAUSE = 0.005, 0.1
+
+
+def environment() -> dict[str, str]:
+    """Return the environment of programs: ``python`` is the one that runs this, with its libraries."""
+    own = str(Path(sys.executable).parent)
+    return {**os.environ, "PATH": os.pathsep.join(filter(None, (own, os.environ.get("PATH"))))}
+
+
+def run_command(
+    mesh: Mesh, words: list[str], suffixes: tuple[str, str], timeout: float, largest_output: int
+) -> Outcome:
+    """Run a program that makes a mesh of another one.
+
+    Args:
+        mesh: Mesh to start from.
+        words: Program and arguments, with {input} and {output} for the files.
+        suffixes: Suffixes of both files.
+        timeout: Seconds after which it is ended.
+        largest_output: Bytes that it may write.
+
+    Returns:
+        The mesh, or the reason of the failure with the end of what the program said.
+    """
+    with tempfile.TemporaryDirectory(prefix="sobolev-batch-", ignore_cleanup_errors=True) as scratch:
+        folder = Path(scratch)
+        files = {name: folder / f"{name}{suffix}" for name, suffix in zip((INPUT, OUTPUT), suffixes, strict=True)}
+        try:
+            _write(mesh, files[INPUT])
+        except InputError as error:
+            return Outcome(Cost(), reason=f"its input cannot be written: {error}")
+        filled = [PLACEHOLDER.sub(lambda found: str(files.get(found[1], found[0])), word) for word in words]
+        said = folder / "stdout.txt", folder / "stderr.txt"
+        started = time.perf_counter()
+        with said[0].open("wb") as out, said[1].open("wb") as err:
+            try:
+                process = subprocess.Popen(  # noqa: S603 -- the user permitted it
+                    filled,
+                    cwd=folder,
+                    env=environment(),
+                    stdin=subprocess.DEVNULL,
+                    stdout=out,
+                    stderr=err,
+                    start_new_session=True,
+                )
+            except (OSError, ValueError) as error:
+                return Outcome(Cost(), reason=f"{words[0]} cannot be started on this machine: {one_line(error)}")
+        problem, cpu_seconds, peak_bytes = _awaited(process, folder, timeout, largest_output)
+        status = process.returncode
+        cost = Cost(time.perf_counter() - started, cpu_seconds, peak_bytes, status)
+        if not problem and status:
+            name = signal.Signals(-status).name if status < 0 else ""
+            problem = f"{words[0]} was ended by {name}" if name else f"{words[0]} ended with exit status {status}"
+        if not problem and not files[OUTPUT].is_file():
+            problem = f"{words[0]} wrote no mesh (output{suffixes[1]})"
+        if not problem:
+            try:
+                return Outcome(cost, _read(files[OUTPUT]))
+            except InputError as error:
+                problem = f"{words[0]} wrote no mesh: {str(error).removeprefix(f'{files[OUTPUT]}: ')}"
+        return Outcome(cost, reason=": ".join(filter(None, (problem, _tail(*said[::-1])))))
+
+
+def _awaited(
+    process: subprocess.Popen[bytes], folder: Path, timeout: float, largest_output: int
+) -> tuple[str, float, float]:
+    """Wait for a program, and return why it was ended before its time, its processor time and its largest memory."""
+    problem, pause, deadline, peak_bytes = "", _FIRST_PAUSE, time.monotonic() + timeout, float("nan")
+    try:
+        while True:
+            # Nothing in subprocess tells the time of a single process. Its peak of memory would count this process,
+            # from which it was forked.
+            found, status, usage = os.wait4(process.pid, 0 if problem else os.WNOHANG)
+            if found:
+                process.returncode = os.waitstatus_to_exitcode(status)
+                return problem, usage.ru_utime + usage.ru_stime, peak_bytes
+            peak_bytes = float(np.fmax(peak_bytes, _resident_bytes(process.pid)))
+            if time.monotonic() > deadline:
+                problem = f"it was ended after {timeout:g} s, its timeout"
+            elif (written := _bytes_below(folder)) > largest_output:
+                problem = f"it was ended after it had written {format_bytes(written)}"
+            if problem:
+                _end(process)
+            time.sleep(pause)
+            pause = min(2 * pause, _LONGEST_PAUSE)
+    finally:
+        # What it left running.
+        _end(process)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """Kill all processes of a program's session."""
+    with suppress(ProcessLookupError, PermissionError):
+        os.killpg(process.pid, signal.SIGKILL)
+
+
+def _resident_bytes(pid: int) -> float:
+    """Return the memory of a process and of those that it started; NaN once it has ended."""
+    with suppress(psutil.Error):
+        process = psutil.Process(pid)
+        return float(sum(one.memory_info().rss for one in (process, *process.children(recursive=True))))
+    return float("nan")
+
+
+def _bytes_below(folder: Path) -> int:
+    total = 0
+    for place, _, names in os.walk(folder):
+        for name in names:
+            try:
+                total += os.lstat(os.path.join(place, name)).st_size
+            except OSError:
+                continue
+    return total
+
+
+def _tail(*files: Path) -> str:
+    """Return the end of the first file that says something, on one line."""
+    for file in files:
+        with file.open("rb") as opened:
+            opened.seek(max(0, file.stat().st_size - 4 * _LONGEST_TAIL))
+            text = " ".join(opened.read().decode(errors="replace").split())
+        if text:
+            return text if len(text) <= _LONGEST_TAIL else f"... {text[-_LONGEST_TAIL:]}"
+    return ""
+
+
+def _write(mesh: Mesh, path: Path) -> None:
+    """Write a mesh in a format of this package or of meshio."""
+    if path.suffix in WRITERS:
+        write_mesh(mesh, path)
+        return
+    meshio = _meshio(path)
+    meshio.write(path, meshio.Mesh(mesh.vertices, [("triangle", mesh.triangles)]))
+
+
+def _read(path: Path) -> Mesh:
+    """Read a mesh in a format of this package or of meshio."""
+    if is_mesh_name(path):
+        return read_mesh(path)
+    meshio = _meshio(path)
+    try:
+        return as_mesh(meshio.read(path))
+    except InputError:
+        raise
+    # On damaged input its readers raise anything.
+    except (Exception, SystemExit) as error:
+        raise MeshError(f"{path}: {one_line(error)}") from error
+
+
+def _meshio(path: Path) -> Any:
+    try:
+        import meshio
+    except ImportError as error:
+        raise MeshError(f"the format {path.suffix} needs the library meshio: pip install meshio") from error
+    if path.suffix not in meshio.extension_to_filetypes:
+        raise MeshError(f"neither this package nor meshio knows the format {path.suffix}")
+    return meshio
