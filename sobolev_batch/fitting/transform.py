@@ -79,9 +79,8 @@ class MeshTransform:
     def nodes(self, vertices: Reals) -> WeightedPoints:
         """Return the quadrature nodes with the vertices at positions (n, 3), in units of length.
 
-        Raises:
-            InputError: The positions are not finite or not (n, 3).
-            LatticeError: Nodes lie beyond the lattice's half period.
+        InputError where these are not finite or not (n, 3), LatticeError where nodes lie beyond the lattice's half
+        period.
         """
         if vertices.shape != (self.count, 3):
             raise InputError(

@@ -270,11 +270,8 @@ def decay_to_period(spacing: float, order: float, widths: Reals) -> float:
 def image_weight(spacing: float, order: float, widths: Reals, images: Reals = _PERIOD) -> float:
     """Sum the kernel over the least distances of surfaces to their images at n/h, relative to its peak.
 
-    Args:
-        spacing: Spacing h of the lattice, in cycles per unit length.
-        order: Order s.
-        widths: Widths of the surfaces along `DIRECTIONS` (13,), in units of length.
-        images: Periods n, (..., 3).
+    The spacing h is in cycles per unit length, the widths along `DIRECTIONS` (13,) in units of length, the images are n
+    (..., 3).
     """
     # The least distance of S to S + v is at least v·u - width(u), for every direction u.
     offsets = np.abs(images @ DIRECTIONS.T) / spacing
@@ -348,16 +345,9 @@ class ReferenceEstimate:
 def area_and_shape(squares: Reals, products: Reals, reference: Reals) -> Reals:
     """Return two orthogonal parts of distances to a reference b: that of area, and the rest, (2, orders, ...).
 
-    The multiple of b nearest to a is c b with c = 1 + <e, b>/<b, b> for the difference e = a - b, in which nothing
-    cancels for near-duplicates. Then e = (c - 1) b + (a - c b).
-
-    Args:
-        squares: ||e||² (orders, ...).
-        products: <e, b>, likewise.
-        reference: ||b||² (orders,).
-
-    Returns:
-        ||(c - 1) b||, and ||a - c b||, good to 1e-15 of the squared distance in its square.
+    For the difference e = a - b they follow from ||e||² and <e, b> (orders, ...) and ||b||² (orders,). The multiple of
+    b nearest to a is c b with c = 1 + <e, b>/<b, b>, in which nothing cancels for near-duplicates. Then e = (c - 1) b +
+    (a - c b). The squares of the norms of both parts are good to 1e-15 of the squared distance.
     """
     norm = np.sqrt(reference).reshape(-1, *[1] * (squares.ndim - 1))
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -246,10 +246,8 @@ def field_of(
 ) -> xr.DataArray:
     """Return a field as it is, or transform a surface on a lattice.
 
-    Raises:
-        LatticeError: The field has other dimensions, or the surface does not fit into the lattice.
-        InputError: The argument is neither a field nor a surface, a field is not complex, or a surface comes without a
-            lattice.
+    LatticeError where the field has other dimensions, or the surface does not fit into the lattice; InputError where
+    the argument is neither, the field is not complex, or a surface comes without a lattice.
     """
     if isinstance(a, xr.DataArray):
         if a.dtype.kind != "c":
@@ -279,12 +277,7 @@ def field_values(field: xr.DataArray) -> Complexes:
 def pair_of(
     a: OperandLike, b: OperandLike, lattice: Lattice | None, orders: Sequence[float]
 ) -> tuple[xr.DataArray, xr.DataArray]:
-    """Return both as fields on one lattice; a surface beside a field is transformed on the field's lattice.
-
-    Raises:
-        LatticeError: As for `field_of`, or the fields lie on different lattices.
-        InputError: As for `field_of`.
-    """
+    """Return both as fields on one lattice, that of a field if there is one; see `field_of` and `common_lattice`."""
     common = common_lattice((a, b), lattice)
     return field_of(a, common, orders), field_of(b, common, orders)
 

@@ -230,20 +230,9 @@ def write_difference(
 ) -> str:
     """Write the meshes among two surfaces, each with the witness function of a against b at its vertices.
 
-    Args:
-        a: Surface.
-        b: Reference.
-        path: Beginning of the paths of the files, to which "-a.ply" and "-b.ply" are added. Its folder is created.
-        order: Order s.
-        scaling: See `same_surface`.
-        subject: Name of the surface in the sentence that is returned.
-
-    Returns:
-        Where the surfaces differ most, and the files, as the end of a line.
-
-    Raises:
-        InputError: The order is out of range, or the path names no file, or its folder cannot be created.
-        StoreError: A file cannot be written.
+    The path is the beginning of those of the files, to which "-a.ply" and "-b.ply" are added. Return where the surfaces
+    differ most, and the files, as the end of a line in which a surface has the name of the subject. StoreError where a
+    file cannot be written; see also `require_place`.
     """
     # Files load what reads stores, which a verdict does without.
     from sobolev_batch.results.figures.meshes import witness_at_vertices, write_vertex_values

@@ -183,13 +183,10 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
 
 
 def _look_at(folder: Path) -> tuple[dict[PurePosixPath, int], dict[str, str]]:
-    """Look at the mesh files in a folder and those below, except hidden ones, stores, and links to folders.
+    """Return the number of triangles of each mesh file that a study can name, and the reason for each other file.
 
-    Small files are read as a whole, up to some bytes together.
-
-    Returns:
-        The number of triangles of each file that a study can name, in the natural order of their paths below the
-        folder, and the reason for each other file.
+    Paths below the folder are in their natural order. Hidden files, stores, and links to folders are left out. Small
+    files are read as a whole, up to some bytes together.
     """
     sizes: dict[PurePosixPath, int] = {}
     left_out: dict[str, str] = {}

@@ -181,9 +181,8 @@ def look_at_extents(
 ) -> tuple[dict[str, Extent], dict[str, str]]:
     """Look at the surfaces that are quickly loaded, one after the other, as long as they take little memory together.
 
-    Returns:
-        Extent of each surface in the study's unit, and the reason for each that cannot be compared with a reference of
-        this extent, by label.
+    Return the extent of each in the study's unit, and the reason for each that cannot be compared with a reference of
+    this extent, by label.
     """
     extents: dict[str, Extent] = {}
     set_aside: dict[str, str] = {}
@@ -251,10 +250,7 @@ def choose_lattice(
     The coarsest and the finest member of each family are compared with the reference on a small lattice. Where one
     lattice would be large, octaves follow a small one. Surfaces that cannot be read, or reach much farther than the
     reference, have no say. For a best effort, neither have pairs that cannot have the accuracy, as long as others can.
-
-    Raises:
-        AccuracyError: A pilot shows that the accuracy cannot be met within the memory, and it is no best effort.
-        StudyError: No pilot could be made.
+    AccuracyError where it is out of reach, and StudyError where no pilot could be made.
     """
     pilots, set_aside = choose_pilots(members, similarity, reference.extent)
     others = {label: member for label, member in members.items() if label not in {*pilots, *set_aside}}

@@ -192,15 +192,10 @@ class FamilyReference(Section):
 
 
 def with_named_meshes(table: Any, meshes: Mapping[str, Any], above: tuple[str, ...] = ()) -> Any:
-    """Return the table of a source with the tables of named meshes in place of their names.
+    """Return the table of a source, or of a mesh by its name, with the tables of named meshes in place of their names.
 
-    Args:
-        table: Table, or the name of a mesh.
-        meshes: Table of each named mesh; it may name others.
-        above: Meshes that are made from this one.
-
-    Raises:
-        ValueError: A name is unknown, or a mesh is made from itself.
+    Meshes are tables by name, which may name others; those above are made from this one. ValueError where a name is
+    unknown, or a mesh is made from itself.
     """
     if isinstance(table, str):
         if table in above or len(above) > _DEEPEST:

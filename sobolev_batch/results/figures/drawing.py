@@ -327,13 +327,7 @@ def write_plots(
     """Write the plots of a store into a folder, each with a panel for each order.
 
     The files are named after the kinds of `plot`; each kind that the store has results for is drawn in each format.
-
-    Returns:
-        Paths of the pictures, and what each of them leaves out, by its name.
-
-    Raises:
-        InputError: The store lacks the horizontal axis.
-        StoreError: The folder cannot be written.
+    Return their paths, and what each of them leaves out, by its name.
     """
     with drawing(size):
         figures = {

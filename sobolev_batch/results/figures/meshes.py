@@ -106,15 +106,10 @@ class StudyMeshes:
 
 
 def matching_labels(tree: xr.DataTree, names: Sequence[str]) -> tuple[str, ...]:
-    """Return the labels of an open store that are meant by names, each once.
+    """Return the labels of an open store that are meant by labels or patterns such as ``scans/*``, each once.
 
-    Args:
-        tree: Open store.
-        names: Labels, or patterns of them with the wildcards ``*``, ``?`` and ``[...]``. A pattern stands for meshes
-            that are computed and have triangles, and never for the reference.
-
-    Raises:
-        InputError: The store has no such label; the message suggests one of the store.
+    A pattern stands for meshes that are computed and have triangles, and never for the reference. InputError, with a
+    suggestion, where the store has no such label.
     """
     meshes = finished_group(tree, "meshes")
     known: list[str] = meshes["mesh"].values.tolist()
@@ -168,13 +163,8 @@ def exported(
 ) -> tuple[StudyMeshes, tuple[str, ...], tuple[float, ...]]:
     """Return the meshes of a store, with the labels and the orders whose witness functions are to be written.
 
-    By default these are all computed meshes with triangles but the reference, and the orders of the study.
-
-    Raises:
-        InputError: The store has no tables yet, no field of its reference or no such label, or the label is that of the
-            reference, or the study's meshes cannot be listed on this machine.
-        OrderError: An order is not below -1/2.
-        StoreError: The location has no store of a study.
+    By default these are all computed meshes with triangles but the reference, and the orders of the study. InputError
+    where the store lacks tables, labels or the field of its reference, or its meshes cannot be listed on this machine.
     """
     tree = as_tree(store)
     of_study = finished_group(tree, "convergence")["order"].values.tolist()
@@ -247,10 +237,7 @@ def write_vertex_values(
 
     The mesh is in its own unit of length; the values (orders, vertices) are in 1 / unit length of the context, a
     "study" or a "comparison", whose unit is given in that of the mesh. The title says what was compared with what.
-
-    Raises:
-        InputError: The library that writes the format is not installed.
-        StoreError: The file cannot be written.
+    StoreError where the file cannot be written.
     """
     escaped = title.encode("unicode_escape").decode("ascii")
     notes = [

@@ -163,12 +163,8 @@ def make_views(
 
     Without labels or patterns of meshes, they are the closest mesh of each chosen family at the first order, and the
     farthest ones. The limits are those of `PAGE_LIMITS`, and the folder is where relative paths in the study start.
-
-    Returns:
-        Views in the order of the study, and the reason for each requested mesh without a view, by its label.
-
-    Raises:
-        InputError: A label or family is unknown, or more meshes are named than may be shown.
+    Return views in the order of the study, and the reason for each requested mesh without one, by its label. InputError
+    where a label or family is unknown, or more meshes are named than may be shown.
     """
     most_meshes, most_triangles, most_values = limits
     named = matching_labels(tree, meshes)
@@ -232,13 +228,8 @@ def _for_display(vertices: Reals, triangles: Triangles, most: int) -> tuple[Real
 def draw_mesh(axes: Axes, view: MeshView, index: int = 0, limit: float | None = None) -> None:
     """Draw a mesh on axes from the side of its eye, the farthest triangles first, so that nearer ones hide them.
 
-    Red where the witness is positive and blue where it is negative: Matplotlib's "RdBu_r" from minus to plus a limit.
-
-    Args:
-        axes: Axes to draw on.
-        view: Mesh to draw.
-        index: Number of the order.
-        limit: End of the scale of colours; default that of `color_limits`.
+    Red where the witness of the order of an index is positive and blue where it is negative: Matplotlib's "RdBu_r" from
+    minus to plus a limit, by default that of `color_limits`.
     """
     right = np.cross(_UP, view.eye)
     right /= np.linalg.norm(right)
@@ -322,17 +313,11 @@ def write_witness_plots(
     formats: Sequence[PictureFormat] = ("png",),
     size: Size | None = None,
 ) -> tuple[tuple[Path, ...], Mapping[str, str]]:
-    """Draw meshes of an open store, coloured by their witness functions, into a folder.
+    """Draw meshes of an open store, coloured by their witness functions, into a folder; see `make_views`.
 
     Each mesh gets a file witness-* with colours and a view of its own; several are also drawn beside each other in the
-    file witness, seen from the front and on one scale of colours, at the first order. See `make_views` for the rest.
-
-    Returns:
-        Paths of the pictures, and the reason for each mesh without one.
-
-    Raises:
-        InputError: A label, order or family is unknown, or too many meshes are named.
-        StoreError: The folder cannot be written.
+    file witness, seen from the front and on one scale of colours, at the first order. Return the paths of the pictures,
+    and the reason for each mesh without one.
     """
     tree = selection.tree
     views, missing = make_views(tree, folder, meshes, PICTURE_LIMITS, up, selection.orders, selection.families)

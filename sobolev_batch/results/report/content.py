@@ -89,15 +89,10 @@ def common_content(
     failed: Mapping[str, str],
     versions: Mapping[str, str],
 ) -> dict[str, Any]:
-    """Return the texts and tables that the pages of a study and of a collection both have.
+    """Return what the pages of a study and of a collection both show.
 
-    Args:
-        title: Title.
-        study: Table of the study file.
-        frames: Rows of `table` of each object.
-        status: Status of the store.
-        failed: Reasons of what failed, by label.
-        versions: Versions of libraries.
+    The study is the table of its file, the frames are the rows of `table` of each object, failures have reasons by
+    label.
     """
     # Of the extra, which `make_report` looks for.
     import tomli_w
@@ -169,9 +164,8 @@ _COLUMNS = (
 def study_verdict(frame: pd.DataFrame, failed: Mapping[str, str]) -> tuple[tuple[str, ...], PageTable, str]:
     """Return the verdict on a study at each order, from the rows of `table` and the reasons of meshes that are missing.
 
-    Returns:
-        A sentence for each order; the table of nearest meshes, smallest meshes below bounds, and meshes that are
-        missing or imprecise; and a note on the sizes and families that the table leaves out, empty where it has all.
+    It is a sentence for each order; the table of nearest meshes, smallest meshes below bounds, and meshes that are
+    missing or imprecise; and a note on the sizes and families that the table leaves out, empty where it has all.
     """
     groups = [(float(order), rows) for order, rows in frame.groupby("order", sort=False)]
     sizes = _sizes(groups[0][1])

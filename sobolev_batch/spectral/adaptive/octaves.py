@@ -242,13 +242,8 @@ def solve_in_octaves(problem: Problem, seed: int, aim: float = 1.0, for_others: 
     """Compute a norm or a distance to an accuracy, with its tail measured in octaves.
 
     The same seed gives the same random frequencies and result. The aim is a fraction of the rtol. Octaves reach farther
-    for others: pairs whose part beyond the octaves is known less well.
-
-    Returns:
-        The first solution that meets the aim; else the last one that can be sampled in some minutes.
-
-    Raises:
-        AccuracyError: The accuracy lies below the rounding of fields.
+    for others: pairs whose part beyond the octaves is known less well. Return the first solution that meets the aim;
+    else the last one that can be sampled in some minutes. AccuracyError where the accuracy lies below rounding.
     """
     aimed = replace(problem, accuracy=replace(problem.accuracy, rtol=aim * problem.accuracy.rtol))
     state = State.first(aimed, seed, for_others)

@@ -88,17 +88,8 @@ def solve(problem: Problem, seed: int = 0) -> Solution:
     """Compute a norm or a distance to an accuracy.
 
     Where a small lattice reaches far enough, or the accuracy is high, it is computed on one lattice. Else what lies
-    beyond a small lattice is measured in octaves.
-
-    Args:
-        problem: Surfaces, orders and accuracy.
-        seed: Seed of the random frequencies of octaves.
-
-    Returns:
-        The first solution that meets the accuracy; for a best effort else the nearest one.
-
-    Raises:
-        AccuracyError: The accuracy lies below the rounding of fields, or is out of reach, and is no best effort.
+    beyond a small lattice is measured in octaves, at random frequencies that follow from the seed. Return the first
+    solution that meets the accuracy; for a best effort else the nearest one, which otherwise is an AccuracyError.
     """
     if not problem.surfaces:
         return Solution.zero(problem.orders)
@@ -207,10 +198,8 @@ def _differ_beyond(problem: Problem, lattice: Lattice) -> bool:
 def _solve_on_lattices(problem: Problem, lattice: Lattice, is_pilot: bool, *, before_octaves: bool = False) -> Solution:
     """Return the first solution that meets the accuracy, else the last of a few rounds or of the largest lattice.
 
-    A pilot is a small lattice that only shows how large distances are.
-
-    Raises:
-        AccuracyError: The accuracy is out of reach, and no best effort.
+    A pilot is a small lattice that only shows how large distances are. AccuracyError where the accuracy is out of
+    reach.
     """
     values: Reals | None = None
     # Their fields may differ by a little more.
@@ -247,15 +236,8 @@ def _with_hidden_part(problem: Problem, solution: Solution, before_octaves: bool
     """Return a solution on a lattice with the error by all that may lie beyond it, and a lattice that shows more of it.
 
     The law of growth extrapolates, and sees no period that begins beyond the lattice. What lies there is less than the
-    areas permit. Where that is too much, it follows from close points, drawn at random.
-
-    Args:
-        problem: Surfaces, orders and accuracy.
-        solution: Numbers that meet the accuracy by the law.
-        before_octaves: True if octaves follow, and may be cheaper than a larger lattice.
-
-    Returns:
-        The solution, and the lattice that is likely to show enough, if there is one.
+    areas permit. Where that is too much, it follows from close points, drawn at random. Octaves may follow, and be
+    cheaper than a larger lattice. There may be no lattice that is likely to show enough.
     """
     found, lattice, orders = solution.estimate, cast(Lattice, solution.lattice), np.array(problem.orders)
     parts = np.array([problem.accuracy.truncation_part(order) for order in problem.orders])

@@ -67,14 +67,8 @@ def relative_distance(
     """Bound a distance over the norm of its reference closely enough to tell on which side of a threshold it is.
 
     One lattice decides, or two, where the areas alone bound what lies beyond them; else octaves measure it, at random
-    frequencies that follow from the seed. The memory of the accuracy counts, and its rtol does not.
-
-    Returns:
-        The bounds, and what they follow from.
-
-    Raises:
-        LatticeError: A surface is too large or too small for any lattice.
-        InputError: The memory is too little, or a surface is of an unknown kind.
+    frequencies that follow from the seed. The memory of the accuracy counts, and its rtol does not. Return the bounds,
+    and what they follow from. LatticeError where a surface is too large or too small for any lattice.
     """
     if surface == reference:
         return Interval(0.0, 0.0), "identical"

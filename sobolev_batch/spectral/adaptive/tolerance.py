@@ -196,10 +196,8 @@ def lattice_of(highest: float, period: float, most: int) -> Lattice:
 def refined(sums: Sums, weights: SobolevWeights, support: Support, accuracy: Accuracy, label: str) -> Lattice:
     """Return the lattice that distances need, from their sums on a smaller one with these weights.
 
-    It is at least as fine and as large as the smaller one. A best effort takes the largest one at last.
-
-    Raises:
-        AccuracyError: The lattice does not fit into the memory; the message gives the reachable rtol.
+    It is at least as fine and as large as the smaller one. A best effort takes the largest one at last; else
+    AccuracyError, with the reachable rtol, where the lattice does not fit into the memory.
     """
     lattice, orders = weights.lattice, weights.orders
     period = _refined_period(sums, weights, support.widths, accuracy)

@@ -96,9 +96,6 @@ def octave_values(
     Values on lattices come from nonuniform FFTs by these settings, and their errors are measured for some orders. Those
     at drawn frequencies, and on lattices where large triangles would take many points, are exact. Known values, on the
     first lattices and maybe at the same drawn frequencies, are not computed again.
-
-    Raises:
-        InputError: The quadrature of a parametrised surface does not converge.
     """
     values: list[NDArray[np.complexfloating]] = []
     finished = 0 if known is None else len(known.sampling.lattices)

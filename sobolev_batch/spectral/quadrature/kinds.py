@@ -51,20 +51,12 @@ _EXACT_CHANGE, _MOST_EXACT_NODES = 1e-12, 1 << 19
 
 @lru_cache(maxsize=16)
 def resolution_of(surface: Smooth, highest_frequency: float, tolerance: float) -> tuple[Counts, float]:
-    """Return the nodes that the transform of a surface takes up to a frequency.
+    """Return the nodes along u and v that the transform of a surface takes up to a frequency, and how far it is off.
 
-    Args:
-        surface: Surface in units of length.
-        highest_frequency: Largest |ξ|, in cycles per unit length.
-        tolerance: Largest change when the nodes are doubled, relative to the area; clipped to 1e-13 to 1e-4.
-
-    Returns:
-        Nodes along u and v, and the change of the transform when they are doubled along u, plus that along v, over
-        the area: the largest one over the probe frequencies.
-
-    Raises:
-        InputError: More than 4,194,304 nodes would be needed, or 2,048 along a parameter that is not periodic: the
-            parametrisation is not smooth, or the surface is large or thin compared with the wavelength.
+    That is the change of the transform when the nodes are doubled along u, plus that along v, over the area: the
+    largest one over the probe frequencies. The tolerance of it is clipped to 1e-13 to 1e-4; frequencies are in cycles
+    per unit length. InputError where more than 4,194,304 nodes would be needed, or 2,048 along a parameter that is not
+    periodic: the parametrisation is not smooth, or the surface is large or thin compared with the wavelength.
     """
     tolerance = min(max(tolerance, FINEST_CHANGE), COARSEST_CHANGE)
     (u, v), change = _refined(surface, highest_frequency, tolerance, MOST_NODES)

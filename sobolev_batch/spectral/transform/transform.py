@@ -73,11 +73,8 @@ def transform_block(
     """Return the transform of a surface on one block of the lattice.
 
     Pass the quadrature plan of the surface by the same settings to transform several blocks with one choice of rules.
-
-    Raises:
-        LatticeError: The surface extends beyond the lattice's half period.
-        InputError: The allowed memory is too little, the quadrature of a parametrised surface does not converge, or
-            the surface is of an unknown kind.
+    LatticeError where the surface extends beyond the lattice's half period, InputError where the allowed memory is too
+    little, or the quadrature of a parametrised surface does not converge.
     """
     kind = kind_of(surface)
     if isinstance(lattice, Lattice):
@@ -146,10 +143,7 @@ def fastest_spec(whole: NufftSpec, workload: Workload, costs: Costs, allowed_byt
     """Return the sub-blocks, batches and oversampling that are predicted to be the fastest within the allowed memory.
 
     That memory is without the result and the mesh. If the whole block fits, nothing is subdivided or prescribed: the
-    values are then those of unlimited memory.
-
-    Raises:
-        InputError: Nothing fits; the message names the smallest memory that works.
+    values are then those of unlimited memory. InputError, with the smallest memory that works, where nothing fits.
     """
 
     def fits(spec: NufftSpec) -> bool:

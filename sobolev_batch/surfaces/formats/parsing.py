@@ -38,11 +38,9 @@ _XML_BYTES = 1 << 14
 
 
 def open_regular(path: Path) -> BufferedReader:
-    """Open a regular file for reading. Pipes could keep a reader waiting for ever, devices could never end.
+    """Open a regular file for reading; OSError or, for impossible names, ValueError where that fails.
 
-    Raises:
-        OSError: The file cannot be opened, or is no regular file.
-        ValueError: No file can have this name.
+    Pipes could keep a reader waiting for ever, devices could never end.
     """
     mode = path.stat().st_mode
     if stat.S_ISDIR(mode):
@@ -101,14 +99,9 @@ def unpacked_limit(packed_bytes: int) -> int:
 
 
 def xml_events(data: bytes, kind: str) -> Iterator[tuple[str, str, dict[str, str]]]:
-    """Parse XML a little at a time, and refuse what would take memory out of proportion.
+    """Parse XML a little at a time, and refuse what would take memory out of proportion in a file of some kind.
 
-    Args:
-        data: Contents of the file.
-        kind: Name of the format, as messages name it.
-
-    Yields:
-        ("start", name, attributes) and ("end", name, {}) of each element, and ("text", piece, {}) between them.
+    Yield ("start", name, attributes) and ("end", name, {}) of each element, and ("text", piece, {}) between them.
     """
     events: list[tuple[str, str, dict[str, str]]] = []
     heard = 0
@@ -169,14 +162,10 @@ def _read_unpacked_bounded(file: IO[bytes], length: int, factor: float) -> bytes
 
 
 def triangle_fans(corners: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Cut each polygon into the fan of triangles around its first corner, exact for convex ones.
+    """Cut each polygon into the fan of triangles around its first corner, exact for convex ones, int64 (m, 3).
 
-    Args:
-        corners: Vertex indices of all polygons, one after the other.
-        sizes: Number of corners of each polygon.
-
-    Returns:
-        Vertex indices of triangles (m, 3), int64; those of a polygon lie next to each other.
+    The corners are vertex indices of all polygons, one after the other, the sizes their numbers. Triangles of a polygon
+    lie next to each other.
     """
     if not len(sizes):
         raise MeshError("the file has no faces")

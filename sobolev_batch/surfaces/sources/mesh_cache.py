@@ -137,17 +137,10 @@ def environment() -> dict[str, str]:
 def run_command(
     mesh: Mesh, words: list[str], suffixes: tuple[str, str], timeout: float, largest_output: int
 ) -> Outcome:
-    """Run a program that makes a mesh of another one.
+    """Run a program that makes a mesh of another one, and return the mesh, or why it failed and what it said last.
 
-    Args:
-        mesh: Mesh to start from.
-        words: Program and arguments, with {input} and {output} for the files.
-        suffixes: Suffixes of both files.
-        timeout: Seconds after which it is ended.
-        largest_output: Bytes that it may write.
-
-    Returns:
-        The mesh, or the reason of the failure with the end of what the program said.
+    Its words have {input} and {output} for files with the suffixes. It may take the timeout in seconds, and write the
+    largest output in bytes.
     """
     with tempfile.TemporaryDirectory(prefix="sobolev-batch-", ignore_cleanup_errors=True) as scratch:
         folder = Path(scratch)
