@@ -210,7 +210,11 @@ class FitRun:
     def finish(self) -> Self:
         """Carry the fit out, go back to the start if that is nearer, and return the run."""
         start, order = self.vertices, self.problem.settings.order
-        self.descend()
+        try:
+            for shares, smoothing, steps in self._stages():
+                self._descend(shares, smoothing, steps)
+        except KeyboardInterrupt:
+            self.end = End.INTERRUPTED
         try:
             before, after = (self.problem.squares(vertices, [order])[0] for vertices in (start, self.vertices))
         except KeyboardInterrupt:
@@ -219,14 +223,6 @@ class FitRun:
             if after > before:
                 self.vertices, self.end = start, End.FARTHER
         return self
-
-    def descend(self) -> None:
-        """Move the vertices to the end of all stages, or to the last step before an interrupt."""
-        try:
-            for shares, smoothing, steps in self._stages():
-                self._descend(shares, smoothing, steps)
-        except KeyboardInterrupt:
-            self.end = End.INTERRUPTED
 
     def _stages(self) -> list[tuple[OrderWeights, float, int]]:
         """Return shares of orders, smoothing and largest number of steps of each stage, from coarse to fine.

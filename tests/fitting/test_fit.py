@@ -130,10 +130,10 @@ def test_a_mesh_at_its_target_stays() -> None:
 
 @pytest.mark.slow
 def test_a_result_that_is_farther_away_is_not_given(monkeypatch: pytest.MonkeyPatch) -> None:
-    def move_away(run: Any) -> None:
+    def move_away(run: Any, *_: Any) -> None:
         run.vertices = run.vertices * 1.1
 
-    monkeypatch.setattr(module.FitRun, "descend", move_away)
+    monkeypatch.setattr(module.FitRun, "_descend", move_away)
     fitted = sb.fit(START, TARGET, -4.0)
     np.testing.assert_allclose(fitted.mesh.vertices, START.vertices, rtol=0, atol=1e-14)
     assert fitted.after == fitted.before

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +12,6 @@ from typing import Self
 
 import numpy as np
 import xarray as xr
-from plyfile import PlyData, PlyElement
 
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.study.plan import members_of
@@ -23,6 +21,7 @@ from sobolev_batch.results.open import AnyStore, as_tree, fields_read, finished_
 from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.metrics.causes import witness
 from sobolev_batch.spectral.shells import Orders, check_orders
+from sobolev_batch.surfaces.formats.plain_formats import write_ply
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Reals, Similarity
 from sobolev_batch.surfaces.sources.mesh_cache import MeshCache
@@ -262,17 +261,8 @@ def _ply(mesh: Mesh, values: Mapping[float, Reals], notes: Sequence[str]) -> byt
     rows = {f"witness_minus_{_number(-order)}".replace(".", "_").replace("+", ""): row for order, row in values.items()}
     first = next(iter(rows))
     # The quality is the scalar that MeshLab and similar programs show.
-    columns = {**dict(zip("xyz", mesh.vertices.T, strict=True)), "quality": rows[first], **rows}
-    kinds = [(name, "<f4" if name == "quality" else "<f8") for name in columns]
-    vertices = np.empty(len(mesh.vertices), dtype=kinds)
-    for name, column in columns.items():
-        vertices[name] = column
-    faces = np.empty(len(mesh.triangles), dtype=[("vertex_indices", "<i4", (3,))])
-    faces["vertex_indices"] = mesh.triangles
-    elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
-    file = io.BytesIO()
-    PlyData(elements, text=False, byte_order="<", comments=[*notes, f"quality repeats {first}"]).write(file)
-    return file.getvalue()
+    quality = {"quality": rows[first].astype(np.float32)}
+    return write_ply(mesh, {**quality, **rows}, [*notes, f"quality repeats {first}"])
 
 
 def _vtp(mesh: Mesh, values: Mapping[float, Reals], notes: Sequence[str]) -> bytes:

@@ -396,7 +396,8 @@ def _finer_sampling(state: State, octave: MeasuredOctave, order: int, permitted:
         return replace(
             sampling, lattices=(first,), draws=beside, seed=_seed(rng), uniform_fraction=_UNIFORM_BESIDE_LATTICE
         )
-    if sums.drawn_variances[order] > sums.lattice_variances[order]:
+    of_lattices, of_draws = sums.parts[:, order]
+    if of_draws > of_lattices:
         return replace(sampling, draws=count, seed=_seed(rng))
     intervals = 2 * round(sampling.lattices[-1].M * np.clip(excess**0.5, 1.25, 2.0) / 2)
     return replace(sampling, lattices=(*sampling.lattices, _lattice(state, sampling.octave, intervals, rng)))

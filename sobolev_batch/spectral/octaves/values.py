@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -201,26 +201,22 @@ class OctaveSums:
 
     Attributes:
         squares: ∫ window (1+|ξ|²)^s |field|² for each order (orders,).
-        lattice_variances: Variance of their part from lattices (orders,).
-        drawn_variances: Variance of their part from drawn frequencies (orders,).
+        parts: Variances of their parts from lattices and from drawn frequencies (2, orders).
+        degrees: Degrees of freedom of these variances (2,).
         energy: Mean of ∫_{|ξ|=r} |field|² dS over the octave.
         energy_deviation: Standard error of the energy.
-        lattice_degrees: Degrees of freedom of the lattices' variances.
-        drawn_degrees: Degrees of freedom of the draws' variances.
     """
 
     squares: Reals
-    lattice_variances: Reals
-    drawn_variances: Reals
+    parts: Reals
+    degrees: Reals
     energy: float
     energy_deviation: float
-    lattice_degrees: int
-    drawn_degrees: int
 
     @property
     def variances(self) -> Reals:
         """Variance of the integrals (orders,)."""
-        return self.lattice_variances + self.drawn_variances
+        return np.asarray(self.parts.sum(axis=0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,7 +246,7 @@ class OctaveWeights:
 
         What is known of the integrals otherwise may have been subtracted from the samples.
         """
-        sums, variances, degrees = np.zeros(len(self.by_order)), np.zeros((2, len(self.by_order))), [0, 0]
+        sums, variances, degrees = np.zeros(len(self.by_order)), np.zeros((2, len(self.by_order))), np.zeros(2)
         for part in self.sampling.parts:
             if part.samples.start == part.samples.stop:
                 continue
@@ -264,7 +260,7 @@ class OctaveWeights:
             degrees[kind] += len(groups) - 1
         deviation = float(np.sqrt(variances[:, -1].sum())) / self.width
         energy = float(sums[-1]) / self.width
-        return OctaveSums(sums[:-1], variances[0, :-1], variances[1, :-1], energy, deviation, *degrees)
+        return OctaveSums(sums[:-1], variances[:, :-1], degrees, energy, deviation)
 
 
 def squared_moduli(values: NDArray[np.complexfloating]) -> Reals:
@@ -272,21 +268,14 @@ def squared_moduli(values: NDArray[np.complexfloating]) -> Reals:
     return np.asarray(values.real.astype(np.float64) ** 2 + values.imag.astype(np.float64) ** 2)
 
 
-def statistical_errors(octaves: Iterable[OctaveSums]) -> Reals:
+def statistical_errors(octaves: Sequence[OctaveSums]) -> Reals:
     """Return how far off the sum of integrals over several octaves may be (orders,), at 99 %."""
-    parts = [
-        part
-        for octave in octaves
-        for part in (
-            (octave.lattice_variances, octave.lattice_degrees),
-            (octave.drawn_variances, octave.drawn_degrees),
-        )
-    ]
     # Few sublattices stay few beside many draws.
-    return quantile_of_sum(np.array([variance for variance, _ in parts]), np.array([count for _, count in parts]))
+    variances = np.concatenate([octave.parts for octave in octaves])
+    return quantile_of_sum(variances, np.concatenate([octave.degrees for octave in octaves]))
 
 
-def quantile_of_sum(variances: Reals, degrees: NDArray[np.int64]) -> Reals:
+def quantile_of_sum(variances: Reals, degrees: NDArray[Any]) -> Reals:
     """Return how far off a sum may be at 99 %, from the variances of its parts (parts, ...) and their degrees.
 
     It is Student's quantile for the degrees of freedom of the sum (F. E. Satterthwaite 1946, doi:10.2307/3002019).

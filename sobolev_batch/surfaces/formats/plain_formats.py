@@ -11,7 +11,7 @@ import os
 import re
 import warnings
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from tempfile import TemporaryFile
 from typing import IO
 
@@ -140,16 +140,20 @@ def parse_stl(data: bytes) -> Raw:
     return merge_coincident(corners, np.arange(len(corners), dtype=np.int64).reshape(-1, 3))
 
 
-def write_ply(mesh: Mesh) -> bytes:
-    """Return a binary PLY file, all digits kept."""
-    vertices = np.empty(len(mesh.vertices), dtype=[(axis, "<f8") for axis in "xyz"])
-    for axis, column in zip("xyz", mesh.vertices.T, strict=True):
-        vertices[axis] = column
+def write_ply(
+    mesh: Mesh, values: Mapping[str, NDArray[np.floating]] | None = None, comments: Sequence[str] = ()
+) -> bytes:
+    """Return a binary PLY file, all digits kept, with further values (n,) of the vertices by their names."""
+    columns = {**dict(zip("xyz", mesh.vertices.T, strict=True)), **(values or {})}
+    kinds = [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()]
+    vertices = np.empty(len(mesh.vertices), dtype=kinds)
+    for name, column in columns.items():
+        vertices[name] = column
     faces = np.empty(len(mesh.triangles), dtype=[("vertex_indices", "<i4", (3,))])
     faces["vertex_indices"] = mesh.triangles
     elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
     file = io.BytesIO()
-    PlyData(elements, text=False, byte_order="<").write(file)
+    PlyData(elements, text=False, byte_order="<", comments=comments).write(file)
     return file.getvalue()
 
 

@@ -35,8 +35,8 @@ from sobolev_batch.surfaces.sources.mesh_cache import (
     OUTPUT,
     PLACEHOLDER,
     Cost,
+    Made,
     MeshCache,
-    Outcome,
     environment,
     run_command,
 )
@@ -159,7 +159,7 @@ class RemesherSource(NestedSource):
             yield name, {**self.parameters, **dict(zip(lists, values, strict=True))}
 
     @abstractmethod
-    def _maker(self, parameters: dict[str, Parameter], folder: Path) -> Callable[[Mesh], Outcome]:
+    def _maker(self, parameters: dict[str, Parameter], folder: Path) -> Callable[[Mesh], Made]:
         """Return a function that makes the mesh of some parameters."""
 
     @abstractmethod
@@ -218,7 +218,7 @@ class CommandSource(RemesherSource):
             raise ValueError("the command has no {output}, the file that it has to write")
         return self
 
-    def _maker(self, parameters: dict[str, Parameter], folder: Path) -> Callable[[Mesh], Outcome]:
+    def _maker(self, parameters: dict[str, Parameter], folder: Path) -> Callable[[Mesh], Made]:
         return partial(
             run_command,
             words=[self._filled(word, parameters, folder) for word in self.command],
@@ -282,7 +282,7 @@ class FunctionSource(RemesherSource):
     function: Callable[..., Any] | str
     version: str | None = None
 
-    def _maker(self, parameters: dict[str, Parameter], folder: Path) -> Callable[[Mesh], Outcome]:
+    def _maker(self, parameters: dict[str, Parameter], folder: Path) -> Callable[[Mesh], Made]:
         return partial(call_function, function=self.function, parameters=parameters)
 
     def _settings(self, parameters: dict[str, Parameter]) -> dict[str, Any]:
@@ -304,7 +304,7 @@ class RemeshedMember(Member):
         cache: Where it is kept; None if nothing may run.
     """
 
-    make: Callable[[Mesh], Outcome]
+    make: Callable[[Mesh], Made]
     identity: Fingerprint
     original: Member
     files: Mapping[str, Path]
@@ -323,11 +323,11 @@ class RemeshedMember(Member):
                 f"the remesher may not run, and its mesh is not kept in {self.cache.folder}; run the study with "
                 "--allow-commands (in Python: allow_commands=True) if you trust it"
             )
-        outcome = self.make(load_mesh(self.original))
-        self.cache.write(digest, outcome, {"made by": self.identity, "of": self.original.name})
-        if outcome.mesh is None:
-            raise MeshError(outcome.reason)
-        return outcome.mesh
+        made = self.make(load_mesh(self.original))
+        self.cache.write(digest, made, {"made by": self.identity, "of": self.original.name})
+        if isinstance(made[1], str):
+            raise MeshError(made[1])
+        return made[1]
 
     def cost(self) -> Cost | None:
         """Return what making it took the last time."""
@@ -345,17 +345,17 @@ class RemeshedMember(Member):
         return replace(self.original.expected_size(), factor=math.inf)
 
 
-def call_function(mesh: Mesh, function: Callable[..., Any] | str, parameters: Mapping[str, Parameter]) -> Outcome:
+def call_function(mesh: Mesh, function: Callable[..., Any] | str, parameters: Mapping[str, Parameter]) -> Made:
     """Call a function that makes a mesh of another one; see `FunctionSource`."""
     if isinstance(function, str):
-        return Outcome(Cost(), reason=f"the function {function} is not at hand; run the study from Python with it")
+        return Cost(), f"the function {function} is not at hand; run the study from Python with it"
     started, processor = time.perf_counter(), time.thread_time()
-    made, reason = None, ""
+    made: Mesh | str
     try:
         made = as_mesh(function(mesh, **parameters))
     except Exception as error:
-        reason = f"{function_name(function)}: {type(error).__name__}: {one_line(error)}"
-    return Outcome(Cost(time.perf_counter() - started, time.thread_time() - processor), made, reason)
+        made = f"{function_name(function)}: {type(error).__name__}: {one_line(error)}"
+    return Cost(time.perf_counter() - started, time.thread_time() - processor), made
 
 
 def function_name(function: Callable[..., Any] | str) -> str:

@@ -55,19 +55,8 @@ class Cost:
     exit_status: float = _NOTHING_KNOWN
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """A mesh that was made, or why it was not.
-
-    Attributes:
-        cost: What it took.
-        mesh: The mesh; None after a failure.
-        reason: Reason of the failure; empty otherwise.
-    """
-
-    cost: Cost
-    mesh: Mesh | None = None
-    reason: str = ""
+# What making a mesh took, and the mesh, or why there is none.
+Made = tuple[Cost, Mesh | str]
 
 
 @dataclass(frozen=True)
@@ -103,13 +92,14 @@ class MeshCache:
         except (KeyError, TypeError, ValueError):
             return None
 
-    def write(self, digest: str, outcome: Outcome, about: Mapping[str, Any]) -> None:
+    def write(self, digest: str, made: Made, about: Mapping[str, Any]) -> None:
         """Keep what was made, or what a failure took, with a description of what made it."""
-        mesh = outcome.mesh
-        if mesh is not None:
+        cost, mesh = made
+        if isinstance(mesh, Mesh):
             self.folder.write({f"{digest}.ply": write_ply(mesh)})
         # It makes the mesh count, so it comes last.
-        entry = {"mesh": mesh and mesh.digest, "cost": asdict(outcome.cost), "reason": outcome.reason, **about}
+        kept, reason = (mesh.digest, "") if isinstance(mesh, Mesh) else (None, mesh)
+        entry = {"mesh": kept, "cost": asdict(cost), "reason": reason, **about}
         self.folder.write({f"{digest}.json": json.dumps(entry, indent=1, default=str).encode()})
 
     def _entry(self, digest: str) -> dict[str, Any]:
@@ -134,9 +124,7 @@ def environment() -> dict[str, str]:
     return {**os.environ, "PATH": os.pathsep.join(filter(None, (own, os.environ.get("PATH"))))}
 
 
-def run_command(
-    mesh: Mesh, words: list[str], suffixes: tuple[str, str], timeout: float, largest_output: int
-) -> Outcome:
+def run_command(mesh: Mesh, words: list[str], suffixes: tuple[str, str], timeout: float, largest_output: int) -> Made:
     """Run a program that makes a mesh of another one, and return the mesh, or why it failed and what it said last.
 
     Its words have {input} and {output} for files with the suffixes. It may take the timeout in seconds, and write the
@@ -148,7 +136,7 @@ def run_command(
         try:
             _write(mesh, files[INPUT])
         except InputError as error:
-            return Outcome(Cost(), reason=f"its input cannot be written: {error}")
+            return Cost(), f"its input cannot be written: {error}"
         filled = [PLACEHOLDER.sub(lambda found: str(files.get(found[1], found[0])), word) for word in words]
         said = folder / "stdout.txt", folder / "stderr.txt"
         started = time.perf_counter()
@@ -164,7 +152,7 @@ def run_command(
                     start_new_session=True,
                 )
             except (OSError, ValueError) as error:
-                return Outcome(Cost(), reason=f"{words[0]} cannot be started on this machine: {one_line(error)}")
+                return Cost(), f"{words[0]} cannot be started on this machine: {one_line(error)}"
         problem, cpu_seconds, peak_bytes = _awaited(process, folder, timeout, largest_output)
         status = process.returncode
         cost = Cost(time.perf_counter() - started, cpu_seconds, peak_bytes, status)
@@ -175,10 +163,10 @@ def run_command(
             problem = f"{words[0]} wrote no mesh (output{suffixes[1]})"
         if not problem:
             try:
-                return Outcome(cost, _read(files[OUTPUT]))
+                return cost, _read(files[OUTPUT])
             except InputError as error:
                 problem = f"{words[0]} wrote no mesh: {str(error).removeprefix(f'{files[OUTPUT]}: ')}"
-        return Outcome(cost, reason=": ".join(filter(None, (problem, _tail(*said[::-1])))))
+        return cost, ": ".join(filter(None, (problem, _tail(*said[::-1]))))
 
 
 def _awaited(

@@ -149,7 +149,7 @@ def test_statistical_errors_grow_with_few_degrees_of_freedom() -> None:
     assert (statistical_errors([few]) / np.sqrt(few.variances) > 3.4).all()
     assert (statistical_errors([many]) / np.sqrt(many.variances) < 2.7).all()
     # Eight sublattices that carry the variance have no more degrees of freedom for many draws beside them.
-    mixed = replace(few, drawn_variances=1e-6 * few.lattice_variances, drawn_degrees=2000)
+    mixed = replace(few, parts=few.parts[0] * np.array([[1.0], [1e-6]]), degrees=np.array([few.degrees[0], 2000]))
     assert (statistical_errors([mixed]) / np.sqrt(mixed.variances) > 3.4).all()
 
 
