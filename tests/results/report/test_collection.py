@@ -11,7 +11,7 @@ from click.testing import CliRunner
 import sobolev_batch as sb
 from sobolev_batch import InputError
 from sobolev_batch.cli import cli
-from sobolev_batch.results.report import collection as collection_module
+from sobolev_batch.results.report import content as content_module
 from sobolev_batch.results.report.build import make_report
 from sobolev_batch.results.tables.league import leagues_of
 from tests.support.browser import Browser, browser
@@ -70,7 +70,7 @@ def test_a_collection_without_league_says_why(store: str, monkeypatch: pytest.Mo
     def refuse(*_: object) -> None:
         raise InputError("no object has all of the methods <a>")
 
-    monkeypatch.setattr(collection_module, "leagues_of", refuse)
+    monkeypatch.setattr(content_module, "leagues_of", refuse)
     text = make_report(store)[0]
     assert "<strong>There is no league.</strong> no object has all of the methods &lt;a&gt;" in text
     assert "left out: methods cannot be compared" in text
@@ -102,4 +102,4 @@ def test_a_sentence_says_which_method_is_nearest(factors: dict[str, float], obje
     rows = method_rows({method: {n: factor / n for n in (100, 400)} for method, factor in factors.items()})
     tables = {f"o{i}": rows for i in range(objects)}
     (league,) = leagues_of(tables, list(tables))
-    assert collection_module.sentence_of(league) == sentence
+    assert content_module.sentence_of(league) == sentence
