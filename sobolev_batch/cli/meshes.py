@@ -225,28 +225,11 @@ def _judge_files(context: click.Context, a: Path, b: Path, below: float) -> int:
 @cli.command("fit", short_help="Move the vertices of START to bring it nearer to TARGET.")
 @click.argument("start", type=PATH)
 @click.argument("target", type=PATH)
+@click.option("-o", "--output", type=PATH, required=True, help="Write the mesh to this file, .ply, .obj, .off or .stl.")
 @click.option(
-    "-o",
-    "--output",
-    type=PATH,
-    required=True,
-    help="Write the mesh to this file, .ply, .obj, .off or .stl.",
+    "--order", type=float, default=DEFAULT_FIT_ORDER, show_default=True, help="Lower the distance of this order."
 )
-@click.option(
-    "--order",
-    type=float,
-    default=DEFAULT_FIT_ORDER,
-    show_default=True,
-    help="Lower the distance of this order.",
-)
-@click.option(
-    "--steps",
-    type=int,
-    default=DEFAULT_STEPS,
-    metavar="N",
-    show_default=True,
-    help="Take N steps at most.",
-)
+@click.option("--steps", type=int, default=DEFAULT_STEPS, metavar="N", show_default=True, help="Take N steps at most.")
 @click.option(
     "--smoothing",
     type=float,

@@ -161,12 +161,7 @@ def estimate_norms(sums: Sums, weights: SobolevWeights, support: Support, discre
     values = np.sqrt(totals)
     tails = truncated(sums, weights, support)
     images = aliased(sums, weights, support.widths)
-    return NormEstimate(
-        values,
-        np.sqrt(totals + tails) - values,
-        change_of_root(totals, images),
-        discretisation,
-    )
+    return NormEstimate(values, np.sqrt(totals + tails) - values, change_of_root(totals, images), discretisation)
 
 
 def change_of_root(totals: Reals, changes: Reals) -> Reals:

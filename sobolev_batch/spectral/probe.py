@@ -172,12 +172,7 @@ def draws_for(surfaces: Sequence[Surface], lattice: Lattice, orders: Sequence[fl
 
 
 def probe_block(
-    surface: Surface,
-    lattice: Lattice,
-    settings: TransformSettings,
-    block: Block,
-    values: Complexes,
-    draws: Draws,
+    surface: Surface, lattice: Lattice, settings: TransformSettings, block: Block, values: Complexes, draws: Draws
 ) -> Probe:
     """Compare one block of a field with the exact transform, at the draws that fall into the block.
 

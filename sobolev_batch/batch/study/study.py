@@ -411,11 +411,7 @@ def _table_of_object(
     all_families = [*families, *({"name": method, "source": "files", "meshes": own[method]} for method in methods)]
     if not all_families:
         raise StudyError("no family has a file of it; add files, or leave it out")
-    return {
-        **common,
-        "study": {**common["study"], "name": f"{common['study']['name']} {name}"},
-        "family": all_families,
-    }
+    return {**common, "study": {**common["study"], "name": f"{common['study']['name']} {name}"}, "family": all_families}
 
 
 def _families(family: Mapping[str, Any], names: Sequence[str], folder: Path) -> dict[str, list[dict[str, Any]]]:

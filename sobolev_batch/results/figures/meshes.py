@@ -179,11 +179,7 @@ def exported(
 
 
 def write_witness(
-    store: AnyStore,
-    mesh: str,
-    path: str | Path,
-    order: Orders | None = None,
-    folder: str | Path = ".",
+    store: AnyStore, mesh: str, path: str | Path, order: Orders | None = None, folder: str | Path = "."
 ) -> Path:
     """Write a mesh of a store with its witness function against the reference at its vertices.
 
@@ -224,13 +220,7 @@ def write_witness(
 
 
 def write_vertex_values(
-    path: Path,
-    mesh: Mesh,
-    values: Reals,
-    orders: Sequence[float],
-    title: str,
-    unit: float,
-    context: str = "study",
+    path: Path, mesh: Mesh, values: Reals, orders: Sequence[float], title: str, unit: float, context: str = "study"
 ) -> None:
     """Write a mesh with its witness function, in the format of the path's suffix, one of `SUFFIXES`.
 

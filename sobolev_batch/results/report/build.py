@@ -57,12 +57,7 @@ Page = tuple[str, tuple[str, ...]]
 
 
 def report(
-    store: AnyStore,
-    path: str | Path,
-    *,
-    folder: str | Path = ".",
-    witnesses: Sequence[str] = (),
-    up: Axis = "z",
+    store: AnyStore, path: str | Path, *, folder: str | Path = ".", witnesses: Sequence[str] = (), up: Axis = "z"
 ) -> Path:
     """Write the report of a store as one HTML page, with tables, plots and meshes, that makes no requests.
 
@@ -102,13 +97,7 @@ def write_page(path: Path, text: str) -> None:
         raise StoreError(f"{path}: the report cannot be written there: {error.strerror or error}") from error
 
 
-def make_report(
-    store: AnyStore,
-    *,
-    folder: str | Path = ".",
-    witnesses: Sequence[str] = (),
-    up: Axis = "z",
-) -> Page:
+def make_report(store: AnyStore, *, folder: str | Path = ".", witnesses: Sequence[str] = (), up: Axis = "z") -> Page:
     """Return the report of a store, and what it leaves out; see `report`."""
     missing = next((library for library in _LIBRARIES if find_spec(library) is None), None)
     if missing is not None:

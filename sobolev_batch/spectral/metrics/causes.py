@@ -11,13 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from sobolev_batch.errors import InputError
 from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.spectral.backends import ComplexDtype, NufftSpec
-from sobolev_batch.spectral.fields import (
-    OperandLike,
-    field_of,
-    pair_of,
-    read_blocks,
-    shells_of,
-)
+from sobolev_batch.spectral.fields import OperandLike, field_of, pair_of, read_blocks, shells_of
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.metrics.datasets import (
     AREA,

@@ -118,10 +118,7 @@ def labelled(order: Orders, values: Mapping[str, Reals], attributes: Mapping[str
 
 
 def labelled_distances(
-    order: Orders,
-    distances: NormEstimate,
-    reference: ReferenceEstimate,
-    attributes: Mapping[str, object],
+    order: Orders, distances: NormEstimate, reference: ReferenceEstimate, attributes: Mapping[str, object]
 ) -> xr.Dataset:
     """Return distances and what they are relative to the reference, in the form of `labelled`."""
     relative, relative_errors = distances.relative_to(reference.norms)

@@ -19,13 +19,7 @@ from sobolev_batch.spectral.adaptive.frequencies import Reference
 from sobolev_batch.spectral.adaptive.problem import Problem, Solution, are_equal
 from sobolev_batch.spectral.adaptive.solve import solve
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.budget import (
-    NormEstimate,
-    ReferenceEstimate,
-    Support,
-    estimate_norms,
-    sums_of_shells,
-)
+from sobolev_batch.spectral.budget import NormEstimate, ReferenceEstimate, Support, estimate_norms, sums_of_shells
 from sobolev_batch.spectral.exact import sphere_distance, sphere_inner_product, sphere_norm
 from sobolev_batch.spectral.fields import (
     OperandLike,

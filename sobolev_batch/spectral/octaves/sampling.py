@@ -363,8 +363,7 @@ class TailSampling:
         octaves = (Octave(cutoff, index) for index in range(1, count + 1))
         draws = _USUAL_DRAWS if normals else 0
         return cls(
-            cutoff,
-            tuple(OctaveSampling.random(one, [USUAL_M], draws, normals, _USUAL_UNIFORM, rng) for one in octaves),
+            cutoff, tuple(OctaveSampling.random(one, [USUAL_M], draws, normals, _USUAL_UNIFORM, rng) for one in octaves)
         )
 
     @classmethod

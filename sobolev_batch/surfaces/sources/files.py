@@ -34,14 +34,7 @@ from sobolev_batch.surfaces.sources.names import (
     numbers_in,
     quoted,
 )
-from sobolev_batch.surfaces.sources.registry import (
-    ExpectedSize,
-    Fingerprint,
-    Member,
-    Source,
-    at_most,
-    checked_times,
-)
+from sobolev_batch.surfaces.sources.registry import ExpectedSize, Fingerprint, Member, Source, at_most, checked_times
 
 MOST_MESHES = 100_000
 _LONGEST_TEXT = 1000

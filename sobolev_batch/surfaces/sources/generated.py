@@ -18,14 +18,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.surfaces.shapes.closed_forms import MOST_TRIANGLES, Ellipsoid, Sphere, Torus
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.subdivision import FINEST_LEVEL, icosphere
-from sobolev_batch.surfaces.sources.registry import (
-    Fingerprint,
-    MadeMember,
-    Member,
-    Several,
-    Source,
-    SurfaceMember,
-)
+from sobolev_batch.surfaces.sources.registry import Fingerprint, MadeMember, Member, Several, Source, SurfaceMember
 
 # Measured peak of the subdivision, for each triangle that it makes.
 _SUBDIVISION_BYTES = 140
