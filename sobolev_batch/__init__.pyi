@@ -57,7 +57,7 @@ from .spectral.metrics.causes import spectrum as spectrum
 from .spectral.metrics.causes import witness as witness
 from .spectral.metrics.norms import distance as distance
 from .spectral.metrics.norms import norm as norm
-from .spectral.metrics.yardsticks import yardsticks as yardsticks
+from .spectral.metrics.norms import yardsticks as yardsticks
 from .surfaces.formats.readers import as_mesh as as_mesh
 from .surfaces.formats.readers import read_mesh as read_mesh
 from .surfaces.formats.readers import write_mesh as write_mesh

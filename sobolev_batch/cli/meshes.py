@@ -121,8 +121,7 @@ def compare_command(
     surface. The exit status is then 0 if they are, 1 if they are not, and 4 if that cannot be told.
     """
     from sobolev_batch.spectral.lattice import Lattice
-    from sobolev_batch.spectral.metrics.norms import distance
-    from sobolev_batch.spectral.metrics.yardsticks import yardsticks
+    from sobolev_batch.spectral.metrics.norms import distance, yardsticks
     from sobolev_batch.surfaces.formats.readers import read_mesh
     from sobolev_batch.surfaces.proximity import proximity
     from sobolev_batch.surfaces.shapes.surface import Similarity, placement_doubt

@@ -16,8 +16,7 @@ from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.quadrature.meshes import RuleUse, WeightedPoints, assign_rules
 from sobolev_batch.spectral.quadrature.rules import corner_rule, midpoint_rule
 from sobolev_batch.spectral.transform.nufft import transform_points
-from sobolev_batch.spectral.transform.settings import ON_CPU, Execution, TransformSettings
-from sobolev_batch.spectral.transform.transform import require_points_inside
+from sobolev_batch.spectral.transform.transform import ON_CPU, Execution, TransformSettings, require_points_inside
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Indices, Reals
 

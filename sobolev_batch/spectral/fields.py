@@ -19,15 +19,16 @@ from sobolev_batch.spectral.octaves.remainder import Remainder
 from sobolev_batch.spectral.probe import Probe, Sample, draws_for, measure, needs_probe, norms_of_checks, probe_block
 from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.shells import Orders, SobolevWeights, check_orders, shell_sums
-from sobolev_batch.spectral.transform.settings import (
+from sobolev_batch.spectral.transform.transform import (
     ON_CPU,
     ErrorTarget,
     Execution,
+    Transformed,
     TransformSettings,
     choose_settings,
     thread_count,
+    transform_block,
 )
-from sobolev_batch.spectral.transform.transform import Transformed, transform_block
 from sobolev_batch.surfaces.formats.readers import SurfaceLike, as_surface
 from sobolev_batch.surfaces.shapes.surface import Extent, Reals, Surface
 

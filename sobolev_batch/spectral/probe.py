@@ -20,7 +20,7 @@ from sobolev_batch.spectral.backends import Complexes
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.shells import SobolevWeights, shell_volumes
-from sobolev_batch.spectral.transform.settings import TransformSettings
+from sobolev_batch.spectral.transform.transform import TransformSettings
 from sobolev_batch.surfaces.shapes.surface import Reals, Surface
 
 # Draws of a small mesh, of a huge one, and pairs of a triangle (or point) and a frequency in between.

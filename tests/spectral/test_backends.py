@@ -30,8 +30,13 @@ from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice, OctaveLattice
 from sobolev_batch.spectral.quadrature.meshes import assign_rules
 from sobolev_batch.spectral.quadrature.rules import corner_rule, midpoint_rule
-from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, TransformSettings
-from sobolev_batch.spectral.transform.transform import Transformed, transform_block
+from sobolev_batch.spectral.transform.transform import (
+    ErrorTarget,
+    Execution,
+    Transformed,
+    TransformSettings,
+    transform_block,
+)
 from tests.support.fake_device import FUNCTIONS, OPTIONS, UFUNCS, Array, CUDARuntimeError, Device
 
 LATTICE = Lattice(5.0, 32)

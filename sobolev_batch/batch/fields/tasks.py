@@ -30,8 +30,7 @@ from sobolev_batch.spectral.octaves.sampling import TailSampling
 from sobolev_batch.spectral.octaves.values import Settings, octave_values, settings_for
 from sobolev_batch.spectral.probe import Probe, draws_for, join, probe_block
 from sobolev_batch.spectral.quadrature.kinds import kind_of
-from sobolev_batch.spectral.transform.settings import Execution, TransformSettings, choose_settings
-from sobolev_batch.spectral.transform.transform import transform_block
+from sobolev_batch.spectral.transform.transform import Execution, TransformSettings, choose_settings, transform_block
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Similarity, Surface
 

@@ -28,12 +28,7 @@ from zarr.abc.store import Store as ZarrStore
 from zarr.buffer.cpu import NDBuffer
 from zarr.storage import StorePath
 
-from sobolev_batch.batch.storage.checked import (
-    CHANGED,
-    CheckedStore,
-    checksum_of,
-    largest_chunk_bytes,
-)
+from sobolev_batch.batch.storage.checked import CHANGED, CheckedStore, checksum_of, largest_chunk_bytes
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.metadata import MOST_BYTES, SCHEMA_VERSION, Document, check_documents
 from sobolev_batch.batch.store.records import Record, RunRecord, record_from_table

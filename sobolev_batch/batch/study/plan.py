@@ -22,8 +22,7 @@ from sobolev_batch.spectral.metrics.datasets import VARIABLES
 from sobolev_batch.spectral.octaves.sampling import TailSampling
 from sobolev_batch.spectral.probe import Sample, draws_for
 from sobolev_batch.spectral.quadrature.kinds import kind_of
-from sobolev_batch.spectral.transform.settings import TransformSettings
-from sobolev_batch.spectral.transform.transform import NUMERICS_VERSION, require_inside
+from sobolev_batch.spectral.transform.transform import NUMERICS_VERSION, TransformSettings, require_inside
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Extent, Similarity, Surface
 from sobolev_batch.surfaces.sources.command import RemeshedMember

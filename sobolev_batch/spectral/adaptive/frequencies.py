@@ -43,7 +43,7 @@ from sobolev_batch.spectral.octaves.values import (
     statistical_errors,
 )
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
-from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, TransformSettings, permits_single
+from sobolev_batch.spectral.transform.transform import ErrorTarget, Execution, TransformSettings, permits_single
 from sobolev_batch.surfaces.shapes.surface import Reals, Surface
 
 Complexes = NDArray[np.complexfloating]

@@ -18,7 +18,7 @@ from sobolev_batch.spectral.octaves.sampling import OctaveSampling
 from sobolev_batch.spectral.octaves.values import OctaveValues
 from sobolev_batch.spectral.probe import Sample, draws_for, needs_probe
 from sobolev_batch.spectral.shells import SobolevWeights
-from sobolev_batch.spectral.transform.settings import ErrorTarget, Execution, TransformSettings, permits_single
+from sobolev_batch.spectral.transform.transform import ErrorTarget, Execution, TransformSettings, permits_single
 from sobolev_batch.surfaces.shapes.mesh import Mesh, shared_triangles
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent, Reals, Similarity, Surface
 

@@ -32,7 +32,7 @@ from sobolev_batch.spectral.octaves.sampling import FaceNormals
 from sobolev_batch.spectral.probe import Sample, estimate
 from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
-from sobolev_batch.spectral.transform.settings import ErrorTarget
+from sobolev_batch.spectral.transform.transform import ErrorTarget
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Reals, Surface
 

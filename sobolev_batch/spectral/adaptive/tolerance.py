@@ -30,8 +30,7 @@ from sobolev_batch.spectral.budget import (
 )
 from sobolev_batch.spectral.lattice import LARGEST_M, Lattice
 from sobolev_batch.spectral.shells import SobolevWeights
-from sobolev_batch.spectral.transform.settings import FINEST_EPS, TransformSettings
-from sobolev_batch.spectral.transform.transform import projected_bytes
+from sobolev_batch.spectral.transform.transform import FINEST_EPS, TransformSettings, projected_bytes
 from sobolev_batch.surfaces.shapes.surface import Reals
 
 # Fraction of the accuracy for aliasing; the rest is for truncation and the fields' own errors.

@@ -25,8 +25,7 @@ from sobolev_batch.spectral.metrics.datasets import (
 )
 from sobolev_batch.spectral.shells import Orders, SobolevWeights, check_orders, shell_volumes
 from sobolev_batch.spectral.transform.nufft import evaluate_at
-from sobolev_batch.spectral.transform.settings import TransformSettings, thread_count
-from sobolev_batch.spectral.transform.transform import require_points_inside
+from sobolev_batch.spectral.transform.transform import TransformSettings, require_points_inside, thread_count
 from sobolev_batch.surfaces.shapes.surface import Reals, Similarity
 
 # Shells this close to an edge, relative to it, lie on it.

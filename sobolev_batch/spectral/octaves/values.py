@@ -18,15 +18,15 @@ from sobolev_batch.spectral.lattice import OctaveLattice
 from sobolev_batch.spectral.octaves.sampling import OctaveSampling
 from sobolev_batch.spectral.probe import norms_of_checks
 from sobolev_batch.spectral.quadrature.kinds import kind_of
-from sobolev_batch.spectral.transform.settings import (
+from sobolev_batch.spectral.transform.transform import (
     ON_CPU,
     ErrorTarget,
     Execution,
     TransformSettings,
     choose_settings,
     permits_single,
+    transform_block,
 )
-from sobolev_batch.spectral.transform.transform import transform_block
 from sobolev_batch.surfaces.shapes.surface import Reals, Surface
 
 Complexes = NDArray[np.complex128]

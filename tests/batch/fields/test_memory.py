@@ -12,8 +12,7 @@ from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers
 from sobolev_batch.batch.fields.compute import size_tasks
 from sobolev_batch.spectral.backends import CPU_COSTS, NufftSpec, Workload
 from sobolev_batch.spectral.lattice import Block
-from sobolev_batch.spectral.transform.settings import TransformSettings
-from sobolev_batch.spectral.transform.transform import fastest_spec, projected_bytes
+from sobolev_batch.spectral.transform.transform import TransformSettings, fastest_spec, projected_bytes
 from sobolev_batch.surfaces.sources.registry import ExpectedSize
 from tests.support.commands import call, write_toml
 

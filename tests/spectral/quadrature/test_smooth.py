@@ -24,8 +24,7 @@ from sobolev_batch import (
 from sobolev_batch.spectral.backends import CPU
 from sobolev_batch.spectral.quadrature import kinds
 from sobolev_batch.spectral.quadrature.kinds import direct_transform, exact_values, resolution_of
-from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
-from sobolev_batch.spectral.transform.transform import transform_block
+from sobolev_batch.spectral.transform.transform import Execution, TransformSettings, transform_block
 from sobolev_batch.surfaces.shapes.smooth import Smooth
 from tests.support.fake_device import Device
 from tests.support.oracles import spheroid_value, torus_value

@@ -13,8 +13,13 @@ from sobolev_batch import InputError, Lattice, Mesh, Sphere, fourier_transform, 
 from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.fields import field_for
 from sobolev_batch.spectral.shells import SobolevWeights
-from sobolev_batch.spectral.transform.settings import ErrorTarget, TransformSettings, choose_settings, permits_single
-from sobolev_batch.spectral.transform.transform import transform_block
+from sobolev_batch.spectral.transform.transform import (
+    ErrorTarget,
+    TransformSettings,
+    choose_settings,
+    permits_single,
+    transform_block,
+)
 from tests.support.shapes import CENTRED_BOX as BOX
 
 LATTICE = Lattice(3.0, 32)

@@ -14,8 +14,7 @@ from sobolev_batch import InputError, Lattice, LatticeError, Mesh, Sphere, fouri
 from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.exact import exact_transform
 from sobolev_batch.spectral.lattice import Block
-from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
-from sobolev_batch.spectral.transform.transform import projected_bytes, transform_block
+from sobolev_batch.spectral.transform.transform import Execution, TransformSettings, projected_bytes, transform_block
 from tests.support.shapes import CENTRED_BOX as BOX
 
 Reals = NDArray[np.float64]
@@ -110,7 +109,7 @@ def test_takes_no_more_memory_than_it_says(intervals: int, memory: float | None)
     code = f"""
 import resource, sys
 import sobolev_batch as sb
-from sobolev_batch.spectral.transform.settings import Execution, TransformSettings
+from sobolev_batch.spectral.transform.transform import Execution, TransformSettings
 from sobolev_batch.spectral.transform.transform import projected_bytes, transform_block
 
 mesh, lattice, settings = sb.icosphere(5), sb.Lattice(5.0, {intervals}), TransformSettings()
