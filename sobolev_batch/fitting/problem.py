@@ -97,16 +97,11 @@ class FitProblem:
     """A mesh and the field of its target on one lattice.
 
     Attributes:
-        mesh: Mesh as it was given.
         start: The same mesh, prepared: moved to the centre, in units of length; no two of its vertices coincide.
         place: Vertex of the prepared mesh for each vertex of the given one.
-        move: Movement to the centre.
         target: Target, moved with the mesh.
-        settings: Settings of the fit.
-        lattice: Lattice of the target's field.
         values: Transform of the target on the half lattice.
         quality: Quality of this field, from which its errors follow; None if unknown.
-        execution: Threads.
     """
 
     mesh: Mesh

@@ -41,9 +41,6 @@ class MeshTransform:
         triangles: Indices of the corners of each triangle, int64 (m, 3).
         of_vertices: Matrix (nodes, vertices): its product with the vertices (n, 3) is the quadrature nodes.
         of_areas: Matrix (nodes, triangles): its product with the areas is their weights.
-        lattice: Lattice of the frequencies.
-        eps: Accuracy of nonuniform FFTs.
-        execution: Backend and threads.
     """
 
     triangles: Indices

@@ -87,10 +87,8 @@ class NufftSpec:
 
     Attributes:
         shape: Modes along each axis.
-        eps: Relative accuracy.
         dtype: Type of strengths and modes.
         oversampling: Ratio of the fine grid to the modes along each axis; None for the fastest one.
-        threads: Threads on the processor.
         batch: Largest number of points at a time.
     """
 
@@ -122,9 +120,7 @@ class Workload:
     """The points to transform.
 
     Attributes:
-        points: Expected number of points.
         largest_points: Bound on the number of points, before shared ones are merged.
-        triangles: Number of triangles.
         fill: Fraction of the lattice's period that the bounding box fills, by volume. At a useful aliasing error it is
             far less than the usual one.
     """

@@ -83,7 +83,6 @@ class NormEstimate:
     """Norms or distances with their errors, each (orders, ...).
 
     Attributes:
-        values: Norms or distances.
         truncation: Bound on the error by frequencies beyond the highest one; without octaves they can only add.
         aliasing: Estimate of the change by the lattice's spacing, either way.
         discretisation: Bound on the error by the triangle rules and the NUFFT.
@@ -287,7 +286,6 @@ class ReferenceEstimate:
     """The norm of the reference b of a distance ||a - b||, and the product <a - b, b>, each (orders,).
 
     Attributes:
-        norms: Norms of the reference.
         products: Products of the difference with the reference, in units of length.
         product_errors: Bounds on the errors of the products.
     """

@@ -72,7 +72,6 @@ class Quality:
 
     Attributes:
         area: Area of the surface, in squared units of length.
-        extent: Extent of the surface.
         probe: Measured error of the field itself; empty for a closed form.
         tail: Quality of the values in octaves; None without octaves.
     """

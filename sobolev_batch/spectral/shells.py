@@ -31,7 +31,6 @@ class SobolevWeights:
 
     Attributes:
         lattice: Lattice of ξ, in cycles per unit length.
-        orders: Orders s.
         cutoff: Radius |ξ| at which a `smooth_step` ends that the weights are multiplied by; None for none.
     """
 

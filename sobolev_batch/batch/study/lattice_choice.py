@@ -65,8 +65,6 @@ class LatticeChoice:
     """Lattice and dtype of all fields of a study.
 
     Attributes:
-        lattice: Lattice of all fields.
-        dtype: Dtype of all fields.
         closest: Smallest distance to the reference among the pilots, for each order; empty if the lattice was given.
         reasons: Reasons of the choice, one line each.
         basis: Digest of the data that the choice was made from; empty if the lattice was given.

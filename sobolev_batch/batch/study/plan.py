@@ -38,8 +38,6 @@ class Row:
 
     Attributes:
         label: Family/name, or "reference"; unique in the study.
-        family: Name of the family, or "reference".
-        member: Surface to be made.
         fingerprint: Digest of the member, see `Member.fingerprint_digest`; empty if one of its files cannot be read.
         key: SHA-256 of all that its field depends on; empty if the fingerprint is.
     """

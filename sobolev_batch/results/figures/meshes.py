@@ -38,7 +38,6 @@ class StudyMeshes:
     """The meshes of an open store, made again by its study.
 
     Attributes:
-        tree: Open store with tables.
         members: Family and member of each surface that the study lists on this machine, by label.
         table: Table of the store about its meshes.
         similarity: Similarity from the meshes' own unit of length to the study's.

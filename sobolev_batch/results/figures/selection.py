@@ -42,9 +42,6 @@ class Selection:
     """The part of an open store that plots show.
 
     Attributes:
-        tree: Open store with tables.
-        orders: Orders of the norm.
-        families: Names of families.
         x: Horizontal axis of convergence.
         truth: Family of the true surface of meshes that move; default the reference.
     """
@@ -100,9 +97,7 @@ class Spectra:
     """Squared distances of some meshes to the reference, by wavelength.
 
     Attributes:
-        labels: Labels of the meshes.
         total: Number of meshes that these were chosen from.
-        orders: Orders s.
         shares: Fractions (meshes, orders, bands) of the squared distance, which sum to one over the bands.
         longest: Longest wavelength (bands,) in the study's unit, decreasing; the first is infinite.
         shortest: Shortest wavelength (bands,) in the study's unit.

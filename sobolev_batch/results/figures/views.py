@@ -88,12 +88,10 @@ class MeshView:
     """A mesh with its witness function.
 
     Attributes:
-        label: Label of the mesh.
         vertices: Points (n, 3) in the study's unit of length, turned so that the third axis points upwards.
         triangles: Indices of vertices, (m, 3).
         values: Witness function (orders, n), positive where the mesh has area that the reference lacks, in
             1 / unit length.
-        orders: Orders s.
         original_triangles: Number of triangles of the mesh itself; the view has fewer where it is a simplification,
             and more where it subdivides them.
         eye: Unit vector (3,) to the viewer of pictures.

@@ -79,9 +79,7 @@ class Frequencies:
     """A lattice of the innermost frequencies, and octaves beyond it.
 
     Attributes:
-        lattice: The lattice.
         octaves: The octaves, which may be none.
-        orders: Orders s.
         widths: Widths of all surfaces together, see `Support`.
         has_tail: True where all that lies beyond the lattice is known, from octaves.
     """
@@ -180,8 +178,6 @@ class Reference:
     """The reference b of a distance ||a - b||, and what is known of it.
 
     Attributes:
-        frequencies: Frequencies of all values.
-        values: Values of b.
         difference: Values whose signed sum is a - b; triangles that both have may be left out.
         signs: Signs of these.
         pair: The surfaces a and b, moved together to the centre of the lattice's period.

@@ -73,8 +73,6 @@ class Core:
     """The innermost frequencies: fields on a small lattice, under a smooth step that ends at a cutoff.
 
     Attributes:
-        lattice: Lattice of the fields.
-        fields: Fields of the surfaces.
         squares: Squared norm of their difference under the step (orders,).
         images: Bound on the change of the squares by the lattice's spacing (orders,).
         errors: Norms of the fields' own errors (orders,).
@@ -129,9 +127,7 @@ class State:
     """A norm or a distance in the course of its computation.
 
     Attributes:
-        problem: Surfaces, orders and accuracy.
         seed: Seed of the random frequencies and points.
-        core: The innermost frequencies.
         octaves: Octaves around them, from the inside out.
         remainders: What lies beyond the core, and beyond each octave.
         for_others: True if other pairs are to be compared at the same frequencies.

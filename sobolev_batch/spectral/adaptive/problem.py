@@ -42,11 +42,8 @@ class Problem:
 
     Attributes:
         surfaces: One surface, or two; none where two surfaces cancel.
-        orders: Orders s.
-        accuracy: Accuracy of the norm or distance.
         support: Area of the surfaces together, and sizes of all surfaces that share the lattice.
         label: Name of the norm or distance in messages.
-        threads: Threads to compute with.
         pair: Surfaces that a distance is between, with the triangles that they share; empty for a norm.
         signs: Signs of the surfaces in the difference.
     """

@@ -64,8 +64,6 @@ class DistanceTarget:
     """Accuracy of the distance between a surface and a reference, for which the surface's field is computed.
 
     Attributes:
-        orders: Orders s.
-        accuracy: Accuracy of the distance.
         reference: Sample of the reference; None for the field of the reference itself.
         distances: Smallest distances (orders,) that the reference's own field has to serve.
     """

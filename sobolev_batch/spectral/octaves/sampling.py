@@ -209,11 +209,8 @@ class OctaveSampling:
     uniform for a fraction, and follow the normals of flat faces for the others.
 
     Attributes:
-        octave: The octave.
         lattices: Random lattices, which may be none.
         draws: Number of drawn frequencies, which may be zero.
-        seed: Seed of their generator.
-        normals: Normals of flat faces.
         uniform_fraction: Fraction of uniform directions, which counts if there are normals.
     """
 

@@ -53,7 +53,6 @@ class OctaveValues:
     """The transform of a surface at the samples of an octave, compared with exact values at a few of them.
 
     Attributes:
-        sampling: The octave and its samples.
         values: Values at all samples, complex (n,).
         radii: |ξ| of each comparison, float64 (P,).
         squares: Contribution of each comparison to the squared norm of the error, without the weight of an order,

@@ -108,7 +108,6 @@ class Execution:
 
     Attributes:
         backend: Backend to compute on. The processor steps in for a GPU that fails.
-        threads: Threads of FINUFFT.
         allowed_bytes: Memory that a transform may take on the processor, without the mesh and the result; None
             for no limit. To stay within it, a transform uses smaller batches, sub-blocks and less oversampling,
             whichever is predicted to be the fastest. On a GPU the limit is its free memory.

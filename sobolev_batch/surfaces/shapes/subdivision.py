@@ -57,7 +57,6 @@ class Edges:
     """The edges of a mesh.
 
     Attributes:
-        mesh: The mesh.
         ends: Vertices of each edge (e, 2), the smaller first.
         sides: Edges of each triangle (m, 3), from its first vertex to its second and so on.
     """

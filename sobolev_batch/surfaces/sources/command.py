@@ -299,7 +299,6 @@ class RemeshedMember(Member):
     Attributes:
         make: Function that makes it of the original.
         identity: The remesher, its parameters and its version.
-        original: Mesh to start from.
         files: Files that the remesher reads besides, by their names in the command.
         cache: Where it is kept; None if nothing may run.
     """

@@ -44,7 +44,6 @@ class Cost:
 
     Attributes:
         make_seconds: Time from the start to the end.
-        make_cpu_seconds: Processor time.
         make_peak_bytes: Largest memory of the process.
         exit_status: Exit status of the program; negative if a signal ended it.
     """
@@ -66,7 +65,6 @@ class MeshCache:
     A mesh is the file DIGEST.ply; DIGEST.json beside it says what made it and what that took.
 
     Attributes:
-        folder: Place of the files.
         may_run: True if what is not there may be made.
     """
 

@@ -260,7 +260,6 @@ class MadeMember(Member):
         make: Function of a module; it takes the meshes of the originals, then the arguments.
         identity: What the fingerprint holds besides the originals and the libraries: the name of the formula, its
             parameters and its version.
-        arguments: Numbers that the function takes.
         originals: Members whose meshes the function takes, by their keys in the fingerprint.
         libraries: Distributions whose versions are part of the fingerprint.
         triangles: Number of triangles of the mesh; None for as many as the first original has.
@@ -358,11 +357,7 @@ OtherSource = Annotated[SerializeAsAny[Source], BeforeValidator(_parse_nested)]
 
 
 class NestedSource(Source):
-    """A source that works on the surfaces of others; each field that holds one is handed what it is handed.
-
-    Attributes:
-        mesh: Table of the other source.
-    """
+    """A source that works on the surfaces of others; each field that holds one is handed what it is handed."""
 
     mesh: OtherSource
 
