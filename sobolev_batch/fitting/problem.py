@@ -8,7 +8,6 @@ from typing import Self
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.fitting import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS
@@ -34,7 +33,7 @@ from sobolev_batch.spectral.shells import SobolevWeights, single_order
 from sobolev_batch.spectral.transform.transform import ErrorTarget, Execution, TransformSettings, choose_settings
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.subdivision import Edges
-from sobolev_batch.surfaces.shapes.surface import Extent, Reals, Similarity, Surface, is_finite_number
+from sobolev_batch.surfaces.shapes.surface import Extent, Indices, Reals, Similarity, Surface, is_finite_number
 
 # Orders s, each with the weight of its squared distance in a sum.
 OrderWeights = tuple[tuple[float, float], ...]
@@ -106,7 +105,7 @@ class FitProblem:
 
     mesh: Mesh
     start: Mesh
-    place: NDArray[np.int64]
+    place: Indices
     move: Similarity
     target: Operand
     settings: FitSettings
@@ -141,7 +140,7 @@ class FitProblem:
         return cls(mesh, start, place, move, target, settings, own, values, quality, execution)
 
     @property
-    def free_vertices(self) -> NDArray[np.int64]:
+    def free_vertices(self) -> Indices:
         """Vertices that may move: those of triangles, without boundaries if these are kept."""
         free = np.asarray(self.start.used_vertices)
         if self.settings.keep_boundary:
@@ -217,7 +216,7 @@ def require_comparable(mesh: Mesh, target: Operand) -> None:
         )
 
 
-def welded(mesh: Mesh) -> tuple[Mesh, NDArray[np.int64]]:
+def welded(mesh: Mesh) -> tuple[Mesh, Indices]:
     """Return a mesh without coinciding vertices, and the vertex there of each vertex of the mesh."""
     # Zero has two signs.
     places, place = np.unique(mesh.vertices + 0.0, axis=0, return_inverse=True)

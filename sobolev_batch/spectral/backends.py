@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 
 from sobolev_batch.errors import BackendError, InputError, one_line
+from sobolev_batch.surfaces.shapes.surface import Reals
 
 ComplexDtype = Literal["complex128", "complex64"]
 Complexes = NDArray[np.complexfloating[Any, Any]]
@@ -40,7 +41,7 @@ DEFAULT_BATCH = 1 << 21
 WIDEST_KERNEL = 16
 
 
-def combine(coefficients: NDArray[np.float64], rows: Array, out: Array | None = None) -> Array:
+def combine(coefficients: Reals, rows: Array, out: Array | None = None) -> Array:
     """Return the matrix product of a few coefficients (..., k), on the host, with rows (k, n) of a backend.
 
     CuPy's product needs cuBLAS, which takes more memory than everything else together.

@@ -31,7 +31,7 @@ from sobolev_batch.spectral.backends import cosine_and_sine
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.mesh import Corners, Mesh
-from sobolev_batch.surfaces.shapes.surface import Reals
+from sobolev_batch.surfaces.shapes.surface import Indices, Reals
 
 Complexes = NDArray[np.complex128]
 # A number as a rounded value and what it lacks.
@@ -310,7 +310,7 @@ def sampled_transform(mesh: Mesh, frequencies: Reals, threads: int = 1) -> Compl
     return values
 
 
-def _face_arrays(mesh: Mesh) -> tuple[Reals, NDArray[np.int64], Reals, tuple[Reals, Reals]]:
+def _face_arrays(mesh: Mesh) -> tuple[Reals, Indices, Reals, tuple[Reals, Reals]]:
     """Return vertices (3, n), indices of corners (3, m), twice the areas (m,), and the first two edges (3, m) each."""
     corners = np.ascontiguousarray(mesh.triangles.T)
     a, b, c = np.moveaxis(mesh.vertices.T[:, corners], 1, 0)
@@ -318,7 +318,7 @@ def _face_arrays(mesh: Mesh) -> tuple[Reals, NDArray[np.int64], Reals, tuple[Rea
 
 
 def _plain_sums(
-    vertices: Reals, corners: NDArray[np.int64], doubled: Reals, edges: tuple[Reals, Reals], frequencies: Reals
+    vertices: Reals, corners: Indices, doubled: Reals, edges: tuple[Reals, Reals], frequencies: Reals
 ) -> Complexes:
     """Return the transform (P,) from the `_face_arrays` of a mesh, a few frequencies at a time."""
     step = max(1, _SAMPLED_PAIRS // len(doubled))
@@ -328,7 +328,7 @@ def _plain_sums(
 
 
 def _group_sums(
-    vertices: Reals, corners: NDArray[np.int64], doubled: Reals, edges: tuple[Reals, Reals], frequencies: Reals
+    vertices: Reals, corners: Indices, doubled: Reals, edges: tuple[Reals, Reals], frequencies: Reals
 ) -> Complexes:
     directions = -2 * np.pi * frequencies
     phases = directions @ vertices
@@ -366,7 +366,7 @@ def _group_sums(
 _NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(14)
 
 
-def sphere_transform(sphere: Sphere, frequencies: NDArray[np.float64]) -> NDArray[np.complex128]:
+def sphere_transform(sphere: Sphere, frequencies: Reals) -> NDArray[np.complex128]:
     """Return the transform ∫ exp(-2πi ξ·x) dσ(x) of the area measure of a sphere of radius R and centre c.
 
     For ξ, float64 (..., 3), in cycles per unit length, it is 4πR² sinc(2R|ξ|) exp(-2πi ξ·c) with sinc(t) =

@@ -9,7 +9,6 @@ from typing import Literal, Self
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from sobolev_batch.errors import InputError, LatticeError
@@ -86,7 +85,7 @@ class Quality:
         """Return the quality of the field of a surface."""
         return cls(surface.area, surface.extent, probe)
 
-    def error_norms(self, weights: SobolevWeights) -> NDArray[np.float64]:
+    def error_norms(self, weights: SobolevWeights) -> Reals:
         """Return the norm of all values' own error for each order (orders,), raised for the small samples."""
         norms = self.probe.norms(weights)
         if self.tail is None or not self.tail.radii:

@@ -17,6 +17,7 @@ from scipy.special import erf
 
 from sobolev_batch.errors import LatticeError
 from sobolev_batch.parameters import is_whole_number
+from sobolev_batch.surfaces.shapes.surface import Indices, Reals
 
 # Beyond this a field takes more than 34 GB even in single precision.
 LARGEST_M = 2048
@@ -28,7 +29,7 @@ _BALL = (6 / math.pi) ** (1 / 3)
 # Layers of an octave's lattice with ξ_z < 0, over which it fades out, and the width of the fading in layers.
 _FADED_LAYERS, _FADING_LAYERS = 3, 1.2
 
-Axes = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+Axes = tuple[Reals, Reals, Reals]
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Block:
         """Number of samples."""
         return math.prod(self.shape)
 
-    def indices(self, axis: int) -> NDArray[np.int64]:
+    def indices(self, axis: int) -> Indices:
         """Return the indices k along an axis, int64 (shape[axis],)."""
         return np.arange(self.start[axis], self.start[axis] + self.shape[axis], dtype=np.int64)
 
@@ -113,7 +114,7 @@ class FrequencyLattice(ABC):
         return 0.0, 0.0, 0.0
 
     @property
-    def rotation(self) -> NDArray[np.float64] | None:
+    def rotation(self) -> Reals | None:
         """Rotation (3, 3) that takes coordinates of surfaces to the lattice's axes; None for none."""
         return None
 
@@ -214,10 +215,10 @@ class Lattice(FrequencyLattice):
         x, y, z = (np.where(np.abs(block.indices(axis)) == self.M // 2, 0.5, 1.0) * self.spacing for axis in range(3))
         return x, y, z * np.where(block.indices(2) > 0, 2.0, 1.0)
 
-    def trapezoid_weights(self, block: Block) -> NDArray[np.float64]:
+    def trapezoid_weights(self, block: Block) -> Reals:
         """Return the product of the `axis_weights` at each sample of a block, float64 (block.shape)."""
         x, y, z = self.axis_weights(block)
-        weights: NDArray[np.float64] = x[:, None, None] * y[:, None] * z
+        weights: Reals = x[:, None, None] * y[:, None] * z
         return weights
 
     def shells(self, block: Block) -> NDArray[np.int32]:
@@ -310,11 +311,11 @@ class OctaveLattice(FrequencyLattice):
         return self.lowest, self.highest
 
     @cached_property
-    def rotation(self) -> NDArray[np.float64]:
+    def rotation(self) -> Reals:
         """Rotation R as a matrix (3, 3)."""
         from scipy.spatial.transform import Rotation
 
-        matrix: NDArray[np.float64] = Rotation.from_quat(self.quaternion).as_matrix()
+        matrix: Reals = Rotation.from_quat(self.quaternion).as_matrix()
         return matrix
 
     @property
@@ -322,7 +323,7 @@ class OctaveLattice(FrequencyLattice):
         """Shift of all samples along the lattice's axes, in units of the spacing."""
         return self.offset
 
-    def half_weights(self) -> NDArray[np.float64]:
+    def half_weights(self) -> Reals:
         """Return the weight of each layer of samples along the z axis, float64: 2 inside, fading to 0 across ξ_z = 0.
 
         The weights of a frequency and of its negative add up to 2.

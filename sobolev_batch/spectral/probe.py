@@ -21,7 +21,7 @@ from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.quadrature.kinds import kind_of
 from sobolev_batch.spectral.shells import SobolevWeights, shell_volumes
 from sobolev_batch.spectral.transform.transform import TransformSettings
-from sobolev_batch.surfaces.shapes.surface import Reals, Surface
+from sobolev_batch.surfaces.shapes.surface import Indices, Reals, Surface
 
 # Draws of a small mesh, of a huge one, and pairs of a triangle (or point) and a frequency in between.
 _MOST_DRAWS, _FEWEST_DRAWS, _PAIRS = 32, 8, 400_000
@@ -39,11 +39,11 @@ class Draws:
     The scales (P,) are trapezoidal weight / (P p), the factor of a squared error.
     """
 
-    indices: NDArray[np.int64]
+    indices: Indices
     frequencies: Reals
     scales: Reals
 
-    def places(self, block: Block) -> tuple[NDArray[np.int64], ...]:
+    def places(self, block: Block) -> tuple[Indices, ...]:
         """Return the array indices of the draws in a block that holds them all."""
         return tuple((self.indices - block.start).T)
 
@@ -135,7 +135,7 @@ def _shell_chances(lattice: Lattice, orders: tuple[float, ...], degree: int) -> 
     return chances / (2 * len(orders))
 
 
-def _draw_point(lattice: Lattice, shell: int, rng: np.random.Generator) -> NDArray[np.int64]:
+def _draw_point(lattice: Lattice, shell: int, rng: np.random.Generator) -> Indices:
     """Draw a point of a shell, with a probability in proportion to its trapezoidal weight."""
     indices = lattice.half.indices(0)
     rest = shell - (indices[:, None] ** 2 + indices**2)

@@ -25,7 +25,7 @@ from sobolev_batch.spectral.quadrature.rules import (
     typical_errors,
 )
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.surface import Reals
+from sobolev_batch.surfaces.shapes.surface import Indices, Reals
 
 _Corners = tuple[Array, Array, Array]
 # Vertices (n, 3), triangles (m, 3) and areas (m,) of a mesh, as arrays of a backend.
@@ -164,7 +164,7 @@ def assign_rules(
     )
 
 
-def choose_rules(sizes: Reals, ranges: Reals) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def choose_rules(sizes: Reals, ranges: Reals) -> tuple[Indices, Indices]:
     """Return how often to halve the edges of triangles, and the index of the rule that follows; see `rule_ranges`.
 
     The sizes are 2π|ξ|ρ (n,), in radians.

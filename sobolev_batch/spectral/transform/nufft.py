@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sobolev_batch.spectral.backends import (
     CPU,
@@ -20,6 +19,7 @@ from sobolev_batch.spectral.backends import (
 )
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice, Lattice
 from sobolev_batch.spectral.quadrature.meshes import WeightedPoints
+from sobolev_batch.surfaces.shapes.surface import Reals
 
 
 def transform_points(
@@ -75,9 +75,7 @@ def transform_points(
     return total, count
 
 
-def evaluate_at(
-    coordinates: NDArray[np.float64], coefficients: Complexes, lattice: Lattice, block: Block, spec: NufftSpec
-) -> NDArray[np.float64]:
+def evaluate_at(coordinates: Reals, coefficients: Complexes, lattice: Lattice, block: Block, spec: NufftSpec) -> Reals:
     """Return Re Σ_ξ c(ξ) exp(+2πi ξ·x_j) over the frequencies ξ of a block, by a type-2 nonuniform FFT.
 
     Args:
@@ -115,7 +113,7 @@ def evaluate_at(
     return values
 
 
-def _first_mode(block: Block, lattice: FrequencyLattice) -> NDArray[np.float64]:
+def _first_mode(block: Block, lattice: FrequencyLattice) -> Reals:
     """Return the shift (3,), in spacings, that moves FINUFFT's modes to a block.
 
     FINUFFT's modes of an axis of n samples start at -(n // 2).
@@ -124,7 +122,7 @@ def _first_mode(block: Block, lattice: FrequencyLattice) -> NDArray[np.float64]:
     return np.array(corner, dtype=np.float64) + lattice.shift
 
 
-def _shifted_strengths(weights: Array, angles: Array, shift: NDArray[np.float64], dtype: ComplexDtype) -> Array:
+def _shifted_strengths(weights: Array, angles: Array, shift: Reals, dtype: ComplexDtype) -> Array:
     """Return strengths whose modes are shifted: a phase factor, at no cost in the FFT."""
     strengths = np.empty(len(weights), dtype=dtype, like=weights)
     axes = np.flatnonzero(shift)

@@ -16,7 +16,6 @@ from itertools import product
 from typing import get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError, LatticeError, one_line
 from sobolev_batch.parameters import available_cores, is_whole_number
@@ -39,7 +38,7 @@ from sobolev_batch.spectral.quadrature.kinds import SurfaceKind, kind_of
 from sobolev_batch.spectral.quadrature.meshes import fixed_rule, weight_masses
 from sobolev_batch.spectral.transform.nufft import transform_points
 from sobolev_batch.surfaces.shapes.subdivision import icosphere
-from sobolev_batch.surfaces.shapes.surface import Similarity, Surface
+from sobolev_batch.surfaces.shapes.surface import Reals, Similarity, Surface
 
 DEFAULT_EPS: dict[ComplexDtype, float] = {"complex128": 1e-9, "complex64": 1e-6}
 # The limits of FINUFFT: below them 2.5 warns, and 2.6 refuses.
@@ -356,7 +355,7 @@ def require_inside(surface: Surface, lattice: Lattice) -> None:
 
 
 def require_points_inside(
-    coordinates: NDArray[np.float64], lattice: Lattice, subject: str = "the points reach", pronoun: str = "them"
+    coordinates: Reals, lattice: Lattice, subject: str = "the points reach", pronoun: str = "them"
 ) -> None:
     """Check that coordinates lie within the lattice's period; see `require_inside`."""
     reach = float(np.abs(coordinates).max(initial=0.0))

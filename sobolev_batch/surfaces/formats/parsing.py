@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.errors import MeshError
 from sobolev_batch.parameters import format_bytes, machine_memory
+from sobolev_batch.surfaces.shapes.surface import Indices
 
 # What a parser makes of a file: vertices (n, 3) and triangles (m, 3).
 Raw = tuple[NDArray[Any], NDArray[Any]]
@@ -161,7 +162,7 @@ def _read_unpacked_bounded(file: IO[bytes], length: int, factor: float) -> bytes
     return data.getvalue()
 
 
-def triangle_fans(corners: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.int64]:
+def triangle_fans(corners: Indices, sizes: Indices) -> Indices:
     """Cut each polygon into the fan of triangles around its first corner, exact for convex ones, int64 (m, 3).
 
     The corners are vertex indices of all polygons, one after the other, the sizes their numbers. Triangles of a polygon
@@ -181,7 +182,7 @@ def triangle_fans(corners: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArr
     return np.stack([corners[first], corners[first + rank + 1], corners[first + rank + 2]], axis=1)
 
 
-def triangle_fans_of_lists(polygons: Sequence[ArrayLike]) -> NDArray[np.int64]:
+def triangle_fans_of_lists(polygons: Sequence[ArrayLike]) -> Indices:
     """Cut polygons, each a sequence of vertex indices, as `triangle_fans` does."""
     if not len(polygons):
         raise MeshError("the file has no faces")
@@ -189,9 +190,7 @@ def triangle_fans_of_lists(polygons: Sequence[ArrayLike]) -> NDArray[np.int64]:
     return triangle_fans(np.concatenate([np.asarray(polygon, dtype=np.int64) for polygon in polygons]), sizes)
 
 
-def merge_coincident(
-    vertices: NDArray[np.floating], triangles: NDArray[np.int64]
-) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
+def merge_coincident(vertices: NDArray[np.floating], triangles: Indices) -> tuple[NDArray[np.floating], Indices]:
     """Merge vertices with exactly the same coordinates, for formats that repeat them."""
     if not np.isfinite(vertices).all():
         # The mesh refuses them and names the entries.

@@ -22,6 +22,7 @@ from plyfile import PlyData, PlyElement, PlyElementParseError
 from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.formats.parsing import Raw, merge_coincident, triangle_fans, triangle_fans_of_lists
 from sobolev_batch.surfaces.shapes.mesh import Mesh
+from sobolev_batch.surfaces.shapes.surface import Indices, Reals
 
 # Numbers per vertex line: x y z, with a weight, a colour, or both.
 _OBJ_VERTEX_SIZES = (3, 4, 6, 7)
@@ -251,7 +252,7 @@ def _obj_corner(word: str, vertices_so_far: int, face: int) -> int:
     return vertices_so_far + index
 
 
-def _stl_text_corners(data: bytes) -> NDArray[np.float64]:
+def _stl_text_corners(data: bytes) -> Reals:
     corners = array("d")
     facet, facet_corners, in_solid = 0, 0, False
     for line in _text_lines(data):
@@ -358,7 +359,7 @@ def _read(source: bytes | IO[bytes], lengths: dict[str, dict[str, int]]) -> PlyD
         return PlyData.read(stream, known_list_len=lengths)
 
 
-def _triangles(faces: PlyElement) -> NDArray[np.int64]:
+def _triangles(faces: PlyElement) -> Indices:
     names = [name for name in _CORNERS if name in faces.data.dtype.names]
     if not names:
         raise MeshError("the PLY faces have no list vertex_indices")

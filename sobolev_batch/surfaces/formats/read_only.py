@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.formats.parsing import Raw, merge_coincident, triangle_fans, unpacked_limit, xml_events
-from sobolev_batch.surfaces.shapes.surface import Indices
+from sobolev_batch.surfaces.shapes.surface import Indices, Reals
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3}
@@ -47,7 +47,7 @@ def parse_gltf(data: bytes) -> Raw:
         raise MeshError(f"it requires the glTF extension {', '.join(map(str, required))}; export it without")
     buffers = _loaded_buffers(tree, binary)
     most = unpacked_limit(len(data))
-    placed: list[tuple[NDArray[np.float64], NDArray[np.int64]]] = []
+    placed: list[tuple[Reals, Indices]] = []
     total = 0
     for matrix, mesh in _placed_meshes(tree):
         for vertices, triangles in _primitives(tree, buffers, tree["meshes"][mesh]):
@@ -127,7 +127,7 @@ def _document(data: bytes) -> tuple[dict[str, Any], bytes | None]:
     return tree, binary
 
 
-def _placed_meshes(tree: dict[str, Any]) -> Iterator[tuple[NDArray[np.float64], int]]:
+def _placed_meshes(tree: dict[str, Any]) -> Iterator[tuple[Reals, int]]:
     """Yield the index of each mesh of the default scene, with the matrix that places it."""
     nodes = tree.get("nodes", [])
     scenes = tree.get("scenes")
@@ -149,7 +149,7 @@ def _placed_meshes(tree: dict[str, Any]) -> Iterator[tuple[NDArray[np.float64], 
             yield matrix, nodes[index]["mesh"]
 
 
-def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
+def _matrix(node: dict[str, Any]) -> Reals:
     if "matrix" in node:
         return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
     x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))
@@ -164,9 +164,7 @@ def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
     return matrix
 
 
-def _primitives(
-    tree: dict[str, Any], buffers: list[bytes], mesh: dict[str, Any]
-) -> Iterator[tuple[NDArray[np.float64], NDArray[np.int64]]]:
+def _primitives(tree: dict[str, Any], buffers: list[bytes], mesh: dict[str, Any]) -> Iterator[tuple[Reals, Indices]]:
     """Yield positions and triangles of each primitive that has area, so no points or lines."""
     for primitive in mesh["primitives"]:
         mode = primitive.get("mode", _TRIANGLES)

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.errors import InputError, MeshError
-from sobolev_batch.surfaces.shapes.surface import LARGEST_LENGTH, Extent, Point
+from sobolev_batch.surfaces.shapes.surface import LARGEST_LENGTH, Extent, Indices, Point, Reals
 
-Corners = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+Corners = tuple[Reals, Reals, Reals]
 # Vectors from the first corner to the second and to the third, (3, k) each: one row an axis.
-_Edges = tuple[NDArray[np.float64], NDArray[np.float64]]
+_Edges = tuple[Reals, Reals]
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 _ALL = slice(None)
@@ -51,8 +51,8 @@ class Mesh:
     (6.0, [[3.0, 5.0, 4.0]], 3)
     """
 
-    vertices: NDArray[np.float64]
-    triangles: NDArray[np.int64]
+    vertices: Reals
+    triangles: Indices
 
     def __init__(self, vertices: ArrayLike, triangles: ArrayLike) -> None:
         checked_vertices = _checked_vertices(vertices)
@@ -72,20 +72,20 @@ class Mesh:
             )
 
     @classmethod
-    def from_checked(cls, vertices: NDArray[np.float64], triangles: NDArray[np.int64]) -> Mesh:
+    def from_checked(cls, vertices: Reals, triangles: Indices) -> Mesh:
         """Return a mesh of arrays that were checked before, without a copy; they become read-only."""
         mesh = object.__new__(cls)
         object.__setattr__(mesh, "vertices", _frozen(vertices))
         object.__setattr__(mesh, "triangles", _frozen(triangles))
         return mesh
 
-    def corners(self, selection: slice | NDArray[np.int64] = _ALL) -> Corners:
+    def corners(self, selection: slice | Indices = _ALL) -> Corners:
         """Return the first, second and third corners (k, 3) of all or some triangles, in units of length."""
         selected = self.triangles[selection]
         return self.vertices[selected[:, 0]], self.vertices[selected[:, 1]], self.vertices[selected[:, 2]]
 
     @cached_property
-    def areas(self) -> NDArray[np.float64]:
+    def areas(self) -> Reals:
         """Area of each triangle (m,), in squared units of length."""
         with np.errstate(over="ignore", invalid="ignore"):
             return self._per_triangle(_areas)
@@ -97,7 +97,7 @@ class Mesh:
             return float(self.areas.sum())
 
     @property
-    def edge_lengths(self) -> NDArray[np.float64]:
+    def edge_lengths(self) -> Reals:
         """Lengths of the three sides of each triangle (m, 3); an inner edge appears twice."""
         return self._per_triangle(_side_lengths)
 
@@ -112,7 +112,7 @@ class Mesh:
         return total / (3 * len(self.triangles)), longest
 
     @cached_property
-    def centroid_radii(self) -> NDArray[np.float64]:
+    def centroid_radii(self) -> Reals:
         """Distance from the centroid of each triangle to its farthest corner (m,)."""
         return self._per_triangle(_centroid_radii)
 
@@ -137,12 +137,12 @@ class Mesh:
         return Mesh(_frozen(vertices), self.triangles)
 
     @cached_property
-    def used_vertices(self) -> NDArray[np.int64]:
+    def used_vertices(self) -> Indices:
         """Indices of the vertices that triangles use, in ascending order."""
         return _frozen(_used(self.triangles, len(self.vertices)))
 
     @property
-    def used_coordinates(self) -> NDArray[np.float64]:
+    def used_coordinates(self) -> Reals:
         """Coordinates of the `used_vertices`, one contiguous row an axis (3, n), in units of length."""
         return np.ascontiguousarray(self.vertices[self.used_vertices].T)
 
@@ -205,14 +205,14 @@ class Mesh:
             raise InputError("PyVista is not installed: pip install 'sobolev-batch[vtk]'") from error
         return pyvista.PolyData.from_regular_faces(np.array(self.vertices), np.array(self.triangles))
 
-    def _zero_areas(self) -> Iterator[tuple[slice, NDArray[np.float64]]]:
+    def _zero_areas(self) -> Iterator[tuple[slice, Reals]]:
         """Yield, for each batch of triangles, the areas below which rounding hides whether they are zero."""
         for number, edges in enumerate(self._edges()):
             with np.errstate(over="ignore"):
-                longest: NDArray[np.float64] = _side_lengths(edges).max(axis=1)
+                longest: Reals = _side_lengths(edges).max(axis=1)
                 yield slice(number * _BATCH, (number + 1) * _BATCH), _AREA_RESOLUTION * longest**2
 
-    def _per_triangle(self, measure: Callable[[_Edges], NDArray[np.float64]]) -> NDArray[np.float64]:
+    def _per_triangle(self, measure: Callable[[_Edges], Reals]) -> Reals:
         """Return a measure of all triangles, taken batch by batch: edges of millions at once take gigabytes."""
         batches = self._edges()
         first = measure(next(batches))
@@ -237,28 +237,28 @@ class Mesh:
     def __repr__(self) -> str:
         return f"Mesh({len(self.vertices)} vertices, {len(self.triangles)} triangles)"
 
-    def __reduce__(self) -> tuple[type[Mesh], tuple[NDArray[np.float64], NDArray[np.int64]]]:
+    def __reduce__(self) -> tuple[type[Mesh], tuple[Reals, Indices]]:
         return Mesh, (self.vertices, self.triangles)
 
 
-def _areas(edges: _Edges) -> NDArray[np.float64]:
+def _areas(edges: _Edges) -> Reals:
     (ux, uy, uz), (vx, vy, vz) = edges
     return np.asarray(0.5 * np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2))
 
 
-def _side_lengths(edges: _Edges) -> NDArray[np.float64]:
+def _side_lengths(edges: _Edges) -> Reals:
     first, second = edges
     return np.stack([np.sqrt(np.einsum("ij,ij->j", side, side)) for side in (first, second - first, second)], axis=1)
 
 
-def _centroid_radii(edges: _Edges) -> NDArray[np.float64]:
+def _centroid_radii(edges: _Edges) -> Reals:
     first, second = edges
     centroid = (first + second) / 3
     squares = [np.einsum("ij,ij->j", arm, arm) for arm in (centroid, first - centroid, second - centroid)]
     return np.asarray(np.sqrt(np.maximum.reduce(squares)))
 
 
-def _used(triangles: NDArray[np.int64], vertex_count: int) -> NDArray[np.int64]:
+def _used(triangles: Indices, vertex_count: int) -> Indices:
     """Return the indices of the vertices that triangles use, in ascending order."""
     used = np.zeros(vertex_count, dtype=bool)
     used[triangles] = True
@@ -274,7 +274,7 @@ def _array(values: ArrayLike, name: str) -> NDArray[Any]:
         raise MeshError(f"{name} must be an array of rows of three, found rows of different lengths") from error
 
 
-def _checked_vertices(vertices: ArrayLike) -> NDArray[np.float64]:
+def _checked_vertices(vertices: ArrayLike) -> Reals:
     array = _array(vertices, "vertices")
     if array.dtype.kind not in "fiu":
         raise MeshError(f"vertices must be real numbers, found dtype {array.dtype}")
@@ -288,7 +288,7 @@ def _checked_vertices(vertices: ArrayLike) -> NDArray[np.float64]:
     return _frozen(converted)
 
 
-def _checked_triangles(triangles: ArrayLike, vertex_count: int) -> NDArray[np.int64]:
+def _checked_triangles(triangles: ArrayLike, vertex_count: int) -> Indices:
     array = _array(triangles, "triangles")
     if array.size == 0:
         raise MeshError("the mesh has no triangles")
@@ -320,7 +320,7 @@ def _frozen(array: NDArray[_Scalar]) -> NDArray[_Scalar]:
     return array
 
 
-def _boundary_and_nonmanifold_edges(triangles: NDArray[np.int64], vertex_count: int) -> tuple[int, int]:
+def _boundary_and_nonmanifold_edges(triangles: Indices, vertex_count: int) -> tuple[int, int]:
     """Return the numbers of edges of exactly one triangle and of more than two."""
     keys = np.empty(3 * len(triangles), dtype=np.int64)
     for start in range(0, len(triangles), _BATCH):
@@ -339,16 +339,14 @@ def _boundary_and_nonmanifold_edges(triangles: NDArray[np.int64], vertex_count: 
     return int(np.count_nonzero(first & ~second)), int(np.count_nonzero(first & second & third))
 
 
-def _duplicate_triangles(triangles: NDArray[np.int64]) -> int:
+def _duplicate_triangles(triangles: Indices) -> int:
     """Return the number of triangles that repeat the three vertices of an earlier one."""
     ordered = np.sort(triangles, axis=1)
     ordered = ordered[np.lexsort(ordered.T)]
     return int(np.count_nonzero((ordered[1:] == ordered[:-1]).all(axis=1)))
 
 
-def shared_triangles(
-    first: NDArray[np.float64], second: NDArray[np.float64]
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def shared_triangles(first: Reals, second: Reals) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return which triangles of two meshes occur in both, in any orientation, each as often in one as in the other.
 
     Triangles are compared by hashes of 64 bits, which a pair of different ones shares with a probability of 5e-20.
@@ -371,7 +369,7 @@ def _matched(hashes: NDArray[np.uint64], others: NDArray[np.uint64]) -> NDArray[
     return matched
 
 
-def _triangle_hashes(corners: NDArray[np.float64]) -> NDArray[np.uint64]:
+def _triangle_hashes(corners: Reals) -> NDArray[np.uint64]:
     """Return the sum of the hashes of the corners of each triangle (m,), which does not depend on their order."""
     sums = np.empty(len(corners), dtype=np.uint64)
     for start in range(0, len(corners), _BATCH):

@@ -12,13 +12,12 @@ from typing import Annotated, Any, ClassVar
 
 import fast_simplification
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, field_validator
 from scipy.spatial import ConvexHull
 
 from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.surface import Point, Reals
+from sobolev_batch.surfaces.shapes.surface import Indices, Point, Reals
 from sobolev_batch.surfaces.sources.generated import Levels, Triple
 from sobolev_batch.surfaces.sources.registry import (
     MadeMember,
@@ -289,7 +288,7 @@ def with_noise(mesh: Mesh, amplitude: float, seed: int) -> Mesh:
     return Mesh((places + sizes[:, None] * normals)[place_of_vertex], mesh.triangles)
 
 
-def _normals(vertices: Reals, triangles: NDArray[np.int64]) -> Reals:
+def _normals(vertices: Reals, triangles: Indices) -> Reals:
     """Return the mean normal of the triangles at each vertex, weighted by area, (m, 3); zero where they cancel."""
     a, b, c = np.moveaxis(vertices[triangles], 1, 0)
     crosses = np.cross(b - a, c - a)
