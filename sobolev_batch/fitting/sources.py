@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
@@ -56,10 +56,10 @@ class FitSource(NestedSource):
     smoothing: Annotated[float, Field(ge=0.0, allow_inf_nan=False, strict=False)] = DEFAULT_SMOOTHING
     keep_boundary: bool = False
 
-    def with_reference(self, reference: Source) -> Self:
+    def with_reference(self, reference: Source) -> Source:
         """Return the source with the study's reference as its target, unless it has one of its own."""
-        source = super().with_reference(reference)
-        return source if source.target is not None else source.model_copy(update={"target": reference})
+        target = reference if self.target is None else self.target.with_reference(reference)
+        return self.model_copy(update={"mesh": self.mesh.with_reference(reference), "target": target})
 
     @property
     def settings(self) -> FitSettings:

@@ -116,10 +116,7 @@ class MeshView:
         areas = np.bincount(self.triangles.ravel(), areas, minlength=len(self.vertices))
         limits = []
         for moduli in np.abs(self.values):
-            order = np.argsort(moduli)
-            below = np.cumsum(areas[order])
-            covering = moduli[order][min(np.searchsorted(below, COVERED_AREA * below[-1]), len(order) - 1)]
-            largest = moduli.max()
+            covering, largest = np.quantile(moduli, COVERED_AREA, weights=areas, method="inverted_cdf"), moduli.max()
             limits.append(largest if largest <= _OUTLYING * covering or covering == 0 else covering)
         return np.array([float(limit) or 1.0 for limit in limits])
 

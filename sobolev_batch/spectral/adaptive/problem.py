@@ -178,23 +178,18 @@ def are_equal(a: Surface, b: Surface) -> bool:
 
 def _without_common_parts(surfaces: Sequence[Surface]) -> Mapping[int, Surface]:
     """Return one surface, or what two do not have in common, by their signs in the difference."""
-    rests: Sequence[Surface | None] = surfaces
-    match surfaces:
-        case (Mesh(), Mesh()):
-            rests = _without_shared_triangles(*surfaces)
-    return {sign: rest for sign, rest in zip((1, -1), rests, strict=False) if rest is not None}
-
-
-def _without_shared_triangles(*meshes: Mesh) -> Sequence[Mesh | None]:
-    """Return two meshes without the triangles that both have; None for one without any others."""
-    shared = shared_triangles(*(mesh.vertices[mesh.triangles] for mesh in meshes))
-    if not shared[0].any():
-        return meshes
-    rests = [
-        Mesh.from_checked(mesh.vertices, np.ascontiguousarray(mesh.triangles[~in_both]))
-        for mesh, in_both in zip(meshes, shared, strict=True)
-    ]
-    return [mesh if len(mesh.triangles) and mesh.area > 0 else None for mesh in rests]
+    meshes = [surface for surface in surfaces if isinstance(surface, Mesh)]
+    if len(meshes) == _PAIR:
+        shared = shared_triangles(*(mesh.vertices[mesh.triangles] for mesh in meshes))
+        if shared[0].any():
+            rests = [
+                Mesh.from_checked(mesh.vertices, np.ascontiguousarray(mesh.triangles[~in_both]))
+                for mesh, in_both in zip(meshes, shared, strict=True)
+            ]
+            return {
+                sign: mesh for sign, mesh in zip((1, -1), rests, strict=True) if len(mesh.triangles) and mesh.area > 0
+            }
+    return dict(zip((1, -1), surfaces, strict=False))
 
 
 def centering(surfaces: Sequence[Surface]) -> Similarity:

@@ -352,10 +352,6 @@ def _converted(found: Any, expected: str) -> Mesh:
     raise InputError(f"expected {expected}; found {name if known else f'{library}.{name}'}")
 
 
-def _of_trimesh(found: Any) -> Mesh:
-    return Mesh(np.array(found.vertices), np.array(found.faces))
-
-
 def _of_scene(found: Any) -> Mesh:
     # Each part is placed as in the scene.
     parts = found.dump()
@@ -390,7 +386,7 @@ def _of_open3d(found: Any) -> Mesh:
 
 
 _LIBRARIES: dict[tuple[str, str], Callable[[Any], Mesh]] = {
-    ("trimesh", "Trimesh"): _of_trimesh,
+    ("trimesh", "Trimesh"): lambda found: Mesh(np.array(found.vertices), np.array(found.faces)),
     ("trimesh", "Scene"): _of_scene,
     ("pyvista", "PolyData"): _of_pyvista,
     ("meshio", "Mesh"): _of_meshio,

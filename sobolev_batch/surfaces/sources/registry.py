@@ -84,17 +84,17 @@ class Source(BaseModel, ABC):
     @property
     def libraries(self) -> tuple[str, ...]:
         """Distributions that the surfaces need, besides those that sobolev-batch requires."""
-        return ()
+        return tuple(library for source in self._nested().values() for library in source.libraries)
 
     @property
     def commands(self) -> tuple[str, ...]:
         """Commands that making the surfaces runs, as a shell would have them."""
-        return ()
+        return tuple(command for source in self._nested().values() for command in source.commands)
 
     @property
     def keeps_meshes(self) -> bool:
         """True if making the surfaces takes long, so that they are kept."""
-        return False
+        return any(source.keeps_meshes for source in self._nested().values())
 
     def with_cache(self, cache: MeshCache) -> Self:
         """Return the source with the place where meshes are kept that take long to make.
@@ -102,7 +102,7 @@ class Source(BaseModel, ABC):
         Args:
             cache: The place; it also says whether commands may run.
         """
-        return self
+        return self.model_copy(update={name: source.with_cache(cache) for name, source in self._nested().items()})
 
     def with_reference(self, reference: Source) -> Source:
         """Return the source for a study with a reference. Override it if the surfaces depend on that.
@@ -110,7 +110,12 @@ class Source(BaseModel, ABC):
         Args:
             reference: Source of the study's reference.
         """
-        return self
+        nested = {name: source.with_reference(reference) for name, source in self._nested().items()}
+        return self.model_copy(update=nested)
+
+    def _nested(self) -> dict[str, Source]:
+        """Return the sources within this one, by their fields; each is handed what this one is handed."""
+        return {name: value for name, value in self if isinstance(value, Source)}
 
     @abstractmethod
     def members(self, folder: Path) -> tuple[Member, ...]:
@@ -357,37 +362,9 @@ OtherSource = Annotated[SerializeAsAny[Source], BeforeValidator(_parse_nested)]
 
 
 class NestedSource(Source):
-    """A source that works on the surfaces of others; each field that holds one is handed what it is handed."""
+    """A source that works on the surfaces of another one, which ``mesh`` is the table of."""
 
     mesh: OtherSource
-
-    @property
-    def libraries(self) -> tuple[str, ...]:
-        """Distributions that the other sources need."""
-        return tuple(library for source in self._nested().values() for library in source.libraries)
-
-    @property
-    def commands(self) -> tuple[str, ...]:
-        """Commands that the other sources run."""
-        return tuple(command for source in self._nested().values() for command in source.commands)
-
-    @property
-    def keeps_meshes(self) -> bool:
-        """True if one of the other sources keeps its meshes."""
-        return any(source.keeps_meshes for source in self._nested().values())
-
-    def with_cache(self, cache: MeshCache) -> Self:
-        """Return the source with the place of kept meshes handed to the other sources."""
-        return self.model_copy(update={name: source.with_cache(cache) for name, source in self._nested().items()})
-
-    def with_reference(self, reference: Source) -> Self:
-        """Return the source with the study's reference handed to the other sources."""
-        return self.model_copy(
-            update={name: source.with_reference(reference) for name, source in self._nested().items()}
-        )
-
-    def _nested(self) -> dict[str, Source]:
-        return {name: value for name, value in self if isinstance(value, Source)}
 
 
 def source_type_of(name: object) -> type[Source]:
