@@ -441,13 +441,10 @@ def _plan_class(cufinufft: Any) -> Any:
 
 @cache
 def gpu_backend() -> Gpu:
-    """Return the GPU, once it has passed a trial.
+    """Return the GPU, once it has passed a trial; BackendError, with what to do, where none is usable.
 
     Nothing of CUDA is loaded before this is called. To use several GPUs, start one process for each, with its own
     CUDA_VISIBLE_DEVICES.
-
-    Raises:
-        BackendError: No usable GPU; the message says why, and what to do.
     """
     backend = Gpu.load()
     try_out(backend)

@@ -55,13 +55,8 @@ _SPLITTER = 2.0**27 + 1
 def exact_transform(mesh: Mesh, frequencies: Reals) -> Complexes:
     """Return the transform ∫ exp(-2πi ξ·x) dμ(x) of a mesh's area measure, free of quadrature error.
 
-    Args:
-        mesh: Mesh in units of length.
-        frequencies: ξ, float64 (P, 3), in cycles per unit length.
-
-    Returns:
-        complex128 (P,). The error of each triangle is about 1e-15 of its contribution, or of its area if that is
-        smaller; the area itself is exact to rounding even on slivers.
+    For ξ, float64 (P, 3), in cycles per unit length, it is complex128 (P,). The error of each triangle is about 1e-15
+    of its contribution, or of its area if that is smaller; the area itself is exact to rounding even on slivers.
     """
     frequencies = np.asarray(frequencies, dtype=np.float64)
     columns = [np.ascontiguousarray(column) for column in mesh.vertices.T]
@@ -285,15 +280,12 @@ _SAMPLED_PAIRS = 1 << 14
 
 
 def sampled_transform(mesh: Mesh, frequencies: Reals, threads: int = 1) -> Complexes:
-    """Return the transform ∫ exp(-2πi ξ·x) dμ(x) of a mesh at single frequencies, fast and to fewer digits.
+    """Return the transform ∫ exp(-2πi ξ·x) dμ(x) of a mesh at single frequencies (P, 3), fast and to fewer digits.
 
     Away from small gaps the divided difference of exp at the corners is a plain sum of their exponentials, which
     neighbouring triangles share. It is several times as fast as `exact_transform` where triangles are not small beside
-    the wavelength.
-
-    Returns:
-        complex128 (P,), for ξ, float64 (P, 3). The error of a triangle is at most about 1e-9 of its area. That of whole
-        meshes at random frequencies was measured to be at most 1e-13 of the area.
+    the wavelength. The error of a triangle is at most about 1e-9 of its area. That of whole meshes at random
+    frequencies was measured to be at most 1e-13 of the area.
     """
     frequencies = np.asarray(frequencies, dtype=np.float64)
     lengths = np.linalg.norm(frequencies, axis=1)
@@ -393,12 +385,10 @@ def sphere_block(sphere: Sphere, lattice: FrequencyLattice, block: Block) -> NDA
 def sphere_inner_product(first: Sphere, second: Sphere, order: float) -> float:
     """Return the inner product of two spheres' area measures in the Sobolev norm of an order s < -1/2.
 
-    It is 4πR₁R₂ times the mean over |t| <= 1 of 2 C(2π(R₁-R₂+dt)) - 2 C(2π(R₁+R₂+dt)), where d is the distance of
-    the centres and C(b) = ∫_0^∞ cos(bρ) (1+ρ²)^s dρ is a Matérn function: a closed form for concentric spheres, a
-    one-dimensional integral otherwise. The relative error is about 1e-13.
-
-    Raises:
-        OrderError: The order is so low that the Bessel functions overflow.
+    It is 4πR₁R₂ times the mean over |t| <= 1 of 2 C(2π(R₁-R₂+dt)) - 2 C(2π(R₁+R₂+dt)), where d is the distance of the
+    centres and C(b) = ∫_0^∞ cos(bρ) (1+ρ²)^s dρ is a Matérn function: a closed form for concentric spheres, a
+    one-dimensional integral otherwise. The relative error is about 1e-13. OrderError where the Bessel functions
+    overflow.
     """
     nu = -order - 0.5
     separation = math.dist(first.center, second.center)

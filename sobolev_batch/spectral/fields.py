@@ -220,8 +220,7 @@ def field_for(
 ) -> Field:
     """Return the field of a surface with an error within a target, by the estimate of its probe; see `compute_field`.
 
-    It is the first of a few attempts that meets the target, or the last. The dtype and quadrature of the settings
-    are kept.
+    It is the first of a few attempts that meets the target, or the last, in the dtype and quadrature of the settings.
     """
     if kind_of(surface).is_closed_form:
         return compute_field(surface, lattice, settings, target.orders, sample=sample)

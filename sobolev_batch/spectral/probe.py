@@ -85,11 +85,10 @@ def norms_of_checks(radii: Reals, squares: Reals, orders: Sequence[float]) -> Re
 
 
 def draw(lattice: Lattice, orders: Sequence[float], degree: int, count: int, seed: int) -> Draws:
-    """Draw P random frequencies of a lattice where the error of a rule of some degree weighs most.
+    """Draw P random frequencies of a lattice where the error of a rule of some degree weighs most, by a seed.
 
-    Half of them follow weight · |ξ|^(2(degree+1)), as the error of the triangle rule does, and half
-    follow the weight alone, as the error of the NUFFT does. The weights of all orders are mixed evenly.
-    The same seed gives the same draws.
+    Half of them follow weight · |ξ|^(2(degree+1)), as the error of the triangle rule does, and half follow the weight
+    alone, as the error of the NUFFT does. The weights of all orders are mixed evenly.
     """
     rng = np.random.default_rng(seed)
     chances = _shell_chances(lattice, tuple(orders), degree)

@@ -93,15 +93,9 @@ def shell_sums(
 ) -> Reals:
     """Sum Re(a conj b) by the trapezoidal rule over each shell of one block of the half lattice.
 
-    Args:
-        values: Field a, complex (..., *block.shape).
-        others: Field b, likewise. None stands for a itself.
-        lattice: Lattice of the fields.
-        block: Block that the values fill.
-
-    Returns:
-        float64 (..., lattice.shell_count), indexed by |k|². The sums of all blocks add up to those of
-        the whole lattice, conjugate half included. A NaN makes the sum of its shell NaN.
+    The fields a and b, or a itself for None, are complex (..., *block.shape). The sums are float64 (...,
+    lattice.shell_count), indexed by |k|². Those of all blocks add up to those of the whole lattice, conjugate half
+    included. A NaN makes the sum of its shell NaN.
     """
     # The type that counting needs, and the weights, once for all fields.
     shells = lattice.shells(block).ravel().astype(np.intp)

@@ -349,11 +349,8 @@ def _duplicate_triangles(triangles: Indices) -> int:
 def shared_triangles(first: Reals, second: Reals) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return which triangles of two meshes occur in both, in any orientation, each as often in one as in the other.
 
-    Triangles are compared by hashes of 64 bits, which a pair of different ones shares with a probability of 5e-20.
-
-    Args:
-        first: Corners of the triangles of one mesh, float64 (m, 3, 3).
-        second: Corners of the triangles of the other mesh, float64 (n, 3, 3).
+    They have corners (m, 3, 3) and (n, 3, 3), and are compared by hashes of 64 bits, which a pair of different ones
+    shares with a probability of 5e-20.
     """
     hashes, other_hashes = _triangle_hashes(first), _triangle_hashes(second)
     return _matched(hashes, other_hashes), _matched(other_hashes, hashes)

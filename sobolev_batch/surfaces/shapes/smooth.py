@@ -136,14 +136,10 @@ class Smooth(ABC):
         """Return the surface after x -> scale * (x - origin)."""
 
     def nodes(self, counts: Counts, most: int = _BATCH) -> Iterator[tuple[Reals, Reals]]:
-        """Yield batches of nodes x (3, k) and weights (k,) of the product rule of both intervals.
+        """Yield batches of at most a number of nodes x (3, k) and weights (k,) of the product rule of both intervals.
 
-        The weights include the area elements. Where `tangents` is None, these are those of the interpolant
-        through all nodes: see `Interval.derivative`.
-
-        Args:
-            counts: Numbers of nodes along u and v, odd where periodic.
-            most: Bound on k.
+        The counts of nodes along u and v are odd where periodic. The weights include the area elements. Where
+        `tangents` is None, these are those of the interpolant through all nodes: see `Interval.derivative`.
         """
         (u, along_u), (v, along_v) = (
             interval.rule(count) for interval, count in zip(self.intervals, counts, strict=True)

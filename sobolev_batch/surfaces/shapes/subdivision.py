@@ -87,16 +87,11 @@ class Edges:
         return np.asarray(np.linalg.norm(vertices[self.ends[:, 0]] - vertices[self.ends[:, 1]], axis=1))
 
     def best(self, scores: Reals, triangles: int) -> Marks:
-        """Mark the edges of the triangles with the largest scores, as many as lead to at most that many triangles.
+        """Mark the edges of the triangles with the largest scores (m,), to lead to at most this many triangles.
 
-        Where an edge of a triangle is marked, so is its longest one: then triangles do not become ever thinner.
-
-        Source: M. C. Rivara, "Algorithms for refining triangular grids suitable for adaptive and multigrid techniques"
-        (1984), doi:10.1002/nme.1620200412.
-
-        Args:
-            scores: Score of each triangle (m,).
-            triangles: Number of triangles to stay at or below.
+        Where an edge of a triangle is marked, so is its longest one: then triangles do not become ever thinner. Source:
+        M. C. Rivara, "Algorithms for refining triangular grids suitable for adaptive and multigrid techniques" (1984),
+        doi:10.1002/nme.1620200412.
         """
         order = np.argsort(-scores, kind="stable")
         fewest, most = 0, len(order)
