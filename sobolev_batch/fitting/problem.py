@@ -33,7 +33,15 @@ from sobolev_batch.spectral.shells import SobolevWeights, single_order
 from sobolev_batch.spectral.transform.transform import ErrorTarget, Execution, TransformSettings, choose_settings
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.subdivision import Edges
-from sobolev_batch.surfaces.shapes.surface import Extent, Indices, Reals, Similarity, Surface, is_finite_number
+from sobolev_batch.surfaces.shapes.surface import (
+    Extent,
+    Indices,
+    Reals,
+    Similarity,
+    Surface,
+    centering,
+    is_finite_number,
+)
 
 # Orders s, each with the weight of its squared distance in a sum.
 OrderWeights = tuple[tuple[float, float], ...]
@@ -127,7 +135,7 @@ class FitProblem:
             own, values, quality = Lattice.from_field(given), field_values(given), quality_of(given)
         else:
             if lattice is None:
-                move = _centering(start, target)
+                move = centering([start, target])
             start, target = move.apply(start), move.apply(target)
             orders = tuple(dict.fromkeys((settings.order, settings.coarse_order)))
             own = lattice or fit_lattice(start, target, orders)
@@ -221,12 +229,6 @@ def welded(mesh: Mesh) -> tuple[Mesh, Indices]:
     # Zero has two signs.
     places, place = np.unique(mesh.vertices + 0.0, axis=0, return_inverse=True)
     return Mesh(places, place.reshape(-1)[mesh.triangles]), place.reshape(-1)
-
-
-def _centering(start: Mesh, target: Surface) -> Similarity:
-    low, high = Extent.union([start.extent, target.extent]).box
-    x, y, z = ((low + high) / 2).tolist()
-    return Similarity(1.0, (x, y, z))
 
 
 def fit_lattice(mesh: Mesh, target: Surface, orders: tuple[float, ...]) -> Lattice:

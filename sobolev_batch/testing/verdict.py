@@ -18,7 +18,7 @@ from sobolev_batch.spectral.fields import fourier_transform
 from sobolev_batch.spectral.shells import single_order
 from sobolev_batch.surfaces.formats.readers import SurfaceLike, as_surface
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.surface import Extent, Similarity, Surface
+from sobolev_batch.surfaces.shapes.surface import Extent, Similarity, Surface, centering
 from sobolev_batch.testing import DEFAULT_ORDER, DEFAULT_RTOL
 from sobolev_batch.visible import table_html
 
@@ -239,8 +239,7 @@ def write_difference(
 
     similarity = Similarity.to_unit_ball(b) if scaling else Similarity()
     pair = [similarity.apply(surface) for surface in (a, b)]
-    x, y, z = np.mean(Extent.union([surface.extent for surface in pair]).box, axis=0).tolist()
-    centered = [Similarity(1.0, (x, y, z)).apply(surface) for surface in pair]
+    centered = list(map(centering(pair).apply, pair))
     extent = Extent.union([surface.extent for surface in centered])
     area = np.array(sum(surface.area for surface in centered))
     lattice = core_lattice(Support(area, extent.widths, extent.reach), (order,), Accuracy(_ACCURACY))

@@ -231,15 +231,10 @@ def _path_problem(path: str) -> str | None:
     return label_problem(path)
 
 
-def _stem(path: PurePosixPath) -> str:
-    """Return the name of a file without format and compression."""
-    return mesh_stem(Path(path))
-
-
 def _is_called_reference(path: PurePosixPath) -> bool:
     """Tell whether the name of a file, or that of a folder on the way to it, is that of a reference."""
     folders = path.parent.parts
-    return any(map(_REFERENCE.search, (_stem(path), *folders))) or any(map(_REFERENCES.fullmatch, folders[-1:]))
+    return any(map(_REFERENCE.search, (mesh_stem(path), *folders))) or any(map(_REFERENCES.fullmatch, folders[-1:]))
 
 
 def _reference(folder: Path, sizes: Mapping[PurePosixPath, int], left_out: Mapping[str, str]) -> PurePosixPath:
@@ -276,7 +271,9 @@ def _families(paths: Sequence[PurePosixPath]) -> dict[str, list[PurePosixPath]]:
     groups: dict[str, list[PurePosixPath]] = {}
     for path in paths:
         # With slashes, or those of a/b and "a b" would be one.
-        groups.setdefault("/".join(path.parent.parts) if has_folders else _without_size(_stem(path)), []).append(path)
+        groups.setdefault("/".join(path.parent.parts) if has_folders else _without_size(mesh_stem(path)), []).append(
+            path
+        )
     if not has_folders:
         alone = [path for members in groups.values() for path in members if len(members) == 1]
         groups = {name: members for name, members in groups.items() if len(members) > 1}
@@ -316,8 +313,8 @@ def _several_objects(paths: Sequence[PurePosixPath]) -> tuple[dict[str, PurePosi
     methods: dict[tuple[str, str], list[PurePosixPath]] = {}
     for (path, name), parts in zip(owned, folders, strict=True):
         # What the name of the file says beside object and size; cowboy in the folder of cow is a method.
-        rest = _stem(path).removeprefix(name)
-        rest = _without_size(_stem(path) if rest[:1].isalnum() else rest).strip(" _-.")
+        rest = mesh_stem(path).removeprefix(name)
+        rest = _without_size(mesh_stem(path) if rest[:1].isalnum() else rest).strip(" _-.")
         # With slashes, or the methods of a/b and "a b" would be one.
         method = "/".join(parts[shared:]) or rest or "".join(parts[-1:])
         family = families.setdefault(method, _free_name(method, families.values()))
@@ -327,14 +324,14 @@ def _several_objects(paths: Sequence[PurePosixPath]) -> tuple[dict[str, PurePosi
 
 def _object_of(reference: PurePosixPath) -> str:
     """Return the name of the object of a reference: cow of objects/cow.ply, cow/original.ply, cow_original.ply."""
-    rest = _REFERENCE.sub("", _stem(reference)).strip(" _-.")
+    rest = _REFERENCE.sub("", mesh_stem(reference)).strip(" _-.")
     own = [part for part in reference.parent.parts if not _REFERENCE.search(part) and not _REFERENCES.fullmatch(part)]
     return rest or "".join(own[-1:])
 
 
 def _owner(path: PurePosixPath, references: Mapping[str, PurePosixPath]) -> str | None:
     """Return the object that a file belongs to: the longest that its name begins with, or that of its folder."""
-    stem = _stem(path)
+    stem = mesh_stem(path)
     # cow_big_500 is of cow_big, not of cow.
     beginnings = (stem[:end] for end in range(len(stem), 0, -1) if not stem[end : end + 1].isalnum())
     return next((name for name in (*beginnings, *path.parent.parts) if name in references), None)
@@ -396,21 +393,22 @@ def _entries(paths: Sequence[str], base: Path) -> list[str]:
     """Return a glob for the files of each folder and ending if it matches these and no others, or else their paths."""
     kinds: dict[tuple[PurePosixPath, str], list[str]] = {}
     for path in map(PurePosixPath, paths):
-        kinds.setdefault((path.parent, path.name.removeprefix(mesh_stem(Path(path)))), []).append(str(path))
+        kinds.setdefault((path.parent, path.name.removeprefix(mesh_stem(path))), []).append(str(path))
     entries: list[str] = []
     for (folder, ending), alike in kinds.items():
         stems = (
-            {"*", _SIZE.sub(lambda size: f"{size['separator']}*", mesh_stem(Path(alike[0])))}
+            {"*", _SIZE.sub(lambda size: f"{size['separator']}*", mesh_stem(PurePosixPath(alike[0])))}
             if len(alike) > 1
             else set()
         )
         globs = [str(folder / f"{stem}{ending}") for stem in sorted(stems) if "*" in stem]
-        entries += [glob for glob in globs if _named(glob, base) == set(alike)][:1] or alike
+        for glob in globs:
+            if {Path(os.path.relpath(path, base)).as_posix() for path in matching_files(base, glob)} == set(alike):
+                entries.append(glob)
+                break
+        else:
+            entries += alike
     return entries
-
-
-def _named(glob: str, base: Path) -> set[str]:
-    return {Path(os.path.relpath(path, base)).as_posix() for path in matching_files(base, glob)}
 
 
 def _paths(entries: Iterable[str], remark: str = "") -> str:

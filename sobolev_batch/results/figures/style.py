@@ -166,9 +166,9 @@ def escaped(text: str) -> str:
     return re.sub(r"^_", "\u2009_", visible(text).replace("$", r"\$"))
 
 
-def shortened(label: str, longest: int = _LONGEST_LABEL) -> str:
+def shortened(label: str) -> str:
     """Return a label for a place with little room."""
-    return escaped(middle_cut(visible(label), longest))
+    return escaped(middle_cut(visible(label), _LONGEST_LABEL))
 
 
 def draw_curve(
@@ -199,7 +199,10 @@ def drawing(size: Size | None) -> Iterator[None]:
 def write_figures(
     figures: Mapping[str, Figure], folder: str | Path, formats: Sequence[PictureFormat], size: Size | None
 ) -> tuple[Path, ...]:
-    """Write figures, made while `drawing` with a size of panels, into a folder; StoreError where that fails."""
+    """Write figures, made while `drawing` with a size of panels, into a folder; StoreError where that fails.
+
+    They have no date. Characters that a font lacks become boxes.
+    """
     folder, paths = Path(folder), []
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -207,18 +210,12 @@ def write_figures(
             for style in formats:
                 dpi = _SCREEN_DPI if style == "png" and size is None else _PAPER_DPI
                 paths.append(folder / f"{stem}.{style}")
-                with drawing(size):
-                    save(figure, paths[-1], style, dpi)
+                with drawing(size), mpl.rc_context(_SAVING), warnings.catch_warnings():
+                    warnings.filterwarnings("ignore", message="Glyph .* missing from")
+                    figure.savefig(paths[-1], dpi=dpi, metadata=_METADATA.get(style))
     except OSError as error:
         raise StoreError(f"{folder}: pictures cannot be written there: {error.strerror or error}") from error
     return tuple(paths)
-
-
-def save(figure: Figure, target: object, style: str, dpi: int = _SCREEN_DPI, **options: Any) -> None:
-    """Write a figure without a date; characters that its font lacks become boxes."""
-    with warnings.catch_warnings(), mpl.rc_context(_SAVING):
-        warnings.filterwarnings("ignore", message="Glyph .* missing from")
-        figure.savefig(target, format=style, dpi=dpi, metadata=_METADATA.get(style), **options)  # type: ignore[arg-type]
 
 
 def parse_size(text: str) -> Size:

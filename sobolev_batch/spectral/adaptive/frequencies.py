@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.spectral.adaptive.problem import (
+    OFF_CENTER,
     Problem,
     Solution,
     SurfaceValues,
-    centering,
     error_target,
     support_of,
 )
@@ -44,7 +44,7 @@ from sobolev_batch.spectral.octaves.values import (
 )
 from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.spectral.transform.transform import ErrorTarget, Execution, TransformSettings, permits_single
-from sobolev_batch.surfaces.shapes.surface import Reals, Surface
+from sobolev_batch.surfaces.shapes.surface import Reals, Surface, centering
 
 Complexes = NDArray[np.complexfloating]
 
@@ -199,7 +199,7 @@ class Reference:
         if problem.is_whole:
             frequencies = Frequencies.from_solution(problem, solution)
             return cls(frequencies, solution.values[1], solution.values, problem.signs, problem.pair)
-        move = centering(problem.pair)
+        move = centering(problem.pair, OFF_CENTER)
         pair = [move.apply(surface) for surface in problem.pair]
         support = replace(support_of(pair), areas=np.array(pair[1].area))
         accuracy = replace(problem.accuracy, best_effort=True)

@@ -20,7 +20,7 @@ from sobolev_batch.spectral.probe import Sample, draws_for, needs_probe
 from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.spectral.transform.transform import ErrorTarget, Execution, TransformSettings, permits_single
 from sobolev_batch.surfaces.shapes.mesh import Mesh, shared_triangles
-from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent, Reals, Similarity, Surface
+from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent, Reals, Surface, centering
 
 Samples = tuple[Sample, ...]
 
@@ -30,7 +30,7 @@ ESTIMATE_CAUTION = 0.7
 # relative accuracy.
 _ROUNDING = 1e-13
 # Surfaces whose common centre is no further from the origin, relative to their extent, stay where they are.
-_OFF_CENTER = 1e-3
+OFF_CENTER = 1e-3
 _PAIR = 2
 # An accuracy called reachable must hold when it is requested.
 _REACHABLE_MARGIN = 1.3
@@ -69,7 +69,7 @@ class Problem:
         different = _without_common_parts(surfaces)
         if not different:
             return cls((), orders, accuracy, Support(np.zeros(()), np.zeros(len(DIRECTIONS))), label, threads)
-        move = centering(list(different.values()))
+        move = centering(list(different.values()), OFF_CENTER)
         is_whole = all(one is other for one, other in zip(different.values(), pair, strict=False))
         surfaces = tuple(move.apply(surface) for surface in different.values())
         pair = surfaces if is_whole else tuple(move.apply(surface) for surface in pair)
@@ -190,15 +190,6 @@ def _without_common_parts(surfaces: Sequence[Surface]) -> Mapping[int, Surface]:
                 sign: mesh for sign, mesh in zip((1, -1), rests, strict=True) if len(mesh.triangles) and mesh.area > 0
             }
     return dict(zip((1, -1), surfaces, strict=False))
-
-
-def centering(surfaces: Sequence[Surface]) -> Similarity:
-    """Return the move of surfaces together to the centre of a lattice's period, which changes no distance."""
-    lowest, highest = Extent.union([surface.extent for surface in surfaces]).box
-    if np.all(np.abs(lowest + highest) <= _OFF_CENTER * (highest - lowest).max()):
-        return Similarity()
-    x, y, z = ((lowest + highest) / 2).tolist()
-    return Similarity(1.0, (x, y, z))
 
 
 @dataclass(frozen=True, eq=False)

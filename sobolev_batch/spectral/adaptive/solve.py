@@ -227,7 +227,11 @@ def _solve_on_lattices(problem: Problem, lattice: Lattice, is_pilot: bool, *, be
                 break
             lattice, is_pilot = larger, False
     shortfall = None if is_met else problem.out_of_reach(solution.estimate, f"on a lattice of M = {lattice.M}")
-    return _not_below_rounding(problem, replace(solution, shortfall=shortfall))
+    # No error is smaller than rounding where its number is.
+    found = solution.estimate
+    rounding = np.where(found.values <= problem.rounding, problem.rounding, 0.0)
+    found = replace(found, discretisation=np.maximum(found.discretisation, rounding))
+    return replace(solution, estimate=found, shortfall=shortfall)
 
 
 def _with_hidden_part(problem: Problem, solution: Solution, before_octaves: bool) -> tuple[Solution, Lattice | None]:
@@ -292,13 +296,6 @@ def _beyond_lattice(problem: Problem, solution: Solution) -> tuple[Reals, Reals]
     # No frequency beyond the lattice weighs more than this at lower orders.
     factors = (1 + lattice.xi_max**2) ** (np.array(problem.orders) - known)
     return factors * (values - shown @ shells), factors * errors
-
-
-def _not_below_rounding(problem: Problem, solution: Solution) -> Solution:
-    """Return a solution whose errors are no smaller than rounding where its numbers are."""
-    found = solution.estimate
-    rounding = np.where(found.values <= problem.rounding, problem.rounding, 0.0)
-    return replace(solution, estimate=replace(found, discretisation=np.maximum(found.discretisation, rounding)))
 
 
 def run_pilot(problem: Problem) -> tuple[Reals, Lattice, ComplexDtype]:

@@ -155,7 +155,7 @@ def first_lattice(support: Support, orders: Sequence[float], accuracy: Accuracy)
     Their energy then grows like |ξ|², which makes the tail beyond ξ_max a closed form. If that requires a large
     lattice, the result is a small pilot lattice, which is likely to be `refined`, and True.
     """
-    period = max(_first_period(support.widths, orders, accuracy), _CLEARANCE * 2 * support.reach)
+    period = _first_period(support, orders, accuracy)
     radii = np.geomspace(0.5, _HIGHEST_FREQUENCY, 400)
     highest = radii[0]
     for order in orders:
@@ -173,8 +173,8 @@ def core_lattice(support: Support, orders: Sequence[float], accuracy: Accuracy) 
 
     Octaves of larger lattices measure the rest, so that its M can be the same for every accuracy.
     """
-    period = max(_first_period(support.widths, orders, accuracy), _CLEARANCE * 2 * support.reach)
-    return lattice_of(_HIGHEST_FREQUENCY, period, min(_PILOT_M, accuracy.largest_intervals))
+    period, most = _first_period(support, orders, accuracy), min(_PILOT_M, accuracy.largest_intervals)
+    return lattice_of(_HIGHEST_FREQUENCY, period, most)
 
 
 def larger_pilot(lattice: Lattice, accuracy: Accuracy) -> Lattice | None:
@@ -253,13 +253,14 @@ def _refined_period(sums: Sums, weights: SobolevWeights, widths: Reals, accuracy
     return next(filter(suffices, accumulate(repeat(0.02 / weights.lattice.spacing), initial=first)))
 
 
-def _first_period(widths: Reals, orders: Sequence[float], accuracy: Accuracy) -> float:
-    """Return the period 1/h at which the kernel alone predicts images that are small enough."""
+def _first_period(support: Support, orders: Sequence[float], accuracy: Accuracy) -> float:
+    """Return the period 1/h that holds surfaces, and at which the kernel predicts images that are small enough."""
     allowed = accuracy.aliasing_part / (ALIASING_CAUTION * _IMAGE_MARGIN / 2)
-
-    farthest = float(widths.max()) + _VANISHED
+    widths, widest = support.widths, float(support.widths.max())
 
     def suffices(period: float) -> bool:
-        return period > farthest or all(image_weight(1 / period, order, widths) <= allowed for order in orders)
+        farthest = period > widest + _VANISHED
+        return farthest or all(image_weight(1 / period, order, widths) <= allowed for order in orders)
 
-    return next(filter(suffices, accumulate(repeat(1.01), mul, initial=max(float(widths.max()), _LEAST_WIDTH))))
+    periods = accumulate(repeat(1.01), mul, initial=max(widest, _LEAST_WIDTH))
+    return max(next(filter(suffices, periods)), _CLEARANCE * 2 * support.reach)

@@ -40,7 +40,6 @@ from sobolev_batch.surfaces.formats.readers import MeshLike, as_mesh, as_surface
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent, Reals
-from sobolev_batch.surfaces.sources.derived import decimated, with_noise
 
 # Relative accuracy of the closed forms of spheres.
 _CLOSED_FORM_ACCURACY = 1e-13
@@ -329,7 +328,7 @@ def yardsticks(
         else:
             # Without an accuracy there is one.
             frequencies = Frequencies(cast(Lattice, lattice), (), orders, support_of([a, b]).widths)
-            values = frequencies.values(b, target, _execution())
+            values = frequencies.values(b, target, Execution(threads=available_cores()))
         curves = _curves(b, frequencies, values, target, float(relative.min()), seed)
         for i in np.flatnonzero(distances > errors).tolist():
             for kind, curve in curves.items():
@@ -341,9 +340,11 @@ def _curves(
     mesh: Mesh, frequencies: Frequencies, values: SurfaceValues, target: ErrorTarget, start: float, seed: int
 ) -> dict[str, _Curve]:
     """Return the distance of a mesh from itself by the amount of each change; searches begin with a relative one."""
+    # It loads libraries that norms do without.
+    from sobolev_batch.surfaces.sources.derived import decimated, with_noise
 
     def apart(changed: Mesh) -> Reals:
-        others = frequencies.values(changed, target, _execution())
+        others = frequencies.values(changed, target, Execution(threads=available_cores()))
         return frequencies.norms([others, values], [changed, mesh], [1, -1]).values
 
     _, radius = mesh.bounding_sphere
@@ -409,10 +410,6 @@ class _Curve:
             if power / self.slope > _LEAST_POWER:
                 return power
         return self.slope
-
-
-def _execution() -> Execution:
-    return Execution(threads=available_cores())
 
 
 def _gap(found: float, wanted: float) -> float:

@@ -111,7 +111,9 @@ def _main_normals(mesh: Mesh) -> tuple[Reals, Reals, Reals]:
     for start in range(0, count, _BATCH):
         part = slice(start, start + _BATCH)
         normals[part], areas[part] = _normals_and_areas(mesh, part)
-        keys[part] = _keys(normals[part])
+        # A number for each normal, the same for those that count as one direction.
+        x, y, z = np.round(normals[part] * _DIRECTION_PARTS).astype(np.int32).T
+        keys[part] = (x * _KEYS_PER_AXIS + y) * _KEYS_PER_AXIS + z
     _, members = np.unique(keys, return_inverse=True)
     sums = np.bincount(members, weights=areas)
     largest = np.argsort(-sums)[:_MOST_DIRECTIONS]
@@ -134,12 +136,6 @@ def _normals_and_areas(mesh: Mesh, part: slice) -> tuple[Reals, Reals]:
     crosses = np.cross(b - a, c - a)
     doubled = np.linalg.norm(crosses, axis=1)
     return without_sign(crosses / np.where(doubled > 0, doubled, 1.0)[:, None]), doubled / 2
-
-
-def _keys(normals: Reals) -> NDArray[np.int32]:
-    """Return a number for each unit normal (k, 3), the same for those that count as one direction."""
-    x, y, z = np.round(normals * _DIRECTION_PARTS).astype(np.int32).T
-    return np.asarray((x * _KEYS_PER_AXIS + y) * _KEYS_PER_AXIS + z)
 
 
 # Samples along an axis of the lattice of each octave, and draws beside it where surfaces have flat faces.

@@ -107,16 +107,12 @@ def octave_values(
             continue
         lattice = None if part.is_drawn else sampling.lattices[number]
         if lattice is None or SurfaceSize.from_surface(surface).prefers_exact(lattice):
-            values.append(_at_frequencies(surface, sampling.frequencies[part.samples], execution))
+            values.append(kind_of(surface).sampled_values(sampling.frequencies[part.samples], execution.threads))
         else:
             block = transform_block(surface, lattice, lattice.half, settings(surface, lattice), execution).values
             values.append(block.ravel()[part.places])
     joined = np.concatenate(values)
     return OctaveValues(sampling, joined, *_compared(surface, sampling, joined, orders))
-
-
-def _at_frequencies(surface: Surface, frequencies: Reals, execution: Execution = ON_CPU) -> Complexes:
-    return kind_of(surface).sampled_values(frequencies, execution.threads)
 
 
 def _compared(
@@ -141,7 +137,7 @@ def _compared(
         chosen.append(part.samples.start + drawn)
         scales.append(weights[drawn] / (count * chances[drawn]))
     places = np.concatenate(chosen)
-    differences = values[places] - _at_frequencies(surface, sampling.frequencies[places])
+    differences = values[places] - kind.sampled_values(sampling.frequencies[places], ON_CPU.threads)
     return sampling.radii[places], np.concatenate(scales) * np.abs(differences) ** 2
 
 

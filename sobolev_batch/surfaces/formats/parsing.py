@@ -10,7 +10,7 @@ import stat
 import zlib
 from collections.abc import Iterator, Sequence
 from io import BufferedReader
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import IO, Any, cast
 from xml.parsers import expat
 
@@ -59,7 +59,7 @@ def checked_length(file: IO[bytes]) -> int:
     return length
 
 
-def is_gzipped(path: Path) -> bool:
+def is_gzipped(path: PurePath) -> bool:
     """Return whether the name of a file says that it is compressed."""
     return path.name.lower().endswith(".gz")
 

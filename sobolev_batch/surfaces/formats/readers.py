@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import IO, Any
 from uuid import uuid4
 
@@ -205,7 +205,7 @@ def _announced_size(header: bytes, length: int) -> tuple[int, float]:
     return triangles, triangles * memory_bytes + _VERTEX_MEMORY * max(0.0, vertices - triangles / 2)
 
 
-def mesh_format(path: Path) -> str:
+def mesh_format(path: PurePath) -> str:
     """Return the suffix in lower case and without .gz, or "freesurfer": it decides on the parser."""
     name = _unpacked_name(path).lower()
     suffix = Path(name).suffix
@@ -217,13 +217,13 @@ def is_mesh_name(path: Path) -> bool:
     return mesh_format(path) in _BY_SUFFIX
 
 
-def mesh_stem(path: Path) -> str:
+def mesh_stem(path: PurePath) -> str:
     """Return the name of a file without its format and compression; FreeSurfer's names are all stem."""
     name = _unpacked_name(path)
     return name if mesh_format(path) == _FREESURFER else Path(name).stem
 
 
-def _unpacked_name(path: Path) -> str:
+def _unpacked_name(path: PurePath) -> str:
     return path.name[: -len(".gz")] if is_gzipped(path) else path.name
 
 

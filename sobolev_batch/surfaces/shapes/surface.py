@@ -158,6 +158,15 @@ class Similarity:
         return surface if self.is_identity else surface.moved(self.scale, self.origin)
 
 
+def centering(surfaces: Sequence[Surface], tolerance: float = 0.0) -> Similarity:
+    """Return the move of surfaces together to the origin; none where they are as near, relative to their size."""
+    low, high = Extent.union([surface.extent for surface in surfaces]).box
+    if np.all(np.abs(low + high) <= tolerance * (high - low).max()):
+        return Similarity()
+    x, y, z = ((low + high) / 2).tolist()
+    return Similarity(1.0, (x, y, z))
+
+
 def placement_doubt(extent: Extent, reference: Extent) -> str | None:
     """Return what makes one doubt that a surface can be compared with a reference, as a question; None if nothing does.
 

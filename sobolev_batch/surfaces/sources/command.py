@@ -136,7 +136,7 @@ class RemesherSource(NestedSource):
             RemeshedMember(
                 name,
                 -1,
-                metadata=_metadata(parameters),
+                metadata=tuple((key, _as_number_or_text(value)) for key, value in parameters.items()),
                 make=self._maker(parameters, folder),
                 identity={"remesher": self._settings(parameters), "version": version},
                 original=original,
@@ -381,6 +381,5 @@ def _as_text(value: Parameter) -> str:
     return number_as_text(value) if isinstance(value, float) else str(value)
 
 
-def _metadata(parameters: Mapping[str, Parameter]) -> tuple[tuple[str, float | str], ...]:
-    numbers = {key: value for key, value in parameters.items() if not isinstance(value, bool | str)}
-    return tuple((key, float(numbers[key]) if key in numbers else _as_text(value)) for key, value in parameters.items())
+def _as_number_or_text(value: Parameter) -> float | str:
+    return _as_text(value) if isinstance(value, bool | str) else float(value)
