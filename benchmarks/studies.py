@@ -22,7 +22,7 @@ from benchmarks.table import Row, Target, as_bytes, as_seconds, at_most
 from benchmarks.timing import Effort, elapsed_seconds, take_turns
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.execution import Progress
-from sobolev_batch.spectral.shells import SobolevWeights
+from sobolev_batch.spectral.lattice import SobolevWeights
 from sobolev_batch.spectral.transform.transform import TransformSettings, transform_block
 
 _WORKERS = 2

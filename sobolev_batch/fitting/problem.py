@@ -27,9 +27,8 @@ from sobolev_batch.spectral.fields import (
     field_values,
     quality_of,
 )
-from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.lattice import Lattice, SobolevWeights, single_order
 from sobolev_batch.spectral.probe import Sample, draws_for, estimate
-from sobolev_batch.spectral.shells import SobolevWeights, single_order
 from sobolev_batch.spectral.transform.transform import ErrorTarget, Execution, TransformSettings, choose_settings
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.subdivision import Edges

@@ -9,10 +9,9 @@ from numpy.typing import ArrayLike
 
 from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.spectral.fields import OperandLike, pair_of
-from sobolev_batch.spectral.lattice import AXES, Lattice
+from sobolev_batch.spectral.lattice import AXES, Lattice, Orders, check_orders
 from sobolev_batch.spectral.metrics.causes import spectrum, witness
 from sobolev_batch.spectral.metrics.norms import distance, norm
-from sobolev_batch.spectral.shells import Orders, check_orders
 from sobolev_batch.surfaces.shapes.surface import Similarity
 
 

@@ -18,7 +18,7 @@ from sobolev_batch.batch.store.store import DIGEST, Store
 from sobolev_batch.batch.store.tables import lost_tables
 from sobolev_batch.errors import DamageError, InputError, StoreError, one_line
 from sobolev_batch.spectral.fields import Quality
-from sobolev_batch.spectral.shells import Orders
+from sobolev_batch.spectral.lattice import Orders
 from sobolev_batch.surfaces.shapes.surface import placement_doubt
 from sobolev_batch.surfaces.sources.names import quoted
 

@@ -18,9 +18,9 @@ from sobolev_batch.results.open import finished_group, location_of, reference_of
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.budget import NormEstimate
 from sobolev_batch.spectral.fields import Quality
+from sobolev_batch.spectral.lattice import Orders, check_orders, shell_sums, smooth_step
 from sobolev_batch.spectral.metrics.causes import band_coordinates
 from sobolev_batch.spectral.metrics.datasets import AREA, KERNEL, LENGTH, NUMBER, described, labelled, order_axis
-from sobolev_batch.spectral.shells import Orders, check_orders, shell_sums, smooth_step
 from sobolev_batch.surfaces.shapes.surface import Reals, Similarity
 from sobolev_batch.surfaces.sources.names import quoted
 

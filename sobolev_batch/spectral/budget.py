@@ -15,7 +15,7 @@ from typing import Self
 import numpy as np
 from scipy.special import exprel, gammaln, kve, zeta
 
-from sobolev_batch.spectral.shells import SobolevWeights
+from sobolev_batch.spectral.lattice import SobolevWeights
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Reals
 
 # Both laws were measured on spheres, boxes, sticks and icospheres, near and far: the truncation was

@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.spectral.backends import Complexes
-from sobolev_batch.spectral.lattice import Block, Lattice
+from sobolev_batch.spectral.lattice import Block, Lattice, SobolevWeights, shell_volumes
 from sobolev_batch.spectral.quadrature.kinds import kind_of
-from sobolev_batch.spectral.shells import SobolevWeights, shell_volumes
 from sobolev_batch.spectral.transform.transform import TransformSettings
 from sobolev_batch.surfaces.shapes.surface import Indices, Reals, Surface
 

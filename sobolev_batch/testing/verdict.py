@@ -15,7 +15,7 @@ from sobolev_batch.spectral.adaptive.threshold import Method, relative_distance
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy, core_lattice
 from sobolev_batch.spectral.budget import Support
 from sobolev_batch.spectral.fields import fourier_transform
-from sobolev_batch.spectral.shells import single_order
+from sobolev_batch.spectral.lattice import single_order
 from sobolev_batch.surfaces.formats.readers import SurfaceLike, as_surface
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Extent, Similarity, Surface, centering

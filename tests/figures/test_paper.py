@@ -7,7 +7,7 @@ import pytest
 
 from sobolev_batch import Lattice, Sphere, distance, fourier_transform, icosphere, norm
 from sobolev_batch.spectral.exact import sphere_block
-from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
+from sobolev_batch.spectral.lattice import SobolevWeights, shell_sums
 
 FIGURE_1B = {
     16: (2.755e00, 4.426e00),

@@ -28,8 +28,7 @@ from sobolev_batch.spectral.backends import (
 )
 from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice, OctaveLattice
-from sobolev_batch.spectral.quadrature.meshes import assign_rules
-from sobolev_batch.spectral.quadrature.rules import corner_rule, midpoint_rule
+from sobolev_batch.spectral.quadrature.meshes import assign_rules, corner_rule, midpoint_rule
 from sobolev_batch.spectral.transform.transform import (
     ErrorTarget,
     Execution,

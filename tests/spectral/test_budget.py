@@ -12,7 +12,7 @@ from sobolev_batch import Lattice, Mesh, Sphere, distance, fourier_transform, ic
 from sobolev_batch.spectral.budget import NormEstimate, Sums, Support, truncated
 from sobolev_batch.spectral.exact import sphere_distance, sphere_inner_product
 from sobolev_batch.spectral.fields import Quality
-from sobolev_batch.spectral.shells import SobolevWeights
+from sobolev_batch.spectral.lattice import SobolevWeights
 from sobolev_batch.surfaces.shapes.surface import Surface
 from tests.support.shapes import CENTRED_BOX as BOX
 

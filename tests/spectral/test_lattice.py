@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sobolev_batch import Lattice, LatticeError, Sphere, fourier_transform, norm
-from sobolev_batch.spectral.shells import SobolevWeights, shell_sums, shell_volumes
+from sobolev_batch.spectral.lattice import SobolevWeights, shell_sums, shell_volumes
 from tests.support.shapes import CENTRED_BOX as BOX
 
 

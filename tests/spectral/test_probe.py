@@ -7,8 +7,8 @@ import pytest
 
 from sobolev_batch import Ellipsoid, Lattice, Mesh, Sphere, Torus, distance, fourier_transform, icosphere, norm
 from sobolev_batch.spectral.fields import PROBED_ORDERS, Quality
+from sobolev_batch.spectral.lattice import SobolevWeights
 from sobolev_batch.spectral.probe import Sample, draw, estimate, measure
-from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.surfaces.shapes.surface import Surface
 
 LATTICE = Lattice(3.0, 24)

@@ -23,12 +23,11 @@ from sobolev_batch.spectral.budget import (
     sums_of_shells,
 )
 from sobolev_batch.spectral.fields import Quality, TailQuality
-from sobolev_batch.spectral.lattice import Block, Lattice
+from sobolev_batch.spectral.lattice import Block, Lattice, SobolevWeights, shell_sums
 from sobolev_batch.spectral.metrics.gram import Arrangement, differences
 from sobolev_batch.spectral.octaves.remainder import Remainder
 from sobolev_batch.spectral.octaves.sampling import TailSampling
 from sobolev_batch.spectral.octaves.values import OctaveSums, OctaveWeights, Tail, squared_moduli
-from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.spectral.spectra import ComparedSpectra, RadialAxis, Spectra
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent
 

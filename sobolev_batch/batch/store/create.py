@@ -35,9 +35,8 @@ from sobolev_batch.batch.store.store import (
 from sobolev_batch.batch.store.tables import array_keys, dataset_keys, hide_tables
 from sobolev_batch.batch.study.plan import Plan
 from sobolev_batch.errors import DamageError, StoreError
-from sobolev_batch.spectral.lattice import AXES
+from sobolev_batch.spectral.lattice import AXES, smooth_step
 from sobolev_batch.spectral.octaves.sampling import TailSampling
-from sobolev_batch.spectral.shells import smooth_step
 from sobolev_batch.spectral.spectra import RadialAxis
 from sobolev_batch.surfaces.shapes.surface import Similarity
 

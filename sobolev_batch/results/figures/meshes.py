@@ -19,8 +19,8 @@ from sobolev_batch.batch.study.study import Study
 from sobolev_batch.errors import InputError, SobolevBatchError, StoreError
 from sobolev_batch.results.open import AnyStore, as_tree, fields_read, finished_group, reference_of
 from sobolev_batch.spectral.backends import ComplexDtype
+from sobolev_batch.spectral.lattice import Orders, check_orders
 from sobolev_batch.spectral.metrics.causes import witness
-from sobolev_batch.spectral.shells import Orders, check_orders
 from sobolev_batch.surfaces.formats.plain_formats import write_ply
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Reals, Similarity

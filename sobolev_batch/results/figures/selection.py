@@ -26,8 +26,8 @@ from sobolev_batch.results.open import (
     reference_of,
 )
 from sobolev_batch.results.store_accessor import StoreAccessor
+from sobolev_batch.spectral.lattice import Orders
 from sobolev_batch.spectral.metrics.causes import spectrum
-from sobolev_batch.spectral.shells import Orders
 from sobolev_batch.surfaces.shapes.surface import Reals
 
 Item = TypeVar("Item")

@@ -38,8 +38,8 @@ from sobolev_batch.results.tables.text import (
     section,
     with_error,
 )
+from sobolev_batch.spectral.lattice import Orders
 from sobolev_batch.spectral.metrics.datasets import observed_rates
-from sobolev_batch.spectral.shells import Orders
 
 _ABOUT = ("family", "name", "level", "rank", "ordered_by", "status", "reason", "triangles", "vertices", "seconds")
 _NUMBERS = (

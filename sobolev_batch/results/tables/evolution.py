@@ -14,8 +14,8 @@ from sobolev_batch.results.open import AnyStore, as_tree, complete_meshes, finis
 from sobolev_batch.results.store_accessor import StoreAccessor, convergence_at
 from sobolev_batch.results.tables import Format
 from sobolev_batch.results.tables.text import machine_table, printed_table, prose, section, with_error
+from sobolev_batch.spectral.lattice import Orders, check_orders
 from sobolev_batch.spectral.metrics.datasets import NUMBER, VARIABLES, described
-from sobolev_batch.spectral.shells import Orders, check_orders
 from sobolev_batch.surfaces.sources.names import quoted
 
 # A mesh whose distance has grown by this factor since its first time is worth a new one.

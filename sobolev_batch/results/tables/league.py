@@ -32,7 +32,7 @@ from sobolev_batch.results.tables.statistics import (
 )
 from sobolev_batch.results.tables.text import Column, column_table, machine_table, prose, section
 from sobolev_batch.spectral.adaptive.tolerance import NEXT_TO_EQUAL
-from sobolev_batch.spectral.shells import Orders
+from sobolev_batch.spectral.lattice import Orders
 from sobolev_batch.surfaces.sources.names import quoted
 
 LEAGUE_NOTE = """\

@@ -24,7 +24,7 @@ from sobolev_batch.results.tables.text import (
     with_error,
 )
 from sobolev_batch.spectral.budget import quotients
-from sobolev_batch.spectral.shells import check_orders
+from sobolev_batch.spectral.lattice import check_orders
 
 Reals = NDArray[np.float64]
 

@@ -30,7 +30,7 @@ from sobolev_batch.spectral.budget import (
     sums_of_shells,
 )
 from sobolev_batch.spectral.fields import field_for
-from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.lattice import Lattice, SobolevWeights, shell_sums
 from sobolev_batch.spectral.octaves.remainder import mean_sinc, remainder
 from sobolev_batch.spectral.octaves.sampling import OctaveSampling
 from sobolev_batch.spectral.octaves.values import (
@@ -42,7 +42,6 @@ from sobolev_batch.spectral.octaves.values import (
     squared_moduli,
     statistical_errors,
 )
-from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.spectral.transform.transform import ErrorTarget, Execution, TransformSettings, permits_single
 from sobolev_batch.surfaces.shapes.surface import Reals, Surface, centering
 

@@ -20,7 +20,7 @@ from sobolev_batch.spectral.adaptive.problem import (
 from sobolev_batch.spectral.adaptive.tolerance import FINER_LATTICE, core_lattice, good_intervals
 from sobolev_batch.spectral.budget import aliased, change_of_root, sums_of_shells
 from sobolev_batch.spectral.fields import Field
-from sobolev_batch.spectral.lattice import Lattice, OctaveLattice
+from sobolev_batch.spectral.lattice import Lattice, OctaveLattice, SobolevWeights, shell_sums
 from sobolev_batch.spectral.octaves.remainder import Remainder, remainder, tail_integral
 from sobolev_batch.spectral.octaves.sampling import FaceNormals, Octave, OctaveSampling
 from sobolev_batch.spectral.octaves.values import (
@@ -35,7 +35,6 @@ from sobolev_batch.spectral.octaves.values import (
     squared_moduli,
 )
 from sobolev_batch.spectral.probe import estimate as estimate_from
-from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.surfaces.shapes.smooth import Smooth
 from sobolev_batch.surfaces.shapes.surface import Reals
 

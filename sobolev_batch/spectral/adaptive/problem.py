@@ -13,11 +13,10 @@ from sobolev_batch.spectral.adaptive.tolerance import Accuracy, unreachable
 from sobolev_batch.spectral.backends import ComplexDtype, Complexes
 from sobolev_batch.spectral.budget import NormEstimate, Support
 from sobolev_batch.spectral.fields import USUAL_DEGREE, Field, field_for
-from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.lattice import Lattice, SobolevWeights
 from sobolev_batch.spectral.octaves.sampling import OctaveSampling
 from sobolev_batch.spectral.octaves.values import OctaveValues
 from sobolev_batch.spectral.probe import Sample, draws_for, needs_probe
-from sobolev_batch.spectral.shells import SobolevWeights
 from sobolev_batch.spectral.transform.transform import ErrorTarget, Execution, TransformSettings, permits_single
 from sobolev_batch.surfaces.shapes.mesh import Mesh, shared_triangles
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent, Reals, Surface, centering

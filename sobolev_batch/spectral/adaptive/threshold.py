@@ -15,9 +15,8 @@ from sobolev_batch.spectral.adaptive.solve import difference_on, solve
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy, core_lattice, lattice_of
 from sobolev_batch.spectral.budget import area_bound, area_bounds
 from sobolev_batch.spectral.fields import USUAL_DEGREE, Field, compute_field
-from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.lattice import Lattice, SobolevWeights, shell_sums, shell_volumes
 from sobolev_batch.spectral.probe import Sample, draws_for, needs_probe
-from sobolev_batch.spectral.shells import SobolevWeights, shell_sums, shell_volumes
 from sobolev_batch.spectral.transform.transform import (
     ErrorTarget,
     Execution,

@@ -28,8 +28,7 @@ from sobolev_batch.spectral.budget import (
     image_weight,
     truncated,
 )
-from sobolev_batch.spectral.lattice import LARGEST_M, Lattice
-from sobolev_batch.spectral.shells import SobolevWeights
+from sobolev_batch.spectral.lattice import LARGEST_M, Lattice, SobolevWeights
 from sobolev_batch.spectral.transform.transform import FINEST_EPS, TransformSettings, projected_bytes
 from sobolev_batch.surfaces.shapes.surface import Reals
 

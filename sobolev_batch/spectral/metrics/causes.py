@@ -12,7 +12,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.spectral.backends import ComplexDtype, NufftSpec
 from sobolev_batch.spectral.fields import OperandLike, field_of, pair_of, read_blocks, shells_of
-from sobolev_batch.spectral.lattice import Block, Lattice
+from sobolev_batch.spectral.lattice import Block, Lattice, Orders, SobolevWeights, check_orders, shell_volumes
 from sobolev_batch.spectral.metrics.datasets import (
     AREA,
     FREQUENCY,
@@ -23,7 +23,6 @@ from sobolev_batch.spectral.metrics.datasets import (
     lattice_attributes,
     order_axis,
 )
-from sobolev_batch.spectral.shells import Orders, SobolevWeights, check_orders, shell_volumes
 from sobolev_batch.spectral.transform.nufft import evaluate_at
 from sobolev_batch.spectral.transform.transform import TransformSettings, require_points_inside, thread_count
 from sobolev_batch.surfaces.shapes.surface import Reals, Similarity

@@ -9,8 +9,7 @@ import numpy as np
 import xarray as xr
 
 from sobolev_batch.spectral.budget import NormEstimate, ReferenceEstimate
-from sobolev_batch.spectral.lattice import AXES, Lattice
-from sobolev_batch.spectral.shells import Orders
+from sobolev_batch.spectral.lattice import AXES, Lattice, Orders
 from sobolev_batch.surfaces.shapes.surface import Reals
 
 KERNEL = "weight (1 + |xi|^2)^s, xi in cycles per unit length"

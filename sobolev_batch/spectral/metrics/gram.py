@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.spectral.budget import Sums, outer_windows
-from sobolev_batch.spectral.lattice import Block
-from sobolev_batch.spectral.shells import SobolevWeights
+from sobolev_batch.spectral.lattice import Block, SobolevWeights
 from sobolev_batch.surfaces.shapes.surface import Reals
 
 Complexes = NDArray[np.complex128]

@@ -32,9 +32,8 @@ from sobolev_batch.spectral.fields import (
     shells_against,
     shells_of,
 )
-from sobolev_batch.spectral.lattice import Lattice
+from sobolev_batch.spectral.lattice import Lattice, Orders, SobolevWeights, check_orders
 from sobolev_batch.spectral.metrics.datasets import VARIABLES, labelled, labelled_distances, lattice_attributes
-from sobolev_batch.spectral.shells import Orders, SobolevWeights, check_orders
 from sobolev_batch.spectral.transform.transform import ErrorTarget, Execution
 from sobolev_batch.surfaces.formats.readers import MeshLike, as_mesh, as_surface
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere

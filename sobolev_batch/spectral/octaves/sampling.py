@@ -19,8 +19,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.spectral.lattice import OctaveLattice
-from sobolev_batch.spectral.shells import STEP_START, smooth_step
+from sobolev_batch.spectral.lattice import STEP_START, OctaveLattice, smooth_step
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Indices, Reals, Surface
 

@@ -14,7 +14,7 @@ from sobolev_batch import Sphere, Study, distance, fourier_transform
 from sobolev_batch.batch.analysis.reducer import Reducer
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.study.plan import make_plan
-from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
+from sobolev_batch.spectral.lattice import SobolevWeights, shell_sums
 from tests.support.studies import SMALL_LATTICE, small_table
 
 ROWS = 11

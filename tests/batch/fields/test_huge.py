@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Mesh, Similarity, Study, icosphere, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client
-from sobolev_batch.spectral.quadrature.rules import gauss_rule
+from sobolev_batch.spectral.quadrature.meshes import gauss_rule
 from tests.support.studies import small_table, variable
 
 pytestmark = pytest.mark.all

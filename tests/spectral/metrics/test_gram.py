@@ -7,8 +7,8 @@ import pytest
 
 from sobolev_batch import Lattice, Sphere, distance, fourier_transform, icosphere
 from sobolev_batch.spectral.budget import add_sums, sums_of_shells
+from sobolev_batch.spectral.lattice import SobolevWeights, shell_sums
 from sobolev_batch.spectral.metrics.gram import Arrangement, differences
-from sobolev_batch.spectral.shells import SobolevWeights, shell_sums
 from sobolev_batch.surfaces.shapes.surface import Surface
 
 LATTICE = Lattice(4.0, 24)

@@ -12,6 +12,7 @@ from scipy.integrate import quad
 
 from sobolev_batch import Mesh, Sphere, Torus, icosphere
 from sobolev_batch.spectral.exact import exact_transform, sphere_transform
+from sobolev_batch.spectral.lattice import smooth_step
 from sobolev_batch.spectral.octaves.sampling import FaceNormals, Octave, OctaveSampling, TailSampling
 from sobolev_batch.spectral.octaves.values import (
     OctaveSums,
@@ -22,7 +23,6 @@ from sobolev_batch.spectral.octaves.values import (
     squared_moduli,
     statistical_errors,
 )
-from sobolev_batch.spectral.shells import smooth_step
 from sobolev_batch.spectral.transform.transform import ErrorTarget
 from sobolev_batch.surfaces.shapes.surface import Surface
 from tests.support.oracles import torus_value

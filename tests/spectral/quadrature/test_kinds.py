@@ -12,8 +12,7 @@ from sobolev_batch.spectral.backends import CPU
 from sobolev_batch.spectral.fields import compute_field
 from sobolev_batch.spectral.quadrature import kinds, meshes
 from sobolev_batch.spectral.quadrature.kinds import kind_of
-from sobolev_batch.spectral.quadrature.meshes import RuleUse, assign_rules
-from sobolev_batch.spectral.quadrature.rules import TriangleRule, corner_rule, midpoint_rule
+from sobolev_batch.spectral.quadrature.meshes import RuleUse, TriangleRule, assign_rules, corner_rule, midpoint_rule
 from sobolev_batch.spectral.transform.transform import Execution, TransformSettings
 from sobolev_batch.surfaces.shapes.surface import Surface
 from tests.support.shapes import CENTRED_BOX as BOX

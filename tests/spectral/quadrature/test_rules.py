@@ -9,7 +9,7 @@ import pytest
 
 from sobolev_batch import Mesh
 from sobolev_batch.spectral.exact import exact_transform
-from sobolev_batch.spectral.quadrature.rules import (
+from sobolev_batch.spectral.quadrature.meshes import (
     HIGHEST_DEGREE,
     TriangleRule,
     candidate_rules,

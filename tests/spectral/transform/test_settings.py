@@ -12,7 +12,7 @@ import pytest
 from sobolev_batch import InputError, Lattice, Mesh, Sphere, fourier_transform, icosphere, norm
 from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.fields import field_for
-from sobolev_batch.spectral.shells import SobolevWeights
+from sobolev_batch.spectral.lattice import SobolevWeights
 from sobolev_batch.spectral.transform.transform import (
     ErrorTarget,
     TransformSettings,
