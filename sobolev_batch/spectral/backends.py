@@ -281,10 +281,7 @@ class Backend:
 
         It is of type 1 with the sign -1; the adjoint is of type 2 with the sign +1 and takes the coefficients of the
         modes. The modes of an axis of n samples start at -(n // 2). A plan keeps references to angles, not copies. The
-        oversampling must be set.
-
-        Raises:
-            RuntimeError: cuFINUFFT failed to make it; it does not say why.
+        oversampling must be set. cuFINUFFT raises RuntimeError without a reason.
         """
         # FINUFFT warns of thread counts and of tolerances, which are checked before.
         return finufft.Plan(

@@ -264,8 +264,7 @@ def decay_to_period(spacing: float, order: float, widths: Reals) -> float:
 def image_weight(spacing: float, order: float, widths: Reals, images: Reals = _PERIOD) -> float:
     """Sum the kernel over the least distances of surfaces to their images at n/h, relative to its peak.
 
-    The spacing h is in cycles per unit length, the widths along `DIRECTIONS` (13,) in units of length, the images are n
-    (..., 3).
+    The spacing h is in cycles per unit length; the widths are those along `DIRECTIONS`; the images are n (..., 3).
     """
     # The least distance of S to S + v is at least v·u - width(u), for every direction u.
     offsets = np.abs(images @ DIRECTIONS.T) / spacing

@@ -418,11 +418,7 @@ def sphere_norm(sphere: Sphere, order: float) -> float:
 
 
 def sphere_distance(first: Sphere, second: Sphere, order: float) -> float:
-    """Return the Sobolev distance of two spheres' area measures, of an order s < -1/2.
-
-    The squared distance is a difference of inner products, with an absolute error of about 1e-13 of the squared
-    norms.
-    """
+    """Return the Sobolev distance of two spheres' area measures; its square is off by 1e-13 of the squared norms."""
     squared = (
         sphere_inner_product(first, first, order)
         + sphere_inner_product(second, second, order)

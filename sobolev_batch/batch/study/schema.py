@@ -332,11 +332,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def plain_tables(table: object) -> dict[str, Any]:
-    """Return a study with DataFrames as lists of rows, values of NumPy as Python's, and paths as texts.
-
-    Raises:
-        StudyError: It is no table, or its validation or messages would take too long.
-    """
+    """Return a study with DataFrames as lists of rows, NumPy's values as Python's, paths as texts; or StudyError."""
     if not isinstance(table, Mapping):
         raise StudyError(f"a study is a mapping of sections, such as {{'study': ...}}, found {shown_value(table)}")
     return {str(key): _plain(value, (key,)) for key, value in table.items()}

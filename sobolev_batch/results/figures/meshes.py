@@ -63,13 +63,10 @@ class StudyMeshes:
         return cls(tree, members, table, Similarity(similarity["scale"], tuple(similarity["origin"])))
 
     def make(self, label: str, most_triangles: float = math.inf) -> tuple[Mesh, Mesh]:
-        """Return the mesh of a label in its own unit of length, and in the study's.
+        """Return the mesh of a label in its own unit of length, and in the study's, or SobolevBatchError.
 
-        Files may have changed, and a store may name files that its study never read: only a mesh with the
-        stored digest passes.
-
-        Raises:
-            SobolevBatchError: The mesh cannot be made, is too large, or is not the one that was computed.
+        Files may have changed, and a store may name files that its study never read: only a mesh with the stored digest
+        passes.
         """
         row = self.table.sel(mesh=label)
         triangles = row["triangles"].item()

@@ -220,10 +220,6 @@ class State:
         """True where single frequencies are cheaper than whole lattices; sums over many nodes are not."""
         return not any(isinstance(surface, Smooth) for surface in self.problem.surfaces)
 
-    def lattice_seconds(self, lattice: OctaveLattice) -> float:
-        """Predict the time of the transforms on a lattice."""
-        return sum(size.lattice_seconds(lattice) for size in self.sizes)
-
     def sampling_seconds(self, sampling: OctaveSampling, known: OctaveSampling | None = None) -> float:
         """Predict the time of the samples of an octave, without those that are known."""
         return sum(size.sampling_seconds(sampling, known) for size in self.sizes)
@@ -347,7 +343,7 @@ def _first_sampling(state: State, octave: Octave) -> OctaveSampling:
         further = _REMAINDER_FRACTION * state.permitted / (_QUANTILE * energy * outside)
     count = int(np.clip((deviation / min(own.min(), further.min())) ** 2, _FEWEST_DRAWS, _MOST_DRAWS))
     lattice = _lattice(state, octave, _FIRST_M, rng)
-    seconds = state.lattice_seconds(lattice)
+    seconds = sum(size.lattice_seconds(lattice) for size in state.sizes)
     alone = max(count, _FEWEST_FLAT_DRAWS) if normals else count
     alone = min(alone, max(_FEWEST_DRAWS, int(_OCTAVE_SECONDS / state.draw_seconds)))
     if state.can_draw and alone * state.draw_seconds < seconds:
@@ -386,7 +382,8 @@ def _finer_sampling(state: State, octave: MeasuredOctave, order: int, permitted:
         return None
     count = int(min(sampling.draws * np.clip(1.5 * excess, 1.5, 16.0), _MOST_DRAWS))
     first = _lattice(state, sampling.octave, _FIRST_M, rng)
-    if not sampling.lattices and count * state.draw_seconds > state.lattice_seconds(first):
+    seconds = sum(size.lattice_seconds(first) for size in state.sizes)
+    if not sampling.lattices and count * state.draw_seconds > seconds:
         beside = sampling.draws if state.normals else 0
         return replace(
             sampling, lattices=(first,), draws=beside, seed=_seed(rng), uniform_fraction=_UNIFORM_BESIDE_LATTICE

@@ -131,8 +131,7 @@ def _largest_share(solution: Solution) -> float:
 def _in_coarser_octaves(problem: Problem, seed: int) -> list[Solution]:
     """Return what octaves reach that aim at less than a problem requires.
 
-    With the same number of samples they come nearer than octaves that aim too high: these stop far below the
-    frequencies that matter.
+    They come nearer than those that aim too high, which stop far below the frequencies that matter.
     """
     found = []
     for rtol in coarser_than(problem.accuracy.rtol):
@@ -298,11 +297,7 @@ def _beyond_lattice(problem: Problem, solution: Solution) -> tuple[Reals, Reals]
 
 
 def run_pilot(problem: Problem) -> tuple[Reals, Lattice, ComplexDtype]:
-    """Return the rough distances (orders,) of a pair of surfaces, and the lattice and dtype that its accuracy needs.
-
-    Raises:
-        AccuracyError: The accuracy cannot be met within the memory.
-    """
+    """Return rough distances (orders,) of a pair, and lattice and dtype that its accuracy needs, or AccuracyError."""
     lattice, is_pilot = first_lattice(problem.support, problem.orders, problem.accuracy)
     while True:
         samples = problem.samples(lattice)

@@ -227,13 +227,7 @@ class SurfaceKind(ABC):
 
     @abstractmethod
     def batches(self, capacity: int, backend: Backend = CPU) -> Iterator[WeightedPoints]:
-        """Yield the points in batches of at most a number, at least 8 times that of the largest rule (3,624).
-
-        Those of a mesh are nearly equal.
-
-        Raises:
-            InputError: A parametrised surface whose quadrature does not converge.
-        """
+        """Yield the points in nearly equal batches of at most a number, 8 times that of the largest rule or more."""
 
     @abstractmethod
     def exact_values(self, frequencies: Reals) -> Complexes:

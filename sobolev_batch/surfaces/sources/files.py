@@ -258,12 +258,9 @@ def _recorded_file(name: str, path: str) -> Path:
 
 
 def matching_files(folder: Path, path: str) -> list[Path]:
-    """Return the files that a path, or a glob of ``**``, ``*``, ``?`` and ``[...]``, names.
+    """Return the files that a path or a glob of ``**``, ``*``, ``?`` and ``[...]`` names; StudyError where none does.
 
     Hidden files match only where a part of the glob begins with a dot; ``**`` follows no links to folders.
-
-    Raises:
-        StudyError: No file can have this name, or the glob matches none.
     """
     if "\0" in path:
         raise StudyError(f"paths: no file can have the name {quoted(path)}, which holds the character NUL")
