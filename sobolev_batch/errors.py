@@ -1,5 +1,8 @@
 """Exceptions of the package: one tree, with plain messages, safe to pickle between processes."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from sobolev_batch.visible import visible
 
 
@@ -86,3 +89,14 @@ def one_line(error: BaseException) -> str:
     """
     message = str(error) if isinstance(error, SobolevBatchError) else " ".join(str(error).split())
     return visible(message) or type(error).__name__
+
+
+@contextmanager
+def from_extra(extra: str, purpose: str, kind: type[InputError] = InputError) -> Iterator[None]:
+    """Turn an import that fails into an error that names its purpose, and the extra that has the library."""
+    try:
+        yield
+    except ImportError as error:
+        raise kind(
+            f"{purpose} a library that is missing ({error}); install the extra: pip install 'sobolev-batch[{extra}]'"
+        ) from error

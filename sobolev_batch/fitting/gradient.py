@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from sobolev_batch.errors import InputError
+from sobolev_batch.errors import InputError, from_extra
 from sobolev_batch.fitting.transform import MeshTransform
 from sobolev_batch.spectral.backends import Complexes, backend_named
 from sobolev_batch.spectral.budget import ALIASING_CAUTION, Support, decay_to_period, sums_of_shells, truncated
@@ -164,11 +164,9 @@ def torch_function(squared: SquaredDistance) -> Callable[[Any], Any]:
     >>> function = sb.torch_function(squared)  # doctest: +SKIP
     >>> function(torch.tensor(ball.vertices, requires_grad=True)).backward()  # doctest: +SKIP
     """
-    try:
+    with from_extra("torch", "functions of PyTorch need"):
         import torch
         from torch.autograd.function import once_differentiable
-    except ImportError as error:
-        raise _missing("PyTorch", "torch") from error
 
     class _Function(torch.autograd.Function):  # type: ignore[misc]
         @staticmethod
@@ -207,10 +205,8 @@ def jax_function(squared: SquaredDistance) -> Callable[[Any], Any]:
     >>> function = sb.jax_function(squared)  # doctest: +SKIP
     >>> gradient = jax.grad(function)(jax.numpy.asarray(ball.vertices))  # doctest: +SKIP
     """
-    try:
+    with from_extra("jax", "functions of JAX need"):
         import jax
-    except ImportError as error:
-        raise _missing("JAX", "jax") from error
 
     def value(vertices: Any) -> Any:
         found = np.asarray(squared.value(np.asarray(vertices)))
@@ -235,10 +231,6 @@ def jax_function(squared: SquaredDistance) -> Callable[[Any], Any]:
     function.defvjp(forward, backward)
     result: Callable[[Any], Any] = function
     return result
-
-
-def _missing(name: str, extra: str) -> InputError:
-    return InputError(f"{name} is not installed; the extra has it: pip install 'sobolev-batch[{extra}]'")
 
 
 def gradient(

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sobolev_batch.errors import InputError
+from sobolev_batch.errors import InputError, from_extra
 from sobolev_batch.parameters import check_seed, is_whole_number
 from sobolev_batch.surfaces.formats.readers import MeshLike, as_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh
@@ -66,14 +66,9 @@ def proximity(a: MeshLike, b: MeshLike, *, points: int = DEFAULT_POINTS, seed: i
     if not is_whole_number(points) or not 1 < points <= MOST_POINTS:
         raise InputError(f"points must be an integer from 2 to {MOST_POINTS}, found {points!r}")
     check_seed(seed)
-    try:
+    with from_extra("vtk", "Hausdorff and Chamfer distances need"):
         import pyvista
         from vtkmodules.vtkFiltersModeling import vtkHausdorffDistancePointSetFilter
-    except ImportError as error:
-        raise InputError(
-            f"Hausdorff and Chamfer distances need a library that is missing ({error}); install the extra: "
-            "pip install 'sobolev-batch[vtk]'"
-        ) from error
     meshes = as_mesh(a), as_mesh(b)
     # Powers of two lose no digit, and keep squares of lengths within the range of doubles.
     scale = 2.0 ** np.frexp(max(float(np.abs(mesh.vertices).max()) for mesh in meshes))[1]

@@ -16,7 +16,7 @@ import xarray as xr
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.study.plan import members_of
 from sobolev_batch.batch.study.study import Study
-from sobolev_batch.errors import InputError, SobolevBatchError, StoreError
+from sobolev_batch.errors import InputError, SobolevBatchError, StoreError, from_extra
 from sobolev_batch.results.open import AnyStore, as_tree, fields_read, finished_group, reference_of
 from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.lattice import Orders, check_orders
@@ -252,15 +252,9 @@ def _ply(mesh: Mesh, values: Mapping[float, Reals], notes: Sequence[str]) -> byt
 
 
 def _vtp(mesh: Mesh, values: Mapping[float, Reals], notes: Sequence[str]) -> bytes:
-    try:
-        import pyvista
+    with from_extra("vtk", "a .vtp file needs"):
         from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
-    except ImportError as error:
-        raise InputError(
-            f"a .vtp file needs the library {error.name}, which is not installed; "
-            "the extra has it: pip install 'sobolev-batch[vtk]'"
-        ) from error
-    surface = pyvista.PolyData.from_regular_faces(np.array(mesh.vertices), mesh.triangles)
+    surface = mesh.to_pyvista()
     for order, row in values.items():
         surface.point_data[f"witness, order {_number(order)}"] = row
     surface.point_data.active_scalars_name = f"witness, order {_number(next(iter(values)))}"

@@ -27,7 +27,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.errors import MeshError
+from sobolev_batch.errors import MeshError, from_extra
 from sobolev_batch.surfaces.formats.parsing import Raw, merge_coincident, triangle_fans, unpacked_limit, xml_events
 from sobolev_batch.surfaces.shapes.surface import Indices, Reals
 
@@ -322,12 +322,8 @@ def parse_vtk(data: bytes, suffix: str) -> Raw:
     """Return the vertices and triangles of a VTK file, legacy (.vtk) or XML (.vtp, .vtu)."""
     if suffix != ".vtk":
         _check_xml(data)
-    try:
+    with from_extra("vtk", "VTK files need", MeshError):
         import pyvista
-    except ImportError as error:
-        raise MeshError(
-            f"VTK files need a library that is missing ({error}); install the extra: pip install 'sobolev-batch[vtk]'"
-        ) from error
     dataset = _dataset(data, suffix)
     kind = "nothing" if dataset is None else dataset.GetClassName()
     if kind == "vtkUnstructuredGrid":

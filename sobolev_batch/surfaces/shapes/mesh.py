@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sobolev_batch.errors import InputError, MeshError
+from sobolev_batch.errors import MeshError, from_extra
 from sobolev_batch.surfaces.shapes.surface import LARGEST_LENGTH, Extent, Indices, Point, Reals
 
 Corners = tuple[Reals, Reals, Reals]
@@ -199,10 +199,8 @@ class Mesh:
         Raises:
             InputError: PyVista is not installed (the extra ``vtk``).
         """
-        try:
+        with from_extra("vtk", "a mesh of PyVista needs"):
             import pyvista
-        except ImportError as error:
-            raise InputError("PyVista is not installed: pip install 'sobolev-batch[vtk]'") from error
         return pyvista.PolyData.from_regular_faces(np.array(self.vertices), np.array(self.triangles))
 
     def _zero_areas(self) -> Iterator[tuple[slice, Reals]]:

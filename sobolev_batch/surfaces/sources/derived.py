@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field, field_validator
 from scipy.spatial import ConvexHull
 
-from sobolev_batch.errors import MeshError
+from sobolev_batch.errors import MeshError, from_extra
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Indices, Point, Reals
 from sobolev_batch.surfaces.sources.generated import Levels, Triple
@@ -55,14 +55,9 @@ def decimated(mesh: Mesh, triangles: int) -> Mesh:
 
 def remeshed(mesh: Mesh, triangles: int) -> Mesh:
     """Return a mesh of about a number of triangles, around clusters of the vertices of another one."""
-    try:
+    with from_extra("studies", "remeshing needs", MeshError):
         import pyacvd
         import pyvista
-    except ImportError as error:
-        raise MeshError(
-            f"remeshing needs a library that is missing ({error}); install the extra: "
-            "pip install 'sobolev-batch[studies]'"
-        ) from error
     # A closed surface of genus g has V = F/2 + 2 - 2g: two vertices more than half the triangles.
     clusters = triangles // 2 + 2
     with warnings.catch_warnings():

@@ -147,7 +147,7 @@ def test_every_function_takes_paths_and_meshes_of_other_libraries(
 def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     # Python's own way to say that a module cannot be imported.
     monkeypatch.setitem(sys.modules, "pyvista", None)
-    with pytest.raises(sb.InputError, match=re.escape("PyVista is not installed: pip install 'sobolev-batch[vtk]'")):
+    with pytest.raises(sb.InputError, match=r"PyVista .* pip install 'sobolev-batch\[vtk\]'"):
         box().to_pyvista()
 
 
