@@ -175,7 +175,7 @@ def study_verdict(frame: pd.DataFrame, failed: Mapping[str, str]) -> tuple[tuple
     for order, rows in groups:
         at_sizes = [rows[rows["mesh"].isin(labels)] for labels in shown_sizes]
         nearest_rows, smallest_rows = _nearest_rows(rows, at_sizes), _smallest_rows(rows, sized[:_MOST_FAMILIES])
-        of_order = (*nearest_rows, *smallest_rows, *_imprecise_rows(rows), *_missing_rows(failed))
+        of_order = (*nearest_rows, *smallest_rows, *_doubtful_rows(rows, failed))
         lines += [{**line, "order": order} for line in of_order]
     omitted = [
         f"{shown} of {total} {things}"
@@ -261,14 +261,11 @@ def _smallest_rows(rows: pd.DataFrame, families: Sequence[str]) -> Iterator[Row]
                 yield _absent(label, "; ".join(filter(None, ("none", closest, open_ones))))
 
 
-def _imprecise_rows(rows: pd.DataFrame) -> Iterator[Row]:
-    """Yield the meshes whose distances have larger errors than the study requests."""
+def _doubtful_rows(rows: pd.DataFrame, failed: Mapping[str, str]) -> Iterator[Row]:
+    """Yield the meshes whose distances have larger errors than the study requests, and those that failed."""
     short = rows[rows["resolved"].astype(bool) & ~rows["within"].astype(bool) & rows["distance"].notna()]
     if len(short):
         yield _absent("above rtol", _names(short["mesh"].tolist()))
-
-
-def _missing_rows(failed: Mapping[str, str]) -> Iterator[Row]:
     if failed:
         yield {**_absent("missing", _names(list(failed))), "reasons": "failed"}
 

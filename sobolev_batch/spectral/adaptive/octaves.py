@@ -16,11 +16,12 @@ from sobolev_batch.spectral.adaptive.problem import (
     SurfaceValues,
     error_target,
     only_or_difference,
+    sums_on,
 )
 from sobolev_batch.spectral.adaptive.tolerance import FINER_LATTICE, core_lattice, good_intervals
-from sobolev_batch.spectral.budget import aliased, change_of_root, sums_of_shells
+from sobolev_batch.spectral.budget import aliased, change_of_root
 from sobolev_batch.spectral.fields import Field
-from sobolev_batch.spectral.lattice import Lattice, OctaveLattice, SobolevWeights, shell_sums
+from sobolev_batch.spectral.lattice import Lattice, OctaveLattice, SobolevWeights
 from sobolev_batch.spectral.octaves.remainder import Remainder, remainder, tail_integral
 from sobolev_batch.spectral.octaves.sampling import FaceNormals, Octave, OctaveSampling
 from sobolev_batch.spectral.octaves.values import (
@@ -97,9 +98,7 @@ class Core:
         )
         fields = problem.fields(lattice, samples, target, problem.dtype(lattice, target))
         weights = SobolevWeights(lattice, problem.orders, cutoff)
-        difference = only_or_difference([field.values for field in fields])
-        sums = sums_of_shells(shell_sums(difference, None, lattice, lattice.half), weights)
-        errors = np.sum([field.quality.probe.norms(weights) for field in fields], axis=0)
+        sums, errors = sums_on(fields, weights)
         images = aliased(sums, weights, problem.support.widths)
         return cls(lattice, fields, np.maximum(sums.totals, 0.0), images, errors, float(sums.outer[1]))
 

@@ -11,9 +11,9 @@ import numpy as np
 from sobolev_batch.errors import AccuracyError
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy, unreachable
 from sobolev_batch.spectral.backends import ComplexDtype, Complexes
-from sobolev_batch.spectral.budget import NormEstimate, Support
+from sobolev_batch.spectral.budget import NormEstimate, Sums, Support, sums_of_shells
 from sobolev_batch.spectral.fields import USUAL_DEGREE, Field, field_for
-from sobolev_batch.spectral.lattice import Lattice, SobolevWeights
+from sobolev_batch.spectral.lattice import Lattice, SobolevWeights, shell_sums
 from sobolev_batch.spectral.octaves.sampling import OctaveSampling
 from sobolev_batch.spectral.octaves.values import OctaveValues
 from sobolev_batch.spectral.probe import Sample, draws_for, needs_probe
@@ -160,6 +160,13 @@ def _discretisation_parts(orders: Sequence[float], accuracy: Accuracy) -> Reals:
 def only_or_difference(values: Sequence[Complexes]) -> Complexes:
     """Return the only values, or the difference of two."""
     return values[0] if len(values) == 1 else values[0] - values[1]
+
+
+def sums_on(fields: Sequence[Field], weights: SobolevWeights) -> tuple[Sums, Reals]:
+    """Return the sums of the only field, or of the difference of two, and the norms of their own errors (orders,)."""
+    lattice, difference = weights.lattice, only_or_difference([field.values for field in fields])
+    sums = sums_of_shells(shell_sums(difference, None, lattice, lattice.half), weights)
+    return sums, np.sum([field.quality.probe.norms(weights) for field in fields], axis=0)
 
 
 def support_of(surfaces: Sequence[Surface]) -> Support:

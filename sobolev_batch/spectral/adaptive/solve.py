@@ -21,10 +21,11 @@ from sobolev_batch.spectral.adaptive.problem import (
     SurfaceValues,
     error_target,
     only_or_difference,
+    sums_on,
 )
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy, first_lattice, larger_pilot, lattice_of, refined
 from sobolev_batch.spectral.backends import ComplexDtype
-from sobolev_batch.spectral.budget import NormEstimate, Sums, estimate_norms, modulus_bound, sums_of_shells
+from sobolev_batch.spectral.budget import NormEstimate, Sums, estimate_norms, modulus_bound
 from sobolev_batch.spectral.fields import Field
 from sobolev_batch.spectral.lattice import Lattice, SobolevWeights, shell_sums
 from sobolev_batch.spectral.octaves.remainder import LOWEST_ORDER, remainder
@@ -347,9 +348,7 @@ def _compute(
 def difference_on(problem: Problem, lattice: Lattice, fields: Sequence[Field]) -> tuple[NormEstimate, Sums]:
     """Return the norm of the only field, or of the difference of two, and the sums that it follows from."""
     weights = SobolevWeights(lattice, problem.orders)
-    difference = only_or_difference([field.values for field in fields])
-    sums = sums_of_shells(shell_sums(difference, None, lattice, lattice.half), weights)
-    errors = np.sum([field.quality.probe.norms(weights) for field in fields], axis=0)
+    sums, errors = sums_on(fields, weights)
     return estimate_norms(sums, weights, problem.support, errors), sums
 
 

@@ -308,9 +308,10 @@ def _last_number(path: Path) -> float:
 
 def names_of_files(paths: list[Path]) -> list[str]:
     """Return stems; file names where stems collide, and whole paths where these collide with any other name."""
-    stems = [mesh_stem(path) for path in paths]
-    names = [stem if alone else path.name for stem, path, alone in zip(stems, paths, _unique(stems), strict=True)]
-    names = [name if alone else path.as_posix() for name, path, alone in zip(names, paths, _unique(names), strict=True)]
+    names = list(map(mesh_stem, paths))
+    for longer in ([path.name for path in paths], [path.as_posix() for path in paths]):
+        counts = Counter(map(caseless_key, names))
+        names = [name if counts[caseless_key(name)] == 1 else other for name, other in zip(names, longer, strict=True)]
     for path, name in zip(paths, names, strict=True):
         problem = label_problem(name)
         if problem is not None:
@@ -322,13 +323,6 @@ def names_of_files(paths: list[Path]) -> list[str]:
             "in the encoding of accents; rename one"
         )
     return names
-
-
-def _unique(names: list[str]) -> list[bool]:
-    """Return, for each name, whether no other one has the same `caseless_key`."""
-    keys = list(map(caseless_key, names))
-    counts = Counter(keys)
-    return [counts[key] == 1 for key in keys]
 
 
 def file_digest(path: Path) -> str:
