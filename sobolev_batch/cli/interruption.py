@@ -22,15 +22,9 @@ class Deadline:
     """The end of this process soon after a request to end, even while it computes.
 
     Python raises no exception until a library returns to it, and loses one in a finalizer. A thread of its own hears
-    of signals at once. It leaves the command some time to clean up, and then ends the process: files and stores are
-    only ever replaced as a whole.
-
-    Args:
-        remark: What to add to the last message.
-        seconds: Time to clean up.
-
-    Attributes:
-        request: Number of the signal that requests the end; 0 before.
+    of signals at once. It leaves the command some seconds to clean up, and then ends the process: files and stores are
+    only ever replaced as a whole. The remark is added to the last message. The request is the number of the signal that
+    requests the end, and 0 before.
     """
 
     _current: ClassVar[Deadline | None] = None

@@ -63,12 +63,7 @@ _LEAST_ERRORS = 5.0
 
 @dataclass(frozen=True)
 class FitSettings:
-    """Settings of a fit; see `fit`.
-
-    Raises:
-        OrderError: The order is not below -1/2.
-        InputError: Another setting is out of range.
-    """
+    """Settings of a fit, see `fit`; OrderError or InputError where one is out of range."""
 
     order: float = DEFAULT_ORDER
     steps: int = DEFAULT_STEPS

@@ -62,16 +62,13 @@ _VANISHED = 120.0
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Relative accuracy of distances, requested in place of a lattice and settings.
+    """Relative accuracy of distances, requested in place of a lattice and settings; InputError where out of range.
 
     Args:
         rtol: Largest error of a distance, relative to it.
         allowed_bytes: Memory that the computation of one field may take, in bytes.
         best_effort: True if the nearest that can be reached will do where the accuracy is out of reach.
         floor: Distance below which errors are relative to it, and no longer to the distance itself.
-
-    Raises:
-        InputError: rtol does not lie between 0 and 1, or the memory is not positive.
     """
 
     rtol: float

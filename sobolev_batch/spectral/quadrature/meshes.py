@@ -220,14 +220,10 @@ class WeightedPoints:
 def fixed_rule(quadrature: str | int) -> TriangleRule | None:
     """Return the rule that a method prescribes for all triangles, or None if the rule depends on their size.
 
-    Args:
-        quadrature: "auto" gives every triangle the cheapest rule that keeps the tolerance at all frequencies of the
-            lattice, and splits triangles that are too large for any rule. An integer from 1 to 50 is the degree
-            of one symmetric rule with interior nodes for all triangles. "gauss8" is the 64-point product rule of
-            K. Koga's paper. Parametrised surfaces ignore the method.
-
-    Raises:
-        InputError: Any other method.
+    The method "auto" gives every triangle the cheapest rule that keeps the tolerance at all frequencies of the lattice,
+    and splits triangles that are too large for any rule. An integer from 1 to 50 is the degree of one symmetric rule
+    with interior nodes for all triangles. "gauss8" is the 64-point product rule of K. Koga's paper. Any other method is
+    an InputError. Parametrised surfaces ignore the method.
     """
     if quadrature == "auto":
         return None

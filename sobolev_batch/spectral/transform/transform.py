@@ -50,7 +50,7 @@ _MOST_THREADS = 1024
 
 @dataclass(frozen=True, init=False)
 class TransformSettings:
-    """Accuracy, dtype and quadrature of fields.
+    """Accuracy, dtype and quadrature of fields; InputError where one is unknown or out of reach for the dtype.
 
     Attributes:
         eps: Accuracy of a field relative to the surface's area; by default 1e-9 in complex128 and 1e-6 in
@@ -59,9 +59,6 @@ class TransformSettings:
         quadrature: Rules for triangles: see `fixed_rule`.
         tolerance: Largest error of the rule on any one triangle, relative to its area, or of the nodes of a
             parametrised surface, relative to the whole area; eps by default.
-
-    Raises:
-        InputError: An unknown dtype or quadrature, or an eps that the dtype cannot reach.
     """
 
     eps: float
