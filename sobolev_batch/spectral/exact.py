@@ -30,7 +30,7 @@ from sobolev_batch.errors import OrderError
 from sobolev_batch.spectral.backends import cosine_and_sine
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
-from sobolev_batch.surfaces.shapes.mesh import Corners, Mesh
+from sobolev_batch.surfaces.shapes.mesh import Corners, Mesh, cross_lengths
 from sobolev_batch.surfaces.shapes.surface import Indices, Reals
 
 Complexes = NDArray[np.complex128]
@@ -101,8 +101,8 @@ def doubled_areas(corners: Corners) -> Reals:
     aspect ratio of 1e6 costs six digits.
     """
     a, b, c = corners
-    (ux, uy, uz), (vx, vy, vz) = b - a, c - a
-    doubled = np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2)
+    (ux, uy, uz), (vx, vy, vz) = edges = b - a, c - a
+    doubled = cross_lengths(*edges)
     flat = np.flatnonzero(doubled < _FLATNESS * (ux * ux + uy * uy + uz * uz + vx * vx + vy * vy + vz * vz))
     doubled[flat] = _doubled_areas_of_flat((a[:, flat], b[:, flat], c[:, flat]))
     return np.asarray(doubled)
@@ -162,8 +162,10 @@ def _contributions(
     near, far = (frequency if frequency.ndim == 1 else frequency[:, mask] for mask in (close, apart))
     phases = _phases(points[0][:, close], near, plain)
     real[close], imaginary[close] = _near(doubled[close], phases, ab[close], ac[close], _SERIES_GAP)
-    exponentials = [_exponential(_phases(corner[:, apart], far, plain)) for corner in points[1:]]
-    quotients = doubled[apart] * _quotient(exponentials, ab[apart], ac[apart])
+    at_corners = (cosine_and_sine(_phases(corner[:, apart], far, plain)) for corner in points[1:])
+    quotients = doubled[apart] * _quotient(
+        [cosines + 1j * sines for cosines, sines in at_corners], ab[apart], ac[apart]
+    )
     real[apart], imaginary[apart] = quotients.real, quotients.imag
     return real, imaginary
 
@@ -230,11 +232,6 @@ def _first_difference(a: Complexes, b: Complexes, gap: Reals) -> Complexes:
     denominator = np.where(wide, gap, 1.0)
     near = a * np.exp(0.5j * gap) * np.sinc(gap / (2 * np.pi))
     return np.where(wide, (b - a) / (1j * denominator), near)
-
-
-def _exponential(phases: Reals) -> Complexes:
-    cosines, sines = cosine_and_sine(phases)
-    return np.asarray(cosines + 1j * sines)
 
 
 def _two_sum(a: Reals, b: Reals) -> Pair:

@@ -113,7 +113,8 @@ def make_report(store: AnyStore, *, folder: str | Path = ".", witnesses: Sequenc
             f"{collection.location}: meshes are shown in the report of one object, such as "
             f"{collection.location.below(collection.objects[0])}"
         )
-    return _collection_page(collection)
+    content = league_content(collection, Status.of_collection(collection))
+    return _filled("league", content, league_data(content["leagues"], content["name"], content["orders"]))
 
 
 def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], up: Axis) -> Page:
@@ -128,11 +129,6 @@ def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], u
     page = _filled("study", content, charts, spectra=spectra, views=views, missing=missing)
     require_unchanged(tree)
     return page
-
-
-def _collection_page(collection: CollectionStore) -> Page:
-    content = league_content(collection, Status.of_collection(collection))
-    return _filled("league", content, league_data(content["leagues"], content["name"], content["orders"]))
 
 
 def _filled(template: str, content: dict[str, Any], charts: Json, **values: Any) -> Page:

@@ -88,7 +88,7 @@ class Mesh:
     def areas(self) -> Reals:
         """Area of each triangle (m,), in squared units of length."""
         with np.errstate(over="ignore", invalid="ignore"):
-            return self._per_triangle(_areas)
+            return self._per_triangle(lambda edges: 0.5 * cross_lengths(*edges))
 
     @cached_property
     def area(self) -> float:
@@ -239,9 +239,10 @@ class Mesh:
         return Mesh, (self.vertices, self.triangles)
 
 
-def _areas(edges: _Edges) -> Reals:
-    (ux, uy, uz), (vx, vy, vz) = edges
-    return np.asarray(0.5 * np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2))
+def cross_lengths(first: Reals, second: Reals) -> Reals:
+    """Return |u × v| of vectors (3, ...)."""
+    (ux, uy, uz), (vx, vy, vz) = first, second
+    return np.asarray(np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2))
 
 
 def _side_lengths(edges: _Edges) -> Reals:

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.special import roots_legendre
 
 from sobolev_batch.errors import InputError
+from sobolev_batch.surfaces.shapes.mesh import cross_lengths
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent, Point, Reals, checked_point, is_finite_number
 
 Counts = tuple[int, int]
@@ -150,7 +151,7 @@ class Smooth(ABC):
             batch = slice(first_row, first_row + rows)
             parts = self._on_grid(u[batch], v) if whole is None else tuple(values[:, batch] for values in whole)
             positions, *tangents = parts
-            weights = _cross_lengths(*tangents)
+            weights = cross_lengths(*tangents)
             weights *= along_u[batch, None]
             weights *= along_v
             points, flat_weights = positions.reshape(3, -1), weights.ravel()
@@ -332,12 +333,6 @@ def _brought_back(interval: Interval, values: Reals) -> Reals:
         turns = np.floor((values - interval.low) / interval.length)
         return np.asarray(values - turns * interval.length)
     return np.asarray(np.clip(values, interval.low, interval.high))
-
-
-def _cross_lengths(first: Reals, second: Reals) -> Reals:
-    """Return |x_u × x_v| of vectors (3, ...)."""
-    (ux, uy, uz), (vx, vy, vz) = first, second
-    return np.asarray(np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2))
 
 
 @lru_cache(maxsize=64)
