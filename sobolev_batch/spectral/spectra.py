@@ -17,9 +17,10 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.spectral.lattice import Lattice, Reals, smooth_step
+from sobolev_batch.spectral.lattice import Lattice, smooth_step
 from sobolev_batch.spectral.octaves.sampling import OctaveSampling, SamplePart, TailSampling
 from sobolev_batch.spectral.octaves.values import quantile_of_sum
+from sobolev_batch.surfaces.shapes.surface import Reals
 
 # Radii for a group of samples of an octave: the weights of orders down to -12 are exact to 1e-13 of the largest one.
 _NODES = 40
