@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.support.mesh_files import LITTLE, Gltf, box_scene, gifti, obj, off, ply, stl_text
+from tests.support.mesh_files import LITTLE, Gltf, box_scene, gifti, obj, ply, stl_text
 from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES
 
 # Writes an attack into a folder, and returns the path of the file to read.
@@ -132,7 +132,7 @@ def _changed(content: bytes, old: bytes, new: bytes) -> bytes:
     return content.replace(old, new, 1)
 
 
-_OBJ, _OFF, _PLY = obj(BOX_VERTICES, BOX_TRIANGLES), off(BOX_VERTICES, BOX_TRIANGLES), ply(BOX_VERTICES, BOX_TRIANGLES)
+_OBJ, _PLY = obj(BOX_VERTICES, BOX_TRIANGLES), ply(BOX_VERTICES, BOX_TRIANGLES)
 _DIGITS = b"9" * 5000
 _FORMATS = (".ply", ".obj", ".stl", ".off", ".gltf", ".glb", ".gii", "_lh.pial")
 

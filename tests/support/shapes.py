@@ -13,7 +13,6 @@ from sobolev_batch.surfaces.shapes.smooth import Smooth
 from sobolev_batch.surfaces.shapes.surface import Point
 
 Reals = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 # A box with sides of 1, 2 and 4, so that axes cannot be confused. Its coordinates are exact in single precision.
 BOX_VERTICES: Reals = np.array([(x, y, z) for x in (0, 1) for y in (0, 2) for z in (0, 4)], dtype=np.float64)

@@ -9,17 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from sobolev_batch import (
-    AccuracyError,
-    InputError,
-    Lattice,
-    Mesh,
-    Sphere,
-    distance,
-    fourier_transform,
-    icosphere,
-    norm,
-)
+import sobolev_batch as sb
 from sobolev_batch.spectral.adaptive.problem import Problem, support_of
 from sobolev_batch.spectral.adaptive.solve import run_pilot
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
@@ -34,19 +24,19 @@ from tests.support.shapes import CENTRED_BOX as BOX
     ],
 )
 def test_spheres_are_as_far_apart_as_their_closed_form_says(order: float, rtol: float) -> None:
-    a, b = Sphere(0.8, (0.2, 0.0, 0.0)), Sphere(0.7, (-0.2, 0.1, 0.0))
-    exact = distance(a, b, order)["distance"].item()
-    dataset = distance(a, b, order, rtol=rtol)
+    a, b = sb.Sphere(0.8, (0.2, 0.0, 0.0)), sb.Sphere(0.7, (-0.2, 0.1, 0.0))
+    exact = sb.distance(a, b, order)["distance"].item()
+    dataset = sb.distance(a, b, order, rtol=rtol)
     assert dataset["within"].item()
     assert abs(dataset["distance"].item() - exact) <= dataset["error"].item() <= rtol * dataset["distance"].item()
-    exact, found = norm(a, order)["norm"].item(), norm(a, order, rtol=rtol)
+    exact, found = sb.norm(a, order)["norm"].item(), sb.norm(a, order, rtol=rtol)
     assert abs(found["norm"].item() - exact) <= found["error"].item() <= rtol * found["norm"].item()
 
 
 @pytest.mark.slow
 def test_the_papers_finest_icosphere_but_one_to_five_digits() -> None:
-    dataset = distance(icosphere(6), Sphere(), -10.0, rtol=1e-5)
-    relative = dataset["distance"].item() / norm(Sphere(), -10.0)["norm"].item()
+    dataset = sb.distance(sb.icosphere(6), sb.Sphere(), -10.0, rtol=1e-5)
+    relative = dataset["distance"].item() / sb.norm(sb.Sphere(), -10.0)["norm"].item()
     assert relative == pytest.approx(7.383836e-05, rel=1e-5)
     # Far fewer points than the paper's 64 a triangle, on a lattice beyond which nothing can hide.
     assert dataset.attrs["M"] <= 150
@@ -55,41 +45,41 @@ def test_the_papers_finest_icosphere_but_one_to_five_digits() -> None:
 
 
 def test_several_orders_share_what_the_most_demanding_needs() -> None:
-    box = Mesh(0.9 * BOX.vertices, BOX.triangles)
-    together = distance(BOX, box, [-3.0, -10.0], rtol=1e-3)
+    box = sb.Mesh(0.9 * BOX.vertices, BOX.triangles)
+    together = sb.distance(BOX, box, [-3.0, -10.0], rtol=1e-3)
     assert together["within"].all()
     assert together["within"].dims == ("order",)
-    alone = distance(BOX, box, -10.0, rtol=1e-3)
+    alone = sb.distance(BOX, box, -10.0, rtol=1e-3)
     assert alone.attrs["xi_max"] < together.attrs["xi_max"]
     difference = abs(together["distance"].values[1] - alone["distance"].item())
     assert difference <= together["error"].values[1] + alone["error"].item()
 
 
 def test_low_accuracy_is_computed_in_single_precision() -> None:
-    assert distance(icosphere(1), Sphere(), -5.0, rtol=1e-2).attrs["dtype"] == "complex64"
-    assert distance(icosphere(1), Sphere(), -5.0, rtol=1e-6).attrs["dtype"] == "complex128"
+    assert sb.distance(sb.icosphere(1), sb.Sphere(), -5.0, rtol=1e-2).attrs["dtype"] == "complex64"
+    assert sb.distance(sb.icosphere(1), sb.Sphere(), -5.0, rtol=1e-6).attrs["dtype"] == "complex128"
 
 
 @pytest.mark.slow
 def test_what_is_out_of_reach_is_refused_with_what_can_be_had() -> None:
-    pair = icosphere(0), icosphere(1)
+    pair = sb.icosphere(0), sb.icosphere(1)
     with pytest.raises(
-        AccuracyError, match=r"rtol 1e-06 is out of reach at order -2 within 0\.6 GB .* about"
+        sb.AccuracyError, match=r"rtol 1e-06 is out of reach at order -2 within 0\.6 GB .* about"
     ) as caught:
-        distance(*pair, -2.0, rtol=1e-6, memory=6e8)
+        sb.distance(*pair, -2.0, rtol=1e-6, memory=6e8)
     assert caught.value.requested == 1e-6
     assert 1e-6 < caught.value.reachable < 0.1
     copy = pickle.loads(pickle.dumps(caught.value))
     assert (str(copy), copy.reachable) == (str(caught.value), caught.value.reachable)
-    assert distance(*pair, -2.0, rtol=1.2 * caught.value.reachable, memory=6e8)["within"].item()
+    assert sb.distance(*pair, -2.0, rtol=1.2 * caught.value.reachable, memory=6e8)["within"].item()
 
 
 @pytest.mark.slow
 def test_a_best_effort_is_the_nearest_that_can_be_had() -> None:
-    a, b, rtol = icosphere(3), Sphere(), 1e-12
-    with pytest.raises(AccuracyError, match="a best effort") as caught:
-        distance(a, b, -10.0, rtol=rtol, memory=6e8)
-    found = distance(a, b, -10.0, rtol=rtol, memory=6e8, best_effort=True)
+    a, b, rtol = sb.icosphere(3), sb.Sphere(), 1e-12
+    with pytest.raises(sb.AccuracyError, match="a best effort") as caught:
+        sb.distance(a, b, -10.0, rtol=rtol, memory=6e8)
+    found = sb.distance(a, b, -10.0, rtol=rtol, memory=6e8, best_effort=True)
     assert not found["within"].item()
     relative = found["error"].item() / found["distance"].item()
     assert rtol < relative < 1.5 * caught.value.reachable
@@ -97,26 +87,26 @@ def test_a_best_effort_is_the_nearest_that_can_be_had() -> None:
 
 @pytest.mark.slow
 def test_a_best_effort_that_succeeds_is_the_same() -> None:
-    a, b = icosphere(1), Sphere()
-    strict, best = (distance(a, b, -3.0, rtol=1e-2, best_effort=best) for best in (False, True))
+    a, b = sb.icosphere(1), sb.Sphere()
+    strict, best = (sb.distance(a, b, -3.0, rtol=1e-2, best_effort=best) for best in (False, True))
     # Sums in threads differ by rounding.
     xr.testing.assert_allclose(strict, best, rtol=1e-3)
     assert strict.attrs.keys() == best.attrs.keys()
-    with pytest.raises(InputError, match="a best effort is made for an rtol"):
-        distance(a, b, -3.0, lattice=Lattice(2.0, 16), best_effort=True)
+    with pytest.raises(sb.InputError, match="a best effort is made for an rtol"):
+        sb.distance(a, b, -3.0, lattice=sb.Lattice(2.0, 16), best_effort=True)
 
 
 @pytest.mark.slow
 def test_what_surfaces_share_cancels() -> None:
-    ball = icosphere(2)
-    less = Mesh(ball.vertices, ball.triangles[5:])
-    patch = Mesh(ball.vertices, ball.triangles[:5])
-    found, expected = distance(ball, less, -1.5, rtol=2e-2), norm(patch, -1.5, rtol=2e-2)
+    ball = sb.icosphere(2)
+    less = sb.Mesh(ball.vertices, ball.triangles[5:])
+    patch = sb.Mesh(ball.vertices, ball.triangles[:5])
+    found, expected = sb.distance(ball, less, -1.5, rtol=2e-2), sb.norm(patch, -1.5, rtol=2e-2)
     assert found["distance"].item() == pytest.approx(expected["norm"].item(), rel=1e-6)
     # One vertex moved by little: six thin triangles, of which lattices see next to nothing.
     vertices = ball.vertices.copy()
     vertices[7] *= 1 + 1e-6
-    near = distance(ball, Mesh(vertices, ball.triangles), -2.0, rtol=5e-2)
+    near = sb.distance(ball, sb.Mesh(vertices, ball.triangles), -2.0, rtol=5e-2)
     assert near["within"].item()
     assert 0 < near["distance"].item() < 1e-5
 
@@ -131,60 +121,62 @@ def test_what_surfaces_share_cancels() -> None:
         ({"memory": 1e3}, "1e-06 GB of memory are too little"),
         ({"order": [-40.0, -1e6]}, "orders go down to -100"),
         ({"rtol": None, "memory": 1e9}, "memory limits the computation for an rtol"),
-        ({"lattice": Lattice(2.0, 16)}, "an rtol chooses the lattice"),
-        ({"a": fourier_transform(BOX, Lattice(2.0, 16))}, "an rtol chooses the lattice"),
+        ({"lattice": sb.Lattice(2.0, 16)}, "an rtol chooses the lattice"),
+        ({"a": sb.fourier_transform(BOX, sb.Lattice(2.0, 16))}, "an rtol chooses the lattice"),
         ({"a": 7}, r"expected a Mesh, the path of a mesh file, .*; found int"),
     ],
 )
 def test_refuses_what_has_no_meaning(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        distance(**{"a": BOX, "b": Sphere(), "order": -2.0, "rtol": 1e-3, **change})
+    with pytest.raises(sb.InputError, match=message):
+        sb.distance(**{"a": BOX, "b": sb.Sphere(), "order": -2.0, "rtol": 1e-3, **change})
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("offset", [1e4, 1e8])
 def test_surfaces_far_apart_are_no_endless_search(offset: float) -> None:
-    far = Mesh(BOX.vertices + offset, BOX.triangles)
-    expected = np.sqrt(2) * norm(BOX, -4.0, rtol=1e-3)["norm"].item()
-    assert distance(BOX, far, -4.0, rtol=1e-2)["distance"].item() == pytest.approx(expected, rel=1e-2)
-    with pytest.raises(AccuracyError, match="below the rounding"):
-        distance(BOX, Sphere(), -4.0, rtol=1e-300)
+    far = sb.Mesh(BOX.vertices + offset, BOX.triangles)
+    expected = np.sqrt(2) * sb.norm(BOX, -4.0, rtol=1e-3)["norm"].item()
+    assert sb.distance(BOX, far, -4.0, rtol=1e-2)["distance"].item() == pytest.approx(expected, rel=1e-2)
+    with pytest.raises(sb.AccuracyError, match="below the rounding"):
+        sb.distance(BOX, sb.Sphere(), -4.0, rtol=1e-300)
 
 
 def test_memory_as_text() -> None:
-    as_text, as_number = (distance(BOX, Sphere(), -5.0, rtol=0.1, memory=memory) for memory in ("600MB", 6e8))
+    as_text, as_number = (sb.distance(BOX, sb.Sphere(), -5.0, rtol=0.1, memory=memory) for memory in ("600MB", 6e8))
     assert as_text.identical(as_number)
 
 
 @pytest.mark.slow
 def test_surfaces_far_from_the_origin_are_compared_where_they_are() -> None:
-    a, b = icosphere(2), icosphere(3)
-    centred = distance(a, b, -3.0, rtol=1e-3)
+    a, b = sb.icosphere(2), sb.icosphere(3)
+    centred = sb.distance(a, b, -3.0, rtol=1e-3)
     away = np.array([1000.0, -2000.0, 500.0])
-    moved = distance(Mesh(a.vertices + away, a.triangles), Mesh(b.vertices + away, b.triangles), -3.0, rtol=1e-3)
+    moved = sb.distance(
+        sb.Mesh(a.vertices + away, a.triangles), sb.Mesh(b.vertices + away, b.triangles), -3.0, rtol=1e-3
+    )
     assert moved["within"].item()
     assert abs(centred["distance"].item() - moved["distance"].item()) <= centred["error"].item() + moved["error"].item()
-    apart = distance(Sphere(1.0, (500.0, 0, 0)), Sphere(1.0, (497.0, 0, 0)), -5.0, rtol=1e-4)
-    exact = distance(Sphere(), Sphere(1.0, (3.0, 0, 0)), -5.0)["distance"].item()
+    apart = sb.distance(sb.Sphere(1.0, (500.0, 0, 0)), sb.Sphere(1.0, (497.0, 0, 0)), -5.0, rtol=1e-4)
+    exact = sb.distance(sb.Sphere(), sb.Sphere(1.0, (3.0, 0, 0)), -5.0)["distance"].item()
     assert abs(apart["distance"].item() - exact) <= apart["error"].item()
 
 
 def test_what_lies_below_rounding_is_refused() -> None:
-    with pytest.raises(AccuracyError, match=r"rtol 1e-12 of about .* at order -10 is below the rounding") as caught:
-        distance(icosphere(3), Sphere(), -10.0, rtol=1e-12)
+    with pytest.raises(sb.AccuracyError, match=r"rtol 1e-12 of about .* at order -10 is below the rounding") as caught:
+        sb.distance(sb.icosphere(3), sb.Sphere(), -10.0, rtol=1e-12)
     assert 1e-12 < caught.value.reachable < 1e-8
-    assert distance(icosphere(3), Sphere(), -10.0, rtol=1.5 * caught.value.reachable)["within"].item()
+    assert sb.distance(sb.icosphere(3), sb.Sphere(), -10.0, rtol=1.5 * caught.value.reachable)["within"].item()
 
 
 @pytest.mark.parametrize("order", [-40.0, -100.0])
 def test_very_negative_orders(order: float) -> None:
-    exact = distance(Sphere(), Sphere(0.9), order)["distance"].item()
-    dataset = distance(Sphere(), Sphere(0.9), order, rtol=1e-4)
+    exact = sb.distance(sb.Sphere(), sb.Sphere(0.9), order)["distance"].item()
+    dataset = sb.distance(sb.Sphere(), sb.Sphere(0.9), order, rtol=1e-4)
     assert abs(dataset["distance"].item() - exact) <= dataset["error"].item() <= 1e-4 * exact
 
 
 def test_a_pilot_without_a_digit_needs_no_larger_lattice() -> None:
-    ball = icosphere(2)
-    again = Mesh(ball.vertices.copy(), ball.triangles)
+    ball = sb.icosphere(2)
+    again = sb.Mesh(ball.vertices.copy(), ball.triangles)
     problem = Problem((again, ball), (-4.0, -10.0), Accuracy(1e-2), support_of((again, ball)), "a copy")
     assert not run_pilot(problem)[0].any()

@@ -9,18 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sobolev_batch import (
-    Ellipsoid,
-    InputError,
-    Lattice,
-    Mesh,
-    ParametrisedSurface,
-    Sphere,
-    Torus,
-    distance,
-    fourier_transform,
-    norm,
-)
+import sobolev_batch as sb
 from sobolev_batch.spectral.backends import CPU
 from sobolev_batch.spectral.quadrature import kinds
 from sobolev_batch.spectral.quadrature.kinds import direct_transform, exact_values, resolution_of
@@ -32,11 +21,11 @@ from tests.support.shapes import HALF_TURN, TURN, Roof, angular_ball, turned_tor
 
 Reals = NDArray[np.float64]
 
-LATTICE = Lattice(4.0, 32)
+LATTICE = sb.Lattice(4.0, 32)
 SMOOTH = [
-    Ellipsoid((1.0, 0.7, 0.4), (0.1, -0.2, 0.3)),
-    Torus(1.0, 0.4, (0.1, -0.2, 0.3)),
-    turned_torus(Torus(0.9, 0.3)),
+    sb.Ellipsoid((1.0, 0.7, 0.4), (0.1, -0.2, 0.3)),
+    sb.Torus(1.0, 0.4, (0.1, -0.2, 0.3)),
+    turned_torus(sb.Torus(0.9, 0.3)),
 ]
 
 
@@ -48,24 +37,24 @@ def frequencies(count: int = 12, highest: float = 7.0) -> Reals:
 
 
 def half_values(surface: Smooth, eps: float = 1e-14) -> NDArray[np.complex128]:
-    return np.asarray(fourier_transform(surface, LATTICE, eps, threads=1).values)
+    return np.asarray(sb.fourier_transform(surface, LATTICE, eps, threads=1).values)
 
 
 @pytest.mark.slow
 def test_the_sphere_as_a_parametrised_surface_is_the_closed_form() -> None:
-    exact = fourier_transform(Sphere(), LATTICE)
-    for surface in (Ellipsoid(), angular_ball()):
-        field = fourier_transform(surface, LATTICE, 1e-14, threads=1)
+    exact = sb.fourier_transform(sb.Sphere(), LATTICE)
+    for surface in (sb.Ellipsoid(), angular_ball()):
+        field = sb.fourier_transform(surface, LATTICE, 1e-14, threads=1)
         assert np.abs(field.values - exact.values).max() < 1e-12 * 4 * math.pi
 
 
 # Surfaces, and their transforms at any frequency: integrals of Bessel functions. Ellipsoids with another axis as the
 # pole's have other nodes.
 INTEGRALS: dict[str, tuple[Smooth, Callable[[float, float, float], float]]] = {
-    "torus": (Torus(1.0, 0.4), lambda x, y, z: torus_value(1.0, 0.4, math.hypot(x, y), z)),
-    "oblate": (Ellipsoid((1.0, 1.0, 0.4)), lambda x, y, z: spheroid_value(1.0, 0.4, math.hypot(x, y), z)),
-    "prolate": (Ellipsoid((0.4, 0.4, 1.0)), lambda x, y, z: spheroid_value(0.4, 1.0, math.hypot(x, y), z)),
-    "lying": (Ellipsoid((0.4, 1.0, 1.0)), lambda x, y, z: spheroid_value(1.0, 0.4, math.hypot(y, z), x)),
+    "torus": (sb.Torus(1.0, 0.4), lambda x, y, z: torus_value(1.0, 0.4, math.hypot(x, y), z)),
+    "oblate": (sb.Ellipsoid((1.0, 1.0, 0.4)), lambda x, y, z: spheroid_value(1.0, 0.4, math.hypot(x, y), z)),
+    "prolate": (sb.Ellipsoid((0.4, 0.4, 1.0)), lambda x, y, z: spheroid_value(0.4, 1.0, math.hypot(x, y), z)),
+    "lying": (sb.Ellipsoid((0.4, 1.0, 1.0)), lambda x, y, z: spheroid_value(1.0, 0.4, math.hypot(y, z), x)),
 }
 
 
@@ -103,7 +92,7 @@ def test_waves_that_the_first_nodes_cannot_see_are_seen_when_they_are_doubled() 
         radii = 1 + 0.02 * np.cos(62 * v)
         return radii * np.sin(u) * np.cos(v), radii * np.sin(u) * np.sin(v), np.cos(u)
 
-    surface = ParametrisedSurface(rippled, HALF_TURN, TURN)
+    surface = sb.ParametrisedSurface(rippled, HALF_TURN, TURN)
     assert resolution_of(surface, 0.01, 1e-9)[0][1] > 2 * 62
     assert surface.area > 1.2 * 4 * math.pi
 
@@ -112,24 +101,24 @@ def test_a_kink_is_refused_with_both_numbers(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(kinds, "MOST_NODES", 1 << 14)
     surface = Roof()
     with pytest.raises(
-        InputError, match=r"not settled to 1e-09 of its area with 16384 nodes.* it still changes by .*kink"
+        sb.InputError, match=r"not settled to 1e-09 of its area with 16384 nodes.* it still changes by .*kink"
     ):
-        fourier_transform(surface, LATTICE)
+        sb.fourier_transform(surface, LATTICE)
     # One that is large beside the wavelength is refused at once.
-    with pytest.raises(InputError, match="it would take more to begin with"):
-        resolution_of(Torus(1.0, 0.4), 1e4, 1e-9)
+    with pytest.raises(sb.InputError, match="it would take more to begin with"):
+        resolution_of(sb.Torus(1.0, 0.4), 1e4, 1e-9)
     # Where less is asked for, it converges, if slowly.
     assert resolution_of(surface, 2.0, 1e-4)[1] <= 1e-4
 
 
 def test_too_few_nodes_are_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
     surface = SMOOTH[1]
-    exact = fourier_transform(surface, LATTICE, 1e-14, threads=1)
+    exact = sb.fourier_transform(surface, LATTICE, 1e-14, threads=1)
     monkeypatch.setattr(kinds, "resolution_of", lambda *_: ((91, 25), 0.0))
-    field = fourier_transform(surface, LATTICE, 1e-12, threads=1)
+    field = sb.fourier_transform(surface, LATTICE, 1e-12, threads=1)
     orders = [-2.0, -5.0]
-    truth = distance(field, exact, orders)["distance"].values
-    reported = norm(field, orders)["discretisation"].values
+    truth = sb.distance(field, exact, orders)["distance"].values
+    reported = sb.norm(field, orders)["discretisation"].values
     assert (truth > 1e-8).all()
     assert (truth <= reported).all()
     assert (reported < 30 * truth).all()
@@ -139,13 +128,13 @@ def test_too_few_nodes_are_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_doubling_the_nodes_changes_is_reported() -> None:
     surface = Roof()
     corners = [[u, v, -abs(u)] for u in (-0.9, 0.0, 1.0) for v in (-0.9, 1.0)]
-    mesh = Mesh(corners, [[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]])
+    mesh = sb.Mesh(corners, [[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]])
     assert mesh.area == pytest.approx(surface.area, rel=1e-12)
     orders = [-2.0, -5.0]
-    exact = fourier_transform(mesh, LATTICE, 1e-13, threads=1)
-    field = fourier_transform(surface, LATTICE, 1e-4, threads=1)
-    truth = distance(field, exact, orders)["distance"].values
-    reported = norm(field, orders)["discretisation"].values
+    exact = sb.fourier_transform(mesh, LATTICE, 1e-13, threads=1)
+    field = sb.fourier_transform(surface, LATTICE, 1e-4, threads=1)
+    truth = sb.distance(field, exact, orders)["distance"].values
+    reported = sb.norm(field, orders)["discretisation"].values
     assert (truth <= reported).all()
     assert (truth > 1e-6).all()
     _, change = resolution_of(surface, LATTICE.highest_frequency, 1e-4)
@@ -155,8 +144,8 @@ def test_what_doubling_the_nodes_changes_is_reported() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("rtol", [1e-2, 1e-5])
 def test_a_norm_to_an_accuracy(rtol: float) -> None:
-    exact = norm(Sphere(0.8), [-3.0, -6.0])["norm"].values
-    found = norm(Ellipsoid((0.8, 0.8, 0.8), (3.0, 0.0, 1.0)), [-3.0, -6.0], rtol=rtol)
+    exact = sb.norm(sb.Sphere(0.8), [-3.0, -6.0])["norm"].values
+    found = sb.norm(sb.Ellipsoid((0.8, 0.8, 0.8), (3.0, 0.0, 1.0)), [-3.0, -6.0], rtol=rtol)
     assert found["within"].all()
     assert (np.abs(found["norm"].values - exact) <= found["error"].values).all()
     assert (found["error"].values <= rtol * exact).all()
@@ -176,7 +165,9 @@ def test_a_gpu_gets_the_same_nodes() -> None:
 
 @pytest.mark.slow
 def test_thin_ellipsoids_take_nodes_in_proportion_and_end_in_a_refusal() -> None:
-    fewer, more = (resolution_of(Ellipsoid((1.0, 1.0, thickness)), 2.0, 1e-9)[0][0] for thickness in (0.04, 0.01))
+    fewer, more = (resolution_of(sb.Ellipsoid((1.0, 1.0, thickness)), 2.0, 1e-9)[0][0] for thickness in (0.04, 0.01))
     assert 2 * fewer < more < 8 * fewer
-    with pytest.raises(InputError, match=r"\(2048 along a parameter that is not periodic\); with \d+ x \d+ it still"):
-        resolution_of(Ellipsoid((1.0, 1.0, 1e-5)), 2.0, 1e-9)
+    with pytest.raises(
+        sb.InputError, match=r"\(2048 along a parameter that is not periodic\); with \d+ x \d+ it still"
+    ):
+        resolution_of(sb.Ellipsoid((1.0, 1.0, 1e-5)), 2.0, 1e-9)
