@@ -131,8 +131,8 @@ def _larger_lattice(
 ) -> _More:
     """Return a larger or finer lattice for errors (orders,) relative to distances."""
     highest, period = lattice.xi_max, 1 / lattice.spacing
-    for order, cut, folded in zip(orders, truncation.tolist(), aliasing.tolist(), strict=True):
-        tail, images = cut / accuracy.truncation_part(order), folded / accuracy.aliasing_part
+    tails, folded = truncation / accuracy.truncation_parts(orders), aliasing / accuracy.aliasing_part
+    for order, tail, images in zip(orders, tails.tolist(), folded.tolist(), strict=True):
         if tail > 1 and order < -1.5:
             # The squared norm beyond ξ_max of two near surfaces falls like its power 2s + 3.
             growth = min(tail ** (1 / (-2 * order - 3)) * 1.02, _LARGEST_GROWTH)

@@ -178,7 +178,7 @@ class State:
     def permitted(self) -> Reals:
         """Largest permitted error of the squares by the tail (orders,)."""
         accuracy = self.problem.accuracy
-        parts = np.array([accuracy.truncation_part(order) for order in self.problem.orders])
+        parts = accuracy.truncation_parts(self.problem.orders)
         return np.asarray(2 * parts * np.maximum(self.squares, accuracy.floor**2))
 
     @property

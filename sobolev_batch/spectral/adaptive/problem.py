@@ -121,7 +121,7 @@ class Problem:
         """Refuse an accuracy of norms (orders,) below the rounding of fields, unless it is a best effort."""
         if self.accuracy.best_effort:
             return
-        parts, floor = _discretisation_parts(self.orders, self.accuracy), self.rounding
+        parts, floor = self.accuracy.discretisation_parts(self.orders), self.rounding
         # A distance of no more than rounding is that of near-duplicates, and has no relative accuracy.
         below = (parts * values < floor) & (values > floor)
         if below.any():
@@ -149,12 +149,8 @@ class Problem:
 
 def error_target(values: Reals, orders: tuple[float, ...], accuracy: Accuracy, area: float) -> ErrorTarget:
     """Return the target of both fields of a pair together at these distances (orders,): never below rounding."""
-    errors = np.maximum(_discretisation_parts(orders, accuracy) * values, _ROUNDING * area)
+    errors = np.maximum(accuracy.discretisation_parts(orders) * values, _ROUNDING * area)
     return ErrorTarget(orders, tuple(errors.tolist()))
-
-
-def _discretisation_parts(orders: Sequence[float], accuracy: Accuracy) -> Reals:
-    return np.array([accuracy.discretisation_part(order) for order in orders])
 
 
 def only_or_difference(values: Sequence[Complexes]) -> Complexes:

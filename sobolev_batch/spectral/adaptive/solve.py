@@ -241,7 +241,7 @@ def _with_hidden_part(problem: Problem, solution: Solution, before_octaves: bool
     cheaper than a larger lattice. There may be no lattice that is likely to show enough.
     """
     found, lattice, orders = solution.estimate, cast(Lattice, solution.lattice), np.array(problem.orders)
-    parts = np.array([problem.accuracy.truncation_part(order) for order in problem.orders])
+    parts = problem.accuracy.truncation_parts(problem.orders)
     allowed = np.maximum(parts * problem.accuracy.scale(found.values), problem.rounding)
 
     def with_part(squares: Reals) -> Solution:

@@ -106,13 +106,13 @@ class Accuracy:
         """Largest relative error by aliasing."""
         return _ALIASING_FRACTION * self.rtol
 
-    def truncation_part(self, order: float) -> float:
-        """Return the largest relative error by truncation at an order; a small one is cheaper at lower orders."""
-        return _TRUNCATION_FRACTION * min(1.0, _HIGH_ORDER / -order) * self.rtol
+    def truncation_parts(self, orders: Sequence[float]) -> Reals:
+        """Return the largest relative error by truncation (orders,); a small one is cheaper at lower orders."""
+        return np.asarray(_TRUNCATION_FRACTION * np.minimum(1.0, _HIGH_ORDER / -np.array(orders)) * self.rtol)
 
-    def discretisation_part(self, order: float) -> float:
-        """Return the largest relative error of both fields together at an order."""
-        return self.rtol - self.aliasing_part - self.truncation_part(order)
+    def discretisation_parts(self, orders: Sequence[float]) -> Reals:
+        """Return the largest relative error of both fields together (orders,)."""
+        return self.rtol - self.aliasing_part - self.truncation_parts(orders)
 
     @property
     def largest_intervals(self) -> int:
@@ -154,10 +154,10 @@ def first_lattice(support: Support, orders: Sequence[float], accuracy: Accuracy)
     period = _first_period(support, orders, accuracy)
     radii = np.geomspace(0.5, _HIGHEST_FREQUENCY, 400)
     highest = radii[0]
-    for order in orders:
+    parts = accuracy.truncation_parts(orders) / (TRUNCATION_CAUTION * _TAIL_MARGIN / 2)
+    for order, allowed in zip(orders, parts, strict=True):
         # ∫_x^∞ r² (1+r²)^s dr over the same from zero; it diverges from order -3/2 on.
         tails = betainc(max(-order - 1.5, 1e-9), 1.5, 1 / (1 + radii**2))
-        allowed = accuracy.truncation_part(order) / (TRUNCATION_CAUTION * _TAIL_MARGIN / 2)
         enough = np.flatnonzero(tails <= allowed)
         highest = max(highest, radii[enough[0]] if enough.size and order < -1.5 else radii[-1])
     most = min(_PILOT_M, accuracy.largest_intervals)
@@ -203,7 +203,7 @@ def refined(sums: Sums, weights: SobolevWeights, support: Support, accuracy: Acc
         return np.asarray(tails.reshape(len(orders), -1).max(axis=1))
 
     most = accuracy.largest_intervals
-    allowed = np.array([accuracy.truncation_part(order) for order in orders])
+    allowed = accuracy.truncation_parts(orders)
     larger = accumulate(repeat(_STEP), mul, initial=lattice.xi_max)
     candidates = [next(larger), *takewhile(lambda highest: 2 * highest * period <= most, larger)]
     highest = next((highest for highest in candidates if not np.any(tail(highest) > allowed)), None)
