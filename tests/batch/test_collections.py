@@ -18,6 +18,7 @@ from sobolev_batch.batch.storage.lock import Lock, locked
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import Plan, make_plan
 from tests.support.commands import call
+from tests.support.stores import flip
 from tests.support.studies import GONE, balls, methods_of, small_table
 
 
@@ -26,64 +27,59 @@ def collection(objects: list[dict[str, Any]], name: str = "small") -> sb.StudyCo
     return sb.StudyCollection.from_table(small_table(study=study, object=objects, family=methods_of()))
 
 
+LABELS = ("ico/1", "ico/2", "egg/1", "egg/2", "reference")
+
+
+@pytest.fixture
+def changeable(store: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(store, tmp_path / "copy.zarr"))
+
+
 @pytest.fixture(scope="module")
 def store(client: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The store of a collection of which one object has lost its reference."""
     path = tmp_path_factory.mktemp("collection") / "balls.zarr"
     summary = sb.run(collection([*balls(a=1.0), GONE, *balls(b=1.1)]), path, client)
-    assert set(summary.computed) == {f"{name}/{label}" for name in "ab" for label in labels()}
+    assert set(summary.computed) == {f"{name}/{label}" for name in "ab" for label in LABELS}
     assert list(summary.failed) == ["gone"]
     assert "the reference cannot be made: nowhere.ply" in summary.failed["gone"].replace(str(Path.cwd()) + "/", "")
     return path
 
 
-def labels() -> list[str]:
-    return ["ico/1", "ico/2", "egg/1", "egg/2", "reference"]
-
-
 def test_each_object_has_a_store_of_its_own(store: Path, client: Client, tmp_path: Path) -> None:
     alone = collection(balls(b=1.1)).studies["b"]
     sb.run(alone, tmp_path / "alone.zarr", client)
-    assert sb.table(store / "b").equals(
-        sb.table(tmp_path / "alone.zarr").assign(seconds=sb.table(store / "b")["seconds"])
-    )
+    ours, own = (sb.table(path).drop(columns="seconds") for path in (store / "b", tmp_path / "alone.zarr"))
+    assert ours.equals(own)
     tree = xr.open_datatree(store, engine="zarr", consolidated=False)
     assert tree["a/convergence"]["distance"].sizes == {"mesh": 5, "order": 2}
     assert tree.attrs["collection"]["objects"] == ["a", "gone", "b"]
 
 
-def test_what_is_damaged_is_named_with_its_object(store: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "copy.zarr"
-    shutil.copytree(store, copy)
-    sound = sb.verify(copy)
+def test_what_is_damaged_is_named_with_its_object(changeable: Path) -> None:
+    sound = sb.verify(changeable)
     assert (sound.is_sound, sound.complete, sound.total) == (True, 10, 10)
     assert {name: one.total for name, one in sound.objects.items()} == {"a": 5, "gone": 0, "b": 5}
-    chunk = copy / "b/fourier/fourier/c/1/0/0/0"
-    data = bytearray(chunk.read_bytes())
-    data[len(data) // 5] ^= 1
-    chunk.write_bytes(data)
-    done = call("verify", copy)
+    flip(changeable / "b/fourier/fourier/c/1/0/0/0")
+    done = call("verify", changeable)
     assert done.returncode == 1
-    lines = done.stdout.splitlines()
-    assert lines[:3] == [
+    *objects, damaged, last = done.stdout.splitlines()
+    assert objects == [
         "a: 5 of 5 surfaces complete, their fields read back",
         "gone: it has no results yet",
         "b: 5 of 5 surfaces complete, their fields read back",
     ]
-    assert lines[3].startswith("b/ico/2: ")
-    assert lines[-1] == "1 surfaces and 0 arrays of tables are damaged; run the study again to repair it"
+    assert damaged.startswith("b/ico/2: ")
+    assert last == "1 surfaces and 0 arrays of tables are damaged; run the study again to repair it"
 
 
 def test_tables_of_a_collection_are_those_of_its_objects(store: Path) -> None:
     joined = sb.table(store, -3)
     assert joined.columns[0] == "object"
-    for name in ("a", "b"):
-        expected = sb.table(store / name, -3)
-        of_object = joined[joined["object"] == name].drop(columns="object").reset_index(drop=True)
-        assert of_object.equals(expected)
+    for name, of_object in joined.groupby("object"):
+        assert of_object.drop(columns="object").reset_index(drop=True).equals(sb.table(store / str(name), -3))
     text = call("table", store, "--order", "-3").stdout
-    assert text.count("Object ") == 2
-    assert text.count("Relative distances are fractions") == 1
+    assert [text.count(part) for part in ("Object ", "Relative distances are fractions")] == [2, 1]
     assert call("table", store, "--format", "csv").stdout.startswith("object,order,mesh")
     refused = call("table", store, "--matrix")
     assert refused.returncode == 2
@@ -107,23 +103,20 @@ def test_a_plan_goes_on_past_an_object_that_cannot_be(tmp_path: Path) -> None:
     assert done.stderr.startswith("not planned: ")
 
 
-def test_a_collection_goes_on_while_its_next_object_is_planned(store: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "copy.zarr"
-    shutil.copytree(store, copy)
-    ended = sb.status(copy)
-    assert not ended.going_on
-    assert list(ended.failed) == ["gone"]
-    with locked(Location.parse(copy / "gone"), Lock.of_this_process()):
-        status = sb.status(copy)
+def test_a_collection_goes_on_while_its_next_object_is_planned(changeable: Path) -> None:
+    ended = sb.status(changeable)
+    assert (ended.going_on, list(ended.failed)) == (False, ["gone"])
+    with locked(Location.parse(changeable / "gone"), Lock.of_this_process()):
+        status = sb.status(changeable)
         assert (status.going_on, status.complete, status.total, status.failed) == (True, 10, 11, {})
         assert "running: planning; by process " in str(status)
     # The lock of a process of which nobody knows whether it runs, from long ago.
     lock = replace(Lock.of_this_process(outlives_process=True), since="2020-01-01T00:00:00Z")
-    with locked(Location.parse(copy / "gone"), lock):
-        status = sb.status(copy)
+    with locked(Location.parse(changeable / "gone"), lock):
+        status = sb.status(changeable)
         assert status.lost
-        assert f"sobolev-batch release {copy / 'gone'}" in str(status)
-    assert not sb.status(copy).lost
+        assert f"sobolev-batch release {changeable / 'gone'}" in str(status)
+    assert not sb.status(changeable).lost
 
 
 def test_runs_lock_the_objects_that_they_plan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -139,24 +132,24 @@ def test_runs_lock_the_objects_that_they_plan(tmp_path: Path, monkeypatch: pytes
     assert not sb.status(tmp_path / "s.zarr").going_on
 
 
-@pytest.mark.parametrize("state", ["failed", "running"])
-def test_the_run_of_a_collection_is_the_one_that_did_not_end_well(store: Path, tmp_path: Path, state: str) -> None:
-    copy = tmp_path / "copy.zarr"
-    shutil.copytree(store, copy)
-    ended = Store.open(copy / "a").read_run()
+def test_the_run_of_a_collection_is_the_one_that_did_not_end_well(changeable: Path) -> None:
+    first = Store.open(changeable / "a")
+    ended = first.read_run()
     assert ended is not None
-    seen = "2020-01-01T00:00:00Z"
-    Store.open(copy / "a").write_run(replace(ended, state=state, started=seen, seen=seen, error="no disk"))  # type: ignore[arg-type]
-    status = sb.status(copy)
-    assert status.run_store == str(copy / "a")
-    shown = f"the latest run of {copy / 'a'} failed: no disk" if state == "failed" else f"release {copy / 'a'}"
-    assert shown in str(status)
-    assert status.lost == (state == "running")
+    ended = replace(ended, started="2020-01-01T00:00:00Z", seen="2020-01-01T00:00:00Z", error="no disk")
+    first.write_run(replace(ended, state="failed"))
+    failed = sb.status(changeable)
+    assert (failed.run_store, failed.lost) == (first.path, False)
+    assert f"the latest run of {first.path} failed: no disk" in str(failed)
+    first.write_run(replace(ended, state="running"))
+    lost = sb.status(changeable)
+    assert (lost.run_store, lost.lost) == (first.path, True)
+    assert f"release {first.path}" in str(lost)
 
 
 def test_a_second_run_computes_what_is_new(store: Path, client: Client) -> None:
     summary = sb.run(collection(balls(a=1.0, b=1.1, c=1.2)), store, client)
-    assert set(summary.computed) == {f"c/{label}" for label in labels()}
+    assert set(summary.computed) == {f"c/{label}" for label in LABELS}
     assert summary.failed == {}
     with pytest.raises(sb.StoreError, match="it holds the store of another collection, 'small', not 'other'"):
         sb.run(collection(balls(a=1.0), "other"), store, client)

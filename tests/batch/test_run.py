@@ -1,18 +1,26 @@
-"""Runs of whole studies on a cluster of processes."""
+"""Runs of whole studies on a cluster of processes, also without the process that submitted them."""
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import tomli_w
 import trimesh
 from distributed import Client
 
 import sobolev_batch as sb
 from sobolev_batch.batch.analysis import tabulate
+from sobolev_batch.batch.cluster.clients import remote_client
 from sobolev_batch.batch.cluster.execution import Progress
-from tests.support.studies import SMALL_LATTICE, small_table, variable
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.results.status import Status
+from tests.support.commands import call, command, finished
+from tests.support.processes import tcp_cluster, wait_until
+from tests.support.recipes import TETRAHEDRON, write_study
+from tests.support.studies import GONE, SMALL_LATTICE, balls, small_table, variable
 
 
 def test_stored_fields_and_tables_are_those_of_the_library(client: Client, finished_store: Path) -> None:
@@ -55,14 +63,12 @@ def test_mesh_facts_are_recorded(finished_store: Path) -> None:
     meshes = sb.open_store(finished_store)["meshes"].to_dataset()
     row = meshes.sel(mesh="ico/2")
     mesh = sb.icosphere(2)
-    assert row["triangles"].item() == 320
-    assert row["vertices"].item() == 162
+    assert (row["triangles"].item(), row["vertices"].item()) == (320, 162)
     assert row["area"].item() == pytest.approx(mesh.area)
     assert row["digest"].item() == mesh.digest
     assert row["edge_length_max"].item() == pytest.approx(mesh.edge_lengths.max())
-    assert row["status"].item() == "complete"
+    assert (row["status"].item(), row["backend"].item()) == ("complete", "finufft")
     assert row["worker"].item().startswith("tcp://127.0.0.1:")
-    assert row["backend"].item() == "finufft"
     assert meshes["level"].values.tolist() == [0, 1, 2, 3, -1]
 
 
@@ -72,21 +78,15 @@ def test_a_run_counts_its_steps_and_a_second_one_has_none(client: Client, study:
 
     steps: list[Progress] = []
     first = sb.run(study, store_path, client, on_progress=steps.append)
-    assert len(first.computed) == 5
-    assert first.reused == ()
-    assert steps[0].stage == "cluster"
-    fields = [step for step in steps if step.stage == "fields"]
+    assert (len(first.computed), first.reused, steps[0].stage) == (5, (), "cluster")
+    fields, reduction = ([step for step in steps if step.stage == stage] for stage in ("fields", "reduction"))
     assert [step.done for step in fields] == list(range(6))
     assert {step.label for step in fields[1:]} == set(first.computed)
-    reduction = [step for step in steps if step.stage == "reduction"]
     assert reduction[-1].done == reduction[-1].total > 0
     before = stamps()
     steps.clear()
     second = sb.run(study, store_path, client, on_progress=steps.append)
-    assert second.computed == ()
-    assert second.reused == first.computed
-    assert steps == []
-    assert stamps() == before
+    assert (second.computed, second.reused, steps) == ((), first.computed, [])
     with pytest.raises(sb.StoreError, match="another study"):
         sb.run(sb.Study.from_table(small_table(study={"name": "other"})), store_path, client)
     assert stamps() == before
@@ -98,12 +98,10 @@ def test_tables_of_an_older_version_are_made_anew(
     with monkeypatch.context() as patch:
         patch.setattr(tabulate, "TABLES_VERSION", tabulate.TABLES_VERSION - 1)
         sb.run(study, store_path, client)
-    steps: list[Progress] = []
-    assert sb.run(study, store_path, client, on_progress=steps.append).computed == ()
-    assert {step.stage for step in steps} >= {"reduction"}
-    steps.clear()
-    sb.run(study, store_path, client, on_progress=steps.append)
-    assert steps == []
+    for reduced in (True, False):
+        steps: list[Progress] = []
+        assert sb.run(study, store_path, client, on_progress=steps.append).computed == ()
+        assert bool(steps) == ("reduction" in {step.stage for step in steps}) == reduced
 
 
 def test_a_bad_mesh_is_recorded_and_stops_nothing(client: Client, tmp_path: Path, store_path: Path) -> None:
@@ -119,8 +117,8 @@ def test_a_bad_mesh_is_recorded_and_stops_nothing(client: Client, tmp_path: Path
     assert "holds only |coordinate| <" in summary.failed["f/large"]
     assert "cannot be read" in summary.failed["f/missing"]
     tree = sb.open_store(store_path)
-    assert np.isnan(variable(tree, "convergence", "distance").sel(mesh=["f/bad", "f/large", "f/missing"]).values).all()
-    assert np.isfinite(variable(tree, "convergence", "distance").sel(mesh="f/good").values).all()
+    distances = variable(tree, "convergence", "distance").isel(order=0)
+    assert distances["mesh"][np.isfinite(distances)].values.tolist() == ["f/good", "reference"]
     assert np.isnan(variable(tree, "distances", "distance").sel(mesh="f/good", other="f/bad").values).all()
     assert variable(tree, "meshes", "status").sel(mesh="f/bad").item() == "failed"
     # Mended, it is computed, and nothing else is.
@@ -128,10 +126,118 @@ def test_a_bad_mesh_is_recorded_and_stops_nothing(client: Client, tmp_path: Path
     assert sb.run(study, store_path, client).computed == ("f/bad",)
 
 
-def test_distances_to_the_reference_alone(client: Client, finished_store: Path, store_path: Path) -> None:
-    table = small_table(compare=None)
-    sb.run(sb.Study.from_table(table), store_path, client)
-    found = variable(sb.open_store(store_path), "distances", "distance")
-    assert found["other"].values.tolist() == ["reference"]
-    whole = variable(sb.open_store(finished_store), "distances", "distance").sel(other=["reference"])
-    assert np.allclose(found.to_numpy(), whole.to_numpy(), rtol=1e-12, atol=0)
+# Dies without any farewell as soon as the study is handed over.
+CLIENT = """
+import os, signal, sys
+import sobolev_batch as sb
+from distributed import Client
+
+client = Client(sys.argv[1])
+sb.submit(sb.Study.from_toml(sys.argv[2]), sys.argv[3], client)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.fixture
+def study_path(tmp_path: Path) -> Path:
+    write_study(tmp_path)
+    return tmp_path / "study.toml"
+
+
+@pytest.mark.all
+def test_the_client_is_killed_and_the_tables_come(study_path: Path, store_path: Path) -> None:
+    with tcp_cluster([], []) as (address, _):
+        client = finished(sys.executable, "-c", CLIENT, address, study_path, store_path)
+        assert client.returncode == -9, client.stderr
+        followed = call("status", store_path, "--follow")
+    assert followed.returncode == 0, followed.stdout + followed.stderr
+    assert f"{store_path}: 6 of 6 complete, 0 failed, 0 to go" in followed.stdout
+    assert "\ndone; by process" in followed.stdout
+    table = call("table", store_path)
+    assert "ico/3" in table.stdout
+    assert "nan" not in table.stdout.lower()
+
+
+def test_the_command_returns_and_says_how_to_follow(study_path: Path, tmp_path: Path, client: Client) -> None:
+    store, address = tmp_path / "with space.zarr", client.scheduler.address
+    for missing in (6, 0):
+        submitted = call("submit", study_path, "--scheduler", address, "--store", store)
+        assert submitted.returncode == 0, submitted.stderr
+        assert submitted.stdout.splitlines() == [
+            f"{missing} of 6 surfaces to be computed by the cluster at {address}",
+            f"follow it by: sobolev-batch status --follow '{store}'",
+        ]
+        assert call("status", store, "--follow").returncode == 0
+
+
+@pytest.mark.process
+def test_a_collection_is_handed_over_by_object(tmp_path: Path, client: Client) -> None:
+    collection = sb.StudyCollection.from_table(small_table(object=[*balls(ball=1.0), GONE]), folder=tmp_path)
+    store, address = tmp_path / "all.zarr", client.scheduler.address
+    submission = sb.submit(collection, store, client)
+    assert (submission.surfaces, submission.missing) == (5, 5)
+    assert submission.objects["ball"].store == str(store / "ball")
+    assert list(submission.refused) == ["gone"]
+    assert call("status", store, "--follow").returncode == 3
+    (tmp_path / "study.toml").write_text(tomli_w.dumps(collection.table))
+    submitted = call("submit", tmp_path / "study.toml", "--scheduler", address, "--store", store)
+    assert submitted.returncode == 3, submitted.stderr
+    assert submitted.stdout.splitlines() == [
+        "ball:",
+        f"0 of 5 surfaces to be computed by the cluster at {address}",
+        "gone:",
+        f"follow it by: sobolev-batch status --follow {store}",
+    ]
+    assert "not submitted: the reference cannot be made" in submitted.stderr
+    assert "gone: it has no results; run the study again to see why" in call("status", store, "--follow").stdout
+
+
+def test_what_is_wrong_is_said_before_anything_is_handed_over(
+    tmp_path: Path, store_path: Path, threads: Client
+) -> None:
+    table = small_table(family=[{"name": "a", "source": "files", "paths": ["no/*.ply"]}])
+    with pytest.raises(sb.StudyError, match="matches no file"):
+        sb.submit(sb.Study.from_table(table, folder=tmp_path), store_path, threads)
+    with pytest.raises(sb.ClusterError, match="requests backend 'gpu'"):
+        sb.submit(sb.Study.from_table(small_table(transform={"backend": "gpu"})), store_path, threads)
+    assert not store_path.exists()
+
+
+@pytest.mark.all
+def test_the_worker_that_drives_is_lost_and_another_takes_over(study_path: Path, store_path: Path) -> None:
+    with tcp_cluster([], []) as (address, workers):
+        assert command("submit", study_path, "--scheduler", address, "--store", store_path).returncode == 0
+        store = Store.open(store_path)
+        begun = wait_until(lambda: (record := store.read_run()) and record.state != "submitted" and record)
+        assert begun
+        driver = next(worker for worker in workers if f"process {worker.pid} " in begun.driver)
+        driver.kill()
+        done = wait_until(lambda: (record := store.read_run()) and record.state in ("done", "failed") and record)
+        assert done
+        assert done.state == "done"
+    status = Status.from_store(store_path)
+    assert (status.complete, status.total) == (6, 6)
+
+
+@pytest.mark.all
+def test_a_study_that_cannot_be_driven_says_so_in_its_store(study_path: Path, store_path: Path) -> None:
+    """A file that the client sees and the workers do not: here, one that goes away."""
+    mesh = study_path.with_name("mesh.off")
+    mesh.write_text(TETRAHEDRON)
+    table = small_table(reference={"source": "files", "paths": ["mesh.off"]})
+    with tcp_cluster([]) as (address, _), remote_client(address) as client:
+        study = sb.Study.from_table(table, folder=mesh.parent)
+        # Holds the only thread until the file is gone.
+        blocked = client.submit(_remove, str(mesh), pure=False, priority=10)
+        sb.submit(study, store_path, client)
+        blocked.result()
+        followed = call("status", store_path, "--follow")
+    assert followed.returncode == 1
+    assert "the latest run failed: the reference cannot be made" in followed.stdout
+
+
+def _remove(path: str) -> None:
+    # The study must have been planned by the client: its store says so.
+    store = Path(path).parent / "results.zarr" / "records" / "zarr.json"
+    wait_until(store.exists)
+    Path(path).unlink()

@@ -26,19 +26,12 @@ _FUNCTIONS: dict[str, tuple[type, str]] = {
 
 @dataclass(frozen=True)
 class Moment:
-    """When a worker ends.
+    """When a worker ends, or what else a signal has it do."""
 
-    Attributes:
-        what: "field" before a field is written, "rename" between its file and its name, "record" before the
-            record is written, "recorded" after it.
-        row: whose.
-        log: a file with a line for each worker that got the signal.
-        times: how many get it, of all workers together.
-        number: of the signal: by default that of an OOM killer.
-    """
-
+    # "field", before it is written; "rename", between its file and its name; "record", before it; "recorded", after it.
     what: str
     row: int
+    # A file with a line for each worker that got the signal, and how many of all workers get it.
     log: str
     times: int = 1
     number: int = signal.SIGKILL

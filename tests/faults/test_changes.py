@@ -1,9 +1,15 @@
-"""What is computed again after a change: what depends on it, and nothing else."""
+"""What is computed again after a change; the same store whatever the workers, and however often a task is done."""
 
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
+from subprocess import PIPE
 from typing import Any
 
 import numpy as np
@@ -12,11 +18,13 @@ import trimesh
 from distributed import Client
 
 from sobolev_batch import StoreError, Study, open_store, run, verify
+from sobolev_batch.batch.cluster.clients import local_client, thread_client
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.store.metadata import SCHEMA_VERSION
+from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study import plan as plan_module
 from sobolev_batch.results.status import Status
-from tests.support.stores import contents
+from tests.support.stores import assert_same_results, contents
 from tests.support.studies import small_table, variable
 
 ALL = ("f/a", "f/b", "reference")
@@ -55,14 +63,17 @@ def test_a_change_of_the_study(
     changes: dict[str, Any], computed: tuple[str, ...], folder: Path, store_path: Path, client: Client
 ) -> None:
     assert run(study_of(folder), store_path, client).computed == ALL
-    before = written(store_path)
+    before, pairs = written(store_path), variable(open_store(store_path), "distances", "distance").load()
     assert run(study_of(folder, **changes), store_path, client).computed == computed
     after = written(store_path)
     assert {path for path in after if after[path] != before[path]} == (set(after) if computed else set())
-    orders = changes.get("norm", {}).get("orders", [-10.0, -3.0])
     tree = open_store(store_path)
-    assert variable(tree, "convergence", "order").values.tolist() == orders
-    assert np.isfinite(variable(tree, "convergence", "distance").values).all()
+    distances, others = (variable(tree, name, "distance") for name in ("convergence", "distances"))
+    assert distances["order"].values.tolist() == changes.get("norm", {}).get("orders", [-10.0, -3.0])
+    assert np.isfinite(distances.values).all()
+    assert others["other"].values.tolist() == (["reference"] if "compare" in changes else [*ALL])
+    if "compare" in changes:
+        assert np.allclose(others, pairs.sel(other=["reference"]), rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize("changes", [{"scaling": {"mode": "fixed", "scale": 0.5}}, {"transform": {"eps": 1e-7}}])
@@ -134,6 +145,67 @@ def test_a_file_that_changes_while_the_study_goes_on(folder: Path, store_path: P
     assert "was changed while the study was going on" in summary.failed["f/b"]
     (folder / "b.off").write_bytes(original)
     assert run(study_of(folder), store_path, client).computed == ("f/b",)
-    tree = open_store(store_path)
-    distances = variable(tree, "convergence", "distance")
+    distances = variable(open_store(store_path), "convergence", "distance")
     assert np.array_equal(distances.sel(mesh="f/a").values, distances.sel(mesh="f/b").values)
+
+
+@pytest.mark.parametrize(
+    "cluster",
+    [partial(thread_client, 4), *(pytest.param(partial(local_client, n), marks=pytest.mark.all) for n in (1, 3))],
+)
+def test_workers_and_threads(
+    cluster: Callable[[], AbstractContextManager[Client]], study: Study, finished_store: Path, store_path: Path
+) -> None:
+    with cluster() as client:
+        run(study, store_path, client)
+    # Bit for bit; what is summed over tiles of other sizes, to rounding.
+    assert_same_results(store_path, finished_store)
+
+
+# Two processes that do the same tasks at the same time, again and again.
+TWICE = """
+import os, sys
+from sobolev_batch import Study
+from sobolev_batch.batch.study.plan import make_plan
+from sobolev_batch.batch.workspace import Workspace
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.fields.tasks import Job, compute_mesh
+from tests.support.studies import small_table
+
+plan = make_plan(Study.from_table(small_table()))
+store = Store.open(sys.argv[1])
+print("ready", flush=True)
+sys.stdin.readline()
+for i, row in Workspace.for_plan(store, plan).rows.items():
+    if row.label == "reference":
+        continue
+    job = Job.for_row(plan, row, store, i)
+    for _ in range(5):
+        store.write_record(i, None)
+        assert compute_mesh(job, plan.blocks).status == "complete"
+"""
+
+
+@pytest.mark.process
+def test_the_same_task_twice_at_once(study: Study, finished_store: Path, store_path: Path, threads: Client) -> None:
+    run(study, store_path, threads)
+    start = partial(
+        subprocess.Popen, [sys.executable, "-c", TWICE, str(store_path)], stdin=PIPE, stdout=PIPE, text=True
+    )
+    with start() as one, start() as other:
+        for twin in (one, other):
+            assert twin.stdout is not None
+            assert twin.stdout.readline() == "ready\n"
+        # The end of their input is the word to go on.
+        for twin in (one, other):
+            assert twin.stdin is not None
+            twin.stdin.close()
+    assert (one.returncode, other.returncode) == (0, 0)
+    assert_same_results(store_path, finished_store)
+    # Facts as text, since those of a sphere hold NaN.
+    ours, clean = (
+        [(str(record.facts), record.quality, record.checksums) for record in Store.open(path).records() if record]
+        for path in (store_path, finished_store)
+    )
+    assert ours == clean
+    assert run(study, store_path, threads).computed == ()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -81,34 +80,23 @@ sys.argv[1:] = ["plan", "study.toml"]
 door.main()
 """
 WORKING = """
-import ctypes
+import ctypes, sys
 import click
 import sobolev_batch.cli as line
 from sobolev_batch.cli.interruption import Deadline
 
-@click.command("work")
-def work():
-    %s
-
-line.cli.add_command(work)
-line.sys.argv[1:] = ["work"]
-line.main()
-"""
-# A function of C, which does not return to Python while a transform goes on.
-COMPUTING = (
-    WORKING
-    % """
+@line.cli.command()
+def computing():
+    # A function of C, which does not return to Python while a transform goes on.
     block = ctypes.CDLL(None).pthread_mutex_lock
     mutex = ctypes.create_string_buffer(256)
     block(mutex)
     click.echo("here", err=True)
     block(mutex)  # held already
-"""
-)
-# Work that keeps what it has is asked again for each part that takes long, and is not killed.
-KEEPING = (
-    WORKING
-    % """
+
+@line.cli.command()
+def keeping():
+    # Work that keeps what it has is asked again for each part that takes long, and is not killed.
     parts = []
     with Deadline.with_results(lambda: True):
         for part in range(3):
@@ -119,8 +107,11 @@ KEEPING = (
             except KeyboardInterrupt:
                 parts.append(part)
     click.echo(f"written: {parts}")
+
+sys.argv[1:] = ["%s"]
+line.main()
 """
-)
+COMPUTING, KEEPING = WORKING % "computing", WORKING % "keeping"
 
 
 @pytest.mark.all
@@ -137,16 +128,3 @@ def test_a_command_ends_while_it_starts_and_computes_and_with_what_it_has(script
     else:
         word = "interrupted before anything began" if script == IMPORTING else WORDS[number]
         assert (process.returncode, rest) == (128 + number, f"{word}\n")
-
-
-@pytest.mark.all
-def test_a_status_that_is_followed_ends_without_a_traceback(store_path: Path, tmp_path: Path) -> None:
-    with started("run", write_toml(tmp_path), "--store", store_path, "--workers", "1") as process:
-        read_until(process, "[1/5]")
-        process.send_signal(signal.SIGSTOP)
-        with started("status", store_path, "--follow") as follower:
-            assert follower.stdout is not None
-            line = follower.stdout.readline()
-            assert re.match(r"[1-5] of 5 done, 0 failed", line), line
-            output, rest = interrupted(follower, signal.SIGTERM)
-            assert (follower.returncode, rest) == (143, "terminated\n"), output

@@ -1,22 +1,28 @@
-"""Processes that are killed: workers, drivers and writers, and tasks that outlive their run."""
+"""Processes that are killed or stopped: workers, schedulers, drivers and writers, and tasks that outlive their run."""
 
 from __future__ import annotations
 
 import json
+import logging
 import os
+import re
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from functools import partial
 from pathlib import Path
-from typing import Any
 
+import dask
 import numpy as np
 import psutil
 import pytest
 from distributed import Client, wait
 
-from sobolev_batch import LockError, Mesh, Study, open_store, run, verify, write_mesh
+from sobolev_batch import ClusterError, LockError, Mesh, StoreError, Study, open_store, run, verify, write_mesh
+from sobolev_batch.batch.cluster import watch
 from sobolev_batch.batch.cluster.clients import local_client
+from sobolev_batch.batch.cluster.watch import Watch
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, locked
 from sobolev_batch.batch.store.create import prepare_store
@@ -28,7 +34,7 @@ from tests.support.commands import TOML, call, command, finished, read_until, st
 from tests.support.processes import PATIENCE_SECONDS, tcp_cluster, wait_until
 from tests.support.shapes import TETRAHEDRON_TRIANGLES, TETRAHEDRON_VERTICES
 from tests.support.stores import assert_same_results, contents
-from tests.support.studies import small_table, variable
+from tests.support.studies import variable
 
 
 @pytest.mark.parametrize(
@@ -61,8 +67,6 @@ def test_a_mesh_that_kills_every_worker_is_blamed_and_no_other(
     assert len(moment.pids) == 4
     assert "ico/2 is failed: its tasks ended the worker that they ran on again and again" in done.stdout
     assert "Traceback" not in done.stderr
-    records = Store.open(store_path).records()
-    assert [record.status for record in records if record] == ["complete", "complete", "failed", "complete", "complete"]
     assert variable(open_store(store_path), "convergence", "distance").sel(mesh="ico/2").isnull().all()
     # Without what kills its workers, it is computed and nothing else is.
     assert run(study, store_path, threads).computed == ("ico/2",)
@@ -95,17 +99,8 @@ def test_the_next_run_computes_what_has_no_record(
 
 
 KILLS = 20
-
-
-def outcome(script: str, store: Path) -> Any:
-    """What a script prints that kills children of its own."""
-    done = finished(sys.executable, "-c", STORES + script, store, timeout=PATIENCE_SECONDS)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
-
-
-# Of scripts whose children start within milliseconds, without imports.
-STORES = """
+# Its children start within milliseconds, without imports. Each writes one value after the other, and says so before.
+KILLED_WRITERS = """
 import json, os, signal, sys
 from pathlib import Path
 import numpy as np
@@ -116,9 +111,6 @@ from sobolev_batch.batch.store.records import Record
 from tests.support.studies import small_table
 
 path = Path(sys.argv[1])
-"""
-# Each child writes one value after the other, and says so before each.
-KILLED_WRITERS = """
 plan = make_plan(Study.from_table(small_table(lattice={"xi_max": 3.0, "M": 64})))
 store = prepare_store(path, plan)
 (place,) = store.places()
@@ -162,49 +154,36 @@ print(json.dumps(found, default=int))
 
 @pytest.mark.process
 def test_a_field_is_the_old_one_or_the_new_one(store_path: Path) -> None:
-    found = outcome(KILLED_WRITERS % KILLS, store_path)
+    done = finished(sys.executable, "-c", KILLED_WRITERS % KILLS, store_path, timeout=PATIENCE_SECONDS)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
     assert (found["torn"], found["unfounded"], found["swept"]) == (0, 0, True)
     # Kills did meet writes, and some came after one.
     assert found["strays"] > 0
     assert found["values"] > KILLS // 2
 
 
-# Killed before every key that is put in place, until the layout is done without.
-KILLED_LAYOUTS = """
-plan = make_plan(Study.from_table(small_table()))
-replace, left = Path.replace, 0
+def test_a_layout_that_was_interrupted_is_begun_anew(
+    study: Study, store_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan, replace, left = make_plan(study), Path.replace, 0
 
-def counted(self, target):
-    global left
-    if left == 0:
-        os.kill(os.getpid(), signal.SIGKILL)
-    left -= 1
-    return replace(self, target)
+    def counted(path: Path, target: Path) -> Path:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise OSError("the disk is gone")
+        return replace(path, target)
 
-for deaths in range(100):
-    child = os.fork()
-    if child == 0:
-        Path.replace, left = counted, deaths
-        prepare_store(path, plan)
-        os._exit(0)
-    status = os.waitpid(child, 0)[1]
-    if status == 0:
-        break
-    assert status == signal.SIGKILL
-print(json.dumps(deaths))
-"""
-
-
-@pytest.mark.all
-def test_a_layout_that_was_interrupted_is_begun_anew(store_path: Path) -> None:
-    assert outcome(KILLED_LAYOUTS, store_path) > 5
-    store = prepare_store(store_path, make_plan(Study.from_table(small_table())))
-    assert store.labels() == ("ico/0", "ico/1", "ico/2", "ico/3", "reference")
-    assert store.records() == (None,) * 5
-
-
-# Moved by so much, the mesh is another one, of equal size in the store.
-SHIFT = 0.125
+    # It ends before every key that is put in place, until it is done with all.
+    monkeypatch.setattr(Path, "replace", counted)
+    for whole in range(100):
+        left = whole
+        with suppress(StoreError):
+            store = prepare_store(store_path, plan)
+            break
+    assert whole > 5
+    assert (store.labels(), store.records()) == (LABELS, (None,) * 5)
 
 
 def write_part(folder: Path, shift: float) -> None:
@@ -216,7 +195,6 @@ def write_part(folder: Path, shift: float) -> None:
 def test_a_worker_that_goes_on_after_another_run_writes_nothing(
     what: str, tmp_path: Path, strike: Callable[..., Moment]
 ) -> None:
-    """Its worker is stopped, its driver killed, the mesh changed, another run done, and the worker continued."""
     study, store, undisturbed = tmp_path / "study.toml", tmp_path / "store.zarr", tmp_path / "undisturbed.zarr"
     family = '[[family]]\nname = "file"\nsource = "files"\npaths = ["part.ply"]\n'
     study.write_text(TOML.partition("[[family]]")[0] + family)
@@ -227,7 +205,8 @@ def test_a_worker_that_goes_on_after_another_run_writes_nothing(
             wait_until(lambda: moment.pids and psutil.Process(worker.pid).status() == psutil.STATUS_STOPPED)
             assert driver.poll() is None
         # The driver was killed.
-        write_part(tmp_path, SHIFT)
+        # Another mesh, of equal size in the store.
+        write_part(tmp_path, 0.125)
         assert run(Study.from_toml(study), store, workers=1).failed == {}
         before = contents(store)
         os.kill(worker.pid, signal.SIGCONT)
@@ -251,3 +230,98 @@ def test_only_the_run_that_has_the_store_writes(store_path: Path, finished_store
         with pytest.raises(LockError, match=r"no longer has the store: process \d+ on .* has it now"):
             Store(location.fenced(Lock.of_this_process().fence)).write_record(0, record)
     assert json.loads(record.to_json(0) if record else "{}")["row"] == 0
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(watch, "_POLL_SECONDS", 1.0)
+    monkeypatch.setattr(watch, "_TELL_AFTER_SECONDS", 3.0)
+    # Of schedulers that are other processes, and of those in this one.
+    monkeypatch.setenv("DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL", "10s")
+    with dask.config.set({"distributed.scheduler.worker-ttl": "10s"}):
+        yield
+
+
+@pytest.fixture
+def stopped(impatient: None, strike: Callable[..., Moment]) -> Iterator[Moment]:
+    """A worker of any cluster that is started meanwhile is stopped before it writes the field of ico/2."""
+    moment = strike("field", 2, number=signal.SIGSTOP)
+    yield moment
+    for pid in moment.pids:
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+
+
+@contextmanager
+def two_workers(nanny: str) -> Iterator[Client]:
+    with tcp_cluster([nanny], [nanny]) as (address, _), Client(address) as client:
+        yield client
+
+
+@pytest.mark.all
+@pytest.mark.parametrize(
+    "cluster",
+    # The worker of a cluster of one's own is started again.
+    [partial(two_workers, "--nanny"), partial(two_workers, "--no-nanny"), partial(local_client, 1)],
+    ids=["nannies", "no nannies", "own"],
+)
+def test_what_a_silent_worker_has_is_told_and_done_by_others(
+    cluster: Callable[[], AbstractContextManager[Client]], stopped: Moment, study: Study,
+    store_path: Path, finished_store: Path, caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
+    with cluster() as client, caplog.at_level(logging.WARNING):
+        summary = run(study, store_path, client)
+    assert len(stopped.pids) == 1
+    assert (summary.computed, summary.failed) == (LABELS, {})
+    assert_same_results(store_path, finished_store)
+    told = re.search(r"the worker (\S+) has said nothing since \d\d:\d\d:\d\d UTC, and has (.*?)\. Dask", caplog.text)
+    assert told is not None, caplog.text
+    assert "ico/2" in told[2]
+
+
+@pytest.mark.all
+@pytest.mark.usefixtures("impatient")
+def test_a_worker_that_was_stopped_before_the_run_is_given_up(study: Study, store_path: Path) -> None:
+    with tcp_cluster([], []) as (address, (_, worker, _)), Client(address) as client:
+        os.kill(worker.pid, signal.SIGSTOP)
+        assert run(study, store_path, client).computed == LABELS
+
+
+@pytest.mark.all
+@pytest.mark.usefixtures("impatient")
+def test_a_scheduler_that_is_silent_ends_the_run(study: Study, store_path: Path, finished_store: Path) -> None:
+    with tcp_cluster([]) as (address, (scheduler, _)):
+
+        def stop_scheduler(progress: object) -> None:
+            if getattr(progress, "label", "") == "ico/1":
+                os.kill(scheduler.pid, signal.SIGSTOP)
+
+        try:
+            with (
+                Client(address, timeout=5) as client,
+                pytest.raises(ClusterError, match="the same command goes on from what is stored"),
+            ):
+                run(study, store_path, client, on_progress=stop_scheduler)
+        finally:
+            os.kill(scheduler.pid, signal.SIGCONT)
+    assert "ico/0" in run(study, store_path, workers=1).reused
+    assert_same_results(store_path, finished_store)
+
+
+@pytest.mark.all
+@pytest.mark.usefixtures("impatient")
+def test_a_cluster_without_workers_is_told() -> None:
+    def told(address: str, needs_gpu: bool) -> str:
+        with Client(address) as client, Watch(client, needs_gpu).kept() as kept:
+            return wait_until(lambda: kept.obstacle)
+
+    with tcp_cluster() as (address, _):
+        assert told(address, False) == "no worker is left; waiting for one to start"
+    with tcp_cluster([]) as (address, _):
+        assert told(address, True).startswith("no worker with a GPU is left, and the study requests one")
+
+
+def test_a_silence_counts_only_what_was_heard_missing() -> None:
+    silence = watch._silence(1.0, watch._silence(1.0, watch._silence(1.0), 5.0), 2.5)
+    assert silence[2] == 7.5
+    assert watch._silence(2.0, silence, 100.0)[2] == 0.0

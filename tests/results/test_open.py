@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -14,20 +15,16 @@ from sobolev_batch.batch.store.tables import hide_tables
 from tests.support.studies import small_table
 
 
-def test_a_store_is_a_path_or_an_open_tree(finished_store: Path) -> None:
-    tree = sb.open_store(finished_store)
-    for function in (sb.table, sb.status, lambda store: sb.matrix(store, -10)):
-        result = function(finished_store)
-        assert function(tree) is not result
-        assert str(function(tree)) == str(result)
-
-
-def test_an_open_tree_finds_its_fields_from_any_folder(finished_store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_store_is_a_path_or_an_open_tree_which_finds_its_fields_from_any_folder(
+    finished_store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(finished_store.parent)
     tree = sb.open_store(finished_store.name)
     monkeypatch.chdir("/")
-    assert sb.table(tree, -5.0)["distance"].notna().any()
-    assert sb.status(tree).complete
+    for function in (sb.table, partial(sb.table, order=-5.0), sb.status, partial(sb.matrix, order=-10)):
+        result = function(finished_store)
+        assert function(tree) is not result
+        assert str(function(tree)) == str(result)
 
 
 def test_tables_of_two_states_are_not_mixed(copy: Path, threads: Client) -> None:

@@ -7,6 +7,7 @@ import pty
 import time
 from contextlib import redirect_stdout
 from dataclasses import replace
+from itertools import zip_longest
 
 import pytest
 from click.testing import CliRunner
@@ -37,27 +38,19 @@ def store() -> Store:
 
 def running(store: Store, *finished: float, begun: float = 0.0, state: str = "running") -> Status:
     """Return the status of a run in which surfaces were finished at these seconds, the first of them in vain."""
-    records = list(store.records())
-    for row in range(len(records)):
-        status = "failed" if row == 0 else "complete"
-        is_there = row < len(finished)
-        record = Record(key="k", status=status, finished=moment(finished[row])) if is_there else None  # type: ignore[arg-type]
-        store.write_record(row, record)
+    for row, end in zip_longest(range(len(store.records())), finished):
+        record = Record(key="k", status="complete" if row else "failed", finished=moment(end or 0.0))
+        store.write_record(row, None if end is None else record)
     now = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
     store.write_run(RunRecord(state, "process 1", moment(begun), now, "fields, 3 of 5"))  # type: ignore[arg-type]
     return Status.from_store(store.path)
 
 
 @pytest.mark.slow
-def test_the_time_left_follows_from_the_last_ones(store: Store) -> None:
+def test_the_time_left_follows_from_the_last_ones_and_what_cannot_be_told_is_not(store: Store) -> None:
     status = running(store, 0, 10, 40, 70)
-    assert status.rate == pytest.approx(1 / 30, rel=0.05)
-    assert status.seconds_left == pytest.approx(30, rel=0.05)
+    assert [status.rate, status.seconds_left] == pytest.approx([1 / 30, 30], rel=0.05)
     assert status.progress == "4 of 5 done, 1 failed, 2 a minute, about 30 s left at this rate"
-
-
-@pytest.mark.slow
-def test_what_cannot_be_told_is_not(store: Store) -> None:
     for status in (running(store, 0, 10), running(store, 0, 0, 0), running(store, 0, 10, 40, begun=20)):
         assert status.progress.endswith(" of 5 done, 1 failed, time left not known yet")
     assert running(store, 0, 10, 20, 30, 40).progress == "5 of 5 done, 1 failed, fields, 3 of 5"

@@ -30,6 +30,15 @@ def imported(path: Path) -> set[str]:
     return names
 
 
+def install(site: Path, name: str, entry_points: str, module: str) -> None:
+    """Install a distribution of one module into a folder that is on the path."""
+    information = site / f"{name}-1.0.dist-info"
+    information.mkdir(parents=True)
+    (information / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (information / "entry_points.txt").write_text(entry_points)
+    (site / f"{name}.py").write_text(module)
+
+
 def run_icospheres(folder: Path, client: Client) -> sb.Study:
     """Run workflows/icosphere.toml below a folder, with fewer levels on a smaller lattice."""
     text = (ROOT / "workflows" / "icosphere.toml").read_text(encoding="utf-8")

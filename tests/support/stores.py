@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import resource
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Barrier
 
 import numpy as np
 import xarray as xr
 
 from sobolev_batch import DamageError
+from sobolev_batch.batch.storage.location import Location
+from sobolev_batch.batch.storage.lock import Lock, acquire
+from sobolev_batch.errors import LockError
 from tests.support.studies import variable
 
 # What depends on who did it, and when.
@@ -83,6 +88,22 @@ def full_disk(most_bytes: int | None = None) -> Iterator[Callable[[int], None]]:
         yield fill
     finally:
         fill(before)
+
+
+def winners(location: Location, count: int) -> int:
+    """Return how many of several drivers that claim a store at once get it."""
+    together = Barrier(count)
+
+    def attempt(number: int) -> bool:
+        together.wait()
+        try:
+            acquire(location, Lock.of_this_process())
+        except LockError:
+            return False
+        return True
+
+    with ThreadPoolExecutor(count) as pool:
+        return sum(pool.map(attempt, range(count)))
 
 
 def contents(store: Path) -> dict[Path, bytes]:

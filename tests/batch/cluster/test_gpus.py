@@ -1,16 +1,31 @@
-"""Workers of a host do not share a GPU."""
+"""Workers of a host do not share a GPU, and clusters have workers with and without one."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
+from contextlib import ExitStack
+from pathlib import Path
+from subprocess import PIPE
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
-from sobolev_batch import BackendError
-from sobolev_batch.batch.cluster.workers import chosen_devices, lock_gpu, release_gpu, visible_devices
+from sobolev_batch import BackendError, Study, open_store, run
+from sobolev_batch.batch.cluster.clients import remote_client
+from sobolev_batch.batch.cluster.workers import (
+    GPU,
+    chosen_devices,
+    lock_gpu,
+    prepare_workers,
+    release_gpu,
+    visible_devices,
+)
+from tests.support.processes import tcp_cluster
+from tests.support.repository import ROOT
+from tests.support.studies import small_table, variable
 
 HOST = ("GPU-aaaa-1", "GPU-aabb-2", "GPU-cccc-3")
 
@@ -75,9 +90,6 @@ def test_what_the_driver_lists(
         assert str(caught.value) == expected
     else:
         assert visible_devices() == expected
-
-
-def test_without_the_library_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pynvml", None)
     with pytest.raises(BackendError, match=r"nvidia-ml-py.* is not installed: pip install 'sobolev-batch\[gpu\]'"):
         visible_devices()
@@ -94,33 +106,59 @@ sys.stdin.read()
 @pytest.mark.process
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="devices are locked on Linux only")
 def test_each_process_gets_a_device_of_its_own_and_a_dead_one_leaves_its_free(monkeypatch: pytest.MonkeyPatch) -> None:
-    devices = [f"GPU-{os.getpid()}-{number}" for number in range(2)]
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    first, second = devices = [f"GPU-{os.getpid()}-{number}" for number in range(2)]
+    words = [sys.executable, "-c", WORKER, *devices]
     processes: list[subprocess.Popen[str]] = []
 
     def start() -> str:
-        process = subprocess.Popen(
-            [sys.executable, "-c", WORKER, *devices],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env={key: value for key, value in os.environ.items() if key != "CUDA_VISIBLE_DEVICES"},
-        )
-        processes.append(process)
-        assert process.stdout is not None
-        return process.stdout.readline().strip()
+        processes.append(stack.enter_context(subprocess.Popen(words, stdin=PIPE, stdout=PIPE, text=True)))
+        assert processes[-1].stdout is not None
+        return processes[-1].stdout.readline().strip()
 
-    try:
-        assert [start() for _ in range(3)] == [f"{devices[0]} {devices[0]}", f"{devices[1]} {devices[1]}", "None None"]
+    # They end with their input.
+    with ExitStack() as stack:
+        assert [start() for _ in range(3)] == [f"{first} {first}", f"{second} {second}", "None None"]
         processes[0].kill()
         processes[0].wait()
-        assert start() == f"{devices[0]} {devices[0]}"
+        assert start() == f"{first} {first}"
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "before")
-        own = f"{devices[0]}-own"
+        own = f"{first}-own"
         for _ in range(2):
-            assert lock_gpu([devices[0], own]) == own
+            assert lock_gpu([first, own]) == own
             assert lock_gpu([own]) is None
             release_gpu(own)
-    finally:
-        for process in processes:
-            process.kill()
-            process.communicate()
+
+
+PRETEND = ["--preload", str(ROOT / "tests" / "support" / "pretend_gpu.py")]
+
+
+@pytest.mark.all
+def test_one_device_serves_one_worker_and_studies_use_what_there_is(
+    finished_store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The name of a device that no other test has.
+    monkeypatch.setenv("PRETEND_GPU", f"GPU-pretend-{os.getpid()}-{os.urandom(4).hex()}")
+    # Two find the host's one GPU, one finds none.
+    with tcp_cluster(PRETEND, PRETEND, []) as (address, _), remote_client(address) as client:
+        workers = prepare_workers(client)
+        without, other, equipped = sorted(workers.members, key=lambda member: (member.backend, member.note))
+        assert [member.backend for member in (without, other, equipped)] == ["cpu", "cpu", "gpu"]
+        assert without.note.startswith("no GPU left: other workers have all of the 1 that it may use")
+        assert equipped.note.startswith("fake, ")
+        declared = client.scheduler_info(n_workers=-1)["workers"]
+        assert [address for address in declared if declared[address]["resources"].get(GPU)] == [equipped.address]
+        family = [{"name": "ico", "source": "icosphere", "levels": [0, 1, 2, 3, 4]}]
+        for backend in ("gpu", "auto", "cpu"):
+            study = Study.from_table(small_table(transform={"backend": backend}, family=family))
+            assert not run(study, tmp_path / f"{backend}.zarr", client).failed
+    expected = variable(open_store(finished_store), "fourier", "fourier")
+    # Each worker with what it has, and the store tells by whom.
+    for backend, libraries in (("gpu", {"cufinufft"}), ("auto", {"cufinufft", "finufft"}), ("cpu", {"finufft"})):
+        tree = open_store(tmp_path / f"{backend}.zarr")
+        meshes = tree["meshes"].to_dataset().drop_sel(mesh="reference")
+        for library, worker in zip(meshes["backend"].values, meshes["worker"].values, strict=True):
+            assert library in libraries
+            assert backend == "cpu" or (library == "cufinufft") == (worker == equipped.address)
+        found = variable(tree, "fourier", "fourier").sel(mesh=expected["mesh"])
+        assert np.abs(found.values - expected.values).max() < 5e-9 * 4 * np.pi

@@ -1,22 +1,27 @@
-"""What workers find at their start, their versions, and what studies that ask for a GPU are told."""
+"""What workers find at their start, their versions, what studies that ask for a GPU are told, and those that leave."""
 
 from __future__ import annotations
 
 import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import dask
 import pytest
+from dask import config
 from distributed import Client
 
-from sobolev_batch import ClusterError, InputError, Study, open_store, run
+from sobolev_batch import ClusterError, InputError, Study, icosphere, open_store, run, write_mesh
 from sobolev_batch.batch.cluster import workers
 from sobolev_batch.batch.cluster.clients import local_client, remote_client
+from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.cluster.workers import MEMORY, prepare_workers, require_same_versions
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.parameters import machine_memory
-from tests.support.processes import PATIENCE_SECONDS, tcp_cluster
+from tests.support import gate
+from tests.support.processes import PATIENCE_SECONDS, WORKER, dask, tcp_cluster
+from tests.support.repository import install
+from tests.support.stores import assert_same_results
 from tests.support.studies import small_table
 
 
@@ -52,9 +57,7 @@ def test_workers_declare_their_memory(client: Client) -> None:
 def test_local_workers_have_the_memory_that_is_given_and_late_ones_are_equipped_too() -> None:
     with local_client(1, "3GB") as client, Client(client.scheduler.address, set_as_default=False) as second:
         first = prepare_workers(client)
-        (member,) = first.members
-        assert member.note
-        assert member.allowed_bytes == pytest.approx(0.85 * 3e9 - 300e6)
+        assert [member.allowed_bytes for member in first.members] == [pytest.approx(0.85 * 3e9 - 300e6)]
         # This client registers nothing and waits for nothing of its own accord.
         assert prepare_workers(second) == first
         client.cluster.scale(2)
@@ -80,7 +83,7 @@ def _die_once(marker: Path) -> str:
 @pytest.mark.all
 def test_a_task_that_claims_memory_goes_on_when_its_only_worker_was_restarted(tmp_path: Path) -> None:
     # Without a word from us, Dask would close its nanny as soon as it looks for the worker and finds none.
-    with dask.config.set({"distributed.deploy.lost-worker-timeout": "0s"}), local_client(1, "1GB") as client:
+    with config.set({"distributed.deploy.lost-worker-timeout": "0s"}), local_client(1, "1GB") as client:
         prepare_workers(client)
         task = client.submit(_die_once, tmp_path / "marker", pure=False, resources={MEMORY: 1e8})
         assert task.result(timeout=PATIENCE_SECONDS) == "alive"
@@ -113,18 +116,52 @@ def test_differences_are_reported_before_anything_is_computed(
     assert Store(store_path).records() == (None,) * 5
 
 
-def test_a_checkout_with_other_numerics(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_numerics_and_libraries_that_the_study_needs(
+    client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    require_same_versions(client, ["installed-nowhere"])  # planning reports this
+    install(tmp_path, "remesher_of_a_test", "", "")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    require_same_versions(client)
+    with pytest.raises(ClusterError, match=r"remesher-of-a-test is missing at the worker .*, 1\.0 here"):
+        require_same_versions(client, ["remesher-of-a-test"])
     monkeypatch.setattr(workers, "NUMERICS_VERSION", -1)
     with pytest.raises(ClusterError, match=r"numerics of sobolev-batch \d+ at the worker .*, -1 here"):
         require_same_versions(client)
 
 
-def test_a_library_that_the_study_needs(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    require_same_versions(client, ["installed-nowhere"])  # planning reports this
-    information = tmp_path / "remesher_of_a_test-2.0.dist-info"
-    information.mkdir()
-    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: remesher-of-a-test\nVersion: 2.0\n")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    require_same_versions(client)
-    with pytest.raises(ClusterError, match=r"remesher-of-a-test is missing at the worker .*, 2\.0 here"):
-        require_same_versions(client, ["remesher-of-a-test"])
+@pytest.mark.all
+def test_a_worker_that_leaves_hands_on_the_task_that_it_is_in_to_one_that_came_later(
+    client: Client, store_path: Path, tmp_path: Path
+) -> None:
+    for level in range(4):
+        write_mesh(icosphere(level), tmp_path / f"{level}.off")
+    family = [{"name": "f", "source": "files", "paths": ["*.off"]}]
+    study = Study.from_table(small_table(family=family), folder=tmp_path)
+    # Holds the worker that loads the first mesh in its task, once it is begun, until the test lets it pass.
+    gate_path, gated = gate.gate_of(tmp_path / "0.off"), ["--preload", gate.__file__]
+    writers: list[int] = []
+    with tcp_cluster(gated) as (address, processes), Client(address) as ours, ThreadPoolExecutor(1) as pool:
+        (first,) = ours.scheduler_info()["workers"]
+
+        def replace() -> None:
+            # Waits for a reader; everybody else passes.
+            writers.append(os.open(gate_path, os.O_WRONLY))
+            gate_path.unlink()
+            processes.append(dask("worker", address, *WORKER, *gated))
+            ours.wait_for_workers(2, timeout=PATIENCE_SECONDS)
+            ours.retire_workers([first])
+
+        def disturb(progress: Progress) -> None:
+            if progress.stage == "cluster":
+                os.mkfifo(gate_path)
+                pool.submit(replace)
+
+        summary = run(study, store_path, ours, on_progress=disturb)
+        # What had begun on the worker ends there after all: it comes too late, and leaves the store alone.
+        os.close(writers[0])
+        processes[1].communicate(timeout=PATIENCE_SECONDS)
+    assert (len(summary.computed), summary.failed) == (5, {})
+    assert {record.worker for record in Store.open(store_path).records() if record} - {first}
+    run(study, tmp_path / "undisturbed.zarr", client)
+    assert_same_results(store_path, tmp_path / "undisturbed.zarr")

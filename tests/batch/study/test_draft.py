@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
 
@@ -13,8 +14,6 @@ import sobolev_batch as sb
 from sobolev_batch.batch.study.study import read_study
 from sobolev_batch.surfaces.sources.files import FileMember
 from tests.support.commands import call
-
-Files = dict[str, dict[str, list[str]]]
 
 # The reference last in each, since it has the most triangles.
 ONE_OBJECT: dict[str, tuple[list[str], str, dict[str, list[str]]]] = {
@@ -63,24 +62,33 @@ SEVERAL_OBJECTS: dict[str, tuple[list[str], str]] = {
 def write(path: Path, level: int) -> None:
     """Write a sphere, in whatever format the name says."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix != ".gz":
-        sb.write_mesh(sb.icosphere(level), path)
-        return
-    sb.write_mesh(sb.icosphere(level), path.with_suffix(""))
-    path.write_bytes(gzip.compress(path.with_suffix("").read_bytes()))
-    path.with_suffix("").unlink()
+    plain = path.with_suffix("") if path.suffix == ".gz" else path
+    sb.write_mesh(sb.icosphere(level), plain)
+    if plain != path:
+        path.write_bytes(gzip.compress(plain.read_bytes()))
+        plain.unlink()
 
 
-def files_of(study: sb.Study) -> Files:
-    """Return the paths of each family below the folder of the meshes, by the names of their members."""
+def files_of(study: sb.Study) -> dict[str, dict[str, str]]:
+    """Return the path of each member of each family, below the folder of the meshes; empty if it is no file."""
     folder = (study.folder / "meshes").absolute()
     return {
         family.name: {
-            member.name: [member.path.relative_to(folder).as_posix()] if isinstance(member, FileMember) else []
+            member.name: member.path.relative_to(folder).as_posix() if isinstance(member, FileMember) else ""
             for member in family.source.members(study.folder)
         }
         for family in study.families
     }
+
+
+def drafted(folder: Path, *paths: str) -> tuple[Sequence[str], Mapping[str, sb.Study]]:
+    """Return the summary and the studies of a draft for several objects."""
+    for path in paths:
+        write(folder / "meshes" / path, 1)
+    draft = sb.init_study(folder / "meshes", folder / "study.toml")
+    collection = read_study(draft.path)
+    assert isinstance(collection, sb.StudyCollection)
+    return draft.summary, collection.studies
 
 
 @pytest.mark.parametrize("layout", ONE_OBJECT)
@@ -107,61 +115,42 @@ def test_several_objects(tmp_path: Path, layout: str) -> None:
         template.format(object=one, method=method, size=size): (one, method)
         for one, method, size in product(("cow", "big cow"), ("even", "quick"), (80, 320))
     }
-    for path in (*references, *own):
-        write(tmp_path / "meshes" / path, 1)
-    draft = sb.init_study(tmp_path / "meshes", tmp_path / "study.toml")
-    collection = read_study(draft.path)
-    assert isinstance(collection, sb.StudyCollection)
-    found = {
-        path: (one, family.strip("*?"))
-        for one, study in collection.studies.items()
-        for family, members in files_of(study).items()
-        for paths in members.values()
-        for path in paths
-    }
-    assert found == own
-    assert draft.summary == ("2 objects: big cow, cow", *draft.summary[1:])
+    summary, studies = drafted(tmp_path, *references, *own)
+    families = {(one, family): paths for one in studies for family, paths in files_of(studies[one]).items()}
+    found = {path: (one, family.strip("*?")) for (one, family), paths in families.items() for path in paths.values()}
+    assert (found, summary[0]) == (own, "2 objects: big cow, cow")
 
 
-@pytest.mark.parametrize("template", ["{}_500.ply", "{}/500.ply", "out/{}.ply"])
-def test_meshes_of_no_method(tmp_path: Path, template: str) -> None:
-    paths = {template.format(one): one for one in ("big cow", "cow")}
-    for path in (*paths, "big cow_original.ply", "cow_original.ply"):
-        write(tmp_path / "meshes" / path, 1)
-    draft = sb.init_study(tmp_path / "meshes", tmp_path / "study.toml")
-    collection = read_study(draft.path)
-    assert isinstance(collection, sb.StudyCollection)
-    found = {name: files_of(study) for name, study in collection.studies.items()}
-    method = "out" if template.startswith("out") else "meshes"
-    assert {one: [*members.values()] for one, families in found.items() for members in [families[method]]} == {
-        one: [[path]] for path, one in paths.items()
+@pytest.mark.parametrize(
+    ("template", "method"), [("{}_500.ply", "meshes"), ("{}/500.ply", "meshes"), ("out/{}.ply", "out")]
+)
+def test_meshes_of_no_method(tmp_path: Path, template: str, method: str) -> None:
+    paths = {one: template.format(one) for one in ("big cow", "cow")}
+    summary, studies = drafted(tmp_path, *paths.values(), "big cow_original.ply", "cow_original.ply")
+    assert {one: [*files_of(study)[method].values()] for one, study in studies.items()} == {
+        one: [path] for one, path in paths.items()
     }
-    assert draft.summary == ("2 objects: big cow, cow", f"method {method}: 2 meshes")
+    assert summary == ("2 objects: big cow, cow", f"method {method}: 2 meshes")
 
 
 def test_links_to_files_count_and_those_to_folders_do_not(tmp_path: Path) -> None:
-    write(tmp_path / "elsewhere" / "far.ply", 1)
-    write(tmp_path / "in" / "original.ply", 2)
-    write(tmp_path / "in" / "own" / "near.ply", 1)
-    (tmp_path / "in" / "out").symlink_to(tmp_path / "elsewhere")
-    (tmp_path / "in" / "own" / "a.ply").symlink_to("near.ply")
-    (tmp_path / "in" / "far.ply").symlink_to(tmp_path / "elsewhere" / "far.ply")
-    draft = sb.init_study(tmp_path / "in", tmp_path / "study.toml")
-    assert draft.summary[1:] == (
-        "family meshes: 1 mesh, 80 triangles",
-        "family own: 2 meshes, 80 triangles",
-    )
+    folder = tmp_path / "in"
+    for path, level in (("elsewhere/far.ply", 1), ("in/original.ply", 2), ("in/own/near.ply", 1)):
+        write(tmp_path / path, level)
+    (folder / "out").symlink_to(tmp_path / "elsewhere")
+    (folder / "own" / "a.ply").symlink_to("near.ply")
+    (folder / "far.ply").symlink_to(tmp_path / "elsewhere" / "far.ply")
+    draft = sb.init_study(folder, tmp_path / "study.toml")
+    assert draft.summary[1:] == ("family meshes: 1 mesh, 80 triangles", "family own: 2 meshes, 80 triangles")
 
 
 def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
     write(tmp_path / "in" / "original.ply", 3)
-    write(tmp_path / "in" / "scan_1.ply", 1)
-    write(tmp_path / "in" / "scan_2.ply", 1)
-    (tmp_path / "in" / "scan_3.ply").write_text("nothing")
-    (tmp_path / "in" / "notes.txt").write_text("nothing")
     write(tmp_path / "in" / "old.zarr" / "mesh.ply", 4)
-    for name in ("{object}.ply", "Scan_1.ply", "\x1b[31mred.ply"):
+    for name in ("scan_1.ply", "scan_2.ply", "{object}.ply", "Scan_1.ply", "\x1b[31mred.ply"):
         write(tmp_path / "in" / name, 1)
+    for name in ("scan_3.ply", "notes.txt"):
+        (tmp_path / "in" / name).write_text("nothing")
     draft = sb.init_study(tmp_path / "in", tmp_path / "study.toml")
     assert sorted(draft.left_out) == ["\x1b[31mred.ply", "scan_1.ply", "scan_3.ply", "{object}.ply"]
     assert "left out: scan_3.ply: " in str(draft)

@@ -1,18 +1,25 @@
-"""Convergence tables of a store put together by hand."""
+"""Convergence tables of stores put together by hand, and tables at orders that a store lacks."""
 
 from __future__ import annotations
 
 import json
 import re
+from itertools import product
+from typing import Any
 
+import pandas as pd
 import pytest
 import xarray as xr
 
+import sobolev_batch as sb
 from sobolev_batch import InputError, smallest_below, table
+from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.tables.convergence import format_smallest, format_table
+from sobolev_batch.results.tables.matrix import format_matrix
+from tests.support.studies import small_table
 
 
-def test_text_shows_values_rates_and_what_is_missing(tree: xr.DataTree) -> None:
+def test_text_shows_values_rates_what_is_missing_and_the_nearest_mesh(tree: xr.DataTree) -> None:
     text = format_table(tree, "text", [-2.5])
     assert text.splitlines()[0] == "Sobolev distance of order -2.5 to reference"
     rows = [line.split() for line in text.splitlines() if line.startswith("f_1")]
@@ -20,20 +27,18 @@ def test_text_shows_values_rates_and_what_is_missing(tree: xr.DataTree) -> None:
     assert " ".join(rows[1]) == "f_1/1 1,280 0.1 5.000 % ± 0.005 %* 0.2000 ± 0.0002 2.00 ± 0.02"
     assert rows[2] == ["f_1/2", *["missing"] * 6]
     assert "\n\nf_1/2 is failed: no 50% of it | is <there>\n\n" in text
-
-
-def test_the_nearest_mesh_is_named(tree: xr.DataTree) -> None:
-    assert "\n\nNearest: f_1/1, which differs by 2.500 % ± 0.003 %.\n\n" in format_table(tree, "text", [-10.0])
     # A mesh whose distance is not larger than its error may be nearer.
     unsure = "\n\nNearest: f_1/0, which differs by 20.00 % ± 0.02 %; its errors leave open whether f_1/1 is nearer."
-    assert unsure in format_table(tree, "text", [-2.5])
+    assert unsure in text
+    assert "\n\nNearest: f_1/1, which differs by 2.500 % ± 0.003 %.\n\n" in format_table(tree, "text", [-10.0])
 
 
 def test_lines_stay_readable(tree: xr.DataTree, near: xr.DataTree) -> None:
     for one in (tree, near):
         assert max(map(len, format_table(one).splitlines())) <= 100
     labels = [*(f"f_1/{'x' * 60}/{i}" for i in range(3)), "reference"]
-    renamed = xr.DataTree.from_dict({name: group.assign_coords(mesh=labels) for name, group in datasets(tree).items()})
+    groups = {name: group for name, group in tree.to_dict().items() if "mesh" in group.coords}
+    renamed = xr.DataTree.from_dict({name: group.assign_coords(mesh=labels) for name, group in groups.items()})
     text = format_table(renamed, "text", [-10.0])
     assert max(map(len, text.split("Nearest")[0].splitlines())) <= 100
     assert re.search(r"^f_1/x+…x+/0 +20 ", text, re.MULTILINE)
@@ -41,53 +46,36 @@ def test_lines_stay_readable(tree: xr.DataTree, near: xr.DataTree) -> None:
     assert "x" * 60 in format_table(renamed, "markdown", [-10.0]).splitlines()[4]
 
 
-def datasets(tree: xr.DataTree) -> dict[str, xr.Dataset]:
-    return {name: group for name, group in tree.to_dict().items() if "mesh" in group.coords}
-
-
 def test_every_order_gets_a_table_and_small_numbers_are_formulas_of_latex(tree: xr.DataTree) -> None:
     for style in ("text", "markdown", "latex"):
         text = format_table(tree, style)
         assert text.index("order -10") < text.index("order -2.5")
-    tree["convergence"]["relative"] *= 1e-7
-    tree["convergence"]["relative_error"] *= 1e-7
+    for name in ("relative", "relative_error"):
+        tree["convergence"][name] *= 1e-7
     assert r"(2.500 ± 0.003) $\times 10^{-7}$ \%" in format_table(tree, "latex", [-10.0])
 
 
-def test_programs_get_nulls_and_blanks_for_missing_numbers(tree: xr.DataTree) -> None:
+def test_programs_get_frames_nulls_and_blanks_for_missing_numbers(tree: xr.DataTree) -> None:
+    frame = table(tree)
+    assert (frame.attrs, frame["mesh"].tolist()) == ({"reference": "reference"}, ["f_1/0", "f_1/1", "f_1/2"] * 2)
+    assert frame.query("order == -10 and level == 1")["relative"].item() == pytest.approx(0.025)
     records = json.loads(format_table(tree, "json", [-10.0]))
-    assert records[2]["distance"] is None
+    assert (records[1]["rate"], records[2]["distance"]) == (2.0, None)
     assert records[2]["reason"] == "no 50% of it | is <there>"
-    assert records[1]["rate"] == 2.0
     lines = format_table(tree, "csv", [-10.0]).splitlines()
     assert len(lines) == 4
     assert lines[3].endswith(",,,,,False,False")
 
 
-def test_frame_is_long_and_leaves_the_reference_out(tree: xr.DataTree) -> None:
-    frame = table(tree)
-    assert len(frame) == 6
-    assert frame.attrs == {"reference": "reference"}
-    assert set(frame["mesh"]) == {"f_1/0", "f_1/1", "f_1/2"}
-    assert frame.query("order == -10 and level == 1")["relative"].item() == pytest.approx(0.025)
-
-
-def test_unknown_orders_and_unfinished_stores(tree: xr.DataTree) -> None:
-    with pytest.raises(InputError, match="the DataTree does not say where it was opened"):
-        format_table(tree, "text", [-3.0])
-    with pytest.raises(InputError, match="no tables yet"):
-        format_table(xr.DataTree())
-
-
 def test_proximities_have_columns_of_their_own(tree: xr.DataTree, near: xr.DataTree) -> None:
     added = [name for name in table(near) if name not in table(tree)]
     assert added == ["hausdorff", "chamfer", "chamfer_error"]
-    text = format_table(near).splitlines()
-    first = text.index("Other distances, the same at all orders")
-    assert text[first + 2].split()[-4:] == ["≥", "Chamfer", "±", "s.e."]
-    assert text[first + 4].split() == ["f_1/0", "0.25", "0.125", "±", "0.001"]
-    assert sum("Hausdorff ≥" in line for line in text) == 1
-    assert "f_1/1 has no proximity: its file has changed" in text
+    text = format_table(near)
+    others = text.partition("\nOther distances, the same at all orders\n")[2].splitlines()
+    assert others[1].split()[-4:] == ["≥", "Chamfer", "±", "s.e."]
+    assert others[3].split() == ["f_1/0", "0.25", "0.125", "±", "0.001"]
+    assert text.count("Hausdorff ≥") == 1
+    assert "\nf_1/1 has no proximity: its file has changed\n" in text
     assert "Hausdorff" not in format_table(tree)
     for style in ("markdown", "latex"):
         table_of_both = format_table(near, style).partition("Other distances")[2]
@@ -111,8 +99,8 @@ def test_notes_are_those_of_all_objects(tree: xr.DataTree, near: xr.DataTree) ->
         assert (text.index("f_1/1 has no proximity") < b) == (a < b)
 
 
-def smallest(tree: xr.DataTree, below: float | str, order: float = -10.0) -> dict[str, object]:
-    (row,) = smallest_below(tree, below, order).to_dict("records")
+def smallest(tree: xr.DataTree, below: float | str) -> dict[str, Any]:
+    (row,) = smallest_below(tree, below, -10.0).to_dict("records")
     return {str(name): value for name, value in row.items()}
 
 
@@ -127,15 +115,19 @@ def test_the_fewest_triangles_win_if_any_mesh_is_near_enough(tree: xr.DataTree) 
 
 
 def test_errors_leave_smaller_meshes_open(tree: xr.DataTree) -> None:
-    # 10 % ± 0.01 %.
-    assert (smallest(tree, 0.10005)["mesh"], smallest(tree, 0.10005)["undecided"]) == ("f_1/1", "f_1/0")
-    assert smallest(tree, 0.1002)["mesh"] == "f_1/0"
-    assert smallest(tree, 0.0998)["undecided"] == ""
-    # Where even the largest mesh is open, none is below.
-    assert (smallest(tree, 0.025)["mesh"], smallest(tree, 0.025)["undecided"]) == ("", "f_1/1")
+    # The smaller mesh has 10 % ± 0.01 %. Where even the largest mesh is open, none is below.
+    for below, mesh, undecided in (
+        (0.10005, "f_1/1", "f_1/0"), (0.1002, "f_1/0", ""), (0.0998, "f_1/1", ""), (0.025, "", "f_1/1"),
+    ):  # fmt: skip
+        found = smallest(tree, below)
+        assert (found["mesh"], found["undecided"]) == (mesh, undecided), below
 
 
-def test_what_has_no_smallest_mesh(tree: xr.DataTree) -> None:
+def test_what_has_no_table_or_no_smallest_mesh(tree: xr.DataTree) -> None:
+    with pytest.raises(InputError, match="the DataTree does not say where it was opened"):
+        format_table(tree, "text", [-3.0])
+    with pytest.raises(InputError, match="no tables yet"):
+        format_table(xr.DataTree())
     (record,) = json.loads(format_smallest(tree, "json", [-10.0], below=0.001))
     assert (record["mesh"], record["triangles"], record["relative"]) == ("", None, None)
     for bound in (0, -1, "x%", "", True):
@@ -144,3 +136,62 @@ def test_what_has_no_smallest_mesh(tree: xr.DataTree) -> None:
     tree["meshes"]["triangles"] = 0 * tree["meshes"].to_dataset()["triangles"]
     with pytest.raises(InputError, match="no surface of the store is known to have any"):
         smallest_below(tree, 0.01)
+
+
+ORDERS = [-10.0, -3.7, -3.0, -0.6]
+
+
+@pytest.fixture(scope="module")
+def stores() -> tuple[str, str]:
+    """Return two stores of the same fields, with octaves and a mesh that failed: of two orders, and of all."""
+    few, every = "memory://orders-few.zarr", "memory://orders-all.zarr"
+    for place, orders in ((few, ORDERS[::2]), (every, ORDERS)):
+        table = small_table(norm={"orders": orders}, lattice={"xi_max": 3.0, "M": 16, "octaves": 1})
+        table["family"].append({"name": "lost", "source": "files", "paths": ["nowhere.ply"]})
+        sb.run(sb.Study.from_table(table), place, workers=1)
+    return few, every
+
+
+@pytest.mark.slow
+def test_any_order_is_that_of_a_study_that_asks_for_it(stores: tuple[str, str]) -> None:
+    few, every = (sb.table(store, ORDERS) for store in stores)
+    pd.testing.assert_frame_equal(few.drop(columns="seconds"), every.drop(columns="seconds"), rtol=1e-12)
+    assert few.attrs["computed"] == [-3.7, -0.6]
+    assert "computed" not in every.attrs
+    assert few[few["mesh"] == "lost/nowhere"]["distance"].isna().all()
+    # Near -1/2 the fields say little, and the errors say that.
+    assert not few[few["order"] == -0.6]["resolved"].all()
+    assert few[(few["order"] == -3.7) & (few["status"] == "complete")]["resolved"].all()
+
+
+@pytest.mark.slow
+def test_matrices_of_any_order(stores: tuple[str, str]) -> None:
+    for values in ("distance", "error"):
+        few, every = (sb.matrix(store, -3.7, values) for store in stores)
+        pd.testing.assert_frame_equal(few, every, rtol=1e-9)
+    few_text, every_text = (format_matrix(sb.open_store(store), "text", [-3.7, -3.0]) for store in stores)
+    assert few_text.startswith(every_text)
+    text = format_table(sb.open_store(stores[0]), "text", [-3.7])
+    for one in (few_text, text):
+        assert "\nNot of the study, but computed now from its stored fields: order -3.7." in one
+    assert re.search(r"frequencies up to 3 on each axis, and samples in octaves up to \d", text)
+
+
+@pytest.mark.slow
+def test_tables_of_any_order_read_no_field_and_no_record(
+    stores: tuple[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(Store, "read_fields")
+    assert set(sb.table(stores[0], -3.7)["order"]) == {-3.7}
+    assert sb.matrix(stores[0], -3).attrs["order"] == -3.0
+    with pytest.raises(AttributeError, match="read_fields"):
+        sb.matrix(stores[0], -3.7)
+    monkeypatch.delattr(Store, "examine_records")
+    assert set(sb.table(stores[0], [-10, -3.7])["order"]) == {-10.0, -3.7}
+
+
+@pytest.mark.slow
+def test_other_orders_are_refused(stores: tuple[str, str]) -> None:
+    for ask, order in product((sb.table, sb.matrix, sb.evolution), (-0.5, 1.0, [], "all")):
+        with pytest.raises(sb.OrderError):
+            ask(stores[0], order)

@@ -37,8 +37,7 @@ def store(client: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
         {"name": "true", **carried(4, [0.0, 0.4, 0.8])},
         {"name": "still", **SHAPE, "levels": [1]},
     ]
-    norm = {"orders": [-2.0, -4.0]}
-    lattice = {"xi_max": LATTICE.xi_max, "M": LATTICE.M}
+    lattice, norm = {"xi_max": LATTICE.xi_max, "M": LATTICE.M}, {"orders": [-2.0, -4.0]}
     study = small_table(lattice=lattice, scaling={"mode": "none"}, norm=norm, reference=SHAPE, family=family)
     sb.run(sb.Study.from_table(study), folder / "moving.zarr", client)
     return folder / "moving.zarr"
@@ -57,8 +56,8 @@ def test_distances_are_those_to_the_reference(store: Path) -> None:
         times = variable(sb.open_store(store), group, "time").sel(mesh=["coarse/0.8", "true/0.0", "still/1"])
         assert np.array_equal(times.values, [0.8, 0.0, np.nan], equal_nan=True)
     # A family begins at its own first time.
-    assert found["growth"].sel(family="late", order=-2.0).values[1] == 1.0
-    assert np.isnan(found["growth"].sel(family="late", order=-2.0).values[0])
+    late = found["growth"].sel(family="late", order=-2.0).values
+    assert np.array_equal(late[:2], [np.nan, 1.0], equal_nan=True)
 
 
 def test_the_true_surface_may_move(store: Path) -> None:
@@ -75,8 +74,7 @@ def test_the_true_surface_may_move(store: Path) -> None:
 
 
 def test_a_new_mesh_pays_once_the_distance_has_certainly_grown(store: Path) -> None:
-    found = sb.evolution(store, -4.0, truth="true")
-    growth = found["growth"].sel(family="coarse", order=-4.0).values
+    growth = sb.evolution(store, -4.0, truth="true")["growth"].sel(family="coarse", order=-4.0).values
     assert 1 < growth[1] < growth[2]
     for factor, moment in ((0.9 * growth[1], 0.4), (0.9 * growth[2], 0.8), (1.1 * growth[2], np.nan)):
         times = sb.evolution(store, -4.0, truth="true", factor=factor)["remesh_time"]
@@ -137,10 +135,8 @@ def test_times_that_differ_by_rounding_are_the_same(client: Client, tmp_path: Pa
     found = sb.evolution(store, [-4.0, -4.0], truth="true")
     assert np.isfinite(found["distance"].sel(time=0.1 + 0.2)).all()
     assert found.sizes["order"] == 1
-    text = format_evolution(sb.open_store(store))
-    assert "1000000.1 " in text
-    assert "1000000.2 " in text
     tree = sb.open_store(store).load()
+    assert {"1000000.1", "1000000.2"} <= set(format_evolution(tree).split())
     meshes = tree["meshes"].to_dataset()
     tree["meshes"] = xr.DataTree(meshes.assign_coords(time=meshes["time"].where(meshes["family"] != "true", 7.0)))
     with pytest.raises(sb.InputError, match="the families 'carried' and 'true' have no time in common"):
@@ -153,7 +149,7 @@ def test_the_plot_has_a_line_for_each_family(store: Path) -> None:
     assert [text.get_text() for text in legend.get_texts()] == ["coarse", "late", "a new mesh pays"]
     assert axes.get_title() == "order -4"
     late = sb.plot(store, "over-time", -4.0, truth="true", family="l*")
-    assert [line.get_label() for line in late.lines][:1] == ["late"]
+    assert late.lines[0].get_label() == "late"
     with pytest.raises(sb.InputError, match="none of the chosen families moves, only coarse, late"):
         sb.plot(store, "over-time", -4.0, truth="true", family="still")
 
@@ -186,10 +182,9 @@ def test_a_report_draws_them(store: Path, tmp_path: Path) -> None:
     with browser(tmp_path / "profile") as reader:
         reader.open(page)
         data = reader.tell("document.getElementById('chart-evolution').data.map(({ name, x, y }) => [name, x, y])")
-        late = found.sel(family="late", order=-2.0).dropna("time", subset=["distance"])
+        late = found.sel(family="late", order=-2.0).dropna("time", subset=["distance"])["distance"].values
         assert [name for name, *_ in data] == ["coarse", "late", "true"]
-        assert data[1][1] == [0.4, 0.8, 1.2]
-        assert data[1][2] == pytest.approx(late["distance"].values, rel=1e-3)
+        assert data[1][1:] == [[0.4, 0.8, 1.2], pytest.approx(late, rel=1e-3)]
         assert reader.complaints() == []
 
 

@@ -41,12 +41,11 @@ def test_frame_becomes_the_matrix() -> None:
         matrix(made(4), -2.0, "rate")  # type: ignore[arg-type]
 
 
-def test_text_fits_a_terminal() -> None:
-    text = format_matrix(made(15))
-    lines = text.splitlines()
+def test_text_fits_a_terminal_and_has_a_table_for_each_order() -> None:
+    lines = format_matrix(made(15)).splitlines()
     assert max(map(len, lines)) <= 100
-    assert lines[0] == "Sobolev distances of order -4, in the square root of a unit length"
-    assert "Sobolev distances of order -2, in the square root of a unit length" in lines
+    heads = [line for line in lines if line.startswith("Sobolev distances of order")]
+    assert heads == [f"Sobolev distances of order {s}, in the square root of a unit length" for s in (-4, -2)]
     row = next(line for line in lines if line.startswith("4 f/3"))
     assert " ".join(row.split()) == "4 f/3 3.00 ± 0.03 missing 1.00 ± 0.01"
 
@@ -65,6 +64,9 @@ def test_people_get_per_cents_of_the_reference(style: Format) -> None:
 
 
 def test_programs_get_lines_of_pairs() -> None:
+    with pytest.raises(InputError, match=r"25 meshes is too large to be read as text.*--format csv"):
+        format_matrix(made(24))
+    assert len(format_matrix(made(24), "csv", [-4.0]).splitlines()) == 1 + 25**2
     lines = format_matrix(made(3), "csv").splitlines()
     assert lines[0] == "order,mesh,other,distance,error,truncation,aliasing,discretisation,statistical"
     assert len(lines) == 1 + 2 * 4 * 4
@@ -75,29 +77,20 @@ def test_programs_get_lines_of_pairs() -> None:
     assert records[1]["distance"] is None
 
 
-def test_many_meshes_are_for_programs() -> None:
-    with pytest.raises(InputError, match=r"25 meshes is too large to be read as text.*--format csv"):
-        format_matrix(made(24))
-    assert len(format_matrix(made(24), "csv", [-4.0]).splitlines()) == 1 + 25**2
-
-
 def test_distances_to_the_reference_alone() -> None:
     tree = made(4)
     tree["distances"] = xr.DataTree(tree["distances"].to_dataset().sel(other=["reference"]))
-    assert len(matrix_frame(distances_at(tree, None), -4.0)) == 5
+    assert (len(matrix_frame(distances_at(tree, None), -4.0)), pairs_of(tree, -4.0)) == (5, None)
     assert "\n3 f/2        3.00 ± 0.03\n" in format_matrix(tree, "text", [-4.0])
-    assert pairs_of(tree, -4.0) is None
 
 
-def test_matrix_leaves_out_failed_meshes_and_keeps_the_reference() -> None:
-    whole = pairs_of(made(5), -4.0)
-    assert whole is not None
-    assert whole["mesh"].values.tolist() == ["f/0", "f/2", "f/3", "f/4", "reference"]
-    assert np.isfinite(whole["distance"]).all()
-    cut = pairs_of(made(5), -4.0, most=3)
-    assert cut is not None
-    assert cut["mesh"].values.tolist() == ["f/0", "f/2", "reference"]
-    assert cut["distance"].values[0, 2] == 1.0
+@pytest.mark.parametrize(("most", "kept"), [(10, ["f/0", "f/2", "f/3", "f/4"]), (3, ["f/0", "f/2"])])
+def test_matrix_leaves_out_failed_meshes_and_keeps_the_reference(most: int, kept: list[str]) -> None:
+    found = pairs_of(made(5), -4.0, most=most)
+    assert found is not None
+    assert found["mesh"].values.tolist() == [*kept, "reference"]
+    # They are at 1, 3, 4 and 5, and the reference at zero.
+    assert found["distance"].values[:, -1].tolist() == [*([1.0, 3.0, 4.0, 5.0][: len(kept)]), 0.0]
 
 
 @pytest.mark.parametrize("style", ["text", "markdown", "latex"])
