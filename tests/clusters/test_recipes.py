@@ -216,7 +216,8 @@ COMMANDS |= {("dask", "scheduler"): dask_scheduler.main, ("dask", "worker"): das
 def check_options(words: list[str]) -> None:
     """Check that a command has each of the options, and that values follow those that take one."""
     command = COMMANDS[words[0], words[1]]
-    command.make_parser(click.Context(command)).parse_args(words[2:])
+    options, *_ = command.make_parser(click.Context(command)).parse_args(words[2:])
+    assert not any(str(value).startswith("--") for value in options.values()), options
 
 
 CLUSTER, GPU, TO_SCHEDULER, TO_WORKERS, STUDY, JOB = yaml.safe_load_all((FOLDER / "kubernetes.yaml").read_text())

@@ -1,4 +1,4 @@
-"""Progress in one line: a count, a rate, and the time left as the last surfaces let it be told."""
+"""Opening stores, and the progress of their runs in one line: a count, a rate, and the time left."""
 
 from __future__ import annotations
 
@@ -7,14 +7,18 @@ import pty
 import time
 from contextlib import redirect_stdout
 from dataclasses import replace
+from functools import partial
 from itertools import zip_longest
+from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from distributed import Client
 
 import sobolev_batch as sb
 from sobolev_batch.batch.store.records import Record, RunRecord
 from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.store.tables import hide_tables
 from sobolev_batch.cli import cli
 from sobolev_batch.cli.common import replace_line
 from sobolev_batch.results.status import Status
@@ -86,3 +90,27 @@ def test_a_terminal_has_one_line_that_changes(monkeypatch: pytest.MonkeyPatch) -
             written += os.read(main, 4096).decode()
         assert written.split("\r\x1b[K") == ["", f"2 of 5 done, {'x' * 16}", "1 of 5 done", ""]
     os.close(main)
+
+
+def test_a_store_is_a_path_or_an_open_tree_which_finds_its_fields_from_any_folder(
+    finished_store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(finished_store.parent)
+    tree = sb.open_store(finished_store.name)
+    monkeypatch.chdir("/")
+    for function in (sb.table, partial(sb.table, order=-5.0), sb.status, partial(sb.matrix, order=-10)):
+        result = function(finished_store)
+        assert function(tree) is not result
+        assert str(function(tree)) == str(result)
+
+
+def test_tables_of_two_states_are_not_mixed(copy: Path, threads: Client) -> None:
+    tree = sb.open_store(copy)
+    before = [str(function(tree, -5.0)) for function in (sb.table, sb.matrix)]
+    # As a run does before it replaces them.
+    hide_tables(Store.open(copy))
+    for function in (sb.table, sb.matrix):
+        with pytest.raises(sb.StoreError, match="a run has changed the store while it was read"):
+            function(tree, -5.0)
+    sb.run(sb.Study.from_table(small_table()), copy, threads)
+    assert [str(function(tree, -5.0)) for function in (sb.table, sb.matrix)] == before
