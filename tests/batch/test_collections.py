@@ -23,8 +23,7 @@ from tests.support.studies import GONE, balls, methods_of, small_table
 
 
 def collection(objects: list[dict[str, Any]], name: str = "small") -> sb.StudyCollection:
-    study = {"name": name}
-    return sb.StudyCollection.from_table(small_table(study=study, object=objects, family=methods_of()))
+    return sb.StudyCollection.from_table(small_table(study={"name": name}, object=objects, family=methods_of()))
 
 
 LABELS = ("ico/1", "ico/2", "egg/1", "egg/2", "reference")
