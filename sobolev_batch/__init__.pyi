@@ -46,6 +46,7 @@ from .results.status import status as status
 from .results.store_accessor import StoreAccessor as StoreAccessor
 from .results.tables.convergence import smallest_below as smallest_below
 from .results.tables.convergence import table as table
+from .results.tables.costs import CostLeague as CostLeague
 from .results.tables.evolution import evolution as evolution
 from .results.tables.league import League as League
 from .results.tables.league import compare_studies as compare_studies

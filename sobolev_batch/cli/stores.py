@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,7 +28,7 @@ from sobolev_batch.cli.common import (
     store_argument,
     up_option,
 )
-from sobolev_batch.errors import SobolevBatchError, StoreError
+from sobolev_batch.errors import InputError, SobolevBatchError, StoreError
 from sobolev_batch.results.tables import Format
 
 if TYPE_CHECKING:
@@ -250,7 +251,7 @@ def plot_command(
     from the study; drawing needs the extra "vtk". By default a few are chosen by their distances.
     """
     from sobolev_batch.batch.collection_store import CollectionStore
-    from sobolev_batch.results.figures.drawing import LEAGUE, write_plots
+    from sobolev_batch.results.figures.drawing import COST_LEAGUE, LEAGUE, write_plots
     from sobolev_batch.results.figures.selection import Selection
     from sobolev_batch.results.figures.style import drawing, parse_size, write_figures
     from sobolev_batch.results.figures.views import write_witness_plots
@@ -262,10 +263,19 @@ def plot_command(
     if CollectionStore.read(store) is not None:
         if meshes:
             raise click.UsageError("--witness draws meshes of one object: name its store, such as STORE/OBJECT")
-        leagues = league(store, orders or None, x=x or "triangles", methods=families or None)
+        chosen, figures = orders or None, {}
         with drawing(panel):
-            figure = LEAGUE.figure(leagues, size=panel)
-        for path in write_figures({"league": figure}, output, formats, panel):
+            # Where no cost is known, there is no league by cost.
+            with suppress(InputError):
+                by_cost = league(store, chosen, by="cost", methods=families or None)
+                figures["league-by-cost"] = COST_LEAGUE.figure(by_cost, size=panel)
+            try:
+                figures["league"] = LEAGUE.figure(league(store, chosen, x=x, methods=families or None), size=panel)
+            except InputError as error:
+                if x or not figures:
+                    raise
+                echo(f"league: {error}", err=True)
+        for path in write_figures(figures, output, formats, panel):
             echo(path)
         return
     with fields_read(store):
@@ -358,24 +368,37 @@ def report_command(store: Location, output: Path, folder: Path, up: Axis, meshes
 @store_argument
 @format_option
 @orders_option("Compare at this order.", "all of the stores")
-@click.option("--x", default="triangles", show_default=True, help="Compare methods at equal values of this size.")
+@click.option(
+    "--by",
+    type=click.Choice(["size", "cost"]),
+    default="size",
+    show_default=True,
+    help="Compare at equal sizes, or list the meshes that no other beats in distance and cost.",
+)
+@click.option("--x", help="Take this size or cost of a mesh. [default: triangles by size, make_seconds by cost]")
 @click.option("--method", "methods", multiple=True, help="Compare this method; may be repeated. [default: all]")
 @click.option("--against", type=location, metavar="STORE", help="Compare with this earlier study instead.")
 def league_command(
     store: Location,
     style: Format,
     orders: tuple[float, ...],
-    x: str,
+    by: str,
+    x: str | None,
     methods: tuple[str, ...],
     against: Location | None,
 ) -> None:
     """Rank the methods of a collection's STORE over its objects.
 
-    With --against, compare each method with itself in an earlier study instead.
+    With --by cost, STORE may also be that of one object. With --against, compare each method with itself in an earlier
+    study instead.
     """
+    from sobolev_batch.results.tables.costs import format_cost_leagues
     from sobolev_batch.results.tables.league import compare_studies, format_changes, format_league, league
 
-    if against is not None:
+    if by == "cost" and against is None:
+        leagues = league(store, orders or None, by="cost", x=x, methods=methods or None)
+        echo_lines(format_cost_leagues(leagues, style))
+    elif against is not None:
         echo_lines(format_changes(compare_studies(store, against, orders or None), style))
     else:
         echo_lines(format_league(league(store, orders or None, x=x, methods=methods or None), style))

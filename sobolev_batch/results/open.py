@@ -28,7 +28,7 @@ Families = str | Sequence[str] | None
 
 # Of the columns of a table. The finer a mesh is, the smaller is the first, and the larger are the others.
 EDGE_LENGTH = "edge_length"
-_GROWING = ("triangles", "vertices", "seconds")
+_GROWING = ("triangles", "vertices", "seconds", "make_seconds", "make_cpu_seconds", "make_peak_bytes")
 _FROM_COARSE_TO_FINE = ("level", "triangles")
 
 _LABELS = {
@@ -36,6 +36,9 @@ _LABELS = {
     "triangles": "number of triangles",
     "vertices": "number of vertices",
     "seconds": "computing time of the mesh in seconds",
+    "make_seconds": "time of making the mesh in seconds",
+    "make_cpu_seconds": "processor time of making the mesh in seconds",
+    "make_peak_bytes": "memory of making the mesh in bytes",
 }
 
 

@@ -47,12 +47,15 @@ from sobolev_batch.results.open import (
     sizes_of,
 )
 from sobolev_batch.results.tables.convergence import table
+from sobolev_batch.results.tables.costs import CostLeague
 from sobolev_batch.results.tables.evolution import evolution
 from sobolev_batch.results.tables.league import League
 from sobolev_batch.results.tables.matrix import pairs_of
 from sobolev_batch.surfaces.shapes.surface import Reals
 
 _MOST_NAMED = 3
+# Points of a front.
+_MOST_LABELS = 20
 # By horizontal axis: what a mesh lacks that has no place on it, and the slope of second-order convergence.
 _MISSING = {"edge_length": "edges", "triangles": "triangles", "vertices": "vertices", "seconds": "a time"}
 _SLOPES = {"edge_length": 2, "triangles": -1, "vertices": -1}
@@ -163,7 +166,31 @@ def draw_league(_leagues: Sequence[League], league: League, axes: Axes) -> None:
     axes.set_ylabel("relative Sobolev distance")
 
 
+def draw_cost_league(_leagues: Sequence[CostLeague], league: CostLeague, axes: Axes) -> None:
+    """Draw the mean relative distance of each member of a league by cost against its mean cost, and their front."""
+    set_log_scale(axes, "xy")
+    methods, means = league.meshes["method"].drop_duplicates().tolist(), league.means
+    for number, method in enumerate(methods):
+        rows = means[means["method"] == method]
+        costs, values, errors = (rows[column].to_numpy() for column in (league.x, "relative", "relative_error"))
+        draw_curve(axes, costs, values, errors, style_of(number), shortened(method), is_joined=False)
+    front = means[means["front"]]
+    axes.plot(front[league.x], front["relative"], "k:", linewidth=1, drawstyle="steps-post", label="front", zorder=1)
+    for row in front.head(_MOST_LABELS).itertuples():
+        place = getattr(row, league.x), row.relative
+        axes.annotate(shortened(row.member), place, (3, 3), textcoords="offset points", fontsize="x-small")
+    members, count = league.meshes[["method", "member"]].drop_duplicates(), len(league.objects)
+    gone = len(members) - len(means)
+    note = f"not drawn: {gone} member{'s' if gone > 1 else ''} that not all objects have" if gone else ""
+    set_title(axes, f"order {league.order:g}, mean of {count} object{'s' if count > 1 else ''}", note)
+    if means.empty:
+        axes.text(0.5, 0.5, "no member to draw", transform=axes.transAxes, ha="center")
+    axes.set_xlabel(escaped(label_of(league.x)))
+    axes.set_ylabel("relative Sobolev distance")
+
+
 LEAGUE = Plot(draw_league, lambda leagues: leagues, 3.6)
+COST_LEAGUE = Plot(draw_cost_league, lambda leagues: leagues, 3.6)
 
 
 # Smaller fractions are not written into their cells.
@@ -403,11 +430,12 @@ def plot(
     return PLOTS[kind].on(ax, selection, selection.orders[0])
 
 
-def plot_league(league: League, ax: Axes | None = None) -> Axes:
+def plot_league(league: League | CostLeague, ax: Axes | None = None) -> Axes:
     """Plot the mean relative distance of each method of a league against the mean size of its meshes.
 
     The points are geometric means over the objects, at the sizes at which the table compares the methods. Bars show
-    the errors of the distances. Both axes are logarithmic.
+    the errors of the distances. Both axes are logarithmic. In a league by cost the points are the members that all
+    objects have, at their mean costs; a dotted line joins those that no other one beats in both means.
 
     Args:
         league: League at one order, see `league`.
@@ -422,4 +450,4 @@ def plot_league(league: League, ax: Axes | None = None) -> Axes:
     >>> ax.get_xlabel()
     'number of triangles'
     """
-    return LEAGUE.on(ax, [league], league)
+    return (LEAGUE if isinstance(league, League) else COST_LEAGUE).on(ax, [league], league)

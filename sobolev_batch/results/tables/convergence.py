@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -40,6 +41,7 @@ from sobolev_batch.results.tables.text import (
 )
 from sobolev_batch.spectral.lattice import Orders
 from sobolev_batch.spectral.metrics.datasets import observed_rates
+from sobolev_batch.surfaces.sources.mesh_cache import Cost
 
 _ABOUT = ("family", "name", "level", "rank", "ordered_by", "status", "reason", "triangles", "vertices", "seconds")
 _NUMBERS = (
@@ -59,6 +61,8 @@ _NUMBERS = (
     "resolved",
     "within",
 )
+# Of meshes that a program or function made.
+_MADE = tuple(item.name for item in fields(Cost))
 # Integers, or missing where a mesh failed.
 _COUNTS = ("triangles", "vertices")
 # Where the study requests them.
@@ -130,7 +134,8 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
         - order, mesh, family, name, level; rank, the place in the family from coarse to fine, and ordered_by, what
           decides on it (level, triangles, names or time);
         - status, reason, triangles, vertices, seconds (of computing), edge_length (mean), and the metadata that the
-          study gives its meshes;
+          study gives its meshes; make_seconds, make_cpu_seconds, make_peak_bytes and exit_status of what made them,
+          where the study does;
         - distance (to the reference), error and its parts truncation, aliasing, discretisation and statistical;
           relative and relative_error (over the norm of the reference);
         - area_part and shape_part: what a change of total area alone explains of the distance, and the rest. Their
@@ -164,7 +169,7 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
     convergence, meshes = convergence_at(tree, order), finished_group(tree, "meshes")
     labels = convergence["mesh"].values
     others = labels != convergence.attrs["reference"]
-    about = [key for key in (*_ABOUT, *metadata_of(tree)) if key in meshes]
+    about = [key for key in (*_ABOUT, *_MADE, *metadata_of(tree)) if key in meshes]
     columns = {"mesh": labels[others], **{key: meshes[key].values[others] for key in about}}
     nearness = {}
     if has_proximity(tree):

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
+from typing import Literal, overload
 
 import numpy as np
 import pandas as pd
@@ -19,6 +20,7 @@ from sobolev_batch.errors import InputError, StoreError
 from sobolev_batch.results.open import EDGE_LENGTH, AnyStore, as_tree, finished_group, reference_of
 from sobolev_batch.results.tables import Format
 from sobolev_batch.results.tables.convergence import table, tables_of
+from sobolev_batch.results.tables.costs import DEFAULT_COST, CostLeague, cost_leagues_of
 from sobolev_batch.results.tables.statistics import (
     SIGNIFICANCE,
     Curve,
@@ -206,47 +208,89 @@ def _objects(count: int) -> str:
     return f"{count} object{'s' if count > 1 else ''}"
 
 
+@overload
 def league(
     store: AnyCollection,
     order: Orders | None = None,
     *,
-    x: str = "triangles",
+    by: Literal["size"] = "size",
+    x: str | None = None,
     methods: Sequence[str] | None = None,
-) -> tuple[League, ...]:
+) -> tuple[League, ...]: ...
+
+
+@overload
+def league(
+    store: AnyCollection,
+    order: Orders | None = None,
+    *,
+    by: Literal["cost"],
+    x: str | None = None,
+    methods: Sequence[str] | None = None,
+) -> tuple[CostLeague, ...]: ...
+
+
+def league(
+    store: AnyCollection,
+    order: Orders | None = None,
+    *,
+    by: Literal["size", "cost"] = "size",
+    x: str | None = None,
+    methods: Sequence[str] | None = None,
+) -> tuple[League, ...] | tuple[CostLeague, ...]:
     """Rank the methods of a collection over its objects, for each order.
 
     Methods are the families that the objects have in common. On each object, they are compared at equal sizes: at sizes
     evenly spaced over the range that all of them have, with straight lines on logarithmic axes between their meshes.
-    docs/leagues.md explains the intervals and the test.
+    By cost, they need nothing in common: what counts are the meshes that no other one of the object beats in both its
+    distance and its cost. docs/leagues.md explains the intervals and the test.
 
     Args:
-        store: Path or URL of the store of a collection; or stores of single objects by the name of the object.
+        store: Path or URL of the store of a collection; or stores of single objects by the name of the object. By cost,
+            also the store of one object.
         order: One of the stores' orders, or several; default all.
-        x: Size of a mesh: "triangles", "vertices", "edge_length", or a number among the metadata of the meshes, such as
-            the seconds that a method took.
+        by: What methods are compared by, "size" or "cost".
+        x: Size or cost of a mesh: "triangles" (the default by size), "vertices", "edge_length", "make_seconds" (the
+            default by cost), "make_cpu_seconds", "make_peak_bytes", or a number among the metadata of the meshes, such
+            as the seconds that a method took.
         methods: Names of the methods to compare; default all.
 
     Returns:
-        A league for each order, with the tables `League.table` and `League.pairs`.
+        A league for each order: with the tables `League.table` and `League.pairs`, or by cost with `CostLeague.table`,
+        `CostLeague.means` and `CostLeague.meshes`.
 
     Raises:
-        InputError: There are no tables yet, an order, size or method is unknown, or no object has all methods.
+        InputError: There are no tables yet, an order, size or method is unknown, no object has all methods, or no mesh
+            has the cost.
         StoreError: The location has no store.
 
     >>> import sobolev_batch as sb
     >>> (at_order,) = sb.league({"sphere": "storage/icosphere.zarr"}, -10)
     >>> at_order.table[["method", "objects"]].to_dict("records")
     [{'method': 'icosphere', 'objects': 1}]
+    >>> (by_cost,) = sb.league("storage/icosphere.zarr", -10, by="cost", x="triangles")
+    >>> by_cost.means[["member", "triangles", "front"]].round(1).to_dict("list")
+    {'member': ['0', '1', '2', '3'], 'triangles': [20.0, 80.0, 320.0, 1280.0], 'front': [True, True, True, True]}
     """
+    if by not in ("size", "cost"):
+        raise InputError(f'methods are compared by "size" or "cost", found {by!r}')
     if isinstance(store, Mapping):
-        return leagues_of(tables_of(store, order), tuple(store), x=x, methods=methods)
-    collection = CollectionStore.read(Location.parse(store))
-    if collection is None:
+        stores, objects = store, tuple(store)
+    elif (collection := CollectionStore.read(Location.parse(store))) is not None:
+        stores, objects = collection.existing_stores, collection.objects
+    elif by == "cost":
+        tree = as_tree(store)
+        objects = (str(tree.attrs["study"]["name"]),)
+        stores = {objects[0]: tree}
+    else:
         raise StoreError(
             f"{store}: it holds no store of a collection; run a study with several objects, or give the stores of "
             "single objects by their names"
         )
-    return leagues_of(tables_of(collection.existing_stores, order), collection.objects, x=x, methods=methods)
+    tables = tables_of(stores, order)
+    if by == "cost":
+        return cost_leagues_of(tables, objects, x or DEFAULT_COST, _chosen(tables, methods))
+    return leagues_of(tables, objects, x=x or "triangles", methods=methods)
 
 
 def leagues_of(
@@ -258,13 +302,19 @@ def leagues_of(
 ) -> tuple[League, ...]:
     """Rank methods by the rows of `table` of each object that has some, among all objects; see `league`."""
     orders = list(dict.fromkeys(s for frame in tables.values() for s in frame["order"]))
+    chosen = _chosen(tables, methods)
+    unfinished = dict.fromkeys((name for name in objects if name not in tables), "it has no tables yet")
+    return tuple(_league(tables, s, x, chosen, unfinished) for s in orders)
+
+
+def _chosen(tables: Mapping[str, pd.DataFrame], methods: Sequence[str] | None) -> list[str]:
+    """Return the methods to compare, default all; InputError where one is unknown."""
     families = list(dict.fromkeys(family for frame in tables.values() for family in frame["family"]))
     chosen = families if methods is None else list(methods)
     unknown = next((method for method in chosen if method not in families), None)
     if unknown is not None:
         raise InputError(f"no method is named {quoted(unknown)}; known are {', '.join(families)}")
-    unfinished = dict.fromkeys((name for name in objects if name not in tables), "it has no tables yet")
-    return tuple(_league(tables, s, x, chosen, unfinished) for s in orders)
+    return chosen
 
 
 def _league(
@@ -290,7 +340,8 @@ def _league(
     if not rows:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:3])
         raise InputError(
-            f"no object can serve to compare the methods {', '.join(methods)} ({reasons}); compare fewer methods"
+            f"no object can serve to compare the methods {', '.join(methods)} ({reasons}); compare fewer methods, "
+            'or compare them by cost (league --by cost, in Python by="cost")'
         )
     arrays = (np.array(parts) for parts in zip(*rows.values(), strict=True))
     return League(order, x, tuple(rows), tuple(methods), left_out, *arrays)

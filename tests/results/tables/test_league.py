@@ -12,6 +12,7 @@ import pytest
 from scipy import stats
 
 import sobolev_batch as sb
+from sobolev_batch.results.tables.costs import CostLeague, cost_leagues_of, format_cost_leagues
 from sobolev_batch.results.tables.league import League, format_league, leagues_of
 from sobolev_batch.results.tables.statistics import Interval, sign_flip_test, within_objects
 from tests.support.studies import method_rows
@@ -197,3 +198,110 @@ def test_what_objects_differ_by_does_not_widen_intervals() -> None:
     noise = 0.1 * rng.standard_normal((2000, 3))
     spread = within_objects(noise + 10 * rng.standard_normal((2000, 1)))
     np.testing.assert_allclose(spread, 0.1, rtol=0.05)
+
+
+def priced(distances: Mapping[str, Mapping[int, float]], errors: float = 0.0, label: str = "{:g}") -> pd.DataFrame:
+    """Return the table of an object from the distances of methods by the seconds that they took."""
+    rows = method_rows(distances, errors).rename(columns={"triangles": "make_seconds"})
+    return rows.assign(mesh=[f"{row.family}/{label.format(row.make_seconds)}" for row in rows.itertuples()])
+
+
+def by_cost(tables: Mapping[str, pd.DataFrame], x: str = "make_seconds") -> CostLeague:
+    methods = list(dict.fromkeys(name for frame in tables.values() for name in frame["family"]))
+    (made,) = cost_leagues_of(tables, [*tables, "later"], x, methods)
+    return made
+
+
+# No times in common: the slow method is worth its time at its end alone.
+QUICK, SLOW = {1: 0.4, 2: 0.2, 3: 0.3}, {10: 0.25, 20: 0.1}
+
+
+def test_the_front_of_an_object_is_what_no_mesh_beats_in_both() -> None:
+    made = by_cost({"cow": priced({"quick": QUICK, "slow": SLOW})})
+    assert made.meshes.loc[made.meshes["front"], "mesh"].tolist() == ["quick/1", "quick/2", "slow/20"]
+    assert not made.meshes["undecided"].any()
+    assert made.table["best"].tolist() == ["1, 2", "20"]
+    assert made.left_out == {"later": "it has no tables yet"}
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_fronts_are_those_of_all_pairs(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    # Small integers, so that many costs and distances are equal.
+    costs, distances = rng.integers(1, 8, 40).astype(float), rng.integers(1, 8, 40).astype(float)
+    errors = rng.choice([0.0, 0.3, 1.2], 40)
+    frame = method_rows({"a": dict(enumerate(distances, 1))}).assign(make_seconds=costs, relative_error=errors)
+
+    def unbeaten(own: np.ndarray, others: np.ndarray) -> list[bool]:
+        return [
+            not any(
+                (costs[j] <= costs[i] and others[j] < own[i]) or (costs[j] < costs[i] and others[j] <= own[i])
+                for j in range(40)
+                if j != i
+            )
+            for i in range(40)
+        ]
+
+    meshes = by_cost({"cow": frame}).meshes
+    assert meshes["front"].tolist() == unbeaten(distances, distances)
+    worst, best = (unbeaten(distances + sign * errors, distances - sign * errors) for sign in (1, -1))
+    assert meshes["undecided"].tolist() == [low != high for low, high in zip(worst, best, strict=True)]
+
+
+def test_objects_count_the_fronts_of_a_method_and_its_members() -> None:
+    bell = priced({"quick": {1: 0.4, 3: 0.3}, "slow": {20: 0.05, 10: 0.06}, "unpriced": {1: 0.01}})
+    tables = {
+        "cow": priced({"quick": QUICK, "slow": SLOW}),
+        "egg": priced({"quick": QUICK, "slow": {10: 0.15, 20: 0.16}}),
+        "bell": bell.assign(make_seconds=bell["make_seconds"].where(bell["family"] != "unpriced")),
+    }
+    made = by_cost(tables)
+    assert made.table[["method", "front", "objects"]].to_numpy().tolist() == [["quick", 3, 3], ["slow", 3, 3]]
+    assert made.table["best"].tolist() == ["1 (3), 2 (2), 3 (1)", "20 (2), 10 (2)"]
+    # The bell lacks a member, and a time of another method.
+    assert made.means["member"].tolist() == ["1", "3", "10", "20"]
+    assert made.means.set_index("member").loc["20", "relative"] == pytest.approx((0.1 * 0.16 * 0.05) ** (1 / 3))
+    assert made.means["fronts"].tolist() == [3, 1, 2, 2]
+    assert made.left_out["unpriced"] == "no mesh has a distance and make_seconds"
+    text = format_cost_leagues([made])
+    assert "bell: quick/1, quick/3, slow/10, slow/20" in text
+    assert "unpriced is left out" in text
+    assert format_cost_leagues([made], "csv").startswith("order,object,method,member,mesh,make_seconds,relative")
+
+
+def test_errors_leave_open_who_is_on_a_front() -> None:
+    made = by_cost({"cow": priced({"a": {1: 1.0, 2: 1.05}, "b": {3: 0.5, 4: 0.9}}, errors=0.1)})
+    assert made.meshes["front"].tolist() == [True, False, True, False]
+    assert made.meshes["undecided"].tolist() == [False, True, False, False]
+    assert made.table.set_index("method")["undecided"].to_dict() == {"a": 0, "b": 0}
+
+
+def test_names_that_hold_the_object_are_members_of_all_objects() -> None:
+    tables = {name: priced({"quick": QUICK}, label=name + "_{:g}") for name in ("cow", "egg")}
+    assert by_cost(tables).means["member"].tolist() == ["{object}_1", "{object}_2", "{object}_3"]
+    shared = {name: priced({"quick": QUICK}, label="1{:g}") for name in ("1", "2")}
+    assert by_cost(shared).means["member"].tolist() == ["11", "12", "13"]
+
+
+@pytest.mark.parametrize(
+    ("x", "message"),
+    [
+        ("edge_length", "edge_length falls where meshes get finer, so it is no cost; take triangles"),
+        ("colour", "no size of meshes is named 'colour'; known are edge_length, triangles"),
+        ("none", "no mesh has both a distance and none; name another cost, such as triangles"),
+    ],
+)
+def test_a_cost_that_nothing_has_is_refused(x: str, message: str) -> None:
+    with pytest.raises(sb.InputError, match=message):
+        by_cost({"cow": POWERS.assign(none=np.nan)}, x)
+
+
+def test_the_plot_by_cost_has_all_members_and_their_front() -> None:
+    tables = {"cow": priced({"quick": QUICK, "slow": SLOW}), "egg": priced({"quick": QUICK, "slow": {20: 0.1}})}
+    axes = sb.plot_league(by_cost(tables))
+    lines = {str(line.get_label()): np.asarray(line.get_xydata()) for line in axes.lines}
+    np.testing.assert_allclose(lines["quick"], [[1, 0.4], [2, 0.2], [3, 0.3]])
+    np.testing.assert_allclose(lines["front"], [[1, 0.4], [2, 0.2], [20, 0.1]])
+    assert [text.get_text() for text in axes.texts] == ["1", "2", "20"]
+    assert axes.get_title().endswith("not drawn: 1 member that not all objects have")
+    assert axes.get_xlabel() == "time of making the mesh in seconds"

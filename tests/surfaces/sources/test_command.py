@@ -14,8 +14,9 @@ from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.surfaces.sources.command import RemeshedMember
 from sobolev_batch.surfaces.sources.mesh_cache import MeshCache
 from sobolev_batch.surfaces.sources.registry import Member, parse_source
+from tests.support.commands import call
 from tests.support.members import BALL, listed, loaded
-from tests.support.studies import small_table
+from tests.support.studies import balls, small_table
 
 COPY: dict[str, Any] = {"source": "command", "mesh": BALL, "command": ["cp", "{input}", "{output}"]}
 # It leaves a file behind for each time that it runs.
@@ -192,6 +193,12 @@ def test_a_study_of_remeshers_keeps_what_fails_apart(tmp_path: Path) -> None:
     assert float(distances["exit_status"].sel(mesh="bad/exit 3")) == 3
     assert distances["make_seconds"].sel(mesh=["copy/2", "half/0.5"]).notnull().all()
     assert float(distances["size"].sel(mesh="half/0.5")) == 0.5
+    (league,) = sb.league(store, -3.0, by="cost")
+    assert (
+        league.meshes["make_seconds"].tolist()
+        == sb.table(store, -3.0).dropna(subset="distance")["make_seconds"].tolist()
+    )
+    assert "front of the means" in call("league", store, "--by", "cost", "--x", "make_cpu_seconds").stdout
     # What is stored names the function, whose meshes are found without it.
     assert json.dumps(tree.attrs["study"]["table"]["family"][2]["function"]).endswith('halved"')
     from sobolev_batch.results.figures.meshes import StudyMeshes
@@ -202,3 +209,21 @@ def test_a_study_of_remeshers_keeps_what_fails_apart(tmp_path: Path) -> None:
     # A second study beside it finds what was made.
     sb.run(study, tmp_path / "again.zarr", workers=1, allow_commands=True)
     assert len((tmp_path / "log").read_text()) == 1
+
+
+def test_methods_without_a_size_in_common_have_a_plot_by_cost(tmp_path: Path) -> None:
+    half = {"name": "half", "source": halved, "mesh": {"source": "icosphere", "levels": [2]}, "size": [0.5, 1.0]}
+    coarse = {"name": "coarse", "source": "icosphere", "levels": [0]}
+    table = small_table(object=balls(a=1.0, b=1.1), family=[half, coarse])
+    place = "memory://by-cost.zarr"
+    sb.run(sb.StudyCollection.from_table(table), place)
+    call("plot", place, "--output", tmp_path / "half", "--family", "half")
+    assert {path.name for path in (tmp_path / "half").iterdir()} == {"league.png", "league-by-cost.png"}
+    done = call("plot", place, "--output", tmp_path)
+    assert done.stdout == f"{tmp_path / 'league-by-cost.png'}\n"
+    assert "no common range of sizes" in done.stderr
+    assert "compare them by cost (league --by cost" in done.stderr
+    assert call("plot", place, "--output", tmp_path, "--x", "triangles").returncode == 2
+    assert (
+        "coarse is left out: no mesh has a distance and make_seconds." in call("league", place, "--by", "cost").stdout
+    )
