@@ -1,13 +1,19 @@
-"""Figures of K. Koga's paper, "Computing weak distance between the 2-sphere and its nonsmooth approximations"."""
+"""Figures of K. Koga's paper, "Computing weak distance between the 2-sphere and its nonsmooth approximations",
+and a table of docs/numerics.md.
+"""
 
 from __future__ import annotations
+
+import re
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from sobolev_batch import Lattice, Sphere, distance, fourier_transform, icosphere, norm
+from sobolev_batch import Ellipsoid, Lattice, Mesh, Sphere, Torus, distance, fourier_transform, icosphere, norm
 from sobolev_batch.spectral.exact import sphere_block
 from sobolev_batch.spectral.lattice import SobolevWeights, shell_sums
+from tests.support.repository import ROOT
 
 FIGURE_1B = {
     16: (2.755e00, 4.426e00),
@@ -56,3 +62,31 @@ def test_figure_3b_icospheres_converge_with_second_order() -> None:
     slope = np.polyfit(np.log(lengths[3:]), np.log(errors[3:]), 1)[0]
     assert slope == pytest.approx(2.0, abs=0.01)
     assert errors[3] / errors[7] == pytest.approx(4.0**4, rel=0.01)
+
+
+TORUS, ELLIPSOID = Torus(1.0, 0.4), Ellipsoid((1.0, 0.7, 0.4))
+
+
+def numbers_of(shape: str) -> list[float]:
+    (line,) = re.findall(rf"^\| {shape} .*\|$", (ROOT / "docs" / "numerics.md").read_text(encoding="utf-8"), re.M)
+    return [float(entry) for entry in line.strip("|").split("|")[1:]]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("shape", "surface", "mesh"),
+    [("torus", TORUS, lambda level: TORUS.mesh(12 << level, 6 << level)), ("ellipsoid", ELLIPSOID, ELLIPSOID.mesh)],
+)
+def test_refinements_converge_with_second_order(
+    shape: str, surface: Torus | Ellipsoid, mesh: Callable[[int], Mesh]
+) -> None:
+    lattice = Lattice(5.0, 64)
+    exact = fourier_transform(surface, lattice)
+    meshes = [mesh(level) for level in range(5)]
+    datasets = [distance(fourier_transform(mesh, lattice), exact, [-5.0, -10.0]) for mesh in meshes]
+    distances = np.array([dataset["distance"].values for dataset in datasets])
+    assert distances[:, 0] == pytest.approx(numbers_of(shape)[:5], rel=5e-3)
+    sizes = np.array([mesh.edge_lengths.mean() for mesh in meshes])
+    for column in distances.T:
+        assert column[3] / column[4] == pytest.approx(4.0, rel=0.005)
+        assert np.polyfit(np.log(sizes[2:]), np.log(column[2:]), 1)[0] == pytest.approx(2.0, abs=0.02)
