@@ -7,8 +7,8 @@ from pathlib import Path
 
 import sobolev_batch as sb
 from benchmarks.timing import Effort
-from sobolev_batch.surfaces.sources.derived import decimated
 from sobolev_batch.surfaces.sources.files import FileSource
+from sobolev_batch.surfaces.sources.generated import decimated
 
 _CORTEX = "nilearn/datasets/data/fsaverage5/pial_left.gii.gz"
 

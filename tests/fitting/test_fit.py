@@ -24,7 +24,7 @@ from sobolev_batch.fitting.descent import (
     triangle_qualities,
 )
 from sobolev_batch.surfaces.shapes.subdivision import Edges
-from sobolev_batch.surfaces.sources.derived import decimated
+from sobolev_batch.surfaces.sources.generated import decimated
 
 
 def bumpy(level: int) -> sb.Mesh:

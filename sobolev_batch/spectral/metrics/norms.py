@@ -39,6 +39,7 @@ from sobolev_batch.surfaces.formats.readers import MeshLike, as_mesh, as_surface
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent, Reals
+from sobolev_batch.surfaces.sources.generated import decimated, with_noise
 
 # Relative accuracy of the closed forms of spheres.
 _CLOSED_FORM_ACCURACY = 1e-13
@@ -339,8 +340,6 @@ def _curves(
     mesh: Mesh, frequencies: Frequencies, values: SurfaceValues, target: ErrorTarget, start: float, seed: int
 ) -> dict[str, _Curve]:
     """Return the distance of a mesh from itself by the amount of each change; searches begin with a relative one."""
-    # It loads libraries that norms do without.
-    from sobolev_batch.surfaces.sources.derived import decimated, with_noise
 
     def apart(changed: Mesh) -> Reals:
         others = frequencies.values(changed, target, Execution(threads=available_cores()))

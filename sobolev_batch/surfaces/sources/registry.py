@@ -36,19 +36,19 @@ _HERE = "sobolev_batch.surfaces.sources"
 # The package's own sources, by name.
 _OWN = {
     "command": f"{_HERE}.command:CommandSource",
-    "decimate": f"{_HERE}.derived:DecimateSource",
+    "decimate": f"{_HERE}.generated:DecimateSource",
     "ellipsoid": f"{_HERE}.generated:EllipsoidSource",
     "files": f"{_HERE}.files:FileSource",
     "fit": "sobolev_batch.fitting.sources:FitSource",
-    "flow": f"{_HERE}.derived:FlowSource",
+    "flow": f"{_HERE}.generated:FlowSource",
     "function": f"{_HERE}.command:FunctionSource",
     "icosphere": f"{_HERE}.generated:IcosphereSource",
-    "moved": f"{_HERE}.derived:MovedSource",
-    "noisy": f"{_HERE}.derived:NoisySource",
+    "moved": f"{_HERE}.generated:MovedSource",
+    "noisy": f"{_HERE}.generated:NoisySource",
     "refine": "sobolev_batch.fitting.sources:RefineSource",
-    "remesh": f"{_HERE}.derived:RemeshSource",
+    "remesh": f"{_HERE}.generated:RemeshSource",
     "sphere": f"{_HERE}.generated:SphereSource",
-    "spherical-levels": f"{_HERE}.derived:SphericalLevelsSource",
+    "spherical-levels": f"{_HERE}.generated:SphericalLevelsSource",
     "torus": f"{_HERE}.generated:TorusSource",
 }
 

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from sobolev_batch import InputError, Lattice, Mesh, Sphere, distance, icosphere, yardsticks
-from sobolev_batch.surfaces.sources.derived import decimated, with_noise
+from sobolev_batch.surfaces.sources.generated import decimated, with_noise
 
 LATTICE = Lattice(3.0, 32)
 ORDERS = [-3.0, -5.0]

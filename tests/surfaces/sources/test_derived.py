@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 
 import sobolev_batch as sb
 from sobolev_batch import Mesh, MeshError, StudyError, icosphere
-from sobolev_batch.surfaces.sources.derived import carried, with_noise
+from sobolev_batch.surfaces.sources.generated import carried, with_noise
 from sobolev_batch.surfaces.sources.registry import parse_source
 from tests.support.members import BALL, connectivity, listed, loaded, members
 from tests.support.mesh_files import off
