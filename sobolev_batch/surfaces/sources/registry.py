@@ -362,7 +362,7 @@ OtherSource = Annotated[SerializeAsAny[Source], BeforeValidator(_parse_nested)]
 
 
 class NestedSource(Source):
-    """A source that works on the surfaces of another one, which ``mesh`` is the table of."""
+    """A source that works on the surfaces of another one; its key ``mesh`` has the table of that."""
 
     mesh: OtherSource
 
