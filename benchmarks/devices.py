@@ -9,7 +9,7 @@ from benchmarks.table import Row, as_seconds, at_most
 from benchmarks.timing import Effort, take_turns
 from benchmarks.transforms import XI_MAX, settings_of_the_paper
 from sobolev_batch.spectral.backends import ComplexDtype, gpu_backend
-from sobolev_batch.spectral.transform.transform import Execution, TransformSettings, transform_block
+from sobolev_batch.spectral.transform import Execution, TransformSettings, transform_block
 
 # Level of the icosphere, intervals per axis, seconds to stay below.
 _CASES = ((7, 128, 0.060), (5, 416, 0.150))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from benchmarks.timing import take_turns
 from sobolev_batch import Lattice, Mesh, Sphere
 from sobolev_batch.spectral.backends import ComplexDtype
-from sobolev_batch.spectral.quadrature.meshes import gauss_rule
+from sobolev_batch.spectral.quadrature import gauss_rule
 
 Complexes = NDArray[np.complexfloating[Any, Any]]
 Reals = NDArray[np.float64]

@@ -23,7 +23,7 @@ from benchmarks.timing import Effort, elapsed_seconds, take_turns
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.spectral.lattice import SobolevWeights
-from sobolev_batch.spectral.transform.transform import TransformSettings, transform_block
+from sobolev_batch.spectral.transform import TransformSettings, transform_block
 
 _WORKERS = 2
 _OVERHEAD = at_most(1.15)

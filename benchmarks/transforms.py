@@ -15,13 +15,7 @@ from benchmarks.table import Row, as_seconds, at_least, at_most
 from benchmarks.timing import Effort, take_turns
 from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.exact import exact_transform
-from sobolev_batch.spectral.transform.transform import (
-    ErrorTarget,
-    Execution,
-    TransformSettings,
-    choose_settings,
-    transform_block,
-)
+from sobolev_batch.spectral.transform import ErrorTarget, Execution, TransformSettings, choose_settings, transform_block
 
 ORDER = -10.0
 XI_MAX = 5.0

@@ -13,8 +13,7 @@ import finufft
 import pytest
 
 import sobolev_batch as sb
-from sobolev_batch.spectral import exact
-from sobolev_batch.spectral.quadrature import kinds
+from sobolev_batch.spectral import exact, kinds
 from tests.support.studies import SMALL_LATTICE, small_table
 
 COARSE, FINE, SPHERE = sb.icosphere(1), sb.icosphere(2), sb.Sphere()

@@ -18,7 +18,7 @@ from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.spectral.fields import Operand, OperandLike, as_operand
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.norms import distance
-from sobolev_batch.spectral.transform.transform import Execution, thread_count
+from sobolev_batch.spectral.transform import Execution, thread_count
 from sobolev_batch.surfaces.formats.readers import MeshLike, as_mesh
 from sobolev_batch.surfaces.proximity import proximity
 from sobolev_batch.surfaces.shapes.mesh import Mesh

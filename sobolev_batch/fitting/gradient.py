@@ -26,7 +26,7 @@ from sobolev_batch.spectral.fields import (
 )
 from sobolev_batch.spectral.lattice import Lattice, Orders, SobolevWeights, check_orders, shell_sums, single_order
 from sobolev_batch.spectral.metrics.datasets import NUMBER, VARIABLES, labelled, lattice_attributes
-from sobolev_batch.spectral.transform.transform import FINEST_EPS, Execution, TransformSettings, thread_count
+from sobolev_batch.spectral.transform import FINEST_EPS, Execution, TransformSettings, thread_count
 from sobolev_batch.surfaces.formats.readers import MeshLike, as_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Extent, Reals

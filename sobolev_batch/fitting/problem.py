@@ -29,7 +29,7 @@ from sobolev_batch.spectral.fields import (
 )
 from sobolev_batch.spectral.lattice import Lattice, SobolevWeights, single_order
 from sobolev_batch.spectral.probe import Sample, draws_for, estimate
-from sobolev_batch.spectral.transform.transform import ErrorTarget, Execution, TransformSettings, choose_settings
+from sobolev_batch.spectral.transform import ErrorTarget, Execution, TransformSettings, choose_settings
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.subdivision import Edges
 from sobolev_batch.surfaces.shapes.surface import (

@@ -13,9 +13,9 @@ from scipy.sparse import coo_array, csr_array, vstack
 from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.backends import Complexes, NufftSpec
 from sobolev_batch.spectral.lattice import Lattice
-from sobolev_batch.spectral.quadrature.meshes import RuleUse, WeightedPoints, assign_rules, corner_rule, midpoint_rule
-from sobolev_batch.spectral.transform.nufft import transform_points
-from sobolev_batch.spectral.transform.transform import ON_CPU, Execution, TransformSettings, require_points_inside
+from sobolev_batch.spectral.nufft import transform_points
+from sobolev_batch.spectral.quadrature import RuleUse, WeightedPoints, assign_rules, corner_rule, midpoint_rule
+from sobolev_batch.spectral.transform import ON_CPU, Execution, TransformSettings, require_points_inside
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Indices, Reals
 

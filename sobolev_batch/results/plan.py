@@ -33,7 +33,7 @@ from sobolev_batch.results.tables.statistics import Curve, common_sizes, least_o
 from sobolev_batch.results.tables.text import duration
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.values import SurfaceSize
-from sobolev_batch.spectral.transform.transform import field_seconds, slowness
+from sobolev_batch.spectral.transform import field_seconds, slowness
 from sobolev_batch.surfaces.shapes.surface import Similarity, placement_doubt
 from sobolev_batch.surfaces.sources.registry import ExpectedSize, Member
 from sobolev_batch.visible import reasons, table_html, visible

@@ -13,11 +13,11 @@ from pydantic import TypeAdapter
 
 from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.spectral.backends import ComplexDtype, Complexes, backend_named
+from sobolev_batch.spectral.kinds import kind_of
 from sobolev_batch.spectral.lattice import AXES, Block, Lattice, Orders, SobolevWeights, check_orders, shell_sums
 from sobolev_batch.spectral.octaves.remainder import Remainder
 from sobolev_batch.spectral.probe import Probe, Sample, draws_for, measure, needs_probe, norms_of_checks, probe_block
-from sobolev_batch.spectral.quadrature.kinds import kind_of
-from sobolev_batch.spectral.transform.transform import (
+from sobolev_batch.spectral.transform import (
     ON_CPU,
     ErrorTarget,
     Execution,

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.spectral.backends import Complexes
+from sobolev_batch.spectral.kinds import kind_of
 from sobolev_batch.spectral.lattice import Block, Lattice, SobolevWeights, shell_volumes
-from sobolev_batch.spectral.quadrature.kinds import kind_of
-from sobolev_batch.spectral.transform.transform import TransformSettings
+from sobolev_batch.spectral.transform import TransformSettings
 from sobolev_batch.surfaces.shapes.surface import Indices, Reals, Surface
 
 # Draws of a small mesh, of a huge one, and pairs of a triangle (or point) and a frequency in between.

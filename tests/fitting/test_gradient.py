@@ -18,7 +18,7 @@ from scipy.special import roots_jacobi, roots_legendre
 import sobolev_batch as sb
 from sobolev_batch.fitting.transform import MeshTransform
 from sobolev_batch.spectral import backends
-from sobolev_batch.spectral.transform.transform import TransformSettings
+from sobolev_batch.spectral.transform import TransformSettings
 from tests.support.fake_device import Device
 from tests.support.shapes import CENTRED_BOX, tetrahedron
 

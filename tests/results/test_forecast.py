@@ -21,12 +21,7 @@ from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.study.plan import Plan, make_plan
 from sobolev_batch.results.plan import forecast, warnings_of
-from sobolev_batch.spectral.transform.transform import (
-    TransformSettings,
-    expected_points,
-    field_seconds,
-    transform_block,
-)
+from sobolev_batch.spectral.transform import TransformSettings, expected_points, field_seconds, transform_block
 from sobolev_batch.surfaces.formats.readers import write_mesh
 from tests.support.commands import call
 from tests.support.studies import balls, methods_of, small_table

@@ -18,24 +18,11 @@ import pytest
 
 from sobolev_batch import BackendError, InputError, Lattice, Mesh, Sphere, fourier_transform, icosphere
 from sobolev_batch.spectral import backends
-from sobolev_batch.spectral.backends import (
-    CPU,
-    GPU_COSTS,
-    Gpu,
-    backend_named,
-    gpu_backend,
-    try_out,
-)
+from sobolev_batch.spectral.backends import CPU, GPU_COSTS, Gpu, backend_named, gpu_backend, try_out
 from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice, OctaveLattice
-from sobolev_batch.spectral.quadrature.meshes import assign_rules, corner_rule, midpoint_rule
-from sobolev_batch.spectral.transform.transform import (
-    ErrorTarget,
-    Execution,
-    Transformed,
-    TransformSettings,
-    transform_block,
-)
+from sobolev_batch.spectral.quadrature import assign_rules, corner_rule, midpoint_rule
+from sobolev_batch.spectral.transform import ErrorTarget, Execution, Transformed, TransformSettings, transform_block
 from tests.support.fake_device import FUNCTIONS, OPTIONS, UFUNCS, Array, CUDARuntimeError, Device
 
 LATTICE = Lattice(5.0, 32)

@@ -31,7 +31,7 @@ from sobolev_batch.errors import BackendError, ClusterError, InputError, StoreEr
 from sobolev_batch.parameters import format_bytes, machine_memory
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.backends import CPU, INSTALL, Backend, gpu_backend
-from sobolev_batch.spectral.transform.transform import NUMERICS_VERSION, slowness
+from sobolev_batch.spectral.transform import NUMERICS_VERSION, slowness
 from sobolev_batch.visible import make_messages_visible
 
 _log = logging.getLogger(__name__)

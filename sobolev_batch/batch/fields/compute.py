@@ -18,7 +18,7 @@ from sobolev_batch.batch.study.plan import Plan, Row
 from sobolev_batch.batch.workspace import Workspace
 from sobolev_batch.errors import ClusterError
 from sobolev_batch.spectral.lattice import Block
-from sobolev_batch.spectral.transform.transform import TransformSettings, projected_bytes
+from sobolev_batch.spectral.transform import TransformSettings, projected_bytes
 from sobolev_batch.surfaces.sources.registry import ExpectedSize
 
 _log = logging.getLogger(__name__)

@@ -24,13 +24,13 @@ from sobolev_batch.batch.study.schema import Backends
 from sobolev_batch.errors import InputError, LatticeError, MeshError, StoreError, one_line
 from sobolev_batch.spectral.adaptive.solve import DistanceTarget
 from sobolev_batch.spectral.fields import Quality, TailQuality, compute_field, field_for
+from sobolev_batch.spectral.kinds import kind_of
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.octaves.remainder import remainder
 from sobolev_batch.spectral.octaves.sampling import TailSampling
 from sobolev_batch.spectral.octaves.values import Settings, octave_values, settings_for
 from sobolev_batch.spectral.probe import Probe, draws_for, join, probe_block
-from sobolev_batch.spectral.quadrature.kinds import kind_of
-from sobolev_batch.spectral.transform.transform import Execution, TransformSettings, choose_settings, transform_block
+from sobolev_batch.spectral.transform import Execution, TransformSettings, choose_settings, transform_block
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Similarity, Surface
 

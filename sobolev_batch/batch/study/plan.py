@@ -17,12 +17,12 @@ from sobolev_batch.batch.study.study import REFERENCE_LABEL, Study
 from sobolev_batch.errors import InputError, MeshError, StudyError
 from sobolev_batch.spectral.adaptive.solve import DistanceTarget
 from sobolev_batch.spectral.fields import USUAL_DEGREE
+from sobolev_batch.spectral.kinds import kind_of
 from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.metrics.datasets import VARIABLES
 from sobolev_batch.spectral.octaves.sampling import TailSampling
 from sobolev_batch.spectral.probe import Sample, draws_for
-from sobolev_batch.spectral.quadrature.kinds import kind_of
-from sobolev_batch.spectral.transform.transform import NUMERICS_VERSION, TransformSettings, require_inside
+from sobolev_batch.spectral.transform import NUMERICS_VERSION, TransformSettings, require_inside
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Extent, Similarity, Surface
 from sobolev_batch.surfaces.sources.command import RemeshedMember

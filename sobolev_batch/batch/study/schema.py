@@ -35,7 +35,7 @@ from sobolev_batch.parameters import byte_count
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.lattice import Lattice, check_orders
-from sobolev_batch.spectral.transform.transform import TransformSettings
+from sobolev_batch.spectral.transform import TransformSettings
 from sobolev_batch.surfaces.formats.parsing import open_regular
 from sobolev_batch.surfaces.proximity import DEFAULT_POINTS, MOST_POINTS
 from sobolev_batch.surfaces.shapes.surface import Similarity

@@ -30,7 +30,7 @@ from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.lattice import Lattice, check_orders
-from sobolev_batch.spectral.transform.transform import TransformSettings
+from sobolev_batch.spectral.transform import TransformSettings
 from sobolev_batch.surfaces.shapes.surface import Similarity
 from sobolev_batch.surfaces.sources.command import function_name
 from sobolev_batch.surfaces.sources.files import MeshTable, matching_files, number_as_text, read_mesh_list

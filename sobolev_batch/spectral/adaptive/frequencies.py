@@ -42,7 +42,7 @@ from sobolev_batch.spectral.octaves.values import (
     squared_moduli,
     statistical_errors,
 )
-from sobolev_batch.spectral.transform.transform import ErrorTarget, Execution, TransformSettings, permits_single
+from sobolev_batch.spectral.transform import ErrorTarget, Execution, TransformSettings, permits_single
 from sobolev_batch.surfaces.shapes.surface import Reals, Surface, centering
 
 Complexes = NDArray[np.complexfloating]

@@ -27,12 +27,12 @@ from sobolev_batch.spectral.adaptive.tolerance import Accuracy, first_lattice, l
 from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.budget import NormEstimate, Sums, estimate_norms, modulus_bound
 from sobolev_batch.spectral.fields import Field
+from sobolev_batch.spectral.kinds import kind_of
 from sobolev_batch.spectral.lattice import Lattice, SobolevWeights, shell_sums
 from sobolev_batch.spectral.octaves.remainder import LOWEST_ORDER, remainder
 from sobolev_batch.spectral.octaves.sampling import FaceNormals
 from sobolev_batch.spectral.probe import Sample, estimate
-from sobolev_batch.spectral.quadrature.kinds import kind_of
-from sobolev_batch.spectral.transform.transform import ErrorTarget
+from sobolev_batch.spectral.transform import ErrorTarget
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Reals, Surface
 

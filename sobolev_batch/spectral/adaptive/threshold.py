@@ -17,13 +17,7 @@ from sobolev_batch.spectral.budget import area_bound, area_bounds
 from sobolev_batch.spectral.fields import USUAL_DEGREE, Field, compute_field
 from sobolev_batch.spectral.lattice import Lattice, SobolevWeights, shell_sums, shell_volumes
 from sobolev_batch.spectral.probe import Sample, draws_for, needs_probe
-from sobolev_batch.spectral.transform.transform import (
-    ErrorTarget,
-    Execution,
-    TransformSettings,
-    choose_settings,
-    transform_block,
-)
+from sobolev_batch.spectral.transform import ErrorTarget, Execution, TransformSettings, choose_settings, transform_block
 from sobolev_batch.surfaces.shapes.surface import Similarity, Surface
 
 Method = Literal["identical", "lattice", "octaves"]

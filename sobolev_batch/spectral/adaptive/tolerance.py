@@ -29,7 +29,7 @@ from sobolev_batch.spectral.budget import (
     truncated,
 )
 from sobolev_batch.spectral.lattice import LARGEST_M, Lattice, SobolevWeights
-from sobolev_batch.spectral.transform.transform import FINEST_EPS, TransformSettings, projected_bytes
+from sobolev_batch.spectral.transform import FINEST_EPS, TransformSettings, projected_bytes
 from sobolev_batch.surfaces.shapes.surface import Reals
 
 # Fraction of the accuracy for aliasing; the rest is for truncation and the fields' own errors.

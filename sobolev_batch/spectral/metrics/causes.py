@@ -23,8 +23,8 @@ from sobolev_batch.spectral.metrics.datasets import (
     lattice_attributes,
     order_axis,
 )
-from sobolev_batch.spectral.transform.nufft import evaluate_at
-from sobolev_batch.spectral.transform.transform import TransformSettings, require_points_inside, thread_count
+from sobolev_batch.spectral.nufft import evaluate_at
+from sobolev_batch.spectral.transform import TransformSettings, require_points_inside, thread_count
 from sobolev_batch.surfaces.shapes.surface import Reals, Similarity
 
 # Shells this close to an edge, relative to it, lie on it.

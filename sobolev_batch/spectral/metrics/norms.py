@@ -34,7 +34,7 @@ from sobolev_batch.spectral.fields import (
 )
 from sobolev_batch.spectral.lattice import Lattice, Orders, SobolevWeights, check_orders
 from sobolev_batch.spectral.metrics.datasets import VARIABLES, labelled, labelled_distances, lattice_attributes
-from sobolev_batch.spectral.transform.transform import ErrorTarget, Execution
+from sobolev_batch.spectral.transform import ErrorTarget, Execution
 from sobolev_batch.surfaces.formats.readers import MeshLike, as_mesh, as_surface
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.mesh import Mesh

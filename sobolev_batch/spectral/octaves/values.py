@@ -14,11 +14,11 @@ from scipy.special import stdtrit
 
 from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.budget import NormEstimate, change_of_root
+from sobolev_batch.spectral.kinds import kind_of
 from sobolev_batch.spectral.lattice import OctaveLattice
 from sobolev_batch.spectral.octaves.sampling import OctaveSampling
 from sobolev_batch.spectral.probe import norms_of_checks
-from sobolev_batch.spectral.quadrature.kinds import kind_of
-from sobolev_batch.spectral.transform.transform import (
+from sobolev_batch.spectral.transform import (
     ON_CPU,
     ErrorTarget,
     Execution,

@@ -56,7 +56,7 @@ from sobolev_batch.surfaces.shapes.surface import Surface
 # What `as_mesh` makes a mesh of: "Any" stands for the meshes of other libraries, whose types may not be installed.
 MeshLike = Mesh | str | os.PathLike[str] | tuple[ArrayLike, ArrayLike] | Any
 SurfaceLike = Surface | MeshLike
-# A further kind has a class in `spectral/quadrature/kinds` too.
+# A further kind has a class in `spectral/kinds` too.
 SURFACE_KINDS = (Mesh, Sphere, Smooth)
 
 _EXPECTED = (

@@ -25,8 +25,8 @@ from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.study.plan import Plan, make_plan
 from sobolev_batch.spectral.backends import CPU_COSTS, NufftSpec, Workload
 from sobolev_batch.spectral.lattice import Block
-from sobolev_batch.spectral.quadrature.meshes import gauss_rule
-from sobolev_batch.spectral.transform.transform import TransformSettings, fastest_spec, projected_bytes
+from sobolev_batch.spectral.quadrature import gauss_rule
+from sobolev_batch.spectral.transform import TransformSettings, fastest_spec, projected_bytes
 from sobolev_batch.surfaces.sources.registry import ExpectedSize
 from tests.support.commands import call, write_toml
 from tests.support.members import loaded

@@ -12,7 +12,7 @@ from sobolev_batch.spectral import fields
 from sobolev_batch.spectral.backends import NufftSpec
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.metrics import causes
-from sobolev_batch.spectral.transform.nufft import evaluate_at
+from sobolev_batch.spectral.nufft import evaluate_at
 from tests.support.oracles import full_lattice_norm, on_whole_cube
 from tests.support.shapes import CENTRED_BOX as BOX
 

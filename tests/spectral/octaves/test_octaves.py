@@ -23,7 +23,7 @@ from sobolev_batch.spectral.octaves.values import (
     squared_moduli,
     statistical_errors,
 )
-from sobolev_batch.spectral.transform.transform import ErrorTarget
+from sobolev_batch.spectral.transform import ErrorTarget
 from sobolev_batch.surfaces.shapes.surface import Surface
 from tests.support.oracles import torus_value
 from tests.support.rectangles import Rectangles

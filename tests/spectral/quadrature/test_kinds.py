@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from sobolev_batch import InputError, Lattice, Mesh, Torus, fourier_transform, icosphere
+from sobolev_batch.spectral import kinds, quadrature
 from sobolev_batch.spectral.backends import CPU
 from sobolev_batch.spectral.exact import exact_transform
 from sobolev_batch.spectral.fields import compute_field
-from sobolev_batch.spectral.quadrature import kinds, meshes
-from sobolev_batch.spectral.quadrature.kinds import kind_of
-from sobolev_batch.spectral.quadrature.meshes import (
+from sobolev_batch.spectral.kinds import kind_of
+from sobolev_batch.spectral.quadrature import (
     HIGHEST_DEGREE,
     RuleUse,
     TriangleRule,
@@ -29,7 +29,7 @@ from sobolev_batch.spectral.quadrature.meshes import (
     rule_ranges,
     symmetric_rule,
 )
-from sobolev_batch.spectral.transform.transform import Execution, TransformSettings
+from sobolev_batch.spectral.transform import Execution, TransformSettings
 from sobolev_batch.surfaces.shapes.surface import Surface
 from tests.support.shapes import CENTRED_BOX as BOX
 
@@ -177,7 +177,7 @@ ODD = Mesh(
 def test_each_place_gets_the_weights_of_all_its_triangles(
     rule: TriangleRule, mesh: Mesh, bits: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(meshes, "_BITS", bits)  # few bits: vertices are numbered anew
+    monkeypatch.setattr(quadrature, "_BITS", bits)  # few bits: vertices are numbered anew
     use = RuleUse(rule, 0, np.arange(len(mesh.triangles), dtype=np.uint32))
     points = use.points((mesh.vertices, mesh.triangles, mesh.areas), CPU)
     # Each triangle on its own.

@@ -10,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 import sobolev_batch as sb
+from sobolev_batch.spectral import kinds
 from sobolev_batch.spectral.backends import CPU
-from sobolev_batch.spectral.quadrature import kinds
-from sobolev_batch.spectral.quadrature.kinds import direct_transform, exact_values, resolution_of
-from sobolev_batch.spectral.transform.transform import Execution, TransformSettings, transform_block
+from sobolev_batch.spectral.kinds import direct_transform, exact_values, resolution_of
+from sobolev_batch.spectral.transform import Execution, TransformSettings, transform_block
 from sobolev_batch.surfaces.shapes.smooth import Smooth
 from tests.support.fake_device import Device
 from tests.support.oracles import spheroid_value, torus_value

@@ -18,7 +18,7 @@ from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.exact import exact_transform
 from sobolev_batch.spectral.fields import field_for
 from sobolev_batch.spectral.lattice import Block, SobolevWeights
-from sobolev_batch.spectral.transform.transform import (
+from sobolev_batch.spectral.transform import (
     ErrorTarget,
     Execution,
     TransformSettings,
@@ -121,8 +121,8 @@ def test_takes_no_more_memory_than_it_says(intervals: int, memory: float | None)
     code = f"""
 import resource, sys
 import sobolev_batch as sb
-from sobolev_batch.spectral.transform.transform import Execution, TransformSettings
-from sobolev_batch.spectral.transform.transform import projected_bytes, transform_block
+from sobolev_batch.spectral.transform import Execution, TransformSettings
+from sobolev_batch.spectral.transform import projected_bytes, transform_block
 
 mesh, lattice, settings = sb.icosphere(5), sb.Lattice(5.0, {intervals}), TransformSettings()
 mesh.areas, mesh.centroid_radii, mesh.extent

@@ -21,13 +21,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.backends import CPU, Backend, cosine_and_sine
 from sobolev_batch.spectral.exact import exact_transform, sampled_transform, sphere_block, sphere_transform
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice
-from sobolev_batch.spectral.quadrature.meshes import (
-    RuleUse,
-    WeightedPoints,
-    assign_rules,
-    loosest_tolerance,
-    weight_masses,
-)
+from sobolev_batch.spectral.quadrature import RuleUse, WeightedPoints, assign_rules, loosest_tolerance, weight_masses
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.smooth import MOST_GAUSS_NODES, MOST_NODES, Counts, Smooth, doubled

@@ -18,7 +18,7 @@ from sobolev_batch.spectral.backends import (
     cosine_and_sine,
 )
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice, Lattice
-from sobolev_batch.spectral.quadrature.meshes import WeightedPoints
+from sobolev_batch.spectral.quadrature import WeightedPoints
 from sobolev_batch.surfaces.shapes.surface import Reals
 
 

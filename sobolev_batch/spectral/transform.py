@@ -33,10 +33,10 @@ from sobolev_batch.spectral.backends import (
     Shape,
     Workload,
 )
+from sobolev_batch.spectral.kinds import SurfaceKind, kind_of
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice, Lattice
-from sobolev_batch.spectral.quadrature.kinds import SurfaceKind, kind_of
-from sobolev_batch.spectral.quadrature.meshes import fixed_rule, weight_masses
-from sobolev_batch.spectral.transform.nufft import transform_points
+from sobolev_batch.spectral.nufft import transform_points
+from sobolev_batch.spectral.quadrature import fixed_rule, weight_masses
 from sobolev_batch.surfaces.shapes.subdivision import icosphere
 from sobolev_batch.surfaces.shapes.surface import Reals, Similarity, Surface
 

@@ -143,7 +143,7 @@ def measured_errors() -> dict[str, Reals]:
     """Return what was measured of each candidate: "largest" (52, 160), "even" and "odd" (52, 64), float64.
 
     They depend on the rules alone, and measuring takes a second of each process, so the package carries them.
-    `python -m sobolev_batch.spectral.quadrature.meshes` writes them anew.
+    `python -m sobolev_batch.spectral.quadrature` writes them anew.
     """
     with np.load(_MEASURED, allow_pickle=False) as stored:  # noqa: TID251
         return {name: stored[name] for name in stored.files}
