@@ -68,10 +68,6 @@ class Measure:
         )
         return cls(np.asarray(lattice), tuple(map(np.asarray, octaves)))
 
-    def __add__(self, other: Measure) -> Measure:
-        octaves = (a + b for a, b in zip(self.octaves, other.octaves, strict=True))
-        return Measure(self.lattice + other.lattice, tuple(octaves))
-
 
 @dataclass(frozen=True, eq=False)
 class Frequencies:
@@ -215,8 +211,9 @@ class Reference:
         """Return the norm of b, and the product <a - b, b>."""
         at, values = self.frequencies, self.values
         difference, own = Measure.from_values(self.difference, self.signs), Measure.from_values([values], [1])
+        other = Measure.from_values([*self.difference, values], [*self.signs, 1])
         # Of a, b and their difference.
-        parts = (difference + own, self.pair[:1], [1]), (own, self.pair[1:], [1]), (difference, self.pair, [1, -1])
+        parts = (other, self.pair[:1], [1]), (own, self.pair[1:], [1]), (difference, self.pair, [1, -1])
         norms = at.norms_of(*parts[1], at.errors([values]))
         distances = at.norms_of(*parts[2], at.errors(self.difference))
         products = at.lattice_sums(difference, own)
