@@ -244,6 +244,8 @@ def carry_out(
     with Heartbeat(workspace.store, lock) as heartbeat:
         workspace.withdraw_lost_fields()
         if not workspace.pending and are_tabulated(workspace) and have_proximities(workspace):
+            # The last run may have been killed before it did.
+            workspace.store.collect_records(workspace.records)
             return _summary(workspace, set())
         client = start()
         with Watch(client, study.backend == "gpu").kept() as watch:
@@ -284,6 +286,7 @@ def _compute(cluster: Cluster, heartbeat: Heartbeat, workspace: Workspace) -> Su
         workspace.withdraw_lost_fields()
         rows = workspace.pending
     measure_proximities(cluster, workspace)
+    workspace.store.collect_records(workspace.records)
     return _summary(workspace, computed)
 
 

@@ -29,8 +29,9 @@ def differences(ours: xr.DataTree, theirs: xr.DataTree) -> Iterator[str]:
     if fields["mesh"].values.tolist() != labels or set(ours.children) != set(theirs.children):
         yield "the meshes or the tables are not the same"
         return
-    for row, (label, record) in enumerate(zip(labels, variable(ours, "records", "record").values, strict=True)):
-        if not record:
+    own, collected = (variable(ours, "records", name).values for name in ("record", "page"))
+    for row, label in enumerate(labels):
+        if not (own[row] or collected[row]):
             yield f"{label}: missing"
         # A field that is missing is NaN, which equals nothing.
         elif not np.array_equal(fields[row].values, right[row].values):

@@ -14,10 +14,11 @@ import inspect
 import os
 import re
 import stat
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
+from glob import escape
 from pathlib import Path
 from typing import Any, Self, cast
 
@@ -149,10 +150,10 @@ class Location:
         """Return whether the location is a local folder that exists."""
         return not self.scheme and Path(self.name).is_dir()
 
-    def discard(self, key: str) -> None:
-        """Remove a key if it exists."""
+    def discard(self, *keys: str) -> None:
+        """Remove keys, those of them that exist."""
         with self.access("written"), suppress(NotADirectoryError):
-            sync(self.zarr_store().delete(key))
+            sync(self.zarr_store().delete_keys(keys))
 
     def remove(self, prefix: str) -> None:
         """Remove all keys below a prefix."""
@@ -302,6 +303,11 @@ class FolderStore(LocalStore):
             path_in(self.root, key)
         return await super().get_partial_values(prototype, ranges)
 
+    async def delete_keys(self, keys: Sequence[str]) -> None:
+        """Remove the files of keys that exist."""
+        for key in keys:
+            await self.delete(key)
+
     async def names(self) -> frozenset[str]:
         """Return the names of files and folders."""
         return frozenset([name async for name in self.list_dir("")])
@@ -372,6 +378,17 @@ class RemoteStore(FsspecStore):
         with _absence_ignored():
             async with _in_time():
                 await self.fs._rm_file(f"{self.path}/{key}")
+
+    async def delete_keys(self, keys: Sequence[str]) -> None:
+        """Remove keys that exist, several by one request."""
+        if len(keys) == 1:
+            await self.delete(keys[0])
+            return
+        # Drivers take a path for a pattern.
+        paths = [escape(f"{self.path}/{key}") for key in keys]
+        with _absence_ignored():
+            async with _in_time():
+                await self.fs._rm(paths)
 
     async def delete_dir(self, prefix: str) -> None:
         """Remove all keys below a prefix."""

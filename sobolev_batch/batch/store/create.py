@@ -23,6 +23,7 @@ from sobolev_batch.batch.store.store import (
     FIELD,
     OCTAVES,
     OCTAVES_GROUP,
+    PAGE,
     QUALITY,
     RECORD,
     REMOVED,
@@ -44,6 +45,8 @@ _log = logging.getLogger(__name__)
 
 # Of a chunk of spectra: its rows are one task, and small ones would be many keys.
 _SPECTRA_BYTES, _MOST_SPECTRA = 2 << 20, 512
+# Records that lie together once a run has ended.
+ROWS_PER_PAGE = 100
 _RECORDED_VERSIONS = ("sobolev-batch", "finufft", "modepy", "numpy", "scipy", "xarray", "zarr")
 
 
@@ -93,7 +96,9 @@ def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
             _create(store, plan)
         _require_same_samples(store, plan, is_trusted=True)
         stored = store.labels()
-        labels = _labels_for(plan, stored, store.records(), is_trusted=True)
+        # Only a row whose mesh the study has lost may serve another one.
+        is_kept = set(stored) <= {row.label for row in plan.rows}
+        labels = _labels_for(plan, stored, [None] * len(stored) if is_kept else store.records(), is_trusted=True)
         if labels != list(stored):
             _lay_out(store, plan, labels, store.read_strings(QUALITY))
         if attributes.get("similarity") != _similarity_entry(plan.similarity):
@@ -117,11 +122,10 @@ def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:
     stored: tuple[str, ...] = ()
     with suppress(StoreError, ValueError, TypeError, KeyError):
         stored = store.labels()
-    prefix = f"{RECORD}/c/"
-    numbers = [key.removeprefix(prefix) for key in store.location.sizes(prefix.rstrip("/"))]
-    count = 1 + max((int(number) for number in numbers if number.isdigit()), default=-1)
+    last, last_page = (max(store.stored_chunks(name), default=-1) for name in (RECORD, PAGE))
+    count = max(1 + last, ROWS_PER_PAGE * (1 + last_page))
     fresh = Store(store.location)
-    fresh.documents = _documents_of(array_keys(RECORD, str, (count,), (1,), ("mesh",)))
+    fresh.documents = _documents_of(_record_keys(count))
     records, damaged = fresh.examine_records()
     keys = {row.key for row in plan.rows}
     if damage is not None and not any(record is not None and record.key in keys for record in records):
@@ -182,7 +186,7 @@ def _lay_out(store: Store, plan: Plan, labels: Sequence[str], qualities: Sequenc
             "fourier",
             xr.Dataset({"quality": ("mesh", padded)}, coords={**axes, "mesh": mesh, **_weight_columns(plan)}),
         ),
-        **array_keys(RECORD, str, (rows,), (1,), ("mesh",)),
+        **_record_keys(rows),
     }
     if plan.tail is not None:
         keys |= array_keys(
@@ -218,6 +222,14 @@ def _spectra_keys(plan: Plan, mesh: NDArray[Any]) -> dict[str, bytes]:
             f"{SPECTRA_GROUP}/{name}", "float64", (rows, width), (step, width), ("mesh", dimension), long_name=meaning
         )
     return keys
+
+
+def _record_keys(rows: int) -> dict[str, bytes]:
+    """Return the keys of the arrays of records: a chunk for each row, which tasks write, and pages of many rows."""
+    return {
+        **array_keys(RECORD, str, (rows,), (1,), ("mesh",)),
+        **array_keys(PAGE, str, (rows,), (ROWS_PER_PAGE,), ("mesh",)),
+    }
 
 
 def _weight_columns(plan: Plan) -> dict[str, tuple[str, NDArray[np.float64], dict[str, str]]]:

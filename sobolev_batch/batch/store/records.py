@@ -17,6 +17,8 @@ Status = Literal["complete", "failed"]
 RunState = Literal["submitted", "running", "done", "failed"]
 
 _ROW = "row"
+# In JSON, in place of a record that a page holds and that counts no more.
+WITHDRAWN = "null"
 
 
 Kind = TypeVar("Kind")
@@ -138,12 +140,12 @@ class Record:
 
     @classmethod
     def from_json(cls, text: str, row: int) -> Self | None:
-        """Return the record of a row that a line holds, or None if the line is empty.
+        """Return the record of a row that a line holds, or None if the line is empty or says that there is none.
 
         Raises:
             DamageError: The line is not a record, or that of another row.
         """
-        if not text:
+        if text in ("", WITHDRAWN):
             return None
         name = "a completion record"
         try:

@@ -31,7 +31,7 @@ from zarr.storage import StorePath
 from sobolev_batch.batch.storage.checked import CHANGED, CheckedStore, checksum_of, largest_chunk_bytes
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.metadata import MOST_BYTES, SCHEMA_VERSION, Document, check_documents
-from sobolev_batch.batch.store.records import Record, RunRecord, record_from_table
+from sobolev_batch.batch.store.records import WITHDRAWN, Record, RunRecord, record_from_table
 from sobolev_batch.batch.study.lattice_choice import LatticeChoice
 from sobolev_batch.errors import DamageError, StoreError
 from sobolev_batch.spectral.lattice import AXES, Block, Lattice
@@ -49,6 +49,7 @@ OCTAVES_GROUP = "octaves"
 OCTAVES = "octaves/octaves"
 RECORDS = "records"
 RECORD = "records/record"
+PAGE = "records/page"
 # Radial spectra, see `sobolev_batch.spectral.spectra`: of norms, of distances from the reference, and of products.
 SPECTRA_GROUP = "spectra"
 SPECTRUM_KEY = "spectra/key"
@@ -57,9 +58,9 @@ SPECTRUM_KEY = "spectra/key"
 DIGEST, UNFINISHED, COLLECTION, REMOVED = "digest", "unfinished", "collection", "removed"
 _RUN = "run"
 # Written by tasks, and by themselves: the digest leaves them out. Qualities are a copy of what records have.
-_BESIDE_DIGEST = (FIELD, OCTAVES, RECORD, QUALITY)
+_BESIDE_DIGEST = (FIELD, OCTAVES, RECORD, PAGE, QUALITY)
 # What tasks need of the metadata: tables have fifty times as much.
-_OF_TASKS = (FIELD, OCTAVES, RECORD)
+_OF_TASKS = (FIELD, OCTAVES, RECORD, PAGE)
 _REQUESTS_AT_ONCE = 64
 
 
@@ -265,6 +266,12 @@ class Store:
         counts = [-(-length // step) for length, step in zip(document["shape"], steps, strict=True)]
         return {"/".join([f"{name}/c", *map(str, index)]): index for index in np.ndindex(*counts)}
 
+    def stored_chunks(self, name: str) -> list[int]:
+        """Return the numbers of the stored chunks of an array along its only axis. Its metadata need not be there."""
+        prefix = f"{name}/c/"
+        numbers = (key.removeprefix(prefix) for key in self.location.sizes(prefix.rstrip("/")))
+        return sorted(int(number) for number in numbers if number.isdigit())
+
     def incomplete_chunks(self, name: str, sizes: Mapping[str, int]) -> list[tuple[int, ...]]:
         """Return the indices of an array's chunks that are missing, or of a wrong length by the sizes of its keys."""
         document = self.document(name)
@@ -294,18 +301,31 @@ class Store:
 
     def examine_records(self) -> tuple[list[Record | None], dict[int, str]]:
         """Return the completion record of each row, None if it has none that can be read, and the damage of those."""
-        count, damage = self.document(RECORD)["shape"][0], {}
-        lines: Sequence[str | None] = [None] * count
-        # If any is damaged, each is read by itself to see which.
-        with suppress(DamageError):
-            lines = self.read_strings(RECORD)
-        records: list[Record | None] = [None] * count
-        for row, line in enumerate(lines):
+        records: list[Record | None] = [None] * self.document(RECORD)["shape"][0]
+        step, paged = self._pages()
+        own = [row for row in self.stored_chunks(RECORD) if row < len(records)]
+        lines, damage = self._read_lines(PAGE, range(paged), step) | self._read_lines(RECORD, own, 1), {}
+        for row, line in lines.items():
             try:
-                records[row] = Record.from_json(str(self.read(RECORD, row)) if line is None else line, row)
+                if isinstance(line, DamageError):
+                    raise line
+                records[row] = Record.from_json(line, row)
             except DamageError as error:
                 damage[row] = error.what
         return records, damage
+
+    def _read_lines(self, name: str, rows: Sequence[int], step: int) -> dict[int, str | DamageError]:
+        """Return the texts of rows, which begin with a chunk of this length, or the damage of their chunk."""
+        if not rows:
+            return {}
+        try:
+            return dict(zip(rows, map(str, self.read(name, list(rows)).tolist()), strict=True))
+        except DamageError as error:
+            if len(rows) <= step:
+                return dict.fromkeys(rows, error)
+        # Each chunk is read by itself to see which.
+        parts = (rows[start : start + step] for start in range(0, len(rows), step))
+        return {row: line for part in parts for row, line in self._read_lines(name, part, step).items()}
 
     def records(self) -> tuple[Record | None, ...]:
         """Return the completion record of each row, or None if it has none that can be read."""
@@ -319,12 +339,36 @@ class Store:
     def read_record(self, row: int) -> Record | None:
         """Return the completion record of one row, or None if it has none that can be read."""
         with suppress(DamageError):
-            return Record.from_json(str(self.read(RECORD, row)), row)
+            line = str(self.read(RECORD, row))
+            return Record.from_json(str(self.read(PAGE, row)) if not line and row < self._pages()[1] else line, row)
         return None
 
     def write_record(self, row: int, record: Record | None) -> None:
-        """Write the completion record of a row, or erase it: one chunk, replaced as a whole."""
-        self.write(RECORD, row, "" if record is None else record.to_json(row))
+        """Write the completion record of a row, or withdraw it: one chunk, replaced as a whole."""
+        self.write(RECORD, row, WITHDRAWN if record is None else record.to_json(row))
+
+    def collect_records(self, records: Sequence[Record | None]) -> None:
+        """Collect the records of all rows in pages, each of rows that all have one, and remove their own chunks.
+
+        If the process ends in between, a page and the chunks beside it say the same.
+        """
+        step, paged = self._pages()
+        pages: dict[int, list[int]] = {}
+        for row in self.stored_chunks(RECORD) if paged else ():
+            pages.setdefault(row // step, []).append(row)
+        most_bytes = largest_chunk_bytes(self.document(PAGE))
+        for page, own in pages.items():
+            start = page * step
+            lines = [record.to_json(start + i) for i, record in enumerate(records[start : start + step]) if record]
+            if len(lines) == step and sum(map(len, lines)) < most_bytes // 2:
+                self.write(PAGE, slice(start, start + step), np.array(lines, dtype=object))
+                self.location.discard(*(f"{RECORD}/c/{row}" for row in own))
+
+    def _pages(self) -> tuple[int, int]:
+        """Return the number of rows of a page, and that of all rows that full pages may hold."""
+        document = self.document(PAGE)
+        count, step = document["shape"][0], document["chunk_grid"]["configuration"]["chunk_shape"][0]
+        return step, count - count % step
 
     def read_run(self) -> RunRecord | None:
         """Return the record of the latest run, or None before the first one."""

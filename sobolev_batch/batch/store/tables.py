@@ -21,6 +21,7 @@ from sobolev_batch.batch.store.store import (
     FIELD,
     OCTAVES,
     OCTAVES_GROUP,
+    PAGE,
     QUALITY,
     RECORD,
     RECORDS,
@@ -124,7 +125,7 @@ def lost_tables(store: Store) -> list[str]:
 def damaged_tables(store: Store) -> dict[str, str]:
     """Return the damage of each small array, of tables and coordinates, that cannot be read."""
     written_with_tables = [QUALITY, *store.spectra]
-    others = {FIELD, OCTAVES, RECORD, *written_with_tables}
+    others = {FIELD, OCTAVES, RECORD, PAGE, *written_with_tables}
     names = [name for name in filter(store.is_array, store.documents) if name not in others]
     expected = [*names, *written_with_tables] if table_names(store) else names
     damage = dict.fromkeys(_incomplete(store, expected), "it is not there, or not all of it")

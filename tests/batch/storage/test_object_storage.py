@@ -26,6 +26,7 @@ from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.storage import location as locations
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import LOCK_KEY
+from sobolev_batch.batch.store import create
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
@@ -107,6 +108,29 @@ def test_requests_grow_by_eight_for_a_mesh(server: Server, threads: Client, url:
     assert counts[1] - counts[0] <= 8 * 10 + 4
     # Coordinates of tables are 48 of them.
     assert counts[0] < 315
+
+
+def test_requests_for_records_grow_with_their_pages(server: Server, url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(create, "ROWS_PER_PAGE", 10)
+    family = [{"name": f"f{i}", "source": "sphere", "radius": 0.5 + 0.01 * i} for i in range(40)]
+    store = prepare_store(url, make_plan(Study.from_table(small_table(family=family))))
+    for row in range(41):
+        store.write_record(row, Record(str(row), "complete"))
+    records = store.records()
+
+    def requests_of(call: Callable[[], object]) -> int:
+        before = len(server.requests())
+        call()
+        return len(server.requests()) - before
+
+    # The chunks are listed; each page is written, and the chunks of its rows are removed at once.
+    assert requests_of(lambda: store.collect_records(records)) == 1 + 2 * 4
+    assert [key for key in server.keys(key_of(url)) if "/record/c/" in key] == [f"{key_of(url)}/records/record/c/40"]
+    # The record of the reference stays alone.
+    assert requests_of(store.records) == 1 + 4 + 1
+    assert store.records() == records
+    assert requests_of(lambda: store.read_record(7)) == 2
+    assert requests_of(lambda: store.collect_records(records)) == 1
 
 
 def test_another_lattice_leaves_nothing_of_the_first(server: Server, url: str) -> None:
