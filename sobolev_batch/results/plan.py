@@ -31,6 +31,7 @@ from sobolev_batch.parameters import available_cores, format_bytes
 from sobolev_batch.results.tables.league import gap_of
 from sobolev_batch.results.tables.statistics import Curve, common_sizes, least_objects
 from sobolev_batch.results.tables.text import duration
+from sobolev_batch.spectral.fields import Quality
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.values import SurfaceSize
 from sobolev_batch.spectral.transform import field_seconds, slowness
@@ -64,10 +65,10 @@ def forecast(
         Seconds from the start to the end, if the workers have their cores for themselves; seconds of a processor, of
         all tasks and processes; and lines that show both.
     """
-    predicted = {row.label: _row_seconds(plan, row) for row in plan.rows}
     missing = [row.label for row in plan.rows if row.label not in stored]
     if not missing:
         return 0.0, 0.0, ["nothing is missing"]
+    predicted = {row.label: _row_seconds(plan, row) for row in plan.rows}
     if len(stored) >= _FEWEST_RECORDS:
         spent = sum(record.seconds for record in stored.values())
         factor = spent / sum(predicted[label] for label in stored)
@@ -448,7 +449,7 @@ def _plan(study: Study, location: Location, client: Client | None) -> StudyPlan:
         if row.label in records and records[row.label].completes(row.key)
     }
     seconds, processor_seconds, (first, *others) = forecast(study_plan, stored, workers, client, planning_seconds)
-    doubtful, count = _doubts_of(study_plan), len(study_plan.rows)
+    doubtful, count = _doubts_of(study_plan, stored), len(study_plan.rows)
     total_bytes = format_bytes(study_plan.field_bytes * count)
     lines = [
         *_study_lines(study_plan),
@@ -479,9 +480,12 @@ def _plan(study: Study, location: Location, client: Client | None) -> StudyPlan:
     )
 
 
-def _doubts_of(study_plan: Plan) -> dict[str, str]:
-    members = {row.label: (row.family, row.member) for row in study_plan.rows if row.label != study_plan.reference}
+def _doubts_of(study_plan: Plan, stored: Mapping[str, Record]) -> dict[str, str]:
+    rows = [row for row in study_plan.rows if row.label != study_plan.reference]
+    members = {row.label: (row.family, row.member) for row in rows if row.label not in stored}
     extents, set_aside = look_at_extents(members, study_plan.similarity, study_plan.reference_extent)
+    # What is stored need not be read again.
+    extents |= {row.label: Quality.from_json(stored[row.label].quality).extent for row in rows if row.label in stored}
     doubts = {label: placement_doubt(extent, study_plan.reference_extent) for label, extent in extents.items()}
     return set_aside | {label: doubt for label, doubt in doubts.items() if doubt is not None}
 
