@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import math
 import os
+import time
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -41,6 +42,10 @@ _LONGEST_TEXT = 1000
 _LARGEST_FILE_BYTES = 64 << 20
 # By how much the length of a file may mislead about its triangles: it may have normals, colours or few digits.
 _LENGTH_FACTOR = 4.0
+# Digests of the last files that were read, by what the file system says of each; a file that was changed within this
+# time may be changed again without a trace there.
+_digests: dict[tuple[str | int, ...], str] = {}
+_SETTLED_NS, _MOST_DIGESTS = 2 * 10**9, 64
 # What a list says of a mesh: its path, and perhaps a name, a time and metadata.
 MeshTable = dict[str, Any]
 # Columns of names, which may look like numbers.
@@ -326,12 +331,26 @@ def names_of_files(paths: list[Path]) -> list[str]:
 
 
 def file_digest(path: Path) -> str:
-    """Return the SHA-256 of a file's bytes, in hexadecimal; MeshError where it cannot be read."""
+    """Return the SHA-256 of a file's bytes, in hexadecimal. A file that has not changed is not read again.
+
+    Raises:
+        MeshError: The file cannot be read.
+    """
     try:
         with open_regular(path) as file:
             checked_length(file)
-            return hashlib.file_digest(file, "sha256").hexdigest()
+            now, status = time.time_ns(), os.fstat(file.fileno())
+            times = status.st_mtime_ns, status.st_ctime_ns
+            state = (str(path), status.st_dev, status.st_ino, status.st_size, *times)
+            if state in _digests:
+                return _digests[state]
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
     except MeshError as error:
         raise MeshError(f"{path}: {error}") from error
     except (OSError, ValueError) as error:
         raise MeshError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    if max(times) + _SETTLED_NS < now:
+        if len(_digests) >= _MOST_DIGESTS:
+            _digests.clear()
+        _digests[state] = digest
+    return digest

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 from collections.abc import Sequence
@@ -12,6 +13,8 @@ import pytest
 from pydantic import ValidationError
 
 from sobolev_batch import MeshError, StudyError
+from sobolev_batch.surfaces.sources import files
+from sobolev_batch.surfaces.sources.files import file_digest
 from sobolev_batch.surfaces.sources.names import caseless_key
 from tests.support.members import listed, loaded, members
 from tests.support.mesh_files import OFF_BOX
@@ -248,3 +251,26 @@ def test_times_that_do_not_belong_to_files_are_refused(tmp_path: Path, glob: str
     put(tmp_path, "a1.off", "b1.off", "c.off")
     with pytest.raises((StudyError, ValidationError), match=message):
         members({"source": "files", "paths": [glob], "times": times}, tmp_path)
+
+
+@pytest.mark.parametrize(("settled_ns", "reads"), [(-(10**18), 1), (10**18, 3)])
+def test_a_file_is_hashed_again_where_it_may_have_changed(
+    settled_ns: int, reads: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hashed, path = [], tmp_path / "a.off"
+
+    def counted(*arguments: Any) -> Any:
+        hashed.append(arguments)
+        return hash_file(*arguments)
+
+    hash_file = hashlib.file_digest
+    monkeypatch.setattr(files, "_SETTLED_NS", settled_ns)
+    monkeypatch.setattr(hashlib, "file_digest", counted)
+    path.write_bytes(OFF_BOX)
+    assert len({file_digest(path) for _ in range(3)}) == 1
+    assert len(hashed) == reads
+    # Of the same length, an hour later.
+    first, other = file_digest(path), OFF_BOX.replace(b"1", b"2", 1)
+    path.write_bytes(other)
+    os.utime(path, (later := path.stat().st_mtime + 3600, later))
+    assert file_digest(path) == hashlib.sha256(other).hexdigest() != first
