@@ -201,7 +201,8 @@ class FileSource(Source):
         times = dict.fromkeys(paths) if self.times is None else _times(paths, self.times)
         names = dict(zip(paths, names_of_files(paths), strict=True))
         # Absolute, since a worker may have been started in another folder.
-        return tuple(FileMember(names[path], -1, path.absolute(), time=time) for path, time in times.items())
+        here = Path.cwd()
+        return tuple(FileMember(names[path], -1, here / path, time=time) for path, time in times.items())
 
 
 @dataclass(frozen=True)
