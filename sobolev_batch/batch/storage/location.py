@@ -313,12 +313,13 @@ class FolderStore(LocalStore):
         return frozenset([name async for name in self.list_dir("")])
 
     async def sizes(self, prefix: str) -> dict[str, int]:
-        """Return the sizes of all files below a prefix."""
+        """Return the sizes of all files below a prefix; links count as empty, and are refused once they are read."""
         sizes, root = {}, len(os.path.join(self.root, ""))
         for file in _files_below(path_in(self.root, prefix)):
             with suppress(FileNotFoundError):  # removed since
-                if file.is_file(follow_symlinks=False):
-                    sizes[file.path[root:].replace(os.sep, "/")] = file.stat(follow_symlinks=False).st_size
+                is_file = file.is_file(follow_symlinks=False)
+                size = file.stat(follow_symlinks=False).st_size if is_file else 0
+                sizes[file.path[root:].replace(os.sep, "/")] = size
         return sizes
 
 
