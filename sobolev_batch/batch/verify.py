@@ -8,13 +8,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sobolev_batch.batch.analysis.spectra import damaged_chunks, withdraw_chunk
 from sobolev_batch.batch.cluster.execution import Cluster, Task
 from sobolev_batch.batch.collection_store import CollectionStore, labelled
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, acquire, release
+from sobolev_batch.batch.store.keyed import damaged_chunks, withdraw_chunk
 from sobolev_batch.batch.store.records import Record
-from sobolev_batch.batch.store.store import LABELS, QUALITY, RECORDS, ROOT, SPECTRA_GROUP, Store
+from sobolev_batch.batch.store.store import LABELS, QUALITY, RECORDS, ROOT, Store
 from sobolev_batch.batch.store.tables import damaged_tables, rows_unlike_tables, table_attributes
 from sobolev_batch.batch.workspace import Workspace, complete_records
 from sobolev_batch.errors import DamageError, LockError, StoreError
@@ -144,7 +144,7 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: 
     records, unread = store.examine_records()
     complete = complete_records(records)
     damaged = {row: f"its completion record is damaged ({what})" for row, what in unread.items()}
-    tables, spectra = damaged_tables(store), dict[tuple[int, int], str]()
+    tables, chunks = damaged_tables(store), list[tuple[str, tuple[int, ...], str]]()
     if not tables and not store.has_digest():
         tables[ROOT] = "tables, coordinates or metadata are not what was written together"
     try:
@@ -156,8 +156,8 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: 
             damaged = rows_unlike_tables(store, records) | damaged
         if QUALITY not in tables and _have_other_qualities(records, store.read_strings(QUALITY)):
             tables[QUALITY] = "it is not what records have"
-        if not tables.keys() & store.spectra:
-            spectra = damaged_chunks(store)
+        if tables.keys().isdisjoint(store.keyed_arrays()):
+            chunks = list(damaged_chunks(store))
     whole = store.rows_with_complete_fields() if complete else set()
 
     def damage_of(row: int) -> str:
@@ -169,15 +169,15 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: 
                 damaged[row] = damage
             if on_progress is not None:
                 on_progress(done, len(complete))
-    if lock is not None and (damaged or spectra):
+    if lock is not None and (damaged or chunks):
         # Whoever has released the store may have changed it since.
         lock.require(store.location)
         for row in damaged:
             store.write_record(row, None)
-        for chunk in spectra:
-            withdraw_chunk(store, *chunk)
-    for (first, last), what in spectra.items():
-        tables[f"{SPECTRA_GROUP} of rows {first} to {last}"] = what
+        for keys, index, _ in chunks:
+            withdraw_chunk(store, keys, index)
+    for keys, index, what in chunks:
+        tables[f"chunk {'/'.join(map(str, index))} of {keys.split('/')[0]}"] = what
     labels = store.labels() if LABELS not in tables else tuple(f"row {row}" for row in range(len(records)))
     return Verification(
         store.path,

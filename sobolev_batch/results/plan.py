@@ -14,7 +14,7 @@ from typing import overload
 import numpy as np
 from distributed import Client
 
-from sobolev_batch.batch.analysis.tabulate import pairs_bytes
+from sobolev_batch.batch.analysis.pairs import PAIR_BYTES, tile_count
 from sobolev_batch.batch.cluster.workers import Workers, prepare_workers, worker_slowness
 from sobolev_batch.batch.collection_store import for_each_object
 from sobolev_batch.batch.fields.compute import Sizes, size_rows
@@ -45,8 +45,6 @@ _ROW_SECONDS, _TRIANGLE_SECONDS = 0.1, 5e-6
 _PROCESS_SECONDS, _CLUSTER_SECONDS = 4.0, 6.0
 # Stored fields tell the speed if there are as many.
 _FEWEST_RECORDS = 3
-# Of the distance of a pair at one order: the number, its error and four parts, as stored.
-_PAIR_BYTES = 6 * 8
 
 
 def forecast(
@@ -229,8 +227,8 @@ def _task_lines(
         largest, (*_, task_bytes) = max(sizes.items(), key=lambda item: item[1][-1])
         yield "memory", f"up to {format_bytes(task_bytes)} in a task, of {largest}"
     if plan.study.pairs == "all":
-        driver_bytes = pairs_bytes(len(plan.rows), len(plan.study.orders))
-        yield "", f"{format_bytes(driver_bytes)} in the driver, for distances of all pairs"
+        needed = PAIR_BYTES * len(plan.study.orders) * len(plan.rows) ** 2
+        yield "all pairs", f"{tile_count(len(plan.rows))} tiles, {format_bytes(needed)} on disk"
     yield from reasons("refused", refused)
     yield from reasons("doubtful", doubtful)
 
@@ -369,7 +367,7 @@ def warnings_of(study: Study | StudyCollection, store: Location) -> tuple[str, .
         useful = [name for name in members if name not in gaps and name not in collection.lacking]
         warnings += _test_warnings(collection, len(useful))
     matrix_bytes = {
-        name: _PAIR_BYTES * len(studies[name].orders) * len(listed) ** 2
+        name: PAIR_BYTES * len(studies[name].orders) * len(listed) ** 2
         for name, listed in members.items()
         if studies[name].pairs == "all"
     }

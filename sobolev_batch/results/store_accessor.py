@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import xarray as xr
 
+from sobolev_batch.batch.analysis.pairs import pair_distances
 from sobolev_batch.batch.analysis.reducer import Reducer
 from sobolev_batch.batch.analysis.spectra import spectrum_keys, stale_chunks
 from sobolev_batch.batch.analysis.tabulate import Results
@@ -219,21 +220,42 @@ def convergence_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
     chosen, others = _divided(stored, order)
     if not others:
         return stored.sel(order=chosen)
-    results = _computed(tree, _spectra_reducer(tree, others), every_pair=False)
+    results = _computed(tree, _spectra_reducer(tree, others))
     accuracy = Accuracy(stored.attrs["rtol"]) if "rtol" in stored.attrs else None
     return _joined(stored, results.convergence_table(accuracy), chosen)
 
 
 def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
-    """Return the distances of a store's meshes at some orders, lazily if it has them all; see `convergence_at`."""
-    stored = finished_group(tree, "distances", load=False)
+    """Return the distances of a store's meshes at some orders, lazily if it has them all; see `convergence_at`.
+
+    The meshes are in the order of the other tables.
+    """
+    meshes = finished_group(tree, "meshes", load=False)
+    labels, stored = meshes["mesh"].values, finished_group(tree, "distances", load=False)
+    has_every_pair = stored.sizes["other"] == stored.sizes["mesh"]
+    stored = stored.drop_vars("key", errors="ignore").sel(mesh=labels)
+    if has_every_pair:
+        stored = stored.sel(other=labels)
     chosen, others = _divided(stored, order)
     if not others:
         return stored.sel(order=chosen)
-    every_pair = stored.sizes["other"] == stored.sizes["mesh"]
-    reducer = stored_reducer(tree, others)[0] if every_pair else _spectra_reducer(tree, others)
-    results = _computed(tree, reducer, every_pair=every_pair)
-    return _joined(stored, results.distances_table(), chosen)
+    if not has_every_pair:
+        return _joined(stored, _computed(tree, _spectra_reducer(tree, others)).distances_table(), chosen)
+    reducer, _ = stored_reducer(tree, others)
+    rows: list[int] = meshes["row"].values.tolist()
+    complete = [row for row in reducer.complete if row in rows]
+    places = np.ix_(*[[rows.index(row) for row in complete]] * 2)
+    found = pair_distances(reducer, complete, complete).named("distance")
+    columns = {name: np.full((len(rows), len(rows), len(others)), np.nan) for name in found}
+    for name, values in found.items():
+        columns[name][places] = np.moveaxis(values, 0, -1)
+    dimensions = ("mesh", "other", "order")
+    computed = xr.Dataset(
+        {name: (dimensions, values, stored[name].attrs) for name, values in columns.items()},
+        coords={**stored.drop_vars("order").coords, "order": ("order", list(others))},
+    )
+    require_unchanged(tree)
+    return _joined(stored, computed, chosen)
 
 
 def reference_norm_at(tree: xr.DataTree, order: float) -> xr.Dataset:
@@ -257,9 +279,9 @@ def order_note(tree: xr.DataTree, orders: Sequence[float]) -> list[str]:
     ]
 
 
-def _computed(tree: xr.DataTree, reducer: Reducer, *, every_pair: bool) -> Results:
-    """Return the norms and distances of an open store at other orders than its own."""
-    results = Results.computed(reducer, finished_group(tree, "meshes"), reference_of(tree), every_pair)
+def _computed(tree: xr.DataTree, reducer: Reducer) -> Results:
+    """Return norms, and distances to the reference, of an open store at other orders than its own."""
+    results = Results.from_spectra(reducer, finished_group(tree, "meshes"), reference_of(tree))
     require_unchanged(tree)
     return results
 

@@ -94,7 +94,7 @@ def test_workers_of_a_cluster_are_tried(client: Client, plan: Plan) -> None:
     *_, first, second = str(found).splitlines()
     assert re.fullmatch(r"time: +about \d+(\.\d+)? s for 5 missing fields, with 2 tasks at once", first)
     assert second.endswith("the speed is that of a transform on a worker")
-    assert "4.0KB in the driver, for distances of all pairs" in str(found)
+    assert "1 tiles, 2.4KB on disk" in str(found)
 
 
 def made_of(**families: Mapping[str, Any] | list[int]) -> list[dict[str, Any]]:

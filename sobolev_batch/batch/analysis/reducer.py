@@ -41,8 +41,6 @@ _READ_AT_ONCE = 8
 _FEWEST_ROWS = 4
 # Factor of the errors of surfaces that are not equal.
 _APART = np.ones(())
-# The others of a tile for each of its rows: they only pass through, and its rows are read but once for them.
-_TILE_LENGTH = 4
 # Of two surfaces that were not compared, the energy's limit is at least this fraction of the last measured energy.
 _LEAST_LIMIT = 0.7
 # Rows of a tile whose values in octaves are held at a time take this many bytes.
@@ -150,22 +148,6 @@ class Reducer:
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name not in ("octave_weights", "axis")}
 
-    def tiles(self, rows: Sequence[int], workers: int) -> Iterator[tuple[Sequence[int], Sequence[int]]]:
-        """Yield rows and others of tiles that cover every pair once, fit into a task's memory and occupy the workers.
-
-        The others of a tile either begin with its rows or have none of them.
-        """
-        for batch in self.row_batches(rows, workers):
-            remaining = rows[rows.index(batch[0]) :]
-            for others in _slices(len(remaining), _TILE_LENGTH * len(batch)):
-                yield batch, remaining[others]
-
-    def row_batches(self, rows: Sequence[int], workers: int) -> list[Sequence[int]]:
-        """Return the rows in batches that fit into a task's memory beside others and occupy the workers."""
-        fitting = max(1, self._capacity - self._group - self._read_at_once)
-        per_worker = max(_GROUP, -(-len(rows) // (2 * max(workers, 1))))
-        return [rows[batch] for batch in _slices(len(rows), min(fitting, per_worker))]
-
     @property
     def task_bytes(self) -> float:
         """Memory that a task takes at most, as measured: the fields that it holds, and temporaries."""
@@ -241,11 +223,12 @@ class Reducer:
         octaves = self.axis.octave_integrals(spectra, self.orders)
         return Tail(octaves, self.axis.statistical_errors(spectra, self.orders), *np.moveaxis(beyond, 0, -1))
 
-    def for_spectra(self, rows: Iterable[int]) -> Self:
-        """Return what is needed for the spectra of some rows alone: of many rows, the rest is much to send."""
+    def only(self, rows: Iterable[int]) -> Self:
+        """Return what is needed for some rows alone: of many rows, the rest is much to send."""
         needed = {*rows} if self.reference is None else {*rows, self.reference}
         checksums = {row: self.checksums[row] for row in sorted(needed & self.checksums.keys())}
-        return replace(self, checksums=checksums, qualities={}, areas=np.empty(0), errors=np.empty((0, 0)))
+        qualities = {row: self.qualities[row] for row in sorted(needed & self.qualities.keys())}
+        return replace(self, checksums=checksums, qualities=qualities)
 
     def spectra(self, rows: Sequence[int]) -> ComparedSpectra:
         """Return the spectra of rows, from their fields. Without the reference's field, those of distances are NaN."""
@@ -274,6 +257,20 @@ class Reducer:
             inner = (octaves * reference_octaves.conj()).real
             parts.append(ComparedSpectra(norms, distances, self.axis.spectra(products[batch], inner, is_square=False)))
         return ComparedSpectra.joined(parts)
+
+    def pairs(self, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
+        """Return distances over (orders, rows, others), in batches of rows that fit into a task's memory.
+
+        The others are the rows, or none of them. The fields of the others are read once for each batch.
+        """
+        distances, is_square = np.zeros((5, len(self.orders), len(rows), len(others))), tuple(rows) == tuple(others)
+        for batch in _slices(len(rows), max(1, self._capacity - self._group - self._read_at_once)):
+            first = batch.start if is_square else 0
+            found = np.stack(list(self.tile(rows[batch], others[first:])))
+            distances[..., batch, first:] = found
+            if is_square:
+                distances[..., first:, batch] = np.swapaxes(found, -1, -2)
+        return NormEstimate(*distances)
 
     def tile(self, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
         """Return distances over (orders, rows, others); the others begin with all of the rows, or have none of them."""

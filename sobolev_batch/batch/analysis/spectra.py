@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 
 import numpy as np
 
 from sobolev_batch.batch.analysis.reducer import Reducer
-from sobolev_batch.batch.store.store import SPECTRA_GROUP, SPECTRUM_KEY, Store
+from sobolev_batch.batch.store.keyed import arrays_of, key_of, missing_chunks
+from sobolev_batch.batch.store.store import SPECTRA_GROUP, SPECTRA_KEYS, Store
 from sobolev_batch.errors import DamageError
 from sobolev_batch.spectral.spectra import ComparedSpectra
 
@@ -17,12 +17,12 @@ from sobolev_batch.spectral.spectra import ComparedSpectra
 def spectrum_keys(keys: Mapping[int, str], reference: int) -> dict[int, str]:
     """Return what tells which fields a row's spectra were computed from, by the keys of all rows with a field."""
     of_reference = keys.get(reference, "")
-    return {row: hashlib.sha256(f"{key} {of_reference}".encode()).hexdigest()[:32] for row, key in keys.items()}
+    return {row: key_of([key, of_reference]) for row, key in keys.items()}
 
 
 def chunks_of_spectra(store: Store) -> Iterator[range]:
     """Yield the rows of each chunk of spectra."""
-    document = store.document(SPECTRUM_KEY)
+    document = store.document(SPECTRA_KEYS)
     (count,), (step,) = document["shape"], document["chunk_grid"]["configuration"]["chunk_shape"]
     for first in range(0, count, step):
         yield range(first, min(first + step, count))
@@ -30,12 +30,10 @@ def chunks_of_spectra(store: Store) -> Iterator[range]:
 
 def stale_chunks(store: Store, keys: Mapping[int, str]) -> list[range]:
     """Return the chunks that are not there as a whole, or lack spectra of rows with these keys; no spectrum is read."""
-    sizes = store.location.sizes(SPECTRA_GROUP)
-    missing = {index[0] for name in store.spectra for index in store.incomplete_chunks(name, sizes)}
-    stale = []
+    missing, stale = missing_chunks(store, SPECTRA_KEYS), []
     for number, rows in enumerate(chunks_of_spectra(store)):
         expected = {row: keys[row] for row in rows if row in keys}
-        if number in missing or not expected.items() <= _stored_keys(store, rows).items():
+        if (number,) in missing or not expected.items() <= _stored_keys(store, rows).items():
             stale.append(rows)
     return stale
 
@@ -43,7 +41,7 @@ def stale_chunks(store: Store, keys: Mapping[int, str]) -> list[range]:
 def _stored_keys(store: Store, rows: range) -> dict[int, str]:
     """Return the keys of the rows of a chunk that have spectra; none if the chunk is damaged."""
     with suppress(DamageError):
-        stored = np.asarray(store.read(SPECTRUM_KEY, slice(rows.start, rows.stop))).tolist()
+        stored = np.asarray(store.read(SPECTRA_KEYS, slice(rows.start, rows.stop))).tolist()
         return {row: key for row, key in zip(rows, stored, strict=True) if key}
     return {}
 
@@ -68,7 +66,7 @@ def fill_chunk(reducer: Reducer, rows: range, keys: Mapping[int, str]) -> None:
         arrays[name][_places(missing, rows)] = values
 
     def write_keys(of: set[int]) -> None:
-        store.write(SPECTRUM_KEY, place, np.array([keys[row] if row in of else "" for row in rows], dtype=object))
+        store.write(SPECTRA_KEYS, place, np.array([keys[row] if row in of else "" for row in rows], dtype=object))
 
     # Should this be interrupted, no old key may stand for new values.
     write_keys(kept)
@@ -82,28 +80,13 @@ def _places(of: set[int], rows: range) -> list[int]:
 
 
 def read_spectra(store: Store, rows: Sequence[int]) -> ComparedSpectra:
-    """Return the spectra of rows of one chunk, in ascending order; a damaged chunk raises a `DamageError`."""
-    return ComparedSpectra.from_arrays(_read(store, rows))
+    """Return the spectra of rows in ascending order; a damaged chunk raises a `DamageError`."""
+    by_chunk = ([row for row in chunk if row in wanted] for wanted in [set(rows)] for chunk in chunks_of_spectra(store))
+    parts = [ComparedSpectra.from_arrays(_read(store, of_chunk)) for of_chunk in by_chunk if of_chunk]
+    return ComparedSpectra.joined(parts)
 
 
 def _read(store: Store, rows: Sequence[int]) -> dict[str, np.ndarray]:
     place, chosen = slice(rows[0], rows[-1] + 1), [row - rows[0] for row in rows]
-    names = [name for name in store.spectra if name != SPECTRUM_KEY]
+    names = arrays_of(store, SPECTRA_KEYS)
     return {name.removeprefix(f"{SPECTRA_GROUP}/"): np.asarray(store.read(name, place))[chosen] for name in names}
-
-
-def damaged_chunks(store: Store) -> dict[tuple[int, int], str]:
-    """Return the damage of each chunk that cannot be read, by its first and last row."""
-    damage = {}
-    for rows in chunks_of_spectra(store):
-        try:
-            for name in store.spectra:
-                store.read(name, slice(rows.start, rows.stop))
-        except DamageError as error:
-            damage[rows[0], rows[-1]] = error.what
-    return damage
-
-
-def withdraw_chunk(store: Store, first: int, last: int) -> None:
-    """Erase the keys of a chunk whose spectra are damaged: the next run computes them again."""
-    store.write(SPECTRUM_KEY, slice(first, last + 1), np.array([""] * (last + 1 - first), dtype=object))

@@ -8,15 +8,15 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from functools import cached_property
 from typing import Any, Literal, Self
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from sobolev_batch.batch.analysis.pairs import Pairs, fill_tile
 from sobolev_batch.batch.analysis.reducer import Reducer
 from sobolev_batch.batch.analysis.spectra import (
     chunks_of_spectra,
@@ -27,7 +27,7 @@ from sobolev_batch.batch.analysis.spectra import (
 )
 from sobolev_batch.batch.cluster.execution import Cluster, Task
 from sobolev_batch.batch.store.records import Facts, Record
-from sobolev_batch.batch.store.store import QUALITY
+from sobolev_batch.batch.store.store import DISTANCES, PAIRS_KEYS, QUALITY
 from sobolev_batch.batch.store.tables import hide_tables, table_attributes, write_table
 from sobolev_batch.batch.study.plan import Row
 from sobolev_batch.batch.study.study import Study
@@ -47,8 +47,6 @@ TABLES_VERSION = 7
 _COORDINATES = ("family", "name", "level", "status", "vertices", "triangles", "edge_length_mean", "seconds")
 # Those that only some studies have.
 _SOME = {"time", *(item.name for item in fields(Cost))}
-# Numbers in the driver's memory for each pair and order, as measured: results, and copies of a table that is written.
-_NUMBERS_OF_A_PAIR = 10
 
 Reals = NDArray[np.float64]
 Criterion = Literal["level", "triangles", "names", "time"]
@@ -65,7 +63,7 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> NormEstimate | No
     """Write the tables, and return the distances to the reference, or None where the tables were there."""
     if are_tabulated(workspace):
         return None
-    plan, threads, complete = workspace.plan, cluster.workers.threads, workspace.complete
+    plan, complete = workspace.plan, workspace.complete
     qualities = {row: Quality.from_json(record.quality) for row, record in complete.items()}
     checksums = {row: record.checksums for row, record in complete.items()}
     reducer = Reducer.for_fields(
@@ -73,43 +71,52 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> NormEstimate | No
     )
     # A larger task is tried all the same, with nothing beside it.
     projected_bytes = min(reducer.task_bytes, cluster.workers.largest_allowed_bytes)
-    keys = _spectrum_keys(workspace)
-    tasks = [
-        Task(
-            fill_chunk,
-            (reducer.for_spectra(rows), rows, {row: keys[row] for row in rows if row in keys}),
-            projected_bytes,
-        )
-        for rows in stale_chunks(workspace.store, keys)
-    ]
-    every_pair = plan.study.pairs == "all"
-    if every_pair:
-        tasks += [Task(reducer.tile, tile, projected_bytes) for tile in reducer.tiles(list(complete), threads)]
-    advance = cluster.count_steps("reduction", len(tasks))
-    results = Results.empty(_meshes_table(workspace), plan.reference, plan.study.orders, every_pair)
-    for task, outcome in cluster.results(tasks, projected_bytes):
-        if task.function == reducer.tile:
-            results.enter_tile(outcome, *task.arguments)
-        advance("", None)
-    results.enter_spectra(reducer, complete)
-    _write_tables(workspace, results)
+    keys, meshes = _spectrum_keys(workspace), _meshes_table(workspace)
+    chunks = stale_chunks(workspace.store, keys)
+    pairs, tiles, replaced = _pairs(workspace), list[tuple[int, int]](), list[str]()
+    if pairs is not None:
+        # Readers find all tables of one state, or none.
+        replaced = hide_tables(workspace.store)
+        pairs.lay_out(coordinates_of(meshes, plan.study.orders))
+        tiles = pairs.stale()
+    advance = cluster.count_steps("reduction", len(chunks) + len(tiles))
+    of_spectra = (
+        Task(fill_chunk, (reducer.only(rows), rows, {row: keys[row] for row in rows if row in keys}), projected_bytes)
+        for rows in chunks
+    )
+    # After all spectra, where their row of the reference comes from.
+    of_pairs = (
+        Task(fill_tile, (reducer.only(part.keys), part, tile), projected_bytes)
+        for part, tile in ((pairs.only(tile), tile) for tile in tiles if pairs is not None)
+    )
+    for tasks in (of_spectra, of_pairs):
+        for _ in cluster.results(tasks, projected_bytes):
+            advance("", None)
+    results = Results.from_spectra(reducer, meshes, plan.reference)
+    _write_tables(workspace, results, replaced)
     return NormEstimate(*results.to_reference)
 
 
+def _pairs(workspace: Workspace) -> Pairs | None:
+    """Return the distances of all pairs, if the study requests them: of the meshes in the order of their rows."""
+    study = workspace.plan.study
+    if study.pairs != "all":
+        return None
+    rows = tuple(sorted(workspace.rows))
+    return Pairs(workspace.store, rows, _record_keys(workspace), study.orders, workspace.reference)
+
+
+def _record_keys(workspace: Workspace) -> dict[int, str]:
+    return {row: record.key for row, record in workspace.complete.items()}
+
+
 def _spectrum_keys(workspace: Workspace) -> dict[int, str]:
-    return spectrum_keys({row: record.key for row, record in workspace.complete.items()}, workspace.reference)
-
-
-def pairs_bytes(meshes: int, orders: int) -> float:
-    """Return the memory that the distances of all pairs take in the driver."""
-    return 8.0 * _NUMBERS_OF_A_PAIR * orders * meshes**2
+    return spectrum_keys(_record_keys(workspace), workspace.reference)
 
 
 @dataclass(frozen=True, eq=False)
 class Results:
     """The results of a reduction in the order of tables, NaN where there are none.
-
-    The distances of all pairs are much of the memory that a run takes: no copy of them is made.
 
     Attributes:
         meshes: Table of the meshes.
@@ -118,7 +125,6 @@ class Results:
         norms: (5, orders, meshes), norms and their errors; see `NormEstimate`.
         to_reference: (5, orders, meshes), distances to the reference.
         parts: (4, orders, meshes), see `Reducer.norms`.
-        distances: (5, orders, meshes, others), distances of all pairs, or to the reference alone.
     """
 
     meshes: xr.Dataset
@@ -127,76 +133,37 @@ class Results:
     norms: Reals
     to_reference: Reals
     parts: Reals
-    distances: Reals
 
     @classmethod
-    def empty(cls, meshes: xr.Dataset, reference: str, orders: tuple[float, ...], every_pair: bool) -> Self:
-        """Return the results before any task."""
-        count = meshes.sizes["mesh"]
-        others = count if every_pair else 1
-        shapes = [(parts, len(orders), count) for parts in (5, 5, 4)]
-        arrays = [np.full(shape, np.nan) for shape in (*shapes, (5, len(orders), count, others))]
-        return cls(meshes, reference, orders, *arrays)
-
-    @classmethod
-    def computed(cls, reducer: Reducer, meshes: xr.Dataset, reference: str, every_pair: bool) -> Self:
-        """Compute norms and distances in this process: from spectra, and those of all pairs from fields."""
-        results = cls.empty(meshes, reference, reducer.orders, every_pair)
-        complete = [row for row in reducer.complete if row in results._places]
-        for tile in reducer.tiles(complete, 1) if every_pair else ():
-            results.enter_tile(reducer.tile(*tile), *tile)
-        results.enter_spectra(reducer, complete)
-        return results
-
-    @property
-    def has_every_pair(self) -> bool:
-        """True for the distances of all pairs, False for those to the reference alone."""
-        return bool(self.distances.shape[-1] == self.distances.shape[-2])
-
-    @cached_property
-    def _places(self) -> dict[int, int]:
-        """Place in the tables of each row of the store."""
-        return {row: place for place, row in enumerate(self.meshes["row"].values.tolist())}
+    def from_spectra(cls, reducer: Reducer, meshes: xr.Dataset, reference: str) -> Self:
+        """Return norms, and distances to the reference, from the spectra that the reducer's store holds."""
+        count, orders = meshes.sizes["mesh"], len(reducer.orders)
+        arrays = [np.full((parts, orders, count), np.nan) for parts in (5, 5, 4)]
+        places = {row: place for place, row in enumerate(meshes["row"].values.tolist())}
+        complete = {row for row in reducer.complete if row in places}
+        of_reference = None if reducer.reference is None else read_spectra(reducer.store, [reducer.reference]).norm
+        for chunk in chunks_of_spectra(reducer.store):
+            rows = [row for row in chunk if row in complete]
+            if rows:
+                norms, distances, parts = reducer.norms_of(rows, read_spectra(reducer.store, rows), of_reference)
+                of_rows = [places[row] for row in rows]
+                for array, numbers in zip(arrays, (np.stack([*norms]), np.stack([*distances]), parts), strict=True):
+                    array[..., of_rows] = numbers
+        return cls(meshes, reference, reducer.orders, *arrays)
 
     @property
     def _reference_place(self) -> int:
         return int(self.meshes.indexes["mesh"].get_loc(self.reference))
-
-    def enter_spectra(self, reducer: Reducer, rows: Collection[int]) -> None:
-        """Enter norms of rows, and distances to the reference, from the spectra that the reducer's store holds."""
-        reference = None if reducer.reference is None else read_spectra(reducer.store, [reducer.reference]).norm
-        for chunk in chunks_of_spectra(reducer.store):
-            of_chunk = [row for row in chunk if row in rows]
-            if of_chunk:
-                spectra = read_spectra(reducer.store, of_chunk)
-                norms, to_reference, parts = reducer.norms_of(of_chunk, spectra, reference)
-                places = [self._places[row] for row in of_chunk]
-                self.norms[..., places] = np.stack(list(norms))
-                self.to_reference[..., places] = np.stack(list(to_reference))
-                self.parts[..., places] = parts
-        if self.has_every_pair:
-            # The direct sums are the more exact ones, and the same numbers in both tables.
-            place = self._reference_place
-            self.distances[..., place] = self.distances[..., place, :] = self.to_reference
-        else:
-            self.distances[..., 0] = self.to_reference
-
-    def enter_tile(self, outcome: NormEstimate, rows: Sequence[int], others: Sequence[int]) -> None:
-        """Enter the outcome of `Reducer.tile` for pairs of rows and others."""
-        pairs = np.stack(list(outcome))
-        i, j = (np.array([self._places[row] for row in side]) for side in (rows, others))
-        self.distances[..., i[:, None], j] = pairs
-        self.distances[..., j[:, None], i] = np.swapaxes(pairs, -1, -2)
 
     def norms_table(self) -> xr.Dataset:
         """Return `norm` (mesh, order) with its error."""
         return self._table({**NormEstimate(*self.norms).named("norm"), "beyond": self.parts[2]}, "mesh")
 
     def distances_table(self) -> xr.Dataset:
-        """Return `distance` (mesh, other, order) with its error."""
-        others = self.meshes["mesh"].values if self.has_every_pair else np.array([self.reference], dtype=object)
-        table = self._table(NormEstimate(*self.distances).named("distance"), "mesh", "other")
-        return describe(table.assign_coords(other=("other", others)))
+        """Return `distance` (mesh, other, order) with its error; the only other is the reference."""
+        distances = NormEstimate(*self.to_reference[..., None]).named("distance")
+        table = self._table(distances, "mesh", "other")
+        return describe(table.assign_coords(other=("other", np.array([self.reference], dtype=object))))
 
     def convergence_table(self, accuracy: Accuracy | None) -> xr.Dataset:
         """Return distances to the reference, relative ones and their parts, and observed orders of convergence."""
@@ -238,19 +205,28 @@ class Results:
     def _table(self, columns: Mapping[str, NDArray[Any]], *dimensions: str) -> xr.Dataset:
         """Return values (orders, ...) as variables whose last dimension is the order."""
         variables = {name: ((*dimensions, "order"), np.moveaxis(values, 0, -1)) for name, values in columns.items()}
-        names = [*_COORDINATES, *(_SOME & self.meshes.coords.keys()), *self.meshes.attrs.get("metadata", ())]
-        coordinates = self.meshes.reset_coords()[names].rename(edge_length_mean="edge_length")
-        orders = np.array(self.orders, dtype=np.float64)
-        return describe(xr.Dataset(variables, coords={**coordinates.variables, "order": ("order", orders)}))
+        return describe(xr.Dataset(variables, coords=coordinates_of(self.meshes, self.orders).variables))
 
 
-def _write_tables(workspace: Workspace, results: Results) -> None:
+def coordinates_of(meshes: xr.Dataset, orders: Sequence[float]) -> xr.Dataset:
+    """Return the coordinates that every table has, from the table of meshes."""
+    names = [*_COORDINATES, *(_SOME & meshes.coords.keys()), *meshes.attrs.get("metadata", ())]
+    coordinates = meshes.reset_coords()[names].rename(edge_length_mean="edge_length")
+    return describe(
+        xr.Dataset(coords={**coordinates.variables, "order": ("order", np.array(orders, dtype=np.float64))})
+    )
+
+
+def _write_tables(workspace: Workspace, results: Results, replaced: Sequence[str]) -> None:
     store = workspace.store
-    replaced = hide_tables(store)
+    replaced = [*replaced, *(hide_tables(store) if _pairs(workspace) is None else ())]
     store.write(QUALITY, ..., np.array(_qualities(workspace), dtype=object))
     write_table(store, "meshes", results.meshes)
     write_table(store, "norms", results.norms_table())
-    write_table(store, "distances", results.distances_table())
+    if PAIRS_KEYS not in store.documents:
+        if store.stored_document(PAIRS_KEYS) is not None:
+            store.location.remove(DISTANCES)
+        write_table(store, DISTANCES, results.distances_table())
     # Written last: its digest says that all tables belong to the fields that are stored.
     convergence = results.convergence_table(workspace.plan.study.accuracy).assign_attrs(digest=_digest(workspace))
     write_table(store, "convergence", convergence)
@@ -265,6 +241,9 @@ def are_tabulated(workspace: Workspace) -> bool:
     if attributes is None or attributes.get("digest") != _digest(workspace):
         return False
     if stale_chunks(workspace.store, _spectrum_keys(workspace)):
+        return False
+    pairs = _pairs(workspace)
+    if pairs is not None and (PAIRS_KEYS not in workspace.store.documents or pairs.stale()):
         return False
     try:
         return list(workspace.store.read_strings(QUALITY)) == _qualities(workspace)

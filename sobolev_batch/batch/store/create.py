@@ -29,7 +29,7 @@ from sobolev_batch.batch.store.store import (
     REMOVED,
     ROOT,
     SPECTRA_GROUP,
-    SPECTRUM_KEY,
+    SPECTRA_KEYS,
     UNFINISHED,
     Store,
 )
@@ -215,12 +215,12 @@ def _spectra_keys(plan: Plan, mesh: NDArray[Any]) -> dict[str, bytes]:
     }
     keys = {
         **dataset_keys(SPECTRA_GROUP, xr.Dataset(coords={**columns, "mesh": mesh})),
-        **array_keys(SPECTRUM_KEY, str, (rows,), (step,), ("mesh",)),
+        **array_keys(SPECTRA_KEYS, str, (rows,), (step,), ("mesh",)),
     }
     for name, (width, dimension, meaning) in axis.arrays().items():
-        keys |= array_keys(
-            f"{SPECTRA_GROUP}/{name}", "float64", (rows, width), (step, width), ("mesh", dimension), long_name=meaning
-        )
+        attributes = {"long_name": meaning, "coordinates": " ".join(["key", *columns])}
+        path, dimensions = f"{SPECTRA_GROUP}/{name}", ("mesh", dimension)
+        keys |= array_keys(path, "float64", (rows, width), (step, width), dimensions, **attributes)
     return keys
 
 

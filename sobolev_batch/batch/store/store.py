@@ -50,9 +50,9 @@ OCTAVES = "octaves/octaves"
 RECORDS = "records"
 RECORD = "records/record"
 PAGE = "records/page"
-# Radial spectra, see `sobolev_batch.spectral.spectra`: of norms, of distances from the reference, and of products.
-SPECTRA_GROUP = "spectra"
-SPECTRUM_KEY = "spectra/key"
+# Radial spectra, see `sobolev_batch.spectral.spectra`, and distances, with their keys.
+SPECTRA_GROUP, DISTANCES = "spectra", "distances"
+SPECTRA_KEYS, PAIRS_KEYS = f"{SPECTRA_GROUP}/key", f"{DISTANCES}/key"
 # Attributes of the root: the digest of tables and metadata; true while the store is being created; the objects of a
 # collection; the labels of meshes that the study has lost.
 DIGEST, UNFINISHED, COLLECTION, REMOVED = "digest", "unfinished", "collection", "removed"
@@ -82,7 +82,7 @@ class Store:
         self._hashes: dict[str, str] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        names = [*_OF_TASKS, *self.spectra]
+        names = [*_OF_TASKS, *self.keyed_arrays()]
         carried = {name: document for name, document in self.documents.items() if name in names}
         return {"location": self.location, "documents": carried, "_hashes": {}}
 
@@ -161,15 +161,19 @@ class Store:
             )
         return self.documents[name]
 
+    def stored_document(self, name: str) -> Document | None:
+        """Return the metadata document of a node that readers may not find yet; None if there is none."""
+        return self._read_document(name)
+
     def is_array(self, name: str) -> bool:
         """Return whether the root lists an array of this name."""
         return self.documents.get(name, {}).get("node_type") == "array"
 
-    @property
-    def spectra(self) -> list[str]:
-        """Names of the arrays of spectra, whose chunks of rows tasks write, and of their keys."""
-        in_group = [name for name in self.documents if name.startswith(f"{SPECTRA_GROUP}/")]
-        return [name for name in in_group if name == SPECTRUM_KEY or len(self.documents[name]["shape"]) > 1]
+    def keyed_arrays(self) -> list[str]:
+        """Return the names of the arrays that tasks of the reduction fill, and of their keys; see `keyed`."""
+        groups = [keys.split("/")[0] for keys in (SPECTRA_KEYS, PAIRS_KEYS) if keys in self.documents]
+        names = (name for name in self.documents if "/" in name and name.split("/")[0] in groups)
+        return [name for name in names if name.endswith("/key") or len(self.documents[name]["shape"]) > 1]
 
     def array(self, name: str) -> zarr.Array[Any]:
         """Return an array, for reading and writing."""
@@ -246,8 +250,9 @@ class Store:
         """Return the SHA-256 of a root and of all keys of the tables, coordinates and metadata that it lists."""
         # The group of records has the state of the latest run.
         keys = {f"{name}/{ROOT}": MOST_BYTES for name in self.documents if name not in ("", RECORDS)}
+        beside = {*_BESIDE_DIGEST, *self.keyed_arrays()}
         for name in filter(self.is_array, self.documents):
-            if name not in (*_BESIDE_DIGEST, *self.spectra):
+            if name not in beside:
                 keys |= dict.fromkeys(self.chunk_keys(name), largest_chunk_bytes(self.documents[name]))
         unknown = {key: keys[key] for key in sorted(keys.keys() - self._hashes.keys())}
         with ThreadPoolExecutor(_REQUESTS_AT_ONCE) as pool:

@@ -119,18 +119,19 @@ def lost_tables(store: Store) -> list[str]:
     """Return the arrays of tables with missing chunks. No chunk is read."""
     names = table_names(store)
     # Errors of norms need the qualities, which are written with the tables, as spectra are.
-    return _incomplete(store, [*names, QUALITY, *store.spectra] if names else [])
+    return _incomplete(store, [*names, QUALITY, *store.keyed_arrays()] if names else [])
 
 
 def damaged_tables(store: Store) -> dict[str, str]:
     """Return the damage of each small array, of tables and coordinates, that cannot be read."""
-    written_with_tables = [QUALITY, *store.spectra]
+    keyed = store.keyed_arrays()
+    written_with_tables = [QUALITY, *keyed]
     others = {FIELD, OCTAVES, RECORD, PAGE, *written_with_tables}
     names = [name for name in filter(store.is_array, store.documents) if name not in others]
     expected = [*names, *written_with_tables] if table_names(store) else names
     damage = dict.fromkeys(_incomplete(store, expected), "it is not there, or not all of it")
     for name in expected:
-        if name not in damage and name not in store.spectra:
+        if name not in damage and name not in keyed:
             try:
                 store.read(name)
             except DamageError as error:

@@ -13,7 +13,7 @@ import xarray as xr
 from distributed import Client
 
 from sobolev_batch import DamageError, Study, open_store, run, table, verify
-from sobolev_batch.batch.store.store import SPECTRUM_KEY, Store
+from sobolev_batch.batch.store.store import SPECTRA_KEYS, Store
 from tests.support.studies import small_table
 
 BALLS = [{"name": f"ball-{k}", "source": "sphere", "radius": 0.5 + 0.1 * k} for k in range(3)]
@@ -111,7 +111,7 @@ def alter(path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", [lose, alter])
-@pytest.mark.parametrize("name", ["spectra/norm", SPECTRUM_KEY])
+@pytest.mark.parametrize("name", ["spectra/norm", SPECTRA_KEYS])
 def test_spectra_that_are_lost_or_altered_are_told_and_made_again(
     name: str, damage: Callable[[Path], None], store_path: Path, threads: Client
 ) -> None:

@@ -1,9 +1,8 @@
-"""Tiles of rows: that they cover every pair, fit, and measure what pair by pair would give."""
+"""Tiles of rows: that they measure what pair by pair would give."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import combinations_with_replacement
 from pathlib import Path
 
 import numpy as np
@@ -67,30 +66,15 @@ def norms_of(values: NDArray[np.complex128], reducer: Reducer) -> NDArray[np.flo
     return norms.reshape(-1, *values.shape[:-3])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("workers", [0, 1, 2, 500])
-@pytest.mark.parametrize("count", [0, 1, 3, 4, 11, 200])
-def test_tiles_cover_every_pair_once(reducer: Reducer, count: int, workers: int) -> None:
-    rows = list(range(5, 5 + 3 * count, 3))
-    pairs = []
-    for side, others in reducer.tiles(rows, workers):
-        assert len(side) <= 3
-        assert list(others[: len(side)]) == list(side) or not set(side) & set(others)
-        shared = set(side) & set(others)
-        pairs += [(i, j) for i in side for j in others if i <= j or not {i, j} <= shared]
-    assert sorted(pairs) == list(combinations_with_replacement(rows, 2))
-    assert [row for batch in reducer.row_batches(rows, workers) for row in batch] == rows
-
-
-def test_tiles_measure_as_pairs_do(reducer: Reducer, fields: NDArray[np.complex128]) -> None:
-    found = np.full((2, ROWS, ROWS), np.nan)
-    for rows, others in reducer.tiles(list(range(ROWS)), 1):
-        values = reducer.tile(rows, others).values
-        found[:, np.array(rows)[:, None], np.array(others)] = values
-        found[:, np.array(others)[:, None], np.array(rows)] = np.swapaxes(values, 1, 2)
+def test_pairs_are_measured_as_each_of_them_is(reducer: Reducer, fields: NDArray[np.complex128]) -> None:
+    rows, others = list(range(0, ROWS, 2)), list(range(1, ROWS, 2))
+    for side, opposite in ((range(ROWS), range(ROWS)), (rows, others)):
+        found = reducer.pairs(list(side), list(opposite)).values
+        expected = norms_of(fields[list(side)][:, None] - fields[list(opposite)], reducer)
+        assert found == pytest.approx(expected, rel=1e-10)
+    found = reducer.pairs(list(range(ROWS)), list(range(ROWS))).values
     assert np.array_equal(found, np.swapaxes(found, 1, 2))
     assert (np.diagonal(found, axis1=1, axis2=2) == 0).all()
-    assert found == pytest.approx(norms_of(fields[:, None] - fields, reducer), rel=1e-10)
 
 
 @pytest.mark.parametrize(("rows", "others"), [([0, 1], [3, 4, 9]), ([2], [9]), ([5], [6, 7, 8])])

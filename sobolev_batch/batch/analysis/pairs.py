@@ -1,0 +1,164 @@
+"""Distances of all pairs in the store: square tiles, each computed by one task and written as chunks of its own.
+
+Neither the driver nor a task holds the whole matrix. A tile has a key, which tells the fields that it was computed
+from: an interrupted run goes on with the tiles that are missing, and new meshes, which come last, cost new tiles.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+import xarray as xr
+
+from sobolev_batch.batch.analysis.reducer import Reducer
+from sobolev_batch.batch.analysis.spectra import read_spectra
+from sobolev_batch.batch.store.keyed import key_of, missing_chunks
+from sobolev_batch.batch.store.store import DISTANCES, PAIRS_KEYS, Store
+from sobolev_batch.batch.store.tables import array_keys, dataset_keys
+from sobolev_batch.errors import DamageError
+from sobolev_batch.spectral.budget import NormEstimate
+from sobolev_batch.spectral.metrics.datasets import VARIABLES
+
+# Meshes along a side of a tile: with fewer, small studies keep their workers busy; with more, there are fewer keys.
+_FEWEST, _MOST, _TILES_OF_A_ROW = 32, 512, 8
+# Of the distances and the parts of their errors, as `NormEstimate.named` gives them.
+_COLUMNS = ("distance", "error", "truncation", "aliasing", "discretisation", "statistical")
+
+
+# Of a pair on disk, for each order.
+PAIR_BYTES = 8 * len(_COLUMNS)
+
+
+def _side(meshes: int) -> int:
+    """Return the number of meshes along a side of a tile: a power of two, which seldom changes as meshes are added."""
+    return int(np.clip(2 ** np.ceil(np.log2(max(meshes, 1) / _TILES_OF_A_ROW)), _FEWEST, _MOST))
+
+
+def tile_count(meshes: int) -> int:
+    """Return the number of tiles that are computed for some meshes."""
+    return math.comb(math.ceil(meshes / _side(meshes)) + 1, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """The distances of all pairs of a study's meshes in a store.
+
+    Attributes:
+        store: Store.
+        rows: Row of each mesh in the order of the matrix, that in which the meshes were added.
+        keys: What each row with a field was computed from, by the row; see `Record`.
+        orders: Sobolev orders s.
+        reference: Row of the reference.
+    """
+
+    store: Store
+    rows: Sequence[int]
+    keys: Mapping[int, str]
+    orders: tuple[float, ...]
+    reference: int
+
+    def lay_out(self, coordinates: xr.Dataset) -> None:
+        """Lay out the arrays in the store, with the coordinates of tables. Tiles that exist stay.
+
+        Readers find the arrays after `Store.consolidate`.
+        """
+        labels = self.store.labels()
+        meshes = coordinates.sel(mesh=[labels[row] for row in self.rows])
+        count, side = len(self.rows), self.side
+        shape, chunks = (count, count, len(self.orders)), (side, side, len(self.orders))
+        others = ("other", meshes["mesh"].values, dict(VARIABLES["other"]))
+        keys = dataset_keys(DISTANCES, meshes.assign_coords(other=others))
+        # xarray makes coordinates of what `coordinates` names.
+        names = " ".join(["key", *map(str, meshes.coords.keys() - meshes.sizes.keys())])
+        for name in _COLUMNS:
+            path, dimensions = f"{DISTANCES}/{name}", ("mesh", "other", "order")
+            attributes = {**VARIABLES[name], "coordinates": names}
+            keys |= array_keys(path, "float64", shape, chunks, dimensions, **attributes)
+        tiles = math.ceil(count / side)
+        keys |= array_keys(PAIRS_KEYS, str, (tiles, tiles), (1, 1), ("tile", "other_tile"))
+        before = self.store.stored_document(f"{DISTANCES}/{_COLUMNS[0]}")
+        if before is not None and before["chunk_grid"]["configuration"]["chunk_shape"] != list(chunks):
+            self.store.location.remove(DISTANCES)
+        self.store.publish(keys)
+
+    @property
+    def side(self) -> int:
+        """Number of meshes along a side of a tile."""
+        return _side(len(self.rows))
+
+    def tile_rows(self, number: int) -> Sequence[int]:
+        """Return the rows along one side of a tile."""
+        return self.rows[number * self.side : (number + 1) * self.side]
+
+    def key_of_tile(self, tile: tuple[int, int]) -> str:
+        """Return the key of what a tile depends on."""
+        sides = [[self.keys.get(row, "") for row in self.tile_rows(number)] for number in tile]
+        # Products lose no digits but those of the difference to the reference, which is their center.
+        return key_of([*sides[0], "|", *sides[1], "|", self.keys.get(self.reference, ""), *map(repr, self.orders)])
+
+    def stale(self) -> list[tuple[int, int]]:
+        """Return the tiles (i, j), i <= j, that are to be computed. No distance is read."""
+        count, missing = math.ceil(len(self.rows) / self.side), missing_chunks(self.store, PAIRS_KEYS)
+        try:
+            stored = np.asarray(self.store.read(PAIRS_KEYS))
+        except DamageError:
+            stored = np.full((count, count), "", dtype=object)
+        return [
+            (i, j)
+            for i in range(count)
+            for j in range(i, count)
+            if {(i, j), (j, i)} & missing or not stored[i, j] == stored[j, i] == self.key_of_tile((i, j))
+        ]
+
+    def only(self, tile: tuple[int, int]) -> Self:
+        """Return what is needed for a tile alone: of many meshes, the rest is much to send."""
+        needed = {self.reference, *self.tile_rows(tile[0]), *self.tile_rows(tile[1])}
+        return replace(self, keys={row: self.keys[row] for row in sorted(needed & self.keys.keys())})
+
+
+def fill_tile(reducer: Reducer, pairs: Pairs, tile: tuple[int, int]) -> None:
+    """Compute a tile of distances, and write it with its mirror image.
+
+    Raises:
+        DamageError: The field of a row is not what was stored.
+        StoreError: The store cannot be read or written.
+    """
+    sides = [pairs.tile_rows(number) for number in tile]
+    complete = [[row for row in side if row in pairs.keys] for side in sides]
+    places = np.ix_(*([side.index(row) for row in rows] for side, rows in zip(sides, complete, strict=True)))
+    estimate = pair_distances(reducer, *complete) if all(complete) else None
+    # Should this be interrupted, no old key may stand for new values.
+    _write_keys(pairs, tile, "")
+    for name in _COLUMNS:
+        values = np.full((len(sides[0]), len(sides[1]), len(pairs.orders)), np.nan)
+        if estimate is not None:
+            values[places] = np.moveaxis(estimate.named("distance")[name], 0, -1)
+        rows, others = (slice(k * pairs.side, k * pairs.side + len(side)) for k, side in zip(tile, sides, strict=True))
+        pairs.store.write(f"{DISTANCES}/{name}", (rows, others), values)
+        pairs.store.write(f"{DISTANCES}/{name}", (others, rows), np.swapaxes(values, 0, 1))
+    _write_keys(pairs, tile, pairs.key_of_tile(tile))
+
+
+def _write_keys(pairs: Pairs, tile: tuple[int, int], key: str) -> None:
+    for i, j in {tile, tile[::-1]}:
+        pairs.store.write(PAIRS_KEYS, (slice(i, i + 1), slice(j, j + 1)), np.array([[key]], dtype=object))
+
+
+def pair_distances(reducer: Reducer, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
+    """Return distances over (orders, rows, others); the others are the rows, or none of them.
+
+    Those to the reference come from spectra: its row of a matrix has the numbers of the other tables.
+    """
+    distances = np.stack(list(reducer.pairs(rows, others)))
+    reference = reducer.reference
+    if reference is not None:
+        of_reference = read_spectra(reducer.store, [reference]).norm
+        for side, opposite, axis in ((rows, others, 2), (others, rows, 3)):
+            if reference in side:
+                _, found, _ = reducer.norms_of(opposite, read_spectra(reducer.store, opposite), of_reference)
+                distances.swapaxes(2, axis)[:, :, side.index(reference)] = np.stack(list(found))
+    return NormEstimate(*distances)

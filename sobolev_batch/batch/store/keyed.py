@@ -1,0 +1,72 @@
+"""Arrays that tasks of the reduction fill, chunk by chunk: spectra, and distances of all pairs.
+
+Each such group has an array of keys, with a chunk for each chunk of the others along the meshes. Keys tell which fields
+the numbers were computed from, so that they are computed again only where a field has changed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from sobolev_batch.batch.store.store import Store
+from sobolev_batch.errors import DamageError
+
+# Place of a chunk of keys, counted in chunks.
+Index = tuple[int, ...]
+
+
+def key_of(parts: Iterable[str]) -> str:
+    """Return the key for what a chunk's numbers depend on."""
+    return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:32]
+
+
+def arrays_of(store: Store, keys: str) -> list[str]:
+    """Return the names of the arrays that an array of keys is for."""
+    group = keys.split("/")[0]
+    return [name for name in store.keyed_arrays() if name.startswith(f"{group}/") and name != keys]
+
+
+def missing_chunks(store: Store, keys: str) -> set[Index]:
+    """Return the places that are not there as a whole. No chunk is read."""
+    sizes, axes = store.location.sizes(keys.split("/")[0]), len(store.document(keys)["shape"])
+    names = [keys, *arrays_of(store, keys)]
+    return {index[:axes] for name in names for index in store.incomplete_chunks(name, sizes)}
+
+
+def damaged_chunks(store: Store) -> Iterator[tuple[str, Index, str]]:
+    """Yield the array of keys, place and damage of each chunk that cannot be read."""
+    for keys in store.keyed_arrays():
+        if keys.endswith("/key"):
+            for index in np.ndindex(*_counts(store, keys)):
+                try:
+                    for name in (keys, *arrays_of(store, keys)):
+                        store.read(name, _region(store, name, index))
+                except DamageError as error:
+                    yield keys, index, error.what
+
+
+def withdraw_chunk(store: Store, keys: str, index: Index) -> None:
+    """Erase the keys of a damaged chunk: the next run computes it again."""
+    region = _region(store, keys, index)
+    shape = [axis.stop - axis.start for axis in region]
+    store.write(keys, region, np.full(shape, "", dtype=object))
+
+
+def _counts(store: Store, name: str) -> list[int]:
+    document = store.document(name)
+    steps = document["chunk_grid"]["configuration"]["chunk_shape"]
+    return [math.ceil(length / step) for length, step in zip(document["shape"], steps, strict=True)]
+
+
+def _region(store: Store, name: str, index: Index) -> tuple[slice, ...]:
+    """Return the place of an array's chunk along the axes of its keys."""
+    document = store.document(name)
+    steps = document["chunk_grid"]["configuration"]["chunk_shape"]
+    return tuple(
+        slice(step * number, min(step * (number + 1), length))
+        for number, step, length in zip(index, steps, document["shape"], strict=False)
+    )
