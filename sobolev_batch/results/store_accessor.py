@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
 
 from sobolev_batch.batch.analysis.pairs import pair_distances
 from sobolev_batch.batch.analysis.reducer import Reducer
-from sobolev_batch.batch.analysis.spectra import spectrum_keys, stale_chunks
-from sobolev_batch.batch.analysis.tabulate import Results
+from sobolev_batch.batch.analysis.spectra import lower_bounds, spectrum_keys, stale_chunks
+from sobolev_batch.batch.analysis.tabulate import Results, coordinates_of
 from sobolev_batch.batch.store.store import QUALITY, Store
 from sobolev_batch.batch.store.tables import rows_unlike_tables
 from sobolev_batch.batch.workspace import complete_records
 from sobolev_batch.errors import DamageError, InputError
-from sobolev_batch.results.open import finished_group, location_of, reference_of, require_unchanged
+from sobolev_batch.results.open import finished_group, location_of, reference_of, require_unchanged, source_of
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.budget import NormEstimate
 from sobolev_batch.spectral.fields import Quality
-from sobolev_batch.spectral.lattice import Orders, check_orders, shell_sums, smooth_step
+from sobolev_batch.spectral.lattice import Orders, check_orders, shell_sums, single_order, smooth_step
 from sobolev_batch.spectral.metrics.causes import band_coordinates
-from sobolev_batch.spectral.metrics.datasets import AREA, KERNEL, LENGTH, NUMBER, described, labelled, order_axis
+from sobolev_batch.spectral.metrics.datasets import AREA, KERNEL, LENGTH, NUMBER, describe, described, order_axis
 from sobolev_batch.surfaces.shapes.surface import Reals, Similarity
 from sobolev_batch.surfaces.sources.names import quoted
 
+# Labels of meshes: one, several, or all.
+Meshes = str | Sequence[str] | None
+_ERRORS_OF_DISTANCES = ("distance", "error", "truncation", "aliasing", "discretisation", "statistical")
+_PARTS_OF_DISTANCES = ("relative", "relative_error", "area_part", "shape_part")
+# Meshes whose distances from another are computed at a time, until others are certainly farther.
+_CANDIDATES = 32
 # The innermost octave has this many spacings of the lattice within it.
 _FEWEST_SPACINGS = 4
 # A band's window is one half at this fraction of its cutoff.
@@ -33,7 +39,7 @@ _HALF_WEIGHT = 0.75
 
 @xr.register_datatree_accessor("sobolev")  # type: ignore[no-untyped-call]
 class StoreAccessor:
-    """Norms, distances and spectra of any order as methods of an open store: ``tree.sobolev.norm("a/1", -2)``.
+    """Norms, distances and spectra of any order as methods of an open store: ``tree.sobolev.distance(-2)``.
 
     They use the octaves beside the fields, if the study has some. `field.sobolev` and the functions that take single
     fields know the lattice alone.
@@ -45,7 +51,7 @@ class StoreAccessor:
 
     >>> import sobolev_batch as sb
     >>> tree = sb.open_store("storage/icosphere.zarr")
-    >>> found = tree.sobolev.distance("icosphere/1", "reference", [-4, -3.5])
+    >>> found = tree.sobolev.distance([-4, -3.5], "icosphere/1")
     >>> found["distance"].dims, bool((found["error"] < found["distance"]).all())
     (('order',), True)
     """
@@ -53,62 +59,133 @@ class StoreAccessor:
     def __init__(self, tree: xr.DataTree) -> None:
         self._tree = tree
 
-    def norm(self, mesh: str, order: Orders) -> xr.Dataset:
-        """Return the norm of a mesh with its error; see `sobolev_batch.norm`.
+    def norm(self, order: Orders, mesh: Meshes = None) -> xr.Dataset:
+        """Return the norms of meshes with their errors, from stored spectra; see `sobolev_batch.norm`.
 
         Args:
-            mesh: Label of the mesh.
             order: One order s < -1/2, or several.
+            mesh: Label of a mesh, or several; default all.
 
         Returns:
-            As `sobolev_batch.norm`, float64, in the square root of a unit length.
+            As `sobolev_batch.norm`, float64, in the square root of a unit length; for several meshes over `mesh`
+            besides, with the coordinates of the store's tables, and NaN for meshes that failed.
 
         >>> import sobolev_batch as sb
         >>> tree = sb.open_store("storage/icosphere.zarr")
-        >>> f"{tree.sobolev.norm('reference', -4)['norm'].item():.3f}"
+        >>> f"{tree.sobolev.norm(-4, 'reference')['norm'].item():.3f}"
         '3.511'
+        >>> tree.sobolev.norm([-4, -3.5])["norm"].sizes
+        Frozen({'mesh': 5, 'order': 2})
         """
-        reducer, rows = stored_reducer(self._tree, order, mesh)
-        norms, _, _ = reducer.norms(rows)
-        return _labelled(order, "norm", norms, {})
+        return self._chosen(norms_at(self._tree, order, mesh).drop_vars("beyond"), order, mesh)
 
-    def distance(self, mesh: str, other: str, order: Orders) -> xr.Dataset:
-        """Return the distance of two meshes with its error, relative to the other one, and in parts of area and shape.
+    def distance(self, order: Orders, mesh: Meshes = None, other: str | None = None) -> xr.Dataset:
+        """Return distances of meshes with their errors, relative to the other mesh, and in parts of area and shape.
 
-        See `sobolev_batch.distance`.
+        Those to the study's reference come from stored spectra: all meshes at a new order take a second or two.
+        Those to another mesh are computed from stored fields. See `sobolev_batch.distance`.
 
         Args:
-            mesh: Label of one mesh.
-            other: Label of the other mesh, which the area part is a multiple of.
             order: One order s < -1/2, or several.
+            mesh: Label of a mesh, or several; default all.
+            other: Label of the mesh that they are compared with, which the area part is a multiple of; default the
+                study's reference.
 
         Returns:
             `distance`, its `error` and the parts of the error, `relative` and `relative_error` as
-            `sobolev_batch.distance`, with `area_part` and `shape_part` (order), float64, in the square root of a unit
-            length.
+            `sobolev_batch.distance`, with `area_part` and `shape_part`, float64, in the square root of a unit length;
+            for several meshes over `mesh` besides, see `norm`.
 
         >>> import sobolev_batch as sb
         >>> tree = sb.open_store("storage/icosphere.zarr")
-        >>> found = tree.sobolev.distance("icosphere/1", "reference", -4)
+        >>> found = tree.sobolev.distance(-4, "icosphere/1")
         >>> bool(abs(found["area_part"] ** 2 + found["shape_part"] ** 2 - found["distance"] ** 2) < 1e-12)
         True
+        >>> tree.sobolev.distance(-2.5)["relative"].idxmin("mesh").item()
+        'reference'
         """
-        reducer, rows = stored_reducer(self._tree, order, mesh, other)
-        norms, distances, parts = reducer.norms(rows)
-        relative, relative_errors = distances.relative_to(NormEstimate(*(part[:, 1:] for part in norms)))
-        others = {"relative": relative, "relative_error": relative_errors}
-        parts_by_name = {"area_part": parts[0], "shape_part": parts[1]}
-        return _labelled(order, "distance", distances, {**others, **parts_by_name})
+        if other is None or other == reference_of(self._tree):
+            table = convergence_at(self._tree, order, mesh)
+            return self._chosen(table[[*_ERRORS_OF_DISTANCES, *_PARTS_OF_DISTANCES]], order, mesh)
+        meshes = finished_group(self._tree, "meshes")
+        complete = meshes["mesh"].values[meshes["status"].values == "complete"].tolist()
+        labels = [mesh] if isinstance(mesh, str) else complete if mesh is None else list(mesh)
+        reducer, rows = stored_reducer(self._tree, order, *labels, other)
+        _, distances, (area, shape, *_) = reducer.norms(rows[:-1])
+        of_other, _, _ = reducer.norms(rows[-1:])
+        columns = {**distances.named("distance"), "area_part": area, "shape_part": shape}
+        columns["relative"], columns["relative_error"] = distances.relative_to(of_other)
+        table = xr.Dataset(
+            {name: (("mesh", "order"), values.T) for name, values in columns.items()},
+            coords=coordinates_of(meshes.sel(mesh=labels), reducer.orders).variables,
+        )
+        return self._chosen(describe(table), order, mesh if isinstance(mesh, str) else labels)
 
-    def spectrum(self, mesh: str, other: str | None, order: Orders) -> xr.Dataset:
+    def nearest(self, mesh: str, count: int = 10, order: float = -2.0) -> xr.Dataset:
+        """Return the meshes nearest to one, nearest first, with their distances.
+
+        Spectra bound each distance from below, so that only the fields of near meshes are read.
+
+        Args:
+            mesh: Label of a mesh.
+            count: Number of meshes; fewer where the store has fewer others.
+            order: Order s < -1/2.
+
+        Returns:
+            Dataset over `mesh` with `distance`, its `error` and the parts of the error.
+
+        Raises:
+            InputError: The count is not positive; see `StoreAccessor` for others.
+
+        >>> import sobolev_batch as sb
+        >>> tree = sb.open_store("storage/icosphere.zarr")
+        >>> tree.sobolev.nearest("icosphere/1", 2, order=-4)["mesh"].values.tolist()
+        ['icosphere/2', 'icosphere/3']
+        """
+        if count < 1:
+            raise InputError(f"the number of nearest meshes must be positive, found {count!r}")
+        orders, meshes = (single_order(order),), finished_group(self._tree, "meshes")
+        reducer, _ = stored_reducer(self._tree, orders)
+        labels = dict(zip(meshes["row"].values.tolist(), meshes["mesh"].values.tolist(), strict=True))
+        row = _row_of(self._tree, meshes, mesh)
+        bounds = lower_bounds(reducer, row, [one for one in reducer.complete if one in labels and one != row])
+        found: list[tuple[float, int, list[float]]] = []
+        candidates = sorted(bounds, key=bounds.__getitem__)
+        for start in range(0, len(candidates), _CANDIDATES):
+            if len(found) >= count and found[count - 1][0] <= bounds[candidates[start]]:
+                break
+            group = candidates[start : start + _CANDIDATES]
+            columns = np.stack([*pair_distances(reducer, [row], group).named("distance").values()])[:, 0, 0]
+            found += zip(columns[0].tolist(), group, columns.T.tolist(), strict=True)
+            found.sort(key=lambda entry: entry[:2])
+        chosen = found[:count]
+        names = NormEstimate(*np.zeros((5, 1))).named("distance")
+        values = np.array([entry[2] for entry in chosen]).reshape(len(chosen), len(names))
+        table = xr.Dataset(
+            {name: (("mesh", "order"), values[:, [k]]) for k, name in enumerate(names)},
+            coords=coordinates_of(meshes.sel(mesh=[labels[one] for _, one, _ in chosen]), orders).variables,
+        )
+        return describe(table).sel(order=orders[0])
+
+    def _chosen(self, table: xr.Dataset, order: Orders, mesh: Meshes) -> xr.Dataset:
+        """Return a table (mesh, order) of some meshes, without the dimension of what is single."""
+        if mesh is not None:
+            for label in [mesh] if isinstance(mesh, str) else mesh:
+                _row_of(self._tree, table, label)
+            table = table.sel(mesh=mesh if isinstance(mesh, str) else list(mesh))
+        if np.ndim(order) == 0:
+            table = table.squeeze("order")
+        return table.assign_attrs(kernel=KERNEL)
+
+    def spectrum(self, order: Orders, mesh: str, other: str | None = None) -> xr.Dataset:
         """Return the squared distance of two meshes, or the squared norm of one, by octaves of the frequency |ξ|.
 
         Neighbouring bands overlap smoothly; at its two ends a band has half of its weight.
 
         Args:
-            mesh: Label of one mesh.
-            other: Label of the other mesh; None for the norm.
             order: One order s < -1/2, or several.
+            mesh: Label of one mesh.
+            other: Label of the other mesh; default none, for the norm.
 
         Returns:
             Dataset over `band`, float64, with the coordinates `lower` and `upper` in cycles per unit length,
@@ -120,7 +197,7 @@ class StoreAccessor:
 
         >>> import sobolev_batch as sb
         >>> tree = sb.open_store("storage/icosphere.zarr")
-        >>> bands = tree.sobolev.spectrum("icosphere/1", "reference", -4)
+        >>> bands = tree.sobolev.spectrum(-4, "icosphere/1", "reference")
         >>> round(bands["share"].sum().item(), 6)
         1.0
         """
@@ -182,33 +259,43 @@ def stored_reducer(tree: xr.DataTree, order: Orders, *meshes: str) -> tuple[Redu
     return Reducer.for_fields(store, store.choice(), orders, qualities, checksums, reference, compared_with), rows
 
 
-def _spectra_reducer(tree: xr.DataTree, orders: tuple[float, ...]) -> Reducer:
-    """Return the reducer of an open store for any orders, and for what follows from stored spectra alone.
+def _computed(tree: xr.DataTree, orders: tuple[float, ...], meshes: Meshes = None) -> Results:
+    """Return norms, and distances to the reference, of an open store at other orders than its own, from spectra.
+
+    Args:
+        tree: Open store.
+        orders: Orders s.
+        meshes: Meshes that are needed, and the reference with them; default all.
 
     Raises:
         DamageError: Spectra are not those of the fields that the tables were made from.
     """
-    store = Store.open(location_of(tree))
-    meshes = finished_group(tree, "meshes", load=False)
-    columns = (meshes[name].values.tolist() for name in ("mesh", "row", "status", "key"))
+    store, table, reference = Store.open(location_of(tree)), finished_group(tree, "meshes"), reference_of(tree)
+    columns = (table[name].values.tolist() for name in ("mesh", "row", "status", "key"))
     complete = {row: (label, key) for label, row, status, key in zip(*columns, strict=True) if status == "complete"}
-    texts, reference = store.read_strings(QUALITY), reference_of(tree)
     row_of_reference = next((row for row, (label, _) in complete.items() if label == reference), -1)
     keys = spectrum_keys({row: key for row, (_, key) in complete.items()}, row_of_reference)
     if stale_chunks(store, keys):
         problem = "they are not those of the stored fields"
         raise DamageError(f"{store.path}: radial spectra are damaged ({problem}); run the study again", problem)
-    qualities = {row: Quality.from_json(texts[row]) for row in complete}
-    return Reducer.for_fields(store, store.choice(), orders, qualities, {}, row_of_reference)
+    if meshes is not None:
+        table = table.sel(mesh=list(dict.fromkeys([*([meshes] if isinstance(meshes, str) else meshes), reference])))
+    texts, needed = store.read_strings(QUALITY), set(table["row"].values.tolist())
+    qualities = {row: Quality.from_json(texts[row]) for row in complete if row in needed}
+    reducer = Reducer.for_fields(store, store.choice(), orders, qualities, {}, row_of_reference)
+    results = Results.from_spectra(reducer, table, reference)
+    require_unchanged(tree)
+    return results
 
 
-def convergence_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
+def convergence_at(tree: xr.DataTree, order: Orders | None, meshes: Meshes = None) -> xr.Dataset:
     """Return the convergence table of an open store at some orders, in memory.
 
     Args:
         tree: Open store.
         order: One order s < -1/2, or several, of the store or not; default all of the store. The attribute
-            ``computed`` of the table lists those that were computed from the fields.
+            ``computed`` of the table lists those that were computed from radial spectra.
+        meshes: Labels of meshes that are needed; default all. The table may have others.
 
     Raises:
         InputError: The store has no tables yet; or other orders are requested, and the tree does not say where it was
@@ -220,7 +307,7 @@ def convergence_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
     chosen, others = _divided(stored, order)
     if not others:
         return stored.sel(order=chosen)
-    results = _computed(tree, _spectra_reducer(tree, others))
+    results = _computed(tree, others, meshes)
     accuracy = Accuracy(stored.attrs["rtol"]) if "rtol" in stored.attrs else None
     return _joined(stored, results.convergence_table(accuracy), chosen)
 
@@ -240,7 +327,7 @@ def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
     if not others:
         return stored.sel(order=chosen)
     if not has_every_pair:
-        return _joined(stored, _computed(tree, _spectra_reducer(tree, others)).distances_table(), chosen)
+        return _joined(stored, _computed(tree, others).distances_table(), chosen)
     reducer, _ = stored_reducer(tree, others)
     rows: list[int] = meshes["row"].values.tolist()
     complete = [row for row in reducer.complete if row in rows]
@@ -258,12 +345,21 @@ def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
     return _joined(stored, computed, chosen)
 
 
-def reference_norm_at(tree: xr.DataTree, order: float) -> xr.Dataset:
-    """Return the norm of an open store's reference at one order, with its error; see `convergence_at`."""
-    stored, reference = finished_group(tree, "norms"), reference_of(tree)
-    if order in stored["order"].values:
-        return stored.sel(mesh=reference, order=order)
-    return StoreAccessor(tree).norm(reference, order)
+def norms_at(tree: xr.DataTree, order: Orders | None, meshes: Meshes = None) -> xr.Dataset:
+    """Return the norms of an open store's meshes at some orders, in memory; see `convergence_at`."""
+    stored = finished_group(tree, "norms")
+    chosen, others = _divided(stored, order)
+    if not others:
+        return stored.sel(order=chosen)
+    return _joined(stored, _computed(tree, others, meshes).norms_table(), chosen)
+
+
+def _row_of(tree: xr.DataTree, table: xr.Dataset, mesh: str) -> int:
+    """Return the row of a mesh with a field."""
+    labels = table["mesh"].values.tolist()
+    if mesh not in labels or table["status"].values[labels.index(mesh)] != "complete":
+        raise InputError(f"{source_of(tree)}: no mesh {quoted(mesh)} with a field; its labels begin {labels[:3]}")
+    return int(finished_group(tree, "meshes", load=False)["row"].sel(mesh=mesh).item())
 
 
 def order_note(tree: xr.DataTree, orders: Sequence[float]) -> list[str]:
@@ -279,13 +375,6 @@ def order_note(tree: xr.DataTree, orders: Sequence[float]) -> list[str]:
     ]
 
 
-def _computed(tree: xr.DataTree, reducer: Reducer) -> Results:
-    """Return norms, and distances to the reference, of an open store at other orders than its own."""
-    results = Results.from_spectra(reducer, finished_group(tree, "meshes"), reference_of(tree))
-    require_unchanged(tree)
-    return results
-
-
 def _divided(stored: xr.Dataset, order: Orders | None) -> tuple[list[float], tuple[float, ...]]:
     """Return the orders that are requested, and those of them that the store lacks."""
     own: list[float] = stored["order"].values.tolist()
@@ -295,17 +384,13 @@ def _divided(stored: xr.Dataset, order: Orders | None) -> tuple[list[float], tup
 
 def _joined(stored: xr.Dataset, computed: xr.Dataset, chosen: list[float]) -> xr.Dataset:
     """Return the chosen orders of two tables."""
+    own = stored.sel(mesh=computed["mesh"]).load()
     both = xr.concat(
-        [stored.load(), computed], "order", data_vars="minimal", coords="minimal", compat="override",
+        [own, computed], "order", data_vars="minimal", coords="minimal", compat="override",
         join="exact", combine_attrs="override",
     )  # fmt: skip
     table = both.sel(order=chosen)
     return table.assign_attrs({**stored.attrs, "computed": computed["order"].values.tolist()})
-
-
-def _labelled(order: Orders, name: str, estimate: NormEstimate, others: Mapping[str, Reals]) -> xr.Dataset:
-    columns = {**estimate.named(name), **others}
-    return labelled(order, {label: values[:, 0] for label, values in columns.items()}, {})
 
 
 Band = tuple[float, Reals, float, float]

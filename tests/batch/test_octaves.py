@@ -173,7 +173,7 @@ def test_fields_in_blocks_and_octaves_in_a_task_of_their_own_are_the_same(client
 
 def test_an_open_store_gives_any_order_from_its_octaves(octave_store: Path) -> None:
     tree = sb.open_store(octave_store)
-    found = tree.sobolev.distance("ball/sphere", "reference", [-1.0, -1.5])
+    found = tree.sobolev.distance([-1.0, -1.5], "ball/sphere", "reference")
     exact = sb.distance(sb.Sphere(), BALL, [-1.0, -1.5])["distance"].values
     assert (np.abs(found["distance"].values - exact) <= found["error"].values).all()
     assert (found["error"].values < 0.1 * exact).all()
@@ -181,17 +181,17 @@ def test_an_open_store_gives_any_order_from_its_octaves(octave_store: Path) -> N
     for name in ("distance", "error", "area_part"):
         assert found[name].sel(order=-1.5).item() == pytest.approx(stored[name].item(), rel=1e-9)
     pair = variable(tree, "distances", "distance").sel(mesh="ico/1", other="ico/2", order=-2.0)
-    single = tree.sobolev.distance("ico/1", "ico/2", -2.0)["distance"]
+    single = tree.sobolev.distance(-2.0, "ico/1", "ico/2")["distance"]
     assert (single.dims, single.item()) == ((), pytest.approx(pair.item(), rel=1e-6))
-    norms = tree.sobolev.norm("ball/sphere", -0.9)
+    norms = tree.sobolev.norm(-0.9, "ball/sphere")
     assert abs(norms["norm"].item() - sb.norm(BALL, -0.9)["norm"].item()) <= norms["error"].item()
     with pytest.raises(sb.InputError, match="no mesh 'ico/9' with a field"):
-        tree.sobolev.norm("ico/9", -2.0)
+        tree.sobolev.norm(-2.0, "ico/9")
 
 
 def test_the_spectrum_of_an_open_store_ends_at_the_areas(octave_store: Path) -> None:
     tree = sb.open_store(octave_store)
-    bands = tree.sobolev.spectrum("ball/sphere", None, [-1.0, -2.0])
+    bands = tree.sobolev.spectrum([-1.0, -2.0], "ball/sphere")
     # A sphere's energy is 2 area sin²(2πr), half of that twice on average.
     assert bands.attrs["energy_limit"] == pytest.approx(2 * BALL.area, rel=1e-3)
     outer = bands["energy"].values[-3:]
@@ -200,5 +200,5 @@ def test_the_spectrum_of_an_open_store_ends_at_the_areas(octave_store: Path) -> 
     assert bands["squared"].sel(order=-2.0).sum().item() == pytest.approx(exact, rel=1e-3)
     assert bands["share"].sum("band").values == pytest.approx(1)
     assert (bands["lower"].values[1:] == bands["upper"].values[:-1]).all()
-    pair, distance = (ask("ico/1", "reference", -2.0) for ask in (tree.sobolev.spectrum, tree.sobolev.distance))
+    pair, distance = (ask(-2.0, "ico/1", "reference") for ask in (tree.sobolev.spectrum, tree.sobolev.distance))
     assert pair["squared"].sum().item() == pytest.approx(distance["distance"].item() ** 2, rel=0.02)

@@ -258,10 +258,10 @@ def test_an_earlier_field_with_its_record(store: Path, earlier: Path, mended: Ca
     assert status(store).lost_records == ("ico/1",)
     tree = open_store(store)
     fields = StoreAccessor(tree)
-    for use in (partial(matrix, tree, -3.5), partial(fields.distance, "ico/1", "reference", -3.0)):
+    for use in (partial(matrix, tree, -3.5), partial(fields.distance, -3.0, "ico/1", "ico/2")):
         with pytest.raises(DamageError, match="the field of ico/1 is damaged"):
             use()
-    assert fields.norm("ico/2", -3.0)["norm"] > 0
+    assert fields.distance(-3.0, "ico/2", "ico/3")["distance"] > 0
     mended("ico/1")
 
 

@@ -11,14 +11,16 @@ from typing import Any
 
 import dask.array
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 
 import sobolev_batch as sb
 from sobolev_batch.batch.store.store import Store
+from sobolev_batch.results import store_accessor
 from sobolev_batch.results.accessor import SobolevAccessor
 from sobolev_batch.spectral.fields import Quality
-from tests.support.studies import variable
+from tests.support.studies import small_table, variable
 
 ORDERS = [-1.5, -7.0]
 
@@ -52,12 +54,11 @@ def test_one_pair_reads_no_other_mesh(finished_store: Path, monkeypatch: pytest.
 
     monkeypatch.setattr(Quality, "from_json", from_json)
     monkeypatch.delattr(Store, "records")
-    found = tree.sobolev.distance("ico/3", "reference", -3.0)
+    monkeypatch.delattr(Store, "read_record")
+    found = tree.sobolev.distance(-3.5, "ico/3")
     assert len(parsed) == 2
-    expected = variable(tree, "convergence", "distance").sel(mesh="ico/3", order=-3.0)
-    assert found["distance"].item() == pytest.approx(expected.item(), rel=1e-12)
-    tree.sobolev.norm("ico/3", -3.0)
-    assert len(parsed) == 3
+    monkeypatch.undo()
+    assert found["distance"].item() == pytest.approx(sb.table(tree, -3.5)["distance"].iloc[3], rel=1e-12)
 
 
 def test_stacks_are_taken_one_by_one(finished_store: Path) -> None:
@@ -125,3 +126,57 @@ assert "sobolev" in dir(xarray.DataArray)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.fixture(scope="module")
+def balls() -> str:
+    """Return a store of all pairs of balls, and of a mesh that failed."""
+    table = small_table(family=[{"name": f"b{k}", "source": "sphere", "radius": 0.3 + 0.05 * k} for k in range(12)])
+    table["family"].append({"name": "lost", "source": "files", "paths": ["nowhere.ply"]})
+    sb.run(sb.Study.from_table(table), "memory://accessor-balls.zarr", workers=1)
+    return "memory://accessor-balls.zarr"
+
+
+def test_distances_of_all_meshes_at_once(balls: str) -> None:
+    tree = sb.open_store(balls)
+    every = tree.sobolev.distance([-3.0, -2.5])
+    assert every["distance"].dims == ("mesh", "order")
+    frame = sb.table(balls, -2.5).set_index("mesh")
+    for name in ("distance", "error", "relative", "relative_error", "area_part", "statistical"):
+        found = every[name].sel(order=-2.5).to_series().drop("reference")
+        assert found.to_numpy() == pytest.approx(frame[name][found.index].to_numpy(), rel=1e-12, nan_ok=True)
+    assert every["family"].sel(mesh="b3/sphere") == "b3"
+    some = tree.sobolev.distance(-2.5, ["b3/sphere", "b1/sphere"])
+    assert some["mesh"].values.tolist() == ["b3/sphere", "b1/sphere"]
+    assert tree.sobolev.distance(-2.5, "b3/sphere")["distance"].dims == ()
+    assert tree.sobolev.norm(-2.5)["norm"].sel(mesh="lost/nowhere").isnull()
+    with pytest.raises(sb.InputError, match="no mesh 'lost/nowhere' with a field"):
+        tree.sobolev.distance(-2.5, "lost/nowhere")
+
+
+def test_distances_of_all_meshes_from_another_than_the_reference(balls: str) -> None:
+    found = sb.open_store(balls).sobolev.distance(-3.0, other="b2/sphere")
+    expected = sb.matrix(balls, -3.0)["b2/sphere"].drop("lost/nowhere")
+    pd.testing.assert_series_equal(
+        found["distance"].to_series()[expected.index], expected, rtol=1e-9, check_names=False
+    )
+
+
+@pytest.mark.parametrize("order", [-3.0, -1.2])
+def test_the_nearest_meshes_are_found_without_the_fields_of_others(
+    balls: str, order: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: set[int] = set()
+    read_fields = Store.read_fields
+
+    def recording(store: Store, rows: list[int], *arguments: Any) -> Any:
+        read.update(rows)
+        return read_fields(store, rows, *arguments)
+
+    monkeypatch.setattr(store_accessor, "_CANDIDATES", 2)
+    expected = sb.matrix(balls, order)["b5/sphere"].drop(["b5/sphere", "lost/nowhere"]).nsmallest(3)
+    monkeypatch.setattr(Store, "read_fields", recording)
+    found = sb.open_store(balls).sobolev.nearest("b5/sphere", 3, order)
+    pd.testing.assert_series_equal(found["distance"].to_series(), expected, rtol=1e-9, check_names=False)
+    assert len(read) <= 8
+    assert sb.open_store(balls).sobolev.nearest("b5/sphere", 50).sizes["mesh"] == 12

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 
 import numpy as np
@@ -12,6 +12,10 @@ from sobolev_batch.batch.store.keyed import arrays_of, key_of, missing_chunks
 from sobolev_batch.batch.store.store import SPECTRA_GROUP, SPECTRA_KEYS, Store
 from sobolev_batch.errors import DamageError
 from sobolev_batch.spectral.spectra import ComparedSpectra
+from sobolev_batch.surfaces.shapes.surface import Reals
+
+# Of a lower bound.
+_ROUNDING = 1e-9
 
 
 def spectrum_keys(keys: Mapping[int, str], reference: int) -> dict[int, str]:
@@ -90,3 +94,23 @@ def _read(store: Store, rows: Sequence[int]) -> dict[str, np.ndarray]:
     place, chosen = slice(rows[0], rows[-1] + 1), [row - rows[0] for row in rows]
     names = arrays_of(store, SPECTRA_KEYS)
     return {name.removeprefix(f"{SPECTRA_GROUP}/"): np.asarray(store.read(name, place))[chosen] for name in names}
+
+
+def lower_bounds(reducer: Reducer, row: int, others: Collection[int]) -> dict[int, float]:
+    """Return a lower bound on the distance of a row from each of some others, at the reducer's first order.
+
+    On each shell two fields differ by no less than their norms there, or those of their differences from a third field.
+    """
+
+    def shells(rows: Sequence[int]) -> Reals:
+        spectra = read_spectra(reducer.store, rows)
+        chosen = spectra.norm if reducer.reference is None else spectra.distance
+        return np.asarray(np.sqrt(np.maximum(chosen.sums[:, : reducer.lattice.shell_count], 0.0)))
+
+    own, weights, bounds = shells([row]), reducer.weights.per_shell[0], dict[int, float]()
+    for chunk in chunks_of_spectra(reducer.store):
+        rows = [one for one in chunk if one in others]
+        if rows:
+            squares = (shells(rows) - own) ** 2 @ weights
+            bounds |= zip(rows, ((1 - _ROUNDING) * np.sqrt(squares)).tolist(), strict=True)
+    return bounds

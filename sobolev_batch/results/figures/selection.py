@@ -126,7 +126,7 @@ class Spectra:
         scale = tree.attrs["similarity"]["scale"]
         if "octaves" in tree:
             accessor = StoreAccessor(tree)
-            spectra = [accessor.spectrum(label, reference, orders) for label in labels]
+            spectra = [accessor.spectrum(orders, label, reference) for label in labels]
         else:
             of_reference = fields.sel(mesh=reference).load()
             spectra = [spectrum(fields.sel(mesh=label), of_reference, orders) for label in labels]

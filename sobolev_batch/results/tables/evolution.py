@@ -80,7 +80,7 @@ def evolution(
             if truth is None:
                 found = convergence.sel(mesh=label, order=orders)
             elif {label, true_label := _at(true_labels, time)} <= complete:
-                found = StoreAccessor(tree).distance(label, str(true_label), orders)
+                found = StoreAccessor(tree).distance(orders, label, str(true_label))
             else:
                 continue
             place = i, times.index(time)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.results.open import AnyStore, as_tree, chosen_orders, complete_meshes, finished_group, reference_of
-from sobolev_batch.results.store_accessor import distances_at, order_note, reference_norm_at
+from sobolev_batch.results.store_accessor import distances_at, norms_at, order_note
 from sobolev_batch.results.tables import Format
 from sobolev_batch.results.tables.text import (
     LINE_LENGTH,
@@ -134,7 +134,7 @@ def _shown_numbers(tree: xr.DataTree, distances: xr.Dataset) -> tuple[Reals, Rea
     """Return the distances of one order, their errors, and the unit of both: the reference if it has a norm."""
     values, errors = distances["distance"].values, distances["error"].values
     if "norms" in tree.children:
-        norm = reference_norm_at(tree, distances["order"].item())
+        norm = norms_at(tree, distances["order"].item()).sel(mesh=reference_of(tree)).squeeze("order")
         relative, bounds = quotients((values, errors), (norm["norm"].values, norm["error"].values))
         if norm["norm"].notnull():
             return 100 * relative, 100 * bounds, f"in % of the norm of {reference_of(tree)}"
