@@ -101,8 +101,8 @@ class StoreAccessor:
         >>> found = tree.sobolev.distance(-4, "icosphere/1")
         >>> bool(abs(found["area_part"] ** 2 + found["shape_part"] ** 2 - found["distance"] ** 2) < 1e-12)
         True
-        >>> tree.sobolev.distance(-2.5)["relative"].idxmin("mesh").item()
-        'reference'
+        >>> tree.sobolev.distance(-2.5)["relative"].sizes
+        Frozen({'mesh': 5})
         """
         if other is None or other == reference_of(self._tree):
             table = convergence_at(self._tree, order, mesh)

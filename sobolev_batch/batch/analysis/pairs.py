@@ -16,12 +16,13 @@ import xarray as xr
 
 from sobolev_batch.batch.analysis.reducer import Reducer
 from sobolev_batch.batch.analysis.spectra import read_spectra
-from sobolev_batch.batch.store.keyed import key_of, missing_chunks
+from sobolev_batch.batch.store.keyed import key_in, key_of, missing_chunks, seal
 from sobolev_batch.batch.store.store import DISTANCES, PAIRS_KEYS, Store
 from sobolev_batch.batch.store.tables import array_keys, dataset_keys
 from sobolev_batch.errors import DamageError
 from sobolev_batch.spectral.budget import NormEstimate
 from sobolev_batch.spectral.metrics.datasets import VARIABLES
+from sobolev_batch.surfaces.shapes.surface import Reals
 
 # Meshes along a side of a tile: with fewer, small studies keep their workers busy; with more, there are fewer keys.
 _FEWEST, _MOST, _TILES_OF_A_ROW = 32, 512, 8
@@ -104,9 +105,10 @@ class Pairs:
         """Return the tiles (i, j), i <= j, that are to be computed. No distance is read."""
         count, missing = math.ceil(len(self.rows) / self.side), missing_chunks(self.store, PAIRS_KEYS)
         try:
-            stored = np.asarray(self.store.read(PAIRS_KEYS))
+            texts = np.asarray(self.store.read(PAIRS_KEYS)).tolist()
         except DamageError:
-            stored = np.full((count, count), "", dtype=object)
+            texts = [[""] * count] * count
+        stored = {(i, j): key_in(text) for i, line in enumerate(texts) for j, text in enumerate(line)}
         return [
             (i, j)
             for i in range(count)
@@ -131,21 +133,26 @@ def fill_tile(reducer: Reducer, pairs: Pairs, tile: tuple[int, int]) -> None:
     complete = [[row for row in side if row in pairs.keys] for side in sides]
     places = np.ix_(*([side.index(row) for row in rows] for side, rows in zip(sides, complete, strict=True)))
     estimate = pair_distances(reducer, *complete) if all(complete) else None
-    # Should this be interrupted, no old key may stand for new values.
-    _write_keys(pairs, tile, "")
-    for name in _COLUMNS:
-        values = np.full((len(sides[0]), len(sides[1]), len(pairs.orders)), np.nan)
+    spans = [slice(k * pairs.side, k * pairs.side + len(side)) for k, side in zip(tile, sides, strict=True)]
+    arrays: dict[str, Reals] = {}
+    for name in sorted(_COLUMNS):
+        arrays[name] = np.full((len(sides[0]), len(sides[1]), len(pairs.orders)), np.nan)
         if estimate is not None:
-            values[places] = np.moveaxis(estimate.named("distance")[name], 0, -1)
-        rows, others = (slice(k * pairs.side, k * pairs.side + len(side)) for k, side in zip(tile, sides, strict=True))
-        pairs.store.write(f"{DISTANCES}/{name}", (rows, others), values)
-        pairs.store.write(f"{DISTANCES}/{name}", (others, rows), np.swapaxes(values, 0, 1))
-    _write_keys(pairs, tile, pairs.key_of_tile(tile))
+            arrays[name][places] = np.moveaxis(estimate.named("distance")[name], 0, -1)
+    mirrored = {name: np.swapaxes(values, 0, 1) for name, values in arrays.items()}
+    both = [(tile, spans, arrays), (tile[::-1], spans[::-1], mirrored)][: len({*tile})]
+    # Should this be interrupted, no old key may stand for new values.
+    for place, *_ in both:
+        _write_key(pairs.store, place, "")
+    for _, region, values_by_name in both:
+        for name, values in values_by_name.items():
+            pairs.store.write(f"{DISTANCES}/{name}", tuple(region), values)
+    for place, _, values_by_name in both:
+        _write_key(pairs.store, place, seal(pairs.key_of_tile(tile), values_by_name.values()))
 
 
-def _write_keys(pairs: Pairs, tile: tuple[int, int], key: str) -> None:
-    for i, j in {tile, tile[::-1]}:
-        pairs.store.write(PAIRS_KEYS, (slice(i, i + 1), slice(j, j + 1)), np.array([[key]], dtype=object))
+def _write_key(store: Store, tile: tuple[int, ...], text: str) -> None:
+    store.write(PAIRS_KEYS, tuple(slice(k, k + 1) for k in tile), np.array([[text]], dtype=object))
 
 
 def pair_distances(reducer: Reducer, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:

@@ -8,7 +8,7 @@ from contextlib import suppress
 import numpy as np
 
 from sobolev_batch.batch.analysis.reducer import Reducer
-from sobolev_batch.batch.store.keyed import arrays_of, key_of, missing_chunks
+from sobolev_batch.batch.store.keyed import arrays_of, key_in, key_of, missing_chunks, read_chunk, seal
 from sobolev_batch.batch.store.store import SPECTRA_GROUP, SPECTRA_KEYS, Store
 from sobolev_batch.errors import DamageError
 from sobolev_batch.spectral.spectra import ComparedSpectra
@@ -32,13 +32,13 @@ def chunks_of_spectra(store: Store) -> Iterator[range]:
         yield range(first, min(first + step, count))
 
 
-def stale_chunks(store: Store, keys: Mapping[int, str]) -> list[range]:
-    """Return the chunks that are not there as a whole, or lack spectra of rows with these keys; no spectrum is read."""
-    missing, stale = missing_chunks(store, SPECTRA_KEYS), []
+def stale_chunks(store: Store, keys: Mapping[int, str]) -> dict[int, range]:
+    """Return the rows of the chunks that lack spectra with these keys, by the chunk's number; no spectrum is read."""
+    missing, stale = missing_chunks(store, SPECTRA_KEYS), dict[int, range]()
     for number, rows in enumerate(chunks_of_spectra(store)):
         expected = {row: keys[row] for row in rows if row in keys}
         if (number,) in missing or not expected.items() <= _stored_keys(store, rows).items():
-            stale.append(rows)
+            stale[number] = rows
     return stale
 
 
@@ -46,36 +46,41 @@ def _stored_keys(store: Store, rows: range) -> dict[int, str]:
     """Return the keys of the rows of a chunk that have spectra; none if the chunk is damaged."""
     with suppress(DamageError):
         stored = np.asarray(store.read(SPECTRA_KEYS, slice(rows.start, rows.stop))).tolist()
-        return {row: key for row, key in zip(rows, stored, strict=True) if key}
+        return {row: key_in(text) for row, text in zip(rows, stored, strict=True) if text}
     return {}
 
 
-def fill_chunk(reducer: Reducer, rows: range, keys: Mapping[int, str]) -> None:
+def fill_chunk(reducer: Reducer, number: int, keys: Mapping[int, str]) -> None:
     """Compute the spectra of a chunk's rows, but for those that it has with these keys, and write the chunk.
 
     Raises:
         DamageError: The field of a row is not what was stored.
         StoreError: The store cannot be read or written.
     """
-    store, place = reducer.store, slice(rows.start, rows.stop)
-    arrays = {name: np.full((len(rows), width), np.nan) for name, (width, *_) in reducer.axis.arrays().items()}
-    kept = {row for row, key in _stored_keys(store, rows).items() if keys.get(row) == key}
-    try:
-        for name, values in _read(store, sorted(kept)).items() if kept else ():
-            arrays[name][_places(kept, rows)] = values
-    except DamageError:
-        kept = set()
+    store, rows = reducer.store, list(chunks_of_spectra(reducer.store))[number]
+    widths = {f"{SPECTRA_GROUP}/{name}": width for name, (width, *_) in reducer.axis.arrays().items()}
+    arrays = {name: np.full((len(rows), widths[name]), np.nan) for name in arrays_of(store, SPECTRA_KEYS)}
+    kept: set[int] = set()
+    with suppress(DamageError):
+        stored_keys, stored = read_chunk(store, SPECTRA_KEYS, (number,))
+        kept = {row for row, key in zip(rows, stored_keys, strict=True) if key and keys.get(row) == key}
+        for name, values in stored.items():
+            arrays[name][_places(kept, rows)] = values[_places(kept, rows)]
     missing = {row for row in rows if row in keys} - kept
     for name, values in reducer.spectra(sorted(missing)).to_arrays().items() if missing else ():
-        arrays[name][_places(missing, rows)] = values
+        arrays[f"{SPECTRA_GROUP}/{name}"][_places(missing, rows)] = values
 
     def write_keys(of: set[int]) -> None:
-        store.write(SPECTRA_KEYS, place, np.array([keys[row] if row in of else "" for row in rows], dtype=object))
+        texts = [
+            seal(keys[row], [values[place] for values in arrays.values()]) if row in of else ""
+            for place, row in enumerate(rows)
+        ]
+        store.write(SPECTRA_KEYS, slice(rows.start, rows.stop), np.array(texts, dtype=object))
 
     # Should this be interrupted, no old key may stand for new values.
     write_keys(kept)
     for name, values in arrays.items():
-        store.write(f"{SPECTRA_GROUP}/{name}", place, values)
+        store.write(name, slice(rows.start, rows.stop), values)
     write_keys(kept | missing)
 
 
@@ -85,15 +90,14 @@ def _places(of: set[int], rows: range) -> list[int]:
 
 def read_spectra(store: Store, rows: Sequence[int]) -> ComparedSpectra:
     """Return the spectra of rows in ascending order; a damaged chunk raises a `DamageError`."""
-    by_chunk = ([row for row in chunk if row in wanted] for wanted in [set(rows)] for chunk in chunks_of_spectra(store))
-    parts = [ComparedSpectra.from_arrays(_read(store, of_chunk)) for of_chunk in by_chunk if of_chunk]
+    parts, wanted = [], set(rows)
+    for number, chunk in enumerate(chunks_of_spectra(store)):
+        of_chunk = wanted.intersection(chunk)
+        if of_chunk:
+            _, arrays = read_chunk(store, SPECTRA_KEYS, (number,))
+            chosen = {name.partition("/")[2]: values[_places(of_chunk, chunk)] for name, values in arrays.items()}
+            parts.append(ComparedSpectra.from_arrays(chosen))
     return ComparedSpectra.joined(parts)
-
-
-def _read(store: Store, rows: Sequence[int]) -> dict[str, np.ndarray]:
-    place, chosen = slice(rows[0], rows[-1] + 1), [row - rows[0] for row in rows]
-    names = arrays_of(store, SPECTRA_KEYS)
-    return {name.removeprefix(f"{SPECTRA_GROUP}/"): np.asarray(store.read(name, place))[chosen] for name in names}
 
 
 def lower_bounds(reducer: Reducer, row: int, others: Collection[int]) -> dict[int, float]:

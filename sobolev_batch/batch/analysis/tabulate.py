@@ -81,8 +81,8 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> NormEstimate | No
         tiles = pairs.stale()
     advance = cluster.count_steps("reduction", len(chunks) + len(tiles))
     of_spectra = (
-        Task(fill_chunk, (reducer.only(rows), rows, {row: keys[row] for row in rows if row in keys}), projected_bytes)
-        for rows in chunks
+        Task(fill_chunk, (reducer.only(rows), number, {row: keys[row] for row in rows if row in keys}), projected_bytes)
+        for number, rows in chunks.items()
     )
     # After all spectra, where their row of the reference comes from.
     of_pairs = (

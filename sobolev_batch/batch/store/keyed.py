@@ -1,7 +1,8 @@
 """Arrays that tasks of the reduction fill, chunk by chunk: spectra, and distances of all pairs.
 
 Each such group has an array of keys, with a chunk for each chunk of the others along the meshes. Keys tell which fields
-the numbers were computed from, so that they are computed again only where a field has changed.
+the numbers were computed from, so that they are computed again only where a field has changed. They are stored with
+checksums of the numbers: a chunk that took the place of another is found.
 """
 
 from __future__ import annotations
@@ -11,7 +12,9 @@ import math
 from collections.abc import Iterable, Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sobolev_batch.batch.storage.checked import CHANGED, checksum_of
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.errors import DamageError
 
@@ -25,9 +28,9 @@ def key_of(parts: Iterable[str]) -> str:
 
 
 def arrays_of(store: Store, keys: str) -> list[str]:
-    """Return the names of the arrays that an array of keys is for."""
+    """Return the names of the arrays that an array of keys is for, sorted."""
     group = keys.split("/")[0]
-    return [name for name in store.keyed_arrays() if name.startswith(f"{group}/") and name != keys]
+    return sorted(name for name in store.keyed_arrays() if name.startswith(f"{group}/") and name != keys)
 
 
 def missing_chunks(store: Store, keys: str) -> set[Index]:
@@ -38,15 +41,42 @@ def missing_chunks(store: Store, keys: str) -> set[Index]:
 
 
 def damaged_chunks(store: Store) -> Iterator[tuple[str, Index, str]]:
-    """Yield the array of keys, place and damage of each chunk that cannot be read."""
+    """Yield the array of keys, place and damage of each chunk that is not what was written."""
     for keys in store.keyed_arrays():
         if keys.endswith("/key"):
             for index in np.ndindex(*_counts(store, keys)):
                 try:
-                    for name in (keys, *arrays_of(store, keys)):
-                        store.read(name, _region(store, name, index))
+                    read_chunk(store, keys, index)
                 except DamageError as error:
                     yield keys, index, error.what
+
+
+def read_chunk(store: Store, keys: str, index: Index) -> tuple[list[str], dict[str, NDArray[np.float64]]]:
+    """Return a chunk of keys, flattened, and of the arrays that they are for, by name.
+
+    Raises:
+        DamageError: A chunk cannot be read, or has other values than those that its keys were written with.
+    """
+    sealed = np.asarray(store.read(keys, _region(store, keys, index)))
+    arrays = {name: np.asarray(store.read(name, _region(store, name, index))) for name in arrays_of(store, keys)}
+    # A single key is for the whole of a chunk, others are for its rows.
+    is_for_rows = sealed.ndim == 1
+    for number, text in enumerate(sealed.ravel().tolist()):
+        if text and text != seal(
+            key_in(text), [values[number] if is_for_rows else values for values in arrays.values()]
+        ):
+            raise DamageError(f"{store.path}: chunk {index} of {keys.split('/')[0]} is damaged ({CHANGED})", CHANGED)
+    return [key_in(text) for text in sealed.ravel().tolist()], arrays
+
+
+def seal(key: str, arrays: Iterable[NDArray[np.float64]]) -> str:
+    """Return a key with the checksums of the values that it is for, in the order of `arrays_of`."""
+    return " ".join([key, *(str(checksum_of(np.ascontiguousarray(values))) for values in arrays)])
+
+
+def key_in(text: str) -> str:
+    """Return the key of a `seal`, or none of an empty text."""
+    return text.partition(" ")[0]
 
 
 def withdraw_chunk(store: Store, keys: str, index: Index) -> None:
