@@ -15,7 +15,7 @@ from distributed import Client
 
 from sobolev_batch.batch.analysis.proximity import have_proximities, measure_proximities
 from sobolev_batch.batch.analysis.tabulate import are_tabulated, tabulate_fields
-from sobolev_batch.batch.cluster.clients import local_client, memory_limit, thread_client
+from sobolev_batch.batch.cluster.clients import local_client, memory_limit, require_blocking, thread_client
 from sobolev_batch.batch.cluster.execution import Cluster, Notify, Progress
 from sobolev_batch.batch.cluster.watch import Watch
 from sobolev_batch.batch.cluster.workers import require_store_access
@@ -108,7 +108,7 @@ def run(
             where anything is missing; a script must then guard its main part by ``if __name__ == "__main__"``.
         workers: Number of these processes; by default one for each core.
         memory: Memory of each of them, in bytes or as a text such as "4GB"; by default equal parts of the machine's.
-        on_progress: Callback for each step; it is called in this thread.
+        on_progress: Callback for each step, such as `print`; it is called in this thread.
         allow_commands: True if the study may run its commands on the workers and here: you trust its file.
 
     Returns:
@@ -121,7 +121,7 @@ def run(
         StoreError: The store cannot be reached or written, belongs to another study, or is being written by another run
             (LockError).
         ClusterError: No worker has the GPU or the memory that the study requests; or the scheduler was lost.
-        InputError: The memory is no size, or not there.
+        InputError: The memory is no size, or not there; or the client is asynchronous.
 
     >>> import sobolev_batch as sb
     >>> study = sb.Study.from_table({
@@ -139,6 +139,7 @@ def run(
     """
     location = Location.parse(store)
     if client is not None:
+        require_blocking(client)
         location = location.absolute()
     require_permission(study, allow_commands)
     study = study.with_cache(mesh_cache(location, may_run=True))
@@ -259,7 +260,7 @@ def carry_out(
                 heartbeat.stage = f"{progress.stage}, {progress.done} of {progress.total}"
                 notify(progress)
 
-            cluster = Cluster.prepare(client, study.libraries, beat)
+            cluster = Cluster.prepare(client, study, beat)
             # Asked before anything is computed: a GPU that nobody has would be waited for.
             cluster.workers.with_backend(study.backend)
             cluster.workers.require_accuracy(study.accuracy)

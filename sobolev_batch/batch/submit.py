@@ -8,10 +8,11 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from uuid import uuid4
 
 from distributed import Client, Future, Status, fire_and_forget, get_worker, worker_client
 
+from sobolev_batch.batch.cluster.clients import require_blocking
+from sobolev_batch.batch.cluster.execution import task_key
 from sobolev_batch.batch.cluster.watch import Watch
 from sobolev_batch.batch.cluster.workers import prepare_workers, require_store_access
 from sobolev_batch.batch.collection_store import CollectionStore, for_each_object
@@ -81,6 +82,7 @@ def submit(
     ...     sb.submit(sb.Study.from_toml("study.toml"), "s3://bucket/results.zarr", client).missing
     2
     """
+    require_blocking(client)
     location = Location.parse(store).absolute()
     require_permission(study, allow_commands)
     study = study.with_cache(mesh_cache(location, may_run=True))
@@ -110,7 +112,8 @@ def _submit(study: Study, location: Location, client: Client) -> Submission:
         heartbeat.write("submitted")
         arguments = replace(study, folder=study.folder.absolute()), workspace.store.path, lock.run
         # Before all tasks of other studies, from which it takes no thread: it leaves its own at once.
-        future = client.submit(drive, *arguments, key=f"sobolev-batch-drive-{uuid4().hex}", pure=False, priority=1)
+        key = task_key("drive", study.name, study.part, "")
+        future = client.submit(drive, *arguments, key=key, pure=False, priority=1)
         fire_and_forget(future)
         _await_acceptance(client, future)
     except BaseException:

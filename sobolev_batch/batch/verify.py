@@ -134,7 +134,7 @@ def _verify_study(store: str | Path | Location, on_progress: Callable[[int, int]
 def damaged_rows(cluster: Cluster, workspace: Workspace) -> list[int]:
     """Return the rows whose fields are not what their records say, found by the workers of a cluster."""
     tasks = (
-        Task(workspace.store.damage_of_field, (i, record), row=i, label=workspace.labels[i])
+        Task(workspace.store.damage_of_field, (i, record), row=i, label=workspace.labels[i], stage="check")
         for i, record in workspace.complete.items()
     )
     return sorted(task.row for task, damage in cluster.results(tasks) if damage)

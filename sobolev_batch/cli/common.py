@@ -226,9 +226,10 @@ def progress_reports() -> Iterator[Callable[[Progress], None]]:
             nonlocal bar
             part = f"{progress.part}: " if progress.part else ""
             if progress.stage == "cluster":
-                echo(f"dashboard: {progress.label}", err=True)
+                echo(progress, err=True)
             elif not sys.stderr.isatty():
-                _print_step(progress, part)
+                if progress.record is not None or progress.done == progress.total:
+                    echo(progress, err=True)
             elif progress.done == 0:
                 bars.close()
                 stage = {"fields": "transforms", "reduction": "tables    ", "proximity": "proximity "}[progress.stage]
@@ -239,14 +240,3 @@ def progress_reports() -> Iterator[Callable[[Progress], None]]:
                 bars.close()
 
         yield show
-
-
-def _print_step(progress: Progress, part: str) -> None:
-    if progress.record is not None:
-        outcome = progress.record.reason or f"{progress.record.seconds:.2f} s"
-        count = f"[{progress.done}/{progress.total}]"
-        echo(f"{part}{count} {progress.label}: {progress.record.status}, {outcome}", err=True)
-    elif progress.stage == "reduction" and progress.done == progress.total:
-        echo(f"{part}tables reduced", err=True)
-    elif progress.stage == "proximity" and progress.done == progress.total:
-        echo(f"{part}{progress.total} Hausdorff and Chamfer distances measured", err=True)

@@ -15,6 +15,7 @@ import numpy as np
 from distributed import Client
 
 from sobolev_batch.batch.analysis.pairs import PAIR_BYTES, tile_count
+from sobolev_batch.batch.cluster.clients import require_blocking
 from sobolev_batch.batch.cluster.workers import Workers, prepare_workers, worker_slowness
 from sobolev_batch.batch.collection_store import for_each_object
 from sobolev_batch.batch.fields.compute import Sizes, size_rows
@@ -431,6 +432,8 @@ def _space_warnings(matrix_bytes: Mapping[str, int], store: Location) -> Iterato
 
 
 def _plan(study: Study, location: Location, client: Client | None) -> StudyPlan:
+    if client is not None:
+        require_blocking(client)
     workers = Workers.of_this_machine(available_cores()) if client is None else prepare_workers(client, study.libraries)
     workers.require_accuracy(study.accuracy)
     earlier_choice, started = stored_choice(location), time.process_time()

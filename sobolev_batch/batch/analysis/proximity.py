@@ -74,7 +74,9 @@ def _measure(cluster: Cluster, workspace: Workspace, keys: Mapping[int, str]) ->
         pair = tuple((workspace.rows[row], complete[row].facts.digest) for row in (i, reference))
         arguments = workspace.store, i, complete[i], key, pair, plan.similarity, points
         projected_bytes = loading_bytes[i] + loading_bytes[reference] + search_bytes
-        tasks.append(Task(measure_proximity, arguments, projected_bytes, row=i, label=workspace.labels[i]))
+        tasks.append(
+            Task(measure_proximity, arguments, projected_bytes, row=i, label=workspace.labels[i], stage="proximity")
+        )
     advance = cluster.count_steps("proximity", len(tasks))
     for task, outcome in cluster.run(tasks, max(task.projected_bytes for task in tasks)):
         record = outcome

@@ -81,12 +81,17 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> NormEstimate | No
         tiles = pairs.stale()
     advance = cluster.count_steps("reduction", len(chunks) + len(tiles))
     of_spectra = (
-        Task(fill_chunk, (reducer.only(rows), number, {row: keys[row] for row in rows if row in keys}), projected_bytes)
+        Task(
+            fill_chunk,
+            (reducer.only(rows), number, {row: keys[row] for row in rows if row in keys}),
+            projected_bytes,
+            stage="spectra",
+        )
         for number, rows in chunks.items()
     )
     # After all spectra, where their row of the reference comes from.
     of_pairs = (
-        Task(fill_tile, (reducer.only(part.keys), part, tile), projected_bytes)
+        Task(fill_tile, (reducer.only(part.keys), part, tile), projected_bytes, stage="pairs")
         for part, tile in ((pairs.only(tile), tile) for tile in tiles if pairs is not None)
     )
     for tasks in (of_spectra, of_pairs):

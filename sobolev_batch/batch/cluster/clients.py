@@ -147,6 +147,19 @@ def thread_client(workers: int | None = None) -> Iterator[Client]:
         yield client
 
 
+def require_blocking(client: Client) -> None:
+    """Refuse a client whose answers would have to be awaited.
+
+    Raises:
+        InputError: It is asynchronous.
+    """
+    if client.asynchronous:
+        raise InputError(
+            "the client is asynchronous, and studies wait for its answers; give a Client without asynchronous=True, "
+            "which works in notebooks too, and call it in a thread of its own where an event loop must go on"
+        )
+
+
 def memory_limit(memory: float | str, workers: int) -> int:
     """Return the memory of each worker in bytes; refuse too little for one, or more than there is for all."""
     limit = byte_count(memory)

@@ -17,6 +17,7 @@ from distributed.scheduler import KilledWorker
 
 from sobolev_batch.batch.cluster.workers import GPU, MEMORY, Workers, prepare_workers
 from sobolev_batch.batch.store.records import Record
+from sobolev_batch.batch.study.study import Study
 from sobolev_batch.errors import ClusterError, StoreError, one_line
 
 Stage = Literal["cluster", "fields", "reduction", "proximity"]
@@ -42,6 +43,17 @@ class Progress:
     record: Record | None = None
     part: str = ""
 
+    def __str__(self) -> str:
+        part, count = f"{self.part}: " if self.part else "", f"{self.done} of {self.total}"
+        if self.stage == "cluster":
+            return f"dashboard: {self.label}"
+        if self.record is not None:
+            outcome = self.record.reason or f"{self.record.seconds:.2f} s"
+            return f"{part}[{self.done}/{self.total}] {self.label}: {self.record.status}, {outcome}"
+        if self.stage == "proximity":
+            return f"{part}{count} Hausdorff and Chamfer distances measured"
+        return f"{part}{count} {'transforms' if self.stage == 'fields' else 'tables reduced'}"
+
 
 Notify = Callable[[Progress], None]
 
@@ -57,6 +69,7 @@ class Task:
         needs_gpu: True where the call has to run on a worker with a GPU.
         row: Row of the store that the task works for, for the caller.
         label: Label of the mesh that it works for, for people.
+        stage: What it does, for people; default the name of the function.
     """
 
     function: Callable[..., Any]
@@ -65,6 +78,17 @@ class Task:
     needs_gpu: bool = False
     row: int = -1
     label: str = ""
+    stage: str = ""
+
+
+def task_key(stage: str, study: str, part: str, label: str) -> tuple[str, str, str]:
+    """Return the key of a task as Dask's dashboard shows it: what it does for which study, its mesh, and a number.
+
+    The dashboard groups tasks by the first of these: all objects (parts) of a study share it.
+    """
+    # What follows a hyphen may be taken for a number of the task.
+    group = f"{stage} {study.removesuffix(f' {part}')}".strip().replace("-", "_")
+    return group, "/".join(filter(None, (part, label))), uuid4().hex
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +102,7 @@ class Cluster:
         in_flight: Number of small tasks that the scheduler knows of at a time, at least: enough to keep workers
             busy, while each costs the scheduler memory.
         in_flight_per_thread: The same for each thread of the workers.
+        study, part: Name of the study, and of its object in a collection, for the names of tasks.
     """
 
     client: Client
@@ -85,11 +110,13 @@ class Cluster:
     notify: Notify = lambda progress: None
     in_flight: int = 2000
     in_flight_per_thread: int = 20
+    study: str = ""
+    part: str = ""
 
     @classmethod
-    def prepare(cls, client: Client, libraries: Iterable[str] = (), notify: Notify = lambda progress: None) -> Self:
+    def prepare(cls, client: Client, study: Study, notify: Notify = lambda progress: None) -> Self:
         """Prepare the workers of a cluster for a study; see `prepare_workers`."""
-        return cls(client, prepare_workers(client, libraries), notify)
+        return cls(client, prepare_workers(client, study.libraries), notify, study=study.name, part=study.part)
 
     def count_steps(self, stage: Stage, total: int) -> Callable[[str, Record | None], None]:
         """Report the start of a stage with its number of steps, and return a function that reports each by label."""
@@ -182,8 +209,7 @@ class Cluster:
             futures[id(task)] = self.client.submit(
                 task.function,
                 *map(submitted, task.arguments),
-                # A worker that stays silent is told with the meshes that it has.
-                key=(f"{task.function.__name__}-{uuid4().hex}", label),
+                key=task_key(task.stage or task.function.__name__, self.study, self.part, label),
                 resources=resources or None,
             )
         return futures[id(task)]

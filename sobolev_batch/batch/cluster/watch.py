@@ -153,5 +153,5 @@ def _silence(heard: object, before: _Silence | None = None, elapsed: float = 0.0
 
 
 def _label_of(key: object) -> str:
-    """Return what a task works for."""
-    return str(key[-1]) if isinstance(key, tuple) else "a task of something else"
+    """Return what a task works for; see `task_key`."""
+    return str(key[1]) if isinstance(key, tuple) and len(key) == 3 else "a task of something else"

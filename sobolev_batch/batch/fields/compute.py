@@ -85,10 +85,10 @@ def _field_task(job: Job, groups: _Groups, projected_bytes: float) -> Task:
     """Return the task that computes and stores a field, after those that it depends on; it gives the record."""
     needs_gpu = job.backend == "gpu"
     if len(groups) == 1:
-        return Task(compute_mesh, (job, *groups), projected_bytes, needs_gpu, job.index, job.row.label)
+        return Task(compute_mesh, (job, *groups), projected_bytes, needs_gpu, job.index, job.row.label, stage="field")
     parts = [(blocks, False) for blocks in groups] + [((), True)] * (job.tail is not None)
-    tasks = [Task(compute_parts, (job, *part), projected_bytes, needs_gpu) for part in parts]
-    return Task(finish_mesh, (job, tasks), row=job.index, label=job.row.label)
+    tasks = [Task(compute_parts, (job, *part), projected_bytes, needs_gpu, stage="part of field") for part in parts]
+    return Task(finish_mesh, (job, tasks), row=job.index, label=job.row.label, stage="field")
 
 
 def size_rows(plan: Plan, rows: Sequence[Row], workers: Workers) -> tuple[dict[str, Sizes], dict[str, str]]:

@@ -74,6 +74,7 @@ class Study:
         table: The study as it was written.
         largest_chunk_bytes: Size above which a stored field is split into blocks, one chunk each.
         cache: Where meshes are kept that take long to make; None if the study makes none, or has no store yet.
+        part: Name of the object, in the study of an object of a collection; else empty.
 
     >>> import sobolev_batch as sb
     >>> study = sb.Study.from_table({
@@ -105,6 +106,7 @@ class Study:
     largest_chunk_bytes: int = 256 << 20
     octaves: int = 0
     cache: MeshCache | None = None
+    part: str = ""
 
     def __post_init__(self) -> None:
         check_orders(self.orders)
@@ -286,7 +288,8 @@ class StudyCollection:
             made = [entry for entries in families for entry in entries[section.name]]
             try:
                 table_of_object = _table_of_object(values, section, listed, made)
-                studies[section.name] = Study.from_table(table_of_object, folder=folder)
+                one = Study.from_table(table_of_object, folder=folder)
+                studies[section.name] = replace(one, part=section.name)
             except StudyError as error:
                 raise StudyError(f"object {quoted(section.name)}: {error}") from error
         own = {name: [family.name for family in study.families] for name, study in studies.items()}

@@ -19,6 +19,8 @@ from sobolev_batch.spectral.adaptive.tolerance import NEXT_TO_EQUAL
 DEFAULT_COST = "make_seconds"
 # Members that a row of a table names, and objects whose fronts a text has.
 _MOST_MEMBERS, _MOST_OBJECTS = 4, 10
+# Costs from it on, such as bytes, are shown as integers.
+_LARGE = 1000.0
 _NOTE = """\
 A mesh is on the front of its object unless another one, at no more cost, is nearer to the
 reference or as near at less cost. It is undecided where the errors of the distances leave that
@@ -203,7 +205,7 @@ def format_cost_leagues(leagues: Sequence[CostLeague], style: Format = "text") -
         rows = means.assign(member=members, objects=len(one.objects)).to_dict(orient="records")
         columns = (
             Column("member", "front of the means", kind="label"),
-            Column(one.x, one.x, "{:.3g}".format),
+            Column(one.x, one.x, lambda cost: f"{cost:,.0f}" if cost >= _LARGE else f"{cost:.3g}"),
             Column("relative", "relative", percent, "relative_error"),
             Column("fronts", "on the front", "{} of {}".format, "objects"),
         )

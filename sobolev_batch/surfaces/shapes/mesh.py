@@ -208,7 +208,9 @@ class Mesh:
         for number, edges in enumerate(self._edges()):
             with np.errstate(over="ignore"):
                 longest: Reals = _side_lengths(edges).max(axis=1)
-                yield slice(number * _BATCH, (number + 1) * _BATCH), _AREA_RESOLUTION * longest**2
+                areas = _AREA_RESOLUTION * longest**2
+            # Outside: whoever reads on may be another thread, to which a setting of NumPy does not belong.
+            yield slice(number * _BATCH, (number + 1) * _BATCH), areas
 
     def _per_triangle(self, measure: Callable[[_Edges], Reals]) -> Reals:
         """Return a measure of all triangles, taken batch by batch: edges of millions at once take gigabytes."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -9,15 +10,27 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from distributed import Client, KilledWorker
+from distributed import Client, Future, KilledWorker
+from distributed.utils import key_split
 
-from sobolev_batch import ClusterError, DamageError, StoreError, Study, run
+from sobolev_batch import (
+    ClusterError,
+    DamageError,
+    InputError,
+    StoreError,
+    Study,
+    StudyCollection,
+    plan,
+    run,
+    submit,
+)
 from sobolev_batch.batch.cluster.execution import Cluster, Progress, Task, describe_failure
 from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers, prepare_workers
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.status import Status
 from tests.support.processes import tcp_cluster
-from tests.support.studies import small_table
+from tests.support.repository import run_blocks
+from tests.support.studies import balls, methods_of, small_table
 
 
 @pytest.fixture
@@ -141,3 +154,43 @@ def test_a_lost_scheduler_ends_the_run_and_blames_no_mesh(store_path: Path, thre
     assert (status.run.state, status.failed) == ("failed", {})
     again = run(study, store_path, threads)
     assert (len(again.reused) >= 3, again.failed) == (True, {})
+
+
+def test_the_dashboard_names_tasks_by_stage_study_and_mesh(threads: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    keys: list[tuple[str, str, str]] = []
+    hand_over = threads.submit
+
+    def recorded(*arguments: Any, key: tuple[str, str, str], **options: Any) -> Future:
+        keys.append(key)
+        return hand_over(*arguments, key=key, **options)
+
+    monkeypatch.setattr(threads, "submit", recorded)
+    table = small_table(study={"name": "my-scans 2024-06"}, object=balls(cow=1.0, egg=1.1), family=methods_of())
+    run(StudyCollection.from_table(table), "memory://names.zarr", threads)
+    field = "field my_scans 2024_06"
+    # The name of the one group of all objects and the one of the prefix, which progress bars show, are the same.
+    assert {(key[0], key_split(key)) for key in keys if key[0].startswith("field")} == {(field, field)}
+    assert all(key_split(key).endswith(" my_scans 2024_06") for key in keys)
+    meshes = ["ico/1", "ico/2", "egg/1", "egg/2", "reference"]
+    shown = sorted(label for group, label, _ in keys if group == field)
+    assert shown == sorted(f"{name}/{mesh}" for name in ("cow", "egg") for mesh in meshes)
+    assert len(set(keys)) == len(keys)
+
+    def transforms(dask_scheduler: Any) -> int:
+        return int(dask_scheduler.task_prefixes[field].state_counts["memory"])
+
+    assert threads.run_on_scheduler(transforms) == 10
+
+
+def test_an_asynchronous_client_is_refused_before_anything_is_made() -> None:
+    client: Any = SimpleNamespace(asynchronous=True)
+    for act in (run, submit, plan):
+        with pytest.raises(InputError, match=r"the client is asynchronous.*give a Client without asynchronous=True"):
+            act(Study.from_table(small_table()), "memory://asynchronous.zarr", client)
+
+
+def test_the_page_of_clusters_runs_a_study_by_a_client_of_the_user(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_blocks("docs/clusters.md")["summary"].computed == ("ico/0", "ico/1", "reference")
+    first, start, *fields, _, last = capsys.readouterr().out.splitlines()
+    assert (first[:22], start, last) == ("dashboard: http://127.", "0 of 3 transforms", "1 of 1 tables reduced")
+    assert re.fullmatch(r"\[1/3\] \S+: complete, \d\.\d\d s", fields[0])
