@@ -351,6 +351,8 @@ def _group_sums(
     return np.asarray(sums)
 
 
+# Of a series, relative to its sum.
+_LEAST_TERM = 1e-17
 # The integrand is smooth where this rule is used, over intervals shorter than their distance from its singularity.
 _NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(14)
 
@@ -435,7 +437,7 @@ def _matern_difference(nu: float, shorter: float, longer: float) -> float:
         nodes = (low + high) / 2 + (high - low) / 2 * _NODES
         return float(factor * (high - low) / 2 * (_NODE_WEIGHTS @ (nodes**nu * kv(nu - 1, nodes))))
     if abs(high - low) < 1:
-        return factor * _integral(lambda b: float(b**nu * kv(nu - 1, b)) if b > 0 else 0.0, low, high)
+        return factor * _integral(lambda b: b * _matern(nu - 1, b) if b > 0 else 0.0, low, high)
     return float(factor * (_matern(nu, low) - _matern(nu, high)))
 
 
@@ -449,6 +451,13 @@ def _integral(function: Callable[[float], float], low: float, high: float) -> fl
 
 
 def _matern(nu: float, b: float) -> float:
-    """Return b^ν K_ν(b), or its limit 2^(ν-1) Γ(ν) at zero."""
+    """Return b^ν K_ν(b); at zero its limit 2^(ν-1) Γ(ν)."""
     value = np.power(b, nu) * kv(nu, b) if b > 0 else math.inf
-    return float(value) if math.isfinite(value) else float(np.exp2(nu - 1) * gamma(nu))
+    if math.isfinite(value):
+        return float(value)
+    # K overflows far below b = ν, where the first terms of its series are all of it (DLMF, 10.31.1).
+    series, term, k = 1.0, 1.0, 1
+    while k < nu and abs(term) > _LEAST_TERM * series:
+        term *= (b / 2) ** 2 / (k * (k - nu))
+        series, k = series + term, k + 1
+    return float(np.exp2(nu - 1) * gamma(nu) * series)

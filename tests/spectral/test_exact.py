@@ -142,9 +142,10 @@ def radial_integral(first: Sphere, second: Sphere, order: float) -> float:
         (Sphere(), Sphere(1.0, (1e-3, 0.0, 0.0))),
         (Sphere(1e-4), Sphere(2e-4, (1e-4, 0.0, 0.0))),
         (Sphere(0.05), Sphere(0.05)),
+        (Sphere(0.8, (0.2, 0.0, 0.0)), Sphere(0.7, (-0.2, 0.1, 0.0))),
     ],
 )
-@pytest.mark.parametrize("order", [-7.25, -10.0])
+@pytest.mark.parametrize("order", [-7.25, -10.0, -79.5, -100.0])
 def test_inner_products_against_the_radial_integral(first: Sphere, second: Sphere, order: float) -> None:
     assert sphere_inner_product(first, second, order) == pytest.approx(radial_integral(first, second, order), rel=1e-12)
 
