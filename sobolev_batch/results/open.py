@@ -14,7 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.store.store import DIGEST, Store
+from sobolev_batch.batch.store.store import DIGEST, OCTAVES_GROUP, SPECTRA_GROUP, Store
 from sobolev_batch.batch.store.tables import lost_tables
 from sobolev_batch.errors import DamageError, InputError, StoreError, one_line
 from sobolev_batch.spectral.fields import Quality
@@ -47,6 +47,8 @@ AnyStore = str | Path | Location | xr.DataTree
 
 # Entries of the encoding of a tree: where it was opened, and the digest of its tables then.
 _SOURCE, _STATE = "source", "state"
+# Groups that may be larger than the memory: xarray computes with them chunk by chunk.
+_LARGE = {"fourier", OCTAVES_GROUP, SPECTRA_GROUP}
 # What zarr and xarray raise for metadata that nobody has written.
 _MEANINGLESS = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError)
 
@@ -54,9 +56,9 @@ _MEANINGLESS = (ValueError, TypeError, LookupError, AttributeError, ArithmeticEr
 def open_store(store: str | Path | Location) -> xr.DataTree:
     """Open a store lazily, as ``xarray.open_datatree(store, engine="zarr")`` does.
 
-    Groups: fourier (the fields), meshes, norms, distances, convergence, records; where the study requests it also
-    proximity. docs/store.md lists their variables with dimensions and units. Fields stay on disk until you ask for
-    values of them; they have the accessor `field.sobolev`.
+    Groups: fourier (the fields), spectra, meshes, norms, distances, convergence, records; where the study requests it
+    also octaves and proximity. docs/store.md lists their variables with dimensions and units. All stay on disk until
+    you ask for values of them. Fields and spectra are Dask arrays; fields have the accessor `field.sobolev`.
 
     Args:
         store: Path or URL of the store.
@@ -87,6 +89,10 @@ def open_store(store: str | Path | Location) -> xr.DataTree:
     with opened.location.access("read"):
         try:
             tree = xr.open_datatree(keys, engine="zarr", consolidated=True, zarr_format=3)
+            for group in _LARGE.intersection(tree.children):
+                lazy = xr.open_dataset(keys, group=group, engine="zarr", consolidated=True, zarr_format=3, chunks={})
+                # Coordinates are small.
+                tree[group].dataset = tree[group].to_dataset().assign(lazy.data_vars)
         except _MEANINGLESS as error:
             problem = f"its metadata make no sense: {one_line(error)}"
             raise DamageError(

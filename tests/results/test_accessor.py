@@ -64,6 +64,8 @@ def test_one_pair_reads_no_other_mesh(finished_store: Path, monkeypatch: pytest.
 def test_stacks_are_taken_one_by_one(finished_store: Path) -> None:
     tree = sb.open_store(finished_store)
     stored = variable(tree, "fourier", "fourier")
+    # One mesh after the other, also where xarray computes with all.
+    assert stored.chunksizes["mesh"] == (1,) * 5
     levels = stored.sel(mesh=["ico/1", "ico/3"])
     norms = levels.sobolev.norm(ORDERS)
     assert norms["norm"].dims == ("mesh", "order")

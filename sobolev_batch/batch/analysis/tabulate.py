@@ -41,7 +41,7 @@ from sobolev_batch.surfaces.sources.mesh_cache import Cost
 from sobolev_batch.surfaces.sources.names import natural_key
 
 # Raise it whenever tables hold something that those of older versions lack: they are then made again.
-TABLES_VERSION = 7
+TABLES_VERSION = 8
 
 # Columns of the table of meshes that all tables have as coordinates, besides times and other metadata.
 _COORDINATES = ("family", "name", "level", "status", "vertices", "triangles", "edge_length_mean", "seconds")
@@ -321,7 +321,10 @@ def _meshes_table(workspace: Workspace) -> xr.Dataset:
         costs = [record.cost or Cost() for record in filled]
         columns |= {item.name: np.array([getattr(cost, item.name) for cost in costs]) for item in fields(Cost)}
     columns["seconds"] = np.array([record.seconds for record in filled])
-    for name in ("worker", "backend", "finished", "key"):
+    # numpy's times are in UTC, and know no zone.
+    times_of_end = [record.finished.removesuffix("Z") or "NaT" for record in filled]
+    columns["finished"] = np.array(times_of_end, dtype="datetime64[s]")
+    for name in ("worker", "backend", "key"):
         columns[name] = _strings([getattr(record, name) for record in filled])
     columns["mesh"], metadata = _strings([row.label for row in rows]), _metadata(rows)
     times = [row.member.time for row in rows]

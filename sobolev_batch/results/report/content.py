@@ -342,7 +342,7 @@ def _meshes_table(meshes: xr.Dataset, families: Sequence[str]) -> PageTable:
     rows = frame[:MOST_MESH_ROWS].assign(
         **{name: frame[name].astype(object).where(frame["triangles"] > 0, None) for name in _COUNTS},
         color=frame["family"].map(families.index),
-        finished=frame["finished"].map(utc_text),
+        finished=frame["finished"].dt.strftime("%Y-%m-%d %H:%M:%S").fillna(""),
     )
     return PageTable("meshes", _MESH_COLUMNS, rows.to_dict(orient="records"), omitted=len(frame) - len(rows))
 

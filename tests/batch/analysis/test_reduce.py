@@ -35,9 +35,14 @@ def test_tables_have_coordinates_and_nothing_but_nan_of_a_mesh_that_failed(store
         small = whole.where(whole["triangles"] < 100, drop=True)
         assert small["mesh"].values.tolist() == ["ico/0", "ico/1", "reference"]
         assert small["family"].values.tolist() == ["ico", "ico", "reference"]
-        failed = whole.sel(mesh="lost/nowhere").drop_vars(["rank", "row", "resolved", "within"], errors="ignore")
+        failed = whole.sel(mesh="lost/nowhere").drop_vars(
+            ["rank", "row", "finished", "resolved", "within"], errors="ignore"
+        )
         assert failed["status"] == "failed"
         assert all(values.isnull().all() for values in (*failed.data_vars.values(), failed["vertices"]))
+    finished = tree["meshes"].to_dataset()["finished"]
+    assert finished.dtype.kind == "M"
+    assert finished.isnull().sum() == 0
     smallest = tree["convergence"].to_dataset()["relative"].groupby("family").min()
     assert smallest["family"].values.tolist() == ["ico", "lost", "reference"]
     assert smallest.isnull().any("order").values.tolist() == [False, True, False]
