@@ -8,13 +8,15 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from sobolev_batch.batch.analysis.pairs import Pairs
+from sobolev_batch.batch.analysis.spectra import spectrum_keys, stale_chunks
 from sobolev_batch.batch.cluster.execution import Cluster, Task
 from sobolev_batch.batch.collection_store import CollectionStore, labelled
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, acquire, release
 from sobolev_batch.batch.store.keyed import damaged_chunks, withdraw_chunk
 from sobolev_batch.batch.store.records import Record
-from sobolev_batch.batch.store.store import LABELS, QUALITY, RECORDS, ROOT, Store
+from sobolev_batch.batch.store.store import LABELS, PAIRS_KEYS, QUALITY, RECORDS, ROOT, SPECTRA_KEYS, Store
 from sobolev_batch.batch.store.tables import damaged_tables, rows_unlike_tables, table_attributes
 from sobolev_batch.batch.workspace import Workspace, complete_records
 from sobolev_batch.errors import DamageError, LockError, StoreError
@@ -158,6 +160,15 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: 
             tables[QUALITY] = "it is not what records have"
         if tables.keys().isdisjoint(store.keyed_arrays()):
             chunks = list(damaged_chunks(store))
+        if not tables:
+            pairs = Pairs.tabulated(store)
+            stale: list[tuple[str, tuple[int, ...]]] = [
+                (SPECTRA_KEYS, (number,)) for number in stale_chunks(store, spectrum_keys(pairs.keys, pairs.reference))
+            ]
+            if PAIRS_KEYS in store.documents:
+                stale += [(PAIRS_KEYS, tile) for tile in pairs.stale()]
+            known = {(keys, index) for keys, index, _ in chunks}
+            chunks += [(*place, "it is not that of the stored fields") for place in stale if place not in known]
     whole = store.rows_with_complete_fields() if complete else set()
 
     def damage_of(row: int) -> str:

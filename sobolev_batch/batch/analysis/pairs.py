@@ -62,6 +62,15 @@ class Pairs:
     orders: tuple[float, ...]
     reference: int
 
+    @classmethod
+    def tabulated(cls, store: Store) -> Self:
+        """Return the distances of all pairs by the tables of a store, which it may lack."""
+        rows, status, keys = (np.asarray(store.read(f"meshes/{name}")).tolist() for name in ("row", "status", "key"))
+        complete = {row: key for row, key, state in zip(rows, keys, status, strict=True) if state == "complete"}
+        study = store.attributes()["study"]
+        reference = store.labels().index(study["reference"])
+        return cls(store, tuple(sorted(rows)), complete, tuple(study["orders"]), reference)
+
     def lay_out(self, coordinates: xr.Dataset) -> None:
         """Lay out the arrays in the store, with the coordinates of tables. Tiles that exist stay.
 

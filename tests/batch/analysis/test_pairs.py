@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from distributed import Client
 from sobolev_batch import DamageError, Study, matrix, open_store, run, table, verify
 from sobolev_batch.batch.analysis import pairs
 from sobolev_batch.batch.analysis.reducer import Reducer
+from sobolev_batch.batch.store.store import Store
 from tests.support.stores import assert_same_results
 from tests.support.studies import small_table
 
@@ -133,3 +135,19 @@ def test_a_mesh_that_failed_has_no_numbers_in_any_tile(store_path: Path, threads
     found = matrix(store_path, -3.0)
     assert found.loc["lost/nowhere"].isna().all()
     assert found.drop(index="lost/nowhere", columns="lost/nowhere").notna().all(axis=None)
+
+
+def test_chunks_of_an_earlier_state_are_told_and_made_again(store_path: Path, threads: Client) -> None:
+    earlier = store_path.with_name("earlier.zarr")
+    study = balls(3, reference={"source": "sphere", "radius": 0.9})
+    run(balls(3), earlier, threads)
+    run(study, store_path, threads)
+    sound = matrix(store_path, -3.0)
+    for group in ("spectra", "distances"):
+        for name in Store.open(earlier).keyed_arrays():
+            if name.startswith(group):
+                shutil.copytree(earlier / name, store_path / name, dirs_exist_ok=True)
+        assert any(group in name for name in verify(store_path).tables)
+        assert run(study, store_path, threads).computed == ()
+        assert verify(store_path).is_sound
+    assert matrix(store_path, -3.0).equals(sound)
