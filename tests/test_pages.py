@@ -143,6 +143,7 @@ def test_every_query_runs_and_answers(client: Client, tmp_path: Path, monkeypatc
     assert found["rates"].index.tolist() == levels
     assert found["at_level"]["mesh"].values.tolist() == levels[3:]
     assert found["nearest"].is_monotonic_increasing
+    assert found["near_another"]["mesh"].values.tolist() == [levels[2], levels[3]]
     assert (found["whole"].loc[levels, levels] == found["part"].to_pandas()).all(axis=None)
     expected = sb.distance(sb.icosphere(3), sb.Sphere(), [-3.5, -2.25], lattice=found["fields"].sobolev.lattice)
     assert found["another"]["distance"].sel(mesh=levels[3]).values == pytest.approx(
