@@ -48,8 +48,10 @@ _OF_OTHERS = 1 / 8
 _LEFT_FRACTION = 0.5
 # Octaves among which the statistical error is divided before anything is known of them, and Student's quantile.
 _USUAL_OCTAVES, _QUANTILE = 6, 2.9
-# Samples along an axis of the first lattice of an octave, and of the largest one.
-_FIRST_M, _LARGEST_M = 64, 192
+# Samples along an axis of the first lattice of an octave, at least and at most, and of the largest one.
+_FEWEST_M, _FIRST_M, _LARGEST_M = 32, 64, 192
+# Samples of an octave on a lattice, as a fraction of M³.
+_FILLED = np.pi / 12 * 7 / 8
 # Draws of an octave: the fewest, the most, and the most time for draws beside a lattice, as a fraction of its own.
 _FEWEST_DRAWS, _MOST_DRAWS, _DRAWS_FRACTION = 256, 1_000_000, 0.5
 # The fewest on flat faces without a lattice: where faces repeat, few draws would miss the frequency of the period.
@@ -341,7 +343,9 @@ def _first_sampling(state: State, octave: Octave) -> OctaveSampling:
         own = np.sqrt(state.permitted_variances / _USUAL_OCTAVES) / (energy * inside)
         further = _REMAINDER_FRACTION * state.permitted / (_QUANTILE * energy * outside)
     count = int(np.clip((deviation / min(own.min(), further.min())) ** 2, _FEWEST_DRAWS, _MOST_DRAWS))
-    lattice = _lattice(state, octave, _FIRST_M, rng)
+    # As many samples as draws would need.
+    intervals = int(np.clip(good_intervals((count / _FILLED) ** (1 / 3)), _FEWEST_M, _FIRST_M))
+    lattice = _lattice(state, octave, intervals, rng)
     seconds = sum(size.lattice_seconds(lattice) for size in state.sizes)
     alone = max(count, _FEWEST_FLAT_DRAWS) if normals else count
     alone = min(alone, max(_FEWEST_DRAWS, int(_OCTAVE_SECONDS / state.draw_seconds)))
