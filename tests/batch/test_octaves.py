@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import replace
-from itertools import permutations
+from itertools import combinations, permutations
 from pathlib import Path
 from typing import Any
 
@@ -202,3 +202,20 @@ def test_the_spectrum_of_an_open_store_ends_at_the_areas(octave_store: Path) -> 
     assert (bands["lower"].values[1:] == bands["upper"].values[:-1]).all()
     pair, distance = (ask(-2.0, "ico/1", "reference") for ask in (tree.sobolev.spectrum, tree.sobolev.distance))
     assert pair["squared"].sum().item() == pytest.approx(distance["distance"].item() ** 2, rel=0.02)
+
+
+def test_pairs_that_were_not_compared_have_errors_that_hold(threads: Client, store_path: Path) -> None:
+    levels = (1, 2, 3)
+    table = small_table(
+        lattice={"xi_max": 4.0, "M": 32, "octaves": 2},
+        norm={"orders": [-1.0, -2.0]},
+        family=[{"name": "ico", "source": "icosphere", "levels": list(levels)}],
+    )
+    sb.run(sb.Study.from_table(table), store_path, threads)
+    pairs = sb.open_store(store_path)["distances"].to_dataset()
+    for one, other in combinations(levels, 2):
+        found = pairs.sel(mesh=f"ico/{one}", other=f"ico/{other}")
+        true = sb.distance(sb.icosphere(one), sb.icosphere(other), [-1.0, -2.0], rtol=1e-2)
+        gaps = np.abs(found["distance"].values - true["distance"].values)
+        assert (gaps <= found["error"].values + true["error"].values).all()
+        assert (found["truncation"].values > 0).all()

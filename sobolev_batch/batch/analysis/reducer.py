@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, field, fields, replace
 from functools import cached_property
@@ -41,8 +42,9 @@ _READ_AT_ONCE = 8
 _FEWEST_ROWS = 4
 # Factor of the errors of surfaces that are not equal.
 _APART = np.ones(())
-# Of two surfaces that were not compared, the energy's limit is at least this fraction of the last measured energy.
-_LEAST_LIMIT = 0.7
+# Of two surfaces that were not compared: the mean energy beyond the octaves is at least this fraction of the last
+# measured one, and exceeds the sum of both own ones by no more than this multiple of the last distance from it.
+_LEAST_LIMIT, _SWING = 0.7, 1.25
 # Rows of a tile whose values in octaves are held at a time take this many bytes.
 _HELD_BYTES = 128 << 20
 # Of a sample of octaves: its frequency, weight and place, values of three fields with their squares, and what moves
@@ -384,9 +386,15 @@ class Reducer:
             if second == self.known_reference and known is not None:
                 return known
         parts = [self.qualities[number].own for number in (row, other)]
+        energies, cutoff = [max(part.energies) for part in parts], parts[0].cutoff
         # Equal meshes have equal values.
-        highest = sum(max(part.energies) for part in parts) if last_energy else 0.0
-        return Remainder.between(min(_LEAST_LIMIT * last_energy, highest), highest, parts[0].cutoff)
+        if not last_energy:
+            return Remainder.between(0.0, 0.0, cutoff)
+        # Between parallel surfaces the energy rises through the sum to twice it, and swings about it.
+        total = sum(energies)
+        largest = sum(math.sqrt(energy) for energy in energies) ** 2
+        highest = max(total, min(total + _SWING * abs(total - last_energy), largest))
+        return Remainder.between(min(_LEAST_LIMIT * last_energy, total), highest, cutoff)
 
     def _direct(self, row: int, other: int) -> Sums:
         """Return the sums of one pair, from the difference of its fields."""
