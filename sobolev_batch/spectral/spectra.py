@@ -280,11 +280,14 @@ class RadialAxis:
         weights = np.stack([(1 + self.radii[beyond] ** 2) ** order for order in orders])
         return np.asarray(weights @ spectra.sums[:, beyond].T)
 
-    def last_energies(self, spectra: Spectra) -> Reals:
-        """Return the mean of ∫_{|ξ|=r} |field|² dS over the last octave (fields,)."""
-        last = self.parts[-1].sampling
-        of_last = [spectra.sums[:, part.place].sum(axis=1) for part in self.parts if part.sampling is last]
-        return np.asarray(np.sum(of_last, axis=0) / last.octave.integral(0.0))
+    def energies(self, spectra: Spectra) -> Reals:
+        """Return the mean of ∫_{|ξ|=r} |field|² dS over each octave (fields, octaves)."""
+        octaves = () if self.sampling is None else self.sampling.octaves
+        energies = np.zeros((len(spectra.sums), len(octaves)))
+        for part in self.parts:
+            octave = part.sampling.octave
+            energies[:, octave.index - 1] += spectra.sums[:, part.place].sum(axis=1) / octave.integral(0.0)
+        return energies
 
     def statistical_errors(self, spectra: Spectra, orders: Sequence[float]) -> Reals:
         """Return how far off the integrals over all octaves may be (orders, fields), at 99 %.

@@ -43,8 +43,9 @@ _FEWEST_ROWS = 4
 # Factor of the errors of surfaces that are not equal.
 _APART = np.ones(())
 # Of two surfaces that were not compared: the mean energy beyond the octaves is at least this fraction of the last
-# measured one, and exceeds the sum of both own ones by no more than this multiple of the last distance from it.
-_LEAST_LIMIT, _SWING = 0.7, 1.25
+# measured one. It exceeds the sum of both own ones by no more than this multiple of the last distance from it; or this
+# fraction of it, where the energy has just grown by more than a factor from octave to octave.
+_LEAST_LIMIT, _SWING, _RISE, _STEEPEST_GROWTH = 0.7, 1.25, 0.9, 2.5
 # Rows of a tile whose values in octaves are held at a time take this many bytes.
 _HELD_BYTES = 128 << 20
 # Of a sample of octaves: its frequency, weight and place, values of three fields with their squares, and what moves
@@ -203,7 +204,7 @@ class Reducer:
         tail, product, square = None, self._sums(spectra.product).totals, self._sums(reference).totals
         beyond_difference = np.zeros_like(beyond)
         if has_octaves:
-            energies = self.axis.last_energies(spectra.distance)
+            energies = self.axis.energies(spectra.distance)
             remainders = [self._remainder(row, self.reference, it) for row, it in zip(rows, energies, strict=True)]
             tail = self._tail(spectra.distance, remainders)
             of_reference = self._tail(reference, [self.qualities[self.reference].own])
@@ -363,7 +364,8 @@ class Reducer:
 
     def _tail_of_pair(self, row: int, other: int, difference: NDArray[np.complexfloating]) -> Tail:
         sums = self.octave_sums(difference)
-        return Tail.from_sums(sums, *self._remainder(row, other, sums[-1].energy).at(self.orders))
+        energies = [octave.energy for octave in sums]
+        return Tail.from_sums(sums, *self._remainder(row, other, energies).at(self.orders))
 
     def _tails_of_pairs(self, sampling: TailSampling, rows: Sequence[int], others: Sequence[int], shared: int) -> Tail:
         """Return the tails of squared distances (orders, rows, others); the first ``shared`` others are the rows."""
@@ -379,22 +381,26 @@ class Reducer:
             parts[..., :shared] += np.swapaxes(np.triu(parts[..., :shared], 1), -1, -2)
         return Tail(*parts)
 
-    def _remainder(self, row: int, other: int, last_energy: float) -> Remainder:
-        """Return what lies beyond the octaves in a distance: known to the reference, else between bounds."""
+    def _remainder(self, row: int, other: int, measured: Sequence[float]) -> Remainder:
+        """Return what lies beyond the octaves in a distance: known to the reference, else between bounds.
+
+        These follow from the energies in the octaves, which are measured, and those of both surfaces beyond.
+        """
         for first, second in ((row, other), (other, row)):
             known = self.qualities[first].difference
             if second == self.known_reference and known is not None:
                 return known
         parts = [self.qualities[number].own for number in (row, other)]
         energies, cutoff = [max(part.energies) for part in parts], parts[0].cutoff
+        before, last = ([0.0, *measured])[-2:]
         # Equal meshes have equal values.
-        if not last_energy:
+        if not last:
             return Remainder.between(0.0, 0.0, cutoff)
-        # Between parallel surfaces the energy rises through the sum to twice it, and swings about it.
+        # Between parallel surfaces the energy grows like |ξ|², rises through the sum to twice it, and swings about it.
         total = sum(energies)
         largest = sum(math.sqrt(energy) for energy in energies) ** 2
-        highest = max(total, min(total + _SWING * abs(total - last_energy), largest))
-        return Remainder.between(min(_LEAST_LIMIT * last_energy, total), highest, cutoff)
+        swing = max(_SWING * abs(total - last), _RISE * total if last > _STEEPEST_GROWTH * before else 0.0)
+        return Remainder.between(min(_LEAST_LIMIT * last, total), max(total, min(total + swing, largest)), cutoff)
 
     def _direct(self, row: int, other: int) -> Sums:
         """Return the sums of one pair, from the difference of its fields."""
