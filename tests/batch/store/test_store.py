@@ -64,6 +64,14 @@ def test_refuses_the_store_of_another_study_and_leaves_it_alone(
     assert contents(store_path) == before
 
 
+def test_a_folder_of_other_files_is_refused_and_left_alone(store_path: Path) -> None:
+    store_path.mkdir()
+    (store_path / "notes.txt").write_text("mine")
+    with pytest.raises(StoreError, match="not empty and holds no store"):
+        prepare_store(store_path, small_plan())
+    assert [path.name for path in contents(store_path)] == ["notes.txt"]
+
+
 def test_new_meshes_become_new_rows(store_path: Path) -> None:
     store = prepare_store(store_path, small_plan())
     store.write_record(0, Record("k", "complete"))

@@ -93,6 +93,8 @@ def test_files_of_longer_names_alone_are_no_files(folder: Path) -> None:
 
 def test_objects_can_be_listed_with_references_and_scalings_of_their_own(folder: Path) -> None:
     ball = {"name": "ball", "reference": {"source": "sphere"}, "scaling": {"mode": "none"}}
+    with pytest.raises(sb.StudyError, match="read them as a StudyCollection"):
+        sb.Study.from_table(table(object=[{"name": "cow"}, ball], family=ICO), folder=folder)
     found = sb.StudyCollection.from_table(table(object=[{"name": "cow"}, ball], family=ICO), folder=folder)
     studies = [(study.name, study.scaling) for study in found.studies.values()]
     assert studies == [("small cow", None), ("small ball", sb.Similarity())]

@@ -224,6 +224,12 @@ def test_bad_files_are_refused_by_name(tmp_path: Path, form: str, name: str) -> 
     assert refusal(path)
 
 
+def test_a_negative_dimension_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "scan.gii"
+    path.write_bytes(changed(GII_BOX, (b'Dim0="8"', b'Dim0="-8"')))
+    assert "negative dimension: [-8, 3]" in refusal(path)
+
+
 # Formats whose vertices and triangles keep their numbers.
 @pytest.mark.parametrize("form", ["ply ascii", "off", "gifti", "freesurfer"])
 @pytest.mark.parametrize(("name", "entry"), [("NaN", "#3"), ("index 8", r"#12 = \[0, 1, 8\]")])
