@@ -12,7 +12,7 @@ from dask import config
 from distributed import Client
 
 from sobolev_batch import ClusterError, InputError, Study, icosphere, open_store, run, write_mesh
-from sobolev_batch.batch.cluster import workers
+from sobolev_batch.batch.cluster import clients, workers
 from sobolev_batch.batch.cluster.clients import local_client, remote_client
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.cluster.workers import MEMORY, prepare_workers, require_same_versions
@@ -51,6 +51,20 @@ def test_workers_declare_their_memory(client: Client) -> None:
         limit = workers[member.address]["memory_limit"]
         assert limit == machine_memory()[0] // len(workers)
         assert 0.5 < member.allowed_bytes / limit < 0.85
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_local_workers_have_equal_parts_of_the_machine(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    limits: list[float] = []
+
+    def start(*, memory_limit: float, **options: object) -> None:
+        limits.append(memory_limit)
+        raise KeyError("not started")
+
+    monkeypatch.setattr(clients, "LocalCluster", start)
+    with pytest.raises(KeyError, match="not started"), local_client(count):
+        pass
+    assert limits == [machine_memory()[0] // count]
 
 
 @pytest.mark.all
