@@ -120,7 +120,9 @@ def require_unchanged(tree: xr.DataTree) -> None:
         StoreError: Its tables are not those that it had, or it is gone.
     """
     source = source_of(tree)
-    if source is not None and Store.open(source).attributes().get(DIGEST) != tree.encoding.get(_STATE):
+    # One that xarray itself has opened says so among its attributes.
+    state = tree.encoding.get(_STATE, tree.attrs.get(DIGEST))
+    if source is not None and Store.open(source).attributes().get(DIGEST) != state:
         raise StoreError(
             f"{source}: a run has changed the store while it was read; once that run has ended, open the store again, "
             "or give the same command again"

@@ -61,6 +61,11 @@ def test_one_pair_reads_no_other_mesh(finished_store: Path, monkeypatch: pytest.
     assert found["distance"].item() == pytest.approx(sb.table(tree, -3.5)["distance"].iloc[3], rel=1e-12)
 
 
+def test_a_tree_that_xarray_has_opened_answers_too(finished_store: Path) -> None:
+    plain, own = xr.open_datatree(finished_store, engine="zarr"), sb.open_store(finished_store)
+    xr.testing.assert_equal(plain.sobolev.distance(-3.5)["distance"], own.sobolev.distance(-3.5)["distance"])
+
+
 def test_stacks_are_taken_one_by_one(finished_store: Path) -> None:
     tree = sb.open_store(finished_store)
     stored = variable(tree, "fourier", "fourier")

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from sobolev_batch import LatticeError, MeshError, Study, StudyError
-from sobolev_batch.batch.study.plan import make_plan
+from sobolev_batch.batch.study.plan import make_plan, members_of
 from tests.support.studies import small_table
 
 
@@ -105,3 +105,13 @@ def test_large_lattices_are_cut_into_chunks_and_small_ones_refused() -> None:
     sizes = [block.size for block in plan.blocks]
     assert (len(sizes), sum(sizes), plan.field_bytes) == (5, 513 * 513 * 257, 513 * 513 * 257 * 16)
     assert max(sizes) * 16 <= 256 << 20
+
+
+def test_two_surfaces_of_one_label_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A source of another package may not keep its promise."""
+    study = Study.from_table(small_table())
+    source = study.families[0].source
+    members = source.members(study.folder)
+    monkeypatch.setattr(type(source), "members", lambda self, folder: [*members, members[0]])
+    with pytest.raises(StudyError, match="two surfaces of the study have the label 'ico/0'"):
+        members_of(study)
