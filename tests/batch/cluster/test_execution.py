@@ -25,6 +25,7 @@ from sobolev_batch import (
     submit,
 )
 from sobolev_batch.batch.cluster.execution import Cluster, Progress, Task, describe_failure
+from sobolev_batch.batch.cluster.watch import Watch
 from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers, prepare_workers
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.status import Status
@@ -194,3 +195,8 @@ def test_the_page_of_clusters_runs_a_study_by_a_client_of_the_user(capsys: pytes
     first, start, *fields, _, last = capsys.readouterr().out.splitlines()
     assert (first[:22], start, last) == ("dashboard: http://127.", "0 of 3 transforms", "1 of 1 tables reduced")
     assert re.fullmatch(r"\[1/3\] \S+: complete, \d\.\d\d s", fields[0])
+
+
+def test_a_failure_of_the_storage_is_not_blamed_on_a_scheduler_that_answers(threads: Client) -> None:
+    with pytest.raises(OSError, match="no room"), Watch(threads).kept():
+        raise OSError("no room")
