@@ -192,7 +192,7 @@ def _study_of_files(intervals: int) -> dict[str, Any]:
     return {
         "study": {"name": "overhead"},
         "lattice": {"xi_max": _XI_MAX, "M": intervals},
-        "norm": {"orders": [-10.0], "pairs": "reference"},
+        "norm": {"orders": [-10.0]},
         "reference": {"source": "sphere"},
         "family": [{"name": "perturbed", "source": "files", "paths": ["*.ply"]}],
     }
@@ -213,7 +213,8 @@ def _study_of_spheres(count: int, intervals: int, orders: Sequence[float], pairs
     table = {
         "study": {"name": "pairs"},
         "lattice": {"xi_max": _XI_MAX, "M": intervals},
-        "norm": {"orders": list(orders), "pairs": pairs},
+        "norm": {"orders": list(orders)},
+        "compare": {"pairs": pairs},
         "reference": {"source": "family", "family": "0"},
         "family": families,
     }
