@@ -204,6 +204,7 @@ def test_the_spectrum_of_an_open_store_ends_at_the_areas(octave_store: Path) -> 
     assert pair["squared"].sum().item() == pytest.approx(distance["distance"].item() ** 2, rel=0.02)
 
 
+@pytest.mark.slow
 def test_pairs_that_were_not_compared_have_errors_that_hold(threads: Client, store_path: Path) -> None:
     levels = (1, 2, 3)
     table = small_table(

@@ -98,6 +98,7 @@ def test_an_interrupted_run_goes_on_with_the_tiles_that_are_missing(
     assert matrix(store_path, -3.0).notna().all(axis=None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_lost", [True, False])
 def test_a_lost_or_altered_tile_is_told_and_made_again(
     is_lost: bool, store_path: Path, threads: Client, tiles: list[Tile]
@@ -120,6 +121,7 @@ def test_a_lost_or_altered_tile_is_told_and_made_again(
     assert matrix(store_path, -3.0).equals(before)
 
 
+@pytest.mark.slow
 def test_a_study_may_turn_to_its_reference_alone_and_back(store_path: Path, threads: Client) -> None:
     run(balls(3), store_path, threads)
     before = matrix(store_path, -3.0)
@@ -140,6 +142,7 @@ def test_a_mesh_that_failed_has_no_numbers_in_any_tile(store_path: Path, threads
     assert found.drop(index="lost/nowhere", columns="lost/nowhere").notna().all(axis=None)
 
 
+@pytest.mark.slow
 def test_chunks_of_an_earlier_state_are_told_and_made_again(store_path: Path, threads: Client) -> None:
     earlier = store_path.with_name("earlier.zarr")
     study = balls(3, reference={"source": "sphere", "radius": 0.9})

@@ -53,6 +53,7 @@ def test_a_weighted_sum_of_a_spectrum_is_a_squared_norm_or_distance(
             assert found.sel(mesh=expected["mesh"]).values == pytest.approx(expected.values, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_only_new_fields_are_read_for_new_meshes(store_path: Path, threads: Client, rows_read: list[int]) -> None:
     run(balls(2), store_path, threads)
     labels = Store(store_path).labels()
@@ -73,6 +74,7 @@ def assert_same_results_as_anew(study: Study, store_path: Path, threads: Client)
     pd.testing.assert_frame_equal(found, expected, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_another_reference_makes_all_spectra_anew(store_path: Path, threads: Client) -> None:
     run(balls(), store_path, threads)
     study = balls(reference={"source": "sphere", "radius": 0.9})
@@ -80,6 +82,7 @@ def test_another_reference_makes_all_spectra_anew(store_path: Path, threads: Cli
     assert_same_results_as_anew(study, store_path, threads)
 
 
+@pytest.mark.slow
 def test_an_interrupted_chunk_is_computed_again(
     store_path: Path, threads: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -110,6 +113,7 @@ def alter(path: Path) -> None:
     path.write_bytes(content)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", [lose, alter])
 @pytest.mark.parametrize("name", ["spectra/norm", SPECTRA_KEYS])
 def test_spectra_that_are_lost_or_altered_are_told_and_made_again(

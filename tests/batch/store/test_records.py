@@ -152,6 +152,7 @@ def test_a_run_collects_and_a_later_one_mends_what_was_killed(study: Study, stor
     assert json.loads(there.read_strings("records/page")[1])["row"] == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", [truncate, empty, flip, delete])
 def test_a_damaged_page_concerns_its_rows_alone(
     damage: Callable[[Path], None], study: Study, store: Path, sound: Path, threads: Client, tmp_path: Path
