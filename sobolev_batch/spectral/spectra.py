@@ -66,6 +66,10 @@ class ComparedSpectra:
         """Return several of these as one, field by field."""
         return cls(*(Spectra.joined([getattr(one, field.name) for one in several]) for field in fields(cls)))
 
+    def __getitem__(self, chosen: Any) -> ComparedSpectra:
+        """Return the spectra of some fields."""
+        return ComparedSpectra(self.norm[chosen], self.distance[chosen], self.product[chosen])
+
     def to_arrays(self) -> dict[str, Reals]:
         """Return the arrays by the names that `RadialAxis.arrays` describes."""
         arrays = {

@@ -169,9 +169,9 @@ def test_distances_of_all_meshes_from_another_than_the_reference(balls: str) -> 
     )
 
 
-@pytest.mark.parametrize("order", [-3.0, -1.2])
+@pytest.mark.parametrize(("mesh", "order"), [("b5/sphere", -3.0), ("b5/sphere", -1.2), ("reference", -3.0)])
 def test_the_nearest_meshes_are_found_without_the_fields_of_others(
-    balls: str, order: float, monkeypatch: pytest.MonkeyPatch
+    balls: str, mesh: str, order: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read: set[int] = set()
     read_fields = Store.read_fields
@@ -181,9 +181,9 @@ def test_the_nearest_meshes_are_found_without_the_fields_of_others(
         return read_fields(store, rows, *arguments)
 
     monkeypatch.setattr(store_accessor, "_CANDIDATES", 2)
-    expected = sb.matrix(balls, order)["b5/sphere"].drop(["b5/sphere", "lost/nowhere"]).nsmallest(3)
+    expected = sb.matrix(balls, order)[mesh].drop([mesh, "lost/nowhere"]).nsmallest(3)
     monkeypatch.setattr(Store, "read_fields", recording)
-    found = sb.open_store(balls).sobolev.nearest("b5/sphere", 3, order)
+    found = sb.open_store(balls).sobolev.nearest(mesh, 3, order)
     pd.testing.assert_series_equal(found["distance"].to_series(), expected, rtol=1e-9, check_names=False)
     assert len(read) <= 8
     assert sb.open_store(balls).sobolev.nearest("b5/sphere", 50).sizes["mesh"] == 12

@@ -89,7 +89,7 @@ def _places(of: set[int], rows: range) -> list[int]:
 
 
 def read_spectra(store: Store, rows: Sequence[int]) -> ComparedSpectra:
-    """Return the spectra of rows in ascending order; a damaged chunk raises a `DamageError`."""
+    """Return the spectra of rows, in their order; a damaged chunk raises a `DamageError`."""
     parts, wanted = [], set(rows)
     for number, chunk in enumerate(chunks_of_spectra(store)):
         of_chunk = wanted.intersection(chunk)
@@ -97,7 +97,8 @@ def read_spectra(store: Store, rows: Sequence[int]) -> ComparedSpectra:
             _, arrays = read_chunk(store, SPECTRA_KEYS, (number,))
             chosen = {name.partition("/")[2]: values[_places(of_chunk, chunk)] for name, values in arrays.items()}
             parts.append(ComparedSpectra.from_arrays(chosen))
-    return ComparedSpectra.joined(parts)
+    places = {row: place for place, row in enumerate(sorted(wanted))}
+    return ComparedSpectra.joined(parts)[[places[row] for row in rows]]
 
 
 def lower_bounds(reducer: Reducer, row: int, others: Collection[int]) -> dict[int, float]:

@@ -18,13 +18,15 @@ from sobolev_batch.batch.storage.checked import CHANGED, checksum_of
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.errors import DamageError
 
+# Raise it where other numbers are computed from the same fields: all chunks are then stale.
+_VERSION = "2"
 # Place of a chunk of keys, counted in chunks.
 Index = tuple[int, ...]
 
 
 def key_of(parts: Iterable[str]) -> str:
     """Return the key for what a chunk's numbers depend on."""
-    return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:32]
+    return hashlib.sha256(" ".join([_VERSION, *parts]).encode()).hexdigest()[:32]
 
 
 def arrays_of(store: Store, keys: str) -> list[str]:
