@@ -147,8 +147,9 @@ class StoreAccessor:
         orders, meshes = (single_order(order),), finished_group(self._tree, "meshes")
         reducer, _ = stored_reducer(self._tree, orders)
         labels = dict(zip(meshes["row"].values.tolist(), meshes["mesh"].values.tolist(), strict=True))
-        row = _row_of(self._tree, meshes, mesh)
-        bounds = lower_bounds(reducer, row, [one for one in reducer.complete if one in labels and one != row])
+        _require_fields(self._tree, meshes, [mesh])
+        row = int(meshes["row"].sel(mesh=mesh).item())
+        bounds = lower_bounds(reducer, row, {one for one in reducer.complete if one in labels and one != row})
         found: list[tuple[float, int, list[float]]] = []
         candidates = sorted(bounds, key=bounds.__getitem__)
         for start in range(0, len(candidates), _CANDIDATES):
@@ -170,8 +171,7 @@ class StoreAccessor:
     def _chosen(self, table: xr.Dataset, order: Orders, mesh: Meshes) -> xr.Dataset:
         """Return a table (mesh, order) of some meshes, without the dimension of what is single."""
         if mesh is not None:
-            for label in [mesh] if isinstance(mesh, str) else mesh:
-                _row_of(self._tree, table, label)
+            _require_fields(self._tree, table, [mesh] if isinstance(mesh, str) else list(mesh))
             table = table.sel(mesh=mesh if isinstance(mesh, str) else list(mesh))
         if np.ndim(order) == 0:
             table = table.squeeze("order")
@@ -240,19 +240,19 @@ def stored_reducer(tree: xr.DataTree, order: Orders, *meshes: str) -> tuple[Redu
         DamageError: The record of a mesh is not the one that the tables were made from.
     """
     store, orders = Store.open(location_of(tree)), check_orders(order)
-    labels, removed = store.labels(), store.removed
-    wanted = {i for i, label in enumerate(labels) if label not in removed and (not meshes or label in meshes)}
+    labels, removed, chosen = store.labels(), store.removed, set(meshes)
+    wanted = {i for i, label in enumerate(labels) if label not in removed and (not chosen or label in chosen)}
     read = {i: store.read_record(i) for i in wanted} if meshes else dict(enumerate(store.records()))
     records = [read[i] if i in wanted else None for i in range(len(labels))]
     for i, problem in (rows_unlike_tables(store, records, wanted) if wanted else {}).items():
         raise DamageError(
             f"{store.path}: the field of {labels[i]} is damaged ({problem}); run the study again", problem, i
         )
+    complete, places = complete_records(records), {label: row for row, label in enumerate(labels)}
     for mesh in meshes:
-        if mesh not in labels or labels.index(mesh) not in complete_records(records):
+        if places.get(mesh) not in complete:
             raise InputError(f"{store.path}: no mesh {quoted(mesh)} with a field; its labels begin {labels[:3]}")
-    rows, reference = [labels.index(mesh) for mesh in meshes], labels.index(store.attributes()["study"]["reference"])
-    complete = complete_records(records)
+    rows, reference = [places[mesh] for mesh in meshes], places[store.attributes()["study"]["reference"]]
     qualities = {row: Quality.from_json(record.quality) for row, record in complete.items()}
     checksums = {row: record.checksums for row, record in complete.items()}
     compared_with = rows[-1] if rows else None
@@ -279,7 +279,9 @@ def _computed(tree: xr.DataTree, orders: tuple[float, ...], meshes: Meshes = Non
         problem = "they are not those of the stored fields"
         raise DamageError(f"{store.path}: radial spectra are damaged ({problem}); run the study again", problem)
     if meshes is not None:
-        table = table.sel(mesh=list(dict.fromkeys([*([meshes] if isinstance(meshes, str) else meshes), reference])))
+        chosen = [meshes] if isinstance(meshes, str) else list(meshes)
+        _require_fields(tree, table, chosen)
+        table = table.sel(mesh=list(dict.fromkeys([*chosen, reference])))
     texts, needed = store.read_strings(QUALITY), set(table["row"].values.tolist())
     qualities = {row: Quality.from_json(texts[row]) for row in complete if row in needed}
     reducer = Reducer.for_fields(store, store.choice(), orders, qualities, {}, row_of_reference)
@@ -330,8 +332,9 @@ def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
         return _joined(stored, _computed(tree, others).distances_table(), chosen)
     reducer, _ = stored_reducer(tree, others)
     rows: list[int] = meshes["row"].values.tolist()
-    complete = [row for row in reducer.complete if row in rows]
-    places = np.ix_(*[[rows.index(row) for row in complete]] * 2)
+    place_of = {row: place for place, row in enumerate(rows)}
+    complete = [row for row in reducer.complete if row in place_of]
+    places = np.ix_(*[[place_of[row] for row in complete]] * 2)
     found = pair_distances(reducer, complete, complete).named("distance")
     columns = {name: np.full((len(rows), len(rows), len(others)), np.nan) for name in found}
     for name, values in found.items():
@@ -354,12 +357,14 @@ def norms_at(tree: xr.DataTree, order: Orders | None, meshes: Meshes = None) -> 
     return _joined(stored, _computed(tree, others, meshes).norms_table(), chosen)
 
 
-def _row_of(tree: xr.DataTree, table: xr.Dataset, mesh: str) -> int:
-    """Return the row of a mesh with a field."""
-    labels = table["mesh"].values.tolist()
-    if mesh not in labels or table["status"].values[labels.index(mesh)] != "complete":
-        raise InputError(f"{source_of(tree)}: no mesh {quoted(mesh)} with a field; its labels begin {labels[:3]}")
-    return int(finished_group(tree, "meshes", load=False)["row"].sel(mesh=mesh).item())
+def _require_fields(tree: xr.DataTree, table: xr.Dataset, meshes: Sequence[str]) -> None:
+    """Refuse labels of meshes that a table lacks, or that have no field."""
+    labels = table["mesh"].values
+    complete = set(labels[table["status"].values == "complete"].tolist())
+    for mesh in meshes:
+        if mesh not in complete:
+            known = labels[:3].tolist()
+            raise InputError(f"{source_of(tree)}: no mesh {quoted(mesh)} with a field; its labels begin {known}")
 
 
 def order_note(tree: xr.DataTree, orders: Sequence[float]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
 import tracemalloc
@@ -157,8 +158,31 @@ def test_distances_of_all_meshes_at_once(balls: str) -> None:
     assert some["mesh"].values.tolist() == ["b3/sphere", "b1/sphere"]
     assert tree.sobolev.distance(-2.5, "b3/sphere")["distance"].dims == ()
     assert tree.sobolev.norm(-2.5)["norm"].sel(mesh="lost/nowhere").isnull()
-    with pytest.raises(sb.InputError, match="no mesh 'lost/nowhere' with a field"):
-        tree.sobolev.distance(-2.5, "lost/nowhere")
+    for order, label in itertools.product((-2.5, -10.0), ("lost/nowhere", "b99/sphere")):
+        with pytest.raises(sb.InputError, match=f"no mesh '{label}' with a field"):
+            tree.sobolev.distance(order, label)
+
+
+class _Counted(str):
+    """A label that counts how often it is compared with another."""
+
+    __slots__ = ()
+    comparisons = 0
+
+    def __eq__(self, other: object) -> bool:
+        _Counted.comparisons += 1
+        return str.__eq__(self, other)
+
+    __hash__ = str.__hash__
+
+
+def test_labels_of_many_meshes_are_found_without_a_search_for_each(balls: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    labels = Store.labels
+    monkeypatch.setattr(Store, "labels", lambda store: tuple(map(_Counted, labels(store))))
+    meshes = [f"b{k}/sphere" for k in range(12)]
+    sb.open_store(balls).sobolev.distance(-3.0, meshes, "b2/sphere")
+    # A search would compare half of all labels with each.
+    assert 0 < _Counted.comparisons <= 4 * len(meshes)
 
 
 def test_distances_of_all_meshes_from_another_than_the_reference(balls: str) -> None:

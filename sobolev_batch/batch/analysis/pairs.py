@@ -140,7 +140,7 @@ def fill_tile(reducer: Reducer, pairs: Pairs, tile: tuple[int, int]) -> None:
     """
     sides = [pairs.tile_rows(number) for number in tile]
     complete = [[row for row in side if row in pairs.keys] for side in sides]
-    places = np.ix_(*([side.index(row) for row in rows] for side, rows in zip(sides, complete, strict=True)))
+    places = np.ix_(*([place for place, row in enumerate(side) if row in pairs.keys] for side in sides))
     estimate = pair_distances(reducer, *complete) if all(complete) else None
     spans = [slice(k * pairs.side, k * pairs.side + len(side)) for k, side in zip(tile, sides, strict=True)]
     arrays: dict[str, Reals] = {}

@@ -291,7 +291,7 @@ class Reducer:
         if shared:
             for square in (sums.squares[..., :shared], sums.outer[..., :shared]):
                 square[...] = np.triu(square) + np.swapaxes(np.triu(square, 1), -1, -2)
-        unequal = np.array([[row != other for other in others] for row in rows], dtype=np.float64)
+        unequal = np.not_equal.outer(rows, others).astype(np.float64)
         areas = self.areas[list(rows)][:, None] + self.areas[list(others)]
         errors = self.errors[:, list(rows)][:, :, None] + self.errors[:, list(others)][:, None, :]
         tail = None if self.sampling is None else self._tails_of_pairs(self.sampling, rows, others, shared)

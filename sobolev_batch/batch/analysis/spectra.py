@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from contextlib import suppress
 
 import numpy as np
@@ -101,7 +101,7 @@ def read_spectra(store: Store, rows: Sequence[int]) -> ComparedSpectra:
     return ComparedSpectra.joined(parts)[[places[row] for row in rows]]
 
 
-def lower_bounds(reducer: Reducer, row: int, others: Collection[int]) -> dict[int, float]:
+def lower_bounds(reducer: Reducer, row: int, others: Set[int]) -> dict[int, float]:
     """Return a lower bound on the distance of a row from each of some others, at the reducer's first order.
 
     On each shell two fields differ by no less than their norms there, or those of their differences from a third field.

@@ -97,7 +97,7 @@ class StudyMeshes:
 
     def stem(self, label: str) -> str:
         """Return the file name of a mesh without suffix: its number in the store and the plain letters of its label."""
-        return file_stem(self.table["mesh"].values.tolist().index(label), label)
+        return file_stem(int(self.table.indexes["mesh"].get_loc(label)), label)
 
 
 def matching_labels(tree: xr.DataTree, names: Sequence[str]) -> tuple[str, ...]:
@@ -110,9 +110,9 @@ def matching_labels(tree: xr.DataTree, names: Sequence[str]) -> tuple[str, ...]:
     known: list[str] = meshes["mesh"].values.tolist()
     usable = (meshes["status"] == "complete") & (meshes["triangles"] > 0) & (meshes["mesh"] != reference_of(tree))
     candidates: list[str] = meshes["mesh"].values[usable.values].tolist()
-    chosen: list[str] = []
+    chosen, labels = list[str](), set(known)
     for name in names:
-        if name in known:
+        if name in labels:
             chosen.append(name)
             continue
         is_pattern = any(character in name for character in "*?[")

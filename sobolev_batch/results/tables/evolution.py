@@ -73,7 +73,7 @@ def evolution(
     labels, true_labels = _labels_by_time(tree, truth)
     complete = set(complete_meshes(tree))
     times = sorted({time for family in labels.values() for time in family})
-    shape = (len(labels), len(times), len(orders))
+    places, shape = {time: k for k, time in enumerate(times)}, (len(labels), len(times), len(orders))
     numbers = {name: np.full(shape, np.nan) for name in _NUMBERS}
     for i, family in enumerate(labels.values()):
         for time, label in family.items():
@@ -83,7 +83,7 @@ def evolution(
                 found = StoreAccessor(tree).distance(orders, label, str(true_label))
             else:
                 continue
-            place = i, times.index(time)
+            place = i, places[time]
             for name, values in numbers.items():
                 values[place] = found[name].values
     return _dataset(list(labels), times, orders, numbers, factor)

@@ -148,6 +148,7 @@ def _tables(distances: xr.Dataset, numbers: Reals, errors: Reals, style: Format)
     """
     labels, others = (distances[name].values.tolist() for name in ("mesh", "other"))
     is_symmetric = labels == others
+    numbers_of = {label: str(i) for i, label in enumerate(labels, 1)}
     names = [f"{i} {middle_cut(label, _LONGEST_LABEL)}" for i, label in enumerate(labels, 1)]
     cells = [
         [
@@ -170,5 +171,5 @@ def _tables(distances: xr.Dataset, numbers: Reals, errors: Reals, style: Format)
             for i, (name, row) in enumerate(zip(names, cells, strict=True))
             if i in named or any(row[j] for j in group)
         ]
-        tables.append(printed_table(rows, ["", *(str(labels.index(others[j]) + 1) for j in group)], style))
+        tables.append(printed_table(rows, ["", *(numbers_of[others[j]] for j in group)], style))
     return tables
