@@ -115,9 +115,9 @@ def test_meshes_by_patterns(folder: Path, tmp_path: Path) -> None:
     assert len(output("witness", STORE, "--mesh", "ico/*", "--output", str(tmp_path), folder=folder).split()) == 2
 
 
-def test_plot_draws_every_picture(folder: Path) -> None:
+def test_plot_draws_every_picture_at_an_order_that_is_not_stored(folder: Path) -> None:
     formats = ("--format", "svg", "--format", "png")
-    options = (*formats, "--family", "i*", "--x", "vertices", "--order", "-3", "--size", "84x60mm")
+    options = (*formats, "--family", "i*", "--x", "vertices", "--order", "-3.5", "--size", "84x60mm")
     done = call("plot", STORE, "--output", "pictures", "--witness", "ico/1", *options, folder=folder)
     assert (done.returncode, done.stderr) == (0, "")
     paths = [folder / line for line in done.stdout.split()]
@@ -166,6 +166,17 @@ def test_the_exit_status_of_a_verdict(folder: Path) -> None:
         assert (done.returncode, done.stderr) == (status, "")
         assert done.stdout.startswith(f"{file}: {word}")
         assert done.stdout.count("\n") == 1
+
+
+def test_an_error_is_no_difference(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise RuntimeError("broken")
+
+    monkeypatch.setattr("sobolev_batch.testing.verdict.same_surface", fail)
+    for options in (("--below", "0.1"), ("--below=0.1",)):
+        done = call("compare", "1.off", "3.off", *options, folder=folder)
+        assert (done.returncode, done.stdout) == (2, "")
+        assert done.stderr == "error: RuntimeError: broken (--debug shows where)\n"
 
 
 def test_fit_writes_a_nearer_mesh_in_the_unit_of_its_files(folder: Path) -> None:

@@ -119,7 +119,7 @@ def test_a_process_shows_names_and_reasons_of_its_workers_too(folder: Path) -> N
     assert done.returncode == 3
     assert not harmful(output + errors)
     assert f"files/broken: failed, {folder}/{SHOWN}/broken.obj: " in errors
-    assert f"files/broken is failed: {folder}/{SHOWN}/broken.obj: " in output
+    assert f"files/broken failed: {folder}/{SHOWN}/broken.obj: " in output
     assert f"WARNING sobolev_batch.batch.study.plan: files/gone: {folder}/{SHOWN_LABEL}/gone.obj: " in errors
 
 

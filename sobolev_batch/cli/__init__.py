@@ -29,6 +29,9 @@ def main() -> None:
     """Run the command line; the process ends with its exit status."""
     debug = "--debug" in sys.argv
     command = next((argument for argument in sys.argv[1:] if not argument.startswith("-")), "")
+    # Of a verdict, the status of other errors means that the files differ.
+    is_verdict = command == "compare" and any(word.partition("=")[0] == "--below" for word in sys.argv)
+    other = EXIT_INPUT if is_verdict else EXIT_OTHER
     # A job at its time limit is also asked to end, and has time to give up its lock of a store.
     deadline = Deadline(_REMARKS.get(command, ""), _SECONDS_WITH_LOCK.get(command, SECONDS_TO_END))
     deadline.start()
@@ -48,11 +51,11 @@ def main() -> None:
     except Exception as error:
         if debug:
             echo_lines(traceback.format_exc().removesuffix("\n"), err=True)
-            sys.exit(EXIT_OTHER)
+            sys.exit(other)
         is_ours = isinstance(error, SobolevBatchError)
         message = str(error) if is_ours else f"{type(error).__name__}: {error} (--debug shows where)"
         echo(f"error: {message}", err=True)
-        sys.exit(EXIT_INPUT if isinstance(error, InputError) else EXIT_OTHER)
+        sys.exit(EXIT_INPUT if isinstance(error, InputError) else other)
     sys.exit(status or 0)
 
 

@@ -49,8 +49,8 @@ def cli(context: click.Context, debug: bool) -> None:
     A study file names families of meshes and a reference. `run` stores the Fourier transform of every
     mesh and prints its distance from the reference.
 
-    The exit status is 0 if all is done, 1 after another error, 2 if the input is wrong, 3 if some meshes failed, 130
-    after Ctrl-C and 143 after SIGTERM.
+    The exit status is 0 if all is done, 2 if the input is wrong, 3 if some meshes failed or are missing, 1 after
+    another error, 130 after Ctrl-C and 143 after SIGTERM. `compare --below` has its own.
     """
     context.obj = debug
     logging.basicConfig(

@@ -118,7 +118,7 @@ def compare_command(
 
     B is the reference. The difference is given in per cent of its norm, with a bound on the error, and with the share
     of the squared distance that a change of area explains. With --below, print one line on whether both are the same
-    surface. The exit status is then 0 if they are, 1 if they are not, and 4 if that cannot be told.
+    surface. The exit status is then 0 if they are, 1 if they are not, 4 if that cannot be told, and 2 after any error.
     """
     from sobolev_batch.spectral.lattice import Lattice
     from sobolev_batch.spectral.metrics.norms import distance, yardsticks

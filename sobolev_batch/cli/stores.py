@@ -55,7 +55,7 @@ def status_command(context: click.Context, store: Location, follow: bool) -> Non
 
     The time left is estimated from the surfaces that were finished last.
 
-    The exit status is 3 if some surfaces failed, and 1 if the run failed or shows no sign of life.
+    The exit status is 1 if the run failed or shows no sign of life, and 3 if some surfaces failed or are missing.
     """
     from sobolev_batch.results.status import status
 
@@ -71,10 +71,10 @@ def status_command(context: click.Context, store: Location, follow: bool) -> Non
             current = status(store)
     replace_line("", shown)
     echo_lines(current)
-    if current.failed or current.not_compared:
-        context.exit(EXIT_SOME_FAILED)
     if current.lost or (current.run is not None and current.run.state == "failed"):
         context.exit(EXIT_OTHER)
+    if current.failed or current.not_compared or current.is_incomplete:
+        context.exit(EXIT_SOME_FAILED)
 
 
 @cli.command("verify")

@@ -18,7 +18,6 @@ from sobolev_batch.batch.store.store import DIGEST, OCTAVES_GROUP, SPECTRA_GROUP
 from sobolev_batch.batch.store.tables import lost_tables
 from sobolev_batch.errors import DamageError, InputError, StoreError, one_line
 from sobolev_batch.spectral.fields import Quality
-from sobolev_batch.spectral.lattice import Orders
 from sobolev_batch.surfaces.shapes.surface import placement_doubt
 from sobolev_batch.surfaces.sources.names import quoted
 
@@ -175,19 +174,6 @@ def finished_group(tree: xr.DataTree, name: str, *, load: bool = True) -> xr.Dat
         raise InputError("the store has no tables yet: run the study to its end")
     dataset = tree[name].to_dataset()
     return dataset.load() if load else dataset
-
-
-def chosen_orders(dataset: xr.Dataset, order: Orders | None) -> list[float]:
-    """Return one order or several of a table as a list, default all of them; InputError if it lacks one."""
-    stored: list[float] = dataset["order"].values.tolist()
-    if order is None:
-        return stored
-    chosen: list[float] = np.atleast_1d(np.asarray(order, dtype=np.float64)).tolist()
-    for s in chosen:
-        if s not in stored:
-            listed = ", ".join(f"{s:g}" for s in stored)
-            raise InputError(f"the store has no order {s:g}, only {listed}; add it to the study and run it again")
-    return chosen
 
 
 def has_proximity(tree: xr.DataTree) -> bool:

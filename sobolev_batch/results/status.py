@@ -170,6 +170,11 @@ class Status:
         return self.run is not None and self.run.state in ("submitted", "running") and not self.lost
 
     @property
+    def is_incomplete(self) -> bool:
+        """True if no run goes on, and surfaces lack a record, or have another one than the tables were made from."""
+        return not self.going_on and (self.waiting > 0 or bool(self.lost_records))
+
+    @property
     def lost(self) -> bool:
         """True if a run began and shows no signs of life any more."""
         if self.run is None or self.run.state not in ("submitted", "running"):
@@ -224,6 +229,8 @@ class Status:
         elif run.state == "failed":
             object_text = f" of {self.run_store}" if self.run_store else ""
             yield f"the latest run{object_text} failed: {run.error}; {start}, ended {run.seen}"
+        elif self.is_incomplete:
+            yield f"ended {run.seen}, incomplete: run the study again; {start}"
         else:
             yield f"done; {start}, ended {run.seen}"
 

@@ -203,6 +203,9 @@ def test_a_damaged_record_counts_as_none(store: Path, mended: Callable[..., None
         damage(store / RECORD.format(row=row))
     assert status(store).lost_records == LABELS[:4]
     assert "ico/2: its completion record is gone" in str(status(store))
+    assert "incomplete: run the study again" in str(status(store))
+    assert "done" not in str(status(store))
+    assert call("status", store).returncode == 3
     found = verify(store)
     assert (tuple(found.fields), found.complete) == (LABELS[:4], 1)
     mended(*LABELS[:4])

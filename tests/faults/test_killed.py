@@ -65,7 +65,7 @@ def test_a_mesh_that_kills_every_worker_is_blamed_and_no_other(
     assert done.returncode == 3, done.stderr
     # Twice beside others, twice alone.
     assert len(moment.pids) == 4
-    assert "ico/2 is failed: its tasks ended the worker that they ran on again and again" in done.stdout
+    assert "ico/2 failed: its tasks ended the worker that they ran on again and again" in done.stdout
     assert "Traceback" not in done.stderr
     assert variable(open_store(store_path), "convergence", "distance").sel(mesh="ico/2").isnull().all()
     # Without what kills its workers, it is computed and nothing else is.

@@ -398,7 +398,7 @@ def plot(
     Args:
         store: Path, URL or opened DataTree of the store.
         kind: Kind of plot.
-        order: One of the store's orders; default its first.
+        order: Order s < -1/2; default the first of the store. Others are computed from what it holds.
         ax: Axes to draw on; its figure gets a colour bar where the kind has one. Without it, the plot has a figure of
             its own, ``ax.figure``, which pyplot does not know, with the legend beside it.
         family: Families to draw, by names or globs; default all.
@@ -410,8 +410,8 @@ def plot(
         The axes.
 
     Raises:
-        InputError: There is no such kind, or the store has no tables yet or lacks the order, a family, the horizontal
-            axis, the distances of all pairs, a mesh to compare, or meshes that move.
+        InputError: There is no such kind, or the store has no tables yet or lacks a family, the horizontal axis, the
+            distances of all pairs, a mesh to compare, or meshes that move.
         DamageError: A field is damaged.
 
     >>> import sobolev_batch as sb

@@ -167,7 +167,7 @@ def exported(
     made, reference = StudyMeshes.from_tree(tree, folder), reference_of(tree)
     status = made.table["status"].sel(mesh=reference).item()
     if status != "complete":
-        raise InputError(f"the reference {reference!r} is {status}: no mesh can be compared with it")
+        raise InputError(f"the reference {reference!r} is not computed: no mesh can be compared with it")
     labels = matching_labels(tree, meshes or ["*"])
     if reference in labels:
         raise InputError(f"{reference!r} is the reference: its witness is zero everywhere")

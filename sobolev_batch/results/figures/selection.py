@@ -18,7 +18,6 @@ from sobolev_batch.results.open import (
     Families,
     as_tree,
     chosen_families,
-    chosen_orders,
     complete_meshes,
     families_of,
     fields_read,
@@ -26,7 +25,7 @@ from sobolev_batch.results.open import (
     reference_of,
 )
 from sobolev_batch.results.store_accessor import StoreAccessor
-from sobolev_batch.spectral.lattice import Orders
+from sobolev_batch.spectral.lattice import Orders, check_orders
 from sobolev_batch.spectral.metrics.causes import spectrum
 from sobolev_batch.surfaces.shapes.surface import Reals
 
@@ -61,9 +60,9 @@ class Selection:
         x: str = EDGE_LENGTH,
         truth: str | None = None,
     ) -> Self:
-        """Choose orders, and families by names or globs, by default all; InputError where the store lacks one."""
+        """Choose any orders, default the study's, and families by names or globs; InputError for an unknown family."""
         tree = as_tree(store)
-        orders = chosen_orders(finished_group(tree, "convergence"), order)
+        orders = finished_group(tree, "convergence")["order"].values.tolist() if order is None else check_orders(order)
         return cls(tree, tuple(orders), tuple(chosen_families(tree, family)), x, truth)
 
     @cached_property

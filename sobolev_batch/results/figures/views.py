@@ -37,7 +37,6 @@ from sobolev_batch.results.open import (
     Families,
     as_tree,
     chosen_families,
-    chosen_orders,
     fields_read,
     finished_group,
 )
@@ -268,7 +267,7 @@ def plot_witness(
     Args:
         store: Path, URL or opened DataTree of the store.
         mesh: Label of the mesh, such as "family/name".
-        order: One of the store's orders; default its first.
+        order: Order s < -1/2; default the first of the store.
         ax: Axes to draw on; its figure gets a colour bar too.
         folder: Folder where relative paths in the study start.
         up: Axis that points upwards in the mesh's own coordinates.
@@ -284,7 +283,7 @@ def plot_witness(
     >>> ax = sb.plot_witness("storage/icosphere.zarr", "icosphere/1", order=-4)  # doctest: +SKIP
     """
     tree = as_tree(store)
-    (order, *_) = chosen_orders(finished_group(tree, "convergence"), order)
+    order = finished_group(tree, "convergence")["order"].values.tolist()[0] if order is None else order
     with fields_read(store):
         views, missing = make_views(tree, folder, [mesh], PICTURE_LIMITS, up, [order])
     if len(views) + len(missing) > 1:

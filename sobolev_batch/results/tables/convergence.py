@@ -306,7 +306,8 @@ def _notes(trees: Sequence[xr.DataTree], frames: Sequence[pd.DataFrame], x: str)
 
 def _failures(tree: xr.DataTree, frame: pd.DataFrame) -> list[str]:
     rows = frame.drop_duplicates("mesh").query("status != 'complete'")
-    failures = [f"{row.mesh} is {row.status}: {row.reason}" for row in rows.itertuples(index=False)]
+    words = {"failed": "failed", "missing": "is missing"}
+    failures = [f"{row.mesh} {words[row.status]}: {row.reason}" for row in rows.itertuples(index=False)]
     if has_proximity(tree):
         reasons = finished_group(tree, "proximity")["reason"].to_series()
         failures += [f"{mesh} has no proximity: {reason}" for mesh, reason in reasons.items() if reason]

@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.results.open import AnyStore, as_tree, chosen_orders, complete_meshes, finished_group, reference_of
+from sobolev_batch.results.open import AnyStore, as_tree, complete_meshes, finished_group, reference_of
 from sobolev_batch.results.store_accessor import distances_at, norms_at, order_note
 from sobolev_batch.results.tables import Format
 from sobolev_batch.results.tables.text import (
@@ -43,14 +43,13 @@ def pairs_of(
     They may be limited to a number of meshes, the first ones and the reference, and to some labels beside it. None
     where the study requests distances to the reference alone.
     """
-    distances = finished_group(tree, "distances", load=False)
-    (order,) = chosen_orders(distances, order)
-    if distances.sizes["other"] != distances.sizes["mesh"]:
+    stored = finished_group(tree, "distances", load=False)
+    if stored.sizes["other"] != stored.sizes["mesh"]:
         return None
     reference, complete = reference_of(tree), complete_meshes(tree)
     others = [label for label in complete if label != reference and (among is None or label in among)]
     kept = others[: None if most is None else max(0, most - 1)] + [reference] * (reference in complete)
-    return distances[["distance", "error"]].sel(order=order, mesh=kept, other=kept).load()
+    return distances_at(tree, order)[["distance", "error"]].sel(order=order, mesh=kept, other=kept).load()
 
 
 def matrix(

@@ -60,7 +60,7 @@ def test_plots_take_the_axes_of_a_caller_and_leave_pyplot_alone(tree: xr.DataTre
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"order": -3}, "no order -3, only -10"),
+        ({"order": -0.4}, "below -1/2, found -0.4"),
         ({"kind": "transform"}, r"one of convergence, .*, energy, found 'transform'"),
         ({"family": "g*"}, "the study has no family 'g\\*', only f_1, reference"),
         ({"x": "weight"}, "no size of meshes is named 'weight'; known are edge_length, triangles"),

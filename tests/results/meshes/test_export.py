@@ -145,7 +145,7 @@ def test_what_cannot_be_asked_for(spheres: Spheres, tmp_path: Path, monkeypatch:
         sb.write_witness(place, "files/beside", tmp_path / "nowhere" / "a.ply", folder=folder)
     tree = sb.open_store(place).load()
     tree["convergence"].attrs["reference"] = "files/bad"
-    with pytest.raises(sb.InputError, match="the reference 'files/bad' is failed"):
+    with pytest.raises(sb.InputError, match="the reference 'files/bad' is not computed"):
         sb.write_witness(tree, LABELS[1], tmp_path / "a.ply", folder=folder)
     (tmp_path / "taken").write_text("")
     done = call("witness", place, "--output", tmp_path / "taken", "--folder", folder)

@@ -26,7 +26,7 @@ def test_text_shows_values_rates_what_is_missing_and_the_nearest_mesh(tree: xr.D
     assert " ".join(rows[0]) == "f_1/0 20 0.2 20.00 % ± 0.02 %! 0.8000 ± 0.0008 36 %"
     assert " ".join(rows[1]) == "f_1/1 1,280 0.1 5.000 % ± 0.005 %* 0.2000 ± 0.0002 2.00 ± 0.02"
     assert rows[2] == ["f_1/2", *["missing"] * 6]
-    assert "\n\nf_1/2 is failed: no 50% of it | is <there>\n\n" in text
+    assert "\n\nf_1/2 failed: no 50% of it | is <there>\n\n" in text
     # A mesh whose distance is not larger than its error may be nearer.
     unsure = "\n\nNearest: f_1/0, which differs by 20.00 % ± 0.02 %; its errors leave open whether f_1/1 is nearer."
     assert unsure in text
