@@ -223,16 +223,3 @@ def shape_penalty(vertices: Reals, triangles: Indices, references: Reals) -> tup
 
 def _squared_edges(a: Reals, b: Reals, c: Reals) -> Reals:
     return np.asarray(sum(np.einsum("ij,ij->i", side, side) for side in (b - a, c - b, a - c)))
-
-
-def smallest_angle(mesh: Mesh) -> float:
-    """Return the smallest angle of all triangles, in degrees; zero with a triangle without an area."""
-    corners = [mesh.vertices[corner] for corner in mesh.triangles.T]
-    angles = []
-    for corner in range(3):
-        this, following, previous = corners[corner], corners[corner - 2], corners[corner - 1]
-        one, other = following - this, previous - this
-        # Small angles keep their digits, unlike those by the law of cosines.
-        sines = np.linalg.norm(np.cross(one, other), axis=1)
-        angles.append(np.arctan2(sines, np.einsum("ij,ij->i", one, other)))
-    return float(np.degrees(np.min(angles)))

@@ -12,7 +12,7 @@ import xarray as xr
 
 from sobolev_batch.errors import AccuracyError, InputError
 from sobolev_batch.fitting import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS
-from sobolev_batch.fitting.descent import Descent, End, Smoothing, smallest_angle
+from sobolev_batch.fitting.descent import Descent, End, Smoothing
 from sobolev_batch.fitting.problem import FitProblem, FitSettings, OrderWeights, welded
 from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.spectral.fields import Operand, OperandLike, as_operand
@@ -280,7 +280,7 @@ def measure_quality(problem: FitProblem, mesh: Mesh) -> FitQuality:
     if result is None:
         result = distance(mesh, target, order, lattice=problem.lattice)
     numbers = {name: result[name].item() for name in ("distance", "error", "relative", "relative_error")}
-    quality = FitQuality(**numbers, smallest_angle=smallest_angle(mesh))
+    quality = FitQuality(**numbers, smallest_angle=float(mesh.smallest_angles.min()))
     if not isinstance(target, Mesh):
         return quality
     try:

@@ -20,7 +20,6 @@ from sobolev_batch.fitting.descent import (
     Smoothing,
     lowest_free_qualities,
     shape_penalty,
-    smallest_angle,
     triangle_qualities,
 )
 from sobolev_batch.surfaces.shapes.subdivision import Edges
@@ -257,20 +256,6 @@ def test_its_derivative_is_that_of_differences() -> None:
     ends = [shape_penalty(vertices + sign * step * direction, ball.triangles, references)[0] for sign in (1, -1)]
     assert value > 0.1
     assert np.sum(gradient * direction) == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("corners", "degrees"),
-    [
-        ([[0, 0, 0], [1, 0, 0], [0, 1, 0]], 45.0),
-        ([[0, 0, 0], [1, 0, 0], [0.5, np.sqrt(0.75), 0]], 60.0),
-        ([[0, 0, 0], [2, 0, 0], [1, np.tan(np.radians(2)), 0]], 2.0),
-        ([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 1, 0], [1, 0, 0], [-1, 2, 0]], 0.0),
-    ],
-)
-def test_the_smallest_angle(corners: list[list[float]], degrees: float) -> None:
-    triangles = np.arange(len(corners)).reshape(-1, 3)
-    assert smallest_angle(sb.Mesh(corners, triangles)) == pytest.approx(degrees, rel=1e-9)
 
 
 def test_smoothing_solves_with_the_graph_laplacian() -> None:

@@ -26,10 +26,12 @@ BOX_AREA = 28.0
 AWKWARD_VERTICES: Reals = BOX_VERTICES / 3 + 1 / 7
 
 
-def mesh_counts(zero_area: int, duplicate: int, boundary: int, nonmanifold: int) -> dict[str, int]:
+def mesh_counts(
+    zero_area: int, duplicate: int, boundary: int, nonmanifold: int, inconsistent: int = 0
+) -> dict[str, int]:
     """Return counts as `Mesh.counts` gives them."""
-    names = ("zero_area_triangles", "duplicate_triangles", "boundary_edges", "nonmanifold_edges")
-    return dict(zip(names, (zero_area, duplicate, boundary, nonmanifold), strict=True))
+    names = ("zero_area_triangles", "duplicate_triangles", "boundary_edges", "nonmanifold_edges", "inconsistent_edges")
+    return dict(zip(names, (zero_area, duplicate, boundary, nonmanifold, inconsistent), strict=True))
 
 
 CLOSED = mesh_counts(0, 0, 0, 0)

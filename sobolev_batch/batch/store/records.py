@@ -52,7 +52,11 @@ class Facts:
         vertices, triangles: Counts; zero for a surface that is no mesh.
         area: Total area in the study's unit of length, squared.
         edge_length_mean, edge_length_max: Lengths of triangle sides, in the study's unit; NaN without triangles.
-        zero_area_triangles, duplicate_triangles, boundary_edges, nonmanifold_edges: See `Mesh.counts`.
+        zero_area_triangles, duplicate_triangles, boundary_edges, nonmanifold_edges, inconsistent_edges: See
+            `Mesh.counts`.
+        volume: Enclosed volume, see `Mesh.volume`.
+        smallest_angle: Smallest angle of all triangles, in degrees.
+        aspect_ratio: Largest aspect ratio of all triangles, see `Mesh.aspect_ratios`.
         digest: SHA-256 of vertices and triangles in the study's unit; empty without triangles.
         points: Number of quadrature points; zero for a closed form.
     """
@@ -66,6 +70,10 @@ class Facts:
     duplicate_triangles: int = 0
     boundary_edges: int = 0
     nonmanifold_edges: int = 0
+    inconsistent_edges: int = 0
+    volume: float = float("nan")
+    smallest_angle: float = float("nan")
+    aspect_ratio: float = float("nan")
     digest: str = ""
     points: int = 0
 

@@ -13,7 +13,8 @@ from sobolev_batch.spectral.lattice import AXES, Lattice, Orders
 from sobolev_batch.surfaces.shapes.surface import Reals
 
 KERNEL = "weight (1 + |xi|^2)^s, xi in cycles per unit length"
-LENGTH, AREA, FREQUENCY, NUMBER = "unit length", "unit length squared", "cycles per unit length", "1"
+LENGTH, AREA, VOLUME = "unit length", "unit length squared", "unit length cubed"
+FREQUENCY, NUMBER, ANGLE = "cycles per unit length", "1", "degree"
 # ||a||_s² = ∫ (1 + |ξ|²)^s |a^|² dξ is an area squared per volume.
 NORM = "unit length^(1/2)"
 
@@ -77,6 +78,10 @@ VARIABLES: Mapping[str, Mapping[str, str]] = {
     "triangles": described("number of triangles", NUMBER),
     "boundary_edges": described("number of edges of one triangle", NUMBER),
     "nonmanifold_edges": described("number of edges of more than two triangles", NUMBER),
+    "inconsistent_edges": described("number of edges whose two triangles face opposite sides", NUMBER),
+    "volume": described("enclosed volume", VOLUME, description="negative for a mesh that is inside out"),
+    "smallest_angle": described("smallest angle of the triangles", ANGLE),
+    "aspect_ratio": described("largest aspect ratio of the triangles; 1 is equilateral", NUMBER),
     "duplicate_triangles": described("number of triangles that repeat another", NUMBER),
     "zero_area_triangles": described("number of triangles without area", NUMBER),
     "digest": described("SHA-256 of vertices and triangles"),

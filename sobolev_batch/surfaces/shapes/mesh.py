@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -151,17 +152,53 @@ class Mesh:
         """Counts of what is unusual about the mesh. All of it is legitimate in a surface measure, none is repaired.
 
         The keys are "zero_area_triangles", to double precision; "duplicate_triangles", which repeat the three vertices
-        of an earlier one in any orientation; "boundary_edges" of exactly one triangle; and "nonmanifold_edges" of more
-        than two.
+        of an earlier one in any orientation; "boundary_edges" of exactly one triangle; "nonmanifold_edges" of more
+        than two; and "inconsistent_edges" of exactly two that face opposite sides there.
         """
-        boundary, nonmanifold = _boundary_and_nonmanifold_edges(self.triangles, len(self.vertices))
+        boundary, nonmanifold, inconsistent = _unusual_edges(self.triangles, len(self.vertices))
         zero_area = sum(int(np.count_nonzero(self.areas[batch] <= limit)) for batch, limit in self._zero_areas())
         return {
             "zero_area_triangles": zero_area,
             "duplicate_triangles": _duplicate_triangles(self.triangles),
             "boundary_edges": boundary,
             "nonmanifold_edges": nonmanifold,
+            "inconsistent_edges": inconsistent,
         }
+
+    @cached_property
+    def volume(self) -> float:
+        """Enclosed volume, in cubed units of length; negative where triangles, seen from outside, run clockwise.
+
+        NaN unless each edge has two triangles that face the same side: `counts` has no boundary, non-manifold or
+        inconsistent edges.
+
+        >>> import sobolev_batch as sb
+        >>> f"{sb.icosphere(5).volume:.3f}"
+        '4.184'
+        """
+        if any(self.counts[f"{kind}_edges"] for kind in ("boundary", "nonmanifold", "inconsistent")):
+            return np.nan
+        # From a point nearby: far from the origin, the parts cancel.
+        origin = self.vertices[self.triangles[0, 0]]
+        parts = []
+        for start in range(0, len(self.triangles), _BATCH):
+            a, b, c = (corner - origin for corner in self.corners(slice(start, start + _BATCH)))
+            parts.append(float(np.einsum("ij,ij->", a, np.cross(b, c))))
+        return math.fsum(parts) / 6
+
+    @property
+    def smallest_angles(self) -> Reals:
+        """Smallest angle of each triangle (m,), in degrees; zero without an area."""
+        return self._per_triangle(_smallest_angles)
+
+    @property
+    def aspect_ratios(self) -> Reals:
+        """Longest edge of each triangle over the radius of its incircle (m,), over that of an equilateral triangle.
+
+        From 1 on, and infinite without an area. Source: C. Stimpson et al., "The Verdict geometric quality library",
+        Sandia report SAND2007-1751 (2007), section 4.3.
+        """
+        return self._per_triangle(_aspect_ratios)
 
     def batches(self, size: int) -> Iterator[tuple[int, Mesh]]:
         """Yield the mesh as numbered meshes of at most ``size`` triangles, each with only the vertices that it uses.
@@ -259,6 +296,20 @@ def _centroid_radii(edges: _Edges) -> Reals:
     return np.asarray(np.sqrt(np.maximum.reduce(squares)))
 
 
+def _smallest_angles(edges: _Edges) -> Reals:
+    # Opposite the shortest side. Unlike the law of cosines, this keeps the digits of small angles.
+    shortest, *others = np.sort(_side_lengths(edges), axis=1).T ** 2
+    return np.asarray(np.degrees(np.arctan2(2 * cross_lengths(*edges), sum(others) - shortest)))
+
+
+def _aspect_ratios(edges: _Edges) -> Reals:
+    lengths, twice_areas = _side_lengths(edges), cross_lengths(*edges)
+    # Twice the area is the perimeter times the radius of the incircle.
+    products = lengths.max(axis=1) * lengths.sum(axis=1)
+    flat = np.full_like(products, np.inf)
+    return np.asarray(np.divide(products, 2 * np.sqrt(3) * twice_areas, out=flat, where=twice_areas > 0))
+
+
 def _used(triangles: Indices, vertex_count: int) -> Indices:
     """Return the indices of the vertices that triangles use, in ascending order."""
     used = np.zeros(vertex_count, dtype=bool)
@@ -321,23 +372,31 @@ def _frozen(array: NDArray[_Scalar]) -> NDArray[_Scalar]:
     return array
 
 
-def _boundary_and_nonmanifold_edges(triangles: Indices, vertex_count: int) -> tuple[int, int]:
-    """Return the numbers of edges of exactly one triangle and of more than two."""
+def _unusual_edges(triangles: Indices, vertex_count: int) -> tuple[int, int, int]:
+    """Return the numbers of edges of exactly one triangle, of more than two, and of two that run along it alike."""
     keys = np.empty(3 * len(triangles), dtype=np.int64)
     for start in range(0, len(triangles), _BATCH):
-        low, middle, high = np.sort(triangles[start : start + _BATCH], axis=1).T
-        batch_keys = keys[3 * start : 3 * (start + len(low))].reshape(3, -1)
-        # A triangle that repeats a vertex has fewer than three edges, each once.
-        batch_keys[0] = np.where(low == middle, -1, low * vertex_count + middle)
-        batch_keys[1] = np.where(middle == high, -1, middle * vertex_count + high)
-        batch_keys[2] = np.where((low == middle) | (middle == high), -1, low * vertex_count + high)
+        ends = np.ascontiguousarray(triangles[start : start + _BATCH].T)
+        nexts = ends[[1, 2, 0]]
+        low, high = np.minimum(ends, nexts), np.maximum(ends, nexts)
+        # A triangle that repeats a vertex has one edge at most, along which it runs both ways.
+        repeats = (low == high).any(axis=0)
+        batch_keys = 3 * (low * vertex_count + high) + np.where(repeats, 2, ends < nexts)
+        batch_keys[low == high] = -1
+        for side in (1, 2):
+            batch_keys[side, repeats & (batch_keys[:side] == batch_keys[side]).any(axis=0)] = -1
+        keys[3 * start : 3 * start + batch_keys.size] = batch_keys.ravel()
     keys.sort()
     keys = keys[np.searchsorted(keys, 0) :]
     if not keys.size:
-        return 0, 0
+        return 0, 0, 0
+    is_alike = (keys[1:] == keys[:-1]) & (keys[1:] % 3 < 2)
+    keys //= 3
     repeats = np.concatenate([[False], keys[1:] == keys[:-1], [False, False]])
     first, second, third = ~repeats[:-2], repeats[1:-1], repeats[2:]
-    return int(np.count_nonzero(first & ~second)), int(np.count_nonzero(first & second & third))
+    inconsistent = first[:-1] & (second & ~third)[:-1] & is_alike
+    boundary, nonmanifold = first & ~second, first & second & third
+    return int(np.count_nonzero(boundary)), int(np.count_nonzero(nonmanifold)), int(np.count_nonzero(inconsistent))
 
 
 def _duplicate_triangles(triangles: Indices) -> int:

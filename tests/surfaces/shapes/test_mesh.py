@@ -99,8 +99,21 @@ def test_a_total_area_of_zero_is_refused(vertices: Any) -> None:
         # The edges of [0, 0, 1] are 0-1 alone: none goes from a vertex to itself.
         ([], [[0, 1, 2], [0, 0, 1]], mesh_counts(1, 0, 2, 0)),
         ([], [*TETRAHEDRON_TRIANGLES, [0, 0, 1]], mesh_counts(1, 0, 0, 1)),
+        ([], [*TETRAHEDRON_TRIANGLES[:3], [0, 2, 3]], mesh_counts(0, 0, 0, 0, 3)),
     ],
-    ids=["closed", "open", "zero area", "duplicate", "duplicates", "fin", "apart", "unused", "repeat", "repeat 2"],
+    ids=[
+        "closed",
+        "open",
+        "zero area",
+        "duplicate",
+        "duplicates",
+        "fin",
+        "apart",
+        "unused",
+        "repeat",
+        "repeat 2",
+        "flipped",
+    ],
 )
 def test_oddities_are_kept_and_counted(extra_vertices: Any, triangles: Any, counts: dict[str, int]) -> None:
     vertices: Reals = np.array([*TETRAHEDRON_VERTICES.tolist(), *extra_vertices], dtype=np.float64)
@@ -108,6 +121,32 @@ def test_oddities_are_kept_and_counted(extra_vertices: Any, triangles: Any, coun
     assert mesh.triangles.tolist() == triangles
     assert np.array_equal(mesh.vertices, vertices)
     assert mesh.counts == counts
+
+
+@pytest.mark.parametrize("scale", [1e-60, 1.0, 1e60])
+@pytest.mark.parametrize("shift", [0.0, 1e6])
+def test_the_volume_is_that_of_closed_consistent_meshes(scale: float, shift: float) -> None:
+    vertices = scale * (np.asarray(box().vertices) + shift)
+    assert Mesh(vertices, BOX_TRIANGLES).volume == pytest.approx(8 * scale**3, rel=1e-9)
+    assert Mesh(vertices, np.flip(BOX_TRIANGLES, 1)).volume == pytest.approx(-8 * scale**3, rel=1e-9)
+    assert np.isnan(Mesh(vertices, BOX_TRIANGLES[1:]).volume)
+    assert np.isnan(Mesh(vertices, [BOX_TRIANGLES[0][::-1], *BOX_TRIANGLES[1:]]).volume)
+
+
+@pytest.mark.parametrize(
+    ("corners", "degrees", "ratio"),
+    [
+        ([[0, 0, 0], [1, 0, 0], [0, 1, 0]], 45.0, (2 + 2 * np.sqrt(2)) / (2 * np.sqrt(3))),
+        ([[0, 0, 0], [1, 0, 0], [0.5, np.sqrt(0.75), 0]], 60.0, 1.0),
+        # A needle: the longest edge over the radius of the incircle, whose diameter is nearly half of its height.
+        ([[0, 0, 0], [2, 0, 0], [1, 2e-9, 0]], np.degrees(2e-9), 2 / 1e-9 / (2 * np.sqrt(3))),
+        ([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 1, 0], [1, 0, 0], [-1, 2, 0]], 0.0, np.inf),
+    ],
+)
+def test_the_shape_of_triangles(corners: list[list[float]], degrees: float, ratio: float) -> None:
+    mesh = Mesh(corners, np.arange(len(corners)).reshape(-1, 3))
+    assert mesh.smallest_angles.min() == pytest.approx(degrees, rel=1e-8)
+    assert mesh.aspect_ratios.max() == pytest.approx(ratio, rel=1e-8)
 
 
 @pytest.mark.parametrize("scale", [1e-60, 1e-6, 1.0, 1e6, 1e60])

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import sobolev_batch as sb
-from sobolev_batch.fitting.descent import smallest_angle
 from sobolev_batch.surfaces.shapes.subdivision import Edges
 from tests.support.shapes import CLOSED
 
@@ -64,14 +63,14 @@ def test_the_best_triangles_are_as_many_as_fit(wanted: int) -> None:
 
 def test_triangles_do_not_become_ever_thinner() -> None:
     mesh = open_mesh()
-    first = smallest_angle(mesh)
+    first = mesh.smallest_angles.min()
     rng = np.random.default_rng(5)
     for _ in range(8):
         edges = Edges.from_mesh(mesh)
         # Always near one place, where thin triangles would pile up.
         distances = np.linalg.norm(np.asarray(mesh.vertices)[mesh.triangles].mean(axis=1) - [0, 0, 1], axis=1)
         mesh = edges.split(edges.best(-distances + 0.01 * rng.random(len(distances)), len(mesh.triangles) + 40))
-    assert smallest_angle(mesh) > first / 2.5
+    assert mesh.smallest_angles.min() > first / 2.5
 
 
 @pytest.mark.parametrize("level", range(6))
