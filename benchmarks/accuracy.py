@@ -39,7 +39,7 @@ def left_to_us(effort: Effort) -> Iterator[Row]:
     ours, other = take_turns([_accurate_distance, papers], case.fresh_mesh, effort.repeats)
     yield Row("2", f"{what}: distance with its error", as_seconds(ours), as_seconds(other), other / ours, _SPEED_UP)
     found = _accurate_distance(case.mesh)
-    near = found["distance"].item() / sb.norm(sb.Sphere(), ORDER)["norm"].item()
+    near = found["distance"].item() / sb.norm(sb.shapes.Sphere(), ORDER)["norm"].item()
     far = relative_distance(case.papers(case.mesh), case.lattice, ORDER)
     difference = abs(near - far) / far
     yield Row("2", f"{what}: relative difference", f"{near:.6e}", f"{far:.6e}", difference, at_most(_RTOL))
@@ -54,7 +54,7 @@ def stored_bytes(effort: Effort) -> Iterator[Row]:
     if not _chooses_lattices():
         yield Row("7", what, target=_STORED)
         return
-    lattice = _chosen_lattice(_accurate_distance(sb.icosphere(level)))
+    lattice = _chosen_lattice(_accurate_distance(sb.shapes.icosphere(level)))
     table = {
         "study": {"name": "stored"},
         "lattice": {"xi_max": lattice.xi_max, "M": lattice.M},
@@ -72,7 +72,7 @@ def stored_bytes(effort: Effort) -> Iterator[Row]:
 
 def _accurate_distance(mesh: sb.Mesh) -> xr.Dataset:
     measured: Callable[..., xr.Dataset] = sb.distance
-    return measured(mesh, sb.Sphere(), ORDER, rtol=_RTOL)
+    return measured(mesh, sb.shapes.Sphere(), ORDER, rtol=_RTOL)
 
 
 def _chosen_lattice(found: xr.Dataset) -> sb.Lattice:

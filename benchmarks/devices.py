@@ -21,12 +21,12 @@ def on_a_gpu(effort: Effort) -> Iterator[Row]:
     """Item 9: transforms alone, of meshes whose lengths are known, until the field is back on the host."""
     try:
         backend = gpu_backend()
-    except sb.BackendError as error:
+    except sb.errors.BackendError as error:
         yield Row("9", f"not run: {error}")
         return
     yield Row("9", f"device: {backend.description}")
     for level, intervals, limit in _QUICK_CASES if effort.quick else _CASES:
-        mesh, lattice = sb.icosphere(level), sb.Lattice(XI_MAX, intervals)
+        mesh, lattice = sb.shapes.icosphere(level), sb.Lattice(XI_MAX, intervals)
         for dtype in _PRECISIONS:
             settings = settings_of_the_paper(mesh, lattice, dtype)
 

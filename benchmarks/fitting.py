@@ -31,7 +31,7 @@ def fits(effort: Effort) -> Iterator[Row]:
         what = f"{len(start.triangles):,} against {len(target.triangles):,} triangles, fitted at order {order:g}"
         yield from _fit(what, start, target, order, ratios, most_seconds, effort)
     yield from _refinement(effort)
-    ellipsoid = sb.Ellipsoid((1.0, 0.8, 0.6))
+    ellipsoid = sb.shapes.Ellipsoid((1.0, 0.8, 0.6))
     level = 1 if effort.quick else 3
     yield from _fit(
         f"ellipsoid of level {level}, fitted", ellipsoid.mesh(level), ellipsoid, -4.0, {-4.0: 0.05}, None, effort
@@ -39,8 +39,10 @@ def fits(effort: Effort) -> Iterator[Row]:
 
 
 def _derivative(level: int, intervals: int, effort: Effort) -> Row:
-    mesh, lattice = sb.icosphere(level), sb.Lattice(2.0 if effort.quick else 5.0, intervals)
-    squared = sb.SquaredDistance.for_mesh(mesh, sb.Sphere(0.9), -2.0, lattice=lattice, threads=effort.threads)
+    mesh, lattice = sb.shapes.icosphere(level), sb.Lattice(2.0 if effort.quick else 5.0, intervals)
+    squared = sb.fitting.SquaredDistance.for_mesh(
+        mesh, sb.shapes.Sphere(0.9), -2.0, lattice=lattice, threads=effort.threads
+    )
     vertices = np.array(mesh.vertices)
     value, both = take_turns([squared.value, squared], lambda: vertices, effort.repeats)
     what = f"T_{level}, M = {intervals}: value and derivative, against the value"
@@ -50,13 +52,13 @@ def _derivative(level: int, intervals: int, effort: Effort) -> Row:
 def _fit(
     what: str,
     start: sb.Mesh,
-    target: sb.Mesh | sb.Ellipsoid,
+    target: sb.Mesh | sb.shapes.Ellipsoid,
     order: float,
     ratios: dict[float, float],
     most_seconds: float | None,
     effort: Effort,
 ) -> Iterator[Row]:
-    found: list[sb.Fit] = []
+    found: list[sb.fitting.Fit] = []
     steps = 10 if effort.quick else 150
     seconds = elapsed_seconds(lambda: found.append(sb.fit(start, target, order, steps=steps)))
     (fitted,) = found
@@ -77,8 +79,8 @@ def _fit(
 def _refinement(effort: Effort) -> Iterator[Row]:
     (start, target), (decimated, _) = (pair_of_cortex(effort, triangles) for triangles in (320, 1280))
     triangles = 2 * len(start.triangles) if effort.quick else len(decimated.triangles)
-    found: list[sb.Fit] = []
-    seconds = elapsed_seconds(lambda: found.append(sb.refine(start, target, -2.0, triangles=triangles)))
+    found: list[sb.fitting.Fit] = []
+    seconds = elapsed_seconds(lambda: found.append(sb.fitting.refine(start, target, -2.0, triangles=triangles)))
     what = f"{len(start.triangles):,} triangles refined to {triangles:,} at order -2"
     for order in (-2.0, -4.0):
         ours, theirs = (

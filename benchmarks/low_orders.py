@@ -28,17 +28,17 @@ def low_orders(effort: Effort) -> Iterator[Row]:
     """Item 10: distances of meshes at low orders, and the sum over points that a user would write instead."""
     coarse, fine = pair_of_cortex(effort, 1280)
     # What is loaded and prepared once.
-    sb.distance(sb.icosphere(0), sb.icosphere(1), -2.0, rtol=1e-2)
+    sb.distance(sb.shapes.icosphere(0), sb.shapes.icosphere(1), -2.0, rtol=1e-2)
     what = f"{len(coarse.triangles):,} against {len(fine.triangles):,} triangles"
     for order, rtol, most in _REQUESTS:
         yield _row(what, coarse, fine, order, rtol, most)
     order, rtol, most = _OF_SPHERE
     level = 3 if effort.quick else 5
-    yield _row(f"T_{level} against the sphere", sb.icosphere(level), sb.Sphere(), order, rtol, most)
+    yield _row(f"T_{level} against the sphere", sb.shapes.icosphere(level), sb.shapes.Sphere(), order, rtol, most)
     yield from _against_points(what, coarse, fine, effort)
 
 
-def _row(what: str, a: sb.Mesh, b: sb.Mesh | sb.Sphere, order: float, rtol: float, most: float) -> Row:
+def _row(what: str, a: sb.Mesh, b: sb.Mesh | sb.shapes.Sphere, order: float, rtol: float, most: float) -> Row:
     seconds, found = _processor_seconds(lambda: sb.distance(a, b, order, rtol=rtol))
     reported = found["error"].item() / found["distance"].item()
     text = f"{what}, order {order:g}, rtol {rtol:g}: processor seconds, relative error {reported:.1g}"
@@ -52,7 +52,7 @@ def _against_points(what: str, coarse: sb.Mesh, fine: sb.Mesh, effort: Effort) -
     """
     from benchmarks.direct import exponential_sum
 
-    exponential_sum(*_points(sb.icosphere(0), sb.icosphere(0), 0))  # compiled by now
+    exponential_sum(*_points(sb.shapes.icosphere(0), sb.shapes.icosphere(0), 0))  # compiled by now
     sums: dict[float, tuple[float, Sum, int]] = {-2.0: (np.pi**2, exponential_sum, 2), -1.0: (np.pi, _yukawa_sum, 3)}
     for order, (factor, double_sum, most_cuts) in sums.items():
         seconds, found = _processor_seconds(partial(sb.distance, coarse, fine, order, rtol=1e-2))

@@ -25,7 +25,7 @@ def peaks(effort: Effort) -> Iterator[Row]:
         with TemporaryDirectory() as name:
             folder = Path(name)
             # Made here and not where memory is measured: making it takes more than transforming it.
-            mesh = sb.icosphere(level)
+            mesh = sb.shapes.icosphere(level)
             count = len(mesh.triangles)
             np.save(folder / "vertices.npy", mesh.vertices)
             np.save(folder / "triangles.npy", mesh.triangles)

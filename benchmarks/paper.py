@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.timing import take_turns
-from sobolev_batch import Lattice, Mesh, Sphere
+from sobolev_batch import Lattice, Mesh
+from sobolev_batch.shapes import Sphere
 from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.quadrature import gauss_rule
 

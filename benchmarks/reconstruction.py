@@ -43,7 +43,7 @@ class Reconstruction:
     start: Callable[[], sb.Mesh]
     orders: tuple[float, ...] = (-2.0,)
 
-    def stages(self, order: float, steps: Sequence[int], effort: Effort) -> list[sb.Fit]:
+    def stages(self, order: float, steps: Sequence[int], effort: Effort) -> list[sb.fitting.Fit]:
         """The fits with each of these numbers of steps."""
         lattice = sb.Lattice(4.0, 24) if effort.quick else sb.Lattice(8.0, 96)
         field = sb.fourier_transform(self.target(), lattice)
@@ -58,7 +58,7 @@ def reconstructions(effort: Effort) -> Iterator[Row]:
         Reconstruction("a head with two ears, from a ball", ears, ball, (-2.0,) if effort.quick else (-4, -3, -2, -1)),
         Reconstruction("a head with two ears, from an egg", ears, egg),
         Reconstruction("an ellipsoid with a semi-axis of 0.03, from a ball", partial(_thin, effort), ball),
-        Reconstruction("a torus, from a ball", lambda: sb.Torus(0.7, 0.3).mesh(96, 48), ball),
+        Reconstruction("a torus, from a ball", lambda: sb.shapes.Torus(0.7, 0.3).mesh(96, 48), ball),
     )
     for reconstruction in targets[: 1 if effort.quick else None]:
         for order in reconstruction.orders:
@@ -67,7 +67,7 @@ def reconstructions(effort: Effort) -> Iterator[Row]:
 
 def head_with_ears(level: int) -> sb.Mesh:
     """A ball with two ears, a nose and a tail, in the unit ball; its triangles are those of an icosphere."""
-    ball = sb.icosphere(level)
+    ball = sb.shapes.icosphere(level)
     bumps = (
         (0.55, 40.0, (0.35, 0.25, 1.0)),
         (0.55, 40.0, (0.35, -0.25, 1.0)),
@@ -79,24 +79,24 @@ def head_with_ears(level: int) -> sb.Mesh:
         for height, sharpness, place in bumps
     )
     head = sb.Mesh(ball.vertices * np.asarray(radii)[:, None], ball.triangles)
-    return sb.Similarity.to_unit_ball(head).apply(head)
+    return sb.shapes.Similarity.to_unit_ball(head).apply(head)
 
 
 def _ball(effort: Effort) -> sb.Mesh:
-    ball = sb.icosphere(2 if effort.quick else 4)
+    ball = sb.shapes.icosphere(2 if effort.quick else 4)
     return ball.moved(0.6, (0.0, 0.0, 0.0))
 
 
 def _egg(effort: Effort) -> sb.Mesh:
-    return sb.Ellipsoid((0.9, 0.6, 0.6)).mesh(2 if effort.quick else 4)
+    return sb.shapes.Ellipsoid((0.9, 0.6, 0.6)).mesh(2 if effort.quick else 4)
 
 
 def _thin(effort: Effort) -> sb.Mesh:
-    return sb.Ellipsoid((1.0, 1.0, 0.03)).mesh(3 if effort.quick else 6)
+    return sb.shapes.Ellipsoid((1.0, 1.0, 0.03)).mesh(3 if effort.quick else 6)
 
 
 def _rows(reconstruction: Reconstruction, order: float, effort: Effort) -> Iterator[Row]:
-    found: list[sb.Fit] = []
+    found: list[sb.fitting.Fit] = []
     steps = [5 if effort.quick else _STAGES[-1]]
     seconds = elapsed_seconds(lambda: found.extend(reconstruction.stages(order, steps, effort)))
     (fit,), target, start = found, reconstruction.target(), reconstruction.start()
@@ -145,7 +145,7 @@ def main() -> None:
 
 def _unit(path: Path) -> sb.Mesh:
     mesh = sb.read_mesh(path)
-    return sb.Similarity.to_unit_ball(mesh).apply(mesh)
+    return sb.shapes.Similarity.to_unit_ball(mesh).apply(mesh)
 
 
 def _draw(reconstruction: Reconstruction, order: float, effort: Effort, path: Path, up: str) -> None:

@@ -71,7 +71,7 @@ _STUDY: dict[str, Any] = {
 
 
 def _write_icosahedra(folder: Path, count: int) -> None:
-    mesh = sb.icosphere(0)
+    mesh = sb.shapes.icosphere(0)
     faces = "".join(f"3 {a} {b} {c}\n" for a, b, c in mesh.triangles.tolist())
     rng = np.random.default_rng(0)
     for number in range(count):

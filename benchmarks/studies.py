@@ -180,7 +180,7 @@ def _measure_parts(paths: Sequence[Path], lattice: sb.Lattice, transform: Transf
 def _write_meshes(folder: Path, count: int, level: int) -> list[Path]:
     """Icospheres whose radius varies by a hundredth from vertex to vertex."""
     rng = np.random.default_rng(0)
-    sphere = sb.icosphere(level)
+    sphere = sb.shapes.icosphere(level)
     paths = [folder / f"{i:03}.ply" for i in range(count)]
     for path in paths:
         radii = 1 + 0.01 * rng.uniform(-1, 1, (len(sphere.vertices), 1))

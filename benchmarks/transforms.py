@@ -52,7 +52,7 @@ class Case:
     @cache
     def from_level(cls, level: int, intervals: int, effort: Effort, dtype: ComplexDtype = "complex128") -> Case:
         """An icosphere on a lattice up to 5 cycles per unit length."""
-        mesh, lattice = sb.icosphere(level), sb.Lattice(XI_MAX, intervals)
+        mesh, lattice = sb.shapes.icosphere(level), sb.Lattice(XI_MAX, intervals)
         upsampling = faster_upsampling(mesh, lattice, eps=_EPS[dtype], dtype=dtype, threads=effort.threads)
         return cls(mesh, lattice, dtype, effort.threads, upsampling, error_target_of_the_paper(mesh))
 
@@ -84,7 +84,7 @@ class Case:
 
     def distances(self) -> tuple[float, float]:
         """The relative distance to the unit sphere from the package's transform and the paper's."""
-        sphere = sb.fourier_transform(sb.Sphere(), self.lattice)
+        sphere = sb.fourier_transform(sb.shapes.Sphere(), self.lattice)
         field = sphere.copy(data=self.ours(self.mesh))
         ours = sb.distance(field, sphere, ORDER)["distance"].item() / sb.norm(sphere, ORDER)["norm"].item()
         return ours, relative_distance(self.papers(self.mesh), self.lattice, ORDER)
@@ -92,7 +92,7 @@ class Case:
 
 def error_target_of_the_paper(mesh: sb.Mesh) -> ErrorTarget:
     """The error of a field that keeps the digits of its mesh's distance to the unit sphere."""
-    distance = sb.distance(mesh, sb.Sphere(), ORDER, rtol=1e-2)["distance"].item()
+    distance = sb.distance(mesh, sb.shapes.Sphere(), ORDER, rtol=1e-2)["distance"].item()
     return ErrorTarget((ORDER,), (_FIELD_ERROR * distance,))
 
 
@@ -134,7 +134,7 @@ def as_in_the_paper(effort: Effort) -> Iterator[Row]:
 def against_the_direct_sum(effort: Effort) -> Iterator[Row]:
     """Item 4: the exact formula, timed where it finishes and carried on by its O(triangles · frequencies)."""
     level, intervals = (2, 24) if effort.quick else (3, 32)
-    mesh, lattice = sb.icosphere(level), sb.Lattice(XI_MAX, intervals)
+    mesh, lattice = sb.shapes.icosphere(level), sb.Lattice(XI_MAX, intervals)
     frequencies = frequencies_of(lattice, lattice.half)
     few = frequencies[:: len(frequencies) // 7]
     error = float(np.abs(direct_transform(mesh, few) - exact_transform(mesh, few)).max() / mesh.area)
@@ -149,7 +149,7 @@ def against_the_direct_sum(effort: Effort) -> Iterator[Row]:
     fast, slow = take_turns([ours, direct], lambda: fresh(mesh), effort.repeats)
     yield Row("4", f"direct sum: T_{level}, half of M = {intervals}", as_seconds(fast), as_seconds(slow), slow / fast)
     finest, most = (4, 32) if effort.quick else (7, 128)
-    large, whole = sb.icosphere(finest), sb.Lattice(XI_MAX, most)
+    large, whole = sb.shapes.icosphere(finest), sb.Lattice(XI_MAX, most)
     larger = len(large.triangles) / len(mesh.triangles) * (whole.half.size / lattice.half.size)
     fast = _our_seconds(large, whole, effort)
     what = f"direct sum: T_{finest}, half of M = {most}, extrapolated"
@@ -160,7 +160,7 @@ def growth(effort: Effort) -> Iterator[Row]:
     """Exponents of the package's time in the triangles and in the intervals per axis."""
     levels = range(1, 4) if effort.quick else range(3, 9 if effort.large else 8)
     intervals = 32 if effort.quick else 64
-    meshes = [sb.icosphere(level) for level in levels]
+    meshes = [sb.shapes.icosphere(level) for level in levels]
     lattice = sb.Lattice(XI_MAX, intervals)
     yield _fitted(
         f"time against triangles: T_{levels[0]} to T_{levels[-1]}, M = {intervals}",
@@ -168,7 +168,7 @@ def growth(effort: Effort) -> Iterator[Row]:
         [_our_seconds(mesh, lattice, effort) for mesh in meshes],
     )
     level = 3 if effort.quick else 5
-    mesh = sb.icosphere(level)
+    mesh = sb.shapes.icosphere(level)
     sizes = (24, 32, 48) if effort.quick else (32, 64, 128, 256)
     yield _fitted(
         f"time against M: T_{level}, M = {sizes[0]} to {sizes[-1]}",

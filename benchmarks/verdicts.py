@@ -19,16 +19,16 @@ Pair = tuple[sb.Mesh, sb.Mesh]
 def verdicts(effort: Effort) -> Iterator[Row]:
     """Item 13: verdicts on pairs of some 100,000 triangles each, beside Hausdorff and Chamfer distances."""
     around, across = (32, 16) if effort.quick else (316, 158)
-    mesh = sb.Torus(1.0, 0.4).mesh(around, across)
-    coarse = sb.Torus(1.0, 0.4).mesh(around // 2, across // 2)
+    mesh = sb.shapes.Torus(1.0, 0.4).mesh(around, across)
+    coarse = sb.shapes.Torus(1.0, 0.4).mesh(around // 2, across // 2)
     pairs = {
         "vertices and triangles in another order": (_permuted(mesh), mesh, "same"),
-        "vertices elsewhere": (sb.Torus(1.0, 0.4).mesh(around + 2, across - 1), mesh, "same"),
+        "vertices elsewhere": (sb.shapes.Torus(1.0, 0.4).mesh(around + 2, across - 1), mesh, "same"),
         "each triangle cut in four, each in three and more": (_cut(coarse, _in_four), _cut(coarse, _in_three), "same"),
         "a hundredth of the triangles lost": (_without(_permuted(mesh), len(mesh.triangles) // 100), mesh, "different"),
         "vertices elsewhere and moved by 0.01": (
-            sb.Mesh(sb.Torus(1.0, 0.4).mesh(around + 2, across - 1).vertices + 0.01 * np.eye(3)[0],
-                    sb.Torus(1.0, 0.4).mesh(around + 2, across - 1).triangles),
+            sb.Mesh(sb.shapes.Torus(1.0, 0.4).mesh(around + 2, across - 1).vertices + 0.01 * np.eye(3)[0],
+                    sb.shapes.Torus(1.0, 0.4).mesh(around + 2, across - 1).triangles),
             mesh,
             "different",
         ),
@@ -45,7 +45,7 @@ def _row(what: str, pair: Pair, expected: str, effort: Effort) -> Row:
 
     outcomes: list[str] = []
     contestants: list[Callable[[Pair], object]] = [
-        lambda given: outcomes.append(sb.same_surface(*given, rtol=1e-2 if effort.quick else 1e-3).outcome)
+        lambda given: outcomes.append(sb.testing.same_surface(*given, rtol=1e-2 if effort.quick else 1e-3).outcome)
     ]
     if find_spec("vtkmodules"):
         contestants.append(lambda given: sb.proximity(*given))

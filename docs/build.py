@@ -6,6 +6,7 @@ missing file stops the build.
 
 from __future__ import annotations
 
+import inspect
 import re
 import shutil
 import sys
@@ -21,6 +22,9 @@ from pdoc.render_helpers import to_html
 
 ROOT = Path(__file__).resolve().parents[1]
 API = "sobolev_batch"
+# Modules of public names, in the order of the pages.
+MODULES = ("plot", "shapes", "fitting", "sources", "testing", "result_types", "errors")
+APIS = (API, *(f"{API}.{name}" for name in MODULES))
 
 PAGES = {
     "README.md": "index.html",
@@ -59,9 +63,18 @@ def build(output: Path) -> None:
         docformat="google", search=False, show_source=False, template_directory=ROOT / "docs" / "templates"
     )
     pages = {PAGES[source]: title[1] if title else source for source, title in titles.items()}
-    env.globals["pages"] = {**pages, f"{API}.html": "API"}
-    module = Module(import_module(API))
-    write(output / f"{API}.html", pdoc.render.html_module(module, {API: module}))
+    packages = {name: import_module(name) for name in APIS}
+    for package in packages.values():
+        inspect.getmembers(package)  # pdoc sees only names that were asked for once
+    modules = {name: Module(package) for name, package in packages.items()}
+    addresses = {name: f"{name.replace('.', '/')}.html" for name in modules}
+    pages |= {address: name.replace(API, "API").replace(".", ": ") for name, address in addresses.items()}
+    (output / API).mkdir(exist_ok=True)
+    for name, module in modules.items():
+        up = "../" * name.count(".")
+        env.globals["pages"] = {up + address: title for address, title in pages.items()}
+        write(output / addresses[name], pdoc.render.html_module(module, modules))
+    env.globals["pages"] = pages
     page = env.get_template("page.html.jinja2")
     for source, text in texts.items():
         rendered, address = to_html(text), PAGES[source]

@@ -14,24 +14,18 @@ task; a reduction over the stored fields makes the tables. Data flows one way th
 
 The public names by subject:
 
-- Numbers with their errors, of surfaces and of fields: `distance`, `norm`.
-- The causes of a distance: `spectrum` (wavelengths), `witness` (places).
-- Meshes made by the metric: `fit` and `refine` give a `Fit`, with its `FitQuality` before and after, and `FitProgress`
-  on the way; `gradient` and `SquaredDistance` are for optimisers of your own, `torch_function` and `jax_function` for
-  tensors.
-- Fields: `fourier_transform` on a `Lattice`; all of the above are methods of `field.sobolev`, see `SobolevAccessor`.
-- Surfaces: `Mesh`, `as_mesh` (of paths, arrays and other libraries' meshes), `read_mesh`, `write_mesh`, `icosphere`,
-  `Sphere`, `Ellipsoid`, `Torus`, `ParametrisedSurface` over two `Interval`; a
-  `Similarity` scales and moves them.
-- Sources of your own: `Source`, `Member`, `SurfaceMember` and `ExpectedSize`, checked by `check_source`.
-- Test suites: `assert_same_surface`, or `same_surface` for its `Verdict`.
-- For orientation: `proximity` of two meshes, a `Proximity` (Hausdorff, Chamfer).
-- Studies: `Study`, `StudyCollection`; `plan` and its `StudyPlan` or `CollectionPlan`, `run` and its `Summary`,
-  `submit` and its `Submission`.
-- Stores: `open_store`, `status` and its `Status`, `verify` and its `Verification`, `release`.
-- Results of a store: `table`, `matrix`, `evolution` (over time), `report`, `write_witness`; on Matplotlib axes:
-  `plot`, `plot_league`, `plot_witness`.
-- Errors: all derive from `SobolevBatchError`.
+- Numbers with their errors, of surfaces and of fields: `distance`, `norm`. Their causes: `spectrum` (wavelengths),
+  `witness` (places). For orientation: `yardsticks`, and `proximity` (Hausdorff, Chamfer).
+- Meshes: `Mesh`, `as_mesh` (of paths, arrays and other libraries' meshes), `read_mesh`, `write_mesh`; `fit` moves the
+  vertices of one towards a target.
+- Fields: `fourier_transform` on a `Lattice`; all of the above are methods of `field.sobolev`.
+- Studies: `Study`, `StudyCollection`, `init_study`, `plan`, `run`, `submit`.
+- Stores: `open_store`, `status`, `verify`, `release`.
+- Results of a store: `table`, `smallest_below`, `matrix`, `evolution` (over time), `league`, `compare_studies`,
+  `report`, `write_witness`.
+- Modules: `plot` (on Matplotlib axes), `shapes` (spheres and surfaces of your own), `fitting` (refinement and
+  derivatives), `sources` (of your own, for studies), `testing` (assertions), `result_types` (classes of what
+  functions return), `errors`.
 """
 
 from importlib import import_module  # noqa: TID251 -- of modules of this package

@@ -5,6 +5,21 @@ from contextlib import contextmanager
 
 from sobolev_batch.visible import visible
 
+__all__ = [
+    "AccuracyError",
+    "BackendError",
+    "ClusterError",
+    "DamageError",
+    "InputError",
+    "LatticeError",
+    "LockError",
+    "MeshError",
+    "OrderError",
+    "SobolevBatchError",
+    "StoreError",
+    "StudyError",
+]
+
 
 class SobolevBatchError(Exception):
     """Base of every error that the package raises on purpose.

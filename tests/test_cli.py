@@ -20,8 +20,8 @@ import pytest
 from distributed import Client
 
 import sobolev_batch as sb
-from sobolev_batch import icosphere
 from sobolev_batch.results.tables import FORMATS
+from sobolev_batch.shapes import icosphere
 from tests.support.commands import COMMAND, STUDY, call, command, finished
 
 pytestmark = pytest.mark.process
@@ -153,7 +153,7 @@ def test_compare_to_an_accuracy_and_on_a_lattice(folder: Path) -> None:
 def test_the_exit_status_of_a_verdict(folder: Path) -> None:
     # As exactly as the package itself computes it.
     first, third = (sb.read_mesh(folder / name) for name in ("1.off", "3.off"))
-    similarity = sb.Similarity.to_unit_ball(third)
+    similarity = sb.shapes.Similarity.to_unit_ball(third)
     pair = similarity.apply(first), similarity.apply(third)
     truth = sb.distance(*pair, -4, rtol=1e-4)["relative"].item()
     for file, below, status, word in (

@@ -76,8 +76,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with hostile names, a mesh and a file that is none."""
     folder = tmp_path_factory.mktemp("hostile")
     (folder / HOSTILE).mkdir()
-    sb.write_mesh(sb.icosphere(1), folder / HOSTILE / "good.obj")
-    sb.write_mesh(sb.icosphere(2), folder / f"{HOSTILE}.obj")
+    sb.write_mesh(sb.shapes.icosphere(1), folder / HOSTILE / "good.obj")
+    sb.write_mesh(sb.shapes.icosphere(2), folder / f"{HOSTILE}.obj")
     (folder / HOSTILE / "broken.obj").write_text("v 1 2\x1b[31m\n")
     return folder
 
@@ -86,7 +86,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def foreign(folder: Path, client: Client) -> str:
     """A store whose labels this package would not have written."""
     (folder / "foreign").mkdir()
-    sb.write_mesh(sb.icosphere(1), folder / "foreign" / f"{LABEL}.obj")
+    sb.write_mesh(sb.shapes.icosphere(1), folder / "foreign" / f"{LABEL}.obj")
     (folder / "foreign" / f"{LABEL}2.obj").write_text("no mesh")
     table = tomllib.loads(TOML.replace("*/*.obj", "foreign/*.obj"))
     with pytest.MonkeyPatch.context() as patch:
@@ -231,13 +231,13 @@ def test_lines_that_are_updated_in_place(capsys: pytest.CaptureFixture[str]) -> 
 
 def test_first_studies_of_hostile_folders(tmp_path: Path) -> None:
     (tmp_path / LABEL).mkdir()
-    sb.write_mesh(sb.icosphere(0), tmp_path / LABEL / "a.ply")
+    sb.write_mesh(sb.shapes.icosphere(0), tmp_path / LABEL / "a.ply")
     (tmp_path / os.fsdecode(b"b\xff.ply")).write_bytes(b"")
     status, text = printed("init", LABEL, folder=tmp_path)
     assert status == 2
     assert f"{SHOWN_LABEL}: its path cannot be in a study file" in text
     for level in range(3):
-        sb.write_mesh(sb.icosphere(level), tmp_path / f"a_{level}.ply")
+        sb.write_mesh(sb.shapes.icosphere(level), tmp_path / f"a_{level}.ply")
     status, text = printed("init", ".", folder=tmp_path)
     assert status == 0
     assert r"left out: b\udcff.ply: " in text

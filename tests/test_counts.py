@@ -16,7 +16,7 @@ import sobolev_batch as sb
 from sobolev_batch.spectral import exact, kinds
 from tests.support.studies import SMALL_LATTICE, small_table
 
-COARSE, FINE, SPHERE = sb.icosphere(1), sb.icosphere(2), sb.Sphere()
+COARSE, FINE, SPHERE = sb.shapes.icosphere(1), sb.shapes.icosphere(2), sb.shapes.Sphere()
 
 
 def run_study(store: str, *levels: int) -> None:
@@ -58,22 +58,22 @@ WORK: dict[str, tuple[Callable[[], object], int, int, int, str]] = {
         "the lattice is chosen from exact values, before one coarse field of each mesh",
     ),
     "gradient": (
-        lambda: sb.gradient(COARSE, SPHERE, -4.0, lattice=SMALL_LATTICE),
+        lambda: sb.fitting.gradient(COARSE, SPHERE, -4.0, lattice=SMALL_LATTICE),
         *(10, 115_200, 0),
         "a field and two sums at the nodes, at two accuracies, and four fields for the share of the target's error",
     ),
     "verdict on equal meshes": (
-        lambda: sb.same_surface(FINE, FINE),
+        lambda: sb.testing.same_surface(FINE, FINE),
         *(0, 0, 0),
         "equal surfaces are equal by their triangles",
     ),
     "verdict far from its tolerance": (
-        lambda: sb.same_surface(COARSE, FINE, rtol=1e-3),
+        lambda: sb.testing.same_surface(COARSE, FINE, rtol=1e-3),
         *(3, 47_340, 25_600),
         "a rough norm of the reference, and the two fields on one lattice",
     ),
     "verdict near its tolerance": (
-        lambda: sb.same_surface(COARSE, FINE, rtol=0.1),
+        lambda: sb.testing.same_surface(COARSE, FINE, rtol=0.1),
         *(5, 25_820, 51_200),
         "a rough norm of the reference, and the two fields on two lattices",
     ),

@@ -14,9 +14,8 @@ from typing import Any
 import pytest
 import yaml
 
-import sobolev_batch as sb
 from sobolev_batch.cli import cli
-from tests.support.repository import PACKAGE, ROOT
+from tests.support.repository import MODULES, PACKAGE, ROOT, public_names
 
 
 @pytest.fixture(scope="module")
@@ -44,40 +43,44 @@ def documented(value: Any) -> list[str]:
 
 
 def test_every_public_name_has_an_example() -> None:
-    for value in (getattr(sb, name) for name in sb.__all__):
+    for value in public_names().values():
         assert ("" if isinstance(value, type) and issubclass(value, Exception) else ">>>") in value.__doc__, value
 
 
 @pytest.mark.process
 @pytest.mark.all
 def test_every_public_name_is_there_with_its_text(site: Path) -> None:
-    page = (site / "sobolev_batch.html").read_text(encoding="utf-8")
-    # From one name to the next, methods and attributes included.
-    sections = dict(re.findall(r'<section id="(\w+)">(.*?)</section>', page, re.DOTALL))
-    assert sorted(sections) == sorted(sb.__all__)
-    for name in sb.__all__:
+    sections = {}
+    for prefix, path in {"": PACKAGE.name, **{f"{name}.": f"{PACKAGE.name}/{name}" for name in MODULES}}.items():
+        page = (site / f"{path}.html").read_text(encoding="utf-8")
+        # From one name to the next, methods and attributes included.
+        for name, section in re.findall(r'<section id="(\w+)">(.*?)</section>', page, re.DOTALL):
+            sections[prefix + name] = section
+    assert sorted(sections) == sorted(public_names())
+    for name, value in public_names().items():
         rendered = " ".join(words(sections[name]))
-        for text in documented(getattr(sb, name)):
+        for text in documented(value):
             for line in text.splitlines():
                 if not re.fullmatch(r"(Args|Attributes|Returns|Raises|Source):", line):
                     assert " ".join(words(line)) in rendered, (name, line)
     # Sections of docstrings became lists, and one name leads to another.
     assert "<li><strong>rtol:</strong>" in sections["distance"]
     assert 'href="#fourier_transform"' in sections["norm"]
-    assert "field.sobolev.norm(-2)" in sections["SobolevAccessor"]
+    assert "field.sobolev.norm(-2)" in sections["result_types.SobolevAccessor"]
 
 
 @pytest.mark.all
 def test_every_page_is_there_and_asks_nobody(site: Path) -> None:
-    pages = {path.name: path.read_text(encoding="utf-8") for path in site.glob("*.html")}
+    pages = {path.relative_to(site).as_posix(): path.read_text(encoding="utf-8") for path in site.rglob("*.html")}
     for source in (ROOT / "docs").glob("*.md"):
         assert f"{source.stem}.html" in pages, source
     for name, page in pages.items():
         assert not re.search(r'(?:src=|<link[^>]*href=|url\()"?https?:', page), name
         for link, section in re.findall(r'(?:href|src)="([^"#]*)(?:#([^"]*))?"', page):
             if not link.startswith(("https:", "data:")):
-                assert (site / link).exists(), (name, link)
-                assert not section or f'id="{section}"' in pages[link or name], (name, link, section)
+                target = (site / name).parent.joinpath(link).resolve() if link else site / name
+                assert target.exists(), (name, link)
+                assert not section or f'id="{section}"' in target.read_text(encoding="utf-8"), (name, link, section)
 
 
 def design() -> str:
@@ -118,7 +121,7 @@ def test_every_command_is_listed_with_its_functions() -> None:
     rows = re.findall(r"^\| `(\w+)` \| .* \| (.+) \|$", text, re.MULTILINE)
     assert sorted(command for command, _ in rows) == sorted(cli.commands)
     for _, functions in rows:
-        assert set(re.findall(r"`sb\.(\w+)`", functions)) <= set(sb.__all__)
+        assert set(re.findall(r"`sb\.([\w.]+)`", functions)) <= {*public_names(), *MODULES}
 
 
 def test_the_citation_is_of_this_version() -> None:

@@ -14,7 +14,7 @@ from tests.support.repository import PACKAGE, run_icospheres
 FLAGS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
 FILES = [file for file in sorted(PACKAGE.rglob("*.py")) if ">>>" in file.read_text(encoding="utf-8")]
 NAMES = [".".join([PACKAGE.name, *file.relative_to(PACKAGE).with_suffix("").parts]) for file in FILES]
-BESIDE_A_STORE = tuple(f"{PACKAGE.name}.{layer}." for layer in ("results", "cli"))
+BESIDE_A_STORE = tuple(f"{PACKAGE.name}.{layer}" for layer in ("results.", "cli.", "plot"))
 # They run studies on clusters of their own.
 WITH_CLUSTERS = {f"{PACKAGE.name}.batch.{name}" for name in ("run", "verify")}
 

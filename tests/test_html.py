@@ -26,29 +26,32 @@ def shown(value: Any) -> tuple[list[str], str]:
     return tags, "".join(page.itertext())
 
 
-def summary() -> sb.Summary:
+def summary() -> sb.result_types.Summary:
     failed = {f"{HOSTILE}/{number}": HOSTILE for number in range(30)}
-    return sb.Summary(HOSTILE, ("a/1", "a/2"), ("a/3",), failed, {HOSTILE: HOSTILE}, {HOSTILE: 0.25})
+    return sb.result_types.Summary(HOSTILE, ("a/1", "a/2"), ("a/3",), failed, {HOSTILE: HOSTILE}, {HOSTILE: 0.25})
 
 
 @pytest.mark.parametrize(
     ("value", "texts"),
     [
         (summary(), ["2 computed, 1 reused, 30 failed", f"{HOSTILE}/19: ", "and 10 more", "error of 25 %"]),
-        (sb.StudyDraft(Path(HOSTILE), [HOSTILE], {HOSTILE: "damaged"}), [f"{HOSTILE}: damaged"]),
+        (sb.result_types.StudyDraft(Path(HOSTILE), [HOSTILE], {HOSTILE: "damaged"}), [f"{HOSTILE}: damaged"]),
         (
-            sb.Verification(HOSTILE, 3, 4, {HOSTILE: "gone"}, {"norm": HOSTILE}, withdrawn=True),
+            sb.result_types.Verification(HOSTILE, 3, 4, {HOSTILE: "gone"}, {"norm": HOSTILE}, withdrawn=True),
             ["damaged", "3 of 4", f"{HOSTILE}: gone", "computes what is damaged again"],
         ),
-        (sb.Status(HOSTILE, 3, 5, {HOSTILE: HOSTILE}, {}, None, False, 0.0), ["3 of 5 complete, 1 failed, 1 to go"]),
-        (sb.Verdict("same", 9e-5, 1.1e-4, 1e-3, -2.0, 0.0, "lattice"), ["relative distance 0.00010 ± 0.00001"]),
+        (
+            sb.result_types.Status(HOSTILE, 3, 5, {HOSTILE: HOSTILE}, {}, None, False, 0.0),
+            ["3 of 5 complete, 1 failed, 1 to go"],
+        ),
+        (sb.testing.Verdict("same", 9e-5, 1.1e-4, 1e-3, -2.0, 0.0, "lattice"), ["relative distance 0.00010 ± 0.00001"]),
     ],
 )
 def test_texts_are_shown_and_never_run(value: Any, texts: list[str]) -> None:
     _, text = shown(value)
     for expected in texts:
         assert expected in text
-    if isinstance(value, sb.Verdict):
+    if isinstance(value, sb.testing.Verdict):
         return
     assert HOSTILE in text
 

@@ -16,6 +16,7 @@ from sobolev_batch.batch.cluster.clients import memory_limit
 from sobolev_batch.batch.cluster.workers import Workers, allowed_bytes
 from sobolev_batch.parameters import available_cores, machine_memory, require_machine_memory
 from sobolev_batch.spectral.transform import thread_count
+from tests.support.repository import public_names
 from tests.support.studies import small_table
 
 TOTAL = psutil.virtual_memory().total
@@ -83,31 +84,35 @@ def test_transforms_take_no_more_threads_than_there_are_cores(monkeypatch: pytes
 
 def test_more_than_there_is_is_refused_with_both_numbers() -> None:
     require_machine_memory(1, "memory")
-    with pytest.raises(sb.InputError, match=r"memory of 1\.0PB is more than there is: .*B, (all of|the limit in) "):
+    with pytest.raises(
+        sb.errors.InputError, match=r"memory of 1\.0PB is more than there is: .*B, (all of|the limit in) "
+    ):
         require_machine_memory(1e15, "memory")
 
 
-SPHERES = sb.Sphere(), sb.Sphere(0.9)
+SPHERES = sb.shapes.Sphere(), sb.shapes.Sphere(0.9)
 STUDY = sb.Study.from_table(small_table())
 # Every public function with such an argument, by name.
 ASKING: dict[str, Callable[[], object]] = {
-    "assert_same_surface": lambda: sb.assert_same_surface(*SPHERES, memory="1000TB"),
+    "testing.assert_same_surface": lambda: sb.testing.assert_same_surface(*SPHERES, memory="1000TB"),
     "distance": lambda: sb.distance(*SPHERES, -2.0, rtol=0.1, memory="1000TB"),
     "norm": lambda: sb.norm(SPHERES[0], -2.0, rtol=0.1, memory=1e15),
     "run": lambda: sb.run(STUDY, "memory://greedy.zarr", memory="1000TB"),
-    "same_surface": lambda: sb.same_surface(*SPHERES, memory="1000TB"),
-    "yardsticks": lambda: sb.yardsticks(sb.icosphere(1), sb.icosphere(2), -2.0, rtol=0.1, memory="1000TB"),
+    "testing.same_surface": lambda: sb.testing.same_surface(*SPHERES, memory="1000TB"),
+    "yardsticks": lambda: sb.yardsticks(
+        sb.shapes.icosphere(1), sb.shapes.icosphere(2), -2.0, rtol=0.1, memory="1000TB"
+    ),
 }
 
 
 @pytest.mark.parametrize("name", ASKING)
 def test_no_function_believes_more_than_there_is(name: str) -> None:
-    with pytest.raises(sb.InputError, match=r"memory (of a worker )?of 1\.0PB is more than there is"):
+    with pytest.raises(sb.errors.InputError, match=r"memory (of a worker )?of 1\.0PB is more than there is"):
         ASKING[name]()
 
 
 def test_every_function_with_a_memory_is_asked() -> None:
-    functions = {name: value for name in sb.__all__ if inspect.isfunction(value := getattr(sb, name))}
+    functions = {name: value for name, value in public_names().items() if inspect.isfunction(value)}
     assert {name for name, one in functions.items() if "memory" in inspect.signature(one).parameters} == set(ASKING)
 
 
@@ -115,7 +120,7 @@ def test_workers_together_have_no_more_than_the_machine() -> None:
     share = 0.6 * TOTAL
     assert memory_limit(share, 1) == int(share)
     with pytest.raises(
-        sb.InputError, match=r"the memory of 2 workers of .* is more .*; ask for less for each, or take"
+        sb.errors.InputError, match=r"the memory of 2 workers of .* is more .*; ask for less for each, or take"
     ):
         memory_limit(share, 2)
 
@@ -132,10 +137,10 @@ def test_integers_of_numpy_are_whole_numbers() -> None:
     goal: Any = np.int64(40)
     assert sb.Lattice(1.0, small) == sb.Lattice(1.0, 100)
     # As an integer of 8 bits, 100 times 100 is 16.
-    assert len(sb.Torus(2.0, 1.0).mesh(small, small).triangles) == 20_000
-    assert len(sb.icosphere(few).triangles) == 1280
-    fitted = sb.refine(sb.icosphere(0), sb.Sphere(), -4.0, triangles=goal, steps=few)
+    assert len(sb.shapes.Torus(2.0, 1.0).mesh(small, small).triangles) == 20_000
+    assert len(sb.shapes.icosphere(few).triangles) == 1280
+    fitted = sb.fitting.refine(sb.shapes.icosphere(0), sb.shapes.Sphere(), -4.0, triangles=goal, steps=few)
     assert 20 < len(fitted.mesh.triangles) <= 40
     for wrong in (True, np.True_, 3.0, "3"):
-        with pytest.raises(sb.InputError, match="level must be an integer"):
-            sb.icosphere(wrong)  # type: ignore[arg-type]
+        with pytest.raises(sb.errors.InputError, match="level must be an integer"):
+            sb.shapes.icosphere(wrong)  # type: ignore[arg-type]

@@ -121,7 +121,7 @@ def test_the_code_of_the_gallery_runs(client: Client, tmp_path: Path, monkeypatc
     run_icospheres(tmp_path, client)
     monkeypatch.chdir(tmp_path)
     # A cow that is a ball through the place of the patch.
-    sb.write_mesh(sb.Similarity(0.38).apply(sb.icosphere(3)), "spot.obj")
+    sb.write_mesh(sb.shapes.Similarity(0.38).apply(sb.shapes.icosphere(3)), "spot.obj")
     results = run_blocks("docs/gallery.md")
     assert sb.read_mesh("twice.ply").area == pytest.approx(results["twice"].area)
     assert {path.stem for path in tmp_path.glob("*.png")} == {"matrix", "spectrum"}
@@ -145,12 +145,14 @@ def test_every_query_runs_and_answers(client: Client, tmp_path: Path, monkeypatc
     assert found["nearest"].is_monotonic_increasing
     assert found["near_another"]["mesh"].values.tolist() == [levels[2], levels[3]]
     assert (found["whole"].loc[levels, levels] == found["part"].to_pandas()).all(axis=None)
-    expected = sb.distance(sb.icosphere(3), sb.Sphere(), [-3.5, -2.25], lattice=found["fields"].sobolev.lattice)
+    expected = sb.distance(
+        sb.shapes.icosphere(3), sb.shapes.Sphere(), [-3.5, -2.25], lattice=found["fields"].sobolev.lattice
+    )
     assert found["another"]["distance"].sel(mesh=levels[3]).values == pytest.approx(
         expected["distance"].values, rel=1e-6
     )
     assert set(found["pair"]) == {levels[0], levels[3]}
-    assert found["along_axis"].loc[0.0].real == pytest.approx(sb.icosphere(3).area, rel=1e-6)
+    assert found["along_axis"].loc[0.0].real == pytest.approx(sb.shapes.icosphere(3).area, rel=1e-6)
     assert found["by_wavelength"].sum() == pytest.approx(1, rel=1e-10)
     # An inscribed mesh lacks area and lies inside: at its vertices, next to the sphere, the sphere has more.
     assert (found["w"].values < 0).all()
@@ -195,7 +197,8 @@ def test_the_page_about_surfaces_that_move_runs(
     Path("storage").mkdir()
     for number, radius in ((0, 1.0), (0.25, 1.1)):
         sb.write_mesh(
-            sb.Mesh(radius * np.asarray(sb.icosphere(2).vertices), sb.icosphere(2).triangles), f"frames/t{number}.ply"
+            sb.Mesh(radius * np.asarray(sb.shapes.icosphere(2).vertices), sb.shapes.icosphere(2).triangles),
+            f"frames/t{number}.ply",
         )
     sb.run(sb.Study.from_table(simulated), "storage/study.zarr", client)
     results = run_blocks("docs/moving.md")
@@ -220,4 +223,4 @@ def test_the_page_about_test_suites_runs(
     assert results["lost_face"].outcome == "different"
     assert results["verdict"].outcome == "same"
     # The fixture of the parametrised test is the assertion itself.
-    results["test_mesher"]((96, 48), sb.assert_same_surface)
+    results["test_mesher"]((96, 48), sb.testing.assert_same_surface)

@@ -15,7 +15,7 @@ HEAVY = {
 LIBRARIES = HEAVY | {"dask", "finufft", "numpy", "pandas", "pydantic", "scipy", "xarray"}
 FIRST_FIELD = """
 import sobolev_batch as sb
-sb.fourier_transform(sb.icosphere(1), sb.Lattice(xi_max=1.0, M=8))
+sb.fourier_transform(sb.shapes.icosphere(1), sb.Lattice(xi_max=1.0, M=8))
 """
 # Parts of SciPy that a first field may load: sizes of lattices, step functions, and what these load.
 PARTS_OF_SCIPY = {"fft", "fftpack", "linalg", "sparse", "special", "version"}

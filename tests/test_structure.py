@@ -7,10 +7,13 @@ from graphlib import CycleError, TopologicalSorter
 import pytest
 
 import sobolev_batch as sb
-from tests.support.repository import PACKAGE, imported
+from tests.support.repository import MODULES, PACKAGE, imported, public_names
 
 # Each may import those before it.
-LAYERS = ("visible", "errors", "parameters", "surfaces", "spectral", "fitting", "batch", "results", "testing", "cli")
+LAYERS = (
+    *("visible", "errors", "parameters", "surfaces", "spectral", "fitting", "batch", "results", "testing"),
+    *("shapes", "sources", "plot", "result_types", "cli"),
+)
 MOST_NAMES_OF_A_FOLDER = 20
 
 Path = tuple[str, ...]
@@ -75,8 +78,12 @@ def test_numbers_know_neither_dask_nor_zarr(layer: str) -> None:
 
 
 def test_names_are_sorted_and_unknown_ones_refused() -> None:
-    assert sb.__all__ == sorted(set(sb.__all__))
-    assert {"Study", "plan", "run", "status", "table", "matrix", "report", "plot"} <= set(sb.__all__)
+    for module in (sb, *MODULES.values()):
+        assert module.__all__ == sorted(set(module.__all__))
+    assert {"Study", "plan", "run", "status", "table", "matrix", "report", *MODULES} <= set(sb.__all__)
     assert dir(sb) == sb.__all__
+    # Each name has one place.
+    names = [name for name in public_names() if not name.startswith("plot.")]
+    assert len(names) == len({name.split(".")[-1] for name in names})
     with pytest.raises(AttributeError, match="nothing"):
         sb.nothing  # type: ignore[attr-defined]  # noqa: B018

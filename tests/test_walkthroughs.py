@@ -49,10 +49,10 @@ def write(mesh: sb.Mesh, path: Path) -> None:
 
 
 def remeshers(folder: Path) -> None:
-    ball = sb.icosphere(3)
+    ball = sb.shapes.icosphere(3)
     objects = {
-        "egg": sb.Ellipsoid((1.0, 0.8, 0.6)).mesh(3),
-        "torus": sb.Torus().mesh(36, 18),
+        "egg": sb.shapes.Ellipsoid((1.0, 0.8, 0.6)).mesh(3),
+        "torus": sb.shapes.Torus().mesh(36, 18),
         "bumps": bumps(ball, 0.1),
         "bean": sb.Mesh(ball.vertices**3 + ball.vertices, ball.triangles),
     }
@@ -74,7 +74,7 @@ def remeshers(folder: Path) -> None:
 def brains(folder: Path) -> None:
     """Two surfaces of each of three subjects, in millimetres, as FreeSurfer writes them."""
     for number, noise in (("01", 0.002), ("02", 0.004), ("03", 0.02)):
-        surface = bumps(sb.icosphere(3), 0.1, 8.0 + int(number))
+        surface = bumps(sb.shapes.icosphere(3), 0.1, 8.0 + int(number))
         for scan, mesh in (("scan", surface), ("rescan", rough(surface, noise))):
             path = folder / "brains" / f"s{number}" / scan / "lh.pial"
             path.parent.mkdir(parents=True)
@@ -82,7 +82,7 @@ def brains(folder: Path) -> None:
 
 
 def scans(folder: Path) -> None:
-    part = sb.Torus().mesh(24, 12)
+    part = sb.shapes.Torus().mesh(24, 12)
     write(part, folder / "scans" / "part.ply")
     for number in range(210):
         place = "scans" if number < 200 else "later"
@@ -90,13 +90,13 @@ def scans(folder: Path) -> None:
 
 
 def statue(folder: Path) -> None:
-    whole = bumps(sb.icosphere(4), 0.15)
+    whole = bumps(sb.shapes.icosphere(4), 0.15)
     write(whole, folder / "statue.ply")
     write(decimated(whole, 500), folder / "simple.ply")
 
 
 def part(folder: Path) -> None:
-    ring = sb.Torus(40.0, 12.0)
+    ring = sb.shapes.Torus(40.0, 12.0)
     write(ring.mesh(144, 72), folder / "part" / "part.stl")
     for name, cells in (("rough", 16), ("middle", 32), ("fine", 96)):
         write(ring.mesh(cells, cells // 2), folder / "part" / "exported" / f"{name}.stl")

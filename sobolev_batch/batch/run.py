@@ -62,7 +62,8 @@ class Summary:
         imprecise: Largest relative error of the distances of each mesh that are less accurate than the study requires.
 
     >>> import sobolev_batch as sb
-    >>> summary = sb.Summary("results.zarr", computed=("ico/2",), reused=("ico/1",), failed={"f/a": "no triangles"})
+    >>> from sobolev_batch.result_types import Summary
+    >>> summary = Summary("results.zarr", computed=("ico/2",), reused=("ico/1",), failed={"f/a": "no triangles"})
     >>> sorted(summary.failed)
     ['f/a']
     """

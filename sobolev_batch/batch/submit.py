@@ -46,7 +46,7 @@ class Submission:
         refused: Reason for each object that cannot be carried out, by its name.
 
     >>> import sobolev_batch as sb
-    >>> submission = sb.Submission("s3://bucket/results.zarr", surfaces=6, missing=4)
+    >>> submission = sb.result_types.Submission("s3://bucket/results.zarr", surfaces=6, missing=4)
     >>> f"{submission.missing} of {submission.surfaces} to compute"
     '4 of 6 to compute'
     """

@@ -45,7 +45,7 @@ class Verification:
             object without a store is 0.
 
     >>> import sobolev_batch as sb
-    >>> sb.Verification("results.zarr", 5, 5, {}, {}, withdrawn=False).is_sound
+    >>> sb.result_types.Verification("results.zarr", 5, 5, {}, {}, withdrawn=False).is_sound
     True
     """
 

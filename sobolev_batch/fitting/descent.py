@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import laplacian
 from scipy.sparse.linalg import splu
 
 from sobolev_batch.errors import LatticeError
-from sobolev_batch.fitting.gradient import SquaredDistance
+from sobolev_batch.fitting.derivatives import SquaredDistance
 from sobolev_batch.fitting.transform import area_derivatives, normals
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Indices, Reals

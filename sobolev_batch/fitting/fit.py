@@ -64,7 +64,7 @@ class FitQuality:
         relative_error: Error of that.
 
     >>> import sobolev_batch as sb
-    >>> sb.FitQuality(distance=0.5, error=0.01, smallest_angle=30.0).distance
+    >>> sb.fitting.FitQuality(distance=0.5, error=0.01, smallest_angle=30.0).distance
     0.5
     """
 
@@ -88,7 +88,7 @@ class FitProgress:
             of squared distances, and a small penalty for triangles that lose their shape.
 
     >>> import sobolev_batch as sb
-    >>> sb.FitProgress(step=3, steps=150, relative=0.5).relative
+    >>> sb.fitting.FitProgress(step=3, steps=150, relative=0.5).relative
     0.5
     """
 
@@ -114,7 +114,7 @@ class Fit:
         remarks: What a user should know about the mesh, as sentences.
 
     >>> import sobolev_batch as sb
-    >>> fitted = sb.fit(sb.icosphere(1), sb.Sphere(1.1), -4.0, steps=5)
+    >>> fitted = sb.fit(sb.shapes.icosphere(1), sb.shapes.Sphere(1.1), -4.0, steps=5)
     >>> fitted.steps, fitted.end
     (5, 'all steps are taken')
     """
@@ -171,7 +171,7 @@ def fit(
             order; or a setting is out of range.
 
     >>> import sobolev_batch as sb
-    >>> fitted = sb.fit(sb.icosphere(1), sb.Sphere(), -4.0, steps=8)
+    >>> fitted = sb.fit(sb.shapes.icosphere(1), sb.shapes.Sphere(), -4.0, steps=8)
     >>> fitted.after.distance < fitted.before.distance / 4
     True
     """
@@ -368,7 +368,7 @@ def refine(
         InputError: The mesh has as many triangles already, or `fit` would refuse mesh, target or settings.
 
     >>> import sobolev_batch as sb
-    >>> refined = sb.refine(sb.icosphere(0), sb.Sphere(), -4.0, triangles=40, steps=5)
+    >>> refined = sb.fitting.refine(sb.shapes.icosphere(0), sb.shapes.Sphere(), -4.0, triangles=40, steps=5)
     >>> len(refined.mesh.triangles) <= 40, refined.after.distance < refined.before.distance / 4
     (True, True)
     """

@@ -20,7 +20,7 @@ class SobolevAccessor:
     """Norms, distances and more as methods of any Fourier field in xarray: ``field.sobolev.norm(-2)``.
 
     Fields have the accessor once you import `fourier_transform` or `open_store` from the package. For fields that
-    you open with plain xarray, import this class: ``from sobolev_batch import SobolevAccessor``.
+    you open with plain xarray, import this class: ``from sobolev_batch.result_types import SobolevAccessor``.
 
     A field lies over xi_x, xi_y and xi_z >= 0, is the transform ∫ exp(-2πi ξ·x) dμ(x) with ξ in cycles per
     unit length, and may be lazy. `norm`, `distance` and `spectrum` also take a stack of fields

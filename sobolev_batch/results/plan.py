@@ -244,7 +244,7 @@ class CollectionPlan:
         warnings: What would make a run useless or end it, see `warnings_of`.
 
     >>> import sobolev_batch as sb
-    >>> plan = sb.CollectionPlan({}, {"cow": "the reference cannot be made: cow.ply: it is empty"})
+    >>> plan = sb.result_types.CollectionPlan({}, {"cow": "the reference cannot be made: cow.ply: it is empty"})
     >>> print(plan)
     cow: the reference cannot be made: cow.ply: it is empty
     0 objects: about 0 s, 0B of fields

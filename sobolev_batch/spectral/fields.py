@@ -153,7 +153,8 @@ def fourier_transform(
 
     Source: K. Koga, "Computing weak distance between the 2-sphere and its nonsmooth approximations".
 
-    >>> from sobolev_batch import Lattice, Sphere, fourier_transform
+    >>> from sobolev_batch import Lattice, fourier_transform
+    >>> from sobolev_batch.shapes import Sphere
     >>> field = fourier_transform(Sphere(radius=1.0), Lattice(xi_max=2.0, M=16))
     >>> field.shape, str(field.dtype)
     ((17, 17, 9), 'complex128')

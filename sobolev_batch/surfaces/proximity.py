@@ -31,7 +31,7 @@ class Proximity:
         chamfer_error: Standard error of `chamfer`, since points are random.
 
     >>> import sobolev_batch as sb
-    >>> sb.Proximity(hausdorff=0.25, chamfer=0.5, chamfer_error=0.01).chamfer
+    >>> sb.result_types.Proximity(hausdorff=0.25, chamfer=0.5, chamfer_error=0.01).chamfer
     0.5
     """
 

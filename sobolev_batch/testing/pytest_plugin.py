@@ -35,7 +35,7 @@ def assert_same_surface(request: pytest.FixtureRequest) -> Callable[..., Verdict
     numbers = count(1)
 
     def check(a: SurfaceLike, b: SurfaceLike, **settings: Any) -> Verdict:
-        """Raise an AssertionError unless two surfaces are the same; see `sobolev_batch.assert_same_surface`."""
+        """Raise an AssertionError unless two surfaces are the same; see `sobolev_batch.testing.assert_same_surface`."""
         __tracebackhide__ = True
         from sobolev_batch.testing.verdict import assert_same_surface
 

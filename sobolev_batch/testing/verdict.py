@@ -48,7 +48,7 @@ class Verdict:
             beyond a lattice).
 
     >>> import sobolev_batch as sb
-    >>> verdict = sb.same_surface(sb.icosphere(3), sb.Sphere())
+    >>> verdict = sb.testing.same_surface(sb.shapes.icosphere(3), sb.shapes.Sphere())
     >>> verdict.outcome, f"{verdict.distance:.3f}", f"{verdict.area_change:.3f}"
     ('different', '0.008', '-0.005')
     """
@@ -137,10 +137,10 @@ def same_surface(
         OrderError: The order is not below -1/2.
 
     >>> import sobolev_batch as sb
-    >>> fine, coarse = sb.icosphere(4), sb.icosphere(3)
-    >>> print(sb.same_surface(coarse, fine, rtol=0.01))
+    >>> fine, coarse = sb.shapes.icosphere(4), sb.shapes.icosphere(3)
+    >>> print(sb.testing.same_surface(coarse, fine, rtol=0.01))
     same surface: relative distance 0.00...
-    >>> sb.same_surface(coarse, fine).outcome
+    >>> sb.testing.same_surface(coarse, fine).outcome
     'different'
     """
     check_seed(seed)
@@ -191,10 +191,10 @@ def assert_same_surface(
         InputError: An argument is no surface, or out of range.
 
     >>> import sobolev_batch as sb
-    >>> sphere = sb.icosphere(4)
-    >>> sb.assert_same_surface(sphere, sb.Sphere(), rtol=0.01).outcome
+    >>> sphere = sb.shapes.icosphere(4)
+    >>> sb.testing.assert_same_surface(sphere, sb.shapes.Sphere(), rtol=0.01).outcome
     'same'
-    >>> sb.assert_same_surface((sphere.vertices, sphere.triangles[100:]), sphere)
+    >>> sb.testing.assert_same_surface((sphere.vertices, sphere.triangles[100:]), sphere)
     Traceback (most recent call last):
         ...
     AssertionError: different surfaces: relative distance 0.05... ± 0.0005 at order -4, above rtol 0.001; area -1.9 %

@@ -150,7 +150,7 @@ def test_a_second_run_computes_what_is_new(store: Path, client: Client) -> None:
     summary = sb.run(collection(balls(a=1.0, b=1.1, c=1.2)), store, client)
     assert set(summary.computed) == {f"c/{label}" for label in LABELS}
     assert summary.failed == {}
-    with pytest.raises(sb.StoreError, match="it holds the store of another collection, 'small', not 'other'"):
+    with pytest.raises(sb.errors.StoreError, match="it holds the store of another collection, 'small', not 'other'"):
         sb.run(collection(balls(a=1.0), "other"), store, client)
 
 
@@ -162,9 +162,9 @@ def test_a_league_needs_no_more_than_the_store(store: Path) -> None:
     frame = sb.compare_studies(store, store, -3)
     assert frame["ratio"].tolist() == [1.0, 1.0]
     assert set(frame["verdict"]) == {"undecided"}
-    with pytest.raises(sb.StoreError, match="it holds no store of a collection"):
+    with pytest.raises(sb.errors.StoreError, match="it holds no store of a collection"):
         sb.league(store / "a")
-    with pytest.raises(sb.StoreError, match="nowhere"):
+    with pytest.raises(sb.errors.StoreError, match="nowhere"):
         sb.league({"a": store / "a", "b": store / "nowhere"})
 
 
@@ -177,5 +177,5 @@ def test_other_references_and_units_are_told_apart(
 ) -> None:
     sb.run(sb.Study.from_table(small_table(**changes)), store_path, client)
     assert len(sb.compare_studies(store_path, store_path, -3)) == 1
-    with pytest.raises(sb.InputError, match="different references or units"):
+    with pytest.raises(sb.errors.InputError, match="different references or units"):
         sb.compare_studies(store_path, finished_store, -3)

@@ -19,7 +19,7 @@ from tests.support.stores import delete, flip, put_back, truncate
 from tests.support.studies import small_table, variable
 
 ORDERS = (-0.8, -1.5, -2.0)
-BALL = sb.Sphere(0.9)
+BALL = sb.shapes.Sphere(0.9)
 LEVELS = [1, 2]
 
 
@@ -49,10 +49,10 @@ def test_distances_are_as_accurate_as_asked_and_their_errors_hold(octave_store: 
     convergence = sb.open_store(octave_store)["convergence"].to_dataset().drop_sel(mesh="reference")
     assert convergence["within"].all()
     ball = convergence.sel(mesh="ball/sphere")
-    exact = sb.distance(sb.Sphere(), BALL, ORDERS)["distance"].values
+    exact = sb.distance(sb.shapes.Sphere(), BALL, ORDERS)["distance"].values
     assert (np.abs(ball["distance"].values - exact) <= ball["error"].values).all()
     for level in LEVELS:
-        other = sb.distance(sb.icosphere(level), sb.Sphere(), ORDERS, rtol=2e-2, seed=7)
+        other = sb.distance(sb.shapes.icosphere(level), sb.shapes.Sphere(), ORDERS, rtol=2e-2, seed=7)
         here = convergence.sel(mesh=f"ico/{level}")
         gap = np.abs(here["distance"].values - other["distance"].values)
         assert (gap <= here["error"].values + other["error"].values).all()
@@ -64,18 +64,18 @@ def test_distances_are_as_accurate_as_asked_and_their_errors_hold(octave_store: 
 def test_norms_pairs_and_parts_agree_with_closed_forms(octave_store: Path) -> None:
     tree = sb.open_store(octave_store)
     norms, pairs = tree["norms"].to_dataset(), tree["distances"].to_dataset()
-    for label, sphere in (("reference", sb.Sphere()), ("ball/sphere", BALL)):
+    for label, sphere in (("reference", sb.shapes.Sphere()), ("ball/sphere", BALL)):
         found, exact = norms.sel(mesh=label), sb.norm(sphere, ORDERS)["norm"].values
         assert (np.abs(found["norm"].values - exact) <= found["error"].values).all()
         assert (found["error"].values < 0.05 * exact).all()
     pair, swapped = (pairs.sel(mesh=a, other=b) for a, b in permutations(("ball/sphere", "ico/2")))
-    alone = sb.distance(sb.icosphere(2), BALL, ORDERS, rtol=2e-2, seed=3)
+    alone = sb.distance(sb.shapes.icosphere(2), BALL, ORDERS, rtol=2e-2, seed=3)
     assert (np.abs(pair["distance"] - alone["distance"].values) <= pair["error"] + alone["error"].values).all()
     for name in ("distance", "error", "statistical"):
         assert np.array_equal(pair[name], swapped[name])
     # The ball is shrunk: <a - b, b> / ||b|| by the closed forms of spheres.
-    exact_norm = sb.norm(sb.Sphere(), ORDERS)["norm"].values
-    products = np.array([sphere_inner_product(BALL, sb.Sphere(), order) for order in ORDERS])
+    exact_norm = sb.norm(sb.shapes.Sphere(), ORDERS)["norm"].values
+    products = np.array([sphere_inner_product(BALL, sb.shapes.Sphere(), order) for order in ORDERS])
     parts = tree["convergence"].to_dataset().sel(mesh="ball/sphere")
     assert parts["area_part"].values == pytest.approx(np.abs(products - exact_norm**2) / exact_norm, rel=0.05)
     assert (parts["area_part"] ** 2 + parts["shape_part"] ** 2).values == pytest.approx(parts["distance"].values ** 2)
@@ -95,7 +95,7 @@ def test_a_run_reuses_octaves_and_a_new_mesh_gets_the_same_frequencies(store: Pa
     assert np.array_equal(after.xi_x, before.xi_x)
     assert np.array_equal(after.octaves.sel(mesh=before.mesh), before.octaves)
     found = variable(sb.open_store(store), "convergence", "distance").sel(mesh="ico/0").values
-    other = sb.distance(sb.icosphere(0), sb.Sphere(), ORDERS, rtol=2e-2)
+    other = sb.distance(sb.shapes.icosphere(0), sb.shapes.Sphere(), ORDERS, rtol=2e-2)
     assert found == pytest.approx(other["distance"].values, rel=0.05)
 
 
@@ -135,7 +135,7 @@ def test_octaves_at_other_frequencies_are_not_mixed(store: Path, client: Client)
     stored = Store.open(store)
     stored.write("octaves/xi_x", ..., np.asarray(stored.read("octaves/xi_x", ...)) + 1.0)
     stored.consolidate()
-    with pytest.raises(sb.StoreError, match="sampled at other frequencies"):
+    with pytest.raises(sb.errors.StoreError, match="sampled at other frequencies"):
         sb.run(sb.Study.from_table(asking()), store, client)
 
 
@@ -174,7 +174,7 @@ def test_fields_in_blocks_and_octaves_in_a_task_of_their_own_are_the_same(client
 def test_an_open_store_gives_any_order_from_its_octaves(octave_store: Path) -> None:
     tree = sb.open_store(octave_store)
     found = tree.sobolev.distance([-1.0, -1.5], "ball/sphere", "reference")
-    exact = sb.distance(sb.Sphere(), BALL, [-1.0, -1.5])["distance"].values
+    exact = sb.distance(sb.shapes.Sphere(), BALL, [-1.0, -1.5])["distance"].values
     assert (np.abs(found["distance"].values - exact) <= found["error"].values).all()
     assert (found["error"].values < 0.1 * exact).all()
     stored = tree["convergence"].to_dataset().sel(mesh="ball/sphere", order=-1.5)
@@ -185,7 +185,7 @@ def test_an_open_store_gives_any_order_from_its_octaves(octave_store: Path) -> N
     assert (single.dims, single.item()) == ((), pytest.approx(pair.item(), rel=1e-6))
     norms = tree.sobolev.norm(-0.9, "ball/sphere")
     assert abs(norms["norm"].item() - sb.norm(BALL, -0.9)["norm"].item()) <= norms["error"].item()
-    with pytest.raises(sb.InputError, match="no mesh 'ico/9' with a field"):
+    with pytest.raises(sb.errors.InputError, match="no mesh 'ico/9' with a field"):
         tree.sobolev.norm(-2.0, "ico/9")
 
 
@@ -216,7 +216,7 @@ def test_pairs_that_were_not_compared_have_errors_that_hold(threads: Client, sto
     pairs = sb.open_store(store_path)["distances"].to_dataset()
     for one, other in combinations(levels, 2):
         found = pairs.sel(mesh=f"ico/{one}", other=f"ico/{other}")
-        true = sb.distance(sb.icosphere(one), sb.icosphere(other), [-1.0, -2.0], rtol=1e-2)
+        true = sb.distance(sb.shapes.icosphere(one), sb.shapes.icosphere(other), [-1.0, -2.0], rtol=1e-2)
         gaps = np.abs(found["distance"].values - true["distance"].values)
         assert (gaps <= found["error"].values + true["error"].values).all()
         assert (found["truncation"].values > 0).all()

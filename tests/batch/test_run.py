@@ -26,10 +26,10 @@ from tests.support.studies import GONE, SMALL_LATTICE, balls, small_table, varia
 def test_stored_fields_and_tables_are_those_of_the_library(client: Client, finished_store: Path) -> None:
     tree = sb.open_store(finished_store)
     study = sb.Study.from_table(small_table())
-    sphere = sb.fourier_transform(sb.Sphere(), SMALL_LATTICE)
+    sphere = sb.fourier_transform(sb.shapes.Sphere(), SMALL_LATTICE)
     for level in range(4):
         field = variable(tree, "fourier", "fourier").sel(mesh=f"ico/{level}").drop_vars(["mesh", "quality"])
-        expected = sb.fourier_transform(sb.icosphere(level), SMALL_LATTICE, threads=1)
+        expected = sb.fourier_transform(sb.shapes.icosphere(level), SMALL_LATTICE, threads=1)
         assert np.abs(field.values - expected.values).max() < 1e-13 * 4 * np.pi
         found = variable(tree, "convergence", "distance").sel(mesh=f"ico/{level}").values
         own = sb.distance(expected, sphere, study.orders)
@@ -42,7 +42,7 @@ def test_stored_fields_and_tables_are_those_of_the_library(client: Client, finis
     matrix = variable(tree, "distances", "distance").sel(order=-10.0).values
     assert np.array_equal(matrix, matrix.T)
     assert (matrix.diagonal() == 0).all()
-    a, b = (sb.fourier_transform(sb.icosphere(level), SMALL_LATTICE) for level in (2, 3))
+    a, b = (sb.fourier_transform(sb.shapes.icosphere(level), SMALL_LATTICE) for level in (2, 3))
     assert matrix[2, 3] == pytest.approx(sb.distance(a, b, -10.0)["distance"].item(), rel=1e-9)
     convergence = tree["convergence"].to_dataset()
     rates = convergence.sel(order=-3.0)["rate"].values
@@ -62,7 +62,7 @@ def test_stored_fields_and_tables_are_those_of_the_library(client: Client, finis
 def test_mesh_facts_are_recorded(finished_store: Path) -> None:
     meshes = sb.open_store(finished_store)["meshes"].to_dataset()
     row = meshes.sel(mesh="ico/2")
-    mesh = sb.icosphere(2)
+    mesh = sb.shapes.icosphere(2)
     assert (row["triangles"].item(), row["vertices"].item()) == (320, 162)
     assert row["area"].item() == pytest.approx(mesh.area)
     assert row["digest"].item() == mesh.digest
@@ -87,7 +87,7 @@ def test_a_run_counts_its_steps_and_a_second_one_has_none(client: Client, study:
     steps.clear()
     second = sb.run(study, store_path, client, on_progress=steps.append)
     assert (second.computed, second.reused, steps) == ((), first.computed, [])
-    with pytest.raises(sb.StoreError, match="another study"):
+    with pytest.raises(sb.errors.StoreError, match="another study"):
         sb.run(sb.Study.from_table(small_table(study={"name": "other"})), store_path, client)
     assert stamps() == before
 
@@ -195,9 +195,9 @@ def test_what_is_wrong_is_said_before_anything_is_handed_over(
     tmp_path: Path, store_path: Path, threads: Client
 ) -> None:
     table = small_table(family=[{"name": "a", "source": "files", "paths": ["no/*.ply"]}])
-    with pytest.raises(sb.StudyError, match="matches no file"):
+    with pytest.raises(sb.errors.StudyError, match="matches no file"):
         sb.submit(sb.Study.from_table(table, folder=tmp_path), store_path, threads)
-    with pytest.raises(sb.ClusterError, match="requests backend 'gpu'"):
+    with pytest.raises(sb.errors.ClusterError, match="requests backend 'gpu'"):
         sb.submit(sb.Study.from_table(small_table(transform={"backend": "gpu"})), store_path, threads)
     assert not store_path.exists()
 

@@ -25,9 +25,10 @@ from dask.utils import parse_bytes
 from distributed import Client
 from distributed.cli import dask_scheduler, dask_worker
 
-from sobolev_batch import ClusterError, Study, open_store
+from sobolev_batch import Study, open_store
 from sobolev_batch.batch.cluster.clients import check_connection, remote_client
 from sobolev_batch.cli import cli
+from sobolev_batch.errors import ClusterError
 from tests.support.commands import COMMAND, finished
 from tests.support.processes import PATIENCE_SECONDS, listening, scheduler_address, stop
 from tests.support.recipes import (

@@ -12,7 +12,8 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from sobolev_batch import AccuracyError, distance, fourier_transform
+from sobolev_batch import distance, fourier_transform
+from sobolev_batch.errors import AccuracyError
 from tests.coverage.cases import Case, all_cases
 
 LEAST_COVERED, LARGEST_MEDIAN = 0.99, 30.0

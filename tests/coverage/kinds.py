@@ -10,7 +10,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from sobolev_batch import Mesh, Similarity, Sphere, icosphere
+from sobolev_batch import Mesh
+from sobolev_batch.shapes import Similarity, Sphere, icosphere
 from sobolev_batch.surfaces.shapes.surface import Surface
 from sobolev_batch.surfaces.sources.files import FileSource
 from sobolev_batch.surfaces.sources.generated import decimated

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 from scipy.special import gamma, k0, k1, kv
 
-from sobolev_batch import Mesh, Sphere
+from sobolev_batch import Mesh
+from sobolev_batch.shapes import Sphere
 
 Reals = NDArray[np.float64]
 

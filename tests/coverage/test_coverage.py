@@ -10,7 +10,8 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import gamma, kv
 
-from sobolev_batch import Mesh, Sphere, distance, icosphere
+from sobolev_batch import Mesh, distance
+from sobolev_batch.shapes import Sphere, icosphere
 from sobolev_batch.surfaces.shapes.surface import Surface
 from tests.coverage.__main__ import PARTS as PARTS_OF_ERRORS
 from tests.coverage.__main__ import described, judge, judged, show

@@ -17,12 +17,13 @@ import pytest
 import trimesh
 from distributed import Client
 
-from sobolev_batch import StoreError, Study, open_store, run, verify
+from sobolev_batch import Study, open_store, run, verify
 from sobolev_batch.batch.cluster.clients import local_client, thread_client
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.store.metadata import SCHEMA_VERSION
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study import plan as plan_module
+from sobolev_batch.errors import StoreError
 from sobolev_batch.results.status import Status
 from tests.support.stores import assert_same_results, contents
 from tests.support.studies import small_table, variable

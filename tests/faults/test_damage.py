@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 from distributed import Client
 
-from sobolev_batch import DamageError, StoreError, Study, matrix, norm, open_store, run, status, verify
+from sobolev_batch import Study, matrix, norm, open_store, run, status, verify
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.store.store import Store
+from sobolev_batch.errors import DamageError, StoreError
 from sobolev_batch.results.store_accessor import StoreAccessor
 from tests.faults.conftest import LABELS
 from tests.support.commands import call, write_toml

@@ -19,7 +19,7 @@ import psutil
 import pytest
 from distributed import Client, wait
 
-from sobolev_batch import ClusterError, LockError, Mesh, StoreError, Study, open_store, run, verify, write_mesh
+from sobolev_batch import Mesh, Study, open_store, run, verify, write_mesh
 from sobolev_batch.batch.cluster import watch
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.watch import Watch
@@ -28,6 +28,7 @@ from sobolev_batch.batch.storage.lock import Lock, locked
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import make_plan
+from sobolev_batch.errors import ClusterError, LockError, StoreError
 from tests.faults.conftest import LABELS
 from tests.faults.fatal import Moment
 from tests.support.commands import TOML, call, command, finished, read_until, started, write_toml

@@ -18,7 +18,7 @@ from uuid import uuid4
 import pytest
 from distributed import Client
 
-from sobolev_batch import StoreError, Study, Summary, release, run
+from sobolev_batch import Study, release, run
 from sobolev_batch.batch import run as run_module
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.storage.location import Location
@@ -26,7 +26,8 @@ from sobolev_batch.batch.storage.lock import LOCK_KEY, Lock, acquire, locked, ut
 from sobolev_batch.batch.store import heartbeat
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import Plan, make_plan
-from sobolev_batch.errors import LockError
+from sobolev_batch.errors import LockError, StoreError
+from sobolev_batch.result_types import Summary
 from tests.support.commands import call, write_toml
 from tests.support.processes import PATIENCE_SECONDS
 from tests.support.stores import full_disk, winners

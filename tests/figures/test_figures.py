@@ -10,7 +10,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from sobolev_batch import Ellipsoid, Lattice, Mesh, Sphere, Torus, distance, fourier_transform, icosphere, norm
+from sobolev_batch import Lattice, Mesh, distance, fourier_transform, norm
+from sobolev_batch.shapes import Ellipsoid, Sphere, Torus, icosphere
 from sobolev_batch.spectral.exact import sphere_block
 from sobolev_batch.spectral.lattice import SobolevWeights, shell_sums
 from tests.support.repository import ROOT

@@ -28,7 +28,7 @@ from sobolev_batch.surfaces.sources.generated import decimated
 
 def bumpy(level: int) -> sb.Mesh:
     """A ball with bumps, whose decimation loses something."""
-    ball = sb.icosphere(level)
+    ball = sb.shapes.icosphere(level)
     x, y, z = np.array(ball.vertices).T
     return sb.Mesh(ball.vertices * (0.8 + 0.15 * np.sin(4 * x) * np.cos(3 * y + z))[:, None], ball.triangles)
 
@@ -39,7 +39,7 @@ START = decimated(TARGET, 200)
 
 
 @pytest.fixture(scope="module")
-def fitted() -> sb.Fit:
+def fitted() -> sb.fitting.Fit:
     return sb.fit(START, TARGET, -4.0)
 
 
@@ -49,7 +49,7 @@ def normals(mesh: sb.Mesh) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_it_comes_nearer_by_every_sobolev_measure(fitted: sb.Fit) -> None:
+def test_it_comes_nearer_by_every_sobolev_measure(fitted: sb.fitting.Fit) -> None:
     orders = [-1.5, -2.0, -4.0]
     before, after = (sb.distance(mesh, TARGET, orders, rtol=3e-2)["distance"].values for mesh in (START, fitted.mesh))
     assert (after < 0.8 * before).all()
@@ -60,7 +60,7 @@ def test_it_comes_nearer_by_every_sobolev_measure(fitted: sb.Fit) -> None:
 
 
 @pytest.mark.slow
-def test_it_keeps_the_triangles_turns_none_over_and_reports_distances_of_points(fitted: sb.Fit) -> None:
+def test_it_keeps_the_triangles_turns_none_over_and_reports_distances_of_points(fitted: sb.fitting.Fit) -> None:
     np.testing.assert_array_equal(fitted.mesh.triangles, START.triangles)
     assert (np.sum(normals(fitted.mesh) * normals(START), axis=1) > 0).all()
     assert fitted.after.smallest_angle > 0.3 * fitted.before.smallest_angle
@@ -98,9 +98,9 @@ def test_boundaries_stay_if_asked_and_triangles_without_common_vertices_together
 
 @pytest.mark.slow
 def test_an_interrupt_keeps_the_best_so_far() -> None:
-    seen: list[sb.FitProgress] = []
+    seen: list[sb.fitting.FitProgress] = []
 
-    def interrupt(progress: sb.FitProgress) -> None:
+    def interrupt(progress: sb.fitting.FitProgress) -> None:
         seen.append(progress)
         if progress.step == 3:
             os.kill(os.getpid(), signal.SIGINT)
@@ -142,14 +142,14 @@ def test_a_result_that_is_farther_away_is_not_given(monkeypatch: pytest.MonkeyPa
 @pytest.mark.parametrize(
     ("after", "remark"),
     [
-        (sb.FitQuality(0.5, 0.01, hausdorff=3.1), "the Hausdorff distance grew 1.6 times"),
-        (sb.FitQuality(0.5, 0.6), "the distance is not larger than its error"),
-        (sb.FitQuality(1.5, 0.1), "no nearer mesh was found: this is the start"),
+        (sb.fitting.FitQuality(0.5, 0.01, hausdorff=3.1), "the Hausdorff distance grew 1.6 times"),
+        (sb.fitting.FitQuality(0.5, 0.6), "the distance is not larger than its error"),
+        (sb.fitting.FitQuality(1.5, 0.1), "no nearer mesh was found: this is the start"),
         (KeyboardInterrupt, "interrupted before the mesh was measured"),
     ],
 )
 def test_what_one_should_know_is_remarked(monkeypatch: pytest.MonkeyPatch, after: Any, remark: str) -> None:
-    measure = Mock(side_effect=[sb.FitQuality(1.0, 0.1, hausdorff=2.0), after])
+    measure = Mock(side_effect=[sb.fitting.FitQuality(1.0, 0.1, hausdorff=2.0), after])
     monkeypatch.setattr(module, "measure_quality", measure)
     fitted = sb.fit(START, TARGET, -4.0, steps=2)
     assert len(fitted.remarks) == 1
@@ -194,13 +194,13 @@ def test_no_triangle_is_turned_over_on_the_way(distance: float) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"mesh": sb.Sphere()}, "expected a Mesh, the path of a mesh file, a pair"),
+        ({"mesh": sb.shapes.Sphere()}, "expected a Mesh, the path of a mesh file, a pair"),
         (
             {"target": 7},
             "a Sphere, a parametrised surface (Ellipsoid, Torus, ParametrisedSurface) or a Fourier field; found int",
         ),
-        ({"target": sb.Sphere(1.0, (9, 0, 0))}, "do not overlap: move one of them to the other first"),
-        ({"target": sb.Sphere(1000.0)}, "are both in the same unit of length?"),
+        ({"target": sb.shapes.Sphere(1.0, (9, 0, 0))}, "do not overlap: move one of them to the other first"),
+        ({"target": sb.shapes.Sphere(1000.0)}, "are both in the same unit of length?"),
         ({"order": -0.5}, "finite only for orders below -1/2, found -0.5"),
         ({"order": [-2.0, -3.0]}, "one order is needed, found 2"),
         ({"steps": 0}, "steps must be a whole number from 1 on, found 0"),
@@ -214,20 +214,20 @@ def test_no_triangle_is_turned_over_on_the_way(distance: float) -> None:
 )
 def test_wrong_arguments_are_named(change: dict[str, Any], message: str) -> None:
     arguments = {"mesh": START, "target": TARGET, "order": -4.0, **change}
-    with pytest.raises(sb.SobolevBatchError, match=re.escape(message)):
+    with pytest.raises(sb.errors.SobolevBatchError, match=re.escape(message)):
         sb.fit(**arguments)
 
 
 def test_a_field_must_be_whole_on_the_lattice_and_serve_the_order() -> None:
     field = sb.fourier_transform(TARGET, sb.Lattice(2.0, 16), order=[-4.0])
-    with pytest.raises(sb.LatticeError, match="fields on different lattices cannot be compared"):
+    with pytest.raises(sb.errors.LatticeError, match="fields on different lattices cannot be compared"):
         sb.fit(START, field, -4.0, lattice=sb.Lattice(2.0, 18))
-    with pytest.raises(sb.InputError, match="take a more negative order, or a field on a larger lattice"):
+    with pytest.raises(sb.errors.InputError, match="take a more negative order, or a field on a larger lattice"):
         sb.fit(START, sb.fourier_transform(TARGET, sb.Lattice(0.5, 8)), -1.0)
     broken = field.copy(deep=True)
     broken[3, 4, 5] = np.nan
-    for use in (sb.fit, sb.gradient, sb.SquaredDistance.for_mesh):
-        with pytest.raises(sb.InputError, match="the field has 1 values that are NaN or infinite"):
+    for use in (sb.fit, sb.fitting.gradient, sb.fitting.SquaredDistance.for_mesh):
+        with pytest.raises(sb.errors.InputError, match="the field has 1 values that are NaN or infinite"):
             use(START, broken, -4.0)
 
 
@@ -248,7 +248,7 @@ def test_the_quality_of_a_triangle_and_its_penalty(height: float, quality: float
 
 
 def test_its_derivative_is_that_of_differences() -> None:
-    ball, rng, step = sb.icosphere(1), np.random.default_rng(1), 1e-6
+    ball, rng, step = sb.shapes.icosphere(1), np.random.default_rng(1), 1e-6
     references = lowest_free_qualities(np.array(ball.vertices), ball.triangles)
     vertices = ball.vertices + 0.3 * rng.normal(size=ball.vertices.shape)
     direction = rng.normal(size=vertices.shape)
@@ -259,7 +259,10 @@ def test_its_derivative_is_that_of_differences() -> None:
 
 
 def test_smoothing_solves_with_the_graph_laplacian() -> None:
-    mesh, rng = sb.Mesh(sb.icosphere(1).vertices, sb.icosphere(1).triangles[:60]), np.random.default_rng(2)
+    mesh, rng = (
+        sb.Mesh(sb.shapes.icosphere(1).vertices, sb.shapes.icosphere(1).triangles[:60]),
+        np.random.default_rng(2),
+    )
     free = np.array([0, 2, 3, 5, 8, 13, 21])
     smoothing = Smoothing.from_mesh(mesh, free, 3.0)
     steps, slopes = rng.normal(size=(7, 3)), rng.normal(size=mesh.vertices.shape)

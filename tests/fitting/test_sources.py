@@ -52,12 +52,12 @@ def test_a_study_fits_to_its_reference_and_reuses_what_it_has(client: Client, tm
 @pytest.mark.parametrize(
     ("table", "make"),
     [
-        (FIT, lambda mesh: sb.fit(mesh, sb.Sphere(), steps=15, threads=1)),
-        (REFINE, lambda mesh: sb.refine(mesh, sb.Sphere(), triangles=120, steps=5, threads=1)),
+        (FIT, lambda mesh: sb.fit(mesh, sb.shapes.Sphere(), steps=15, threads=1)),
+        (REFINE, lambda mesh: sb.fitting.refine(mesh, sb.shapes.Sphere(), triangles=120, steps=5, threads=1)),
     ],
 )
 def test_a_member_is_the_fit_in_the_unit_ball_of_its_target(
-    table: dict[str, Any], make: Callable[[sb.Mesh], sb.Fit]
+    table: dict[str, Any], make: Callable[[sb.Mesh], sb.fitting.Fit]
 ) -> None:
     start, found = loaded(members(table["mesh"])[0]), loaded(members({**table, "target": SPHERE})[0])
     expected = make(sb.Mesh((start.vertices - [100, 0, 0]) / 30, start.triangles)).mesh
@@ -68,7 +68,7 @@ def test_a_member_is_the_fit_in_the_unit_ball_of_its_target(
 def test_refined_members_have_levels_and_more_triangles_than_their_start() -> None:
     assert listed(members({**REFINE, "target": SPHERE})) == [("120", 0), ("200", 1)]
     (too_many,) = members({**REFINE, "target": SPHERE, "triangles": [60]})
-    with pytest.raises(sb.MeshError, match="cannot be fitted to sphere: the mesh has 80 triangles already"):
+    with pytest.raises(sb.errors.MeshError, match="cannot be fitted to sphere: the mesh has 80 triangles already"):
         too_many.load()
 
 
@@ -93,7 +93,7 @@ def test_the_reference_is_handed_down_to_nested_sources() -> None:
     nested = parse_source({"source": "fit", "mesh": {**FIT, "steps": 1}, "steps": 1})
     found = nested.with_reference(parse_source(SPHERE)).members(Path())
     assert [member.name for member in found] == ["1", "2"]
-    with pytest.raises(sb.StudyError, match="there is nothing to fit to"):
+    with pytest.raises(sb.errors.StudyError, match="there is nothing to fit to"):
         nested.members(Path())
     # A target of its own stays.
     with_own = parse_source({**FIT, "target": {**SPHERE, "radius": 29.0}})
@@ -102,10 +102,10 @@ def test_the_reference_is_handed_down_to_nested_sources() -> None:
 
 def test_a_mesh_that_cannot_be_fitted_is_named() -> None:
     (member,) = members({**FIT, "mesh": {**STARTS, "levels": [1]}, "target": {"source": "sphere"}})
-    with pytest.raises(sb.MeshError, match=r"1 cannot be fitted to sphere: .*the same unit of length"):
+    with pytest.raises(sb.errors.MeshError, match=r"1 cannot be fitted to sphere: .*the same unit of length"):
         member.load()
     (closed_form,) = members({**FIT, "mesh": {"source": "sphere"}, "target": SPHERE})
-    with pytest.raises(sb.MeshError, match="is no mesh; its triangles are needed"):
+    with pytest.raises(sb.errors.MeshError, match="is no mesh; its triangles are needed"):
         closed_form.load()
 
 
@@ -118,11 +118,11 @@ def test_a_mesh_that_cannot_be_fitted_is_named() -> None:
     ],
 )
 def test_wrong_keys_are_named(fit: dict[str, Any], message: str) -> None:
-    with pytest.raises(sb.StudyError, match=message):
+    with pytest.raises(sb.errors.StudyError, match=message):
         sb.Study.from_table(table(**fit))
 
 
 def test_a_reference_of_a_family_needs_a_target() -> None:
     study = {**table(), "reference": {"source": "family", "family": "start"}}
-    with pytest.raises(sb.StudyError, match="family 'fitted': there is nothing to fit to"):
+    with pytest.raises(sb.errors.StudyError, match="family 'fitted': there is nothing to fit to"):
         sb.plan(sb.Study.from_table(study))

@@ -29,12 +29,12 @@ ORDERS = [-1.5, -7.0]
 @pytest.fixture(scope="module")
 def fields() -> tuple[xr.DataArray, xr.DataArray]:
     lattice = sb.Lattice(4.0, 32)
-    return sb.fourier_transform(sb.icosphere(1), lattice), sb.fourier_transform(sb.Sphere(), lattice)
+    return sb.fourier_transform(sb.shapes.icosphere(1), lattice), sb.fourier_transform(sb.shapes.Sphere(), lattice)
 
 
 def test_methods_are_the_functions(fields: tuple[xr.DataArray, xr.DataArray]) -> None:
     a, b = fields
-    points = sb.icosphere(1).vertices
+    points = sb.shapes.icosphere(1).vertices
     own: SobolevAccessor = a.sobolev
     xr.testing.assert_identical(own.norm(ORDERS), sb.norm(a, ORDERS))
     xr.testing.assert_identical(own.distance(b, -2), sb.distance(a, b, -2))
@@ -43,7 +43,9 @@ def test_methods_are_the_functions(fields: tuple[xr.DataArray, xr.DataArray]) ->
     xr.testing.assert_allclose(own.witness(b, -2, points), sb.witness(a, b, -2, points), rtol=1e-9)
     assert own.lattice == sb.Lattice(4.0, 32)
     # A surface beside a field is transformed on its lattice.
-    assert own.distance(sb.Sphere(), -2)["distance"].item() == pytest.approx(own.distance(b, -2)["distance"].item())
+    assert own.distance(sb.shapes.Sphere(), -2)["distance"].item() == pytest.approx(
+        own.distance(b, -2)["distance"].item()
+    )
 
 
 def test_one_pair_reads_no_other_mesh(finished_store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,7 +91,7 @@ def test_stacks_are_taken_one_by_one(finished_store: Path) -> None:
 
 @pytest.mark.slow
 def test_a_stack_is_not_held_at_once() -> None:
-    field = sb.fourier_transform(sb.Sphere(0.5), sb.Lattice(4.0, 48))
+    field = sb.fourier_transform(sb.shapes.Sphere(0.5), sb.Lattice(4.0, 48))
     values = dask.array.ones((40, *field.shape), dtype=np.complex128, chunks=(1, *field.shape))
     lazy = xr.DataArray(values, dims=("mesh", *field.dims), coords={**field.coords, "mesh": np.arange(40)})
     lazy.isel(mesh=slice(1)).sobolev.norm(-2.0)
@@ -108,21 +110,24 @@ REFUSED: list[tuple[Callable[[xr.DataArray, xr.DataArray], object], str]] = [
     (lambda stack, b: stack.expand_dims(time=2).sobolev.norm(-2), "one dimension, found time, mesh"),
     (lambda stack, b: stack.isel(mesh=slice(0)).sobolev.norm(-2), "no fields along mesh"),
     (lambda stack, b: xr.DataArray(np.zeros(3)).sobolev.lattice, "needs the coordinates"),
-    (lambda stack, b: b.sobolev.distance(sb.fourier_transform(sb.Sphere(), sb.Lattice(4.0, 30)), -2), "different lat"),
+    (
+        lambda stack, b: b.sobolev.distance(sb.fourier_transform(sb.shapes.Sphere(), sb.Lattice(4.0, 30)), -2),
+        "different lat",
+    ),
 ]
 
 
 @pytest.mark.parametrize(("ask", "message"), REFUSED)
 def test_refusals(ask: Any, message: str, fields: tuple[xr.DataArray, xr.DataArray]) -> None:
     stack = xr.concat(fields, dim="mesh")
-    with pytest.raises(sb.InputError, match=message):
+    with pytest.raises(sb.errors.InputError, match=message):
         ask(stack, fields[1])
     # Without labels, the dimension alone.
     assert "mesh" not in stack.sobolev.norm(-2).coords
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("name", ["fourier_transform", "open_store", "SobolevAccessor"])
+@pytest.mark.parametrize("name", ["fourier_transform", "open_store", "result_types"])
 def test_is_registered_when_fields_are_made_and_not_before(name: str) -> None:
     code = f"""
 import sys
@@ -159,7 +164,7 @@ def test_distances_of_all_meshes_at_once(balls: str) -> None:
     assert tree.sobolev.distance(-2.5, "b3/sphere")["distance"].dims == ()
     assert tree.sobolev.norm(-2.5)["norm"].sel(mesh="lost/nowhere").isnull()
     for order, label in itertools.product((-2.5, -10.0), ("lost/nowhere", "b99/sphere")):
-        with pytest.raises(sb.InputError, match=f"no mesh '{label}' with a field"):
+        with pytest.raises(sb.errors.InputError, match=f"no mesh '{label}' with a field"):
             tree.sobolev.distance(order, label)
 
 

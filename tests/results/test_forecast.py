@@ -38,7 +38,9 @@ def records(plan: Plan, *labels: str, seconds: float) -> dict[str, Record]:
     return {label: Record(keys[label], "complete", seconds=seconds) for label in labels}
 
 
-@pytest.mark.parametrize("mesh", [sb.icosphere(1), sb.icosphere(4), sb.Torus(1.0, 0.4).mesh(96, 48)])
+@pytest.mark.parametrize(
+    "mesh", [sb.shapes.icosphere(1), sb.shapes.icosphere(4), sb.shapes.Torus(1.0, 0.4).mesh(96, 48)]
+)
 @pytest.mark.parametrize("xi_max", [2.0, 8.0])
 def test_points_are_predicted_without_the_mesh(mesh: sb.Mesh, xi_max: float) -> None:
     lattice, settings = sb.Lattice(xi_max, 48), TransformSettings()
@@ -146,7 +148,7 @@ def test_what_would_make_a_run_useless_is_told_before_it(
     table: dict[str, Any], expected: list[str], tmp_path: Path
 ) -> None:
     for suffix in ("ply", "off"):
-        write_mesh(sb.icosphere(1), tmp_path / f"80.{suffix}")
+        write_mesh(sb.shapes.icosphere(1), tmp_path / f"80.{suffix}")
     made = (sb.StudyCollection if "object" in table else sb.Study).from_table(table, folder=tmp_path)
     found = warnings_of(made, Location.parse(tmp_path / "s.zarr"))
     assert len(found) == len(expected)

@@ -110,7 +110,7 @@ def test_tables_of_two_states_are_not_mixed(copy: Path, threads: Client) -> None
     # As a run does before it replaces them.
     hide_tables(Store.open(copy))
     for function in (sb.table, sb.matrix):
-        with pytest.raises(sb.StoreError, match="a run has changed the store while it was read"):
+        with pytest.raises(sb.errors.StoreError, match="a run has changed the store while it was read"):
             function(tree, -5.0)
     sb.run(sb.Study.from_table(small_table()), copy, threads)
     assert [str(function(tree, -5.0)) for function in (sb.table, sb.matrix)] == before

@@ -13,8 +13,9 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from sobolev_batch import SobolevBatchError, Study, open_store, run
+from sobolev_batch import Study, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client
+from sobolev_batch.errors import SobolevBatchError
 from tests.soak.studies import STUDY, write_meshes
 from tests.support.commands import call
 from tests.support.stores import contents, put_back

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sobolev_batch import icosphere
+from sobolev_batch.shapes import icosphere
 from tests.support.mesh_files import off
 
 STUDY = """

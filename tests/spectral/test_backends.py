@@ -16,7 +16,9 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from sobolev_batch import BackendError, InputError, Lattice, Mesh, Sphere, fourier_transform, icosphere
+from sobolev_batch import Lattice, Mesh, fourier_transform
+from sobolev_batch.errors import BackendError, InputError
+from sobolev_batch.shapes import Sphere, icosphere
 from sobolev_batch.spectral import backends
 from sobolev_batch.spectral.backends import CPU, GPU_COSTS, Gpu, backend_named, gpu_backend, try_out
 from sobolev_batch.spectral.fields import compute_field, field_for

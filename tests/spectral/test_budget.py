@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sobolev_batch import Lattice, Mesh, Sphere, distance, fourier_transform, icosphere, norm
+from sobolev_batch import Lattice, Mesh, distance, fourier_transform, norm
+from sobolev_batch.shapes import Sphere, icosphere
 from sobolev_batch.spectral.budget import NormEstimate, Sums, Support, truncated
 from sobolev_batch.spectral.exact import sphere_distance, sphere_inner_product
 from sobolev_batch.spectral.fields import Quality

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sobolev_batch import Lattice, Mesh, OrderError, Sphere, icosphere, norm
+from sobolev_batch import Lattice, Mesh, norm
+from sobolev_batch.errors import OrderError
+from sobolev_batch.shapes import Sphere, icosphere
 from sobolev_batch.spectral.exact import (
     exact_transform,
     sampled_transform,

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sobolev_batch import Lattice, LatticeError, Sphere, fourier_transform, norm
+from sobolev_batch import Lattice, fourier_transform, norm
+from sobolev_batch.errors import LatticeError
+from sobolev_batch.shapes import Sphere
 from sobolev_batch.spectral.lattice import SobolevWeights, shell_sums, shell_volumes
 from tests.support.shapes import CENTRED_BOX as BOX
 

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sobolev_batch import Mesh, Similarity, icosphere
+from sobolev_batch import Mesh
+from sobolev_batch.shapes import Similarity, icosphere
 from sobolev_batch.spectral.exact import exact_transform, sampled_transform
 from sobolev_batch.spectral.octaves.sampling import FaceNormals
 from sobolev_batch.surfaces.shapes.mesh import shared_triangles

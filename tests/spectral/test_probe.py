@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sobolev_batch import Ellipsoid, Lattice, Mesh, Sphere, Torus, distance, fourier_transform, icosphere, norm
+from sobolev_batch import Lattice, Mesh, distance, fourier_transform, norm
+from sobolev_batch.shapes import Ellipsoid, Sphere, Torus, icosphere
 from sobolev_batch.spectral.fields import PROBED_ORDERS, Quality
 from sobolev_batch.spectral.lattice import SobolevWeights
 from sobolev_batch.spectral.probe import Sample, draw, estimate, measure

@@ -13,6 +13,18 @@ import sobolev_batch as sb
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = Path(sb.__file__).parent
+# Those of public names, beside the package itself.
+MODULES = {
+    module.__name__.removeprefix("sobolev_batch."): module
+    for module in (sb.errors, sb.fitting, sb.plot, sb.result_types, sb.shapes, sb.sources, sb.testing)
+}
+
+
+def public_names() -> dict[str, Any]:
+    """The public functions and classes, by their names below the package."""
+    modules: dict[str, Any] = {"": sb, **{f"{name}.": module for name, module in MODULES.items()}}
+    found = {prefix + name: getattr(module, name) for prefix, module in modules.items() for name in module.__all__}
+    return {name: value for name, value in found.items() if name not in MODULES}
 
 
 def blocks(path: str, language: str) -> list[str]:

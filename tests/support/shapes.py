@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch import Interval, Mesh, ParametrisedSurface, Torus
+from sobolev_batch import Mesh
+from sobolev_batch.shapes import Interval, ParametrisedSurface, Torus
 from sobolev_batch.surfaces.shapes.smooth import Smooth
 from sobolev_batch.surfaces.shapes.surface import Point
 

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sobolev_batch import Mesh, Study, icosphere, run, write_mesh
+from sobolev_batch import Mesh, Study, run, write_mesh
+from sobolev_batch.shapes import icosphere
 
 RADIUS, CENTER = 40.0, np.array([10.0, -3.0, 5.0])
 # To the right of who looks at a picture of the witness.

@@ -24,7 +24,7 @@ def square(side: float, height: float = 0.0, *, stray: tuple[float, float, float
         (square(2.0), square(2.0, 0.25), 0.25, 0.5),
         # A vertex that no triangle uses is not on the surface.
         (square(2.0), square(2.0, 0.25, stray=(50.0, 0.0, 0.0)), 0.25, 0.5),
-        (sb.icosphere(3), sb.icosphere(3), 0.0, 0.0),
+        (sb.shapes.icosphere(3), sb.shapes.icosphere(3), 0.0, 0.0),
     ],
 )
 def test_surfaces_that_are_parallel_or_the_same(a: sb.Mesh, b: sb.Mesh, hausdorff: float, chamfer: float) -> None:
@@ -91,5 +91,5 @@ def test_lengths_scale(scale: float) -> None:
 )
 def test_wrong_points_and_seeds_are_refused(key: str, values: list[Any], message: str) -> None:
     for value in values:
-        with pytest.raises(sb.InputError, match=message):
+        with pytest.raises(sb.errors.InputError, match=message):
             proximity(square(1.0), square(2.0), **{key: value})

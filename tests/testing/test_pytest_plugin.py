@@ -19,11 +19,11 @@ TESTS = """
 import sobolev_batch as sb, pytest
 
 def test_same(assert_same_surface):
-    assert_same_surface(sb.icosphere(1), sb.icosphere(1))
+    assert_same_surface(sb.shapes.icosphere(1), sb.shapes.icosphere(1))
 
 @pytest.mark.parametrize("text", ["a/b", "c"])
 def test_lost(assert_same_surface, text):
-    sphere = sb.icosphere(2)
+    sphere = sb.shapes.icosphere(2)
     assert_same_surface(sphere, sphere)
     assert_same_surface((sphere.vertices, sphere.triangles[30:]), sphere)
 """
@@ -32,7 +32,7 @@ def test_lost(assert_same_surface, text):
 @pytest.fixture(autouse=True)
 def _without_other_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
     # The inner sessions run in this process, and import no libraries anew.
-    assert sb.assert_same_surface.__doc__
+    assert sb.testing.assert_same_surface.__doc__
     # Where the package is installed, its entry point would register the plug-in a second time.
     monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
 

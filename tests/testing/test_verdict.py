@@ -24,7 +24,7 @@ PATCH = 80
 
 @pytest.fixture(scope="module")
 def mesh() -> sb.Mesh:
-    return sb.Ellipsoid((1.0, 0.8, 0.6)).mesh(4)
+    return sb.shapes.Ellipsoid((1.0, 0.8, 0.6)).mesh(4)
 
 
 def permuted(mesh: sb.Mesh) -> sb.Mesh:
@@ -49,7 +49,7 @@ CUTS: list[Callable[[sb.Mesh], sb.Mesh]] = [
 
 @pytest.mark.parametrize("cut", CUTS)
 def test_the_same_surface_in_other_triangles(cut: Callable[[sb.Mesh], sb.Mesh], mesh: sb.Mesh) -> None:
-    verdict = sb.same_surface(cut(mesh), mesh)
+    verdict = sb.testing.same_surface(cut(mesh), mesh)
     assert (bool(verdict), verdict.outcome) == (True, "same")
     assert verdict.distance + verdict.error <= verdict.rtol
     assert verdict.area_change == pytest.approx(0.0, abs=1e-12)
@@ -68,7 +68,7 @@ CHANGES: dict[str, Callable[[sb.Mesh], sb.Mesh]] = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CHANGES)
 def test_another_surface(name: str, mesh: sb.Mesh) -> None:
-    verdict = sb.same_surface(CHANGES[name](mesh), mesh)
+    verdict = sb.testing.same_surface(CHANGES[name](mesh), mesh)
     assert (bool(verdict), verdict.outcome) == (False, "different")
     assert verdict.distance - verdict.error > verdict.rtol
 
@@ -78,87 +78,90 @@ def test_another_surface(name: str, mesh: sb.Mesh) -> None:
 def test_neither_the_unit_nor_the_place_of_both_matters(scale: float, mesh: sb.Mesh) -> None:
     place = scale * np.array([1e3, -2e3, 0.0])
     own, other = (sb.Mesh(scale * one.vertices + place, one.triangles) for one in (mesh, split(mesh)))
-    assert sb.same_surface(other, own)
-    assert sb.same_surface((other.vertices, other.triangles[PATCH:]), own).outcome == "different"
+    assert sb.testing.same_surface(other, own)
+    assert sb.testing.same_surface((other.vertices, other.triangles[PATCH:]), own).outcome == "different"
     # One triangle of 20,480, which is 5e-5 of the area.
-    assert sb.same_surface((other.vertices, other.triangles[1:]), own, rtol=1e-4).outcome == "different"
+    assert sb.testing.same_surface((other.vertices, other.triangles[1:]), own, rtol=1e-4).outcome == "different"
 
 
 @pytest.mark.slow
 def test_flat_and_open_meshes_of_several_parts() -> None:
     square = sb.Mesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
-    assert sb.same_surface(split(split(square)), square)
-    assert sb.same_surface((split(square).vertices, split(square).triangles[1:]), square).outcome == "different"
+    assert sb.testing.same_surface(split(split(square)), square)
+    assert sb.testing.same_surface((split(square).vertices, split(square).triangles[1:]), square).outcome == "different"
     both = np.concatenate([square.vertices, square.vertices + np.array([3, 0, 0])])
     beside = sb.Mesh(both, [[0, 1, 2], [0, 2, 3], [4, 5, 6]])
-    assert sb.same_surface(permuted(split(beside)), beside)
-    assert sb.same_surface(square, beside).outcome == "different"
+    assert sb.testing.same_surface(permuted(split(beside)), beside)
+    assert sb.testing.same_surface(square, beside).outcome == "different"
 
 
 @pytest.mark.slow
 def test_files_and_closed_forms(tmp_path: Path) -> None:
-    sb.write_mesh(sb.icosphere(4), tmp_path / "sphere.ply")
-    verdict = sb.same_surface(tmp_path / "sphere.ply", sb.Sphere(), rtol=0.01)
+    sb.write_mesh(sb.shapes.icosphere(4), tmp_path / "sphere.ply")
+    verdict = sb.testing.same_surface(tmp_path / "sphere.ply", sb.shapes.Sphere(), rtol=0.01)
     assert verdict
-    assert verdict.area_change == pytest.approx(sb.icosphere(4).area / (4 * np.pi) - 1)
-    assert sb.same_surface(sb.Sphere(), sb.Sphere(), order=-2)
-    assert not sb.same_surface(sb.Torus(1.0, 0.3), sb.Torus(1.0, 0.31))
+    assert verdict.area_change == pytest.approx(sb.shapes.icosphere(4).area / (4 * np.pi) - 1)
+    assert sb.testing.same_surface(sb.shapes.Sphere(), sb.shapes.Sphere(), order=-2)
+    assert not sb.testing.same_surface(sb.shapes.Torus(1.0, 0.3), sb.shapes.Torus(1.0, 0.31))
 
 
 def test_between_same_and_different_it_is_undecided() -> None:
     # With the norm's own unit of length the numbers are those of `distance`.
-    truth = float(sb.distance(sb.Sphere(0.9), sb.Sphere(), -4.0)["distance"] / sb.norm(sb.Sphere(), -4.0)["norm"])
-    verdict = sb.same_surface(sb.Sphere(0.9), sb.Sphere(), rtol=truth, scaling=False)
+    truth = float(
+        sb.distance(sb.shapes.Sphere(0.9), sb.shapes.Sphere(), -4.0)["distance"]
+        / sb.norm(sb.shapes.Sphere(), -4.0)["norm"]
+    )
+    verdict = sb.testing.same_surface(sb.shapes.Sphere(0.9), sb.shapes.Sphere(), rtol=truth, scaling=False)
     assert (bool(verdict), verdict.outcome) == (False, "undecided")
     assert abs(verdict.distance - truth) <= verdict.error
     assert str(verdict).startswith("undecided: relative distance 0.")
     with pytest.raises(AssertionError, match=r"^undecided: .*; take another rtol$"):
-        sb.assert_same_surface(sb.Sphere(0.9), sb.Sphere(), rtol=truth, scaling=False)
+        sb.testing.assert_same_surface(sb.shapes.Sphere(0.9), sb.shapes.Sphere(), rtol=truth, scaling=False)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("move", "rtol"), [(5e-4, 1e-5), (1e-4, 1e-7), (1e-6, 1e-12)])
 def test_the_bounds_hold_the_truth(move: float, rtol: float) -> None:
-    own = sb.icosphere(2)
+    own = sb.shapes.icosphere(2)
     moved = sb.Mesh(own.vertices + np.array([move, 0, 0]), own.triangles)
     truth = float(sb.distance(moved, own, -4.0, rtol=1e-3)["distance"] / sb.norm(own, -4.0, rtol=1e-3)["norm"])
-    verdict = sb.same_surface(moved, own, rtol=rtol, scaling=False)
+    verdict = sb.testing.same_surface(moved, own, rtol=rtol, scaling=False)
     assert verdict.lower <= truth <= verdict.upper
 
 
 def test_bounds_far_apart_are_told_as_such() -> None:
-    verdict = sb.Verdict("different", 281.4, 2.34e12, 1e-3, -4.0, 3.0, "lattice")
+    verdict = sb.testing.Verdict("different", 281.4, 2.34e12, 1e-3, -4.0, 3.0, "lattice")
     assert "relative distance from 280 to 2.4 × 10¹² at order -4" in str(verdict)
-    verdict = sb.Verdict("same", 0.0, 9.52e-4, 1e-3, -4.0, 0.0, "lattice")
+    verdict = sb.testing.Verdict("same", 0.0, 9.52e-4, 1e-3, -4.0, 0.0, "lattice")
     assert "relative distance at most 0.00096 at order -4" in str(verdict)
-    assert "; area +100 %" in str(sb.Verdict("different", 1.0, 1.0, 1e-3, -4.0, 1.0, "lattice"))
+    assert "; area +100 %" in str(sb.testing.Verdict("different", 1.0, 1.0, 1e-3, -4.0, 1.0, "lattice"))
 
 
 @pytest.mark.parametrize(
     ("arguments", "settings", "message"),
     [
-        ((3, sb.Sphere()), {}, "expected a Mesh.* found int"),
-        ((sb.Sphere(), (1, 2, 3)), {}, "expected a Mesh, the path of a mesh file"),
-        ((sb.Sphere(), sb.Sphere()), {"rtol": 0}, "rtol must lie between 0 and 1, found 0"),
-        ((sb.Sphere(), sb.Sphere()), {"order": [-2, -3]}, "one order is needed, found 2"),
-        (("nowhere.ply", sb.Sphere()), {}, "nowhere.ply: "),
-        ((sb.Sphere(), sb.Sphere()), {"memory": "9000TB"}, "memory of .* is more than there is"),
+        ((3, sb.shapes.Sphere()), {}, "expected a Mesh.* found int"),
+        ((sb.shapes.Sphere(), (1, 2, 3)), {}, "expected a Mesh, the path of a mesh file"),
+        ((sb.shapes.Sphere(), sb.shapes.Sphere()), {"rtol": 0}, "rtol must lie between 0 and 1, found 0"),
+        ((sb.shapes.Sphere(), sb.shapes.Sphere()), {"order": [-2, -3]}, "one order is needed, found 2"),
+        (("nowhere.ply", sb.shapes.Sphere()), {}, "nowhere.ply: "),
+        ((sb.shapes.Sphere(), sb.shapes.Sphere()), {"memory": "9000TB"}, "memory of .* is more than there is"),
         # A seed is refused also where the verdict follows from a lattice, without random frequencies.
-        ((sb.Sphere(), sb.Sphere()), {"seed": 1.5}, "seed must be a whole number from 0 on, found 1.5"),
+        ((sb.shapes.Sphere(), sb.shapes.Sphere()), {"seed": 1.5}, "seed must be a whole number from 0 on, found 1.5"),
     ],
 )
 def test_refusals(arguments: tuple[Any, Any], settings: dict[str, Any], message: str) -> None:
-    with pytest.raises(sb.InputError, match=message):
-        sb.same_surface(*arguments, **settings)
+    with pytest.raises(sb.errors.InputError, match=message):
+        sb.testing.same_surface(*arguments, **settings)
 
 
 @pytest.mark.slow
 def test_the_files_show_the_place_of_a_lost_patch(tmp_path: Path) -> None:
-    whole = sb.Mesh(1000 + 20 * sb.icosphere(4).vertices, sb.icosphere(4).triangles)
+    whole = sb.Mesh(1000 + 20 * sb.shapes.icosphere(4).vertices, sb.shapes.icosphere(4).triangles)
     heights = whole.vertices[whole.triangles].mean(axis=1)[:, 2]
     torn = sb.Mesh(whole.vertices, whole.triangles[heights < 1019.5])
     with pytest.raises(AssertionError) as failure:
-        sb.assert_same_surface(torn, whole, witness=tmp_path / "new" / "part")
+        sb.testing.assert_same_surface(torn, whole, witness=tmp_path / "new" / "part")
     message = str(failure.value)
     assert "\n" not in message
     files = [tmp_path / "new" / f"part-{label}.ply" for label in "ab"]
@@ -181,14 +184,14 @@ def test_a_place_that_cannot_be_written_leaves_the_failure_as_it_is(tmp_path: Pa
     (tmp_path / "file").write_text("")
     for witness in (tmp_path / "file" / "part", "", ".", "a\0b", 3):
         with pytest.raises(AssertionError, match=r"^different surfaces: .*; no witness: "):
-            sb.assert_same_surface(sb.icosphere(1), sb.icosphere(3), witness=witness)  # type: ignore[arg-type]
+            sb.testing.assert_same_surface(sb.shapes.icosphere(1), sb.shapes.icosphere(3), witness=witness)  # type: ignore[arg-type]
 
 
 def test_equal_surfaces_and_surfaces_in_closed_form_have_no_files(tmp_path: Path) -> None:
-    sphere = sb.icosphere(2)
-    assert sb.assert_same_surface(sphere, sphere, witness=tmp_path / "same").outcome == "same"
+    sphere = sb.shapes.icosphere(2)
+    assert sb.testing.assert_same_surface(sphere, sphere, witness=tmp_path / "same").outcome == "same"
     with pytest.raises(AssertionError, match=r"; no witness: neither surface is a mesh$"):
-        sb.assert_same_surface(sb.Sphere(0.9), sb.Sphere(), witness=tmp_path / "part")
+        sb.testing.assert_same_surface(sb.shapes.Sphere(0.9), sb.shapes.Sphere(), witness=tmp_path / "part")
     assert not list(tmp_path.iterdir())
     difference = write_difference(sphere, sphere, tmp_path / "w", -4.0)
     assert difference == f"they differ nowhere; witness: {tmp_path / 'w-a.ply'} {tmp_path / 'w-b.ply'}"

@@ -25,8 +25,9 @@ from dask_jobqueue.local import LocalCluster
 from distributed import Adaptive, Client, Security
 from distributed.core import Status
 
-from sobolev_batch import SobolevBatchError, Study, open_store, run
+from sobolev_batch import Study, open_store, run
 from sobolev_batch.batch.cluster.execution import Progress
+from sobolev_batch.errors import SobolevBatchError
 from sobolev_batch.results.tables.convergence import format_table
 
 # dask_jobqueue ends the process on Ctrl-C with the exit status of success.

@@ -92,7 +92,7 @@ class StudyDraft:
 
     >>> from pathlib import Path
     >>> import sobolev_batch as sb
-    >>> draft = sb.StudyDraft(Path("study.toml"), ("reference cow.ply, 500 triangles",), {})
+    >>> draft = sb.result_types.StudyDraft(Path("study.toml"), ("reference cow.ply, 500 triangles",), {})
     >>> print(draft)
     study.toml: reference cow.ply, 500 triangles
     next: sobolev-batch plan study.toml
@@ -135,9 +135,9 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
     >>> from tempfile import TemporaryDirectory
     >>> import sobolev_batch as sb
     >>> with TemporaryDirectory() as folder:
-    ...     sb.write_mesh(sb.icosphere(4), Path(folder, "original.ply"))
+    ...     sb.write_mesh(sb.shapes.icosphere(4), Path(folder, "original.ply"))
     ...     for level in (1, 2):
-    ...         sb.write_mesh(sb.icosphere(level), Path(folder, f"ball_{level}.ply"))
+    ...         sb.write_mesh(sb.shapes.icosphere(level), Path(folder, f"ball_{level}.ply"))
     ...     draft = sb.init_study(folder, Path(folder, "study.toml"))
     ...     study = sb.Study.from_toml(draft.path)
     >>> draft.summary

@@ -33,11 +33,8 @@ from sobolev_batch.results.figures.style import (
     write_figures,
 )
 from sobolev_batch.results.open import (
-    AnyStore,
     Families,
-    as_tree,
     chosen_families,
-    fields_read,
     finished_group,
 )
 from sobolev_batch.results.tables.convergence import table
@@ -249,51 +246,11 @@ def _mapping(limit: float) -> ScalarMappable:
     return ScalarMappable(Normalize(-limit, limit), "RdBu_r")
 
 
-def plot_witness(
-    store: AnyStore,
-    mesh: str,
-    order: float | None = None,
-    ax: Axes | None = None,
-    *,
-    folder: str | Path = ".",
-    up: Axis = "z",
-) -> Axes:
-    """Plot a mesh coloured by its witness function: red where it has area that the reference lacks, else blue.
-
-    The study makes the mesh again. It is seen from the front and above, or from the side of the worst places if these
-    are hidden there; then the title says so. Where a few values are far
-    larger than all others, the colours end below them: the colour bar has arrows, with at most 1 % of the area beyond.
-
-    Args:
-        store: Path, URL or opened DataTree of the store.
-        mesh: Label of the mesh, such as "family/name".
-        order: Order s < -1/2; default the first of the store.
-        ax: Axes to draw on; its figure gets a colour bar too.
-        folder: Folder where relative paths in the study start.
-        up: Axis that points upwards in the mesh's own coordinates.
-
-    Returns:
-        The axes.
-
-    Raises:
-        InputError: The label is unknown, or the mesh cannot be made again, or is not the one that was computed.
-        DamageError: A field is damaged.
-
-    >>> import sobolev_batch as sb
-    >>> ax = sb.plot_witness("storage/icosphere.zarr", "icosphere/1", order=-4)  # doctest: +SKIP
-    """
-    tree = as_tree(store)
-    order = finished_group(tree, "convergence")["order"].values.tolist()[0] if order is None else order
-    with fields_read(store):
-        views, missing = make_views(tree, folder, [mesh], PICTURE_LIMITS, up, [order])
-    if len(views) + len(missing) > 1:
-        raise InputError(f"{mesh!r} stands for several meshes, and one is plotted; give its label")
-    for label, reason in missing.items():
-        raise InputError(f"{label}: {reason}")
-    (view,) = views
-    axes = ax or Figure(figsize=(WIDTH_INCHES, _HEIGHT_INCHES), layout="constrained").subplots()
+def draw_witness(view: MeshView, axes: Axes | None = None) -> Axes:
+    """Draw a mesh at its first order on axes, or on those of a new figure, with its label above and a colour bar."""
+    axes = axes or Figure(figsize=(WIDTH_INCHES, _HEIGHT_INCHES), layout="constrained").subplots()
     draw_mesh(axes, view)
-    set_title(axes, escaped(mesh), _seen(view))
+    set_title(axes, escaped(view.label), _seen(view))
     _add_colorbar(axes.figure, axes, [view], view.color_limits[0], 0)  # type: ignore[arg-type]
     return axes
 

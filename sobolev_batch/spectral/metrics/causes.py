@@ -74,7 +74,8 @@ def spectrum(
         LatticeError: The fields lie on different lattices, or a surface does not fit into the lattice.
         InputError: Edges do not increase from zero or above, or a surface comes without a lattice.
 
-    >>> from sobolev_batch import Lattice, Sphere, icosphere, spectrum
+    >>> from sobolev_batch import Lattice, spectrum
+    >>> from sobolev_batch.shapes import Sphere, icosphere
     >>> bands = spectrum(icosphere(1), Sphere(), -2.0, bands=[0, 1, 2, 4], lattice=Lattice(3.0, 32))
     >>> bands["share"].round(2).values.tolist()
     [0.26, 0.41, 0.32]
@@ -204,7 +205,8 @@ def witness(
 
     Source: A. Gretton et al., "A kernel two-sample test" (2012), JMLR 13, section 2.3.
 
-    >>> from sobolev_batch import Lattice, Sphere, witness
+    >>> from sobolev_batch import Lattice, witness
+    >>> from sobolev_batch.shapes import Sphere
     >>> w = witness(Sphere(), Sphere(0.9), -4.0, [[1, 0, 0], [0, 0, 0]], lattice=Lattice(3.0, 32))
     >>> (w > 0).values.tolist()
     [True, False]

@@ -81,7 +81,8 @@ def norm(
         InputError: A surface comes without a lattice or an rtol, or with both.
         AccuracyError: The rtol is out of reach, and no best effort; the message gives the reachable one.
 
-    >>> from sobolev_batch import Lattice, Sphere, icosphere, norm
+    >>> from sobolev_batch import Lattice, norm
+    >>> from sobolev_batch.shapes import Sphere, icosphere
     >>> f"{norm(Sphere(), -2.0)['norm'].item():.6f}"
     '4.442778'
     >>> norms = norm(icosphere(2), [-2.0, -5.0], lattice=Lattice(3.0, 32))
@@ -141,7 +142,8 @@ def distance(
         InputError: A surface comes without a lattice, or an rtol with a lattice or a field.
         AccuracyError: The rtol is out of reach, and no best effort; the message gives the reachable one.
 
-    >>> from sobolev_batch import Sphere, distance, icosphere
+    >>> from sobolev_batch import distance
+    >>> from sobolev_batch.shapes import Sphere, icosphere
     >>> f"{distance(Sphere(), Sphere(0.9), -2.0)['distance'].item():.6f}"
     '2.205136'
     >>> near = distance(icosphere(2), Sphere(), -5.0, rtol=1e-2)
@@ -306,7 +308,7 @@ def yardsticks(
         AccuracyError: The rtol is out of reach, and no best effort; the message gives the reachable one.
 
     >>> import sobolev_batch as sb
-    >>> found = sb.yardsticks(sb.icosphere(1), sb.icosphere(3), -2.0, lattice=sb.Lattice(3.0, 24))
+    >>> found = sb.yardsticks(sb.shapes.icosphere(1), sb.shapes.icosphere(3), -2.0, lattice=sb.Lattice(3.0, 24))
     >>> bool(0.05 < found["moved"] < 0.2), bool(30 < found["decimated"] < 60)
     (True, True)
     """

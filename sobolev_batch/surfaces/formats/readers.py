@@ -290,7 +290,7 @@ def write_mesh(mesh: MeshLike, path: str | Path) -> None:
     >>> from pathlib import Path
     >>> import sobolev_batch as sb
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     sb.write_mesh(sb.icosphere(1), Path(folder) / "ball.obj")
+    ...     sb.write_mesh(sb.shapes.icosphere(1), Path(folder) / "ball.obj")
     ...     sb.read_mesh(Path(folder) / "ball.obj")
     Mesh(42 vertices, 80 triangles)
     """

@@ -42,7 +42,7 @@ class Sphere:
         InputError: The radius is not positive, or beyond 1e150, or the centre is not three finite numbers.
 
     >>> import sobolev_batch as sb
-    >>> sphere = sb.Sphere(2.0, center=(1.0, 0.0, 0.0))
+    >>> sphere = sb.shapes.Sphere(2.0, center=(1.0, 0.0, 0.0))
     >>> f"{sphere.area:.4f}"
     '50.2655'
     """
@@ -89,7 +89,7 @@ class Ellipsoid(Smooth):
         InputError: The semi-axes are not three numbers from 1e-150 to 1e150, or the centre is not three finite numbers.
 
     >>> import sobolev_batch as sb
-    >>> ellipsoid = sb.Ellipsoid((1.0, 0.8, 0.5))
+    >>> ellipsoid = sb.shapes.Ellipsoid((1.0, 0.8, 0.5))
     >>> f"{ellipsoid.area:.4f} {ellipsoid.mesh(5).area:.4f}"
     '7.3056 7.3034'
     """
@@ -176,7 +176,7 @@ class Torus(Smooth):
         InputError: The radii are not finite numbers with 0 < r < R, or the centre is not three finite numbers.
 
     >>> import sobolev_batch as sb
-    >>> torus = sb.Torus(R=1.0, r=0.4)
+    >>> torus = sb.shapes.Torus(R=1.0, r=0.4)
     >>> f"{torus.area:.4f}"
     '15.7914'
     >>> torus.mesh(around=48, across=24)

@@ -57,7 +57,7 @@ class Interval:
 
     >>> import numpy as np
     >>> import sobolev_batch as sb
-    >>> nodes, weights = sb.Interval(0.0, np.pi).rule(12)
+    >>> nodes, weights = sb.shapes.Interval(0.0, np.pi).rule(12)
     >>> f"{weights @ np.sin(nodes):.12f}"
     '2.000000000000'
     """
@@ -267,8 +267,8 @@ class ParametrisedSurface(Smooth):
     >>> import sobolev_batch as sb
     >>> def saddle(u, v):
     ...     return u, v, 0.5 * (u**2 - v**2)
-    >>> side = sb.Interval(-0.8, 0.8)
-    >>> surface = sb.ParametrisedSurface(saddle, u=side, v=side)
+    >>> side = sb.shapes.Interval(-0.8, 0.8)
+    >>> surface = sb.shapes.ParametrisedSurface(saddle, u=side, v=side)
     >>> f"{surface.area:.6f}"
     '3.044304'
     """

@@ -35,7 +35,7 @@ def icosphere(level: int) -> Mesh:
         InputError: The level is not an integer from 0 to 12.
 
     >>> import sobolev_batch as sb
-    >>> sb.icosphere(2)
+    >>> sb.shapes.icosphere(2)
     Mesh(162 vertices, 320 triangles)
     """
     if not is_whole_number(level) or not 0 <= level <= FINEST_LEVEL:

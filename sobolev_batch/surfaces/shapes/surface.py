@@ -115,10 +115,10 @@ class Similarity:
         InputError: The scale is not positive and finite, or the origin is not three finite numbers.
 
     >>> import sobolev_batch as sb
-    >>> millimetres = sb.Sphere(20.0, center=(10.0, 0.0, 0.0))
-    >>> sb.Similarity(0.1, origin=(10.0, 0.0, 0.0)).apply(millimetres)
+    >>> millimetres = sb.shapes.Sphere(20.0, center=(10.0, 0.0, 0.0))
+    >>> sb.shapes.Similarity(0.1, origin=(10.0, 0.0, 0.0)).apply(millimetres)
     Sphere(radius=2.0, center=(0.0, 0.0, 0.0))
-    >>> sb.Similarity.to_unit_ball(millimetres)
+    >>> sb.shapes.Similarity.to_unit_ball(millimetres)
     Similarity(scale=0.05, origin=(10.0, 0.0, 0.0))
     """
 
@@ -170,7 +170,7 @@ def centering(surfaces: Sequence[Surface], tolerance: float = 0.0) -> Similarity
 def placement_doubt(extent: Extent, reference: Extent) -> str | None:
     """Return what makes one doubt that a surface can be compared with a reference, as a question; None if nothing does.
 
-    >>> from sobolev_batch import Sphere
+    >>> from sobolev_batch.shapes import Sphere
     >>> placement_doubt(Sphere(25.4).extent, Sphere().extent)
     'it is 25.4 times as large as the reference: are both in the same unit of length?'
     >>> placement_doubt(Sphere(1.0, (1.5, 1.5, 0.0)).extent, Sphere().extent)

@@ -40,13 +40,14 @@ def check_source(source: Source, folder: str | Path = ".") -> None:
 
     >>> from pathlib import Path
     >>> import sobolev_batch as sb
-    >>> class Balls(sb.Source):
+    >>> class Balls(sb.sources.Source):
     ...     radii: list[float]
     ...
-    ...     def members(self, folder: Path) -> tuple[sb.Member, ...]:
-    ...         return tuple(sb.SurfaceMember("ball", -1, sb.Sphere(radius), {"ball": 1}) for radius in self.radii)
-    >>> sb.check_source(Balls(radii=[1.0]))
-    >>> sb.check_source(Balls(radii=[1.0, 2.0]))
+    ...     def members(self, folder: Path) -> tuple[sb.sources.Member, ...]:
+    ...         balls = map(sb.shapes.Sphere, self.radii)
+    ...         return tuple(sb.sources.SurfaceMember("ball", -1, ball, {"ball": 1}) for ball in balls)
+    >>> sb.sources.check_source(Balls(radii=[1.0]))
+    >>> sb.sources.check_source(Balls(radii=[1.0, 2.0]))
     Traceback (most recent call last):
         ...
     AssertionError: Balls breaks 2 promises of a source:

@@ -66,17 +66,18 @@ class Source(BaseModel, ABC):
 
     >>> from pathlib import Path
     >>> import sobolev_batch as sb
-    >>> class StretchedBalls(sb.Source):
+    >>> class StretchedBalls(sb.sources.Source):
     ...     sizes: list[float]
     ...
-    ...     def members(self, folder: Path) -> tuple[sb.Member, ...]:
+    ...     def members(self, folder: Path) -> tuple[sb.sources.Member, ...]:
+    ...         balls = {size: sb.shapes.Ellipsoid((size, 1.0, 1.0)) for size in sorted(self.sizes)}
     ...         return tuple(
-    ...             sb.SurfaceMember(f"{size:g}", rank, sb.Ellipsoid((size, 1.0, 1.0)), {"stretched ball": size})
-    ...             for rank, size in enumerate(sorted(self.sizes))
+    ...             sb.sources.SurfaceMember(f"{size:g}", rank, ball, {"stretched ball": size})
+    ...             for rank, (size, ball) in enumerate(balls.items())
     ...         )
     >>> [member.name for member in StretchedBalls(sizes=[2.0, 1.5]).members(Path())]
     ['1.5', '2']
-    >>> sb.check_source(StretchedBalls(sizes=[2.0, 1.5]))
+    >>> sb.sources.check_source(StretchedBalls(sizes=[2.0, 1.5]))
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
@@ -143,7 +144,7 @@ class ExpectedSize:
         factor: Factor by which the number of triangles may be wrong, either way; infinite where nothing is known of it.
 
     >>> import sobolev_batch as sb
-    >>> sb.ExpectedSize(triangles=20_480, projected_bytes=3e6).triangles
+    >>> sb.sources.ExpectedSize(triangles=20_480, projected_bytes=3e6).triangles
     20480
     """
 
@@ -169,17 +170,17 @@ class Member(ABC):
     >>> from dataclasses import dataclass
     >>> import sobolev_batch as sb
     >>> @dataclass(frozen=True)
-    ... class TorusMember(sb.Member):
+    ... class TorusMember(sb.sources.Member):
     ...     cells: int
     ...
     ...     def load(self) -> sb.Mesh:
-    ...         return sb.Torus().mesh(2 * self.cells, self.cells)
+    ...         return sb.shapes.Torus().mesh(2 * self.cells, self.cells)
     ...
     ...     def fingerprint(self) -> dict[str, int]:
     ...         return {"torus of cells": self.cells}
     ...
-    ...     def expected_size(self) -> sb.ExpectedSize:
-    ...         return sb.ExpectedSize(4 * self.cells**2, 600.0 * self.cells**2)
+    ...     def expected_size(self) -> sb.sources.ExpectedSize:
+    ...         return sb.sources.ExpectedSize(4 * self.cells**2, 600.0 * self.cells**2)
     >>> TorusMember("coarse", 0, cells=6).load()
     Mesh(72 vertices, 144 triangles)
     """
@@ -240,7 +241,7 @@ class SurfaceMember(Member):
         identity: Fingerprint: the name of the formula, its parameters, and the version of what makes it.
 
     >>> import sobolev_batch as sb
-    >>> sb.SurfaceMember("ball", -1, sb.Sphere(2.0), {"ball": 2.0}).load()
+    >>> sb.sources.SurfaceMember("ball", -1, sb.shapes.Sphere(2.0), {"ball": 2.0}).load()
     Sphere(radius=2.0, center=(0.0, 0.0, 0.0))
     """
 

@@ -21,11 +21,11 @@ LEVELS = {"a10": 1, "a9": 2, "b": 0}
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     for name, level in LEVELS.items():
-        sb.write_mesh(sb.icosphere(level), tmp_path / f"{name}.ply")
+        sb.write_mesh(sb.shapes.icosphere(level), tmp_path / f"{name}.ply")
     return tmp_path
 
 
-def run(folder: Path, **family: Any) -> sb.Summary:
+def run(folder: Path, **family: Any) -> sb.result_types.Summary:
     source = {"name": "f", "source": "files", **({} if "meshes" in family else {"paths": ["*.ply"]})}
     study = sb.Study.from_table(small_table(family=[{**source, **family}]), folder=folder)
     return sb.run(study, store_of(folder), workers=1)
@@ -62,7 +62,7 @@ def test_files_go_from_few_triangles_to_many_and_have_rates_unless_a_key_orders_
 
 
 def test_copies_with_noise_are_no_sequence(tmp_path: Path) -> None:
-    ball = sb.icosphere(1)
+    ball = sb.shapes.icosphere(1)
     draw = np.random.default_rng(1)
     for noise in (0.0, 0.2, 0.4):
         vertices = ball.vertices + draw.normal(scale=noise, size=ball.vertices.shape)

@@ -12,10 +12,11 @@ import pytest
 import xarray as xr
 from distributed import Client
 
-from sobolev_batch import DamageError, Study, matrix, open_store, run, table, verify
+from sobolev_batch import Study, matrix, open_store, run, table, verify
 from sobolev_batch.batch.analysis import pairs
 from sobolev_batch.batch.analysis.reducer import Reducer
 from sobolev_batch.batch.store.store import Store
+from sobolev_batch.errors import DamageError
 from tests.support.studies import small_table
 
 Tile = tuple[tuple[int, ...], tuple[int, ...]]

@@ -191,5 +191,5 @@ def test_a_worker_killed_in_the_middle(store_path: Path, finished: Path) -> None
 
 
 def test_a_closed_form_has_no_proximity() -> None:
-    with pytest.raises(sb.StudyError, match=r"the reference is not one but a Sphere; take a fine mesh"):
+    with pytest.raises(sb.errors.StudyError, match=r"the reference is not one but a Sphere; take a fine mesh"):
         make_plan(sb.Study.from_table(small_table(proximity={})))

@@ -12,8 +12,9 @@ import pytest
 import xarray as xr
 from distributed import Client
 
-from sobolev_batch import DamageError, Study, open_store, run, table, verify
+from sobolev_batch import Study, open_store, run, table, verify
 from sobolev_batch.batch.store.store import SPECTRA_KEYS, Store
+from sobolev_batch.errors import DamageError
 from tests.support.studies import small_table
 
 BALLS = [{"name": f"ball-{k}", "source": "sphere", "radius": 0.5 + 0.1 * k} for k in range(3)]

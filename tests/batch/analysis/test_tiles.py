@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sobolev_batch import Sphere, Study, distance, fourier_transform
+from sobolev_batch import Study, distance, fourier_transform
 from sobolev_batch.batch.analysis.reducer import Reducer
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.study.plan import make_plan
+from sobolev_batch.shapes import Sphere
 from sobolev_batch.spectral.lattice import SobolevWeights, shell_sums
 from tests.support.studies import SMALL_LATTICE, small_table
 

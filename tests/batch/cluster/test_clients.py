@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 from distributed import Client, LocalCluster
 
-from sobolev_batch import ClusterError, InputError, Study, run
+from sobolev_batch import Study, run
 from sobolev_batch.batch.cluster.clients import remote_client, require_private
 from sobolev_batch.batch.cluster.execution import Progress
+from sobolev_batch.errors import ClusterError, InputError
 from tests.support.commands import call
 from tests.support.processes import PATIENCE_SECONDS, WORKER, dask, listening, tcp_cluster
 from tests.support.recipes import write_study

@@ -13,21 +13,12 @@ import pytest
 from distributed import Client, Future, KilledWorker
 from distributed.utils import key_split
 
-from sobolev_batch import (
-    ClusterError,
-    DamageError,
-    InputError,
-    StoreError,
-    Study,
-    StudyCollection,
-    plan,
-    run,
-    submit,
-)
+from sobolev_batch import Study, StudyCollection, plan, run, submit
 from sobolev_batch.batch.cluster.execution import Cluster, Progress, Task, describe_failure
 from sobolev_batch.batch.cluster.watch import Watch
 from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers, prepare_workers
 from sobolev_batch.batch.store.store import Store
+from sobolev_batch.errors import ClusterError, DamageError, InputError, StoreError
 from sobolev_batch.results.status import Status
 from tests.support.processes import tcp_cluster
 from tests.support.repository import run_blocks

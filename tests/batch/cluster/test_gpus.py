@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sobolev_batch import BackendError, Study, open_store, run
+from sobolev_batch import Study, open_store, run
 from sobolev_batch.batch.cluster.clients import remote_client
 from sobolev_batch.batch.cluster.workers import (
     GPU,
@@ -23,6 +23,7 @@ from sobolev_batch.batch.cluster.workers import (
     release_gpu,
     visible_devices,
 )
+from sobolev_batch.errors import BackendError
 from tests.support.processes import tcp_cluster
 from tests.support.repository import ROOT
 from tests.support.studies import small_table, variable

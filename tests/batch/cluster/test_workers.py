@@ -11,13 +11,15 @@ import pytest
 from dask import config
 from distributed import Client
 
-from sobolev_batch import ClusterError, InputError, Study, icosphere, open_store, run, write_mesh
+from sobolev_batch import Study, open_store, run, write_mesh
 from sobolev_batch.batch.cluster import clients, workers
 from sobolev_batch.batch.cluster.clients import local_client, remote_client
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.cluster.workers import MEMORY, prepare_workers, require_same_versions
 from sobolev_batch.batch.store.store import Store
+from sobolev_batch.errors import ClusterError, InputError
 from sobolev_batch.parameters import machine_memory
+from sobolev_batch.shapes import icosphere
 from tests.support import gate
 from tests.support.processes import PATIENCE_SECONDS, WORKER, dask, tcp_cluster
 from tests.support.repository import install

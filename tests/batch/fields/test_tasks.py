@@ -16,13 +16,15 @@ import pytest
 from distributed import Client
 from numpy.typing import NDArray
 
-from sobolev_batch import ClusterError, Lattice, Mesh, Similarity, Study, icosphere, open_store, run
+from sobolev_batch import Lattice, Mesh, Study, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers
 from sobolev_batch.batch.fields.compute import size_tasks
 from sobolev_batch.batch.fields.tasks import Job, compute_mesh, compute_parts, finish_mesh
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.study.plan import Plan, make_plan
+from sobolev_batch.errors import ClusterError
+from sobolev_batch.shapes import Similarity, icosphere
 from sobolev_batch.spectral.backends import CPU_COSTS, NufftSpec, Workload
 from sobolev_batch.spectral.lattice import Block
 from sobolev_batch.spectral.quadrature import gauss_rule

@@ -12,9 +12,10 @@ import pytest
 from zarr.core.buffer import default_buffer_prototype
 from zarr.core.sync import sync
 
-from sobolev_batch import StoreError, Study, run
+from sobolev_batch import Study, run
 from sobolev_batch.batch.storage.location import Location, path_in
 from sobolev_batch.batch.store.store import Store
+from sobolev_batch.errors import StoreError
 from sobolev_batch.results.status import Status
 from tests.support.studies import small_table
 

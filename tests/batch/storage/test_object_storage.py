@@ -20,7 +20,7 @@ from zarr.buffer.cpu import Buffer
 from zarr.core.buffer import default_buffer_prototype
 from zarr.core.sync import sync
 
-from sobolev_batch import Lattice, StoreError, Study, open_store, run
+from sobolev_batch import Lattice, Study, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client, thread_client
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.storage import location as locations
@@ -32,6 +32,7 @@ from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import table_attributes, write_table
 from sobolev_batch.batch.study.plan import make_plan
+from sobolev_batch.errors import StoreError
 from tests.support.commands import STUDY, call, command, finished
 from tests.support.object_storage import (
     BUCKET,

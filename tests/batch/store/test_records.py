@@ -12,13 +12,14 @@ from typing import Any
 import pytest
 from distributed import Client
 
-from sobolev_batch import StoreError, Study, run, status, verify
+from sobolev_batch import Study, run, status, verify
 from sobolev_batch.batch.storage.location import FolderStore
 from sobolev_batch.batch.store import create
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import Plan, make_plan
+from sobolev_batch.errors import StoreError
 from tests.support.stores import assert_same_results, delete, empty, flip, put_back, truncate
 from tests.support.studies import small_table
 

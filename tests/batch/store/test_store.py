@@ -14,12 +14,13 @@ import pytest
 import zarr
 from distributed import Client
 
-from sobolev_batch import StoreError, Study, open_store, run
+from sobolev_batch import Study, open_store, run
 from sobolev_batch.batch.store import metadata as documents
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import Plan, make_plan
+from sobolev_batch.errors import StoreError
 from sobolev_batch.results.status import Status
 from tests.support.commands import COMMAND, finished
 from tests.support.repository import ROOT, blocks, install

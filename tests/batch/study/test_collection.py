@@ -34,7 +34,7 @@ def folder(tmp_path: Path) -> Path:
     ]
     for path in map(tmp_path.joinpath, made):
         path.parent.mkdir(parents=True, exist_ok=True)
-        sb.write_mesh(sb.icosphere(0), path)
+        sb.write_mesh(sb.shapes.icosphere(0), path)
     return tmp_path
 
 
@@ -67,7 +67,7 @@ def test_a_file_is_of_the_object_with_the_longest_name_that_fits(
 ) -> None:
     paths = {name: template.format(object=name, method="quick") for name in names}
     for path in (*paths.values(), *(f"{name}.off" for name in names)):
-        sb.write_mesh(sb.icosphere(0), tmp_path / path)
+        sb.write_mesh(sb.shapes.icosphere(0), tmp_path / path)
     family = [{"name": "{method}", "source": "files", "paths": [template.replace("80", "*")]}]
     objects = [{"name": name} for name in names]
     references = {"source": "files", "paths": ["{object}.off"]}
@@ -85,19 +85,19 @@ def test_files_of_longer_names_alone_are_no_files(folder: Path) -> None:
     objects = [{"name": "cow"}, {"name": "cow_2"}]
     found = sb.StudyCollection.from_table(table(object=objects, family=family), folder=folder)
     assert found.lacking == {"cow": ("quick",)}
-    with pytest.raises(sb.StudyError, match="object 'cow': no family has a file of it"):
+    with pytest.raises(sb.errors.StudyError, match="object 'cow': no family has a file of it"):
         sb.StudyCollection.from_table(table(object=objects, family=family[:1]), folder=folder)
-    with pytest.raises(sb.StudyError, match="family 'quick': no file that it names is of an object"):
+    with pytest.raises(sb.errors.StudyError, match="family 'quick': no file that it names is of an object"):
         sb.StudyCollection.from_table(table(object=[{"name": "horse"}], family=family), folder=folder)
 
 
 def test_objects_can_be_listed_with_references_and_scalings_of_their_own(folder: Path) -> None:
     ball = {"name": "ball", "reference": {"source": "sphere"}, "scaling": {"mode": "none"}}
-    with pytest.raises(sb.StudyError, match="read them as a StudyCollection"):
+    with pytest.raises(sb.errors.StudyError, match="read them as a StudyCollection"):
         sb.Study.from_table(table(object=[{"name": "cow"}, ball], family=ICO), folder=folder)
     found = sb.StudyCollection.from_table(table(object=[{"name": "cow"}, ball], family=ICO), folder=folder)
     studies = [(study.name, study.scaling) for study in found.studies.values()]
-    assert studies == [("small cow", None), ("small ball", sb.Similarity())]
+    assert studies == [("small cow", None), ("small ball", sb.shapes.Similarity())]
 
 
 def test_named_meshes_give_objects_too(folder: Path) -> None:
@@ -162,7 +162,7 @@ def listed(name: str) -> dict[str, str]:
     ],
 )
 def test_refusals_name_the_place(folder: Path, changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(sb.StudyError, match=message):
+    with pytest.raises(sb.errors.StudyError, match=message):
         sb.StudyCollection.from_table(table(**changes), folder=folder)
 
 
@@ -201,5 +201,5 @@ def test_a_family_may_be_of_the_mesh_with_the_name_of_the_object() -> None:
     studies = sb.StudyCollection.from_table(table).studies
     assert {name: study.table["family"][0]["mesh"] for name, study in studies.items()} == {"ball": "ball", "egg": "egg"}
     table["family"][0]["mesh"] = "{object}s"
-    with pytest.raises(sb.StudyError, match="no mesh is named 'balls'; did you mean ball"):
+    with pytest.raises(sb.errors.StudyError, match="no mesh is named 'balls'; did you mean ball"):
         sb.StudyCollection.from_table(table)

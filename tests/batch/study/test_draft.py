@@ -63,7 +63,7 @@ def write(path: Path, level: int) -> None:
     """Write a sphere, in whatever format the name says."""
     path.parent.mkdir(parents=True, exist_ok=True)
     plain = path.with_suffix("") if path.suffix == ".gz" else path
-    sb.write_mesh(sb.icosphere(level), plain)
+    sb.write_mesh(sb.shapes.icosphere(level), plain)
     if plain != path:
         path.write_bytes(gzip.compress(plain.read_bytes()))
         plain.unlink()
@@ -167,17 +167,19 @@ def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
 
 
 def test_folders_without_meshes_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(sb.StudyError, match="no such folder"):
+    with pytest.raises(sb.errors.StudyError, match="no such folder"):
         sb.init_study(tmp_path / "nowhere", tmp_path / "study.toml")
     (tmp_path / "a.ply").write_text("nothing")
-    with pytest.raises(sb.StudyError, match=r"no mesh file that can be read: a\.ply: no PLY header"):
+    with pytest.raises(sb.errors.StudyError, match=r"no mesh file that can be read: a\.ply: no PLY header"):
         sb.init_study(tmp_path, tmp_path / "study.toml")
     assert not (tmp_path / "study.toml").exists()
     sb.write_mesh(sb.Mesh(np.eye(4, 3), [[0, 1, 2], [3, 1, 0], [3, 2, 1], [3, 0, 2]]), tmp_path / "b.ply")
-    with pytest.raises(sb.StudyError, match=r"^b\.ply is the only mesh that can be read, and too small to decimate"):
+    with pytest.raises(
+        sb.errors.StudyError, match=r"^b\.ply is the only mesh that can be read, and too small to decimate"
+    ):
         sb.init_study(tmp_path, tmp_path / "study.toml")
     write(tmp_path / "c.ply", 1)
-    with pytest.raises(sb.StudyError, match="no study can be written there: No such file"):
+    with pytest.raises(sb.errors.StudyError, match="no study can be written there: No such file"):
         sb.init_study(tmp_path, tmp_path / "nowhere" / "study.toml")
 
 

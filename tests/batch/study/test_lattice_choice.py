@@ -55,7 +55,7 @@ def test_every_distance_to_the_reference_is_as_accurate_as_asked(client: Client,
     assert convergence["within"].all()
     assert (convergence["error"] <= RTOL * convergence["distance"]).all()
     for level in range(4):
-        truth = sb.distance(sb.icosphere(level), sb.Sphere(), [-10.0, -4.0], rtol=1e-5)
+        truth = sb.distance(sb.shapes.icosphere(level), sb.shapes.Sphere(), [-10.0, -4.0], rtol=1e-5)
         here = convergence.sel(mesh=f"ico/{level}")
         gap = np.abs(here["distance"].values - truth["distance"].values)
         assert (gap <= here["error"] + truth["error"].values).all()
@@ -115,7 +115,9 @@ def test_what_falls_short_in_the_end_is_marked(
 
 def test_what_cannot_be_met_is_refused_before_anything_is_written(client: Client, store_path: Path) -> None:
     study = asking(accuracy={"rtol": 1e-7, "memory": "700MB"}, norm={"orders": [-2.0]})
-    with pytest.raises(sb.AccuracyError, match=r"ico/\d: rtol 1e-07 is out of reach at order -2 .* can be reached"):
+    with pytest.raises(
+        sb.errors.AccuracyError, match=r"ico/\d: rtol 1e-07 is out of reach at order -2 .* can be reached"
+    ):
         sb.run(study, store_path, client)
     assert not store_path.exists()
 
@@ -163,8 +165,8 @@ def test_another_accuracy_is_another_choice(client: Client, store_path: Path) ->
 def folder(tmp_path: Path) -> Path:
     """Balls whose names are not in the order of their triangles, one in another unit, and one that is no mesh."""
     for level, name in enumerate("zxy"):
-        sb.write_mesh(sb.icosphere(level), tmp_path / f"{name}.off")
-    ball = sb.icosphere(3)
+        sb.write_mesh(sb.shapes.icosphere(level), tmp_path / f"{name}.off")
+    ball = sb.shapes.icosphere(3)
     sb.write_mesh(sb.Mesh(25.4 * ball.vertices, ball.triangles), tmp_path / "inches.off")
     (tmp_path / "broken.off").write_text("OFF\n" + "1 2 3\n" * 10_000)
     return tmp_path
@@ -178,10 +180,10 @@ def study(folder: Path) -> sb.Study:
 
 @pytest.mark.slow
 def test_a_mesh_beyond_the_pilots_has_its_place_in_the_lattice_and_wrong_ones_have_none(folder: Path) -> None:
-    ball = sb.icosphere(1)
+    ball = sb.shapes.icosphere(1)
     sb.write_mesh(sb.Mesh(1.5 * ball.vertices, ball.triangles), folder / "large.off")
     found = {f"f/{member.name}": ("f", member) for member in members({"source": "files", "paths": ["*.off"]}, folder)}
-    pilots, _ = choose_pilots(found, sb.Similarity(), sb.Sphere().extent)
+    pilots, _ = choose_pilots(found, sb.shapes.Similarity(), sb.shapes.Sphere().extent)
     # The coarsest and the finest that can be compared, by their triangles.
     assert set(pilots) == {"f/z", "f/y"}
     plan = sb.plan(study(folder), folder / "s.zarr")
@@ -190,7 +192,7 @@ def test_a_mesh_beyond_the_pilots_has_its_place_in_the_lattice_and_wrong_ones_ha
     assert "doubtful:      f/inches: its extent is 25.4 times that" in str(plan)
     for name in ("x", "y", "z", "large"):
         (folder / f"{name}.off").unlink()
-    with pytest.raises(sb.StudyError, match=r"none of the study's surfaces can serve .*f/(broken|inches): "):
+    with pytest.raises(sb.errors.StudyError, match=r"none of the study's surfaces can serve .*f/(broken|inches): "):
         sb.plan(study(folder), folder / "s.zarr")
 
 
@@ -200,14 +202,17 @@ def test_wrong_meshes_fail_by_their_own_names_and_the_others_have_their_accuracy
     assert "in the same unit of length?" in summary.failed["f/inches"]
     table = sb.table(folder / "mixed.zarr").set_index("mesh").drop(["f/broken", "f/inches"])
     assert table["within"].all()
-    exact = [sb.distance(sb.icosphere(level), sb.Sphere(), -4.0, rtol=1e-3)["distance"].item() for level in range(3)]
+    exact = [
+        sb.distance(sb.shapes.icosphere(level), sb.shapes.Sphere(), -4.0, rtol=1e-3)["distance"].item()
+        for level in range(3)
+    ]
     for name, value in zip("zxy", exact, strict=True):
         assert abs(table["distance"][f"f/{name}"] - value) <= 1.01 * table["error"][f"f/{name}"] + 1e-3 * value
 
 
 @pytest.mark.all
 def test_a_best_effort_serves_the_meshes_that_can_be_served(client: Client, folder: Path) -> None:
-    near = sb.icosphere(2)
+    near = sb.shapes.icosphere(2)
     rough = np.random.default_rng(0).normal(size=near.vertices.shape)
     twin = sb.Mesh(near.vertices + 1e-5 * rough, near.triangles)
     sb.write_mesh(twin, folder / "near.off")
@@ -216,7 +221,7 @@ def test_a_best_effort_serves_the_meshes_that_can_be_served(client: Client, fold
     table = {**study(folder).table, "norm": {"orders": [-0.7]}}
     table["reference"] = {"source": "icosphere", "levels": [2]}
     strict = sb.Study.from_table(table, folder=folder)
-    with pytest.raises(sb.AccuracyError, match=r"rtol 0\.1 .* at order -0\.7"):
+    with pytest.raises(sb.errors.AccuracyError, match=r"rtol 0\.1 .* at order -0\.7"):
         sb.plan(strict, folder / "s.zarr")
     table["accuracy"]["best_effort"] = True
     best = sb.Study.from_table(table, folder=folder)
@@ -232,7 +237,7 @@ def test_a_best_effort_serves_the_meshes_that_can_be_served(client: Client, fold
 
 
 def test_units_are_doubted_where_numbers_are_shown(client: Client, folder: Path) -> None:
-    small = sb.icosphere(2)
+    small = sb.shapes.icosphere(2)
     sb.write_mesh(sb.Mesh(small.vertices / 10, small.triangles), folder / "small.off")
     store = folder / "mixed.zarr"
     sb.run(study(folder), store, client)

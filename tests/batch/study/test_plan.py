@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 import trimesh
 
-from sobolev_batch import LatticeError, MeshError, Study, StudyError
+from sobolev_batch import Study
 from sobolev_batch.batch.study.plan import make_plan, members_of
+from sobolev_batch.errors import LatticeError, MeshError, StudyError
 from tests.support.studies import small_table
 
 

@@ -16,8 +16,10 @@ import pytest
 from distributed import Client
 
 import sobolev_batch as sb
-from sobolev_batch import Sphere, Study, check_source, fourier_transform, open_store, run
+from sobolev_batch import Study, fourier_transform, open_store, run
 from sobolev_batch.batch.study.plan import make_plan
+from sobolev_batch.shapes import Sphere
+from sobolev_batch.sources import check_source
 from sobolev_batch.surfaces.sources import registry
 from sobolev_batch.surfaces.sources.registry import SurfaceMember, parse_source
 from tests.support.mesh_files import off
@@ -47,11 +49,11 @@ def egg_table(**changes: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("table", "levels", "unit"),
     # The reference's bounding sphere becomes the unit sphere at the origin.
-    [(torus_table(), 4, sb.Torus(2.0 / 2.8, 0.8 / 2.8)), (egg_table(), 5, sb.Ellipsoid((1.0, 0.7, 0.4)))],
+    [(torus_table(), 4, sb.shapes.Torus(2.0 / 2.8, 0.8 / 2.8)), (egg_table(), 5, sb.shapes.Ellipsoid((1.0, 0.7, 0.4)))],
     ids=["torus", "ellipsoid"],
 )
 def test_refinements_converge_with_second_order(
-    threads: Client, store_path: Path, table: dict[str, Any], levels: int, unit: sb.Torus | sb.Ellipsoid
+    threads: Client, store_path: Path, table: dict[str, Any], levels: int, unit: sb.shapes.Torus | sb.shapes.Ellipsoid
 ) -> None:
     study = sb.Study.from_table(table)
     summary = sb.run(study, store_path, threads)
@@ -88,7 +90,7 @@ def test_blocks_of_a_smooth_surface_make_the_same_store(threads: Client, tmp_pat
         tree = sb.open_store(tmp_path / name)
         fields.append(variable(tree, "fourier", "fourier").sel(mesh="reference").values)
         errors.append(variable(tree, "norms", "discretisation").sel(mesh="reference").values)
-    assert np.abs(fields[0] - fields[1]).max() < 1e-8 * sb.Torus(2.0, 0.8).area
+    assert np.abs(fields[0] - fields[1]).max() < 1e-8 * sb.shapes.Torus(2.0, 0.8).area
     assert errors[0] == pytest.approx(errors[1], rel=3.0)
 
 
@@ -113,7 +115,7 @@ PAGE = "docs/surfaces.md"
 def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The packages of the page, installed."""
     entry_points = [text for text in blocks(PAGE, "toml") if text.startswith("[project.")]
-    modules = [text for text in blocks(PAGE, "python") if "(sb.Source)" in text]
+    modules = [text for text in blocks(PAGE, "python") if "(sb.sources.Source)" in text]
     site, names = tmp_path / "site", []
     for entry_point, module in zip(entry_points, modules, strict=True):
         match = re.fullmatch(r'\[project\.entry-points\."(.*)"\]\n(.*) = "(\w+)(:\w+)"\n', entry_point)

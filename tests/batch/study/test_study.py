@@ -18,9 +18,11 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 
 import sobolev_batch as sb
-from sobolev_batch import Lattice, OrderError, Similarity, Study
+from sobolev_batch import Lattice, Study
 from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.batch.study.schema import StudyDocument, models_in
+from sobolev_batch.errors import OrderError
+from sobolev_batch.shapes import Similarity
 from sobolev_batch.surfaces.sources.files import FileSource
 from sobolev_batch.surfaces.sources.names import quoted
 from sobolev_batch.surfaces.sources.registry import Source, source_type_of
@@ -137,7 +139,7 @@ def test_a_study_knows_what_its_sources_need() -> None:
 
 def refusal(table: Any) -> str:
     """What a study is refused with; one line, of a length that can be read."""
-    with pytest.raises(sb.StudyError) as caught:
+    with pytest.raises(sb.errors.StudyError) as caught:
         sb.Study.from_table(table)
     return orderly(str(caught.value))
 
@@ -183,7 +185,7 @@ PLACES: list[tuple[str, Any, str]] = [
     ("norm.orders", [-1.0 - k for k in range(101)], "orders: at most 100 entries are allowed, found 101"),
     ("transform.eps", 1e-20, "eps must lie between 1e-14 and 0.1"),
     ("scaling.scale", 2.0, "scale and origin belong to mode = 'fixed'"),
-    ("reference", sb.Sphere(), "reference must be a table"),
+    ("reference", sb.shapes.Sphere(), "reference must be a table"),
     ("reference", {"source": "spere"}, r"\[reference\]: no source is named 'spere'; known are .*; did you mean 'sphe"),
     ("reference", {"source": "sphere", "center": [0, 0]}, r"\[reference\]: entry 3 of center is missing"),
     ("reference", {"source": "torus", "R": 1.0, "r": 2.0}, r"\[reference\]: .*0 < r < R"),
@@ -295,7 +297,7 @@ def test_files_that_are_no_studies(tmp_path: Path, content: bytes, reason: str) 
     path = tmp_path / "s.toml"
     path.write_bytes(content)
     start = time.process_time()
-    with pytest.raises(sb.StudyError, match=reason) as caught:
+    with pytest.raises(sb.errors.StudyError, match=reason) as caught:
         sb.Study.from_toml(path)
     assert orderly(str(caught.value)).startswith(f"{path}: ")
     assert time.process_time() - start < 5
@@ -306,7 +308,7 @@ def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     (tmp_path / "zero").symlink_to("/dev/zero")
     reasons = {"pipe": "it is a pipe", "zero": "it is a pipe, a socket or a device", "": "Is a directory"}
     for name, reason in {**reasons, "no": "No such file", "a\0b": "null byte"}.items():
-        with pytest.raises(sb.StudyError, match=f"cannot be read: .*{reason}"):
+        with pytest.raises(sb.errors.StudyError, match=f"cannot be read: .*{reason}"):
             sb.Study.from_toml(tmp_path / name)
 
 
@@ -325,6 +327,6 @@ _fuzz = settings(derandomize=True, deadline=None, max_examples=40, suppress_heal
 def test_damaged_studies_end_in_a_plan_or_a_study_error(path: str, value: Any) -> None:
     try:
         make_plan(sb.Study.from_table(changed(path, value)))
-    except sb.InputError as error:
+    except sb.errors.InputError as error:
         orderly(str(error))
     assert len(quoted(value)) <= 80

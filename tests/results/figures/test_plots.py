@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -37,40 +38,41 @@ def pairs(tree: xr.DataTree) -> xr.DataTree:
 
 @pytest.mark.slow
 def test_pairs_get_a_heat_map(pairs: xr.DataTree, tmp_path: Path) -> None:
-    axes = sb.plot(pairs, "matrix", -10.0)
+    axes = sb.plot.matrix(pairs, -10.0)
     assert axes.get_title().startswith("Sobolev distance of order -10")
     shown = [text.get_text() for text in axes.get_yticklabels()]
     assert shown in ([r"\$^\$/0", r"\$^\$/1", "reference"], ["reference", r"\$^\$/1", r"\$^\$/0"])
     paths, _ = write_plots(Selection.from_store(pairs), tmp_path)
     assert [path.name for path in paths] == ["convergence.png", "matrix.png"]
-    alone = sb.plot(pairs, "matrix", -10.0, family="_*")
+    alone = sb.plot.matrix(pairs, -10.0, family="_*")
     assert [text.get_text() for text in alone.texts] == ["no two meshes differ"]
 
 
 @pytest.mark.process
 def test_plots_take_the_axes_of_a_caller_and_leave_pyplot_alone(tree: xr.DataTree) -> None:
     axes = Figure().subplots()
-    assert sb.plot(tree, ax=axes) is axes
-    assert isinstance(sb.plot(tree), Axes)
+    assert sb.plot.convergence(tree, ax=axes) is axes
+    assert isinstance(sb.plot.convergence(tree), Axes)
     code = "import sobolev_batch as sb, sys; sb.plot; assert 'matplotlib.pyplot' not in sys.modules"
     done = finished(sys.executable, "-c", code)
     assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("plot", "arguments", "message"),
     [
-        ({"order": -0.4}, "below -1/2, found -0.4"),
-        ({"kind": "transform"}, r"one of convergence, .*, energy, found 'transform'"),
-        ({"family": "g*"}, "the study has no family 'g\\*', only f_1, reference"),
-        ({"x": "weight"}, "no size of meshes is named 'weight'; known are edge_length, triangles"),
-        ({"kind": "matrix"}, "distances to the reference alone; set pairs"),
+        (sb.plot.convergence, {"order": -0.4}, "below -1/2, found -0.4"),
+        (sb.plot.convergence, {"family": "g*"}, "the study has no family 'g\\*', only f_1, reference"),
+        (sb.plot.convergence, {"x": "weight"}, "no size of meshes is named 'weight'; known are edge_length, triangles"),
+        (sb.plot.matrix, {}, "distances to the reference alone; set pairs"),
     ],
 )
-def test_what_cannot_be_plotted(tree: xr.DataTree, arguments: dict[str, Any], message: str) -> None:
+def test_what_cannot_be_plotted(
+    tree: xr.DataTree, plot: Callable[..., Axes], arguments: dict[str, Any], message: str
+) -> None:
     nearest = tree["convergence"].to_dataset()[["distance"]].expand_dims(other=["reference"])
-    with pytest.raises(sb.InputError, match=message):
-        sb.plot(xr.DataTree.from_dict({**tree.to_dict(), "/distances": nearest}), **arguments)
+    with pytest.raises(sb.errors.InputError, match=message):
+        plot(xr.DataTree.from_dict({**tree.to_dict(), "/distances": nearest}), **arguments)
 
 
 def lines(_subject: object, count: int, axes: Axes) -> None:
@@ -125,12 +127,12 @@ def test_the_size_is_that_of_a_panel_and_refused_places_are_named(tree: xr.DataT
     (path, *_), _ = write_plots(Selection.from_store(tree), tmp_path / "new" / "folder", size=parse_size("3x2in"))
     # The header of a PNG: two panels of 300 dots per inch.
     assert struct.unpack(">II", path.read_bytes()[16:24]) == (900, 1200)
-    with pytest.raises(sb.StoreError, match="pictures cannot be written there"):
+    with pytest.raises(sb.errors.StoreError, match="pictures cannot be written there"):
         write_plots(Selection.from_store(tree), path)
     for text in ("8.4x6cm", "84x60mm", "84 × 60 mm"):
         assert parse_size(text) == pytest.approx((8.4 / 2.54, 6 / 2.54))
     for text in ("6", "6x", "6x4m", "axb", "1.2.3x4", "100x100", "0x4", "5x5mm"):
-        with pytest.raises(sb.InputError, match=r"size|inches"):
+        with pytest.raises(sb.errors.InputError, match=r"size|inches"):
             parse_size(text)
 
 
@@ -140,9 +142,9 @@ def slope_of(line: Line2D) -> float:
 
 
 def test_convergence_picture_has_a_line_per_family_and_the_slope(tree: xr.DataTree) -> None:
-    axes = sb.plot(tree)
+    axes = sb.plot.convergence(tree)
     assert axes.get_title() == "order -10\nnot drawn: 1 not computed"
-    assert sb.plot(tree, "convergence", -2.5).get_title().startswith("order -2.5\n")
+    assert sb.plot.convergence(tree, -2.5).get_title().startswith("order -2.5\n")
     assert [text.get_text() for text in axes.figure.legends[0].get_texts()] == ["f_1", "slope 2"]
     family, slope = axes.lines
     assert np.allclose(family.get_xydata(), [[0.1, 0.025], [0.2, 0.1]])
@@ -159,7 +161,7 @@ def test_convergence_picture_has_a_line_per_family_and_the_slope(tree: xr.DataTr
     ],
 )
 def test_other_horizontal_axes(tree: xr.DataTree, x: str, places: list[float], label: str, slopes: list[int]) -> None:
-    axes = sb.plot(tree, x=x)
+    axes = sb.plot.convergence(tree, x=x)
     family, *others = axes.lines
     assert (axes.get_xlabel(), np.asarray(family.get_xdata()).tolist()) == (label, places)
     assert [line.get_label() for line in others] == [f"slope {slope}" for slope in slopes]
@@ -176,7 +178,7 @@ def changed(tree: xr.DataTree, **values: list[float]) -> xr.DataTree:
 
 def test_distances_below_their_errors_are_hollow_and_stretch_no_axis(tree: xr.DataTree) -> None:
     unsure = changed(tree, relative_error=[1e-3, 0.2, np.nan, 0.0], resolved=[1, 0, 0, 1])
-    axes = sb.plot(unsure)
+    axes = sb.plot.convergence(unsure)
     assert [text.get_text() for text in axes.figure.legends[0].get_texts()] == ["f_1", "slope 2", "not above its error"]
     hollow = [line for line in axes.lines if line.get_markerfacecolor() == "white" and np.size(line.get_xydata())]
     assert [np.asarray(line.get_xydata()).tolist() for line in hollow] == [[[0.1, 0.025]]]
@@ -188,7 +190,7 @@ def test_whatever_is_not_drawn_is_counted_and_named(tree: xr.DataTree) -> None:
     figure = PLOTS["convergence"].figure(Selection.from_store(changed(tree, relative=[0.0, 0.0, np.nan, 0.0])))
     assert notes_of(figure) == ["not drawn: 1 not computed, 2 equal to the reference", "families not drawn: f_1"]
     assert [axes.get_title().split("\n")[0] for axes in figure.axes] == ["order -10", "order -2.5"]
-    nameless = sb.plot(tree, x="triangles", family="f?1")
+    nameless = sb.plot.convergence(tree, x="triangles", family="f?1")
     assert "families" not in nameless.get_title()
 
 
@@ -197,7 +199,7 @@ def test_few_outliers_do_not_take_the_colours_of_a_matrix() -> None:
     points[1] = points[2] + 1e-12
     for chosen, extend in ((points, "min"), (points[2:], "neither")):
         labels = ["reference", *(f"f{i % 10}/mesh {i}" for i in range(1, len(chosen)))]
-        axes = sb.plot(tree_of(chosen, labels, {-2.0: 1.0}), "matrix")
+        axes = sb.plot.matrix(tree_of(chosen, labels, {-2.0: 1.0}))
         (image,), (_, bar) = axes.images, axes.figure.axes
         low, high = image.get_clim()
         assert (low > 1e-3, high) == (True, cdist(chosen, chosen).max())

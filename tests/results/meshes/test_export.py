@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 from plyfile import PlyData
 
 import sobolev_batch as sb
-from sobolev_batch import icosphere, open_store
+from sobolev_batch import open_store
 from sobolev_batch.results.figures.meshes import StudyMeshes, fields_of, witness_at_vertices
 from sobolev_batch.results.figures.selection import Selection
 from sobolev_batch.results.figures.views import FRONT, MeshView, draw_mesh, make_views, write_witness_plots
+from sobolev_batch.shapes import icosphere
 from tests.support.commands import call
 from tests.support.spheres import LABELS, LONG, ORDERS, RADIUS, RIGHT, STRANGE
 
@@ -139,19 +140,19 @@ def test_what_cannot_be_asked_for(spheres: Spheres, tmp_path: Path, monkeypatch:
         ("files/bad", "a.ply", None, "its status is 'failed'"),
     ]
     for label, name, orders, message in refused:
-        with pytest.raises(sb.InputError, match=message):
+        with pytest.raises(sb.errors.InputError, match=message):
             sb.write_witness(place, label, tmp_path / name, orders, folder)
-    with pytest.raises(sb.StoreError, match="cannot be written there: No such file"):
+    with pytest.raises(sb.errors.StoreError, match="cannot be written there: No such file"):
         sb.write_witness(place, "files/beside", tmp_path / "nowhere" / "a.ply", folder=folder)
     tree = sb.open_store(place).load()
     tree["convergence"].attrs["reference"] = "files/bad"
-    with pytest.raises(sb.InputError, match="the reference 'files/bad' is not computed"):
+    with pytest.raises(sb.errors.InputError, match="the reference 'files/bad' is not computed"):
         sb.write_witness(tree, LABELS[1], tmp_path / "a.ply", folder=folder)
     (tmp_path / "taken").write_text("")
     done = call("witness", place, "--output", tmp_path / "taken", "--folder", folder)
     assert "no files can be written there" in done.stderr
     monkeypatch.setitem(__import__("sys").modules, "pyvista", None)
-    with pytest.raises(sb.InputError, match=r"PyVista needs a library.*pip install 'sobolev-batch\[vtk\]'"):
+    with pytest.raises(sb.errors.InputError, match=r"PyVista needs a library.*pip install 'sobolev-batch\[vtk\]'"):
         sb.write_witness(place, "files/beside", tmp_path / "a.vtp", folder=folder)
     assert os.listdir(tmp_path) == ["taken"]
 

@@ -17,10 +17,11 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 
 import sobolev_batch as sb
-from sobolev_batch import DamageError, InputError, StoreError, Study, icosphere, open_store, run
+from sobolev_batch import Study, open_store, run
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import hide_tables
 from sobolev_batch.cli import cli
+from sobolev_batch.errors import DamageError, InputError, StoreError
 from sobolev_batch.results.figures import selection
 from sobolev_batch.results.figures.selection import Spectra
 from sobolev_batch.results.figures.views import make_views
@@ -28,6 +29,7 @@ from sobolev_batch.results.report import build, content
 from sobolev_batch.results.report.build import make_report
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables.league import leagues_of
+from sobolev_batch.shapes import icosphere
 from tests.support.browser import Browser, browser
 from tests.support.studies import GONE, balls, method_rows, methods_of, small_table
 
@@ -274,7 +276,7 @@ def test_a_page_shows_one_state_of_a_store(copy: Path, tmp_path: Path, monkeypat
         return make_views(*arguments, **options)
 
     monkeypatch.setattr(build, "make_views", make_views_while_a_run_begins)
-    with pytest.raises(sb.StoreError, match="a run has changed the store while it was read"):
+    with pytest.raises(sb.errors.StoreError, match="a run has changed the store while it was read"):
         sb.report(copy, tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()
 

@@ -12,8 +12,9 @@ import pytest
 import xarray as xr
 
 import sobolev_batch as sb
-from sobolev_batch import InputError, smallest_below, table
+from sobolev_batch import smallest_below, table
 from sobolev_batch.batch.store.store import Store
+from sobolev_batch.errors import InputError
 from sobolev_batch.results.tables.convergence import format_smallest, format_table
 from sobolev_batch.results.tables.matrix import format_matrix
 from tests.support.studies import small_table
@@ -193,5 +194,5 @@ def test_tables_of_any_order_read_no_field_and_no_record(
 @pytest.mark.slow
 def test_other_orders_are_refused(stores: tuple[str, str]) -> None:
     for ask, order in product((sb.table, sb.matrix, sb.evolution), (-0.5, 1.0, [], "all")):
-        with pytest.raises(sb.OrderError):
+        with pytest.raises(sb.errors.OrderError):
             ask(stores[0], order)

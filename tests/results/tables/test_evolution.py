@@ -139,24 +139,24 @@ def test_times_that_differ_by_rounding_are_the_same(client: Client, tmp_path: Pa
     assert {"1000000.1", "1000000.2"} <= set(format_evolution(tree).split())
     meshes = tree["meshes"].to_dataset()
     tree["meshes"] = xr.DataTree(meshes.assign_coords(time=meshes["time"].where(meshes["family"] != "true", 7.0)))
-    with pytest.raises(sb.InputError, match="the families 'carried' and 'true' have no time in common"):
+    with pytest.raises(sb.errors.InputError, match="the families 'carried' and 'true' have no time in common"):
         sb.evolution(tree, truth="true")
 
 
 def test_the_plot_has_a_line_for_each_family(store: Path) -> None:
-    axes = sb.plot(store, "over-time", -4.0, truth="true")
+    axes = sb.plot.over_time(store, -4.0, truth="true")
     (legend,) = axes.figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["coarse", "late", "a new mesh pays"]
     assert axes.get_title() == "order -4"
-    late = sb.plot(store, "over-time", -4.0, truth="true", family="l*")
+    late = sb.plot.over_time(store, -4.0, truth="true", family="l*")
     assert late.lines[0].get_label() == "late"
-    with pytest.raises(sb.InputError, match="none of the chosen families moves, only coarse, late"):
-        sb.plot(store, "over-time", -4.0, truth="true", family="still")
+    with pytest.raises(sb.errors.InputError, match="none of the chosen families moves, only coarse, late"):
+        sb.plot.over_time(store, -4.0, truth="true", family="still")
 
 
 def test_new_times_of_files_need_no_new_field(client: Client, tmp_path: Path) -> None:
     for number in (2, 10, 1):
-        ball = sb.icosphere(1)
+        ball = sb.shapes.icosphere(1)
         (tmp_path / f"frame_{number}.off").write_bytes(off(ball.vertices * (1 + number / 50), ball.triangles.tolist()))
 
     def study(**times: Any) -> sb.Study:
@@ -166,10 +166,12 @@ def test_new_times_of_files_need_no_new_field(client: Client, tmp_path: Path) ->
 
     store = tmp_path / "frames.zarr"
     sb.run(study(), store, client)
-    with pytest.raises(sb.InputError, match="no mesh of the store has a time"):
+    with pytest.raises(sb.errors.InputError, match="no mesh of the store has a time"):
         sb.evolution(store)
     assert sb.run(study(times="names"), store, client).computed == ()
-    with pytest.raises(sb.InputError, match="no mesh has a time, except those that the others are compared with"):
+    with pytest.raises(
+        sb.errors.InputError, match="no mesh has a time, except those that the others are compared with"
+    ):
         sb.evolution(store, truth="frames")
     found, table = sb.evolution(store, -4.0), sb.table(store).set_index("mesh")["distance"]
     assert found["time"].values.tolist() == [1.0, 2.0, 10.0]
@@ -197,5 +199,5 @@ def test_a_report_draws_them(store: Path, tmp_path: Path) -> None:
     ],
 )
 def test_wrong_questions(store: Path, arguments: dict[str, Any], message: str) -> None:
-    with pytest.raises(sb.InputError, match=message):
+    with pytest.raises(sb.errors.InputError, match=message):
         sb.evolution(store, **arguments)

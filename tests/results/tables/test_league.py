@@ -66,7 +66,7 @@ def test_the_plot_has_the_means_of_the_table_whatever_the_sizes_of_the_meshes() 
     # The k-th meshes of the objects differ in size: a mean of these would put b below a.
     plain = method_rows({"a": {n: 1.0 / n for n in (100, 400, 1600)}, "b": {n: 2.0 / n for n in (400, 1600, 6400)}})
     made = ranked({"x": plain, "y": method_rows({"a": {n: 3.0 / n for n in SIZES}, "b": {n: 6.0 / n for n in SIZES}})})
-    lines = {line.get_label(): line for line in sb.plot_league(made).lines}
+    lines = {line.get_label(): line for line in sb.plot.league(made).lines}
     for method, relative in made.table.set_index("method")["relative"].items():
         places, values = np.asarray(lines[str(method)].get_xydata()).T
         assert np.exp(np.log(values).mean()) == pytest.approx(relative, rel=1e-12)
@@ -119,9 +119,11 @@ def test_objects_that_cannot_be_compared_are_left_out_and_named(
 def test_methods_may_be_chosen_and_must_be_known() -> None:
     one = of_powers({"a": 1}, 1.0)
     assert ranked({"x": POWERS, "y": one}, methods=["a"]).objects == ("x", "y")
-    with pytest.raises(sb.InputError, match=r"compare the methods a, b \(y: no distance of b; w: no distance of a\)"):
+    with pytest.raises(
+        sb.errors.InputError, match=r"compare the methods a, b \(y: no distance of b; w: no distance of a\)"
+    ):
         ranked({"y": one, "w": of_powers({"b": 1}, 1.0)})
-    with pytest.raises(sb.InputError, match="no method is named 'c'; known are a, b"):
+    with pytest.raises(sb.errors.InputError, match="no method is named 'c'; known are a, b"):
         ranked({"x": POWERS}, methods=["c"])
 
 
@@ -286,13 +288,13 @@ def test_names_that_hold_the_object_are_members_of_all_objects() -> None:
     ],
 )
 def test_a_cost_that_nothing_has_is_refused(x: str, message: str) -> None:
-    with pytest.raises(sb.InputError, match=message):
+    with pytest.raises(sb.errors.InputError, match=message):
         by_cost({"cow": POWERS.assign(none=np.nan)}, x)
 
 
 def test_the_plot_by_cost_has_all_members_and_their_front() -> None:
     tables = {"cow": priced({"quick": QUICK, "slow": SLOW}), "egg": priced({"quick": QUICK, "slow": {20: 0.1}})}
-    axes = sb.plot_league(by_cost(tables))
+    axes = sb.plot.league(by_cost(tables))
     lines = {str(line.get_label()): np.asarray(line.get_xydata()) for line in axes.lines}
     np.testing.assert_allclose(lines["quick"], [[1, 0.4], [2, 0.2], [3, 0.3]])
     np.testing.assert_allclose(lines["front"], [[1, 0.4], [2, 0.2], [20, 0.1]])

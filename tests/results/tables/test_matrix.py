@@ -10,7 +10,8 @@ import pandas as pd
 import pytest
 import xarray as xr
 
-from sobolev_batch import InputError, matrix
+from sobolev_batch import matrix
+from sobolev_batch.errors import InputError
 from sobolev_batch.results.store_accessor import distances_at
 from sobolev_batch.results.tables import Format
 from sobolev_batch.results.tables.matrix import format_matrix, matrix_frame, pairs_of

@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sobolev_batch import AccuracyError, InputError, Mesh, distance, icosphere
+from sobolev_batch import Mesh, distance
+from sobolev_batch.errors import AccuracyError, InputError
+from sobolev_batch.shapes import icosphere
 from sobolev_batch.spectral.adaptive import octaves
 from sobolev_batch.spectral.octaves.remainder import Remainder, remainder
 from tests.support.rectangles import Rectangles

@@ -26,7 +26,7 @@ from tests.support.shapes import CENTRED_BOX as BOX
     ],
 )
 def test_spheres_are_as_far_apart_as_their_closed_form_says(order: float, rtol: float) -> None:
-    a, b = sb.Sphere(0.8, (0.2, 0.0, 0.0)), sb.Sphere(0.7, (-0.2, 0.1, 0.0))
+    a, b = sb.shapes.Sphere(0.8, (0.2, 0.0, 0.0)), sb.shapes.Sphere(0.7, (-0.2, 0.1, 0.0))
     exact = sb.distance(a, b, order)["distance"].item()
     dataset = sb.distance(a, b, order, rtol=rtol)
     assert dataset["within"].item()
@@ -37,8 +37,8 @@ def test_spheres_are_as_far_apart_as_their_closed_form_says(order: float, rtol: 
 
 @pytest.mark.slow
 def test_the_papers_finest_icosphere_but_one_to_five_digits() -> None:
-    dataset = sb.distance(sb.icosphere(6), sb.Sphere(), -10.0, rtol=1e-5)
-    relative = dataset["distance"].item() / sb.norm(sb.Sphere(), -10.0)["norm"].item()
+    dataset = sb.distance(sb.shapes.icosphere(6), sb.shapes.Sphere(), -10.0, rtol=1e-5)
+    relative = dataset["distance"].item() / sb.norm(sb.shapes.Sphere(), -10.0)["norm"].item()
     assert relative == pytest.approx(7.383836e-05, rel=1e-5)
     # Far fewer points than the paper's 64 a triangle, on a lattice beyond which nothing can hide.
     assert dataset.attrs["M"] <= 150
@@ -58,15 +58,15 @@ def test_several_orders_share_what_the_most_demanding_needs() -> None:
 
 
 def test_low_accuracy_is_computed_in_single_precision() -> None:
-    assert sb.distance(sb.icosphere(1), sb.Sphere(), -5.0, rtol=1e-2).attrs["dtype"] == "complex64"
-    assert sb.distance(sb.icosphere(1), sb.Sphere(), -5.0, rtol=1e-6).attrs["dtype"] == "complex128"
+    assert sb.distance(sb.shapes.icosphere(1), sb.shapes.Sphere(), -5.0, rtol=1e-2).attrs["dtype"] == "complex64"
+    assert sb.distance(sb.shapes.icosphere(1), sb.shapes.Sphere(), -5.0, rtol=1e-6).attrs["dtype"] == "complex128"
 
 
 @pytest.mark.slow
 def test_what_is_out_of_reach_is_refused_with_what_can_be_had() -> None:
-    pair = sb.icosphere(0), sb.icosphere(1)
+    pair = sb.shapes.icosphere(0), sb.shapes.icosphere(1)
     with pytest.raises(
-        sb.AccuracyError, match=r"rtol 1e-06 is out of reach at order -2 within 0\.6 GB .* about"
+        sb.errors.AccuracyError, match=r"rtol 1e-06 is out of reach at order -2 within 0\.6 GB .* about"
     ) as caught:
         sb.distance(*pair, -2.0, rtol=1e-6, memory=6e8)
     assert caught.value.requested == 1e-6
@@ -78,8 +78,8 @@ def test_what_is_out_of_reach_is_refused_with_what_can_be_had() -> None:
 
 @pytest.mark.slow
 def test_a_best_effort_is_the_nearest_that_can_be_had() -> None:
-    a, b, rtol = sb.icosphere(3), sb.Sphere(), 1e-12
-    with pytest.raises(sb.AccuracyError, match="a best effort") as caught:
+    a, b, rtol = sb.shapes.icosphere(3), sb.shapes.Sphere(), 1e-12
+    with pytest.raises(sb.errors.AccuracyError, match="a best effort") as caught:
         sb.distance(a, b, -10.0, rtol=rtol, memory=6e8)
     found = sb.distance(a, b, -10.0, rtol=rtol, memory=6e8, best_effort=True)
     assert not found["within"].item()
@@ -89,18 +89,18 @@ def test_a_best_effort_is_the_nearest_that_can_be_had() -> None:
 
 @pytest.mark.slow
 def test_a_best_effort_that_succeeds_is_the_same() -> None:
-    a, b = sb.icosphere(1), sb.Sphere()
+    a, b = sb.shapes.icosphere(1), sb.shapes.Sphere()
     strict, best = (sb.distance(a, b, -3.0, rtol=1e-2, best_effort=best) for best in (False, True))
     # Sums in threads differ by rounding.
     xr.testing.assert_allclose(strict, best, rtol=1e-3)
     assert strict.attrs.keys() == best.attrs.keys()
-    with pytest.raises(sb.InputError, match="a best effort is made for an rtol"):
+    with pytest.raises(sb.errors.InputError, match="a best effort is made for an rtol"):
         sb.distance(a, b, -3.0, lattice=sb.Lattice(2.0, 16), best_effort=True)
 
 
 @pytest.mark.slow
 def test_what_surfaces_share_cancels() -> None:
-    ball = sb.icosphere(2)
+    ball = sb.shapes.icosphere(2)
     less = sb.Mesh(ball.vertices, ball.triangles[5:])
     patch = sb.Mesh(ball.vertices, ball.triangles[:5])
     found, expected = sb.distance(ball, less, -1.5, rtol=2e-2), sb.norm(patch, -1.5, rtol=2e-2)
@@ -129,8 +129,8 @@ def test_what_surfaces_share_cancels() -> None:
     ],
 )
 def test_refuses_what_has_no_meaning(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(sb.InputError, match=message):
-        sb.distance(**{"a": BOX, "b": sb.Sphere(), "order": -2.0, "rtol": 1e-3, **change})
+    with pytest.raises(sb.errors.InputError, match=message):
+        sb.distance(**{"a": BOX, "b": sb.shapes.Sphere(), "order": -2.0, "rtol": 1e-3, **change})
 
 
 @pytest.mark.slow
@@ -139,18 +139,20 @@ def test_surfaces_far_apart_are_no_endless_search(offset: float) -> None:
     far = sb.Mesh(BOX.vertices + offset, BOX.triangles)
     expected = np.sqrt(2) * sb.norm(BOX, -4.0, rtol=1e-3)["norm"].item()
     assert sb.distance(BOX, far, -4.0, rtol=1e-2)["distance"].item() == pytest.approx(expected, rel=1e-2)
-    with pytest.raises(sb.AccuracyError, match="below the rounding"):
-        sb.distance(BOX, sb.Sphere(), -4.0, rtol=1e-300)
+    with pytest.raises(sb.errors.AccuracyError, match="below the rounding"):
+        sb.distance(BOX, sb.shapes.Sphere(), -4.0, rtol=1e-300)
 
 
 def test_memory_as_text() -> None:
-    as_text, as_number = (sb.distance(BOX, sb.Sphere(), -5.0, rtol=0.1, memory=memory) for memory in ("600MB", 6e8))
+    as_text, as_number = (
+        sb.distance(BOX, sb.shapes.Sphere(), -5.0, rtol=0.1, memory=memory) for memory in ("600MB", 6e8)
+    )
     assert as_text.identical(as_number)
 
 
 @pytest.mark.slow
 def test_surfaces_far_from_the_origin_are_compared_where_they_are() -> None:
-    a, b = sb.icosphere(2), sb.icosphere(3)
+    a, b = sb.shapes.icosphere(2), sb.shapes.icosphere(3)
     centred = sb.distance(a, b, -3.0, rtol=1e-3)
     away = np.array([1000.0, -2000.0, 500.0])
     moved = sb.distance(
@@ -158,27 +160,31 @@ def test_surfaces_far_from_the_origin_are_compared_where_they_are() -> None:
     )
     assert moved["within"].item()
     assert abs(centred["distance"].item() - moved["distance"].item()) <= centred["error"].item() + moved["error"].item()
-    apart = sb.distance(sb.Sphere(1.0, (500.0, 0, 0)), sb.Sphere(1.0, (497.0, 0, 0)), -5.0, rtol=1e-4)
-    exact = sb.distance(sb.Sphere(), sb.Sphere(1.0, (3.0, 0, 0)), -5.0)["distance"].item()
+    apart = sb.distance(sb.shapes.Sphere(1.0, (500.0, 0, 0)), sb.shapes.Sphere(1.0, (497.0, 0, 0)), -5.0, rtol=1e-4)
+    exact = sb.distance(sb.shapes.Sphere(), sb.shapes.Sphere(1.0, (3.0, 0, 0)), -5.0)["distance"].item()
     assert abs(apart["distance"].item() - exact) <= apart["error"].item()
 
 
 def test_what_lies_below_rounding_is_refused() -> None:
-    with pytest.raises(sb.AccuracyError, match=r"rtol 1e-12 of about .* at order -10 is below the rounding") as caught:
-        sb.distance(sb.icosphere(3), sb.Sphere(), -10.0, rtol=1e-12)
+    with pytest.raises(
+        sb.errors.AccuracyError, match=r"rtol 1e-12 of about .* at order -10 is below the rounding"
+    ) as caught:
+        sb.distance(sb.shapes.icosphere(3), sb.shapes.Sphere(), -10.0, rtol=1e-12)
     assert 1e-12 < caught.value.reachable < 1e-8
-    assert sb.distance(sb.icosphere(3), sb.Sphere(), -10.0, rtol=1.5 * caught.value.reachable)["within"].item()
+    assert sb.distance(sb.shapes.icosphere(3), sb.shapes.Sphere(), -10.0, rtol=1.5 * caught.value.reachable)[
+        "within"
+    ].item()
 
 
 @pytest.mark.parametrize("order", [-40.0, -100.0])
 def test_very_negative_orders(order: float) -> None:
-    exact = sb.distance(sb.Sphere(), sb.Sphere(0.9), order)["distance"].item()
-    dataset = sb.distance(sb.Sphere(), sb.Sphere(0.9), order, rtol=1e-4)
+    exact = sb.distance(sb.shapes.Sphere(), sb.shapes.Sphere(0.9), order)["distance"].item()
+    dataset = sb.distance(sb.shapes.Sphere(), sb.shapes.Sphere(0.9), order, rtol=1e-4)
     assert abs(dataset["distance"].item() - exact) <= dataset["error"].item() <= 1e-4 * exact
 
 
 def test_a_pilot_without_a_digit_needs_no_larger_lattice() -> None:
-    ball = sb.icosphere(2)
+    ball = sb.shapes.icosphere(2)
     again = sb.Mesh(ball.vertices.copy(), ball.triangles)
     problem = Problem((again, ball), (-4.0, -10.0), Accuracy(1e-2), support_of((again, ball)), "a copy")
     assert not run_pilot(problem)[0].any()
@@ -198,7 +204,7 @@ def test_below_the_floor_errors_are_relative_to_it() -> None:
 
 
 def test_first_lattices_hold_the_surfaces_with_room_for_their_images() -> None:
-    support = Support(np.array(sb.Sphere().area), sb.Sphere().extent.widths, 1.0)
+    support = Support(np.array(sb.shapes.Sphere().area), sb.shapes.Sphere().extent.widths, 1.0)
     for order in (-3.0, -6.0, -12.0):
         loose, tight = (first_lattice(support, [order], Accuracy(rtol))[0] for rtol in (1e-2, 1e-6))
         assert 1 / loose.spacing > 2.5

@@ -23,7 +23,7 @@ def bounded(surface: Surface, reference: Surface, order: float, threshold: float
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_spheres_against_their_closed_form(order: float, method: str, gap: float, sign: int) -> None:
     side = 1 + sign * gap
-    surface, reference = sb.Sphere(0.97, (0.01, 0.02, 0.0)), sb.Sphere()
+    surface, reference = sb.shapes.Sphere(0.97, (0.01, 0.02, 0.0)), sb.shapes.Sphere()
     truth = float(sb.distance(surface, reference, order)["distance"] / sb.norm(reference, order)["norm"])
     found, used = bounded(surface, reference, order, side * truth)
     assert found.lower <= truth <= found.upper
@@ -45,7 +45,7 @@ def test_surfaces_that_repeat_beyond_the_lattice(order: float, threshold: float)
 
 
 def test_a_distance_at_the_threshold_is_left_undecided() -> None:
-    surface, reference = sb.Sphere(0.97), sb.Sphere()
+    surface, reference = sb.shapes.Sphere(0.97), sb.shapes.Sphere()
     truth = float(sb.distance(surface, reference, -4.0)["distance"] / sb.norm(reference, -4.0)["norm"])
     found, _ = bounded(surface, reference, -4.0, truth)
     assert found.lower <= truth <= found.upper
@@ -54,6 +54,6 @@ def test_a_distance_at_the_threshold_is_left_undecided() -> None:
 
 
 def test_surfaces_that_do_not_feel_each_other_are_as_far_apart_as_their_norms_say() -> None:
-    found, _ = bounded(sb.Sphere(1.0, (1e6, -2e6, 0.0)), sb.Sphere(), -4.0, 1e-3)
+    found, _ = bounded(sb.shapes.Sphere(1.0, (1e6, -2e6, 0.0)), sb.shapes.Sphere(), -4.0, 1e-3)
     assert found.lower == pytest.approx(2**0.5, rel=0.05)
     assert found.lower <= 2**0.5 <= found.upper

@@ -28,7 +28,7 @@ WITNESS_ORDERS = [-0.8, -3.0, -10.0]
 
 
 def as_field(values: Complexes, lattice: sb.Lattice) -> xr.DataArray:
-    return sb.fourier_transform(sb.Sphere(0.1), lattice).copy(data=values)
+    return sb.fourier_transform(sb.shapes.Sphere(0.1), lattice).copy(data=values)
 
 
 def random_values(rng: np.random.Generator) -> Complexes:
@@ -63,7 +63,7 @@ def test_near_twins_keep_their_digits() -> None:
 
 @pytest.mark.parametrize("bands", [None, 1, 7, 40])
 def test_bands_add_up_to_the_squared_distance(bands: int | None) -> None:
-    a, b = sb.fourier_transform(BOX, LATTICE), sb.fourier_transform(sb.Sphere(), LATTICE)
+    a, b = sb.fourier_transform(BOX, LATTICE), sb.fourier_transform(sb.shapes.Sphere(), LATTICE)
     dataset = sb.spectrum(a, b, ORDERS, bands=bands)
     squares = sb.distance(a, b, ORDERS)["distance"].values ** 2
     assert dataset["squared"].sum("band").values == pytest.approx(squares, rel=1e-12)
@@ -78,7 +78,7 @@ def test_bands_are_sums_over_the_whole_lattice() -> None:
     rng = np.random.default_rng(0)
     lattice = sb.Lattice(1.5, 6)
     values = rng.standard_normal(lattice.shape) + 1j * rng.standard_normal(lattice.shape)
-    field = sb.fourier_transform(sb.Sphere(0.1), lattice).copy(data=values)
+    field = sb.fourier_transform(sb.shapes.Sphere(0.1), lattice).copy(data=values)
     edges = [0.0, 0.5, 0.8, 1.5, 2.1]  # the shells |k|² = 1 and 9 lie on edges, those beyond 17 in no band
     dataset = sb.spectrum(field, None, -2.0, bands=edges)
     whole, weights = on_whole_cube(values, lattice, 0.0)
@@ -94,23 +94,23 @@ def test_bands_are_sums_over_the_whole_lattice() -> None:
 
 
 def test_energy_of_a_sphere_is_twice_its_area_in_the_mean() -> None:
-    whole = sb.spectrum(sb.Sphere(), None, -2.0, bands=[1.0, 5.0], lattice=sb.Lattice(5.0, 160))
-    assert whole["energy"].item() == pytest.approx(2 * sb.Sphere().area, rel=0.02)
+    whole = sb.spectrum(sb.shapes.Sphere(), None, -2.0, bands=[1.0, 5.0], lattice=sb.Lattice(5.0, 160))
+    assert whole["energy"].item() == pytest.approx(2 * sb.shapes.Sphere().area, rel=0.02)
 
 
 def test_default_bands_and_wavelengths() -> None:
-    similarity = sb.Similarity(0.02)
-    dataset = sb.spectrum(sb.icosphere(2), sb.Sphere(), -3.0, lattice=LATTICE, similarity=similarity)
+    similarity = sb.shapes.Similarity(0.02)
+    dataset = sb.spectrum(sb.shapes.icosphere(2), sb.shapes.Sphere(), -3.0, lattice=LATTICE, similarity=similarity)
     assert dataset["upper"].values == pytest.approx([0.5, 1, 2, 4, 4 * 3**0.5])
     assert dataset["lower"].values[0] == 0
     assert dataset["longest_wavelength"].values == pytest.approx([np.inf, 2, 1, 0.5, 0.25])
     assert dataset["own_shortest_wavelength"].values[:4] == pytest.approx([100, 50, 25, 12.5])
     assert dataset["squared"].dims == ("band",)
-    assert "own_longest_wavelength" not in sb.spectrum(sb.Sphere(), None, -3.0, lattice=LATTICE).coords
+    assert "own_longest_wavelength" not in sb.spectrum(sb.shapes.Sphere(), None, -3.0, lattice=LATTICE).coords
 
 
 def test_equal_fields_have_no_shares_and_missing_samples_no_numbers() -> None:
-    a = sb.fourier_transform(sb.Sphere(), LATTICE)
+    a = sb.fourier_transform(sb.shapes.Sphere(), LATTICE)
     assert np.isnan(sb.spectrum(a, a, -2.0)["share"].values).all()
     assert np.isnan(sb.distance(a, a, -2.0)["area_share"].item())
     damaged = a.copy()
@@ -124,8 +124,8 @@ def test_equal_fields_have_no_shares_and_missing_samples_no_numbers() -> None:
     "bands", [0, -3, [1.0], [1.0, 1.0], [2.0, 1.0], [-1.0, 1.0], [0.0, np.inf], "octaves", [[0, 1]]]
 )
 def test_refuses_bands(bands: object) -> None:
-    with pytest.raises(sb.InputError, match="band"):
-        sb.spectrum(sb.Sphere(), None, -2.0, lattice=LATTICE, bands=bands)  # type: ignore[arg-type]
+    with pytest.raises(sb.errors.InputError, match="band"):
+        sb.spectrum(sb.shapes.Sphere(), None, -2.0, lattice=LATTICE, bands=bands)  # type: ignore[arg-type]
 
 
 def random_pair(seed: int) -> tuple[Complexes, Complexes]:
@@ -185,17 +185,19 @@ def test_is_positive_where_the_first_has_more() -> None:
     lattice = sb.Lattice(4.0, 40)
     right = np.array([[1.0, 0, 0], [-1.0, 0, 0]])
     evaluated = sb.witness(
-        sb.Sphere(0.5, (0.5, 0, 0)), sb.Sphere(0.5, (-0.5, 0, 0)), -4.0, right, lattice=lattice
+        sb.shapes.Sphere(0.5, (0.5, 0, 0)), sb.shapes.Sphere(0.5, (-0.5, 0, 0)), -4.0, right, lattice=lattice
     ).values
     assert evaluated[0] > 0 > evaluated[1]
     assert evaluated[0] == pytest.approx(-evaluated[1], rel=1e-9)
-    assert sb.witness(sb.Sphere(), sb.Sphere(), -4.0, right, lattice=lattice).values == pytest.approx([0, 0], abs=1e-15)
+    assert sb.witness(sb.shapes.Sphere(), sb.shapes.Sphere(), -4.0, right, lattice=lattice).values == pytest.approx(
+        [0, 0], abs=1e-15
+    )
 
 
 def test_single_precision() -> None:
     lattice = sb.Lattice(4.0, 40)
     points = np.random.default_rng(8).uniform(-1, 1, (5_000, 3))
-    a, b = (sb.fourier_transform(surface, lattice) for surface in (BOX, sb.Sphere()))
+    a, b = (sb.fourier_transform(surface, lattice) for surface in (BOX, sb.shapes.Sphere()))
     exact = sb.witness(a, b, -3.0, points, eps=1e-13, threads=1)
     scale = float(np.abs(exact).max())
     single = sb.witness(a, b, -3.0, points, dtype="complex64", threads=1)
@@ -212,12 +214,12 @@ def test_missing_samples_and_no_points() -> None:
 
 def test_refusals() -> None:
     field = as_field(random_pair(0)[0], RANDOM)
-    with pytest.raises(sb.LatticeError, match=r"points reach to \|coordinate\| = 1\.2, .* < 1/\(2h\) = 1;"):
+    with pytest.raises(sb.errors.LatticeError, match=r"points reach to \|coordinate\| = 1\.2, .* < 1/\(2h\) = 1;"):
         sb.witness(field, field, -2.0, [[0, -1.2, 0]])
     for points, message in (([[1.0, 2.0]], r"\(1, 2\)"), ([[np.nan, 0, 0]], "1 of 1 points"), ("x", "real numbers")):
-        with pytest.raises(sb.InputError, match=message):
+        with pytest.raises(sb.errors.InputError, match=message):
             sb.witness(field, field, -2.0, points)
-    with pytest.raises(sb.OrderError):
+    with pytest.raises(sb.errors.OrderError):
         sb.witness(field, field, -0.5, np.zeros((1, 3)))
-    with pytest.raises(sb.InputError, match="dtype"):
+    with pytest.raises(sb.errors.InputError, match="dtype"):
         sb.witness(field, field, -2.0, np.zeros((1, 3)), dtype="float32")  # type: ignore[arg-type]

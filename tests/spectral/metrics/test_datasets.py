@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from sobolev_batch import Lattice, Sphere, distance, fourier_transform, icosphere, norm, spectrum, witness
+from sobolev_batch import Lattice, distance, fourier_transform, norm, spectrum, witness
+from sobolev_batch.shapes import Sphere, icosphere
 from sobolev_batch.spectral.metrics.datasets import observed_rates
 
 LATTICE = Lattice(2.0, 16)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sobolev_batch import Lattice, Sphere, distance, fourier_transform, icosphere
+from sobolev_batch import Lattice, distance, fourier_transform
+from sobolev_batch.shapes import Sphere, icosphere
 from sobolev_batch.spectral.budget import add_sums, sums_of_shells
 from sobolev_batch.spectral.lattice import SobolevWeights, shell_sums
 from sobolev_batch.spectral.metrics.gram import Arrangement, differences

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from sobolev_batch import InputError, Lattice, Mesh, Sphere, distance, icosphere, yardsticks
+from sobolev_batch import Lattice, Mesh, distance, yardsticks
+from sobolev_batch.errors import InputError
+from sobolev_batch.shapes import Sphere, icosphere
 from sobolev_batch.surfaces.sources.generated import decimated, with_noise
 
 LATTICE = Lattice(3.0, 32)

@@ -10,7 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import quad
 
-from sobolev_batch import Mesh, Sphere, Torus, icosphere
+from sobolev_batch import Mesh
+from sobolev_batch.shapes import Sphere, Torus, icosphere
 from sobolev_batch.spectral.exact import exact_transform, sphere_transform
 from sobolev_batch.spectral.lattice import smooth_step
 from sobolev_batch.spectral.octaves.sampling import FaceNormals, Octave, OctaveSampling, TailSampling

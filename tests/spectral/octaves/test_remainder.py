@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import sobolev_batch as sb
-from sobolev_batch import Mesh, Sphere
+from sobolev_batch import Mesh
+from sobolev_batch.shapes import Sphere
 from sobolev_batch.spectral.fields import Quality, TailQuality
 from sobolev_batch.spectral.octaves.remainder import remainder
 from sobolev_batch.spectral.probe import Probe
@@ -24,7 +25,7 @@ PLATES, MOVED = (Rectangles.tapered(40, 1 / 20, 0.2, offset) for offset in (0.0,
 
 
 def test_energies_of_one_surface_are_twice_its_area() -> None:
-    for surface in (BOX, Sphere(0.7, (0.1, 0.2, 0.3)), sb.Torus(1.0, 0.4)):
+    for surface in (BOX, Sphere(0.7, (0.1, 0.2, 0.3)), sb.shapes.Torus(1.0, 0.4)):
         beyond = remainder([surface], [1], 60.0, ORDERS, points=200)
         assert np.allclose(beyond.energies, 2 * surface.area, rtol=0.02), surface
 
@@ -84,7 +85,7 @@ def test_a_remainder_survives_the_quality_of_a_field() -> None:
 
 
 def test_between_the_orders_of_a_study_energies_are_interpolated() -> None:
-    pair: list[Surface] = [sb.icosphere(3), Sphere()]
+    pair: list[Surface] = [sb.shapes.icosphere(3), Sphere()]
     usual = remainder(pair, [1, -1], 60.0, points=1000)
     for order in (-0.6, -0.85, -1.25, -1.75, -2.5):
         (value,), (error,) = usual.at([order])

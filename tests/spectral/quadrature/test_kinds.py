@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sobolev_batch import InputError, Lattice, Mesh, Torus, fourier_transform, icosphere
+from sobolev_batch import Lattice, Mesh, fourier_transform
+from sobolev_batch.errors import InputError
+from sobolev_batch.shapes import Torus, icosphere
 from sobolev_batch.spectral import kinds, quadrature
 from sobolev_batch.spectral.backends import CPU
 from sobolev_batch.spectral.exact import exact_transform

@@ -23,9 +23,9 @@ Reals = NDArray[np.float64]
 
 LATTICE = sb.Lattice(4.0, 32)
 SMOOTH = [
-    sb.Ellipsoid((1.0, 0.7, 0.4), (0.1, -0.2, 0.3)),
-    sb.Torus(1.0, 0.4, (0.1, -0.2, 0.3)),
-    turned_torus(sb.Torus(0.9, 0.3)),
+    sb.shapes.Ellipsoid((1.0, 0.7, 0.4), (0.1, -0.2, 0.3)),
+    sb.shapes.Torus(1.0, 0.4, (0.1, -0.2, 0.3)),
+    turned_torus(sb.shapes.Torus(0.9, 0.3)),
 ]
 
 
@@ -42,8 +42,8 @@ def half_values(surface: Smooth, eps: float = 1e-14) -> NDArray[np.complex128]:
 
 @pytest.mark.slow
 def test_the_sphere_as_a_parametrised_surface_is_the_closed_form() -> None:
-    exact = sb.fourier_transform(sb.Sphere(), LATTICE)
-    for surface in (sb.Ellipsoid(), angular_ball()):
+    exact = sb.fourier_transform(sb.shapes.Sphere(), LATTICE)
+    for surface in (sb.shapes.Ellipsoid(), angular_ball()):
         field = sb.fourier_transform(surface, LATTICE, 1e-14, threads=1)
         assert np.abs(field.values - exact.values).max() < 1e-12 * 4 * math.pi
 
@@ -51,10 +51,10 @@ def test_the_sphere_as_a_parametrised_surface_is_the_closed_form() -> None:
 # Surfaces, and their transforms at any frequency: integrals of Bessel functions. Ellipsoids with another axis as the
 # pole's have other nodes.
 INTEGRALS: dict[str, tuple[Smooth, Callable[[float, float, float], float]]] = {
-    "torus": (sb.Torus(1.0, 0.4), lambda x, y, z: torus_value(1.0, 0.4, math.hypot(x, y), z)),
-    "oblate": (sb.Ellipsoid((1.0, 1.0, 0.4)), lambda x, y, z: spheroid_value(1.0, 0.4, math.hypot(x, y), z)),
-    "prolate": (sb.Ellipsoid((0.4, 0.4, 1.0)), lambda x, y, z: spheroid_value(0.4, 1.0, math.hypot(x, y), z)),
-    "lying": (sb.Ellipsoid((0.4, 1.0, 1.0)), lambda x, y, z: spheroid_value(1.0, 0.4, math.hypot(y, z), x)),
+    "torus": (sb.shapes.Torus(1.0, 0.4), lambda x, y, z: torus_value(1.0, 0.4, math.hypot(x, y), z)),
+    "oblate": (sb.shapes.Ellipsoid((1.0, 1.0, 0.4)), lambda x, y, z: spheroid_value(1.0, 0.4, math.hypot(x, y), z)),
+    "prolate": (sb.shapes.Ellipsoid((0.4, 0.4, 1.0)), lambda x, y, z: spheroid_value(0.4, 1.0, math.hypot(x, y), z)),
+    "lying": (sb.shapes.Ellipsoid((0.4, 1.0, 1.0)), lambda x, y, z: spheroid_value(1.0, 0.4, math.hypot(y, z), x)),
 }
 
 
@@ -92,7 +92,7 @@ def test_waves_that_the_first_nodes_cannot_see_are_seen_when_they_are_doubled() 
         radii = 1 + 0.02 * np.cos(62 * v)
         return radii * np.sin(u) * np.cos(v), radii * np.sin(u) * np.sin(v), np.cos(u)
 
-    surface = sb.ParametrisedSurface(rippled, HALF_TURN, TURN)
+    surface = sb.shapes.ParametrisedSurface(rippled, HALF_TURN, TURN)
     assert resolution_of(surface, 0.01, 1e-9)[0][1] > 2 * 62
     assert surface.area > 1.2 * 4 * math.pi
 
@@ -101,12 +101,12 @@ def test_a_kink_is_refused_with_both_numbers(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(kinds, "MOST_NODES", 1 << 14)
     surface = Roof()
     with pytest.raises(
-        sb.InputError, match=r"not settled to 1e-09 of its area with 16384 nodes.* it still changes by .*kink"
+        sb.errors.InputError, match=r"not settled to 1e-09 of its area with 16384 nodes.* it still changes by .*kink"
     ):
         sb.fourier_transform(surface, LATTICE)
     # One that is large beside the wavelength is refused at once.
-    with pytest.raises(sb.InputError, match="it would take more to begin with"):
-        resolution_of(sb.Torus(1.0, 0.4), 1e4, 1e-9)
+    with pytest.raises(sb.errors.InputError, match="it would take more to begin with"):
+        resolution_of(sb.shapes.Torus(1.0, 0.4), 1e4, 1e-9)
     # Where less is asked for, it converges, if slowly.
     assert resolution_of(surface, 2.0, 1e-4)[1] <= 1e-4
 
@@ -144,8 +144,8 @@ def test_what_doubling_the_nodes_changes_is_reported() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("rtol", [1e-2, 1e-5])
 def test_a_norm_to_an_accuracy(rtol: float) -> None:
-    exact = sb.norm(sb.Sphere(0.8), [-3.0, -6.0])["norm"].values
-    found = sb.norm(sb.Ellipsoid((0.8, 0.8, 0.8), (3.0, 0.0, 1.0)), [-3.0, -6.0], rtol=rtol)
+    exact = sb.norm(sb.shapes.Sphere(0.8), [-3.0, -6.0])["norm"].values
+    found = sb.norm(sb.shapes.Ellipsoid((0.8, 0.8, 0.8), (3.0, 0.0, 1.0)), [-3.0, -6.0], rtol=rtol)
     assert found["within"].all()
     assert (np.abs(found["norm"].values - exact) <= found["error"].values).all()
     assert (found["error"].values <= rtol * exact).all()
@@ -165,9 +165,11 @@ def test_a_gpu_gets_the_same_nodes() -> None:
 
 @pytest.mark.slow
 def test_thin_ellipsoids_take_nodes_in_proportion_and_end_in_a_refusal() -> None:
-    fewer, more = (resolution_of(sb.Ellipsoid((1.0, 1.0, thickness)), 2.0, 1e-9)[0][0] for thickness in (0.04, 0.01))
+    fewer, more = (
+        resolution_of(sb.shapes.Ellipsoid((1.0, 1.0, thickness)), 2.0, 1e-9)[0][0] for thickness in (0.04, 0.01)
+    )
     assert 2 * fewer < more < 8 * fewer
     with pytest.raises(
-        sb.InputError, match=r"\(2048 along a parameter that is not periodic\); with \d+ x \d+ it still"
+        sb.errors.InputError, match=r"\(2048 along a parameter that is not periodic\); with \d+ x \d+ it still"
     ):
-        resolution_of(sb.Ellipsoid((1.0, 1.0, 1e-5)), 2.0, 1e-9)
+        resolution_of(sb.shapes.Ellipsoid((1.0, 1.0, 1e-5)), 2.0, 1e-9)

@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sobolev_batch import InputError, Lattice, LatticeError, Mesh, Sphere, fourier_transform, icosphere, norm
+from sobolev_batch import Lattice, Mesh, fourier_transform, norm
+from sobolev_batch.errors import InputError, LatticeError
+from sobolev_batch.shapes import Sphere, icosphere
 from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.exact import exact_transform
 from sobolev_batch.spectral.fields import field_for
@@ -124,7 +126,7 @@ import sobolev_batch as sb
 from sobolev_batch.spectral.transform import Execution, TransformSettings
 from sobolev_batch.spectral.transform import projected_bytes, transform_block
 
-mesh, lattice, settings = sb.icosphere(5), sb.Lattice(5.0, {intervals}), TransformSettings()
+mesh, lattice, settings = sb.shapes.icosphere(5), sb.Lattice(5.0, {intervals}), TransformSettings()
 mesh.areas, mesh.centroid_radii, mesh.extent
 settings.plan(mesh, lattice).lowest_degree
 unit = 1 if sys.platform == "darwin" else 1024

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sobolev_batch import MeshError, icosphere
+from sobolev_batch.errors import MeshError
+from sobolev_batch.shapes import icosphere
 from tests.support.mesh_files import Gltf, Read, box_scene
 from tests.support.shapes import BOX_AREA, BOX_TRIANGLES, BOX_VERTICES, CLOSED, box, soup
 

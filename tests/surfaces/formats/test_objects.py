@@ -105,12 +105,12 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
 @pytest.mark.parametrize("name", WRONG)
 def test_what_is_no_mesh_is_refused_by_its_type(name: str) -> None:
     make, reason = WRONG[name]
-    with pytest.raises(sb.InputError, match=reason):
+    with pytest.raises(sb.errors.InputError, match=reason):
         sb.as_mesh(make())
 
 
 LATTICE = sb.Lattice(2.0, 12)
-BALL = sb.icosphere(0)
+BALL = sb.shapes.icosphere(0)
 # Every function that takes a mesh; the target is a field, since closeness to a surface takes longer.
 USES: dict[str, Callable[[Any, xr.DataArray], Any]] = {
     "distance": lambda mesh, target: sb.distance(mesh, target, -2.0)["distance"].item(),
@@ -119,16 +119,18 @@ USES: dict[str, Callable[[Any, xr.DataArray], Any]] = {
     "witness": lambda mesh, target: sb.witness(mesh, target, -2.0, [[0, 0, 0]]).item(),
     "fourier_transform": lambda mesh, _: abs(sb.fourier_transform(mesh, LATTICE)).sum().item(),
     "proximity": lambda mesh, _: sb.proximity(mesh, BALL, points=10).hausdorff,
-    "gradient": lambda mesh, target: sb.gradient(mesh, target, -2.0, threads=1)["squared_distance"].item(),
-    "target": lambda mesh, _: sb.SquaredDistance.for_mesh(BALL, mesh, -2.0, lattice=LATTICE).value(BALL.vertices),
+    "gradient": lambda mesh, target: sb.fitting.gradient(mesh, target, -2.0, threads=1)["squared_distance"].item(),
+    "target": lambda mesh, _: sb.fitting.SquaredDistance.for_mesh(BALL, mesh, -2.0, lattice=LATTICE).value(
+        BALL.vertices
+    ),
     "fit": lambda mesh, target: sb.fit(mesh, target, -4.0, steps=1, threads=1).mesh.area,
-    "refine": lambda mesh, target: sb.refine(mesh, target, -4.0, triangles=21, steps=1, threads=1).mesh.area,
+    "refine": lambda mesh, target: sb.fitting.refine(mesh, target, -4.0, triangles=21, steps=1, threads=1).mesh.area,
 }
 
 
 @pytest.fixture(scope="module")
 def target() -> xr.DataArray:
-    return sb.fourier_transform(sb.Sphere(1.2), LATTICE)
+    return sb.fourier_transform(sb.shapes.Sphere(1.2), LATTICE)
 
 
 @pytest.mark.slow
@@ -147,7 +149,7 @@ def test_every_function_takes_paths_and_meshes_of_other_libraries(
 def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     # Python's own way to say that a module cannot be imported.
     monkeypatch.setitem(sys.modules, "pyvista", None)
-    with pytest.raises(sb.InputError, match=r"PyVista .* pip install 'sobolev-batch\[vtk\]'"):
+    with pytest.raises(sb.errors.InputError, match=r"PyVista .* pip install 'sobolev-batch\[vtk\]'"):
         box().to_pyvista()
 
 

@@ -16,7 +16,8 @@ import pytest
 import trimesh
 
 import sobolev_batch as sb
-from sobolev_batch import Mesh, icosphere, read_mesh
+from sobolev_batch import Mesh, read_mesh
+from sobolev_batch.shapes import icosphere
 from sobolev_batch.surfaces.formats.readers import mesh_format, mesh_stem
 from tests.support.mesh_files import BIG, BOXES, LITTLE, OFF_BOX, WRITERS, Read, obj, off, ply, stl_text
 from tests.support.shapes import (
@@ -262,7 +263,7 @@ def test_files_of_trimesh_are_read(read: Read, ending: str, options: dict[str, A
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".OBJ", ".stl"])
 def test_written_digits_come_back_and_other_programs_read_them(suffix: str, tmp_path: Path) -> None:
-    ball, path = sb.icosphere(2), tmp_path / f"mesh{suffix}"
+    ball, path = sb.shapes.icosphere(2), tmp_path / f"mesh{suffix}"
     if suffix != ".stl":
         sb.write_mesh(MESH, path)
         assert sb.read_mesh(path).digest == MESH.digest
@@ -278,10 +279,10 @@ def test_written_digits_come_back_and_other_programs_read_them(suffix: str, tmp_
 @pytest.mark.parametrize(
     ("name", "error", "message"),
     [
-        ("mesh.xyz", sb.InputError, re.escape("are written as .ply, .obj, .stl, .off; found the suffix '.xyz'")),
-        ("nowhere/mesh.ply", sb.InputError, "there is no folder"),
-        ("folder.ply", sb.InputError, "it exists already and is no file"),
-        (f"{'x' * 300}.ply", sb.MeshError, "cannot be written there: File name too long"),
+        ("mesh.xyz", sb.errors.InputError, re.escape("are written as .ply, .obj, .stl, .off; found the suffix '.xyz'")),
+        ("nowhere/mesh.ply", sb.errors.InputError, "there is no folder"),
+        ("folder.ply", sb.errors.InputError, "it exists already and is no file"),
+        (f"{'x' * 300}.ply", sb.errors.MeshError, "cannot be written there: File name too long"),
     ],
 )
 def test_what_cannot_be_written_is_named(tmp_path: Path, name: str, error: type[Exception], message: str) -> None:
@@ -293,12 +294,12 @@ def test_what_cannot_be_written_is_named(tmp_path: Path, name: str, error: type[
 
 def test_an_old_file_stays_until_the_new_one_is_whole(tmp_path: Path) -> None:
     path = tmp_path / "mesh.ply"
-    sb.write_mesh(sb.icosphere(0), path)
+    sb.write_mesh(sb.shapes.icosphere(0), path)
     before = path.read_bytes()
     with (
         full_disk(len(before)),
-        pytest.raises(sb.MeshError, match=r"mesh\.ply: .* cannot be written .*: File too large"),
+        pytest.raises(sb.errors.MeshError, match=r"mesh\.ply: .* cannot be written .*: File too large"),
     ):
-        sb.write_mesh(sb.icosphere(3), path)
+        sb.write_mesh(sb.shapes.icosphere(3), path)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]

@@ -11,7 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from sobolev_batch import MeshError, icosphere, read_mesh, write_mesh
+from sobolev_batch import read_mesh, write_mesh
+from sobolev_batch.errors import MeshError
+from sobolev_batch.shapes import icosphere
 from sobolev_batch.surfaces.formats import parsing
 from sobolev_batch.surfaces.formats.readers import expected_size
 from tests.support.mesh_attacks import ATTACKS

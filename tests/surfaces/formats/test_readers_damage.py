@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sobolev_batch import MeshError, read_mesh
+from sobolev_batch import read_mesh
+from sobolev_batch.errors import MeshError
 from tests.support.mesh_files import (
     BIG,
     BOXES,

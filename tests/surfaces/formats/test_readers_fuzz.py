@@ -13,7 +13,8 @@ from random import Random
 import numpy as np
 import pytest
 
-from sobolev_batch import MeshError, read_mesh
+from sobolev_batch import read_mesh
+from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.formats.readers import expected_size
 from tests.support.mesh_files import BOXES, LITTLE, Content, ply
 from tests.support.shapes import BOX_MIXED, BOX_VERTICES

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import pyvista
 
-from sobolev_batch import MeshError, read_mesh
+from sobolev_batch import read_mesh
+from sobolev_batch.errors import MeshError
 from tests.support.shapes import AWKWARD_VERTICES, BOX_AREA, BOX_MIXED, BOX_QUADS, BOX_TRIANGLES, BOX_VERTICES, CLOSED
 
 KINDS = [(suffix, binary) for suffix in (".vtk", ".vtp", ".vtu") for binary in (True, False)]

@@ -12,7 +12,9 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import ellipe
 
-from sobolev_batch import Ellipsoid, InputError, Mesh, Similarity, Sphere, Torus, icosphere
+from sobolev_batch import Mesh
+from sobolev_batch.errors import InputError
+from sobolev_batch.shapes import Ellipsoid, Similarity, Sphere, Torus, icosphere
 from sobolev_batch.surfaces.shapes.smooth import Smooth
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS
 from tests.support.shapes import CLOSED

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sobolev_batch import Mesh, MeshError
+from sobolev_batch import Mesh
+from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.shapes.mesh import shared_triangles
 from tests.support.shapes import (
     AWKWARD_VERTICES,

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sobolev_batch import Mesh, Similarity, Sphere, icosphere
+from sobolev_batch import Mesh
+from sobolev_batch.shapes import Similarity, Sphere, icosphere
 from sobolev_batch.surfaces.shapes.surface import placement_doubt
 from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES, box, tetrahedron
 

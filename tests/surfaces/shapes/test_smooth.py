@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from scipy.special import eval_legendre
 
-from sobolev_batch import InputError, Interval, ParametrisedSurface, Similarity, Torus
+from sobolev_batch.errors import InputError
+from sobolev_batch.shapes import Interval, ParametrisedSurface, Similarity, Torus
 from tests.support.shapes import HALF_TURN, ROTATION, TURN, angular_ball, ball, plate, turned_torus
 
 TORUS = Torus(1.0, 0.4)

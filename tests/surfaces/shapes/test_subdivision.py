@@ -14,7 +14,7 @@ from tests.support.shapes import CLOSED
 
 def open_mesh() -> sb.Mesh:
     """Return a bumpy sheet with a boundary, an edge of three triangles and vertices that are not used."""
-    ball = sb.icosphere(2)
+    ball = sb.shapes.icosphere(2)
     upper = np.asarray(ball.triangles)[np.asarray(ball.vertices)[ball.triangles][..., 2].mean(axis=1) > 0]
     vertices = np.asarray(ball.vertices) * (1 + 0.2 * np.sin(7 * np.asarray(ball.vertices)[:, :1]))
     fin = [[upper[0, 0], upper[0, 1], len(vertices)]]
@@ -27,7 +27,7 @@ def normals(mesh: sb.Mesh) -> np.ndarray:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.05, 0.3, 0.7, 1.0])
-@pytest.mark.parametrize("mesh", [sb.icosphere(2), open_mesh()], ids=["closed", "open"])
+@pytest.mark.parametrize("mesh", [sb.shapes.icosphere(2), open_mesh()], ids=["closed", "open"])
 def test_a_split_mesh_is_the_same_surface(mesh: sb.Mesh, share: float) -> None:
     edges = Edges.from_mesh(mesh)
     marks = np.random.default_rng(7).random(len(edges.ends)) < share
@@ -47,7 +47,7 @@ def test_a_split_mesh_is_the_same_surface(mesh: sb.Mesh, share: float) -> None:
 
 @pytest.mark.parametrize("wanted", [320, 321, 330, 500, 1000, 1279, 1280, 10_000])
 def test_the_best_triangles_are_as_many_as_fit(wanted: int) -> None:
-    edges = Edges.from_mesh(sb.icosphere(2))
+    edges = Edges.from_mesh(sb.shapes.icosphere(2))
     # Scores that fall from one point on, as those of a place with much detail do.
     scores = -np.linalg.norm(np.asarray(edges.mesh.vertices)[edges.mesh.triangles].mean(axis=1) - [0.1, 0.2, 1], axis=1)
     marks = edges.best(scores, wanted)
@@ -75,7 +75,7 @@ def test_triangles_do_not_become_ever_thinner() -> None:
 
 @pytest.mark.parametrize("level", range(6))
 def test_the_surface_is_closed_and_on_the_sphere(level: int) -> None:
-    mesh = sb.icosphere(level)
+    mesh = sb.shapes.icosphere(level)
     assert (len(mesh.vertices), len(mesh.triangles)) == (10 * 4**level + 2, 20 * 4**level)
     assert set(mesh.triangles.ravel()) == set(range(len(mesh.vertices)))
     assert mesh.counts == CLOSED
@@ -86,4 +86,4 @@ def test_the_surface_is_closed_and_on_the_sphere(level: int) -> None:
     volumes = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
     assert (np.sign(volumes) == np.sign(volumes[0])).all()
     assert abs(volumes.sum()) < 4 / 3 * math.pi
-    assert mesh.digest == sb.icosphere(level).digest
+    assert mesh.digest == sb.shapes.icosphere(level).digest

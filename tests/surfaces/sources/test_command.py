@@ -39,7 +39,7 @@ def test_lists_are_swept_and_every_value_is_known(tmp_path: Path) -> None:
     family = made({**HALVED, "size": [0.25, 2.0], "flip": False}, tmp_path)
     assert listed(family) == [("0.25", -1), ("2", -1)]
     assert family[0].metadata == (("size", 0.25), ("flip", "false"))
-    assert loaded(family[0]).area == pytest.approx(sb.icosphere(3).area / 16)
+    assert loaded(family[0]).area == pytest.approx(sb.shapes.icosphere(3).area / 16)
     several = made({**HALVED, "size": [0.25, 2.0], "flip": [True, False]}, tmp_path)
     assert [member.name for member in several][:2] == ["size=0.25,flip=true", "size=0.25,flip=false"]
     assert len({member.fingerprint_digest() for member in several}) == 4
@@ -71,7 +71,7 @@ def test_a_mesh_is_made_once_and_found_again(tmp_path: Path) -> None:
     log, place = tmp_path / "log", tmp_path / "kept"
     table = {**COUNTED, "log": str(log)}
     first, again = made(table, place)[0], pickle.loads(pickle.dumps(made(table, place)[0]))
-    assert loaded(first).digest == loaded(again).digest == sb.icosphere(3).digest
+    assert loaded(first).digest == loaded(again).digest == sb.shapes.icosphere(3).digest
     assert len(log.read_text()) == 1
     cost = again.cost()
     assert cost is not None
@@ -79,12 +79,12 @@ def test_a_mesh_is_made_once_and_found_again(tmp_path: Path) -> None:
     assert cost.make_cpu_seconds > 0
     # Where it may not run, what is kept is found, and nothing else.
     assert loaded(made(table, place, may_run=False)[0]) is not None
-    with pytest.raises(sb.MeshError, match=r"may not run.*--allow-commands"):
+    with pytest.raises(sb.errors.MeshError, match=r"may not run.*--allow-commands"):
         made(table, tmp_path / "elsewhere", may_run=False)[0].load()
     # What is damaged is made again.
     (ply,) = place.glob("*.ply")
     ply.write_bytes(ply.read_bytes()[:-100] + bytes(100))
-    assert loaded(first).digest == sb.icosphere(3).digest
+    assert loaded(first).digest == sb.shapes.icosphere(3).digest
     assert len(log.read_text()) == 2
 
 
@@ -115,7 +115,7 @@ def test_all_that_a_mesh_depends_on_is_in_its_fingerprint(tmp_path: Path) -> Non
     (tmp_path / "copy.sh").write_text("cat $1 > $2")
     assert digest() != first
     (tmp_path / "copy.sh").unlink()
-    with pytest.raises(sb.MeshError, match=r"copy\.sh"):
+    with pytest.raises(sb.errors.MeshError, match=r"copy\.sh"):
         digest()
 
 
@@ -136,7 +136,7 @@ def test_a_program_that_fails_says_why(tmp_path: Path, command: str, reason: str
     timeout = 0.3 if "sleep" in command else 60
     limits = {"timeout": timeout, "largest_output": 100_000}
     member = made({**COPY, "command": ["sh", "-c", command + " # {output}"], **limits}, tmp_path)[0]
-    with pytest.raises(sb.MeshError, match=reason):
+    with pytest.raises(sb.errors.MeshError, match=reason):
         member.load()
     cost = member.cost()
     assert cost is not None
@@ -145,9 +145,9 @@ def test_a_program_that_fails_says_why(tmp_path: Path, command: str, reason: str
 
 @pytest.mark.process
 def test_a_program_that_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(sb.MeshError, match="no-such-remesher cannot be started on this machine"):
+    with pytest.raises(sb.errors.MeshError, match="no-such-remesher cannot be started on this machine"):
         made({**COPY, "command": ["no-such-remesher", "{output}"]}, tmp_path)[0].load()
-    with pytest.raises(sb.StudyError, match="version: no-such-remesher"):
+    with pytest.raises(sb.errors.StudyError, match="version: no-such-remesher"):
         made({**COPY, "version": ["no-such-remesher"]}, tmp_path)
 
 
@@ -155,8 +155,8 @@ def test_a_program_that_is_not_there_is_named(tmp_path: Path) -> None:
 def test_formats_of_other_remeshers(tmp_path: Path) -> None:
     pytest.importorskip("meshio")
     member = made({**COPY, "input": ".mesh", "output": ".mesh"}, tmp_path)[0]
-    assert loaded(member).area == pytest.approx(sb.icosphere(3).area, rel=1e-12)
-    with pytest.raises(sb.MeshError, match=r"neither this package nor meshio knows the format \.nope"):
+    assert loaded(member).area == pytest.approx(sb.shapes.icosphere(3).area, rel=1e-12)
+    with pytest.raises(sb.errors.MeshError, match=r"neither this package nor meshio knows the format \.nope"):
         made({**COPY, "input": ".nope"}, tmp_path)[0].load()
 
 
@@ -164,7 +164,7 @@ def test_a_function_that_raises_is_named(tmp_path: Path) -> None:
     def broken(mesh: sb.Mesh) -> sb.Mesh:
         raise RuntimeError("no convergence")
 
-    with pytest.raises(sb.MeshError, match="broken: RuntimeError: no convergence"):
+    with pytest.raises(sb.errors.MeshError, match="broken: RuntimeError: no convergence"):
         made({**HALVED, "function": broken}, tmp_path)[0].load()
 
 
@@ -182,7 +182,7 @@ def test_a_study_of_remeshers_keeps_what_fails_apart(tmp_path: Path) -> None:
     )
     study = sb.Study.from_table(table)
     store = tmp_path / "small.zarr"
-    with pytest.raises(sb.StudyError, match=r"the study runs commands: sh -c .*--allow-commands"):
+    with pytest.raises(sb.errors.StudyError, match=r"the study runs commands: sh -c .*--allow-commands"):
         sb.run(study, store)
     assert not store.exists()
     summary = sb.run(study, store, workers=1, allow_commands=True)
@@ -204,7 +204,7 @@ def test_a_study_of_remeshers_keeps_what_fails_apart(tmp_path: Path) -> None:
     from sobolev_batch.results.figures.meshes import StudyMeshes
 
     meshes = StudyMeshes.from_tree(tree, ".")
-    assert meshes.make("half/0.5")[0].area == pytest.approx(sb.icosphere(2).area / 4)
+    assert meshes.make("half/0.5")[0].area == pytest.approx(sb.shapes.icosphere(2).area / 4)
     assert isinstance(meshes.members["copy/2"][1], RemeshedMember)
     # A second study beside it finds what was made.
     sb.run(study, tmp_path / "again.zarr", workers=1, allow_commands=True)

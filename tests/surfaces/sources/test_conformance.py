@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from pydantic import ConfigDict
 
-from sobolev_batch import ExpectedSize, Member, Mesh, Source, Sphere, check_source, icosphere
+from sobolev_batch import Mesh
+from sobolev_batch.shapes import Sphere, icosphere
+from sobolev_batch.sources import ExpectedSize, Member, Source, check_source
 from sobolev_batch.surfaces.sources.registry import parse_source
 from tests.support.members import KINDS
 from tests.support.mesh_files import OFF_BOX

@@ -13,7 +13,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import sobolev_batch as sb
-from sobolev_batch import Mesh, MeshError, StudyError, icosphere
+from sobolev_batch import Mesh
+from sobolev_batch.errors import MeshError, StudyError
+from sobolev_batch.shapes import icosphere
 from sobolev_batch.surfaces.sources.generated import carried, with_noise
 from sobolev_batch.surfaces.sources.registry import parse_source
 from tests.support.members import BALL, connectivity, listed, loaded, members
@@ -79,7 +81,7 @@ def velocity(time: float, angles: np.ndarray, strength: float, period: float) ->
 
 @pytest.mark.parametrize(("time", "strength", "period"), [(0.7, 2.0, 5.0), (2.5, 2.0, 5.0), (3.1, 0.5, 4.0)])
 def test_vertices_follow_the_velocity(time: float, strength: float, period: float) -> None:
-    x, y, z = np.asarray(sb.icosphere(2).vertices).T
+    x, y, z = np.asarray(sb.shapes.icosphere(2).vertices).T
     # Longitudes mean nothing at the poles, which no vertex meets on its way.
     start = np.concatenate([np.arctan2(y, x), np.arcsin(z)])
     path = solve_ivp(velocity, (0, time), start, "DOP853", rtol=1e-11, atol=1e-11, args=(strength, period))

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from sobolev_batch import MeshError, StudyError
+from sobolev_batch.errors import MeshError, StudyError
 from sobolev_batch.surfaces.sources import files
 from sobolev_batch.surfaces.sources.files import file_digest
 from sobolev_batch.surfaces.sources.names import caseless_key

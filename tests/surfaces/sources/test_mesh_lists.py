@@ -99,7 +99,7 @@ def test_a_frame_loses_nothing() -> None:
 @pytest.mark.slow
 def test_metadata_become_coordinates_and_sizes_of_rates(tmp_path: Path) -> None:
     for level in (0, 1):
-        sb.write_mesh(sb.icosphere(level), tmp_path / f"{level}.ply")
+        sb.write_mesh(sb.shapes.icosphere(level), tmp_path / f"{level}.ply")
     frame = pd.DataFrame({"path": ["0.ply", "1.ply"], "effort": [1.0, 4.0], "tool": ["a", None]})
     study = sb.Study.from_table(
         small_table(family=[{"name": "f", "source": "files", "meshes": frame}]), folder=tmp_path
@@ -111,7 +111,7 @@ def test_metadata_become_coordinates_and_sizes_of_rates(tmp_path: Path) -> None:
     by_effort = sb.table("memory://mesh-lists.zarr", -3, x="effort")
     fall = np.log(by_effort["distance"][0] / by_effort["distance"][1]) / np.log(4)
     assert by_effort["rate"][1] == pytest.approx(fall)
-    with pytest.raises(sb.InputError, match=r"known are edge_length, triangles, vertices, seconds, effort$"):
+    with pytest.raises(sb.errors.InputError, match=r"known are edge_length, triangles, vertices, seconds, effort$"):
         sb.table("memory://mesh-lists.zarr", x="tool")
 
 
@@ -119,7 +119,7 @@ def test_metadata_cannot_take_the_name_of_a_variable_of_tables(finished_store: P
     tree = sb.open_store(finished_store)
     groups = [tree[name].to_dataset() for name in ("meshes", "norms", "distances", "convergence")]
     taken = {str(name) for group in groups for name in group.variables}
-    sb.write_mesh(sb.icosphere(0), tmp_path / "a.ply")
+    sb.write_mesh(sb.shapes.icosphere(0), tmp_path / "a.ply")
     for name in taken - {"name", "time"}:
         meshes = [{"path": "a.ply", name: 1.0}]
         study = sb.Study.from_table(

@@ -12,7 +12,9 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from sobolev_batch import Ellipsoid, Mesh, Sphere, StudyError, Torus, icosphere
+from sobolev_batch import Mesh
+from sobolev_batch.errors import StudyError
+from sobolev_batch.shapes import Ellipsoid, Sphere, Torus, icosphere
 from sobolev_batch.surfaces.sources import registry as sources
 from sobolev_batch.surfaces.sources.registry import ExpectedSize, Member, Source, parse_source
 from tests.support.members import BALL, KINDS, listed, loaded, members

@@ -60,8 +60,8 @@ class SquaredDistance:
 
     >>> import sobolev_batch as sb
     >>> from scipy.optimize import minimize
-    >>> ball = sb.icosphere(1)
-    >>> squared = sb.SquaredDistance.for_mesh(ball, sb.Sphere(1.1), -2.0, lattice=sb.Lattice(2.0, 20))
+    >>> ball = sb.shapes.icosphere(1)
+    >>> squared = sb.fitting.SquaredDistance.for_mesh(ball, sb.shapes.Sphere(1.1), -2.0, lattice=sb.Lattice(2.0, 20))
     >>> value, gradient = squared(ball.vertices)
     >>> gradient.shape
     (42, 3)
@@ -159,9 +159,9 @@ def torch_function(squared: SquaredDistance) -> Callable[[Any], Any]:
         InputError: PyTorch is not installed.
 
     >>> import sobolev_batch as sb
-    >>> ball = sb.icosphere(1)
-    >>> squared = sb.SquaredDistance.for_mesh(ball, sb.Sphere(1.1), -2.0, lattice=sb.Lattice(2.0, 20))
-    >>> function = sb.torch_function(squared)  # doctest: +SKIP
+    >>> ball = sb.shapes.icosphere(1)
+    >>> squared = sb.fitting.SquaredDistance.for_mesh(ball, sb.shapes.Sphere(1.1), -2.0, lattice=sb.Lattice(2.0, 20))
+    >>> function = sb.fitting.torch_function(squared)  # doctest: +SKIP
     >>> function(torch.tensor(ball.vertices, requires_grad=True)).backward()  # doctest: +SKIP
     """
     with from_extra("torch", "functions of PyTorch need"):
@@ -200,9 +200,9 @@ def jax_function(squared: SquaredDistance) -> Callable[[Any], Any]:
         InputError: JAX is not installed.
 
     >>> import sobolev_batch as sb
-    >>> ball = sb.icosphere(1)
-    >>> squared = sb.SquaredDistance.for_mesh(ball, sb.Sphere(1.1), -2.0, lattice=sb.Lattice(2.0, 20))
-    >>> function = sb.jax_function(squared)  # doctest: +SKIP
+    >>> ball = sb.shapes.icosphere(1)
+    >>> squared = sb.fitting.SquaredDistance.for_mesh(ball, sb.shapes.Sphere(1.1), -2.0, lattice=sb.Lattice(2.0, 20))
+    >>> function = sb.fitting.jax_function(squared)  # doctest: +SKIP
     >>> gradient = jax.grad(function)(jax.numpy.asarray(ball.vertices))  # doctest: +SKIP
     """
     with from_extra("jax", "functions of JAX need"):
@@ -272,10 +272,10 @@ def gradient(
         BackendError: "gpu", and no GPU is usable.
 
     >>> import sobolev_batch as sb
-    >>> found = sb.gradient(sb.icosphere(1), sb.Sphere(1.1), -4.0, lattice=sb.Lattice(2.0, 20))
+    >>> found = sb.fitting.gradient(sb.shapes.icosphere(1), sb.shapes.Sphere(1.1), -4.0, lattice=sb.Lattice(2.0, 20))
     >>> found["gradient"].shape
     (42, 3)
-    >>> outwards = (found["gradient"].values * sb.icosphere(1).vertices).sum(axis=1)
+    >>> outwards = (found["gradient"].values * sb.shapes.icosphere(1).vertices).sum(axis=1)
     >>> bool((outwards < 0).all())  # the squared distance falls where vertices move outwards
     True
     >>> bool(found["error"] < 0.2 * abs(found["gradient"]).sum())

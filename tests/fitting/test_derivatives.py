@@ -24,8 +24,8 @@ from tests.support.shapes import CENTRED_BOX, tetrahedron
 
 Reals = NDArray[np.float64]
 
-BALL = sb.icosphere(1)
-SPHERE = sb.Sphere(0.7, (0.2, -0.1, 0.05))
+BALL = sb.shapes.icosphere(1)
+SPHERE = sb.shapes.Sphere(0.7, (0.2, -0.1, 0.05))
 # A small lattice, so that plain sums are possible, with a period of 10.
 SMALL = sb.Lattice(0.5, 10)
 
@@ -37,7 +37,7 @@ _COUNT = 12
 class PlainSums:
     """Σ (1 + |ξ|²)^s |mesh^ - sphere^|² over the whole cube of frequencies of a lattice."""
 
-    def __init__(self, sphere: sb.Sphere, lattice: sb.Lattice, orders: Sequence[float]) -> None:
+    def __init__(self, sphere: sb.shapes.Sphere, lattice: sb.Lattice, orders: Sequence[float]) -> None:
         half, step = lattice.M // 2, 2 * lattice.xi_max / lattice.M
         indices = np.array(list(product(range(-half, half + 1), repeat=3)), dtype=np.float64)
         self.frequencies = step * indices
@@ -78,7 +78,7 @@ class PlainSums:
 
 
 def wrinkled(seed: int) -> sb.Mesh:
-    ball, rng = sb.icosphere(0), np.random.default_rng(seed)
+    ball, rng = sb.shapes.icosphere(0), np.random.default_rng(seed)
     return sb.Mesh(ball.vertices + 0.2 * rng.normal(size=ball.vertices.shape), ball.triangles)
 
 
@@ -87,7 +87,7 @@ def moved(mesh: sb.Mesh, *by: float) -> sb.Mesh:
 
 
 MESHES = {
-    "ball": sb.icosphere(0),
+    "ball": sb.shapes.icosphere(0),
     "wrinkled": wrinkled(1),
     "a single triangle": sb.Mesh([[0.0, 0, 0], [2.0, 0, 0], [0.0, 1.5, 0.5]], [[0, 1, 2]]),
     "slivers": sb.Mesh([[0.0, 0, 0], [1.0, 0, 0], [2.0, 1e-6, 0], [1.0, 1e-3, 1]], [[0, 1, 2], [0, 2, 3], [1, 2, 3]]),
@@ -112,17 +112,17 @@ def test_it_is_the_derivative_of_plain_sums(name: str) -> None:
     mesh, orders = MESHES[name], [-0.75, -2.0, -6.0]
     vertices, sums = np.array(mesh.vertices), PlainSums(SPHERE, SMALL, orders)
     for order, square, expected in zip(orders, *sums.value_and_derivative(vertices, mesh.triangles), strict=True):
-        value, found = sb.SquaredDistance.for_mesh(mesh, SPHERE, order, lattice=SMALL, eps=1e-12)(vertices)
+        value, found = sb.fitting.SquaredDistance.for_mesh(mesh, SPHERE, order, lattice=SMALL, eps=1e-12)(vertices)
         assert value == pytest.approx(square, rel=1e-9)
         assert np.linalg.norm(found - expected) <= 1e-9 * np.linalg.norm(expected)
 
 
 @pytest.mark.parametrize("tolerance", [0.1, 1e-3, 1e-8])
 def test_it_is_exact_for_the_value_whatever_the_quadrature(tolerance: float) -> None:
-    mesh, lattice = sb.icosphere(2), sb.Lattice(4.0, 40)
-    fine = sb.SquaredDistance.for_mesh(mesh, SPHERE, -2.0, lattice=lattice)
+    mesh, lattice = sb.shapes.icosphere(2), sb.Lattice(4.0, 40)
+    fine = sb.fitting.SquaredDistance.for_mesh(mesh, SPHERE, -2.0, lattice=lattice)
     transform = MeshTransform.from_mesh(mesh, lattice, TransformSettings(1e-13, tolerance=tolerance))
-    squared = sb.SquaredDistance(transform, fine.target, fine.factors)
+    squared = sb.fitting.SquaredDistance(transform, fine.target, fine.factors)
     rng = np.random.default_rng(0)
     direction, vertices, step = rng.normal(size=mesh.vertices.shape), np.array(mesh.vertices), 1e-5
     _, found = squared(vertices)
@@ -131,8 +131,8 @@ def test_it_is_exact_for_the_value_whatever_the_quadrature(tolerance: float) -> 
 
 
 def test_the_value_is_the_squared_distance_whether_vertices_are_flat_or_not() -> None:
-    mesh, lattice = sb.icosphere(2), sb.Lattice(4.0, 40)
-    squared = sb.SquaredDistance.for_mesh(mesh, SPHERE, -2.0, lattice=lattice)
+    mesh, lattice = sb.shapes.icosphere(2), sb.Lattice(4.0, 40)
+    squared = sb.fitting.SquaredDistance.for_mesh(mesh, SPHERE, -2.0, lattice=lattice)
     expected = sb.distance(mesh, SPHERE, -2.0, lattice=lattice)["distance"].item() ** 2
     (value, gradient), (flat_value, flat) = squared(mesh.vertices), squared(mesh.vertices.ravel())
     assert squared.value(mesh.vertices) == pytest.approx(expected, rel=1e-8)
@@ -144,15 +144,15 @@ ORDERS = [-1.5, -2.0, -4.0]
 
 
 @cache
-def pair_and_gradient(name: str) -> tuple[sb.Mesh, sb.Mesh | sb.Sphere, xr.Dataset]:
+def pair_and_gradient(name: str) -> tuple[sb.Mesh, sb.Mesh | sb.shapes.Sphere, xr.Dataset]:
     """A mesh, its target, and the derivative from a lattice that is finer and reaches farther than others."""
-    pairs: dict[str, tuple[sb.Mesh, sb.Mesh | sb.Sphere]] = {
-        "ball in ball": (sb.icosphere(1), sb.Sphere()),
-        "moved": (sb.icosphere(1), sb.Sphere(1.0, (0.2, 0, 0))),
+    pairs: dict[str, tuple[sb.Mesh, sb.Mesh | sb.shapes.Sphere]] = {
+        "ball in ball": (sb.shapes.icosphere(1), sb.shapes.Sphere()),
+        "moved": (sb.shapes.icosphere(1), sb.shapes.Sphere(1.0, (0.2, 0, 0))),
         "box": (CENTRED_BOX, moved(CENTRED_BOX, 0.05, 0.02, 0.01)),
     }
     mesh, target = pairs[name]
-    return mesh, target, sb.gradient(mesh, target, ORDERS, lattice=sb.Lattice(8.0, 72), eps=1e-10)
+    return mesh, target, sb.fitting.gradient(mesh, target, ORDERS, lattice=sb.Lattice(8.0, 72), eps=1e-10)
 
 
 @pytest.mark.slow
@@ -162,7 +162,7 @@ def test_its_error_covers_what_a_finer_lattice_finds(name: str, highest: float, 
     mesh, target, finest = pair_and_gradient(name)
     lattice = sb.Lattice(highest, intervals)
     for operand in (target, sb.fourier_transform(target, lattice, eps, order=ORDERS)):
-        found = sb.gradient(mesh, operand, ORDERS, lattice=lattice, eps=eps)
+        found = sb.fitting.gradient(mesh, operand, ORDERS, lattice=lattice, eps=eps)
         off = np.sqrt(((found["gradient"] - finest["gradient"]) ** 2).sum(["vertex", "axis"]))
         assert (off <= found["error"] + finest["error"]).all()
         assert (found["error"] <= 200 * off + 1e-6 * abs(found["gradient"]).sum(["vertex", "axis"])).all()
@@ -173,93 +173,97 @@ def test_its_error_covers_what_a_finer_lattice_finds(name: str, highest: float, 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_measured_part_of_its_error_covers_that_of_a_coarse_eps(seed: int) -> None:
     lattice = sb.Lattice(3.0, 30)
-    coarse, fine = (sb.gradient(wrinkled(seed), SPHERE, -4.0, lattice=lattice, eps=eps) for eps in (1e-2, 1e-9))
+    coarse, fine = (sb.fitting.gradient(wrinkled(seed), SPHERE, -4.0, lattice=lattice, eps=eps) for eps in (1e-2, 1e-9))
     difference = float(np.linalg.norm(coarse["gradient"] - fine["gradient"]))
     assert 0 < difference < coarse["discretisation"].item() / 2
 
 
 def test_a_lattice_of_a_few_samples_leaves_most_beyond_it_and_unknown_quality_no_error() -> None:
-    found = sb.gradient(sb.icosphere(1), SPHERE, -2.0, lattice=sb.Lattice(0.1, 2))
+    found = sb.fitting.gradient(sb.shapes.icosphere(1), SPHERE, -2.0, lattice=sb.Lattice(0.1, 2))
     assert found["error"] > np.linalg.norm(found["gradient"])
     field = sb.fourier_transform(SPHERE, SMALL).drop_attrs()
-    found = sb.gradient(sb.icosphere(1), field, -2.0)
+    found = sb.fitting.gradient(sb.shapes.icosphere(1), field, -2.0)
     assert np.isfinite(found["gradient"]).all()
     assert np.isnan(found["error"])
 
 
 def test_a_gpu_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    expected = sb.gradient(sb.icosphere(2), SPHERE, [-2.0, -4.0], lattice=SMALL)["gradient"]
+    expected = sb.fitting.gradient(sb.shapes.icosphere(2), SPHERE, [-2.0, -4.0], lattice=SMALL)["gradient"]
     monkeypatch.setattr(backends, "gpu_backend", lambda: Device().backend())
-    found = sb.gradient(sb.icosphere(2), SPHERE, [-2.0, -4.0], lattice=SMALL, backend="gpu")["gradient"]
+    found = sb.fitting.gradient(sb.shapes.icosphere(2), SPHERE, [-2.0, -4.0], lattice=SMALL, backend="gpu")["gradient"]
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8 * float(abs(expected).max()))
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((sb.Sphere(), SPHERE, -2.0), "Open3D; found Sphere"),
-        ((sb.icosphere(0), SPHERE, -0.5), "finite only for orders below -1/2, found -0.5"),
-        ((sb.icosphere(0), "sphere", -2.0), "sphere: no mesh format"),
-        ((moved(sb.icosphere(0), 9, 0, 0), SPHERE, -2.0), "to |coordinate| = 9.8"),
+        ((sb.shapes.Sphere(), SPHERE, -2.0), "Open3D; found Sphere"),
+        ((sb.shapes.icosphere(0), SPHERE, -0.5), "finite only for orders below -1/2, found -0.5"),
+        ((sb.shapes.icosphere(0), "sphere", -2.0), "sphere: no mesh format"),
+        ((moved(sb.shapes.icosphere(0), 9, 0, 0), SPHERE, -2.0), "to |coordinate| = 9.8"),
     ],
 )
-def test_wrong_arguments_are_named(arguments: tuple[sb.Mesh, sb.Sphere, float], message: str) -> None:
-    for function in (sb.gradient, sb.SquaredDistance.for_mesh):
-        with pytest.raises(sb.SobolevBatchError, match=re.escape(message)):
+def test_wrong_arguments_are_named(arguments: tuple[sb.Mesh, sb.shapes.Sphere, float], message: str) -> None:
+    for function in (sb.fitting.gradient, sb.fitting.SquaredDistance.for_mesh):
+        with pytest.raises(sb.errors.SobolevBatchError, match=re.escape(message)):
             function(*arguments, lattice=SMALL)
 
 
 def test_positions_are_checked() -> None:
-    squared = sb.SquaredDistance.for_mesh(sb.icosphere(0), SPHERE, -2.0, lattice=SMALL)
-    with pytest.raises(sb.InputError, match=r"the mesh has 12 vertices: pass positions \(12, 3\), or 36 numbers"):
+    squared = sb.fitting.SquaredDistance.for_mesh(sb.shapes.icosphere(0), SPHERE, -2.0, lattice=SMALL)
+    with pytest.raises(
+        sb.errors.InputError, match=r"the mesh has 12 vertices: pass positions \(12, 3\), or 36 numbers"
+    ):
         squared(np.zeros((11, 3)))
-    with pytest.raises(sb.InputError, match="must be finite: found NaN or infinity"):
+    with pytest.raises(sb.errors.InputError, match="must be finite: found NaN or infinity"):
         squared(np.full((12, 3), np.nan))
-    with pytest.raises(sb.LatticeError, match="hold"):
-        squared(sb.icosphere(0).vertices + 10.0)
-    with pytest.raises(sb.InputError, match="needs a lattice"):
-        sb.gradient(sb.icosphere(0), SPHERE, -2.0)
-    with pytest.raises(sb.InputError, match="one order is needed, found 2"):
-        sb.SquaredDistance.for_mesh(sb.icosphere(0), SPHERE, [-2.0, -3.0], lattice=SMALL)  # type: ignore[arg-type]
+    with pytest.raises(sb.errors.LatticeError, match="hold"):
+        squared(sb.shapes.icosphere(0).vertices + 10.0)
+    with pytest.raises(sb.errors.InputError, match="needs a lattice"):
+        sb.fitting.gradient(sb.shapes.icosphere(0), SPHERE, -2.0)
+    with pytest.raises(sb.errors.InputError, match="one order is needed, found 2"):
+        sb.fitting.SquaredDistance.for_mesh(sb.shapes.icosphere(0), SPHERE, [-2.0, -3.0], lattice=SMALL)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
-def squared() -> sb.SquaredDistance:
-    return sb.SquaredDistance.for_mesh(BALL, sb.Sphere(1.1), -2.0, lattice=sb.Lattice(2.0, 20))
+def squared() -> sb.fitting.SquaredDistance:
+    return sb.fitting.SquaredDistance.for_mesh(BALL, sb.shapes.Sphere(1.1), -2.0, lattice=sb.Lattice(2.0, 20))
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-12), ("float32", 1e-4)])
-def test_torch_gives_the_same(squared: sb.SquaredDistance, dtype: str, tolerance: float) -> None:
+def test_torch_gives_the_same(squared: sb.fitting.SquaredDistance, dtype: str, tolerance: float) -> None:
     torch = pytest.importorskip("torch", reason="PyTorch comes with the extra 'torch'")
     value, gradient = squared(BALL.vertices)
     vertices = torch.tensor(np.array(BALL.vertices), dtype=getattr(torch, dtype), requires_grad=True)
-    function = sb.torch_function(squared)
+    function = sb.fitting.torch_function(squared)
     found = function(vertices)
     (3 * found).backward()
     assert found.dtype == vertices.grad.dtype == vertices.dtype
     assert found.item() == pytest.approx(value, rel=tolerance)
     assert function(vertices.detach()).item() == pytest.approx(value, rel=tolerance)
     np.testing.assert_allclose(vertices.grad.numpy(), 3 * gradient, rtol=0, atol=tolerance * np.abs(gradient).max())
-    with pytest.raises(sb.InputError, match="the mesh has 42 vertices"):
+    with pytest.raises(sb.errors.InputError, match="the mesh has 42 vertices"):
         function(torch.zeros(5, 3))
 
 
 @pytest.mark.parametrize("compiled", [False, True])
-def test_jax_gives_the_same(squared: sb.SquaredDistance, compiled: bool) -> None:
+def test_jax_gives_the_same(squared: sb.fitting.SquaredDistance, compiled: bool) -> None:
     jax = pytest.importorskip("jax", reason="JAX comes with the extra 'jax'")
     value, gradient = squared(BALL.vertices)
     vertices = jax.numpy.asarray(np.array(BALL.vertices))
-    function: Any = jax.value_and_grad(lambda moved: 3 * sb.jax_function(squared)(moved))
+    function: Any = jax.value_and_grad(lambda moved: 3 * sb.fitting.jax_function(squared)(moved))
     found, slopes = (jax.jit(function) if compiled else function)(vertices)
     assert float(found) == pytest.approx(3 * value, rel=1e-4)
-    assert float(sb.jax_function(squared)(vertices)) == pytest.approx(value, rel=1e-4)
+    assert float(sb.fitting.jax_function(squared)(vertices)) == pytest.approx(value, rel=1e-4)
     np.testing.assert_allclose(np.asarray(slopes), 3 * gradient, rtol=0, atol=1e-4 * np.abs(gradient).max())
 
 
 @pytest.mark.parametrize(("library", "name"), [("torch", "PyTorch"), ("jax", "JAX")])
 def test_a_missing_library_is_named(
-    squared: sb.SquaredDistance, library: str, name: str, monkeypatch: pytest.MonkeyPatch
+    squared: sb.fitting.SquaredDistance, library: str, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, library, None)
-    with pytest.raises(sb.InputError, match=rf"{name} .* is missing .* pip install 'sobolev-batch\[{library}\]'"):
-        getattr(sb, f"{library}_function")(squared)
+    with pytest.raises(
+        sb.errors.InputError, match=rf"{name} .* is missing .* pip install 'sobolev-batch\[{library}\]'"
+    ):
+        getattr(sb.fitting, f"{library}_function")(squared)

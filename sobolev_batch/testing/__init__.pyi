@@ -1,0 +1,8 @@
+# The public names of this package: each is imported from its module when it is first asked for.
+from .verdict import Verdict as Verdict
+from .verdict import assert_same_surface as assert_same_surface
+from .verdict import same_surface as same_surface
+
+__all__: list[str]
+DEFAULT_RTOL: float
+DEFAULT_ORDER: float
