@@ -7,7 +7,7 @@ from . import shapes as shapes
 from . import sources as sources
 from . import testing as testing
 from .batch.run import run as run
-from .batch.store.heartbeat import release as release
+from .batch.store.heartbeat import unlock as unlock
 from .batch.study.draft import init_study as init_study
 from .batch.study.study import Study as Study
 from .batch.study.study import StudyCollection as StudyCollection

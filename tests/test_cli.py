@@ -249,6 +249,7 @@ REFUSED = [
     ("run greedy.toml", "memory of 1.0PB is more than there is"),
     ("run lacking.toml --store none.zarr", "matches no file"),
     ("status nothing.zarr", "it holds no store of a study"),
+    ("unlock nothing.zarr", "it holds no store of a study"),
     (f"table {STORE} --below much", "found 'much'"),
     (f"table {STORE} --order -0.4", "below -1/2, found -0.4"),
     (f"plot {STORE} --output study.toml", "study.toml: no files can be written there"),
@@ -320,7 +321,7 @@ def test_nothing_answers_at_the_scheduler(folder: Path) -> None:
     assert not (folder / "new.zarr").exists()
 
 
-COMMANDS = "compare fit init league plan plot release report run status submit table verify witness"
+COMMANDS = "compare fit init league plan plot report run status submit table unlock verify witness"
 # Libraries that take long to import.
 NUMERICS = "numpy scipy pandas xarray dask distributed zarr fsspec pydantic trimesh matplotlib finufft psutil tabulate"
 HELP = """

@@ -149,7 +149,7 @@ def test_commands_show_names_of_files(folder: Path) -> None:
         ("table", f"{HOSTILE}/none.zarr"),
         ("table", HOSTILE, "--format", HOSTILE),
         ("table", HOSTILE, f"--{HOSTILE}"),
-        ("release", f"{HOSTILE}.zarr"),
+        ("unlock", f"{HOSTILE}.zarr"),
         ("compare", f"{HOSTILE}/good.obj", f"{HOSTILE}/broken.obj"),
         ("compare", f"{HOSTILE}.obj", f"{HOSTILE}/good.obj", "--below", "90%"),
         ("fit", f"{HOSTILE}/good.obj", f"{HOSTILE}/good.obj", "-o", f"{HOSTILE}/none/a.obj"),

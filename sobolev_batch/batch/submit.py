@@ -132,7 +132,7 @@ def drive(study: Study, store: str, run: str) -> None:
     try:
         present = Lock.read(location)
         if present is None or present.run != run:
-            _log.warning("%s: the store was released since the study was submitted, or is done; left alone", store)
+            _log.warning("%s: the store was unlocked since the study was submitted, or is done; left alone", store)
             return
         acquire(location, lock)
         with worker_client() as client:

@@ -181,7 +181,7 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: 
             if on_progress is not None:
                 on_progress(done, len(complete))
     if lock is not None and (damaged or chunks):
-        # Whoever has released the store may have changed it since.
+        # Whoever has unlocked the store may have changed it since.
         lock.require(store.location)
         for row in damaged:
             store.write_record(row, None)

@@ -1,4 +1,4 @@
-"""Commands that read a store: status, verify, release, table, plot, witness, report, league."""
+"""Commands that read a store: status, verify, unlock, table, plot, witness, report, league."""
 
 from __future__ import annotations
 
@@ -116,18 +116,18 @@ def verify_command(context: click.Context, store: Location) -> None:
     context.exit(EXIT_OTHER)
 
 
-@cli.command("release")
+@cli.command("unlock")
 @store_argument
-@click.option("--force", is_flag=True, help="Release it even if its run was active a moment ago.")
-def release_command(store: Location, force: bool) -> None:
+@click.option("--force", is_flag=True, help="Unlock it even if its run was active a moment ago.")
+def unlock_command(store: Location, force: bool) -> None:
     """Remove the lock that a killed run left on STORE."""
-    from sobolev_batch.batch.store.heartbeat import release
+    from sobolev_batch.batch.store.heartbeat import unlock
 
-    lock = release(store, force=force)
+    lock = unlock(store, force=force)
     if lock is None:
         echo(f"{store}: not locked by any run")
     else:
-        echo(f"{store}: released from {lock.driver}, which had locked it since {lock.since}")
+        echo(f"{store}: unlocked; {lock.driver} had locked it since {lock.since}")
 
 
 @cli.command("table")

@@ -218,14 +218,14 @@ class Status:
         if run.state == "submitted":
             yield f"submitted {age}, no worker has taken it up yet; {start}"
             if self.lost:
-                yield f"if that cluster is gone, submit the study again after: sobolev-batch release {store}"
+                yield f"if that cluster is gone, submit the study again after: sobolev-batch unlock {store}"
         elif run.state == "running":
             yield f"running: {run.stage or _PLANNING}; {start}, last sign of life {age}"
             if run.error:
                 yield run.error
             if self.lost:
                 yield "its process is probably gone; run or submit the study again, and it continues from the store"
-                yield f"if the store turns out to be locked: sobolev-batch release {store}"
+                yield f"if the store turns out to be locked: sobolev-batch unlock {store}"
         elif run.state == "failed":
             object_text = f" of {self.run_store}" if self.run_store else ""
             yield f"the latest run{object_text} failed: {run.error}; {start}, ended {run.seen}"

@@ -114,7 +114,7 @@ def test_a_collection_goes_on_while_its_next_object_is_planned(changeable: Path)
     with locked(Location.parse(changeable / "gone"), lock):
         status = sb.status(changeable)
         assert status.lost
-        assert f"sobolev-batch release {changeable / 'gone'}" in str(status)
+        assert f"sobolev-batch unlock {changeable / 'gone'}" in str(status)
     assert not sb.status(changeable).lost
 
 
@@ -143,7 +143,7 @@ def test_the_run_of_a_collection_is_the_one_that_did_not_end_well(changeable: Pa
     first.write_run(replace(ended, state="running"))
     lost = sb.status(changeable)
     assert (lost.run_store, lost.lost) == (first.path, True)
-    assert f"release {first.path}" in str(lost)
+    assert f"unlock {first.path}" in str(lost)
 
 
 def test_a_second_run_computes_what_is_new(store: Path, client: Client) -> None:

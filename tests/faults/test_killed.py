@@ -224,7 +224,7 @@ def test_only_the_run_that_has_the_store_writes(store_path: Path, finished_store
     location, lock = Location(str(finished_store)), Lock.of_this_process()
     store = Store(location.fenced(lock.fence))
     record = store.read_record(0)
-    with pytest.raises(LockError, match="the store was released, or its run is over"):
+    with pytest.raises(LockError, match="the store was unlocked, or its run is over"):
         store.write_record(0, record)
     with locked(location, lock):
         store.write_record(0, record)

@@ -18,7 +18,7 @@ from uuid import uuid4
 import pytest
 from distributed import Client
 
-from sobolev_batch import Study, release, run
+from sobolev_batch import Study, run, unlock
 from sobolev_batch.batch import run as run_module
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.storage.location import Location
@@ -68,9 +68,9 @@ def test_the_second_run_refuses_and_names_the_first(store_path: Path, tmp_path: 
         for second in (call("run", study, "--store", store_path), call("verify", store_path)):
             assert second.returncode == 2
             assert f"another run has this store to itself: process {os.getpid()} on " in second.stderr
-            assert f"sobolev-batch release {store_path}" in second.stderr
+            assert f"sobolev-batch unlock {store_path}" in second.stderr
         # Not from somebody who is alive.
-        refused = call("release", store_path)
+        refused = call("unlock", store_path)
         assert refused.returncode == 2
         assert f"process {os.getpid()} on" in refused.stderr
         assert "is alive" in refused.stderr
@@ -80,7 +80,7 @@ def test_the_second_run_refuses_and_names_the_first(store_path: Path, tmp_path: 
 
 
 @pytest.mark.slow
-def test_a_run_whose_store_was_released_ends(
+def test_a_run_whose_store_was_unlocked_ends(
     store_path: Path, monkeypatch: pytest.MonkeyPatch, threads: Client
 ) -> None:
     monkeypatch.setattr(heartbeat, "HEARTBEAT_SECONDS", 0.02)
@@ -91,9 +91,9 @@ def test_a_run_whose_store_was_released_ends(
                 thread.join(PATIENCE_SECONDS)
 
     with driving(store_path, threads, wait_for_the_end_of_the_heartbeat) as first:
-        released = call("release", "--force", store_path)
-        assert released.returncode == 0
-        assert f"released from process {os.getpid()} on" in released.stdout
+        unlocked = call("unlock", "--force", store_path)
+        assert unlocked.returncode == 0
+        assert f"unlocked; process {os.getpid()} on" in unlocked.stdout
     with pytest.raises(LockError, match="nothing more is written by a run that no longer has the store"):
         first.result()
 
@@ -108,27 +108,27 @@ def test_a_run_that_loses_its_store_while_it_plans_leaves_it_alone(
 
     def plan_slowly(*arguments: Any) -> Plan:
         planned = make_plan(*arguments)
-        release(store_path, force=True)
+        unlock(store_path, force=True)
         acquire(location, other)
         under_way.write_text("what the other run is writing")
         return planned
 
     monkeypatch.setattr(run_module, "make_plan", plan_slowly)
-    with pytest.raises(LockError, match="the store was released"):
+    with pytest.raises(LockError, match="the store was unlocked"):
         run(study, store_path, threads)
     assert under_way.exists()
     assert Lock.read(location) == other
 
 
 @pytest.mark.slow
-def test_the_lock_of_another_machine_is_released_by_hand_unless_its_run_gave_a_sign_of_life(
+def test_the_lock_of_another_machine_is_unlocked_by_hand_unless_its_run_gave_a_sign_of_life(
     study: Study, location: Location, store_path: Path, threads: Client
 ) -> None:
     run(study, store_path, threads)
     location.create(LOCK_KEY, ELSEWHERE.to_json())
     with pytest.raises(LockError, match=r"process 12 on far\.example, since 2026-01-01"):
         run(study, store_path, threads)
-    assert (release(store_path), release(store_path)) == (ELSEWHERE, None)
+    assert (unlock(store_path), unlock(store_path)) == (ELSEWHERE, None)
     assert len(run(study, store_path, threads).reused) == 5
     there = Store.open(store_path)
     latest = there.read_run()
@@ -136,14 +136,14 @@ def test_the_lock_of_another_machine_is_released_by_hand_unless_its_run_gave_a_s
     location.create(LOCK_KEY, ELSEWHERE.to_json())
     there.write_run(replace(latest, driver="process 12 on far.example, cluster c", state="running", seen=utc_now()))
     with pytest.raises(LockError, match=r"process 12 on far\.example was alive \d+ s ago"):
-        release(store_path)
-    assert release(store_path, force=True) == ELSEWHERE
+        unlock(store_path)
+    assert unlock(store_path, force=True) == ELSEWHERE
     # A lock that was just taken, before any sign of life; a store that cannot be read.
     (store_path / "zarr.json").write_text("")
     location.create(LOCK_KEY, replace(ELSEWHERE, since=utc_now()).to_json())
     with pytest.raises(LockError, match="was alive"):
-        release(store_path)
-    assert release(store_path, force=True) is not None
+        unlock(store_path)
+    assert unlock(store_path, force=True) is not None
 
 
 LOCKING = """

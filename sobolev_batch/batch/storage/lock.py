@@ -3,7 +3,7 @@
 Tasks of one run never write the same chunk, but those of two runs would. The lock lies in the store, where
 drivers on different machines see it, and is created by an operation that succeeds for one of them only. It is
 removed when its run ends. The lock of a killed driver is taken over if its process is certainly gone, and is
-otherwise released by hand.
+otherwise unlocked by hand.
 
 A task may outlive its driver: a worker that was stopped goes on when it is continued, perhaps after another run has
 stored something newer. Before each write it looks whether the lock is still that of its run.
@@ -115,14 +115,14 @@ class Lock:
     def require(self, location: Location) -> None:
         """Check that its holder still has the store."""
         if not self.is_held(location):
-            raise LockError(f"{location}: the store was released, or removed, and is no longer that of this process")
+            raise LockError(f"{location}: the store was unlocked, or removed, and is no longer that of this process")
 
 
 def _require_run(run: str, location: Location) -> None:
     """Check that a run still has the store."""
     lock = Lock.read(location)
     if lock is None or lock.run != run:
-        others = "the store was released, or its run is over" if lock is None else f"{lock.driver} has it now"
+        others = "the store was unlocked, or its run is over" if lock is None else f"{lock.driver} has it now"
         raise LockError(f"{location}: nothing more is written by a run that no longer has the store: {others}")
 
 
@@ -163,7 +163,7 @@ def _take_over(location: Location, lock: Lock, current: Lock) -> None:
     refusal = LockError(
         f"{location}: another run has this store to itself: {current.driver}, since {current.since}. "
         "Wait for it or stop it; if it is gone without having been able to say so, "
-        f"release the store with: sobolev-batch release {location}"
+        f"unlock the store with: sobolev-batch unlock {location}"
     )
     if not current.holder_is_gone or not location.create(_TAKEOVER_KEY, lock.to_json()):
         raise refusal
@@ -186,7 +186,7 @@ def release(location: Location, lock: Lock) -> None:
             if current.folder == "made":
                 location.remove_empty_folder()
     except StoreError as error:
-        _log.warning("the store stays locked, release it with: sobolev-batch release %s (%s)", location, error)
+        _log.warning("the store stays locked, unlock it with: sobolev-batch unlock %s (%s)", location, error)
 
 
 def break_lock(location: Location) -> None:

@@ -1,6 +1,6 @@
 """Heartbeat of a run: a record in its store that is renewed while it runs and completed when it ends.
 
-A store whose run has no heartbeat any more can be released from its lock.
+A store whose run has no heartbeat any more can be unlocked.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class Heartbeat:
         """Check that the run still held the store at the latest beat."""
         if self._is_lost:
             raise LockError(
-                f"{self._store.path}: the store was released while this run was going on, and is no longer its own; "
+                f"{self._store.path}: the store was unlocked while this run was going on, and is no longer its own; "
                 "what was recorded counts"
             )
 
@@ -101,7 +101,7 @@ class Heartbeat:
                 _log.warning("the run's record could not be written: %s", error)
 
 
-def release(store: str | Path | Location, *, force: bool = False) -> Lock | None:
+def unlock(store: str | Path | Location, *, force: bool = False) -> Lock | None:
     """Remove the lock of a run that cannot do so itself, because it or its machine was killed.
 
     A run that is still going on notices within seconds, and ends.
@@ -115,23 +115,27 @@ def release(store: str | Path | Location, *, force: bool = False) -> Lock | None
 
     Raises:
         LockError: The run was alive a moment ago.
-        StoreError: The store cannot be read or written.
+        StoreError: There is no store, or it cannot be read or written; or it is that of a collection, whose objects
+            have locks of their own.
 
     >>> import sobolev_batch as sb
-    >>> sb.release("memory://new.zarr") is None
-    True
+    >>> sb.unlock("memory://new.zarr")
+    Traceback (most recent call last):
+        ...
+    sobolev_batch.errors.StoreError: memory://new.zarr: it holds no store of a study
     """
     location = Location.parse(store)
     lock = Lock.read(location)
     if lock is None:
+        Store.open(location)
         return None
     if not force and lock.holder_is_alive:
-        raise LockError(f"{location}: {lock.driver} is alive; stop it, or release the store all the same by --force")
+        raise LockError(f"{location}: {lock.driver} is alive; stop it, or unlock the store all the same by --force")
     silence = math.inf if force or lock.holder_is_gone else _silence_seconds(location, lock)
     if silence < LOST_AFTER_SECONDS:
         raise LockError(
             f"{location}: {lock.driver} was alive {max(silence, 0):.0f} s ago; stop it, or wait until it has been "
-            f"silent for {LOST_AFTER_SECONDS:.0f} s; --force releases the store all the same"
+            f"silent for {LOST_AFTER_SECONDS:.0f} s; --force unlocks the store all the same"
         )
     break_lock(location)
     return lock
