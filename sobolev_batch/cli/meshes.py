@@ -181,8 +181,8 @@ def _details(result: xr.Dataset, rtol: float | None) -> str:
     """Return the distance of one order and the parts of its error, on one line."""
     from sobolev_batch.results.tables.text import with_error
 
-    names = ("truncation", "aliasing", "discretisation", *(("statistical",) if result["statistical"] > 0 else ()))
-    parts = ", ".join(f"{name} {result[name].item():.0e}" for name in names)
+    by_part = result["error_part"].to_series()
+    parts = ", ".join(f"{name} {part:.0e}" for name, part in by_part.items() if name != "statistical" or part > 0)
     remark = "" if rtol is None or result["within"].item() else f", more than rtol {rtol:g}"
     distance_text = with_error(result["distance"].item(), result["error"].item())
     return f"order {result['order'].item():g}: distance {distance_text} ({parts}){remark}"

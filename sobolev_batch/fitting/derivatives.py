@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from sobolev_batch.errors import InputError, from_extra
 from sobolev_batch.fitting.transform import MeshTransform
 from sobolev_batch.spectral.backends import Complexes, backend_named
-from sobolev_batch.spectral.budget import ALIASING_CAUTION, Support, decay_to_period, sums_of_shells, truncated
+from sobolev_batch.spectral.budget import ALIASING_CAUTION, PARTS, Support, decay_to_period, sums_of_shells, truncated
 from sobolev_batch.spectral.fields import (
     Operand,
     OperandLike,
@@ -260,10 +260,11 @@ def gradient(
     Returns:
         Dataset over `order` with `gradient` (order, vertex, axis), float64, without a unit: length over length. The
         other variables are over `order` alone: `squared_distance`, in units of length, and the `error` of the
-        gradient in the Euclidean norm over all vertices and axes. It is the sum of `truncation` (frequencies beyond
-        the lattice) and `aliasing` (its spacing), both estimates, and `discretisation` (quadrature, NUFFT and the
-        error of a field), which is measured; NaN for a field without the attribute `quality`. A single order has no
-        dimension. The vector points where the squared distance grows fastest.
+        gradient in the Euclidean norm over all vertices and axes. It is the sum of `error_part` over `part`:
+        truncation (frequencies beyond the lattice) and aliasing (its spacing), both estimates, discretisation
+        (quadrature, NUFFT and the error of a field), which is measured, and statistical, which is zero. It is NaN for
+        a field without the attribute `quality`. A single order has no dimension. The vector points where the squared
+        distance grows fastest.
 
     Raises:
         OrderError: An order is not below -1/2.
@@ -291,10 +292,10 @@ def gradient(
     coarser, gradients = (one.gradients(one.factors) for one in pair)
     fine = pair[-1]
     parts = fine.errors(gradients)
-    parts["discretisation"] = parts["discretisation"] + _norms(gradients - coarser)
-    numbers = {"squared_distance": fine.squares(fine.factors), "error": np.sum(list(parts.values()), axis=0), **parts}
+    parts[:, PARTS.index("discretisation")] += _norms(gradients - coarser)
+    numbers = {"squared_distance": fine.squares(fine.factors), "error": parts.sum(axis=1), "error_part": parts}
     dataset = labelled(order, numbers, lattice_attributes(fine.weights.lattice, fine.field))
-    for name in ("error", *parts):
+    for name in ("error", "error_part"):
         dataset[name].attrs = {**dataset[name].attrs, "units": NUMBER}
     dims = (*dataset["error"].dims, "vertex", "axis")
     values = gradients.reshape(*np.shape(order), *gradients.shape[1:])
@@ -333,18 +334,16 @@ class _Difference:
     def _derivative(self, coefficients: Complexes) -> Reals:
         return self.transform.derivative(np.asarray(self.mesh.vertices), coefficients)
 
-    def errors(self, gradients: Reals) -> dict[str, Reals]:
-        """Return the parts of the gradients' errors (orders,), besides quadrature and NUFFT."""
+    def errors(self, gradients: Reals) -> Reals:
+        """Return the parts of the gradients' errors (orders, part), besides quadrature and NUFFT."""
         quality = quality_of(self.field)
         if quality is None:
-            return dict.fromkeys(("truncation", "aliasing", "discretisation"), np.full(len(gradients), np.nan))
+            return np.full((len(gradients), len(PARTS)), np.nan)
         extent = Extent.union([self.mesh.extent, quality.extent])
         support = Support(np.array(self.mesh.area + quality.area), extent.widths)
-        return {
-            "truncation": self._truncation(support),
-            "aliasing": self._aliasing(support, gradients),
-            "discretisation": self._of_field(quality) if self.is_given else np.zeros(len(gradients)),
-        }
+        none = np.zeros(len(gradients))
+        of_field = self._of_field(quality) if self.is_given else none
+        return np.stack([self._truncation(support), self._aliasing(support, gradients), of_field, none], axis=1)
 
     def _truncation(self, support: Support) -> Reals:
         """Estimate the derivative of what lies beyond the lattice.

@@ -10,7 +10,7 @@ import xarray as xr
 from sobolev_batch.batch.analysis.pairs import pair_distances
 from sobolev_batch.batch.analysis.reducer import Reducer
 from sobolev_batch.batch.analysis.spectra import lower_bounds, spectrum_keys, stale_chunks
-from sobolev_batch.batch.analysis.tabulate import Results, coordinates_of
+from sobolev_batch.batch.analysis.tabulate import Results, table_of
 from sobolev_batch.batch.store.store import QUALITY, Store
 from sobolev_batch.batch.store.tables import rows_unlike_tables
 from sobolev_batch.batch.workspace import complete_records
@@ -21,14 +21,13 @@ from sobolev_batch.spectral.budget import NormEstimate
 from sobolev_batch.spectral.fields import Quality
 from sobolev_batch.spectral.lattice import Orders, check_orders, shell_sums, single_order, smooth_step
 from sobolev_batch.spectral.metrics.causes import band_coordinates
-from sobolev_batch.spectral.metrics.datasets import AREA, KERNEL, LENGTH, NUMBER, describe, described, order_axis
+from sobolev_batch.spectral.metrics.datasets import AREA, KERNEL, LENGTH, NUMBER, described, order_axis
 from sobolev_batch.surfaces.shapes.surface import Reals, Similarity
 from sobolev_batch.surfaces.sources.names import quoted
 
 # Labels of meshes: one, several, or all.
 Meshes = str | Sequence[str] | None
-_ERRORS_OF_DISTANCES = ("distance", "error", "truncation", "aliasing", "discretisation", "statistical")
-_PARTS_OF_DISTANCES = ("relative", "relative_error", "area_part", "shape_part")
+_OF_DISTANCES = ("distance", "error", "error_part", "relative", "relative_error", "area_part", "shape_part")
 # Meshes whose distances from another are computed at a time, until others are certainly farther.
 _CANDIDATES = 32
 # The innermost octave has this many spacings of the lattice within it.
@@ -92,7 +91,7 @@ class StoreAccessor:
                 study's reference.
 
         Returns:
-            `distance`, its `error` and the parts of the error, `relative` and `relative_error` as
+            `distance`, its `error` and as `error_part` the parts of that (`part`), `relative` and `relative_error` as
             `sobolev_batch.distance`, with `area_part` and `shape_part`, float64, in the square root of a unit length;
             for several meshes over `mesh` besides, see `norm`.
 
@@ -106,7 +105,7 @@ class StoreAccessor:
         """
         if other is None or other == reference_of(self._tree):
             table = convergence_at(self._tree, order, mesh)
-            return self._chosen(table[[*_ERRORS_OF_DISTANCES, *_PARTS_OF_DISTANCES]], order, mesh)
+            return self._chosen(table[[*_OF_DISTANCES]], order, mesh)
         meshes = finished_group(self._tree, "meshes")
         complete = meshes["mesh"].values[meshes["status"].values == "complete"].tolist()
         labels = [mesh] if isinstance(mesh, str) else complete if mesh is None else list(mesh)
@@ -115,11 +114,8 @@ class StoreAccessor:
         of_other, _, _ = reducer.norms(rows[-1:])
         columns = {**distances.named("distance"), "area_part": area, "shape_part": shape}
         columns["relative"], columns["relative_error"] = distances.relative_to(of_other)
-        table = xr.Dataset(
-            {name: (("mesh", "order"), values.T) for name, values in columns.items()},
-            coords=coordinates_of(meshes.sel(mesh=labels), reducer.orders).variables,
-        )
-        return self._chosen(describe(table), order, mesh if isinstance(mesh, str) else labels)
+        table = table_of(columns, meshes.sel(mesh=labels), reducer.orders)
+        return self._chosen(table, order, mesh if isinstance(mesh, str) else labels)
 
     def nearest(self, mesh: str, count: int = 10, order: float = -2.0) -> xr.Dataset:
         """Return the meshes nearest to one, nearest first, with their distances.
@@ -132,7 +128,7 @@ class StoreAccessor:
             order: Order s < -1/2.
 
         Returns:
-            Dataset over `mesh` with `distance`, its `error` and the parts of the error.
+            Dataset over `mesh` with `distance`, its `error`, and as `error_part` the parts of that (`part`).
 
         Raises:
             InputError: The count is not positive; see `StoreAccessor` for others.
@@ -156,17 +152,14 @@ class StoreAccessor:
             if len(found) >= count and found[count - 1][0] <= bounds[candidates[start]]:
                 break
             group = candidates[start : start + _CANDIDATES]
-            columns = np.stack([*pair_distances(reducer, [row], group).named("distance").values()])[:, 0, 0]
+            columns = np.stack([*pair_distances(reducer, [row], group)])[:, 0, 0]
             found += zip(columns[0].tolist(), group, columns.T.tolist(), strict=True)
             found.sort(key=lambda entry: entry[:2])
         chosen = found[:count]
-        names = NormEstimate(*np.zeros((5, 1))).named("distance")
-        values = np.array([entry[2] for entry in chosen]).reshape(len(chosen), len(names))
-        table = xr.Dataset(
-            {name: (("mesh", "order"), values[:, [k]]) for k, name in enumerate(names)},
-            coords=coordinates_of(meshes.sel(mesh=[labels[one] for _, one, _ in chosen]), orders).variables,
-        )
-        return describe(table).sel(order=orders[0])
+        # Values and the parts of their errors, over one order.
+        estimate = NormEstimate(*np.array([entry[2] for entry in chosen]).reshape(-1, 5).T[:, None])
+        table = table_of(estimate.named("distance"), meshes.sel(mesh=[labels[one] for _, one, _ in chosen]), orders)
+        return table.sel(order=orders[0])
 
     def _chosen(self, table: xr.Dataset, order: Orders, mesh: Meshes) -> xr.Dataset:
         """Return a table (mesh, order) of some meshes, without the dimension of what is single."""
@@ -334,16 +327,13 @@ def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
     rows: list[int] = meshes["row"].values.tolist()
     place_of = {row: place for place, row in enumerate(rows)}
     complete = [row for row in reducer.complete if row in place_of]
-    places = np.ix_(*[[place_of[row] for row in complete]] * 2)
+    first, second = np.ix_(*[[place_of[row] for row in complete]] * 2)
     found = pair_distances(reducer, complete, complete).named("distance")
-    columns = {name: np.full((len(rows), len(rows), len(others)), np.nan) for name in found}
+    columns = {}
     for name, values in found.items():
-        columns[name][places] = np.moveaxis(values, 0, -1)
-    dimensions = ("mesh", "other", "order")
-    computed = xr.Dataset(
-        {name: (dimensions, values, stored[name].attrs) for name, values in columns.items()},
-        coords={**stored.drop_vars("order").coords, "order": ("order", list(others))},
-    )
+        columns[name] = np.full((len(others), len(rows), len(rows), *values.shape[3:]), np.nan)
+        columns[name][:, first, second] = values
+    computed = table_of(columns, meshes, others, "mesh", "other").assign_coords(other=stored["other"])
     require_unchanged(tree)
     return _joined(stored, computed, chosen)
 

@@ -78,6 +78,10 @@ class Support:
     reach: float = 0.0
 
 
+# Of an error, in the order of `NormEstimate`.
+PARTS = ("truncation", "aliasing", "discretisation", "statistical")
+
+
 @dataclass(frozen=True)
 class NormEstimate:
     """Norms or distances with their errors, each (orders, ...).
@@ -109,15 +113,8 @@ class NormEstimate:
         return quotients((self.values, self.errors), (norms.values, norms.errors))
 
     def named(self, name: str) -> dict[str, Reals]:
-        """Return the values under a name, the error and its parts under theirs."""
-        return {
-            name: self.values,
-            "error": self.errors,
-            "truncation": self.truncation,
-            "aliasing": self.aliasing,
-            "discretisation": self.discretisation,
-            "statistical": np.broadcast_to(self.statistical, np.shape(self.values)),
-        }
+        """Return the values under a name, the error, and as "error_part" its `PARTS` (orders, ..., part)."""
+        return {name: self.values, "error": self.errors, "error_part": np.stack([*self][1:], axis=-1)}
 
 
 def quotients(values: tuple[Reals, Reals], norms: tuple[Reals, Reals]) -> tuple[Reals, Reals]:

@@ -51,8 +51,7 @@ def test_stored_fields_and_tables_are_those_of_the_library(client: Client, finis
     # At order -10 the coarse lattice's aliasing exceeds the distances: marked, and without a rate.
     assert not convergence.sel(order=-10.0)["resolved"].any()
     assert np.isnan(convergence.sel(order=-10.0)["rate"]).all()
-    parts = convergence["truncation"] + convergence["aliasing"] + convergence["discretisation"]
-    assert np.array_equal(parts, convergence["error"])
+    assert np.array_equal(convergence["error_part"].sum("part"), convergence["error"])
     # All pairs know their errors too, about as well as pair by pair.
     pair = sb.distance(a, b, study.orders)
     ours = tree["distances"].to_dataset().sel(mesh="ico/2", other="ico/3")

@@ -12,8 +12,8 @@ from scipy.special import gamma, kv
 
 from sobolev_batch import Mesh, distance
 from sobolev_batch.shapes import Sphere, icosphere
+from sobolev_batch.spectral.budget import PARTS
 from sobolev_batch.surfaces.shapes.surface import Surface
-from tests.coverage.__main__ import PARTS as PARTS_OF_ERRORS
 from tests.coverage.__main__ import described, judge, judged, show
 from tests.coverage.cases import KINDS, cases_of
 from tests.coverage.matern import kernel, radial_integral
@@ -168,7 +168,7 @@ def test_triangles_that_both_meshes_have_are_left_out() -> None:
 def test_the_report_lists_what_is_uncovered_and_refused(capsys: pytest.CaptureFixture[str]) -> None:
     wrong = {"case": CASE, "kind": CASE.kind, "order": CASE.order, "measured": True, "refused": np.nan, "broken": False}
     wrong |= {"value": 1.0, "reported": 0.1, "truth": 2.0, "uncertainty": 0.01, "seconds": 3.5}
-    wrong |= dict.fromkeys(PARTS_OF_ERRORS, 0.025)
+    wrong |= dict.fromkeys(PARTS, 0.025)
     refused = wrong | {"measured": False, "value": np.nan, "refused": 0.2, "broken": True, "seconds": 7.0}
     assert not show(judged([wrong, refused]))
     printed = capsys.readouterr().out

@@ -166,8 +166,7 @@ def test_its_error_covers_what_a_finer_lattice_finds(name: str, highest: float, 
         off = np.sqrt(((found["gradient"] - finest["gradient"]) ** 2).sum(["vertex", "axis"]))
         assert (off <= found["error"] + finest["error"]).all()
         assert (found["error"] <= 200 * off + 1e-6 * abs(found["gradient"]).sum(["vertex", "axis"])).all()
-        parts = found["truncation"] + found["aliasing"] + found["discretisation"]
-        np.testing.assert_allclose(parts, found["error"])
+        np.testing.assert_allclose(found["error_part"].sum("part"), found["error"])
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -175,7 +174,7 @@ def test_the_measured_part_of_its_error_covers_that_of_a_coarse_eps(seed: int) -
     lattice = sb.Lattice(3.0, 30)
     coarse, fine = (sb.fitting.gradient(wrinkled(seed), SPHERE, -4.0, lattice=lattice, eps=eps) for eps in (1e-2, 1e-9))
     difference = float(np.linalg.norm(coarse["gradient"] - fine["gradient"]))
-    assert 0 < difference < coarse["discretisation"].item() / 2
+    assert 0 < difference < coarse["error_part"].sel(part="discretisation").item() / 2
 
 
 def test_a_lattice_of_a_few_samples_leaves_most_beyond_it_and_unknown_quality_no_error() -> None:

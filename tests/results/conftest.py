@@ -7,6 +7,7 @@ import pytest
 import xarray as xr
 
 from sobolev_batch.spectral.fields import Quality
+from sobolev_batch.spectral.metrics.datasets import dataset_of
 from sobolev_batch.spectral.probe import Probe
 from sobolev_batch.surfaces.shapes.subdivision import icosphere
 
@@ -21,8 +22,8 @@ def tree() -> xr.DataTree:
     rate = np.array([[np.nan, np.nan], [2.0, 2.0], [np.nan, np.nan], [np.nan, np.nan]])
     columns = {
         "distance": distance,
-        **dict.fromkeys(("error", "truncation"), distance / 1000),
-        **dict.fromkeys(("aliasing", "discretisation", "statistical"), 0 * distance),
+        "error": distance / 1000,
+        "error_part": np.multiply.outer(distance, [1e-3, 0.0, 0.0, 0.0]),
         "relative": distance / 4,
         "relative_error": distance / 4000,
         "area_part": 0.6 * distance,
@@ -32,11 +33,8 @@ def tree() -> xr.DataTree:
         "resolved": np.array([[True, True], [True, False], [False, False], [False, False]]),
         "within": np.array([[True, False], [True, False], [False, False], [True, True]]),
     }
-    convergence = xr.Dataset(
-        {name: (("mesh", "order"), values) for name, values in columns.items()},
-        coords={"mesh": MESHES, "order": [-10.0, -2.5]},
-        attrs={"reference": "reference"},
-    ).assign(edge_length=("mesh", [0.2, 0.1, np.nan, np.nan]))
+    coordinates = {"mesh": MESHES, "order": [-10.0, -2.5], "edge_length": ("mesh", [0.2, 0.1, np.nan, np.nan])}
+    convergence = dataset_of(columns, ("mesh", "order"), coordinates).assign_attrs(reference="reference")
     about = {
         "family": ["f_1", "f_1", "f_1", "reference"],
         "name": ["0", "1", "2", "reference"],

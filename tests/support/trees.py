@@ -9,18 +9,17 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.spatial.distance import cdist
 
-ERRORS = ("error", "truncation", "aliasing", "discretisation", "statistical")
+from sobolev_batch.spectral.metrics.datasets import dataset_of
 
 
 def distances_of(points: npt.ArrayLike, labels: Sequence[str], factors: Mapping[float, float]) -> xr.Dataset:
     """Return the distances of all pairs times a factor for each order, with errors of a hundredth."""
     places = np.asarray(points, dtype=float).reshape(len(labels), -1)
     distance = cdist(places, places)[..., None] * np.array([*factors.values()])
-    parts = {"distance": distance, **dict.fromkeys(ERRORS, distance / 100)}
-    return xr.Dataset(
-        {name: (("mesh", "other", "order"), values) for name, values in parts.items()},
-        coords={"mesh": labels, "other": labels, "order": [*factors]},
-    )
+    parts = np.multiply.outer(distance, [0.01, 0.0, 0.0, 0.0])
+    columns = {"distance": distance, "error": distance / 100, "error_part": parts}
+    coordinates = {"mesh": labels, "other": labels, "order": [*factors]}
+    return dataset_of(columns, ("mesh", "other", "order"), coordinates)
 
 
 def tree_of(points: npt.ArrayLike, labels: Sequence[str], factors: Mapping[float, float]) -> xr.DataTree:

@@ -20,18 +20,16 @@ from sobolev_batch.batch.store.keyed import key_in, key_of, missing_chunks, seal
 from sobolev_batch.batch.store.store import DISTANCES, PAIRS_KEYS, Store
 from sobolev_batch.batch.store.tables import array_keys, dataset_keys
 from sobolev_batch.errors import DamageError
-from sobolev_batch.spectral.budget import NormEstimate
-from sobolev_batch.spectral.metrics.datasets import VARIABLES
+from sobolev_batch.spectral.budget import PARTS, NormEstimate
+from sobolev_batch.spectral.metrics.datasets import VARIABLES, describe
 from sobolev_batch.surfaces.shapes.surface import Reals
 
 # Meshes along a side of a tile: with fewer, small studies keep their workers busy; with more, there are fewer keys.
 _FEWEST, _MOST, _TILES_OF_A_ROW = 32, 512, 8
 # Of the distances and the parts of their errors, as `NormEstimate.named` gives them.
-_COLUMNS = ("distance", "error", "truncation", "aliasing", "discretisation", "statistical")
-
-
+_COLUMNS = ("distance", "error", "error_part")
 # Of a pair on disk, for each order.
-PAIR_BYTES = 8 * len(_COLUMNS)
+PAIR_BYTES = 8 * (2 + len(PARTS))
 
 
 def _side(meshes: int) -> int:
@@ -81,13 +79,15 @@ class Pairs:
         count, side = len(self.rows), self.side
         shape, chunks = (count, count, len(self.orders)), (side, side, len(self.orders))
         others = ("other", meshes["mesh"].values, dict(VARIABLES["other"]))
-        keys = dataset_keys(DISTANCES, meshes.assign_coords(other=others))
+        keys = dataset_keys(DISTANCES, describe(meshes.assign_coords(other=others, part=np.array(PARTS, dtype=object))))
         # xarray makes coordinates of what `coordinates` names.
         names = " ".join(["key", *map(str, meshes.coords.keys() - meshes.sizes.keys())])
         for name in _COLUMNS:
             path, dimensions = f"{DISTANCES}/{name}", ("mesh", "other", "order")
             attributes = {**VARIABLES[name], "coordinates": names}
-            keys |= array_keys(path, "float64", shape, chunks, dimensions, **attributes)
+            # A chunk for each part, as small as those of the distances.
+            length, step, axis = ((len(PARTS),), (1,), ("part",)) if name == "error_part" else ((), (), ())
+            keys |= array_keys(path, "float64", shape + length, chunks + step, dimensions + axis, **attributes)
         tiles = math.ceil(count / side)
         keys |= array_keys(PAIRS_KEYS, str, (tiles, tiles), (1, 1), ("tile", "other_tile"))
         before = self.store.stored_document(f"{DISTANCES}/{_COLUMNS[0]}")
@@ -141,13 +141,14 @@ def fill_tile(reducer: Reducer, pairs: Pairs, tile: tuple[int, int]) -> None:
     sides = [pairs.tile_rows(number) for number in tile]
     complete = [[row for row in side if row in pairs.keys] for side in sides]
     places = np.ix_(*([place for place, row in enumerate(side) if row in pairs.keys] for side in sides))
-    estimate = pair_distances(reducer, *complete) if all(complete) else None
+    unknown = np.full((1 + len(PARTS), len(pairs.orders), *map(len, complete)), np.nan)
+    estimate = pair_distances(reducer, *complete) if all(complete) else NormEstimate(*unknown)
     spans = [slice(k * pairs.side, k * pairs.side + len(side)) for k, side in zip(tile, sides, strict=True)]
     arrays: dict[str, Reals] = {}
-    for name in sorted(_COLUMNS):
-        arrays[name] = np.full((len(sides[0]), len(sides[1]), len(pairs.orders)), np.nan)
-        if estimate is not None:
-            arrays[name][places] = np.moveaxis(estimate.named("distance")[name], 0, -1)
+    for name, values in sorted(estimate.named("distance").items()):
+        moved = np.moveaxis(values, 0, 2)
+        arrays[name] = np.full((*map(len, sides), *moved.shape[2:]), np.nan)
+        arrays[name][places] = moved
     mirrored = {name: np.swapaxes(values, 0, 1) for name, values in arrays.items()}
     both = [(tile, spans, arrays), (tile[::-1], spans[::-1], mirrored)][: len({*tile})]
     # Should this be interrupted, no old key may stand for new values.

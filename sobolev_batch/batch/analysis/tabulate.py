@@ -36,12 +36,12 @@ from sobolev_batch.errors import DamageError
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.budget import NormEstimate
 from sobolev_batch.spectral.fields import Quality
-from sobolev_batch.spectral.metrics.datasets import describe, observed_rates
+from sobolev_batch.spectral.metrics.datasets import dataset_of, describe, observed_rates
 from sobolev_batch.surfaces.sources.mesh_cache import Cost
 from sobolev_batch.surfaces.sources.names import natural_key
 
 # Raise it whenever tables hold something that those of older versions lack: they are then made again.
-TABLES_VERSION = 9
+TABLES_VERSION = 10
 
 # Columns of the table of meshes that all tables have as coordinates, besides times and other metadata.
 _COORDINATES = ("family", "name", "level", "status", "vertices", "triangles", "edge_length_mean", "seconds")
@@ -162,12 +162,13 @@ class Results:
 
     def norms_table(self) -> xr.Dataset:
         """Return `norm` (mesh, order) with its error."""
-        return self._table({**NormEstimate(*self.norms).named("norm"), "beyond": self.parts[2]}, "mesh")
+        columns = {**NormEstimate(*self.norms).named("norm"), "beyond": self.parts[2]}
+        return table_of(columns, self.meshes, self.orders)
 
     def distances_table(self) -> xr.Dataset:
         """Return `distance` (mesh, other, order) with its error; the only other is the reference."""
         distances = NormEstimate(*self.to_reference[..., None]).named("distance")
-        table = self._table(distances, "mesh", "other")
+        table = table_of(distances, self.meshes, self.orders, "mesh", "other")
         return describe(table.assign_coords(other=("other", np.array([self.reference], dtype=object))))
 
     def convergence_table(self, accuracy: Accuracy | None) -> xr.Dataset:
@@ -196,7 +197,7 @@ class Results:
             "within": np.ones_like(distances, dtype=bool) if accuracy is None else accuracy.met(to_reference),
         }
         attributes = {"reference": self.reference, **({} if accuracy is None else {"rtol": accuracy.rtol})}
-        return self._table(columns, "mesh").assign_attrs(attributes)
+        return table_of(columns, self.meshes, self.orders).assign_attrs(attributes)
 
     def _sequences(self) -> list[list[int]]:
         """Return the places of the meshes of each family that goes from coarse to fine."""
@@ -207,15 +208,19 @@ class Results:
                 families.setdefault(family, []).append(place)
         return list(families.values())
 
-    def _table(self, columns: Mapping[str, NDArray[Any]], *dimensions: str) -> xr.Dataset:
-        """Return values (orders, ...) as variables whose last dimension is the order."""
-        variables = {name: ((*dimensions, "order"), np.moveaxis(values, 0, -1)) for name, values in columns.items()}
-        return describe(xr.Dataset(variables, coords=coordinates_of(self.meshes, self.orders).variables))
+
+def table_of(
+    columns: Mapping[str, NDArray[Any]], meshes: xr.Dataset, orders: Sequence[float], *dimensions: str
+) -> xr.Dataset:
+    """Return values (orders, ...) by name over dimensions (default "mesh") and the order, as a table of meshes."""
+    dimensions = dimensions or ("mesh",)
+    moved = {name: np.moveaxis(values, 0, len(dimensions)) for name, values in columns.items()}
+    return dataset_of(moved, (*dimensions, "order"), coordinates_of(meshes, orders).variables)
 
 
 def coordinates_of(meshes: xr.Dataset, orders: Sequence[float]) -> xr.Dataset:
     """Return the coordinates that every table has, from the table of meshes."""
-    names = [*_COORDINATES, *(_SOME & meshes.coords.keys()), *meshes.attrs.get("metadata", ())]
+    names = [*_COORDINATES, *sorted(_SOME & meshes.coords.keys()), *meshes.attrs.get("metadata", ())]
     coordinates = meshes.reset_coords()[names].rename(edge_length_mean="edge_length")
     return describe(
         xr.Dataset(coords={**coordinates.variables, "order": ("order", np.array(orders, dtype=np.float64))})
@@ -334,7 +339,7 @@ def _meshes_table(workspace: Workspace) -> xr.Dataset:
     table = xr.Dataset(variables, attrs={"metadata": list(metadata)})
     # Texts have no missing value, which `where` needs of variables that are no coordinates.
     texts = [name for name, values in columns.items() if values.dtype == object]
-    return describe(table.set_coords([*texts, *_COORDINATES, *(_SOME & columns.keys()), *metadata]))
+    return describe(table.set_coords([*texts, *_COORDINATES, *sorted(_SOME & columns.keys()), *metadata]))
 
 
 def _metadata(rows: Sequence[Row]) -> dict[str, NDArray[np.generic]]:

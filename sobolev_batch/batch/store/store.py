@@ -242,7 +242,9 @@ class Store:
     def _root(self) -> Document:
         """Return the document at the root with those of all nodes, as zarr consolidates them, without the digest."""
         attributes = {name: value for name, value in self.documents[""]["attributes"].items() if name != DIGEST}
-        nodes = {name: self.documents[name] for name in sorted(self.documents) if name}
+        # Readers list the variables of a group in this order: the number and its error first.
+        names = sorted(filter(None, self.documents), key=lambda name: name.split("/")[0])
+        nodes = {name: self.documents[name] for name in names}
         consolidated = {"kind": "inline", "must_understand": False, "metadata": nodes}
         return {**self.documents[""], "attributes": attributes, "consolidated_metadata": consolidated}
 

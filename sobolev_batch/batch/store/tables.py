@@ -73,7 +73,10 @@ def dataset_keys(group: str, dataset: xr.Dataset) -> dict[str, bytes]:
     # A missing chunk is a lost one, and never a table of zeros.
     with zarr.config.set({"array.write_empty_chunks": True}):
         dataset.to_zarr(MemoryStore(keys), group=group, mode="w", zarr_format=3, consolidated=False, encoding=encoding)
-    return _bytes_of(keys)
+    # xarray writes several at a time, in any order.
+    places = {str(name): place for place, name in enumerate(dataset.variables)}
+    written = _bytes_of(keys)
+    return {key: written[key] for key in sorted(written, key=lambda key: places.get(key.split("/")[1], -1))}
 
 
 def _steps(variable: xr.Variable) -> int:
@@ -101,7 +104,7 @@ def write_table(store: Store, group: str, dataset: xr.Dataset) -> None:
     store.publish(dataset_keys(group, dataset.drop_vars(large)))
     # One after the other, since keys are copies.
     for name in large:
-        store.publish(dataset_keys(group, dataset[[name]].drop_vars(list(dataset.coords))))
+        store.publish(dataset_keys(group, dataset[[name]].drop_vars(list(dataset.coords), errors="ignore")))
 
 
 def table_attributes(store: Store, group: str) -> dict[str, Any] | None:

@@ -19,7 +19,7 @@ from sobolev_batch.spectral.adaptive.solve import DistanceTarget
 from sobolev_batch.spectral.fields import USUAL_DEGREE
 from sobolev_batch.spectral.kinds import kind_of
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.metrics.datasets import VARIABLES
+from sobolev_batch.spectral.metrics.datasets import TAKEN_NAMES
 from sobolev_batch.spectral.octaves.sampling import TailSampling
 from sobolev_batch.spectral.probe import Sample, draws_for
 from sobolev_batch.spectral.transform import NUMERICS_VERSION, TransformSettings, require_inside
@@ -174,9 +174,9 @@ def members_of(study: Study) -> dict[str, tuple[str, Member]]:
                 raise StudyError(f"two surfaces of the study have the label {label!r}")
             if isinstance(member, RemeshedMember):
                 # What was wanted, beside what came of it.
-                named = ((f"target_{name}" if name in VARIABLES else name, value) for name, value in member.metadata)
+                named = ((f"target_{name}" if name in TAKEN_NAMES else name, value) for name, value in member.metadata)
                 member = replace(member, metadata=tuple(named))
-            taken = next((name for name, _ in member.metadata if name in VARIABLES), None)
+            taken = next((name for name, _ in member.metadata if name in TAKEN_NAMES), None)
             if taken is not None:
                 raise StudyError(
                     f"family {family.name!r}: the metadata of {quoted(member.name)} have the name {taken!r}, which "

@@ -39,8 +39,9 @@ from sobolev_batch.results.tables.text import (
     section,
     with_error,
 )
+from sobolev_batch.spectral.budget import PARTS
 from sobolev_batch.spectral.lattice import Orders
-from sobolev_batch.spectral.metrics.datasets import observed_rates
+from sobolev_batch.spectral.metrics.datasets import observed_rates, parts_as_variables
 from sobolev_batch.surfaces.sources.mesh_cache import Cost
 
 _ABOUT = ("family", "name", "level", "rank", "ordered_by", "status", "reason", "triangles", "vertices", "seconds")
@@ -48,10 +49,7 @@ _NUMBERS = (
     "edge_length",
     "distance",
     "error",
-    "truncation",
-    "aliasing",
-    "discretisation",
-    "statistical",
+    *PARTS,
     "relative",
     "relative_error",
     "area_part",
@@ -177,7 +175,7 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
         nearness = {key: proximity[key].values for key in _PROXIMITIES}
     frames = []
     for s in dict.fromkeys(convergence["order"].values.tolist()):
-        row = convergence.sel(order=s)
+        row = parts_as_variables(convergence.sel(order=s))
         numbers = {key: row[key].values[others] for key in _NUMBERS}
         frames.append(pd.DataFrame({"order": s, **columns, **numbers, **nearness}))
     frame = pd.concat(frames, ignore_index=True).astype(dict.fromkeys(_COUNTS, "Int64"))

@@ -23,12 +23,13 @@ from sobolev_batch.results.tables.text import (
     section,
     with_error,
 )
-from sobolev_batch.spectral.budget import quotients
+from sobolev_batch.spectral.budget import PARTS, quotients
 from sobolev_batch.spectral.lattice import check_orders
+from sobolev_batch.spectral.metrics.datasets import parts_as_variables
 
 Reals = NDArray[np.float64]
 
-_COLUMNS = ("distance", "error", "truncation", "aliasing", "discretisation", "statistical")
+_COLUMNS = ("distance", "error", *PARTS)
 # A longer printed matrix cannot be read.
 _MOST_MESHES = 20
 _LONGEST_LABEL = 30
@@ -88,7 +89,7 @@ def matrix(
     distances = distances_at(tree, order)
     if values not in _COLUMNS:
         raise InputError(f"values must be one of {', '.join(_COLUMNS)}, found {values!r}")
-    frame: pd.DataFrame = distances[values].sel(order=order).transpose("mesh", "other").to_pandas()
+    frame: pd.DataFrame = parts_as_variables(distances)[values].sel(order=order).transpose("mesh", "other").to_pandas()
     frame.attrs = {"order": order, "reference": reference_of(tree), "values": values}
     return frame
 
@@ -96,7 +97,7 @@ def matrix(
 def matrix_frame(distances: xr.Dataset, order: float) -> pd.DataFrame:
     """Return the distances of one order in long form, with their errors: one row for each pair of meshes."""
     columns = list(_COLUMNS)
-    chosen = distances[columns].sel(order=order).load()
+    chosen = parts_as_variables(distances.sel(order=order))[columns].load()
     frame = chosen.to_dataframe(dim_order=["mesh", "other"]).reset_index()
     return frame[["order", "mesh", "other", *columns]]
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
-from sobolev_batch.spectral.budget import NormEstimate, ReferenceEstimate
+from sobolev_batch.spectral.budget import PARTS, NormEstimate, ReferenceEstimate
 from sobolev_batch.spectral.lattice import AXES, Lattice, Orders
 from sobolev_batch.surfaces.shapes.surface import Reals
 
@@ -37,13 +38,14 @@ VARIABLES: Mapping[str, Mapping[str, str]] = {
     "gradient": described("derivative of the squared distance with respect to the vertices", NUMBER),
     "norm": described("Sobolev norm", NORM, kernel="(1 + |ξ|²)^s"),
     "distance": described("Sobolev distance", NORM, kernel="(1 + |ξ|²)^s"),
-    "error": described("bound on the error", NORM, description="truncation + aliasing + discretisation + statistical"),
-    "truncation": described(
-        "error of truncation", NORM, description="frequencies beyond the highest one; on a given lattice they only add"
+    "error": described("bound on the error", NORM, description="the sum of error_part"),
+    "error_part": described("part of the bound on the error", NORM),
+    "part": described(
+        "cause of a part of the error",
+        description="truncation: frequencies beyond the highest one, which only add on a given lattice; "
+        "aliasing: spacing of the lattice; discretisation: quadrature and NUFFT; "
+        "statistical: random frequencies, in 99 % of cases",
     ),
-    "aliasing": described("error of aliasing", NORM, description="spacing of the lattice"),
-    "discretisation": described("error of discretisation", NORM, description="quadrature and NUFFT"),
-    "statistical": described("error of random frequencies", NORM, description="holds in 99 % of cases"),
     "relative": described("distance over the norm of the reference", NUMBER),
     "relative_error": described("bound on the error of the relative distance", NUMBER),
     "area_part": described("distance explained by a change of total area alone", NORM),
@@ -101,6 +103,26 @@ VARIABLES: Mapping[str, Mapping[str, str]] = {
 }
 
 
+# Variables of results and columns of frames have these names.
+TAKEN_NAMES = VARIABLES.keys() | set(PARTS)
+
+
+def dataset_of(
+    columns: Mapping[str, NDArray[Any]], dimensions: Sequence[str], coordinates: Mapping[Any, Any]
+) -> xr.Dataset:
+    """Return values by name over some dimensions, and `error_part` over `part` besides, as a described dataset."""
+    variables = {
+        name: ((*dimensions, *(("part",) if name == "error_part" else ())), values) for name, values in columns.items()
+    }
+    names = {"part": np.array(PARTS, dtype=object)} if "error_part" in columns else {}
+    return describe(xr.Dataset(variables, coords={**coordinates, **names}))
+
+
+def parts_as_variables(dataset: xr.Dataset) -> xr.Dataset:
+    """Return a dataset with a variable for each part of the error in place of `error_part`."""
+    return dataset.drop_dims("part").assign(dataset["error_part"].to_dataset("part"))
+
+
 def describe(dataset: xr.Dataset) -> xr.Dataset:
     """Add to variables the attributes that they lack, in place, and return the dataset."""
     for name, variable in dataset.variables.items():
@@ -117,8 +139,11 @@ def order_axis(order: Orders) -> tuple[tuple[str, ...], Reals, dict[str, str]]:
 def labelled(order: Orders, values: Mapping[str, Reals], attributes: Mapping[str, Any]) -> xr.Dataset:
     """Return values (orders,) by name over the dimension `order`, or without dimensions for a single order."""
     axis = order_axis(order)
-    variables = {name: (axis[0], np.asarray(value).reshape(axis[1].shape)) for name, value in values.items()}
-    return describe(xr.Dataset(variables, coords={"order": axis}, attrs={"kernel": KERNEL, **attributes}))
+    columns = {
+        name: np.reshape(value, (*axis[1].shape, *([len(PARTS)] if name == "error_part" else [])))
+        for name, value in values.items()
+    }
+    return dataset_of(columns, axis[0], {"order": axis}).assign_attrs({"kernel": KERNEL, **attributes})
 
 
 def labelled_distances(

@@ -69,9 +69,9 @@ def norm(
             A whole number from 0 on.
 
     Returns:
-        Dataset over `order` with `norm`, its `error`, and the four parts of the error: `truncation`
-        (frequencies beyond the highest one; on a given lattice it can only add to the norm), `aliasing`,
-        `discretisation` and `statistical` (zero without octaves). All are float64, in the square root of a unit
+        Dataset over `order` with `norm`, its `error`, and `error_part`, the four parts of the error over `part`:
+        truncation (frequencies beyond the highest one; on a given lattice it can only add to the norm), aliasing,
+        discretisation and statistical (zero without octaves). All are float64, in the square root of a unit
         length. The error is NaN for fields without the attribute `quality`. A single order has no dimension.
         Attributes hold the lattice and the kernel. With rtol, `within` is True where the error is below rtol times
         the norm.

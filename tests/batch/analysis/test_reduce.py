@@ -30,6 +30,9 @@ def test_tables_have_coordinates_and_nothing_but_nan_of_a_mesh_that_failed(store
     table["family"].append({"name": "lost", "source": "files", "paths": ["nowhere.ply"]})
     run(Study.from_table(table), store_path, threads)
     tree = xr.open_datatree(store_path, engine="zarr").load()
+    for group, number in (("norms", "norm"), ("distances", "distance"), ("convergence", "distance")):
+        assert list(tree[group].data_vars)[:3] == [number, "error", "error_part"]
+        xr.testing.assert_equal(tree[group]["error_part"].sum("part", skipna=False), tree[group]["error"])
     for group in ("meshes", "norms", "distances", "convergence"):
         whole = tree[group].to_dataset()
         small = whole.where(whole["triangles"] < 100, drop=True)

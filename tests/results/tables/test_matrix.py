@@ -15,7 +15,8 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.results.store_accessor import distances_at
 from sobolev_batch.results.tables import Format
 from sobolev_batch.results.tables.matrix import format_matrix, matrix_frame, pairs_of
-from tests.support.trees import ERRORS, tree_of
+from sobolev_batch.spectral.budget import PARTS
+from tests.support.trees import tree_of
 
 
 def made(count: int, failed: int = 1) -> xr.DataTree:
@@ -74,7 +75,7 @@ def test_programs_get_lines_of_pairs() -> None:
     assert "-4.0,f/0,f/1,,,,,," in lines
     records = json.loads(format_matrix(made(3), "json", [-4.0]))
     pair = {"order": -4.0, "mesh": "f/0", "other": "f/2"}
-    assert records[2] == {**pair, "distance": 2.0, **dict.fromkeys(ERRORS, 0.02)}
+    assert records[2] == {**pair, "distance": 2.0, "error": 0.02, "truncation": 0.02, **dict.fromkeys(PARTS[1:], 0.0)}
     assert records[1]["distance"] is None
 
 

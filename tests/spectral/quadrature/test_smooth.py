@@ -118,7 +118,7 @@ def test_too_few_nodes_are_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
     field = sb.fourier_transform(surface, LATTICE, 1e-12, threads=1)
     orders = [-2.0, -5.0]
     truth = sb.distance(field, exact, orders)["distance"].values
-    reported = sb.norm(field, orders)["discretisation"].values
+    reported = sb.norm(field, orders)["error_part"].sel(part="discretisation").values
     assert (truth > 1e-8).all()
     assert (truth <= reported).all()
     assert (reported < 30 * truth).all()
@@ -134,7 +134,7 @@ def test_what_doubling_the_nodes_changes_is_reported() -> None:
     exact = sb.fourier_transform(mesh, LATTICE, 1e-13, threads=1)
     field = sb.fourier_transform(surface, LATTICE, 1e-4, threads=1)
     truth = sb.distance(field, exact, orders)["distance"].values
-    reported = sb.norm(field, orders)["discretisation"].values
+    reported = sb.norm(field, orders)["error_part"].sel(part="discretisation").values
     assert (truth <= reported).all()
     assert (truth > 1e-6).all()
     _, change = resolution_of(surface, LATTICE.highest_frequency, 1e-4)
