@@ -12,6 +12,7 @@ import subprocess
 import sys
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import dask
 import numpy as np
@@ -166,6 +167,39 @@ def test_the_exit_status_of_a_verdict(folder: Path) -> None:
         assert (done.returncode, done.stderr) == (status, "")
         assert done.stdout.startswith(f"{file}: {word}")
         assert done.stdout.count("\n") == 1
+
+
+def document(*arguments: str, folder: Path, status: int = 0) -> dict[str, Any]:
+    """The JSON document that is all that a command prints."""
+    table: dict[str, Any] = json.loads(output(*arguments, "--format", "json", folder=folder, status=status))
+    return table
+
+
+def test_json_has_the_numbers_that_texts_round(folder: Path) -> None:
+    options = ("--order=-4,-3", "--xi-max", "3", "--M", "24", "--proximity")
+    found = document("compare", "1.off", "3.off", *options, folder=folder)
+    first, third = (sb.read_mesh(folder / name) for name in ("1.off", "3.off"))
+    similarity = sb.shapes.Similarity.to_unit_ball(third)
+    pair = similarity.apply(first), similarity.apply(third)
+    expected = sb.distance(*pair, [-4.0, -3.0], lattice=sb.Lattice(3.0, 24))
+    assert [row["order"] for row in found["orders"]] == [-4.0, -3.0]
+    for name in ("distance", "error", "relative", "relative_error", "truncation"):
+        assert [row[name] for row in found["orders"]] == pytest.approx(expected[name].values.tolist(), rel=1e-9)
+    assert (found["scale"], found["a"]) == (similarity.scale, "1.off")
+    assert found["area_change"] == pytest.approx(first.area / third.area - 1)
+    assert found["proximity"]["hausdorff"] == sb.proximity(*pair).hausdorff
+    verdict = document("compare", "1.off", "3.off", "--below", "0.01", folder=folder, status=1)
+    assert verdict["outcome"] == "different"
+    assert 0.01 < verdict["lower"] < verdict["distance"] < verdict["upper"]
+
+
+def test_json_of_studies_and_stores(folder: Path) -> None:
+    plan = document("plan", "study.toml", folder=folder)
+    assert (plan["study"], plan["stored"], plan["lattice"]) == ("cli", plan["labels"], {"xi_max": 3.0, "M": 16})
+    status = document("status", STORE, folder=folder)
+    assert (status["complete"], status["run"]["state"], status["seconds_left"]) == (3, "done", None)
+    checked = document("verify", STORE, folder=folder)
+    assert (checked["is_sound"], checked["total"], checked["fields"]) == (True, 3, {})
 
 
 def test_an_error_is_no_difference(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

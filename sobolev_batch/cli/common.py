@@ -132,6 +132,13 @@ format_option = click.option(
     show_default=True,
     help="Print text, markdown or latex for people, csv or json for programs.",
 )
+json_option = click.option(
+    *("--format", "style"),
+    type=click.Choice(["text", "json"]),
+    default="text",
+    show_default=True,
+    help="Print text for people, or one JSON document for programs.",
+)
 study_argument = click.argument("study", type=PATH)
 best_effort_option = click.option(
     "--best-effort",
@@ -187,6 +194,13 @@ def echo(line: object = "", *, err: bool = False) -> None:
 def echo_lines(text: object, *, err: bool = False) -> None:
     """Print a text of several lines, whose names are visible already."""
     click.echo(visible_lines(str(text)), err=err)
+
+
+def echo_json(result: Any, **more: Any) -> None:
+    """Print a result and what follows from it as one JSON document; docs/commands.md lists the keys."""
+    from sobolev_batch.results.tables.text import json_text
+
+    click.echo(json_text((result if isinstance(result, dict) else vars(result)) | more))
 
 
 def overwrite(line: str = "") -> None:

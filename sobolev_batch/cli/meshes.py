@@ -21,8 +21,10 @@ from sobolev_batch.cli.common import (
     best_effort_option,
     cli,
     echo,
+    echo_json,
     echo_lines,
     fraction_of_norm,
+    json_option,
     memory_option,
     orders_option,
     progress_bar,
@@ -43,7 +45,7 @@ if TYPE_CHECKING:
 
 _STATUSES = {"same": 0, "different": EXIT_DIFFERENT, "undecided": EXIT_UNDECIDED}
 # Options of compare that a verdict knows; it chooses the accuracy of the distance itself.
-_KNOWN = {"a", "b", "below", "orders", "memory", "no_scaling"}
+_KNOWN = {"a", "b", "below", "orders", "memory", "no_scaling", "style"}
 
 # Default of compare, which then takes the nearest attainable accuracy.
 _DEFAULT_RTOL = 1e-2
@@ -97,6 +99,7 @@ _below_option = click.option(
 )
 @click.option("--no-scaling", is_flag=True, help="Keep the files' unit. Otherwise B is scaled to the unit sphere.")
 @_below_option
+@json_option
 @click.pass_context
 def compare_command(
     context: click.Context,
@@ -113,6 +116,7 @@ def compare_command(
     witness_path: Path | None,
     no_scaling: bool,
     below: float | None,
+    style: str,
 ) -> None:
     """Print how much two meshes differ.
 
@@ -149,7 +153,15 @@ def compare_command(
     orders = orders or (-2.0,)
     accuracy: dict[str, Any] = {"lattice": lattice, "rtol": rtol, "memory": memory, "best_effort": best_effort}
     results = yardsticks(*pair, orders, **accuracy) if with_yardsticks else distance(*pair, orders, **accuracy)
-    _print_answers(a.name, b.name, results, first.area / second.area - 1, rtol)
+    area_change = first.area / second.area - 1
+    if style == "json":
+        if witness_path is not None:
+            write_difference(first, second, witness_path, orders[0], scaling=not no_scaling, subject=a.name)
+        rows = results.to_dataframe().reset_index().to_dict(orient="records")
+        more = {"settings": results.attrs, "proximity": nearness, "doubt": doubt}
+        echo_json({"a": a, "b": b, "area_change": area_change, **vars(similarity), "orders": rows, **more})
+        return
+    _print_answers(a.name, b.name, results, area_change, rtol)
     echo(f"scale {similarity.scale:.6g}, origin {' '.join(f'{x:.6g}' for x in similarity.origin)}")
     if nearness is not None:
         echo(
@@ -217,7 +229,10 @@ def _judge_files(context: click.Context, a: Path, b: Path, below: float) -> int:
     (order,) = orders
     settings = {"scaling": not context.params["no_scaling"], "memory": context.params["memory"]}
     verdict = same_surface(a, b, rtol=below, order=order, **settings)
-    echo(f"{a.name}: {verdict}")
+    if context.params["style"] == "json":
+        echo_json(verdict, a=a, b=b, distance=verdict.distance, error=verdict.error)
+    else:
+        echo(f"{a.name}: {verdict}")
     return _STATUSES[verdict.outcome]
 
 

@@ -15,10 +15,12 @@ from sobolev_batch.cli.common import (
     EXIT_SOME_FAILED,
     cli,
     echo,
+    echo_json,
     echo_lines,
     folder_option,
     format_option,
     fraction_of_norm,
+    json_option,
     location,
     meshes_option,
     orders_option,
@@ -49,8 +51,9 @@ def _require_folder(path: Path) -> None:
 @cli.command("status")
 @store_argument
 @click.option("--follow", is_flag=True, help="Show the progress on one line until the run has ended.")
+@json_option
 @click.pass_context
-def status_command(context: click.Context, store: Location, follow: bool) -> None:
+def status_command(context: click.Context, store: Location, follow: bool, style: str) -> None:
     """Show the progress of STORE's study, and what failed and why.
 
     The time left is estimated from the surfaces that were finished last.
@@ -62,7 +65,7 @@ def status_command(context: click.Context, store: Location, follow: bool) -> Non
     current = status(store)
     shown = ""
     while follow and current.going_on:
-        shown = replace_line(current.progress, shown)
+        shown = "" if style == "json" else replace_line(current.progress, shown)
         time.sleep(_FOLLOW_SECONDS)
         current = status(store)
         if current.run_store and not current.going_on:
@@ -70,7 +73,11 @@ def status_command(context: click.Context, store: Location, follow: bool) -> Non
             time.sleep(_FOLLOW_SECONDS)
             current = status(store)
     replace_line("", shown)
-    echo_lines(current)
+    if style == "json":
+        names = ("waiting", "going_on", "lost", "is_incomplete", "seconds_left")
+        echo_json(current, **{name: getattr(current, name) for name in names})
+    else:
+        echo_lines(current)
     if current.lost or (current.run is not None and current.run.state == "failed"):
         context.exit(EXIT_OTHER)
     if current.failed or current.not_compared or current.is_incomplete:
@@ -79,8 +86,9 @@ def status_command(context: click.Context, store: Location, follow: bool) -> Non
 
 @cli.command("verify")
 @store_argument
+@json_option
 @click.pass_context
-def verify_command(context: click.Context, store: Location) -> None:
+def verify_command(context: click.Context, store: Location, style: str) -> None:
     """Check all data of STORE against its checksums.
 
     All objects of a collection are checked. Damaged data are listed and, if STORE can be written, removed; `run`
@@ -97,6 +105,9 @@ def verify_command(context: click.Context, store: Location) -> None:
             bar.update(1)
 
         result = verify(store, show)
+    if style == "json":
+        echo_json(result, is_sound=result.is_sound)
+        context.exit(0 if result.is_sound else EXIT_OTHER)
     for name, one in (result.objects or {str(store): result}).items():
         counts = f"{one.complete} of {one.total} surfaces complete, their fields read back"
         echo(f"{name}: {counts if one.total else 'it has no results yet'}")

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import click
 
@@ -17,7 +17,9 @@ from sobolev_batch.cli.common import (
     allow_commands_option,
     cli,
     echo,
+    echo_json,
     echo_lines,
+    json_option,
     memory_option,
     progress_reports,
     store_option,
@@ -28,8 +30,6 @@ from sobolev_batch.cli.common import (
 if TYPE_CHECKING:
     from sobolev_batch.batch.storage.location import Location
     from sobolev_batch.batch.study.study import Study, StudyCollection
-
-Result = TypeVar("Result")
 
 # Lines about distances that are less accurate than requested.
 _MOST_IMPRECISE = 10
@@ -152,8 +152,8 @@ def submit_command(
     The cluster computes it without this process. The objects of a study are handed over one after another.
     """
     from sobolev_batch.batch.cluster.clients import remote_client
-    from sobolev_batch.batch.study.study import Study, read_study
-    from sobolev_batch.batch.submit import Submission, submit
+    from sobolev_batch.batch.study.study import read_study
+    from sobolev_batch.batch.submit import submit
 
     parsed = read_study(study)
     location = (store or _made_default_store(parsed)).absolute()
@@ -161,13 +161,11 @@ def submit_command(
     with remote_client(scheduler, trust_network) as client:
         submission = submit(parsed, location, client, allow_commands=allow_commands)
 
-    def show(one: Submission) -> None:
-        echo(f"{one.missing} of {one.surfaces} surfaces to be computed by the cluster at {scheduler}")
-
-    if isinstance(parsed, Study):
-        show(submission)
-    else:
-        _show_objects(parsed, submission.objects, submission.refused, show, "submitted")
+    for name, one in (submission.objects or {"": submission}).items():
+        where = f"{name}: " if name else ""
+        echo(f"{where}{one.missing} of {one.surfaces} surfaces to be computed by the cluster at {scheduler}")
+    for name, reason in submission.refused.items():
+        echo(f"{name}: not submitted: {reason}", err=True)
     echo(f"follow it by: sobolev-batch status --follow {shlex.quote(str(location))}")
     if submission.refused:
         context.exit(EXIT_SOME_FAILED)
@@ -179,6 +177,7 @@ def submit_command(
 @_scheduler_option()
 @trust_option
 @allow_commands_option
+@json_option
 @click.pass_context
 def plan_command(
     context: click.Context,
@@ -187,6 +186,7 @@ def plan_command(
     scheduler: str | None,
     trust_network: bool,
     allow_commands: bool,
+    style: str,
 ) -> None:
     """Show what running STUDY would do.
 
@@ -194,20 +194,17 @@ def plan_command(
     stored, and the number of surfaces that the store has already.
     """
     from sobolev_batch.batch.cluster.clients import remote_client
-    from sobolev_batch.batch.study.study import Study, read_study
-    from sobolev_batch.results.plan import plan
+    from sobolev_batch.batch.study.study import read_study
+    from sobolev_batch.results.plan import CollectionPlan, plan
 
     parsed = read_study(study)
     with remote_client(scheduler, trust_network) if scheduler else nullcontext() as client:
-        if isinstance(parsed, Study):
-            echo_lines(plan(parsed, store, client, allow_commands=allow_commands))
-            return
         made = plan(parsed, store, client, allow_commands=allow_commands)
-    _show_objects(parsed, made.objects, made.refused, echo_lines, "planned")
-    for text in made.warnings:
-        echo(f"warning: {text}", err=True)
-    echo(made.total)
-    if made.refused:
+    if style == "json":
+        echo_json(made.to_table())
+    else:
+        echo_lines(made)
+    if isinstance(made, CollectionPlan) and made.refused:
         context.exit(EXIT_SOME_FAILED)
 
 
@@ -223,22 +220,6 @@ def _is_best_effort(study: Study | StudyCollection) -> bool:
 
     studies = [study] if isinstance(study, Study) else study.studies.values()
     return any(one.accuracy is not None and one.accuracy.best_effort for one in studies)
-
-
-def _show_objects(
-    collection: StudyCollection,
-    results: Mapping[str, Result],
-    refused: Mapping[str, str],
-    show: Callable[[Result], None],
-    done: str,
-) -> None:
-    """Print what was done for each object of a collection, or why it was not."""
-    for name in collection.studies:
-        echo(f"{name}:")
-        if name in results:
-            show(results[name])
-        else:
-            echo(f"not {done}: {refused[name]}", err=True)
 
 
 def _print_league(place: Location) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import overload
+from typing import Any, overload
 
 import numpy as np
 from distributed import Client
@@ -164,6 +164,11 @@ class StudyPlan:
         """Bytes of all stored fields."""
         return self.field_bytes * len(self.labels)
 
+    def to_table(self) -> dict[str, Any]:
+        """Return the numbers for programs, with the name of the study and without what is shown."""
+        numbers = {name: value for name, value in vars(self).items() if name != "lines"}
+        return {**numbers, "study": self.study.name, "total_bytes": self.total_bytes}
+
     def __str__(self) -> str:
         return "\n".join(visible(f"{name + ':' * bool(name):<14} {text}") for name, text in self._shown)
 
@@ -271,6 +276,11 @@ class CollectionPlan:
             f"{len(self.objects)} objects: about {duration(self.seconds, digits=2)}, "
             f"{format_bytes(self.total_bytes)} of fields"
         )
+
+    def to_table(self) -> dict[str, Any]:
+        """Return the numbers for programs; see `StudyPlan.to_table`."""
+        objects = {name: one.to_table() for name, one in self.objects.items()}
+        return {**vars(self), "objects": objects, "seconds": self.seconds, "total_bytes": self.total_bytes}
 
     def __str__(self) -> str:
         lines = [f"{visible(name)}:\n{one}" for name, one in self.objects.items()]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -98,8 +99,13 @@ def test_a_plan_goes_on_past_an_object_that_cannot_be(tmp_path: Path) -> None:
     path.write_text(tomli_w.dumps(made.table))
     done = call("plan", path, "--store", tmp_path / "s.zarr")
     assert done.returncode == 3
-    assert [line for line in done.stdout.splitlines() if line in {"a:", "gone:", "b:"}] == ["a:", "gone:", "b:"]
-    assert done.stderr.startswith("not planned: ")
+    heads = [line for line in done.stdout.splitlines() if line.startswith(("a:", "gone:", "b:"))]
+    assert heads[:2] == ["a:", "b:"]
+    assert heads[2].startswith("gone: the reference cannot be made")
+    done = call("plan", path, "--store", tmp_path / "s.zarr", "--format", "json")
+    table = json.loads(done.stdout)
+    assert (done.returncode, list(table["objects"]), list(table["refused"])) == (3, ["a", "b"], ["gone"])
+    assert table["total_bytes"] == sum(one["total_bytes"] for one in table["objects"].values())
 
 
 def test_a_collection_goes_on_while_its_next_object_is_planned(changeable: Path) -> None:

@@ -181,12 +181,10 @@ def test_a_collection_is_handed_over_by_object(tmp_path: Path, client: Client) -
     submitted = call("submit", tmp_path / "study.toml", "--scheduler", address, "--store", store)
     assert submitted.returncode == 3, submitted.stderr
     assert submitted.stdout.splitlines() == [
-        "ball:",
-        f"0 of 5 surfaces to be computed by the cluster at {address}",
-        "gone:",
+        f"ball: 0 of 5 surfaces to be computed by the cluster at {address}",
         f"follow it by: sobolev-batch status --follow {store}",
     ]
-    assert "not submitted: the reference cannot be made" in submitted.stderr
+    assert "gone: not submitted: the reference cannot be made" in submitted.stderr
     assert "gone: it has no results; run the study again to see why" in call("status", store, "--follow").stdout
 
 

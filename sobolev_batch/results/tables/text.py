@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import pandas as pd
@@ -294,8 +295,17 @@ def machine_table(frame: pd.DataFrame, style: Format) -> str:
             lambda cells: cells if pd.api.types.is_numeric_dtype(cells) else cells.map(_csv_cell)
         )
         return str(texts.to_csv(index=False, lineterminator="\n")).rstrip("\n")
-    records = frame.astype(object).where(frame.notna(), None).to_dict(orient="records")
-    return json.dumps(records, indent=2, allow_nan=False)
+    return json_text(frame.astype(object).where(frame.notna(), None).to_dict(orient="records"))
+
+
+def json_text(value: Any) -> str:
+    """Return dataclasses, paths, tables and lists as ASCII JSON; null are numbers that are unknown or unbounded."""
+    text = json.dumps(value, default=_plain)
+    return json.dumps(json.loads(text, parse_constant=lambda _: None), indent=2)
+
+
+def _plain(value: Any) -> Any:
+    return os.fspath(value) if isinstance(value, os.PathLike) else asdict(value)
 
 
 def printed_table(rows: Sequence[Sequence[str]], headers: Sequence[str], style: Format) -> str:
