@@ -54,8 +54,13 @@ WORK: dict[str, tuple[Callable[[], object], int, int, int, str]] = {
     ),
     "distance to an accuracy": (
         lambda: sb.distance(COARSE, FINE, -4.0, rtol=0.05),
-        *(2, 5_900, 51_200),
+        *(2, 5_900, 25_600),
         "the lattice is chosen from exact values, before one coarse field of each mesh",
+    ),
+    "distance to a high accuracy": (
+        lambda: sb.distance(sb.shapes.icosphere(4), SPHERE, -10.0, rtol=1e-3),
+        *(2, 23_040, 327_680),
+        "one field, and a coarse one of the frequencies beyond, each probed at 32 of them",
     ),
     "gradient": (
         lambda: sb.fitting.gradient(COARSE, SPHERE, -4.0, lattice=SMALL_LATTICE),

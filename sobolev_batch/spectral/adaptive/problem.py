@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -99,10 +100,16 @@ class Problem:
         """Smallest norm that differs from zero by more than rounding."""
         return _ROUNDING * self.area
 
+    @cached_property
+    def _samples(self) -> dict[Lattice, Samples]:
+        return {}
+
     def samples(self, lattice: Lattice) -> Samples:
-        """Return samples of all surfaces at the same frequencies."""
-        draws = draws_for(self.surfaces, lattice, self.orders, USUAL_DEGREE)
-        return tuple(Sample.from_surface(surface, draws) for surface in self.surfaces)
+        """Return samples of all surfaces at the same frequencies; those of a lattice are computed once."""
+        if lattice not in self._samples:
+            draws = draws_for(self.surfaces, lattice, self.orders, USUAL_DEGREE)
+            self._samples[lattice] = tuple(Sample.from_surface(surface, draws) for surface in self.surfaces)
+        return self._samples[lattice]
 
     def dtype(self, lattice: Lattice, target: ErrorTarget) -> ComplexDtype:
         """Return the cheapest dtype that meets a target."""

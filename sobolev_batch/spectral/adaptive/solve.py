@@ -23,12 +23,19 @@ from sobolev_batch.spectral.adaptive.problem import (
     only_or_difference,
     sums_on,
 )
-from sobolev_batch.spectral.adaptive.tolerance import Accuracy, first_lattice, larger_pilot, lattice_of, refined
+from sobolev_batch.spectral.adaptive.tolerance import (
+    LEAST_CLEARANCE,
+    Accuracy,
+    first_lattice,
+    larger_pilot,
+    lattice_of,
+    refined,
+)
 from sobolev_batch.spectral.backends import ComplexDtype
-from sobolev_batch.spectral.budget import NormEstimate, Sums, estimate_norms, modulus_bound
+from sobolev_batch.spectral.budget import NormEstimate, Sums, Support, estimate_norms, modulus_bound
 from sobolev_batch.spectral.fields import Field
 from sobolev_batch.spectral.kinds import kind_of
-from sobolev_batch.spectral.lattice import Lattice, SobolevWeights, shell_sums
+from sobolev_batch.spectral.lattice import LARGEST_M, Lattice, SobolevWeights, shell_sums
 from sobolev_batch.spectral.octaves.remainder import LOWEST_ORDER, remainder
 from sobolev_batch.spectral.octaves.sampling import FaceNormals
 from sobolev_batch.spectral.probe import Sample, estimate
@@ -53,6 +60,9 @@ _NEGLIGIBLE = 0.3
 _POINTS_SECONDS, _TRIANGLE_SECONDS, _SAMPLE_SECONDS = 0.1, 1.2e-5, 4e-7
 # M of the largest lattice that takes less time than octaves.
 _WIDE_M = 160
+# Squared errors of the values on a sparse lattice, as a fraction of the allowed truncation; the order at which these
+# fields are computed; and how much too small a sum over so few frequencies may be.
+_OF_VALUES, _COARSE_ORDER, _SPARSE_CAUTION = 0.1, -2.0, 2.0
 # The least factor by which a lattice grows that shows more.
 _LEAST_GROWTH = 1.1
 # A pilot has to tell how large distances are, not more.
@@ -95,8 +105,8 @@ def solve(problem: Problem, seed: int = 0) -> Solution:
     first = first_lattice(problem.support, problem.orders, problem.accuracy)
     on_lattices, in_octaves = partial(_solve_on_lattices, strict, *first), partial(solve_in_octaves, strict, seed)
     attempts = [on_lattices]
-    seem_equal = bool(_near_duplicates(problem, first[0]).any())
-    if seem_equal and _differ_beyond(problem, first[0]):
+    seem_equal = bool(_near_duplicates(strict, first[0]).any())
+    if seem_equal and _differ_beyond(strict, first[0]):
         # No lattice would show it.
         attempts = [in_octaves]
     elif permits_octaves(problem.accuracy):
@@ -263,8 +273,14 @@ def _with_hidden_part(problem: Problem, solution: Solution, before_octaves: bool
     if np.all(certain <= permitted(_NEGLIGIBLE)):
         return with_part(certain), None
     if np.all(np.isfinite(certain)):
-        farther = needed(certain, permitted(_NEGLIGIBLE), powers - 2)
-        if 2 * farther * period <= min(_quick_intervals(problem), largest):
+        farther, quick = needed(certain, permitted(_NEGLIGIBLE), powers - 2), min(_quick_intervals(problem), largest)
+        sparse = _sparse_lattice(problem.support, farther)
+        if quick >= sparse.M:
+            bound = _bound_up_to(problem, lattice, sparse, permitted(_OF_VALUES))
+            bound += modulus_bound(problem.area, orders, sparse.xi_max)
+            if np.all(np.where(has_digit, bound, 0.0) <= permitted(1.0)):
+                return with_part(np.minimum(bound, certain)), None
+        if 2 * farther * period <= quick:
             return with_part(certain), lattice_of(farther, period, largest)
     hidden, error = _beyond_lattice(problem, solution)
     bound = np.minimum(np.maximum(hidden, 0.0) + error, certain)
@@ -275,6 +291,32 @@ def _with_hidden_part(problem: Problem, solution: Solution, before_octaves: bool
         largest = min(_WIDE_M, largest)
     farther = needed(bound, permitted(0.5), powers)
     return with_part(bound), lattice_of(farther, period, largest) if 2 * farther * period <= largest else None
+
+
+def _sparse_lattice(support: Support, highest: float) -> Lattice:
+    """Return the lattice of the largest spacing on which surfaces fit and no peak of their transforms is missed."""
+    # A square of a transform has twice the bandwidth of the transform.
+    period = max(2 * float(support.widths.max()), LEAST_CLEARANCE * 2 * support.reach)
+    return lattice_of(highest, period, LARGEST_M)
+
+
+def _bound_up_to(problem: Problem, lattice: Lattice, sparse: Lattice, squared_errors: Reals) -> Reals:
+    """Return a bound on the squared norm (orders,) between a lattice and the end of a sparse one, measured there.
+
+    Only these frequencies count, so coarse fields will do: their squared errors (orders,) may be larger.
+    """
+    # Beyond the lattice no weight of an order exceeds that of a higher one times this factor.
+    orders, highest_order = np.array(problem.orders), max(_COARSE_ORDER, *problem.orders)
+    factors = (1 + lattice.xi_max**2) ** (orders - highest_order)
+    target = ErrorTarget((highest_order,), (float(np.sqrt(squared_errors / factors).min()),))
+    target, samples = target.tightened(problem.inexact_count), problem.samples(sparse)
+    fields = problem.fields(sparse, samples, target, problem.dtype(sparse, target))
+    beyond = only_or_difference([field.values for field in fields]).copy()
+    beyond[np.ix_(*(np.abs(axis) <= lattice.xi_max for axis in sparse.axes))] = 0
+    squares = SobolevWeights(sparse, problem.orders).per_shell @ shell_sums(beyond, None, sparse, sparse.half)
+    coarse = SobolevWeights(sparse, (highest_order,))
+    errors = np.sqrt(factors) * sum(float(field.quality.probe.norms(coarse)[0]) for field in fields)
+    return np.asarray(_SPARSE_CAUTION * (np.sqrt(squares) + errors) ** 2)
 
 
 def _quick_intervals(problem: Problem) -> int:

@@ -48,7 +48,7 @@ _PILOT_M = 64
 _LARGER_PILOT_M = 128
 _HIGHEST_FREQUENCY = 1e4
 # Surfaces end this much short of the period.
-_CLEARANCE = 1.001
+LEAST_CLEARANCE = 1.001
 # Surfaces may be as small as a point, but the kernel is a unit of length wide.
 _LEAST_WIDTH = 0.01
 # An accuracy called reachable must hold when it is requested, on a pilot that differs a little.
@@ -259,4 +259,4 @@ def _first_period(support: Support, orders: Sequence[float], accuracy: Accuracy)
         return farthest or all(image_weight(1 / period, order, widths) <= allowed for order in orders)
 
     periods = accumulate(repeat(1.01), mul, initial=max(widest, _LEAST_WIDTH))
-    return max(next(filter(suffices, periods)), _CLEARANCE * 2 * support.reach)
+    return max(next(filter(suffices, periods)), LEAST_CLEARANCE * 2 * support.reach)
