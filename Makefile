@@ -28,6 +28,7 @@ test-fast: $(READY)  ## those that start no process and take less than a second,
 	$(PYTEST) -n 2 -m "not (all or process or slow)"
 
 test-all: $(READY)  ## all tests, before a release: whole studies, clusters, browsers, kills, huge meshes; a quarter of an hour
+	-npm install --silent --no-save --no-package-lock --prefix . zarrita@0.7  # a reader in another language, where npm is
 	$(PYTEST) -n 3
 
 durations: $(READY)  ## run the tests and record the seconds of each file in tests/durations.tsv

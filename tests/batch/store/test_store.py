@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -114,6 +115,28 @@ def test_zarr_and_numpy_alone_compute_norms_and_distances(octaves: int, store_pa
             squared = names["squared_norm"](store, row, reference, order) + distance["beyond"].item()
             assert squared == pytest.approx(distance["distance"].item() ** 2, rel=1e-13)
     assert (norms["beyond"] > 0).all() == (convergence["beyond"].drop_sel(mesh="reference") > 0).all() == bool(octaves)
+
+
+@pytest.mark.all
+@pytest.mark.process
+@pytest.mark.parametrize("octaves", [0, 1])
+def test_a_reader_in_another_language_computes_norms_and_distances(
+    octaves: int, store_path: Path, threads: Client
+) -> None:
+    script = ROOT / "tests/batch/store/norms.mjs"
+    (loop,) = blocks("docs/store.md", "js")
+    assert loop in script.read_text(encoding="utf-8")
+    node = shutil.which("node")
+    if node is None or not (ROOT / "node_modules/zarrita").is_dir():
+        pytest.skip("needs node, and zarrita as `make test-all` installs it by npm")
+    run(Study.from_table(small_table(lattice={"xi_max": 3.0, "M": 16, "octaves": octaves})), store_path, threads)
+    tree = open_store(store_path)
+    for table, number, others in (("norms", "norm", []), ("convergence", "distance", ["reference"])):
+        stored = tree[table].to_dataset().sel(mesh="ico/2", order=-3.0)
+        done = finished(node, script, store_path, -3, "ico/2", *others)
+        assert (done.returncode, done.stderr) == (0, "")
+        squared = float(done.stdout) ** 2 + stored["beyond"].item()
+        assert squared == pytest.approx(stored[number].item() ** 2, rel=1e-12)
 
 
 Document = dict[str, Any]
