@@ -120,7 +120,7 @@ def test_a_process_shows_names_and_reasons_of_its_workers_too(folder: Path) -> N
     assert not harmful(output + errors)
     assert f"files/broken: failed, {folder}/{SHOWN}/broken.obj: " in errors
     assert f"files/broken failed: {folder}/{SHOWN}/broken.obj: " in output
-    assert f"WARNING sobolev_batch.batch.study.plan: files/gone: {folder}/{SHOWN_LABEL}/gone.obj: " in errors
+    assert f"warning: files/gone: {folder}/{SHOWN_LABEL}/gone.obj: " in errors
 
 
 WORK = """

@@ -15,6 +15,7 @@ from distributed import Client
 
 from sobolev_batch.batch.analysis.proximity import have_proximities, measure_proximities
 from sobolev_batch.batch.analysis.tabulate import are_tabulated, tabulate_fields
+from sobolev_batch.batch.checks import ready_to_run
 from sobolev_batch.batch.cluster.clients import local_client, memory_limit, require_blocking, thread_client
 from sobolev_batch.batch.cluster.execution import Cluster, Notify, Progress
 from sobolev_batch.batch.cluster.watch import Watch
@@ -27,14 +28,13 @@ from sobolev_batch.batch.store.create import require_usable
 from sobolev_batch.batch.store.heartbeat import Heartbeat
 from sobolev_batch.batch.store.store import stored_choice
 from sobolev_batch.batch.study.plan import make_plan
-from sobolev_batch.batch.study.study import Study, StudyCollection
+from sobolev_batch.batch.study.study import AnyStudy, Study, StudyCollection, StudyLike
 from sobolev_batch.batch.verify import damaged_rows
 from sobolev_batch.batch.workspace import Workspace, failed_proximities
-from sobolev_batch.errors import DamageError, InputError, StudyError
+from sobolev_batch.errors import DamageError, InputError
 from sobolev_batch.parameters import available_cores, require_machine_memory
 from sobolev_batch.spectral.adaptive.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.spectral.budget import NormEstimate
-from sobolev_batch.surfaces.sources.mesh_cache import MeshCache
 from sobolev_batch.visible import reasons, table_html
 
 _log = logging.getLogger(__name__)
@@ -42,8 +42,6 @@ _log = logging.getLogger(__name__)
 # A study whose distances miss the accuracy requested is computed again on a larger lattice,
 # this often in all.
 _MOST_ROUNDS = 3
-# Folder beside a store for the meshes that its study makes, and commands that a refusal lists.
-_MADE_MESHES, _MOST_COMMANDS = "made-meshes", 3
 # Fields that turn out damaged are computed again; where that goes on, something destroys them.
 _MOST_REPAIRS = 3
 
@@ -90,8 +88,8 @@ class Summary:
 
 
 def run(
-    study: Study | StudyCollection,
-    store: str | Path | Location,
+    study: StudyLike,
+    store: str | Path | Location | None = None,
     client: Client | None = None,
     *,
     workers: int | None = None,
@@ -101,10 +99,13 @@ def run(
 ) -> Summary:
     """Compute the fields that a store lacks of a study, then norms, distances and convergence tables.
 
+    What would make the run useless, such as too few objects for a league, is logged as a warning first; see `plan`.
+
     Args:
-        study: Study to carry out, or collection: studies of several objects, one after the other.
-        store: Path or URL of a new or existing store, which all workers reach under this name. A store in memory:// is
-            computed by threads of this process, and gone when it ends.
+        study: Study, collection (studies of several objects, carried out one after the other), or the path of the file
+            of either.
+        store: Path or URL of a new or existing store, which all workers reach under this name; default
+            storage/NAME.zarr. A store in memory:// is computed by threads of this process, and gone when it ends.
         client: Client of the cluster to compute on. By default single-threaded processes on this machine are started
             where anything is missing; a script must then guard its main part by ``if __name__ == "__main__"``.
         workers: Number of these processes; by default one for each core.
@@ -138,12 +139,10 @@ def run(
     >>> sb.run(study, "memory://run-example.zarr").reused
     ('ball/sphere', 'reference')
     """
-    location = Location.parse(store)
     if client is not None:
         require_blocking(client)
-        location = location.absolute()
-    require_permission(study, allow_commands)
-    study = study.with_cache(mesh_cache(location, may_run=True))
+    study, location = ready_to_run(study, store, allow_commands=allow_commands)
+    location = location if client is None else location.absolute()
     notify = on_progress or _ignore
     with ExitStack() as stack:
         # One cluster serves all studies, and none is started where nothing is missing.
@@ -168,26 +167,8 @@ def _ignore(progress: Progress) -> None:
     """Report a step of a run to nobody."""
 
 
-def require_permission(study: Study | StudyCollection, allow_commands: bool) -> None:
-    """Refuse a study that runs commands and may not.
-
-    Raises:
-        StudyError: It does.
-    """
-    if study.commands and not allow_commands:
-        raise StudyError(
-            f"the study runs commands: {', '.join(study.commands[:_MOST_COMMANDS])}; if you trust it, allow them by "
-            "--allow-commands (in Python: allow_commands=True)"
-        )
-
-
-def mesh_cache(location: Location, may_run: bool) -> MeshCache:
-    """Return the place beside a store where its study keeps the meshes that it makes; stores there share it."""
-    return MeshCache(location.absolute().beside(_MADE_MESHES), may_run)
-
-
 def _own_cluster(
-    study: Study | StudyCollection, location: Location, workers: int | None, memory: float | str | None
+    study: AnyStudy, location: Location, workers: int | None, memory: float | str | None
 ) -> AbstractContextManager[Client]:
     """Return a cluster on this machine, not yet started, after a look at whether the machine has the memory."""
     for part in [study] if isinstance(study, Study) else study.studies.values():

@@ -11,19 +11,20 @@ from pathlib import Path
 
 from distributed import Client, Future, Status, fire_and_forget, get_worker, worker_client
 
+from sobolev_batch.batch.checks import ready_to_run
 from sobolev_batch.batch.cluster.clients import require_blocking
 from sobolev_batch.batch.cluster.execution import task_key
 from sobolev_batch.batch.cluster.watch import Watch
 from sobolev_batch.batch.cluster.workers import prepare_workers, require_store_access
 from sobolev_batch.batch.collection_store import CollectionStore, for_each_object
-from sobolev_batch.batch.run import carry_out, mesh_cache, require_permission
+from sobolev_batch.batch.run import carry_out
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, acquire, release
 from sobolev_batch.batch.store.create import require_usable
 from sobolev_batch.batch.store.heartbeat import Heartbeat
 from sobolev_batch.batch.store.store import Store, stored_choice
 from sobolev_batch.batch.study.plan import make_plan
-from sobolev_batch.batch.study.study import Study, StudyCollection
+from sobolev_batch.batch.study.study import Study, StudyLike
 from sobolev_batch.batch.workspace import Workspace
 from sobolev_batch.errors import ClusterError, StoreError
 
@@ -59,7 +60,7 @@ class Submission:
 
 
 def submit(
-    study: Study | StudyCollection, store: str | Path | Location, client: Client, *, allow_commands: bool = False
+    study: StudyLike, store: str | Path | Location | None, client: Client, *, allow_commands: bool = False
 ) -> Submission:
     """Hand a study over to a cluster and return; it goes on without this process.
 
@@ -68,8 +69,9 @@ def submit(
     collection are handed over one after another; one that cannot be carried out stops no other.
 
     Args:
-        study: Study to carry out, of one object or of several.
-        store: Path or URL of a new or existing store, which this process and all workers reach under this name.
+        study: Study, collection, or the path of the file of either.
+        store: Path or URL of a new or existing store, which this process and all workers reach under this name; None
+            for storage/NAME.zarr.
         client: Client of the cluster; it may be closed afterwards.
         allow_commands: True if the study may run its commands on the workers and here: you trust its file.
 
@@ -79,13 +81,12 @@ def submit(
 
     >>> import sobolev_batch as sb
     >>> with Client("tls://scheduler:8786") as client:  # doctest: +SKIP
-    ...     sb.submit(sb.Study.from_toml("study.toml"), "s3://bucket/results.zarr", client).missing
+    ...     sb.submit("study.toml", "s3://bucket/results.zarr", client).missing
     2
     """
     require_blocking(client)
-    location = Location.parse(store).absolute()
-    require_permission(study, allow_commands)
-    study = study.with_cache(mesh_cache(location, may_run=True))
+    study, location = ready_to_run(study, store, allow_commands=allow_commands)
+    location = location.absolute()
     if isinstance(study, Study):
         return _submit(study, location, client)
     CollectionStore.prepared(location, study)

@@ -53,9 +53,11 @@ def cli(context: click.Context, debug: bool) -> None:
     another error, 130 after Ctrl-C and 143 after SIGTERM. `compare --below` has its own.
     """
     context.obj = debug
+    for level in (logging.WARNING, logging.ERROR):
+        logging.addLevelName(level, logging.getLevelName(level).lower())
     logging.basicConfig(
         level=logging.DEBUG if debug else logging.WARNING,
-        format="%(levelname)s %(name)s: %(message)s",
+        format="%(levelname)s %(name)s: %(message)s" if debug else "%(levelname)s: %(message)s",
         stream=sys.stderr,
     )
     if debug:

@@ -94,7 +94,7 @@ def run_command(
     """
     from sobolev_batch.batch.cluster.clients import remote_client
     from sobolev_batch.batch.run import run
-    from sobolev_batch.batch.study.study import Study, read_study
+    from sobolev_batch.batch.study.study import Study, as_study
     from sobolev_batch.results.open import open_store
     from sobolev_batch.results.tables.convergence import format_table
 
@@ -102,20 +102,18 @@ def run_command(
         raise click.UsageError(
             "--workers and --memory are for a cluster on this machine; the workers of a scheduler have their own"
         )
-    parsed = read_study(study)
-    place = store or _made_default_store(parsed)
-    _echo_warnings(parsed, place)
+    parsed = as_study(study)
     with progress_reports() as show:
         if scheduler:
             with remote_client(scheduler, trust_network) as client:
-                summary = run(parsed, place, client, on_progress=show, allow_commands=allow_commands)
+                summary = run(parsed, store, client, on_progress=show, allow_commands=allow_commands)
         else:
             limit = None if memory is None else f"{memory}B"
-            summary = run(parsed, place, workers=workers, memory=limit, on_progress=show, allow_commands=allow_commands)
+            summary = run(parsed, store, workers=workers, memory=limit, on_progress=show, allow_commands=allow_commands)
     if isinstance(parsed, Study):
-        echo_lines(format_table(open_store(place)))
+        echo_lines(format_table(open_store(summary.store)))
     else:
-        _print_league(place)
+        _print_league(summary.store)
     echo()
     echo(
         f"{len(summary.computed)} computed, {len(summary.reused)} reused, {len(summary.failed)} failed; "
@@ -152,21 +150,17 @@ def submit_command(
     The cluster computes it without this process. The objects of a study are handed over one after another.
     """
     from sobolev_batch.batch.cluster.clients import remote_client
-    from sobolev_batch.batch.study.study import read_study
     from sobolev_batch.batch.submit import submit
 
-    parsed = read_study(study)
-    location = (store or _made_default_store(parsed)).absolute()
-    _echo_warnings(parsed, location)
     with remote_client(scheduler, trust_network) as client:
-        submission = submit(parsed, location, client, allow_commands=allow_commands)
+        submission = submit(study, store, client, allow_commands=allow_commands)
 
     for name, one in (submission.objects or {"": submission}).items():
         where = f"{name}: " if name else ""
         echo(f"{where}{one.missing} of {one.surfaces} surfaces to be computed by the cluster at {scheduler}")
     for name, reason in submission.refused.items():
         echo(f"{name}: not submitted: {reason}", err=True)
-    echo(f"follow it by: sobolev-batch status --follow {shlex.quote(str(location))}")
+    echo(f"follow it by: sobolev-batch status --follow {shlex.quote(submission.store)}")
     if submission.refused:
         context.exit(EXIT_SOME_FAILED)
 
@@ -194,25 +188,16 @@ def plan_command(
     stored, and the number of surfaces that the store has already.
     """
     from sobolev_batch.batch.cluster.clients import remote_client
-    from sobolev_batch.batch.study.study import read_study
     from sobolev_batch.results.plan import CollectionPlan, plan
 
-    parsed = read_study(study)
     with remote_client(scheduler, trust_network) if scheduler else nullcontext() as client:
-        made = plan(parsed, store, client, allow_commands=allow_commands)
+        made = plan(study, store, client, allow_commands=allow_commands)
     if style == "json":
         echo_json(made.to_table())
     else:
         echo_lines(made)
     if isinstance(made, CollectionPlan) and made.refused:
         context.exit(EXIT_SOME_FAILED)
-
-
-def _echo_warnings(study: Study | StudyCollection, place: Location) -> None:
-    from sobolev_batch.results.plan import warnings_of
-
-    for text in warnings_of(study, place):
-        echo(f"warning: {text}", err=True)
 
 
 def _is_best_effort(study: Study | StudyCollection) -> bool:
@@ -222,7 +207,7 @@ def _is_best_effort(study: Study | StudyCollection) -> bool:
     return any(one.accuracy is not None and one.accuracy.best_effort for one in studies)
 
 
-def _print_league(place: Location) -> None:
+def _print_league(place: str) -> None:
     """Print the league of a collection, or why there is none."""
     from sobolev_batch.errors import InputError
     from sobolev_batch.results.tables.league import format_league, league
@@ -231,13 +216,3 @@ def _print_league(place: Location) -> None:
         echo_lines(format_league(league(place)))
     except InputError as error:
         echo(f"no league: {error}")
-
-
-def _made_default_store(study: Study | StudyCollection) -> Location:
-    """Return the default store of a study, whose folder is made; folders that users name are not."""
-    from sobolev_batch.results.plan import DEFAULT_FOLDER, default_store
-
-    place = default_store(study)
-    with place.access("written"):
-        DEFAULT_FOLDER.mkdir(exist_ok=True)
-    return place

@@ -2,42 +2,34 @@
 
 from __future__ import annotations
 
-import math
-import shutil
 import time
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, overload
 
-import numpy as np
 from distributed import Client
 
 from sobolev_batch.batch.analysis.pairs import PAIR_BYTES, tile_count
+from sobolev_batch.batch.checks import place_of, require_permission, warnings_of, with_mesh_cache
 from sobolev_batch.batch.cluster.clients import require_blocking
 from sobolev_batch.batch.cluster.workers import Workers, prepare_workers, worker_slowness
 from sobolev_batch.batch.collection_store import for_each_object
 from sobolev_batch.batch.fields.compute import Sizes, size_rows
-from sobolev_batch.batch.run import mesh_cache, require_permission
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store, stored_choice
 from sobolev_batch.batch.study.lattice_choice import look_at_extents
-from sobolev_batch.batch.study.plan import Plan, Row, make_plan, members_of
-from sobolev_batch.batch.study.study import REFERENCE_LABEL, Study, StudyCollection
+from sobolev_batch.batch.study.plan import Plan, Row, make_plan
+from sobolev_batch.batch.study.study import Study, StudyCollection, StudyLike, as_study
 from sobolev_batch.batch.workspace import complete_records
-from sobolev_batch.errors import InputError
 from sobolev_batch.parameters import available_cores, format_bytes
-from sobolev_batch.results.tables.league import gap_of
-from sobolev_batch.results.tables.statistics import Curve, common_sizes, least_objects
 from sobolev_batch.results.tables.text import duration
 from sobolev_batch.spectral.fields import Quality
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.values import SurfaceSize
 from sobolev_batch.spectral.transform import field_seconds, slowness
 from sobolev_batch.surfaces.shapes.surface import Similarity, placement_doubt
-from sobolev_batch.surfaces.sources.registry import ExpectedSize, Member
 from sobolev_batch.visible import reasons, table_html, visible
 
 # Time to describe and record a surface, and that of each of its triangles.
@@ -98,9 +90,6 @@ def _row_seconds(plan: Plan, row: Row) -> float:
     octaves = () if plan.tail is None else plan.tail.octaves
     sampling = sum(size.sampling_seconds(octave) for octave in octaves)
     return _ROW_SECONDS + _TRIANGLE_SECONDS * expected.triangles + expected.seconds + transform + sampling
-
-
-DEFAULT_FOLDER = Path("storage")
 
 
 @dataclass(frozen=True)
@@ -301,7 +290,7 @@ def plan(
 
 @overload
 def plan(
-    study: Study | str | Path,
+    study: Study,
     store: str | Path | Location | None = None,
     client: Client | None = None,
     *,
@@ -309,8 +298,18 @@ def plan(
 ) -> StudyPlan: ...
 
 
+@overload
 def plan(
-    study: Study | StudyCollection | str | Path,
+    study: StudyLike,
+    store: str | Path | Location | None = None,
+    client: Client | None = None,
+    *,
+    allow_commands: bool = False,
+) -> StudyPlan | CollectionPlan: ...
+
+
+def plan(
+    study: StudyLike,
     store: str | Path | Location | None = None,
     client: Client | None = None,
     *,
@@ -322,7 +321,7 @@ def plan(
     that cannot be carried out stops no other.
 
     Args:
-        study: Study of one object or of several, or the path of a study file of one object.
+        study: Study, collection, or the path of the file of either.
         store: Path or URL of a new or existing store; default storage/NAME.zarr.
         client: Client of the cluster to plan for; default processes on this machine, one per core.
         allow_commands: True if the commands of the study may run here, which make the few surfaces that are loaded.
@@ -343,102 +342,13 @@ def plan(
     surfaces:      5 in 1 family, reference reference
     ...
     """
-    study = study if isinstance(study, Study | StudyCollection) else Study.from_toml(study)
-    location = default_store(study) if store is None else Location.parse(store)
-    study = study.with_cache(mesh_cache(location, allow_commands))
+    study = as_study(study)
+    location = place_of(study, store)
+    study = with_mesh_cache(study, location, allow_commands)
     if isinstance(study, StudyCollection):
         plans, refused = for_each_object(study, location, lambda _, part, place: _plan(part, place, client))
         return CollectionPlan(plans, refused, warnings_of(study, location))
     return replace(_plan(study, location, client), warnings=warnings_of(study, location))
-
-
-def warnings_of(study: Study | StudyCollection, store: Location) -> tuple[str, ...]:
-    """Return a line for each thing that would make a run of a study fail late, or useless. No surface is made.
-
-    They are sizes without a common range, too few objects for the test of a league, and distances of all pairs for
-    which the disk has no place.
-    """
-    if isinstance(study, Study) and study.pairs != "all" and len(study.families) == 1:
-        return ()
-    collection = study if isinstance(study, StudyCollection) else None
-    studies = {"": study} if isinstance(study, Study) else study.studies
-    members: dict[str, dict[str, tuple[str, Member]]] = {}
-    for name, one in studies.items():
-        # The run reports what cannot be listed.
-        with suppress(InputError):
-            members[name] = members_of(one)
-    gaps = {name: _gap_in_sizes(listed.values(), alone=collection is None) for name, listed in members.items()}
-    gaps = {name: gap for name, gap in gaps.items() if gap}
-    warnings = []
-    if gaps:
-        first, gap = next(iter(gaps.items()))
-        where = f" for {len(gaps)} of {len(studies)} objects, such as {first}" if first else ""
-        warnings.append(f"{gap}; methods cannot be ranked at equal triangles{where}; add meshes of sizes that all have")
-    if collection is not None:
-        useful = [name for name in members if name not in gaps and name not in collection.lacking]
-        warnings += _test_warnings(collection, len(useful))
-    matrix_bytes = {
-        name: PAIR_BYTES * len(studies[name].orders) * len(listed) ** 2
-        for name, listed in members.items()
-        if studies[name].pairs == "all"
-    }
-    return (*warnings, *_space_warnings(matrix_bytes, store))
-
-
-def _gap_in_sizes(members: Iterable[tuple[str, Member]], *, alone: bool) -> str:
-    """Return which families have no range of sizes in common; nothing where they have one, or might.
-
-    Where an object is alone, only families of several sizes count: others need not be meant for a comparison by size.
-    """
-    sizes: dict[str, list[ExpectedSize]] = {}
-    for family, member in members:
-        if family != REFERENCE_LABEL and member.time is None:
-            sizes.setdefault(family, []).append(member.expected_size())
-    known = {
-        family: [(size.triangles, size.factor) for size in listed]
-        for family, listed in sizes.items()
-        if all(size.triangles > 0 and math.isfinite(size.factor) for size in listed)
-        and len({size.triangles for size in listed}) > alone
-    }
-    likely = {family: _range_of(count for count, _ in listed) for family, listed in known.items()}
-    largest = [_range_of(end for count, by in listed for end in (count / by, count * by)) for listed in known.values()]
-    return gap_of(likely) if known and common_sizes(largest) is None else ""
-
-
-def _range_of(sizes: Iterable[float]) -> Curve:
-    """Return a curve without distances over the range of some sizes."""
-    logarithms = np.log(sorted(sizes))[[0, -1]]
-    return Curve(logarithms, np.zeros(2), np.zeros(2))
-
-
-def _test_warnings(collection: StudyCollection, objects: int) -> Iterator[str]:
-    """Yield what makes a league useless whose test can tell no two methods apart."""
-    methods = {family.name for study in collection.studies.values() for family in study.families}
-    pairs, count = math.comb(len(methods), 2), len(collection.studies)
-    if pairs and objects < (least := least_objects(pairs)):
-        shown = f"{count} object{'s' * (count != 1)}"
-        shown = shown if objects == count else f"{objects} of {shown} that have all methods at common sizes"
-        yield (
-            f"the test of a league cannot tell {len(methods)} methods from chance with {shown}; "
-            f"take {least} objects or more, or compare fewer methods (league --method)"
-        )
-
-
-def _space_warnings(matrix_bytes: Mapping[str, int], store: Location) -> Iterator[str]:
-    """Yield the need for space of the distances of all pairs, by object, where a disk does not have it."""
-    if store.scheme or not matrix_bytes:
-        return
-    places = [store.below(name) if name else store for name in matrix_bytes]
-    stored = sum(size for place in places for size in place.sizes("distances").values())
-    needed, folder = sum(matrix_bytes.values()), Path(str(store)).absolute()
-    disk = shutil.disk_usage(next(one for one in (folder, *folder.parents) if one.exists()))
-    # Some file systems do not say how large they are.
-    if disk.total and needed - stored > disk.free:
-        yield (
-            f'pairs = "all": the distances of all pairs take {format_bytes(needed)} on disk, and '
-            f"{format_bytes(disk.free)} are free at {store}; "
-            'set pairs = "reference" in [compare], or choose another place with --store'
-        )
 
 
 def _plan(study: Study, location: Location, client: Client | None) -> StudyPlan:
@@ -499,11 +409,6 @@ def _doubts_of(study_plan: Plan, stored: Mapping[str, Record]) -> dict[str, str]
     extents |= {row.label: Quality.from_json(stored[row.label].quality).extent for row in rows if row.label in stored}
     doubts = {label: placement_doubt(extent, study_plan.reference_extent) for label, extent in extents.items()}
     return set_aside | {label: doubt for label, doubt in doubts.items() if doubt is not None}
-
-
-def default_store(study: Study | StudyCollection) -> Location:
-    """Return the location of a study's store if none is named."""
-    return Location.parse(DEFAULT_FOLDER / f"{study.name}.zarr")
 
 
 def _stored_records(location: Location) -> dict[str, Record]:

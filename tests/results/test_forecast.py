@@ -16,11 +16,12 @@ import tomli_w
 from distributed import Client
 
 import sobolev_batch as sb
+from sobolev_batch.batch.checks import warnings_of
 from sobolev_batch.batch.cluster.workers import Workers
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.study.plan import Plan, make_plan
-from sobolev_batch.results.plan import forecast, warnings_of
+from sobolev_batch.results.plan import forecast
 from sobolev_batch.spectral.transform import TransformSettings, expected_points, field_seconds, transform_block
 from sobolev_batch.surfaces.formats.readers import write_mesh
 from tests.support.commands import call
@@ -173,11 +174,13 @@ def test_pairs_that_the_disk_has_no_place_for_are_told(tmp_path: Path, monkeypat
     assert found(0) == ()
 
 
-def test_commands_print_warnings_first(tmp_path: Path) -> None:
+def test_warnings_come_first_in_commands_and_in_python(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "study.toml"
     path.write_text(tomli_w.dumps(small_table(object=balls(a=1.0), family=methods_of())))
     plan, run = (call(word, path, "--store", f"memory://warnings-{word}") for word in ("plan", "run"))
-    assert plan.stderr.startswith(f"warning: {FEW} 1 object; ")
-    assert run.stderr.startswith(plan.stderr)
-    made = sb.plan(sb.StudyCollection.from_toml(path), "memory://warnings-python")
-    assert f"warning: {made.warnings[0]}" in str(made)
+    (warning,) = sb.plan(path, "memory://warnings-python").warnings
+    assert warning.startswith(f"{FEW} 1 object; ")
+    assert f"warning: {warning}\n" in plan.stdout
+    assert run.stderr.startswith(f"warning: {warning}\n")
+    sb.run(path, "memory://warnings-python")
+    assert caplog.messages[0] == warning

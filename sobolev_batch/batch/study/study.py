@@ -315,13 +315,18 @@ def is_collection(table: Mapping[str, Any]) -> bool:
     return "object" in table or "objects" in table or OBJECT in templates or METHOD in templates
 
 
-def read_study(path: str | Path) -> Study | StudyCollection:
-    """Read a study file, of one object or of several."""
+AnyStudy = Study | StudyCollection
+# As functions take it.
+StudyLike = AnyStudy | str | Path
 
-    def parse(table: Mapping[str, Any], folder: Path) -> Study | StudyCollection:
+
+def as_study(study: StudyLike) -> AnyStudy:
+    """Return a study of one object or of several, which may be given by the path of its file."""
+
+    def parse(table: Mapping[str, Any], folder: Path) -> AnyStudy:
         return (StudyCollection if is_collection(table) else Study).from_table(table, folder=folder)
 
-    return _parsed_file(path, parse)
+    return study if isinstance(study, AnyStudy) else _parsed_file(study, parse)
 
 
 def _parsed_file(path: str | Path, parse: Callable[..., Parsed]) -> Parsed:

@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from sobolev_batch.batch.checks import SIGNIFICANCE, gap_of, least_objects
 from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.errors import InputError, StoreError
@@ -22,13 +23,11 @@ from sobolev_batch.results.tables import Format
 from sobolev_batch.results.tables.convergence import table, tables_of
 from sobolev_batch.results.tables.costs import DEFAULT_COST, CostLeague, cost_leagues_of
 from sobolev_batch.results.tables.statistics import (
-    SIGNIFICANCE,
     Curve,
     Interval,
     Reals,
     adjusted,
     common_sizes,
-    least_objects,
     sign_flip_test,
     within_objects,
 )
@@ -332,7 +331,7 @@ def _league(
         elif exact:
             left_out[name] = f"{', '.join(exact)} reproduced it, up to rounding"
         elif common is None:
-            left_out[name] = gap_of(curves)
+            left_out[name] = gap_of({method: curve.range for method, curve in curves.items()})
         else:
             values, errors = zip(*(curve.at(common) for curve in curves.values()), strict=True)
             slopes = [curve.slope() for curve in _curves(at_order, EDGE_LENGTH, methods).values()]
@@ -351,14 +350,6 @@ def _curves(frame: pd.DataFrame, x: str, methods: Sequence[str]) -> dict[str, Cu
     """Return the curve of each method that has distances from an object."""
     curves = {method: Curve.from_rows(frame[frame["family"] == method], x) for method in methods}
     return {method: curve for method, curve in curves.items() if curve is not None}
-
-
-def gap_of(curves: Mapping[str, Curve]) -> str:
-    """Return which methods have no range of sizes in common."""
-    first = max(curves, key=lambda method: curves[method].sizes[0])
-    last = min(curves, key=lambda method: curves[method].sizes[-1])
-    begin, end = np.exp(curves[first].sizes[0]), np.exp(curves[last].sizes[-1])
-    return f"no common range of sizes: {first} begins at {begin:,.5g}, {last} ends at {end:,.5g}"
 
 
 def compare_studies(

@@ -13,6 +13,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from sobolev_batch.batch.checks import Range, common_range
 from sobolev_batch.results.open import sizes_of
 from sobolev_batch.spectral.adaptive.tolerance import NEXT_TO_EQUAL
 
@@ -20,15 +21,11 @@ Reals = NDArray[np.float64]
 
 # Sizes at which curves are compared, evenly spaced on a logarithmic axis.
 _SIZES = 5
-# Curves whose ranges miss each other by less than this are compared between their ends.
-_LARGEST_GAP = 1.2
 # Meshes whose sizes differ by a smaller factor tell no rate.
 _SMALLEST_RANGE = 1.1
 # Of a logarithm; the bar of a larger error would leave no room for the distances.
 _LARGEST_ERROR = 3.0
 CONFIDENCE = 0.95
-# A p-value below it counts as a difference.
-SIGNIFICANCE = 0.05
 # All changes of sign are tried for as many objects, and as many random ones for more.
 _MOST_ENUMERATED, _DRAWS, _SEED = 14, 20_000, 0
 
@@ -60,6 +57,11 @@ class Curve:
         with np.errstate(divide="ignore", invalid="ignore"):
             shares = np.fmin(relative_errors / relative, 1.0)
             return cls(np.log(sizes[known][order]), np.log(relative), -np.log1p(-shares))
+
+    @property
+    def range(self) -> Range:
+        """Smallest and largest size, as logarithms."""
+        return float(self.sizes[0]), float(self.sizes[-1])
 
     @property
     def bars(self) -> Reals:
@@ -99,10 +101,8 @@ class Curve:
 
 def common_sizes(curves: Sequence[Curve]) -> Reals | None:
     """Return sizes (5,) in the range that all curves have, all alike between their ends where these nearly meet."""
-    low, high = max(curve.sizes[0] for curve in curves), min(curve.sizes[-1] for curve in curves)
-    if low <= high:
-        return np.linspace(low, high, _SIZES)
-    return np.full(_SIZES, (low + high) / 2) if low - high <= np.log(_LARGEST_GAP) else None
+    common = common_range([curve.range for curve in curves])
+    return None if common is None else np.linspace(*common, _SIZES)
 
 
 @dataclass(frozen=True)
@@ -179,16 +179,6 @@ def sign_flip_test(differences: Reals, errors: Reals) -> float:
     # Rounding must not decide between a sum and its mirror image.
     tolerance = 1e-12 * float(np.abs(differences).sum())
     return float(np.mean(np.abs(signs @ differences) + slack >= observed - slack - tolerance))
-
-
-def least_objects(tests: int) -> int:
-    """Return with how many objects the most extreme of all changes of sign is rare enough, among several tests.
-
-    >>> least_objects(1), least_objects(6)
-    (6, 8)
-    """
-    # Of 2^n changes of sign two are as extreme.
-    return math.floor(math.log2(2 * tests / SIGNIFICANCE)) + 1
 
 
 def adjusted(p_values: Reals) -> Reals:

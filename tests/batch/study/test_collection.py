@@ -10,7 +10,7 @@ import pytest
 import tomli_w
 
 import sobolev_batch as sb
-from sobolev_batch.batch.study.study import read_study
+from sobolev_batch.batch.study.study import as_study
 from tests.support.studies import small_table
 
 
@@ -169,7 +169,7 @@ def test_refusals_name_the_place(folder: Path, changes: dict[str, Any], message:
 def test_a_study_file_is_read_as_what_it_is(folder: Path) -> None:
     for made, kind in ((table(), sb.StudyCollection), (small_table(), sb.Study)):
         (folder / "study.toml").write_text(tomli_w.dumps(made))
-        assert isinstance(read_study(folder / "study.toml"), kind)
+        assert isinstance(as_study(folder / "study.toml"), kind)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import sobolev_batch as sb
-from sobolev_batch.batch.study.study import read_study
+from sobolev_batch.batch.study.study import as_study
 from sobolev_batch.surfaces.sources.files import FileMember
 from tests.support.commands import call
 
@@ -86,7 +86,7 @@ def drafted(folder: Path, *paths: str) -> tuple[Sequence[str], Mapping[str, sb.S
     for path in paths:
         write(folder / "meshes" / path, 1)
     draft = sb.init_study(folder / "meshes", folder / "study.toml")
-    collection = read_study(draft.path)
+    collection = as_study(draft.path)
     assert isinstance(collection, sb.StudyCollection)
     return draft.summary, collection.studies
 
