@@ -100,5 +100,7 @@ def test_a_folder_of_meshes(tmp_path: Path) -> None:
 def test_a_cluster(tmp_path: Path) -> None:
     outputs = run_notebook(FOLDER / "cluster.ipynb", tmp_path)
     assert "6 of 6 complete, 0 failed, 0 to go" in shown(outputs, "cluster", "going_on")
-    assert "0 computed, 6 reused, 0 failed" in shown(outputs, "cluster", "sb.run")
+    ran = shown(outputs, "cluster", "sb.run")
+    assert re.search(r"^dashboard: http://\S+\n0 of 2 transforms\n\[1/2\] finer/[56]: complete, ", ran)
+    assert "2 computed, 6 reused, 0 failed" in ran
     assert "icosphere/4" in shown(outputs, "cluster", "sb.table")
