@@ -263,7 +263,12 @@ def _computed(tree: xr.DataTree, orders: tuple[float, ...], meshes: Meshes = Non
     Raises:
         DamageError: Spectra are not those of the fields that the tables were made from.
     """
-    store, table, reference = Store.open(location_of(tree)), finished_group(tree, "meshes"), reference_of(tree)
+    store, reference = Store.open(location_of(tree)), reference_of(tree)
+    table = finished_group(tree, "meshes", load=False)
+    if meshes is not None:
+        chosen = [meshes] if isinstance(meshes, str) else list(meshes)
+        _require_fields(tree, table, chosen)
+        table = table.sel(mesh=list(dict.fromkeys([*chosen, reference])))
     columns = (table[name].values.tolist() for name in ("mesh", "row", "status", "key"))
     complete = {row: (label, key) for label, row, status, key in zip(*columns, strict=True) if status == "complete"}
     row_of_reference = next((row for row, (label, _) in complete.items() if label == reference), -1)
@@ -271,16 +276,10 @@ def _computed(tree: xr.DataTree, orders: tuple[float, ...], meshes: Meshes = Non
     if stale_chunks(store, keys):
         problem = "they are not those of the stored fields"
         raise DamageError(f"{store.path}: radial spectra are damaged ({problem}); run the study again", problem)
-    if meshes is not None:
-        chosen = [meshes] if isinstance(meshes, str) else list(meshes)
-        _require_fields(tree, table, chosen)
-        table = table.sel(mesh=list(dict.fromkeys([*chosen, reference])))
-    texts, needed = store.read_strings(QUALITY), set(table["row"].values.tolist())
-    qualities = {row: Quality.from_json(texts[row]) for row in complete if row in needed}
+    texts = np.asarray(store.read(QUALITY, sorted(complete))).tolist()
+    qualities = {row: Quality.from_json(text) for row, text in zip(sorted(complete), texts, strict=True)}
     reducer = Reducer.for_fields(store, store.choice(), orders, qualities, {}, row_of_reference)
-    results = Results.from_spectra(reducer, table, reference)
-    require_unchanged(tree)
-    return results
+    return Results.from_spectra(reducer, table, reference)
 
 
 def convergence_at(tree: xr.DataTree, order: Orders | None, meshes: Meshes = None) -> xr.Dataset:
@@ -298,13 +297,13 @@ def convergence_at(tree: xr.DataTree, order: Orders | None, meshes: Meshes = Non
         OrderError: An order is not below -1/2.
         DamageError: A field is not what was stored.
     """
-    stored = finished_group(tree, "convergence")
+    stored = finished_group(tree, "convergence", load=False)
     chosen, others = _divided(stored, order)
     if not others:
-        return stored.sel(order=chosen)
+        return stored.sel(order=chosen).load()
     results = _computed(tree, others, meshes)
     accuracy = Accuracy(stored.attrs["rtol"]) if "rtol" in stored.attrs else None
-    return _joined(stored, results.convergence_table(accuracy), chosen)
+    return _joined(tree, stored, results.convergence_table(accuracy), chosen)
 
 
 def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
@@ -322,7 +321,7 @@ def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
     if not others:
         return stored.sel(order=chosen)
     if not has_every_pair:
-        return _joined(stored, _computed(tree, others).distances_table(), chosen)
+        return _joined(tree, stored, _computed(tree, others).distances_table(), chosen)
     reducer, _ = stored_reducer(tree, others)
     rows: list[int] = meshes["row"].values.tolist()
     place_of = {row: place for place, row in enumerate(rows)}
@@ -334,25 +333,23 @@ def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
         columns[name] = np.full((len(others), len(rows), len(rows), *values.shape[3:]), np.nan)
         columns[name][:, first, second] = values
     computed = table_of(columns, meshes, others, "mesh", "other").assign_coords(other=stored["other"])
-    require_unchanged(tree)
-    return _joined(stored, computed, chosen)
+    return _joined(tree, stored, computed, chosen)
 
 
 def norms_at(tree: xr.DataTree, order: Orders | None, meshes: Meshes = None) -> xr.Dataset:
     """Return the norms of an open store's meshes at some orders, in memory; see `convergence_at`."""
-    stored = finished_group(tree, "norms")
+    stored = finished_group(tree, "norms", load=False)
     chosen, others = _divided(stored, order)
     if not others:
-        return stored.sel(order=chosen)
-    return _joined(stored, _computed(tree, others, meshes).norms_table(), chosen)
+        return stored.sel(order=chosen).load()
+    return _joined(tree, stored, _computed(tree, others, meshes).norms_table(), chosen)
 
 
 def _require_fields(tree: xr.DataTree, table: xr.Dataset, meshes: Sequence[str]) -> None:
     """Refuse labels of meshes that a table lacks, or that have no field."""
-    labels = table["mesh"].values
-    complete = set(labels[table["status"].values == "complete"].tolist())
-    for mesh in meshes:
-        if mesh not in complete:
+    labels, is_complete = table.indexes["mesh"], table["status"].values == "complete"
+    for mesh, place in zip(meshes, labels.get_indexer(list(meshes)).tolist(), strict=True):
+        if place < 0 or not is_complete[place]:
             known = labels[:3].tolist()
             raise InputError(f"{source_of(tree)}: no mesh {quoted(mesh)} with a field; its labels begin {known}")
 
@@ -377,14 +374,14 @@ def _divided(stored: xr.Dataset, order: Orders | None) -> tuple[list[float], tup
     return chosen, tuple(dict.fromkeys(s for s in chosen if s not in own))
 
 
-def _joined(stored: xr.Dataset, computed: xr.Dataset, chosen: list[float]) -> xr.Dataset:
-    """Return the chosen orders of two tables."""
-    own = stored.sel(mesh=computed["mesh"]).load()
-    both = xr.concat(
-        [own, computed], "order", data_vars="minimal", coords="minimal", compat="override",
-        join="exact", combine_attrs="override",
-    )  # fmt: skip
-    table = both.sel(order=chosen)
+def _joined(tree: xr.DataTree, stored: xr.Dataset, computed: xr.Dataset, chosen: list[float]) -> xr.Dataset:
+    """Return the chosen orders of two tables of an open store, which no run has changed since it was opened."""
+    own = [s for s in stored["order"].values.tolist() if s in chosen]
+    table = xr.concat(
+        [*([stored.sel(mesh=computed["mesh"], order=own)] if own else []), computed],
+        "order", data_vars="minimal", coords="minimal", compat="override", join="exact", combine_attrs="override",
+    ).sel(order=chosen).load()  # fmt: skip
+    require_unchanged(tree)
     return table.assign_attrs({**stored.attrs, "computed": computed["order"].values.tolist()})
 
 

@@ -37,7 +37,7 @@ def stale_chunks(store: Store, keys: Mapping[int, str]) -> dict[int, range]:
     missing, stale = missing_chunks(store, SPECTRA_KEYS), dict[int, range]()
     for number, rows in enumerate(chunks_of_spectra(store)):
         expected = {row: keys[row] for row in rows if row in keys}
-        if (number,) in missing or not expected.items() <= _stored_keys(store, rows).items():
+        if (number,) in missing or (expected and not expected.items() <= _stored_keys(store, rows).items()):
             stale[number] = rows
     return stale
 

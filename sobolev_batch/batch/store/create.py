@@ -43,7 +43,7 @@ from sobolev_batch.surfaces.shapes.surface import Similarity
 
 _log = logging.getLogger(__name__)
 
-# Of a chunk of spectra: its rows are one task, and small ones would be many keys.
+# Of a chunk of spectra: its rows are one task, and small ones would be many keys. Qualities have as many rows.
 _SPECTRA_BYTES, _MOST_SPECTRA = 2 << 20, 512
 # Records that lie together once a run has ended.
 ROWS_PER_PAGE = 100
@@ -169,6 +169,8 @@ def _lay_out(store: Store, plan: Plan, labels: Sequence[str], qualities: Sequenc
     """
     rows, mesh = len(labels), np.array(labels, dtype=object)
     padded = np.array([*qualities, *[""] * (rows - len(qualities))], dtype=object)
+    # Whoever reads the field of one mesh reads the qualities of few.
+    chunks = {"chunks": (min(rows, _MOST_SPECTRA),)}
     units = {"units": "cycles per unit length"}
     axes = {name: (name, axis, units) for name, axis in zip(AXES, plan.lattice.axes, strict=True)}
     keys = {
@@ -184,7 +186,9 @@ def _lay_out(store: Store, plan: Plan, labels: Sequence[str], qualities: Sequenc
         ),
         **dataset_keys(
             "fourier",
-            xr.Dataset({"quality": ("mesh", padded)}, coords={**axes, "mesh": mesh, **_weight_columns(plan)}),
+            xr.Dataset(
+                {"quality": ("mesh", padded, {}, chunks)}, coords={**axes, "mesh": mesh, **_weight_columns(plan)}
+            ),
         ),
         **_record_keys(rows),
     }

@@ -66,7 +66,10 @@ def dataset_keys(group: str, dataset: xr.Dataset) -> dict[str, bytes]:
     """Return the keys of a group with the arrays of a dataset, with checksums, one chunk each unless they are large."""
     keys: dict[str, Buffer] = {}
     encoding = {
-        str(name): {"compressors": (Crc32cCodec(),), "chunks": (_steps(variable), *variable.shape[1:])}
+        str(name): {
+            "compressors": (Crc32cCodec(),),
+            "chunks": variable.encoding.get("chunks", (_steps(variable), *variable.shape[1:])),
+        }
         for name, variable in dataset.variables.items()
         if variable.ndim
     }
