@@ -96,7 +96,7 @@ GROUPS: dict[str, list[tuple[Change, tuple[str, ...], set[str] | None]]] = {
     "tables and coordinates": [(at(key, damage), (), {key.partition("/c/")[0]}) for damage, key in SMALL],
     "in another place or of an earlier state": [
         # Of equal length.
-        (exchange("distances/aliasing/c/0/0/0", "distances/discretisation/c/0/0/0"), (), None),
+        (exchange("distances/error_part/c/0/0/0/1", "distances/error_part/c/0/0/0/2"), (), None),
         (exchange("meshes/edge_length_mean/c/0", "meshes/area/c/0"), (), None),
         (exchange("fourier/xi_x/c/0", "convergence/edge_length/c/0"), (), None),
         (restore("convergence/distance/c/0/0"), (), None),
