@@ -45,7 +45,9 @@ def _row(what: str, pair: Pair, expected: str, effort: Effort) -> Row:
 
     outcomes: list[str] = []
     contestants: list[Callable[[Pair], object]] = [
-        lambda given: outcomes.append(sb.testing.same_surface(*given, rtol=1e-2 if effort.quick else 1e-3).outcome)
+        lambda given: outcomes.append(
+            sb.testing.same_surface(*given, tolerance=1e-2 if effort.quick else 1e-3, order=-4.0).outcome
+        )
     ]
     if find_spec("vtkmodules"):
         contestants.append(lambda given: sb.proximity(*given))

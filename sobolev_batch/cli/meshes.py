@@ -31,9 +31,8 @@ from sobolev_batch.cli.common import (
 )
 from sobolev_batch.cli.interruption import Deadline
 from sobolev_batch.errors import InputError, MeshError
-from sobolev_batch.fitting import DEFAULT_ORDER as DEFAULT_FIT_ORDER
 from sobolev_batch.fitting import DEFAULT_SMOOTHING, DEFAULT_STEPS
-from sobolev_batch.testing import DEFAULT_ORDER
+from sobolev_batch.spectral import DEFAULT_ORDER
 from sobolev_batch.visible import visible
 
 if TYPE_CHECKING:
@@ -56,15 +55,14 @@ _below_option = click.option(
     "--below",
     type=fraction_of_norm,
     metavar="FRACTION",
-    help="Tell whether the distance is below FRACTION of the norm of B, such as 1e-3 or 0.1%, by the exit status. "
-    f"[default order: {DEFAULT_ORDER:g}]",
+    help="Tell whether the distance is below FRACTION of the norm of B, such as 1e-3 or 0.1%, by the exit status.",
 )
 
 
 @cli.command("compare")
 @click.argument("a", type=PATH)
 @click.argument("b", type=PATH)
-@orders_option("Print the distance of this order, which may be any below -1/2.", "-2")
+@orders_option("Print the distance of this order, which may be any below -1/2.", f"{DEFAULT_ORDER:g}")
 @click.option(
     "--rtol", type=float, help="Reach this relative error at most. [default: 1e-2, or the nearest attainable]"
 )
@@ -150,7 +148,7 @@ def compare_command(
         echo(f"note: {a.name}: {doubt}", err=True)
     # Refused before a long computation where its library is not installed.
     nearness = proximity(*pair) if with_proximity else None
-    orders = orders or (-2.0,)
+    orders = orders or (DEFAULT_ORDER,)
     accuracy: dict[str, Any] = {"lattice": lattice, "rtol": rtol, "memory": memory, "best_effort": best_effort}
     results = yardsticks(*pair, orders, **accuracy) if with_yardsticks else distance(*pair, orders, **accuracy)
     area_change = first.area / second.area - 1
@@ -228,7 +226,7 @@ def _judge_files(context: click.Context, a: Path, b: Path, below: float) -> int:
         raise click.UsageError("--below takes one --order")
     (order,) = orders
     settings = {"scaling": not context.params["no_scaling"], "memory": context.params["memory"]}
-    verdict = same_surface(a, b, rtol=below, order=order, **settings)
+    verdict = same_surface(a, b, tolerance=below, order=order, **settings)
     if context.params["style"] == "json":
         echo_json(verdict, a=a, b=b, distance=verdict.distance, error=verdict.error)
     else:
@@ -240,9 +238,7 @@ def _judge_files(context: click.Context, a: Path, b: Path, below: float) -> int:
 @click.argument("start", type=PATH)
 @click.argument("target", type=PATH)
 @click.option("-o", "--output", type=PATH, required=True, help="Write the mesh to this file, .ply, .obj, .off or .stl.")
-@click.option(
-    "--order", type=float, default=DEFAULT_FIT_ORDER, show_default=True, help="Lower the distance of this order."
-)
+@click.option("--order", type=float, default=DEFAULT_ORDER, show_default=True, help="Lower the distance of this order.")
 @click.option("--steps", type=int, default=DEFAULT_STEPS, metavar="N", show_default=True, help="Take N steps at most.")
 @click.option(
     "--smoothing",

@@ -8,4 +8,4 @@ import lazy_loader
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 # Here, as the command line shows them without importing what computes.
-DEFAULT_ORDER, DEFAULT_STEPS, DEFAULT_SMOOTHING = -2.0, 150, 0.25
+DEFAULT_STEPS, DEFAULT_SMOOTHING = 150, 0.25

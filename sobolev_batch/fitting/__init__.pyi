@@ -9,6 +9,5 @@ from .fit import FitQuality as FitQuality
 from .fit import refine as refine
 
 __all__: list[str]
-DEFAULT_ORDER: float
 DEFAULT_STEPS: int
 DEFAULT_SMOOTHING: float

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from sobolev_batch.errors import InputError, from_extra
 from sobolev_batch.fitting.transform import MeshTransform
+from sobolev_batch.spectral import DEFAULT_ORDER
 from sobolev_batch.spectral.backends import Complexes, backend_named
 from sobolev_batch.spectral.budget import ALIASING_CAUTION, PARTS, Support, decay_to_period, sums_of_shells, truncated
 from sobolev_batch.spectral.fields import (
@@ -79,7 +80,7 @@ class SquaredDistance:
         cls,
         mesh: MeshLike,
         target: OperandLike,
-        order: float,
+        order: float = DEFAULT_ORDER,
         *,
         lattice: Lattice | None = None,
         eps: float | None = None,
@@ -236,7 +237,7 @@ def jax_function(squared: SquaredDistance) -> Callable[[Any], Any]:
 def gradient(
     mesh: MeshLike,
     target: OperandLike,
-    order: Orders,
+    order: Orders = DEFAULT_ORDER,
     *,
     lattice: Lattice | None = None,
     eps: float | None = None,

@@ -11,10 +11,11 @@ import numpy as np
 import xarray as xr
 
 from sobolev_batch.errors import AccuracyError, InputError
-from sobolev_batch.fitting import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS
+from sobolev_batch.fitting import DEFAULT_SMOOTHING, DEFAULT_STEPS
 from sobolev_batch.fitting.descent import Descent, End, Smoothing
 from sobolev_batch.fitting.problem import FitProblem, FitSettings, OrderWeights, welded
 from sobolev_batch.parameters import is_whole_number
+from sobolev_batch.spectral import DEFAULT_ORDER
 from sobolev_batch.spectral.fields import Operand, OperandLike, as_operand
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.metrics.norms import distance

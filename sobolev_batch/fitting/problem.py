@@ -10,10 +10,11 @@ import numpy as np
 import xarray as xr
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.fitting import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS
+from sobolev_batch.fitting import DEFAULT_SMOOTHING, DEFAULT_STEPS
 from sobolev_batch.fitting.derivatives import SquaredDistance, factors_of
 from sobolev_batch.fitting.transform import MeshTransform
 from sobolev_batch.parameters import is_whole_number
+from sobolev_batch.spectral import DEFAULT_ORDER
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy, core_lattice, lattice_of
 from sobolev_batch.spectral.backends import Complexes
 from sobolev_batch.spectral.budget import Support

@@ -10,9 +10,10 @@ import numpy as np
 from pydantic import Field
 
 from sobolev_batch.errors import InputError, MeshError, StudyError
-from sobolev_batch.fitting import DEFAULT_ORDER, DEFAULT_SMOOTHING, DEFAULT_STEPS
+from sobolev_batch.fitting import DEFAULT_SMOOTHING, DEFAULT_STEPS
 from sobolev_batch.fitting.fit import MOST_TRIANGLES, fitted_mesh, largest_while_refining
 from sobolev_batch.fitting.problem import FitSettings
+from sobolev_batch.spectral import DEFAULT_ORDER
 from sobolev_batch.spectral.transform import Execution
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Similarity, Surface

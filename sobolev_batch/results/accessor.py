@@ -8,6 +8,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from sobolev_batch.errors import InputError, LatticeError
+from sobolev_batch.spectral import DEFAULT_ORDER
 from sobolev_batch.spectral.fields import OperandLike, pair_of
 from sobolev_batch.spectral.lattice import AXES, Lattice, Orders, check_orders
 from sobolev_batch.spectral.metrics.causes import spectrum, witness
@@ -50,18 +51,18 @@ class SobolevAccessor:
         """Lattice on whose Hermitian half the field is sampled."""
         return Lattice.from_field(self._field)
 
-    def norm(self, order: Orders) -> xr.Dataset:
+    def norm(self, order: Orders = DEFAULT_ORDER) -> xr.Dataset:
         """Return the norm ||a||_s of one order or several, with its error; see `sobolev_batch.norm`."""
         return self._each(lambda field: norm(field, order))
 
-    def distance(self, other: OperandLike, order: Orders) -> xr.Dataset:
+    def distance(self, other: OperandLike, order: Orders = DEFAULT_ORDER) -> xr.Dataset:
         """Return the distance from another field or a surface, with its error; see `sobolev_batch.distance`."""
         return self._each_with(other, order, lambda field, common: distance(field, common, order))
 
     def spectrum(
         self,
         other: OperandLike | None,
-        order: Orders,
+        order: Orders = DEFAULT_ORDER,
         *,
         bands: int | Sequence[float] | None = None,
         similarity: Similarity | None = None,

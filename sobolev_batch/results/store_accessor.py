@@ -16,6 +16,7 @@ from sobolev_batch.batch.store.tables import rows_unlike_tables
 from sobolev_batch.batch.workspace import complete_records
 from sobolev_batch.errors import DamageError, InputError
 from sobolev_batch.results.open import finished_group, location_of, reference_of, require_unchanged, source_of
+from sobolev_batch.spectral import DEFAULT_ORDER
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.budget import NormEstimate
 from sobolev_batch.spectral.fields import Quality
@@ -117,7 +118,7 @@ class StoreAccessor:
         table = table_of(columns, meshes.sel(mesh=labels), reducer.orders)
         return self._chosen(table, order, mesh if isinstance(mesh, str) else labels)
 
-    def nearest(self, mesh: str, count: int = 10, order: float = -2.0) -> xr.Dataset:
+    def nearest(self, mesh: str, count: int = 10, order: float = DEFAULT_ORDER) -> xr.Dataset:
         """Return the meshes nearest to one, nearest first, with their distances.
 
         Spectra bound each distance from below, so that only the fields of near meshes are read.

@@ -1,11 +1,8 @@
 """Testing: is this surface the same as that one, to a tolerance?
 
-In: two surfaces and an rtol. Out: a verdict, an assertion of test suites, and files that show where they differ.
+In: two surfaces and a tolerance. Out: a verdict, an assertion of test suites, and files that show where they differ.
 """
 
 import lazy_loader
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-
-# Here, as the command line shows them without importing what computes.
-DEFAULT_RTOL, DEFAULT_ORDER = 1e-3, -4.0

@@ -4,5 +4,3 @@ from .verdict import assert_same_surface as assert_same_surface
 from .verdict import same_surface as same_surface
 
 __all__: list[str]
-DEFAULT_RTOL: float
-DEFAULT_ORDER: float

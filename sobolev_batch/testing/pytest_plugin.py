@@ -1,6 +1,7 @@
 """Plug-in of pytest: a fixture that asserts that two surfaces are the same, and writes files where they are not.
 
-pytest loads it in every session of an environment, so it imports nothing else before a test requests the fixture.
+A conftest.py loads it by ``pytest_plugins = ["sobolev_batch.testing.pytest_plugin"]``. It imports nothing else before a
+test requests the fixture.
 """
 
 from __future__ import annotations

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Literal
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from sobolev_batch.errors import InputError, SobolevBatchError, one_line
 from sobolev_batch.parameters import available, available_cores, check_seed
 from sobolev_batch.results.tables.text import rounded_outwards, with_error
+from sobolev_batch.spectral import DEFAULT_ORDER
 from sobolev_batch.spectral.adaptive.threshold import Method, relative_distance
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy, core_lattice
 from sobolev_batch.spectral.budget import Support
@@ -18,12 +20,19 @@ from sobolev_batch.spectral.fields import fourier_transform
 from sobolev_batch.spectral.lattice import single_order
 from sobolev_batch.surfaces.formats.readers import SurfaceLike, as_surface
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.surface import Extent, Similarity, Surface, centering
-from sobolev_batch.testing import DEFAULT_ORDER, DEFAULT_RTOL
+from sobolev_batch.surfaces.shapes.surface import (
+    Extent,
+    Similarity,
+    Surface,
+    centering,
+    is_finite_number,
+    placement_doubt,
+)
 from sobolev_batch.visible import table_html
 
 Outcome = Literal["same", "different", "undecided"]
 
+_DEFAULT_TOLERANCE = 1e-3
 # A larger relative error says less than the bounds themselves.
 _WIDEST = 0.25
 # From here on per cents are whole numbers.
@@ -37,18 +46,20 @@ class Verdict:
     """Answer to whether two surfaces are the same, to a tolerance. It is true if they are the same.
 
     Attributes:
-        outcome: "same" if the upper bound is at most rtol, "different" if the lower one is above it, else "undecided".
+        outcome: "same" if the upper bound is at most the tolerance, "different" if the lower one is above it, else
+            "undecided".
         lower: Lower bound on the Sobolev distance of the surfaces over the Sobolev norm of the reference.
         upper: Upper bound on it. The bounds are only as narrow as the outcome needs.
-        rtol: Largest distance of surfaces that count as the same.
+        tolerance: Largest relative distance of surfaces that count as the same.
         order: Order s of the norm.
         area_change: Area of the surface over that of the reference, less one.
         method: What the distance follows from: "identical" (meshes have the same triangles),
             "lattice" (the areas bound what lies beyond it), or "octaves" (random frequencies measure what lies
             beyond a lattice).
+        doubt: Question whether both are in the same unit of length and in the same place, where they do not look it.
 
     >>> import sobolev_batch as sb
-    >>> verdict = sb.testing.same_surface(sb.shapes.icosphere(3), sb.shapes.Sphere())
+    >>> verdict = sb.testing.same_surface(sb.shapes.icosphere(3), sb.shapes.Sphere(), order=-4)
     >>> verdict.outcome, f"{verdict.distance:.3f}", f"{verdict.area_change:.3f}"
     ('different', '0.008', '-0.005')
     """
@@ -56,10 +67,11 @@ class Verdict:
     outcome: Outcome
     lower: float
     upper: float
-    rtol: float
+    tolerance: float
     order: float
     area_change: float
     method: Method
+    doubt: str = ""
 
     @property
     def distance(self) -> float:
@@ -83,13 +95,14 @@ class Verdict:
         number = f"relative distance {self._number} at order {self.order:g}"
         change = 100 * self.area_change
         area = f"area {change:+,.0f} %" if abs(change) >= _WHOLE else f"area {change:+.2g} %"
+        doubt = f"; {self.doubt}" if self.doubt else ""
         match self.outcome:
             case "same":
-                return f"same surface: {number}, within rtol {self.rtol:g}"
+                return f"same surface: {number}, within tolerance {self.tolerance:g}"
             case "different":
-                return f"different surfaces: {number}, above rtol {self.rtol:g}; {area}"
+                return f"different surfaces: {number}, above tolerance {self.tolerance:g}; {area}{doubt}"
             case "undecided":
-                return f"undecided: {number}, which does not tell it from rtol {self.rtol:g}; take another rtol"
+                return f"undecided: {number}, which does not tell it from tolerance {self.tolerance:g}; take another"
 
     @property
     def _number(self) -> str:
@@ -104,7 +117,7 @@ def same_surface(
     a: SurfaceLike,
     b: SurfaceLike,
     *,
-    rtol: float = DEFAULT_RTOL,
+    tolerance: float = _DEFAULT_TOLERANCE,
     order: float = DEFAULT_ORDER,
     scaling: bool = True,
     memory: float | str | None = None,
@@ -120,9 +133,9 @@ def same_surface(
         a: Surface: a `Mesh`, a surface in closed form such as a `Sphere`, the path of a mesh file, or a tuple of
             vertices (n, 3) and triangles (m, 3).
         b: Reference, likewise.
-        rtol: Largest distance of surfaces that count as the same, over the norm of the reference.
-        order: Order s < -1/2 of the norm. Orders from -3 on take seconds for an rtol of 1e-3,
-            and most time near -1/2.
+        tolerance: Largest distance of surfaces that count as the same, over the norm of the reference.
+        order: Order s < -1/2 of the norm. Orders from -4 down are proven without random frequencies, in tenths of a
+            second for a tolerance of 1e-3; others take seconds, and most time near -1/2.
         scaling: Compare both in the unit of length in which the bounding sphere of the reference has the radius 1.
             Otherwise they are compared in their own, on which norms depend.
         memory: Memory that a transform may take, in bytes or as a text such as "4GB"; default 2e9.
@@ -138,29 +151,32 @@ def same_surface(
 
     >>> import sobolev_batch as sb
     >>> fine, coarse = sb.shapes.icosphere(4), sb.shapes.icosphere(3)
-    >>> print(sb.testing.same_surface(coarse, fine, rtol=0.01))
+    >>> print(sb.testing.same_surface(coarse, fine, tolerance=0.01, order=-4))
     same surface: relative distance 0.00...
     >>> sb.testing.same_surface(coarse, fine).outcome
     'different'
     """
     check_seed(seed)
-    accuracy = Accuracy(rtol) if memory is None else Accuracy(rtol, available(memory))
+    if not (is_finite_number(tolerance) and 0 < tolerance < 1):
+        raise InputError(f"tolerance must be a number between 0 and 1, found {tolerance!r}")
+    accuracy = Accuracy(_ACCURACY) if memory is None else Accuracy(_ACCURACY, available(memory))
     checked_order = single_order(order)
     surface, reference = (as_surface(one) for one in (a, b))
     area_change = surface.area / reference.area - 1
     similarity = Similarity.to_unit_ball(reference) if scaling else Similarity()
     pair = similarity.apply(surface), similarity.apply(reference)
-    bounds, method = relative_distance(*pair, checked_order, rtol, accuracy, available_cores(), seed)
+    bounds, method = relative_distance(*pair, checked_order, tolerance, accuracy, available_cores(), seed)
     lower, upper = bounds.lower, bounds.upper
-    outcome: Outcome = "same" if upper <= rtol else "different" if lower > rtol else "undecided"
-    return Verdict(outcome, lower, upper, float(rtol), checked_order, area_change, method)
+    outcome: Outcome = "same" if upper <= tolerance else "different" if lower > tolerance else "undecided"
+    doubt = placement_doubt(surface.extent, reference.extent) or ""
+    return Verdict(outcome, lower, upper, float(tolerance), checked_order, area_change, method, doubt)
 
 
 def assert_same_surface(
     a: SurfaceLike,
     b: SurfaceLike,
     *,
-    rtol: float = DEFAULT_RTOL,
+    tolerance: float = _DEFAULT_TOLERANCE,
     order: float = DEFAULT_ORDER,
     scaling: bool = True,
     memory: float | str | None = None,
@@ -174,14 +190,15 @@ def assert_same_surface(
     Args:
         a: Surface; see `same_surface`.
         b: Reference, likewise.
-        rtol: See `same_surface`.
+        tolerance: See `same_surface`.
         order: See `same_surface`.
         scaling: See `same_surface`.
         memory: See `same_surface`.
         seed: See `same_surface`.
-        witness: Beginning of the paths of files to write if the surfaces differ, such as "failures/part". Meshes are
-            written as failures/part-a.ply and failures/part-b.ply, with the witness function of a against b at their
-            vertices: positive where a has area that b lacks. The message then names the place where it is largest.
+        witness: Beginning of the paths of files to write unless the surfaces are the same, such as "failures/part";
+            default a new temporary folder. Meshes are written as failures/part-a.ply and failures/part-b.ply, with the
+            witness function of a against b at their vertices: positive where a has area that b lacks. The message
+            names them, and the place where it is largest.
 
     Returns:
         The verdict, which is "same".
@@ -192,26 +209,28 @@ def assert_same_surface(
 
     >>> import sobolev_batch as sb
     >>> sphere = sb.shapes.icosphere(4)
-    >>> sb.testing.assert_same_surface(sphere, sb.shapes.Sphere(), rtol=0.01).outcome
+    >>> sb.testing.assert_same_surface(sphere, sb.shapes.Sphere(), tolerance=0.01, order=-4).outcome
     'same'
-    >>> sb.testing.assert_same_surface((sphere.vertices, sphere.triangles[100:]), sphere)
+    >>> sb.testing.assert_same_surface((sphere.vertices, sphere.triangles[100:]), sphere, order=-4)
     Traceback (most recent call last):
         ...
-    AssertionError: different surfaces: relative distance 0.05... ± 0.0005 at order -4, above rtol 0.001; area -1.9 %
+    AssertionError: different surfaces: relative distance 0.05... at order -4, above tolerance 0.001; area -1.9 %;
+    a has less area near (...); witness: ...-a.ply ...-b.ply
     """
     __tracebackhide__ = True
     surface, reference = as_surface(a), as_surface(b)
-    verdict = same_surface(surface, reference, rtol=rtol, order=order, scaling=scaling, memory=memory, seed=seed)
+    verdict = same_surface(
+        surface, reference, tolerance=tolerance, order=order, scaling=scaling, memory=memory, seed=seed
+    )
     if verdict:
         return verdict
     message = str(verdict)
-    if witness is not None:
-        try:
-            difference = write_difference(surface, reference, Path(witness), order, scaling=scaling)
-            message += f"; {difference}"
-        except (SobolevBatchError, OSError, ValueError, TypeError) as error:
-            # The test must fail for its own reason.
-            message += f"; no witness: {one_line(error)}"
+    try:
+        path = Path(mkdtemp(prefix="sobolev-batch-"), "difference") if witness is None else Path(witness)
+        message += f"; {write_difference(surface, reference, path, order, scaling=scaling)}"
+    except (SobolevBatchError, OSError, ValueError, TypeError) as error:
+        # The test must fail for its own reason.
+        message += f"; no witness: {one_line(error)}"
     raise AssertionError(message)
 
 

@@ -33,7 +33,6 @@ def test_lost(assert_same_surface, text):
 def _without_other_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
     # The inner sessions run in this process, and import no libraries anew.
     assert sb.testing.assert_same_surface.__doc__
-    # Where the package is installed, its entry point would register the plug-in a second time.
     monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
 
 
@@ -43,7 +42,8 @@ def _without_other_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_files_lie_where_the_message_says(pytester: pytest.Pytester, options: list[str], folder: str) -> None:
     pytester.makepyfile(test_meshes=TESTS)
     pytester.path.joinpath("pytest.ini").write_text("[pytest]")
-    result = pytester.runpytest_subprocess("-p", MODULE, f"--basetemp={pytester.path}/temp", *options)
+    pytester.makeconftest(f"pytest_plugins = [{MODULE!r}]")
+    result = pytester.runpytest_subprocess(f"--basetemp={pytester.path}/temp", *options)
     result.assert_outcomes(passed=1, failed=2)
     files = sorted(file.name for file in pytester.path.glob(f"{folder}/*.ply"))
     # Of the second comparison of each test.
@@ -54,6 +54,6 @@ def test_files_lie_where_the_message_says(pytester: pytest.Pytester, options: li
     assert "verdict.py" not in result.stdout.str()
 
 
-def test_pytest_finds_it() -> None:
+def test_only_those_who_ask_for_it_load_it() -> None:
     project = tomllib.loads(Path(ROOT, "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert project["entry-points"]["pytest11"] == {"sobolev-batch": MODULE}
+    assert "pytest11" not in project.get("entry-points", {})

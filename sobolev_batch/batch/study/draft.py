@@ -49,7 +49,7 @@ rtol = 1e-2                # the largest relative error: 1 % of the distance its
 best_effort = true         # where that is out of reach, compute the nearest attainable accuracy and mark it
 
 [norm]
-orders = [-2.0, -4.0]      # -2 weighs details, -4 the overall form; -1.5 sees finer details and takes longer
+orders = [-2.0]            # add -4.0 for the overall form, or -1.5 for finer details, which takes longer
 
 """
 _TAIL = """
@@ -143,7 +143,7 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
     >>> draft.summary
     ('reference original.ply, 5,120 triangles', 'family ball: 2 meshes, 80 to 320 triangles')
     >>> study.orders
-    (-2.0, -4.0)
+    (-2.0,)
     """
     folder, output = Path(folder), Path(output)
     if os.path.lexists(output):

@@ -32,6 +32,7 @@ from pydantic_core import ErrorDetails, PydanticKnownError
 
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.parameters import byte_count
+from sobolev_batch.spectral import DEFAULT_ORDER
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.lattice import Lattice, check_orders
@@ -144,7 +145,7 @@ class _AccuracySection(Section):
 
 
 class _NormSection(Section):
-    orders: Annotated[tuple[Number, ...], Field(min_length=1, strict=False), at_most(_MOST_ORDERS)]
+    orders: Annotated[tuple[Number, ...], Field(min_length=1, strict=False), at_most(_MOST_ORDERS)] = (DEFAULT_ORDER,)
 
     def settings(self) -> tuple[float, ...]:
         """Return the orders, each once."""
@@ -276,7 +277,7 @@ class StudyDocument(Section):
     mesh: dict[Name, Annotated[SerializeAsAny[Source], BeforeValidator(_source)]] = {}
     lattice: _LatticeSection | None = None
     accuracy: _AccuracySection | None = None
-    norm: _NormSection
+    norm: _NormSection = _NormSection()
     compare: _CompareSection = _CompareSection()
     transform: _TransformSection = _TransformSection()
     reference: Annotated[FamilyReference | SerializeAsAny[Source] | None, BeforeValidator(_reference)]

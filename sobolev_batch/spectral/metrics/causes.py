@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.parameters import is_whole_number
+from sobolev_batch.spectral import DEFAULT_ORDER
 from sobolev_batch.spectral.backends import ComplexDtype, NufftSpec
 from sobolev_batch.spectral.fields import OperandLike, field_of, pair_of, read_blocks, shells_of
 from sobolev_batch.spectral.lattice import Block, Lattice, Orders, SobolevWeights, check_orders, shell_volumes
@@ -34,7 +35,7 @@ _ON_EDGE = 1e-12
 def spectrum(
     a: OperandLike,
     b: OperandLike | None,
-    order: Orders,
+    order: Orders = DEFAULT_ORDER,
     *,
     bands: int | Sequence[float] | None = None,
     lattice: Lattice | None = None,

@@ -17,6 +17,7 @@ import xarray as xr
 
 from sobolev_batch.errors import InputError, LatticeError, MeshError
 from sobolev_batch.parameters import available, available_cores, check_seed
+from sobolev_batch.spectral import DEFAULT_ORDER
 from sobolev_batch.spectral.adaptive.frequencies import Frequencies, Reference
 from sobolev_batch.spectral.adaptive.problem import Problem, Solution, SurfaceValues, are_equal, support_of
 from sobolev_batch.spectral.adaptive.solve import solve
@@ -47,7 +48,7 @@ _CLOSED_FORM_ACCURACY = 1e-13
 
 def norm(
     a: OperandLike,
-    order: Orders,
+    order: Orders = DEFAULT_ORDER,
     *,
     lattice: Lattice | None = None,
     rtol: float | None = None,
@@ -106,7 +107,7 @@ def norm(
 def distance(
     a: OperandLike,
     b: OperandLike,
-    order: Orders,
+    order: Orders = DEFAULT_ORDER,
     *,
     lattice: Lattice | None = None,
     rtol: float | None = None,
@@ -270,7 +271,7 @@ _KINDS = ("moved", "noise", "decimated")
 def yardsticks(
     a: MeshLike,
     b: MeshLike,
-    order: Orders,
+    order: Orders = DEFAULT_ORDER,
     *,
     lattice: Lattice | None = None,
     rtol: float | None = None,

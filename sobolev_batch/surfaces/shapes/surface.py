@@ -31,6 +31,14 @@ SurfaceType = TypeVar("SurfaceType", bound="Surface")
 
 # Surfaces whose sizes differ by more are hardly the same object.
 _MOST_RATIO = 4.0
+# What such a ratio suggests, where it is met to this fraction of it.
+_UNITS = {
+    10: "millimetres and the other in centimetres",
+    25.4: "millimetres and the other in inches",
+    100: "centimetres and the other in metres",
+    1000: "millimetres and the other in metres",
+}
+_UNIT_MARGIN = 0.02
 # Of the smaller box, the fraction that overlaps with the other one at least.
 _LEAST_OVERLAP = 0.3
 # Around each box, as a fraction of the smaller size.
@@ -172,7 +180,7 @@ def placement_doubt(extent: Extent, reference: Extent) -> str | None:
 
     >>> from sobolev_batch.shapes import Sphere
     >>> placement_doubt(Sphere(25.4).extent, Sphere().extent)
-    'it is 25.4 times as large as the reference: are both in the same unit of length?'
+    'it is 25.4 times as large as the reference: is one in millimetres and the other in inches?'
     >>> placement_doubt(Sphere(1.0, (1.5, 1.5, 0.0)).extent, Sphere().extent)
     'its bounding box hardly overlaps with that of the reference: are both in the same place?'
     """
@@ -184,7 +192,9 @@ def placement_doubt(extent: Extent, reference: Extent) -> str | None:
     factor = max(ratio, 1 / ratio)
     if factor > _MOST_RATIO:
         word = "large" if ratio > 1 else "small"
-        return f"it is {factor:.3g} times as {word} as the reference: are both in the same unit of length?"
+        units = next((names for one, names in _UNITS.items() if abs(factor / one - 1) < _UNIT_MARGIN), "")
+        question = f"is one in {units}" if units else "are both in the same unit of length"
+        return f"it is {float(f'{factor:.3g}'):,g} times as {word} as the reference: {question}?"
     (low, high), (other_low, other_high) = extent.box, reference.box
     # Flat surfaces have boxes without a volume.
     margin = _MARGIN * min(size, reference_size)

@@ -241,7 +241,7 @@ def test_units_are_doubted_where_numbers_are_shown(client: Client, folder: Path)
     sb.write_mesh(sb.Mesh(small.vertices / 10, small.triangles), folder / "small.off")
     store = folder / "mixed.zarr"
     sb.run(study(folder), store, client)
-    doubt = "f/small: it is 10 times as small as the reference: are both in the same unit of length?"
+    doubt = "f/small: it is 10 times as small as the reference: is one in millimetres and the other in centimetres?"
     assert doubt in call("table", store).stdout
     page = sb.report(store, folder / "report.html").read_text()
     assert "1 mesh may be in another unit or place" in page

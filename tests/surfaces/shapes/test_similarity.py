@@ -64,9 +64,9 @@ def placed(scale: float = 1.0, x: float = 0.0, y: float = 0.0, z: float = 0.0) -
 @pytest.mark.parametrize(
     ("mesh", "doubt"),
     [
-        (placed(1000.0), "1e+03 times as large"),
+        (placed(1000.0), "1,000 times as large as the reference: is one in millimetres and the other in metres?"),
         (placed(1 / 25.4), "25.4 times as small"),
-        (placed(0.11), "9.09 times as small"),
+        (placed(0.11), "9.09 times as small as the reference: are both in the same unit of length?"),
         (placed(1.0, 1.6, 0.8), "hardly overlaps"),
         (placed(1.0, 0.6, 0.0), "reaches beyond the reference by 30 % of its size"),
         (placed(0.3, 0.5, 0.0, 0.2), None),
