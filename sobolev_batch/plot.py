@@ -10,12 +10,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from matplotlib.axes import Axes
-
-from sobolev_batch.errors import InputError
-from sobolev_batch.results.figures.drawing import COST_LEAGUE, LEAGUE, PLOTS
-from sobolev_batch.results.figures.selection import Selection
-from sobolev_batch.results.figures.views import PICTURE_LIMITS, Axis, draw_witness, make_views
+from sobolev_batch.errors import InputError, from_extra
 from sobolev_batch.results.open import (
     EDGE_LENGTH,
     AnyStore,
@@ -26,6 +21,13 @@ from sobolev_batch.results.open import (
 )
 from sobolev_batch.results.tables.costs import CostLeague
 from sobolev_batch.results.tables.league import League
+
+with from_extra("plot", "a plot needs"):
+    from matplotlib.axes import Axes
+
+    from sobolev_batch.results.figures.drawing import COST_LEAGUE, LEAGUE, PLOTS
+    from sobolev_batch.results.figures.selection import Selection
+    from sobolev_batch.results.figures.views import PICTURE_LIMITS, Axis, draw_witness, make_views
 
 __all__ = ["convergence", "energy", "league", "matrix", "over_time", "spectrum", "witness"]
 

@@ -357,7 +357,7 @@ def test_nothing_answers_at_the_scheduler(folder: Path) -> None:
 
 COMMANDS = "compare fit init league plan plot report run status submit table unlock verify witness"
 # Libraries that take long to import.
-NUMERICS = "numpy scipy pandas xarray dask distributed zarr fsspec pydantic trimesh matplotlib finufft psutil tabulate"
+NUMERICS = "numpy scipy pandas xarray dask distributed zarr fsspec pydantic matplotlib finufft psutil tabulate"
 HELP = """
 import sys
 from click.testing import CliRunner

@@ -30,7 +30,7 @@ from sobolev_batch.cli.common import (
     store_argument,
     up_option,
 )
-from sobolev_batch.errors import InputError, SobolevBatchError, StoreError
+from sobolev_batch.errors import InputError, SobolevBatchError, StoreError, from_extra
 from sobolev_batch.results.tables import Format
 
 if TYPE_CHECKING:
@@ -262,12 +262,14 @@ def plot_command(
     from the study; drawing needs the extra "vtk". By default a few are chosen by their distances.
     """
     from sobolev_batch.batch.collection_store import CollectionStore
-    from sobolev_batch.results.figures.drawing import COST_LEAGUE, LEAGUE, write_plots
-    from sobolev_batch.results.figures.selection import Selection
-    from sobolev_batch.results.figures.style import drawing, parse_size, write_figures
-    from sobolev_batch.results.figures.views import write_witness_plots
     from sobolev_batch.results.open import EDGE_LENGTH, fields_read
     from sobolev_batch.results.tables.league import league
+
+    with from_extra("plot", "a plot needs"):
+        from sobolev_batch.results.figures.drawing import COST_LEAGUE, LEAGUE, write_plots
+        from sobolev_batch.results.figures.selection import Selection
+        from sobolev_batch.results.figures.style import drawing, parse_size, write_figures
+        from sobolev_batch.results.figures.views import write_witness_plots
 
     panel = None if size is None else parse_size(size)
     _require_folder(output)

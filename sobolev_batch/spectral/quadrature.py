@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
 
-import modepy
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,7 +24,7 @@ HIGHEST_DEGREE = 50
 FINEST_TOLERANCE = 1e-15
 # Sizes 2π|ξ|ρ of triangles (radians) at which the largest and the typical errors of rules are tabulated.
 _SIZES, _SIZES_ON_AVERAGE = np.geomspace(1e-4, 200.0, 160), np.geomspace(1e-3, 200.0, 64)
-_MEASURED = Path(__file__).with_name("rule_errors.npz")
+_TABULATED = Path(__file__).with_name("rules.npz")
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,12 +74,12 @@ def symmetric_rule(degree: int) -> TriangleRule:
     """Return the fully symmetric rule of a degree from 1 to 50, with positive weights and interior nodes.
 
     Source: H. Xiao, Z. Gimbutas, "A numerical algorithm for the construction of efficient quadrature rules
-    in two and higher dimensions" (2010), doi:10.1016/j.camwa.2009.10.027; tables from modepy.
+    in two and higher dimensions" (2010), doi:10.1016/j.camwa.2009.10.027.
     """
-    rule = modepy.XiaoGimbutasSimplexQuadrature(degree, 2)
-    second, third = (1 + np.asarray(rule.nodes, dtype=np.float64)) / 2
-    weights = np.asarray(rule.weights, dtype=np.float64)
-    return TriangleRule(degree, np.stack([1 - second - third, second, third], axis=1), weights / weights.sum())
+    found = tabulated()
+    end = int(found["sizes"][:degree].sum())
+    own = slice(end - int(found["sizes"][degree - 1]), end)
+    return TriangleRule(degree, found["nodes"][own], found["weights"][own])
 
 
 @cache
@@ -107,7 +106,7 @@ def rule_ranges(tolerance: float) -> tuple[tuple[TriangleRule, ...], Reals]:
     tolerance = max(tolerance, FINEST_TOLERANCE)
     rules: list[TriangleRule] = []
     ranges: list[float] = []
-    for rule, row in zip(candidate_rules(), measured_errors()["largest"], strict=True):
+    for rule, row in zip(candidate_rules(), tabulated()["largest"], strict=True):
         beyond = np.flatnonzero(row > tolerance)
         last = beyond[0] - 1 if beyond.size else len(_SIZES) - 1
         limit = float(_SIZES[last]) if last >= 0 else 0.0
@@ -127,7 +126,7 @@ def typical_errors(rule: TriangleRule) -> tuple[Reals, Reals, Reals]:
     neighbours that point opposite ways, and mostly cancels. Both are relative to the area, and each is the larger one
     of the equilateral and the flat triangle.
     """
-    stored, row = measured_errors(), candidate_rules().index(rule)
+    stored, row = tabulated(), candidate_rules().index(rule)
     return _SIZES_ON_AVERAGE, stored["even"][row], stored["odd"][row]
 
 
@@ -139,13 +138,14 @@ def candidate_rules() -> tuple[TriangleRule, ...]:
 
 
 @cache
-def measured_errors() -> dict[str, Reals]:
-    """Return what was measured of each candidate: "largest" (52, 160), "even" and "odd" (52, 64), float64.
+def tabulated() -> dict[str, Reals]:
+    """Return the symmetric rules and what was measured of each candidate, float64.
 
-    They depend on the rules alone, and measuring takes a second of each process, so the package carries them.
-    `python -m sobolev_batch.spectral.quadrature` writes them anew.
+    The "nodes" (n, 3) and "weights" (n,) of all degrees follow each other; "sizes" (50,) has the number of each. The
+    errors "largest" (52, 160), "even" and "odd" (52, 64) depend on the rules alone, and measuring takes a second of
+    each process, so the package carries them. `python -m sobolev_batch.spectral.quadrature` measures them anew.
     """
-    with np.load(_MEASURED, allow_pickle=False) as stored:  # noqa: TID251
+    with np.load(_TABULATED, allow_pickle=False) as stored:  # noqa: TID251
         return {name: stored[name] for name in stored.files}
 
 
@@ -472,4 +472,5 @@ def _radial_integrals(energy: Reals, radii: Reals, orders: Sequence[float]) -> R
 if __name__ == "__main__":
     _largest = [measure_largest_errors(rule) for rule in candidate_rules()]
     _even, _odd = zip(*(measure_typical_errors(rule) for rule in candidate_rules()), strict=True)
-    np.savez_compressed(_MEASURED, largest=_largest, even=_even, odd=_odd)
+    _rules = {name: tabulated()[name] for name in ("sizes", "nodes", "weights")}
+    np.savez_compressed(_TABULATED, allow_pickle=False, largest=_largest, even=_even, odd=_odd, **_rules)

@@ -55,11 +55,11 @@ _locking = ThreadLock()
 
 _OF_DASK = ("dask", "distributed")
 _OF_NUMBERS = (
-    *("cloudpickle", "sobolev-batch", "numpy", "scipy", "finufft", "modepy", "zarr", "xarray"),
-    *("fast-simplification", "trimesh", "plyfile"),
+    *("cloudpickle", "sobolev-batch", "numpy", "scipy", "finufft", "zarr", "xarray"),
+    *("trimesh", "plyfile"),
 )
 # Not every study needs these. Processes that have them must have the same.
-_OF_EXTRAS = ("pyacvd", "vtk")
+_OF_EXTRAS = ("fast-simplification", "pyacvd", "vtk")
 
 
 @dataclass(frozen=True)

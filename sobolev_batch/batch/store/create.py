@@ -47,7 +47,7 @@ _log = logging.getLogger(__name__)
 _SPECTRA_BYTES, _MOST_SPECTRA = 2 << 20, 512
 # Records that lie together once a run has ended.
 ROWS_PER_PAGE = 100
-_RECORDED_VERSIONS = ("sobolev-batch", "finufft", "modepy", "numpy", "scipy", "xarray", "zarr")
+_RECORDED_VERSIONS = ("sobolev-batch", "finufft", "numpy", "scipy", "xarray", "zarr")
 
 
 def require_usable(location: Location) -> None:

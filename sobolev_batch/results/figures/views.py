@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal, Self, get_args
 
-import fast_simplification
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
@@ -207,7 +207,10 @@ def _view(tree: xr.DataTree, label: str, mesh: Mesh, orders: tuple[float, ...], 
 
 def _for_display(vertices: Reals, triangles: Triangles, most: int) -> tuple[Reals, Triangles]:
     """Simplify a large mesh, and subdivide a small one so that values vary within its triangles."""
-    if len(triangles) > most:
+    # Without this extra, large meshes take longer to draw.
+    if len(triangles) > most and find_spec("fast_simplification"):
+        import fast_simplification
+
         simplified = fast_simplification.simplify(vertices, triangles, target_count=most)
         return np.asarray(simplified[0], dtype=np.float64), np.asarray(simplified[1], dtype=np.int32)
     while 4 * len(triangles) <= min(most, _ENOUGH_TRIANGLES):

@@ -8,7 +8,6 @@ import hashlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +18,7 @@ import xarray as xr
 from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import utc_now
-from sobolev_batch.errors import InputError, StoreError
-from sobolev_batch.results.figures.drawing import MOST_MESHES, clustered_order
-from sobolev_batch.results.figures.selection import Selection, Spectra
-from sobolev_batch.results.figures.views import Axis, MeshView, make_views
+from sobolev_batch.errors import InputError, StoreError, from_extra
 from sobolev_batch.results.open import (
     AnyStore,
     as_tree,
@@ -37,7 +33,6 @@ from sobolev_batch.results.open import (
     reference_of,
     require_unchanged,
 )
-from sobolev_batch.results.report.content import PageTable, league_content, study_content, utc_text
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables.convergence import table
 from sobolev_batch.results.tables.evolution import evolution
@@ -46,8 +41,16 @@ from sobolev_batch.results.tables.matrix import pairs_of
 from sobolev_batch.results.tables.text import minus
 from sobolev_batch.visible import visible
 
-# Of the extra.
-_LIBRARIES = ("jinja2", "plotly", "tomli_w")
+with from_extra("report", "a report needs"):
+    import jinja2
+    import plotly.offline
+    from jinja2.utils import htmlsafe_json_dumps
+
+    from sobolev_batch.results.figures.drawing import MOST_MESHES, clustered_order
+    from sobolev_batch.results.figures.selection import Selection, Spectra
+    from sobolev_batch.results.figures.views import Axis, MeshView, make_views
+    from sobolev_batch.results.report.content import PageTable, league_content, study_content, utc_text
+
 # Points of all convergence charts together, and numbers of all matrices: 10 bytes each, on a page of up to 15 MB.
 MOST_POINTS, MOST_NUMBERS = 50_000, 400_000
 
@@ -99,12 +102,6 @@ def write_page(path: Path, text: str) -> None:
 
 def make_report(store: AnyStore, *, folder: str | Path = ".", witnesses: Sequence[str] = (), up: Axis = "z") -> Page:
     """Return the report of a store, and what it leaves out; see `report`."""
-    missing = next((library for library in _LIBRARIES if find_spec(library) is None), None)
-    if missing is not None:
-        raise InputError(
-            f"a report needs the library {missing}, which is not installed; "
-            "the extra has it: pip install 'sobolev-batch[report]'"
-        )
     collection = CollectionStore.read(Location.parse(location_of(store)))
     if collection is None:
         return _study_page(store, folder, witnesses, up)
@@ -133,10 +130,6 @@ def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], u
 
 def _filled(template: str, content: dict[str, Any], charts: Json, **values: Any) -> Page:
     """Return a page from its template, with all that it needs to be drawn, and what it leaves out."""
-    import jinja2
-    import plotly.offline
-    from jinja2.utils import htmlsafe_json_dumps
-
     # Two thirds of a page, if the browser were not to unpack it.
     library = plotly.offline.get_plotlyjs()
     scripts = [_page_file("tables.js"), _page_file("charts.js")]

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
+import tomli_w
 import xarray as xr
 
 from sobolev_batch.batch.collection_store import CollectionStore
@@ -95,8 +96,6 @@ def common_content(
     label.
     """
     # Of the extra, which `make_report` looks for.
-    import tomli_w
-
     rows = pd.concat(frames.values(), ignore_index=True)
     meshes = rows[rows["order"] == rows["order"].iloc[0]]
     orders = [minus(f"{order:g}") for order in rows["order"].drop_duplicates()]

@@ -177,9 +177,15 @@ def write_off(mesh: Mesh) -> bytes:
 
 def write_stl(mesh: Mesh) -> bytes:
     """Return a binary STL file, which has single precision and no shared vertices."""
-    import trimesh
-
-    return bytes(trimesh.exchange.stl.export_stl(mesh.to_trimesh()))
+    corners = mesh.vertices[mesh.triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    records = np.zeros(len(corners), _STL_RECORD)
+    records["corners"] = corners
+    # That of a triangle without an area is zero.
+    records["normal"] = np.divide(normals, lengths, where=lengths > 0, out=np.zeros_like(normals))
+    header = bytes(_STL_HEADER_BYTES - 4) + len(corners).to_bytes(4, "little")
+    return header + records.tobytes()
 
 
 def _text_lines(data: bytes) -> Iterator[str]:

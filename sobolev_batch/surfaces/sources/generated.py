@@ -190,7 +190,8 @@ Fractions = Several[Annotated[float, Field(gt=0, allow_inf_nan=False, strict=Fal
 
 def decimated(mesh: Mesh, triangles: int) -> Mesh:
     """Return a mesh with its edges collapsed down to a number of triangles."""
-    import fast_simplification
+    with from_extra("studies", "decimation needs", MeshError):
+        import fast_simplification
 
     vertices, faces = fast_simplification.simplify(
         np.array(mesh.vertices), np.array(mesh.triangles, dtype=np.int32), target_count=triangles

@@ -296,9 +296,6 @@ def test_what_is_missing_or_damaged_is_said(store: str, tmp_path: Path, monkeypa
         patch.setattr(Spectra, "from_tree", damaged)
         with pytest.raises(DamageError, match=r"memory://hostile.zarr: a field is damaged.*verify"):
             make_report(store)
-    monkeypatch.setitem(sys.modules, "plotly", None)
-    with pytest.raises(InputError, match=r"library plotly.*pip install 'sobolev-batch\[report\]'"):
-        make_report(store)
 
 
 @pytest.fixture(scope="module")

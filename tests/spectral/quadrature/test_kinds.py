@@ -26,10 +26,10 @@ from sobolev_batch.spectral.quadrature import (
     gauss_rule,
     measure_largest_errors,
     measure_typical_errors,
-    measured_errors,
     midpoint_rule,
     rule_ranges,
     symmetric_rule,
+    tabulated,
 )
 from sobolev_batch.spectral.transform import Execution, TransformSettings
 from sobolev_batch.surfaces.shapes.surface import Surface
@@ -87,7 +87,7 @@ def test_no_triangle_within_range_exceeds_the_tolerance(tolerance: float) -> Non
 
 @pytest.mark.parametrize("row", [0, 2, 9, 51])
 def test_the_errors_that_the_package_carries_are_those_of_its_rules(row: int) -> None:
-    rule, carried = candidate_rules()[row], measured_errors()
+    rule, carried = candidate_rules()[row], tabulated()
     assert carried["largest"][row] == pytest.approx(measure_largest_errors(rule), rel=1e-6, abs=1e-15)
     even, odd = measure_typical_errors(rule)
     assert carried["even"][row] == pytest.approx(even, rel=1e-6, abs=1e-15)
