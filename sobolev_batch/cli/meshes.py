@@ -123,6 +123,7 @@ def compare_command(
     surface. The exit status is then 0 if they are, 1 if they are not, 4 if that cannot be told, and 2 after any error.
     """
     from sobolev_batch.spectral.lattice import Lattice
+    from sobolev_batch.spectral.metrics.datasets import parts_as_variables
     from sobolev_batch.spectral.metrics.norms import distance, yardsticks
     from sobolev_batch.surfaces.formats.readers import read_mesh
     from sobolev_batch.surfaces.proximity import proximity
@@ -155,7 +156,7 @@ def compare_command(
     if style == "json":
         if witness_path is not None:
             write_difference(first, second, witness_path, orders[0], scaling=not no_scaling, subject=a.name)
-        rows = results.to_dataframe().reset_index().to_dict(orient="records")
+        rows = parts_as_variables(results).to_dataframe().reset_index().to_dict(orient="records")
         more = {"settings": results.attrs, "proximity": nearness, "doubt": doubt}
         echo_json({"a": a, "b": b, "area_change": area_change, **vars(similarity), "orders": rows, **more})
         return
