@@ -6,18 +6,8 @@ from contextlib import contextmanager
 from sobolev_batch.visible import visible
 
 __all__ = [
-    "AccuracyError",
-    "BackendError",
-    "ClusterError",
-    "DamageError",
-    "InputError",
-    "LatticeError",
-    "LockError",
-    "MeshError",
-    "OrderError",
-    "SobolevBatchError",
-    "StoreError",
-    "StudyError",
+    *("AccuracyError", "BackendError", "ClusterError", "DamageError", "InputError", "LatticeError", "LockError"),
+    *("MeshError", "OrderError", "SobolevBatchError", "StoreError", "StudyError"),
 ]
 
 

@@ -95,13 +95,8 @@ def matrix(store: AnyStore, order: float | None = None, ax: Axes | None = None, 
     """Plot the distances of all pairs as a heat map, with similar meshes beside each other.
 
     The scale of colours is logarithmic; arrows end it where a few distances lie far beyond the others. White pairs are
-    equal. It shows up to 300 meshes, the first ones and the reference.
-
-    Args:
-        store: Path, URL or opened DataTree of a store with all pairs.
-        order: Order of the norm.
-        ax: Axes to draw on; its figure gets a colour bar.
-        family: Families to draw.
+    equal. It shows up to 300 meshes, the first ones and the reference. The store needs the distances of all pairs; the
+    parameters are those of `convergence`, and the figure of the axes gets a colour bar.
 
     >>> import sobolev_batch as sb
     >>> sb.plot.matrix("storage/icosphere.zarr", order=-10).get_title()
@@ -113,13 +108,8 @@ def matrix(store: AnyStore, order: float | None = None, ax: Axes | None = None, 
 def spectrum(store: AnyStore, order: float | None = None, ax: Axes | None = None, *, family: Families = None) -> Axes:
     """Plot the fractions of each squared distance to the reference by wavelength, as a heat map.
 
-    It reads the field of each mesh, and shows up to 24, evenly through the study; the title says so.
-
-    Args:
-        store: Path, URL or opened DataTree of the store.
-        order: Order of the norm.
-        ax: Axes to draw on; its figure gets a colour bar.
-        family: Families to draw.
+    It reads the field of each mesh, and shows up to 24, evenly through the study; the title says so. The
+    parameters are those of `convergence`; the figure of the axes gets a colour bar.
 
     >>> import sobolev_batch as sb
     >>> ax = sb.plot.spectrum("storage/icosphere.zarr", order=-10)
@@ -134,12 +124,7 @@ def energy(store: AnyStore, ax: Axes | None = None, *, family: Families = None) 
 
     It is a fraction of its limit for large |ξ|: twice the area of both surfaces, if no parts of them coincide. A mesh
     agrees with the reference at the wavelengths where its line is far below 1; where it reaches 1, they have nothing in
-    common. Like `spectrum` it shows up to 24 meshes.
-
-    Args:
-        store: Path, URL or opened DataTree of the store.
-        ax: Axes to draw on.
-        family: Families to draw.
+    common. Like `spectrum` it shows up to 24 meshes. The parameters are those of `convergence`.
 
     >>> import sobolev_batch as sb
     >>> sb.plot.energy("storage/icosphere.zarr").get_ylabel()

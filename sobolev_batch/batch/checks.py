@@ -20,6 +20,8 @@ from sobolev_batch.surfaces.sources.registry import ExpectedSize, Member
 
 _log = logging.getLogger(__name__)
 
+# A store as functions take it that have a default.
+StoreLike = str | Path | Location | None
 # Ends of a range of logarithms of sizes.
 Range = tuple[float, float]
 
@@ -32,34 +34,27 @@ _LARGEST_GAP = 1.2
 SIGNIFICANCE = 0.05
 
 
-def ready_to_run(
-    study: StudyLike, store: str | Path | Location | None, *, allow_commands: bool
-) -> tuple[AnyStudy, Location]:
-    """Return a study that may run, and the place of its store; log what would make the run useless.
+def settled(study: StudyLike, store: StoreLike, *, may_run: bool) -> tuple[AnyStudy, Location]:
+    """Return a study that keeps the meshes that it makes beside its store, and the place of the store.
 
-    Raises:
-        StudyError: The study is none, or runs commands and may not.
+    Stores there share the meshes. The place is storage/NAME.zarr where none is named.
     """
     study = as_study(study)
+    location = Location.parse(_DEFAULT_FOLDER / f"{study.name}.zarr" if store is None else store)
+    return study.with_cache(MeshCache(location.absolute().beside(_MADE_MESHES), may_run)), location
+
+
+def ready_to_run(study: StudyLike, store: StoreLike, *, allow_commands: bool) -> tuple[AnyStudy, Location]:
+    """Return a study that may run, and the place of its store; log what would make the run useless."""
+    study, location = settled(study, store, may_run=True)
     require_permission(study, allow_commands)
-    location = place_of(study, store)
     if store is None:
         # Other folders are not made: their names may be mistakes.
         with location.access("written"):
             _DEFAULT_FOLDER.mkdir(exist_ok=True)
     for text in warnings_of(study, location):
         _log.warning("%s", text)
-    return with_mesh_cache(study, location, may_run=True), location
-
-
-def place_of(study: AnyStudy, store: str | Path | Location | None) -> Location:
-    """Return the place of a study's store, which is storage/NAME.zarr where none is named."""
-    return Location.parse(_DEFAULT_FOLDER / f"{study.name}.zarr" if store is None else store)
-
-
-def with_mesh_cache(study: AnyStudy, location: Location, may_run: bool) -> AnyStudy:
-    """Return a study that keeps the meshes that it makes beside its store; stores there share them."""
-    return study.with_cache(MeshCache(location.absolute().beside(_MADE_MESHES), may_run))
+    return study, location
 
 
 def require_permission(study: AnyStudy, allow_commands: bool) -> None:

@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from distributed import Client
 
 from sobolev_batch.batch.analysis.proximity import have_proximities, measure_proximities
 from sobolev_batch.batch.analysis.tabulate import are_tabulated, tabulate_fields
-from sobolev_batch.batch.checks import ready_to_run
+from sobolev_batch.batch.checks import StoreLike, ready_to_run
 from sobolev_batch.batch.cluster.clients import local_client, memory_limit, require_blocking, thread_client
 from sobolev_batch.batch.cluster.execution import Cluster, Notify, Progress
 from sobolev_batch.batch.cluster.watch import Watch
@@ -89,7 +88,7 @@ class Summary:
 
 def run(
     study: StudyLike,
-    store: str | Path | Location | None = None,
+    store: StoreLike = None,
     client: Client | None = None,
     *,
     workers: int | None = None,

@@ -7,11 +7,10 @@ import time
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 from distributed import Client, Future, Status, fire_and_forget, get_worker, worker_client
 
-from sobolev_batch.batch.checks import ready_to_run
+from sobolev_batch.batch.checks import StoreLike, ready_to_run
 from sobolev_batch.batch.cluster.clients import require_blocking
 from sobolev_batch.batch.cluster.execution import task_key
 from sobolev_batch.batch.cluster.watch import Watch
@@ -59,9 +58,7 @@ class Submission:
     refused: Mapping[str, str] = field(default_factory=dict)
 
 
-def submit(
-    study: StudyLike, store: str | Path | Location | None, client: Client, *, allow_commands: bool = False
-) -> Submission:
+def submit(study: StudyLike, store: StoreLike, client: Client, *, allow_commands: bool = False) -> Submission:
     """Hand a study over to a cluster and return; it goes on without this process.
 
     One of the workers drives it, in a thread besides those for tasks; should that worker be lost,

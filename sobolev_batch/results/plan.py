@@ -5,13 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, overload
 
 from distributed import Client
 
 from sobolev_batch.batch.analysis.pairs import PAIR_BYTES, tile_count
-from sobolev_batch.batch.checks import place_of, require_permission, warnings_of, with_mesh_cache
+from sobolev_batch.batch.checks import StoreLike, require_permission, settled, warnings_of
 from sobolev_batch.batch.cluster.clients import require_blocking
 from sobolev_batch.batch.cluster.workers import Workers, prepare_workers, worker_slowness
 from sobolev_batch.batch.collection_store import for_each_object
@@ -21,7 +20,7 @@ from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store, stored_choice
 from sobolev_batch.batch.study.lattice_choice import look_at_extents
 from sobolev_batch.batch.study.plan import Plan, Row, make_plan
-from sobolev_batch.batch.study.study import Study, StudyCollection, StudyLike, as_study
+from sobolev_batch.batch.study.study import Study, StudyCollection, StudyLike
 from sobolev_batch.batch.workspace import complete_records
 from sobolev_batch.parameters import available_cores, format_bytes
 from sobolev_batch.results.tables.text import duration
@@ -280,40 +279,18 @@ class CollectionPlan:
 
 @overload
 def plan(
-    study: StudyCollection,
-    store: str | Path | Location | None = None,
-    client: Client | None = None,
-    *,
-    allow_commands: bool = False,
-) -> CollectionPlan: ...
-
-
-@overload
-def plan(
-    study: Study,
-    store: str | Path | Location | None = None,
-    client: Client | None = None,
-    *,
-    allow_commands: bool = False,
+    study: Study, store: StoreLike = None, client: Client | None = None, *, allow_commands: bool = False
 ) -> StudyPlan: ...
-
-
 @overload
 def plan(
-    study: StudyLike,
-    store: str | Path | Location | None = None,
-    client: Client | None = None,
-    *,
-    allow_commands: bool = False,
-) -> StudyPlan | CollectionPlan: ...
-
-
+    study: StudyCollection, store: StoreLike = None, client: Client | None = None, *, allow_commands: bool = False
+) -> CollectionPlan: ...
+@overload
 def plan(
-    study: StudyLike,
-    store: str | Path | Location | None = None,
-    client: Client | None = None,
-    *,
-    allow_commands: bool = False,
+    study: StudyLike, store: StoreLike = None, client: Client | None = None, *, allow_commands: bool = False
+) -> StudyPlan | CollectionPlan: ...
+def plan(
+    study: StudyLike, store: StoreLike = None, client: Client | None = None, *, allow_commands: bool = False
 ) -> StudyPlan | CollectionPlan:
     """Return what running a study would do, without computing anything.
 
@@ -342,9 +319,7 @@ def plan(
     surfaces:      5 in 1 family, reference reference
     ...
     """
-    study = as_study(study)
-    location = place_of(study, store)
-    study = with_mesh_cache(study, location, allow_commands)
+    study, location = settled(study, store, may_run=allow_commands)
     if isinstance(study, StudyCollection):
         plans, refused = for_each_object(study, location, lambda _, part, place: _plan(part, place, client))
         return CollectionPlan(plans, refused, warnings_of(study, location))
