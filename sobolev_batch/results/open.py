@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
+from itertools import accumulate, chain
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +16,11 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.store.store import DIGEST, OCTAVES_GROUP, SPECTRA_GROUP, Store
+from sobolev_batch.batch.store.store import DIGEST, OCTAVES_GROUP, RECORDS, SPECTRA_GROUP, JoinedStore, Store
 from sobolev_batch.batch.store.tables import lost_tables
 from sobolev_batch.errors import DamageError, InputError, StoreError, one_line
 from sobolev_batch.spectral.fields import Quality
+from sobolev_batch.spectral.metrics.datasets import describe
 from sobolev_batch.surfaces.shapes.surface import placement_doubt
 from sobolev_batch.surfaces.sources.names import quoted
 
@@ -46,24 +49,31 @@ AnyStore = str | Path | Location | xr.DataTree
 
 # Entries of the encoding of a tree: where it was opened, and the digest of its tables then.
 _SOURCE, _STATE = "source", "state"
+# Another: the trees of several stores that are open as one, each with the labels of its meshes by their own labels.
+_PARTS = "parts"
 # Groups that may be larger than the memory: xarray computes with them chunk by chunk.
 _LARGE = {"fourier", OCTAVES_GROUP, SPECTRA_GROUP}
 # What zarr and xarray raise for metadata that nobody has written.
 _MEANINGLESS = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError)
 
 
-def open_store(store: str | Path | Location) -> xr.DataTree:
+def open_store(store: str | Path | Location | Sequence[str | Path | Location]) -> xr.DataTree:
     """Open a store lazily, as ``xarray.open_datatree(store, engine="zarr")`` does.
 
     Groups: fourier (the fields), spectra, meshes, norms, distances, convergence, records; where the study requests it
     also octaves and proximity. docs/store.md lists their variables with dimensions and units. All stay on disk until
     you ask for values of them. Fields and spectra are Dask arrays; fields have the accessor `field.sobolev`.
 
+    Several stores open as one, without copies of their fields. They need the same lattice, similarity and reference.
+    Their meshes follow each other, with the name of their `study` as a coordinate, which begins labels and families if
+    a label comes twice. Tables have the orders that all stores have, and distances to the reference.
+
     Args:
-        store: Path or URL of the store.
+        store: Path or URL of the store, or several.
 
     Raises:
-        StoreError: The location has no store of a study, cannot be reached, or holds something else.
+        StoreError: The location has no store of a study, cannot be reached, or holds something else; or several stores
+            do not fit together.
         DamageError: Data of a table are missing. (Damaged data raise when they are read.)
 
     >>> import sobolev_batch as sb
@@ -73,6 +83,8 @@ def open_store(store: str | Path | Location) -> xr.DataTree:
     >>> tree["convergence"].attrs["reference"]
     'reference'
     """
+    if not isinstance(store, str | Path | Location):
+        return _joined([open_store(place) for place in store])
     # Else values that are read once the process has gone to another folder would be missing ones.
     location = Location.parse(store).absolute()
     opened = Store.open(location)
@@ -101,13 +113,114 @@ def open_store(store: str | Path | Location) -> xr.DataTree:
     return tree
 
 
+def _joined(trees: Sequence[xr.DataTree]) -> xr.DataTree:
+    """Return open stores as one."""
+    if not trees:
+        raise InputError("no store is named")
+    for tree in trees[1:]:
+        differences = [name for name, value in _common(tree).items() if value != _common(trees[0])[name]]
+        if differences:
+            raise StoreError(
+                f"{source_of(tree)}: it cannot be opened as one with {source_of(trees[0])}: "
+                f"they differ in {', '.join(differences)}"
+            )
+    names, study = _names_in_all(trees), trees[0].attrs["study"]
+    stored = [set(tree.attrs["study"]["orders"]) for tree in trees]
+    orders = [s for s in study["orders"] if all(s in others for others in stored)]
+    firsts = [*accumulate((store_of(tree).row_count for tree in trees), initial=0)]
+    groups = {
+        group: _concatenated(
+            [_part(tree, group, own, first, orders) for tree, own, first in zip(trees, names, firsts, strict=False)]
+        )
+        for group in trees[0].children
+        if group != RECORDS and all(group in tree.children for tree in trees)
+    }
+    groups["meshes"].attrs["metadata"] = list(dict.fromkeys(chain(*map(metadata_of, trees))))
+    groups["convergence"].attrs["reference"] = reference_of(trees[0])
+    title = " + ".join(str(tree.attrs["title"]) for tree in trees)
+    joined = xr.DataTree.from_dict(groups)
+    joined.attrs = {**trees[0].attrs, "title": title, "study": {**study, "name": title, "orders": orders}}
+    joined.encoding = {_PARTS: list(zip(trees, names, strict=True))}
+    return joined
+
+
+def _common(tree: xr.DataTree) -> dict[str, Any]:
+    """Return what stores have in common that open as one."""
+    reference = finished_group(tree, "meshes", load=False)["key"].sel(mesh=reference_of(tree)).item()
+    of_study = {name: tree.attrs["study"][name] for name in ("lattice", "dtype", "octaves")}
+    return {**of_study, "similarity": tree.attrs["similarity"], "reference": reference}
+
+
+def _names_in_all(trees: Sequence[xr.DataTree]) -> list[dict[str, str]]:
+    """Return the label among all stores of each mesh by its own label; the reference is that of the first store."""
+    own = [finished_group(tree, "meshes", load=False)["mesh"].values.tolist() for tree in trees]
+    for tree, labels in zip(trees[1:], own[1:], strict=True):
+        labels.remove(reference_of(tree))
+    twice = next((label for label, count in Counter(chain(*own)).items() if count > 1), None)
+    begins = [f"{tree.attrs['study']['name']}/" if twice else "" for tree in trees]
+    if twice and len(set(begins)) < len(begins):
+        raise StoreError(f"{source_of(trees[0])}: another study of the same name has a mesh {quoted(twice)} too")
+    names = [{label: f"{begin}{label}" for label in labels} for begin, labels in zip(begins, own, strict=True)]
+    names[0][reference_of(trees[0])] = reference_of(trees[0])
+    return names
+
+
+def _part(tree: xr.DataTree, group: str, names: Mapping[str, str], first: int, orders: Sequence[float]) -> xr.Dataset:
+    """Return a group of one of several stores: of these meshes, with their labels among all, and rows after others."""
+    part, study = tree[group].to_dataset(), str(tree.attrs["study"]["name"])
+    if "order" in part.dims:
+        part = part.sel(order=list(orders))
+    if "other" in part.dims:
+        part = part.drop_dims(["tile", "other_tile"], errors="ignore").sel(other=[reference_of(tree)])
+    own = [label for label in part["mesh"].values.tolist() if label in names]
+    part = part.sel(mesh=own)
+    columns = {"mesh": [names[label] for label in own], "study": [study] * len(own)}
+    if "family" in part.coords:
+        begins = [names[label].removesuffix(label) for label in own]
+        columns["family"] = [f"{begin}{family}" for begin, family in zip(begins, part["family"].values, strict=True)]
+    if "row" in part:
+        part = part.assign(row=part["row"] + first)
+    return part.assign_coords({name: ("mesh", np.array(texts, dtype=object)) for name, texts in columns.items()})
+
+
+def _concatenated(parts: Sequence[xr.Dataset]) -> xr.Dataset:
+    """Return parts one after the other, with NaN or empty texts where only others have a coordinate."""
+    known = {name: column for part in parts for name, column in part.coords.items() if column.dims == ("mesh",)}
+    absent = {name: np.array(np.nan if column.dtype.kind in "fiu" else "", object) for name, column in known.items()}
+    filled = []
+    for part in parts:
+        lacking = {
+            name: ("mesh", np.full(part.sizes["mesh"], absent[name])) for name in known.keys() - part.coords.keys()
+        }
+        same = {"other": parts[0]["other"]} if "other" in part.dims else {}
+        filled.append(part.assign_coords({**lacking, **same}))
+    return describe(
+        xr.concat(
+            filled, "mesh", data_vars="minimal", coords="minimal", compat="override", join="exact",
+            combine_attrs="drop_conflicts",
+        )
+    )  # fmt: skip
+
+
+def store_of(tree: xr.DataTree) -> Store:
+    """Return the store of an open tree, or those of several as one."""
+    parts = tree.encoding.get(_PARTS)
+    if parts is None:
+        return Store.open(location_of(tree))
+    stores = [store_of(part) for part, _ in parts]
+    labels = [names.get(label, "") for store, (_, names) in zip(stores, parts, strict=True) for label in store.labels()]
+    return JoinedStore(stores, labels)
+
+
 def as_tree(store: AnyStore) -> xr.DataTree:
     """Return a store as a DataTree, which it may be already."""
     return store if isinstance(store, xr.DataTree) else open_store(store)
 
 
 def source_of(tree: xr.DataTree) -> str | None:
-    """Return the path or URL at which a tree was opened by `open_store`; None for other trees."""
+    """Return the path or URL at which a tree was opened by `open_store`, or all of them; None for other trees."""
+    if _PARTS in tree.encoding:
+        return ", ".join(str(source_of(part)) for part, _ in tree.encoding[_PARTS])
     source = tree.encoding.get(_SOURCE)
     return None if source is None else str(source)
 
@@ -118,6 +231,10 @@ def require_unchanged(tree: xr.DataTree) -> None:
     Raises:
         StoreError: Its tables are not those that it had, or it is gone.
     """
+    for part, _ in tree.encoding.get(_PARTS, ()):
+        require_unchanged(part)
+    if _PARTS in tree.encoding:
+        return
     source = source_of(tree)
     # One that xarray itself has opened says so among its attributes.
     state = tree.encoding.get(_STATE, tree.attrs.get(DIGEST))
@@ -132,10 +249,12 @@ def location_of(store: AnyStore) -> str | Path | Location:
     """Return the path or URL of a store, which may be open.
 
     Raises:
-        InputError: A DataTree that does not say where it was opened.
+        InputError: A DataTree that does not say where it was opened, or of several stores.
     """
     if not isinstance(store, xr.DataTree):
         return store
+    if _PARTS in store.encoding:
+        raise InputError(f"{source_of(store)}: this is done for one store at a time")
     source = source_of(store)
     if source is None:
         raise InputError(

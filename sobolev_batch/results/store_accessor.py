@@ -11,11 +11,12 @@ from sobolev_batch.batch.analysis.pairs import pair_distances
 from sobolev_batch.batch.analysis.reducer import Reducer
 from sobolev_batch.batch.analysis.spectra import lower_bounds, spectrum_keys, stale_chunks
 from sobolev_batch.batch.analysis.tabulate import Results, table_of
-from sobolev_batch.batch.store.store import QUALITY, Store
+from sobolev_batch.batch.store.records import Record
+from sobolev_batch.batch.store.store import QUALITY
 from sobolev_batch.batch.store.tables import rows_unlike_tables
 from sobolev_batch.batch.workspace import complete_records
 from sobolev_batch.errors import DamageError, InputError
-from sobolev_batch.results.open import finished_group, location_of, reference_of, require_unchanged, source_of
+from sobolev_batch.results.open import finished_group, reference_of, require_unchanged, source_of, store_of
 from sobolev_batch.spectral import DEFAULT_ORDER
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
 from sobolev_batch.spectral.budget import NormEstimate
@@ -233,19 +234,24 @@ def stored_reducer(tree: xr.DataTree, order: Orders, *meshes: str) -> tuple[Redu
         OrderError: An order is not below -1/2.
         DamageError: The record of a mesh is not the one that the tables were made from.
     """
-    store, orders = Store.open(location_of(tree)), check_orders(order)
+    store, orders = store_of(tree), check_orders(order)
     labels, removed, chosen = store.labels(), store.removed, set(meshes)
-    wanted = {i for i, label in enumerate(labels) if label not in removed and (not chosen or label in chosen)}
-    read = {i: store.read_record(i) for i in wanted} if meshes else dict(enumerate(store.records()))
-    records = [read[i] if i in wanted else None for i in range(len(labels))]
-    for i, problem in (rows_unlike_tables(store, records, wanted) if wanted else {}).items():
-        raise DamageError(
-            f"{store.path}: the field of {labels[i]} is damaged ({problem}); run the study again", problem, i
-        )
-    complete, places = complete_records(records), {label: row for row, label in enumerate(labels)}
+    complete: dict[int, Record] = {}
+    for first, part in store.parts:
+        own = labels[first : first + part.row_count]
+        known = ((i, label) for i, label in enumerate(own) if label and label not in removed)
+        wanted = {i for i, label in known if not chosen or label in chosen}
+        read = {i: part.read_record(i) for i in wanted} if meshes else dict(enumerate(part.records()))
+        records = [read[i] if i in wanted else None for i in range(len(own))]
+        for i, problem in (rows_unlike_tables(part, records, wanted) if wanted else {}).items():
+            raise DamageError(
+                f"{part.path}: the field of {own[i]} is damaged ({problem}); run the study again", problem, i
+            )
+        complete |= {first + row: record for row, record in complete_records(records).items()}
+    places = {label: row for row, label in enumerate(labels)}
     for mesh in meshes:
         if places.get(mesh) not in complete:
-            raise InputError(f"{store.path}: no mesh {quoted(mesh)} with a field; its labels begin {labels[:3]}")
+            raise InputError(f"{source_of(tree)}: no mesh {quoted(mesh)} with a field; its labels begin {labels[:3]}")
     rows, reference = [places[mesh] for mesh in meshes], places[store.attributes()["study"]["reference"]]
     qualities = {row: Quality.from_json(record.quality) for row, record in complete.items()}
     checksums = {row: record.checksums for row, record in complete.items()}
@@ -264,7 +270,7 @@ def _computed(tree: xr.DataTree, orders: tuple[float, ...], meshes: Meshes = Non
     Raises:
         DamageError: Spectra are not those of the fields that the tables were made from.
     """
-    store, reference = Store.open(location_of(tree)), reference_of(tree)
+    store, reference = store_of(tree), reference_of(tree)
     table = finished_group(tree, "meshes", load=False)
     if meshes is not None:
         chosen = [meshes] if isinstance(meshes, str) else list(meshes)
@@ -274,11 +280,14 @@ def _computed(tree: xr.DataTree, orders: tuple[float, ...], meshes: Meshes = Non
     complete = {row: (label, key) for label, row, status, key in zip(*columns, strict=True) if status == "complete"}
     row_of_reference = next((row for row, (label, _) in complete.items() if label == reference), -1)
     keys = spectrum_keys({row: key for row, (_, key) in complete.items()}, row_of_reference)
-    if stale_chunks(store, keys):
-        problem = "they are not those of the stored fields"
-        raise DamageError(f"{store.path}: radial spectra are damaged ({problem}); run the study again", problem)
-    texts = np.asarray(store.read(QUALITY, sorted(complete))).tolist()
-    qualities = {row: Quality.from_json(text) for row, text in zip(sorted(complete), texts, strict=True)}
+    qualities: dict[int, Quality] = {}
+    for first, part in store.parts:
+        rows = [row for row in sorted(complete) if first <= row < first + part.row_count]
+        if stale_chunks(part, {row - first: keys[row] for row in rows}):
+            problem = "they are not those of the stored fields"
+            raise DamageError(f"{part.path}: radial spectra are damaged ({problem}); run the study again", problem)
+        texts = np.asarray(part.read(QUALITY, [row - first for row in rows])).tolist() if rows else []
+        qualities |= {row: Quality.from_json(text) for row, text in zip(rows, texts, strict=True)}
     reducer = Reducer.for_fields(store, store.choice(), orders, qualities, {}, row_of_reference)
     return Results.from_spectra(reducer, table, reference)
 
@@ -357,7 +366,7 @@ def _require_fields(tree: xr.DataTree, table: xr.Dataset, meshes: Sequence[str])
 
 def order_note(tree: xr.DataTree, orders: Sequence[float]) -> list[str]:
     """Return what orders that were computed from the fields rest on, as lines of a note of a table."""
-    choice = Store.open(location_of(tree)).choice()
+    choice = store_of(tree).choice()
     frequencies = f"frequencies up to {choice.lattice.xi_max:g} on each axis"
     if choice.tail is not None:
         frequencies = f"{frequencies}, and samples in octaves up to {choice.tail.highest_frequency:.4g}"

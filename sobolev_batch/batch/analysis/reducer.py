@@ -11,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.batch.store.store import FIELD, Store
+from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.lattice_choice import LatticeChoice
 from sobolev_batch.spectral.budget import (
     NormEstimate,
@@ -105,7 +105,7 @@ class Reducer:
 
         Spectra that are stored need no checksums.
         """
-        count = store.document(FIELD)["shape"][0]
+        count = sum(part.row_count for _, part in store.parts)
         areas, errors = np.full(count, np.nan), np.full((len(orders), count), np.nan)
         weights = SobolevWeights(choice.lattice, orders, None if choice.tail is None else choice.tail.cutoff)
         for row, quality in qualities.items():

@@ -26,10 +26,11 @@ def spectrum_keys(keys: Mapping[int, str], reference: int) -> dict[int, str]:
 
 def chunks_of_spectra(store: Store) -> Iterator[range]:
     """Yield the rows of each chunk of spectra."""
-    document = store.document(SPECTRA_KEYS)
-    (count,), (step,) = document["shape"], document["chunk_grid"]["configuration"]["chunk_shape"]
-    for first in range(0, count, step):
-        yield range(first, min(first + step, count))
+    for before, part in store.parts:
+        document = part.document(SPECTRA_KEYS)
+        (count,), (step,) = document["shape"], document["chunk_grid"]["configuration"]["chunk_shape"]
+        for first in range(0, count, step):
+            yield range(before + first, before + min(first + step, count))
 
 
 def stale_chunks(store: Store, keys: Mapping[int, str]) -> dict[int, range]:
@@ -91,12 +92,13 @@ def _places(of: set[int], rows: range) -> list[int]:
 def read_spectra(store: Store, rows: Sequence[int]) -> ComparedSpectra:
     """Return the spectra of rows, in their order; a damaged chunk raises a `DamageError`."""
     parts, wanted = [], set(rows)
-    for number, chunk in enumerate(chunks_of_spectra(store)):
-        of_chunk = wanted.intersection(chunk)
-        if of_chunk:
-            _, arrays = read_chunk(store, SPECTRA_KEYS, (number,))
-            chosen = {name.partition("/")[2]: values[_places(of_chunk, chunk)] for name, values in arrays.items()}
-            parts.append(ComparedSpectra.from_arrays(chosen))
+    for before, part in store.parts:
+        for number, chunk in enumerate(chunks_of_spectra(part)):
+            of_chunk = {row - before for row in wanted.intersection(range(before + chunk.start, before + chunk.stop))}
+            if of_chunk:
+                _, arrays = read_chunk(part, SPECTRA_KEYS, (number,))
+                chosen = {name.partition("/")[2]: values[_places(of_chunk, chunk)] for name, values in arrays.items()}
+                parts.append(ComparedSpectra.from_arrays(chosen))
     places = {row: place for place, row in enumerate(sorted(wanted))}
     return ComparedSpectra.joined(parts)[[places[row] for row in rows]]
 

@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict
-from itertools import product
+from itertools import accumulate, product
 from pathlib import Path
 from typing import Any, Self
 
@@ -300,6 +300,16 @@ class Store:
         check_documents(self.path, {name: document})
         return document
 
+    @property
+    def parts(self) -> tuple[tuple[int, Store], ...]:
+        """The stores that this one is made of, each with the number of rows before its own; see `JoinedStore`."""
+        return ((0, self),)
+
+    @property
+    def row_count(self) -> int:
+        """Number of rows."""
+        return int(self.document(FIELD)["shape"][0])
+
     # Labels and records
 
     def labels(self) -> tuple[str, ...]:
@@ -474,7 +484,7 @@ class Store:
 
     def rows_with_complete_fields(self) -> set[int]:
         """Return the rows whose blocks all exist in their full length. No block is read."""
-        rows = set(range(self.document(FIELD)["shape"][0]))
+        rows = set(range(self.row_count))
         for name in self.documents.keys() & {FIELD, OCTAVES}:
             rows -= {index[0] for index in self.incomplete_chunks(name, self.location.sizes(f"{name}/c"))}
         return rows
@@ -490,6 +500,37 @@ class Store:
             return self.labels()
         except DamageError:
             return [f"row {row}" for row in range(count)]
+
+
+class JoinedStore(Store):
+    """Stores of one lattice and one reference, for reading fields and spectra: the rows of one follow those of another.
+
+    Metadata are those of the first one.
+    """
+
+    def __init__(self, stores: Sequence[Store], labels: Sequence[str]) -> None:
+        super().__init__(stores[0].location)
+        self.documents = stores[0].documents
+        self._stores, self._labels = tuple(stores), tuple(labels)
+
+    @property
+    def parts(self) -> tuple[tuple[int, Store], ...]:
+        """The stores, each with the number of rows before its own."""
+        firsts = accumulate((store.row_count for store in self._stores), initial=0)
+        return tuple(zip(firsts, self._stores, strict=False))
+
+    def labels(self) -> tuple[str, ...]:
+        """Return the label of each row; empty for rows that are left out."""
+        return self._labels
+
+    def read_fields(self, rows: Sequence[int], place: Place, checksums: Sequence[int] | None = None) -> NDArray[Any]:
+        """Return the values of several rows at a place, from the store of each; see `Store.read_fields`."""
+        found: dict[int, NDArray[Any]] = {}
+        for first, store in self.parts:
+            places = [k for k, row in enumerate(rows) if first <= row < first + store.row_count]
+            expected = None if checksums is None else [checksums[k] for k in places]
+            found |= zip(places, store.read_fields([rows[k] - first for k in places], place, expected), strict=True)
+        return np.stack([found[k] for k in range(len(rows))])
 
 
 def _array_at(place: Place) -> str:
