@@ -109,7 +109,10 @@ def _rows(reconstruction: Reconstruction, order: float, effort: Effort) -> Itera
         text = f"{what}: relative distance at order {measured:g}, against the start"
         yield Row("12", text, f"{after:.3g}", f"{before:.3g}", after / before)
     near, far = sb.proximity(fit.mesh, target), sb.proximity(start, target)
-    for name, after, before in (("Hausdorff", near.hausdorff, far.hausdorff), ("Chamfer", near.chamfer, far.chamfer)):
+    for name, after, before in (
+        ("Hausdorff", near["hausdorff"], far["hausdorff"]),
+        ("Chamfer", near["chamfer"], far["chamfer"]),
+    ):
         yield Row("12", f"{what}: {name} distance, against the start", f"{after:.3g}", f"{before:.3g}", after / before)
     angle, even = fit.after.smallest_angle, fit.before.smallest_angle
     yield Row("12", f"{what}: smallest angle in degrees", f"{angle:.3g}", f"{even:.3g}", angle / even)

@@ -10,13 +10,11 @@ from sobolev_batch.results.status import Status
 from sobolev_batch.results.store_accessor import StoreAccessor
 from sobolev_batch.results.tables.costs import CostLeague
 from sobolev_batch.results.tables.league import League
-from sobolev_batch.surfaces.proximity import Proximity
 
 __all__ = [
     "CollectionPlan",
     "CostLeague",
     "League",
-    "Proximity",
     "SobolevAccessor",
     "Status",
     "StoreAccessor",

@@ -134,7 +134,7 @@ def test_compare_is_exact_to_1_per_cent_without_options(folder: Path) -> None:
     # One digit is shown of the error, rounded up.
     assert error <= 0.02 * value
     assert re.search(r"^order -2: distance \S+ ± \S+ \(truncation", shown, re.M)
-    assert re.search(r"^scale 0\.033\d*, origin 100 ", shown, re.M)
+    assert re.search(r"in radii of 3\.off, 30 units of the files each \(scale 0\.033\d*, origin 100 ", shown)
 
 
 def test_compare_to_an_accuracy_and_on_a_lattice(folder: Path) -> None:
@@ -146,9 +146,30 @@ def test_compare_to_an_accuracy_and_on_a_lattice(folder: Path) -> None:
     assert re.findall(r"^1\.off .* 3\.off .* at order (-\d)", shown, re.M) == ["-4", "-6"]
     for yardstick in (r"moved by \S+ %", r"with noise of \S+ %", r"decimated to \d+ triangles"):
         assert len(re.findall(rf"^  3\.off {yardstick}", shown, re.M)) == 2
-    assert re.search(r"^Hausdorff at least 6\.\d\de-02, Chamfer 8\.\d{4}e-02 ± \de-04", shown, re.M)
+    near = sb.proximity(*(sb.read_mesh(folder / name) for name in ("1.off", "3.off")))
+    lengths = [f"{near[f'hausdorff{way}']:.4g}" for way in ("_forward", "_backward", "")]
+    assert re.search(rf"^Hausdorff, at least +{' +'.join(lengths)}$", shown, re.M)
+    assert re.search(rf"^Chamfer, the sum of both means: {near['chamfer']:.3f}\d* ± \S+ \(s\.e\.\)$", shown, re.M)
     for written, own in (("new/w-a.ply", "1.off"), ("new/w-b.ply", "3.off")):
         assert np.array_equal(sb.read_mesh(folder / written).vertices, sb.read_mesh(folder / own).vertices)
+
+
+def test_compare_names_units_and_defects(folder: Path) -> None:
+    ball = sb.shapes.icosphere(2)
+    part = sb.Mesh(100 * ball.vertices, np.vstack([ball.triangles[1:], ball.triangles[5:6]]))
+    inverted = sb.Mesh(100 * ball.vertices, ball.triangles[:, ::-1])
+    sb.write_mesh(part, folder / "part.off")
+    sb.write_mesh(inverted, folder / "inverted.off")
+    files = ("part.off", "inverted.off", "--order=-4", "--unit", "mm")
+    done = [call("compare", *files, *more, folder=folder) for more in ((), ("--no-scaling",))]
+    scaled, kept = (one.stdout + one.stderr for one in done)
+    for shown in (scaled, kept):
+        assert re.search(r"part\.off: 3 open edges, .* 1 duplicate triangle, counted twice$", shown, re.M)
+        assert "inverted.off: all triangles face inwards\n" in shown
+    assert "distances of orders are in radii of inverted.off, 100 mm each" in scaled
+    assert "wavelengths above 1 mm" not in scaled
+    assert "wavelengths above 1 mm weigh alike" in kept
+    assert "in 1 mm; the radius of inverted.off is 100\n" in kept
 
 
 def test_the_exit_status_of_a_verdict(folder: Path) -> None:
@@ -188,7 +209,7 @@ def test_json_has_the_numbers_that_texts_round(folder: Path) -> None:
         assert [row[name] for row in found["orders"]] == pytest.approx(expected[name].values.tolist(), rel=1e-9)
     assert (found["scale"], found["a"]) == (similarity.scale, "1.off")
     assert found["area_change"] == pytest.approx(first.area / third.area - 1)
-    assert found["proximity"]["hausdorff"] == sb.proximity(*pair).hausdorff
+    assert found["proximity"]["hausdorff"] == sb.proximity(first, third)["hausdorff"]
     verdict = document("compare", "1.off", "3.off", "--below", "0.01", folder=folder, status=1)
     assert verdict["outcome"] == "different"
     assert 0.01 < verdict["lower"] < verdict["distance"] < verdict["upper"]

@@ -46,6 +46,8 @@ _STATUSES = {"same": 0, "different": EXIT_DIFFERENT, "undecided": EXIT_UNDECIDED
 # Options of compare that a verdict knows; it chooses the accuracy of the distance itself.
 _KNOWN = {"a", "b", "below", "orders", "memory", "no_scaling", "style"}
 
+# A radius beyond it, or below its inverse, is far from the unit of length.
+_FAR_UNIT = 10.0
 # Default of compare, which then takes the nearest attainable accuracy.
 _DEFAULT_RTOL = 1e-2
 # In radii of the target; distances have about as many digits.
@@ -86,7 +88,16 @@ _below_option = click.option(
     is_flag=True,
     help="Print which move, noise and decimation bring B as far from itself.",
 )
-@click.option("--proximity", "with_proximity", is_flag=True, help="Also print Hausdorff and Chamfer distances.")
+@click.option(
+    "--proximity",
+    "with_proximity",
+    is_flag=True,
+    help="Also print Hausdorff, mean, RMS and other usual distances.",
+)
+@click.option(
+    "--threshold", type=float, help="Take this length for the F-score of --proximity. [default: 1 % of the radius of B]"
+)
+@click.option("--unit", metavar="NAME", help="Name the unit of length of both files, such as mm.")
 @click.option(
     "--witness",
     "witness_path",
@@ -111,6 +122,8 @@ def compare_command(
     intervals: int | None,
     with_yardsticks: bool,
     with_proximity: bool,
+    threshold: float | None,
+    unit: str | None,
     witness_path: Path | None,
     no_scaling: bool,
     below: float | None,
@@ -145,10 +158,11 @@ def compare_command(
     similarity = Similarity() if no_scaling else Similarity.to_unit_ball(second)
     pair = similarity.apply(first), similarity.apply(second)
     doubt = placement_doubt(*(surface.extent for surface in pair))
-    if doubt is not None:
-        echo(f"note: {a.name}: {doubt}", err=True)
-    # Refused before a long computation where its library is not installed.
-    nearness = proximity(*pair) if with_proximity else None
+    radius = second.bounding_sphere[1]
+    for line in _remarks({a.name: first, b.name: second}, doubt, radius if no_scaling else 1.0, unit):
+        echo(f"note: {line}", err=True)
+    # Bad settings are refused before a long computation.
+    nearness = proximity(first, second, threshold=threshold) if with_proximity else None
     orders = orders or (DEFAULT_ORDER,)
     accuracy: dict[str, Any] = {"lattice": lattice, "rtol": rtol, "memory": memory, "best_effort": best_effort}
     results = yardsticks(*pair, orders, **accuracy) if with_yardsticks else distance(*pair, orders, **accuracy)
@@ -157,18 +171,65 @@ def compare_command(
         if witness_path is not None:
             write_difference(first, second, witness_path, orders[0], scaling=not no_scaling, subject=a.name)
         rows = parts_as_variables(results).to_dataframe().reset_index().to_dict(orient="records")
-        more = {"settings": results.attrs, "proximity": nearness, "doubt": doubt}
+        defects = {"a": first.defects, "b": second.defects}
+        more = {"settings": results.attrs, "proximity": nearness, "doubt": doubt, "defects": defects, "unit": unit}
         echo_json({"a": a, "b": b, "area_change": area_change, **vars(similarity), "orders": rows, **more})
         return
     _print_answers(a.name, b.name, results, area_change, rtol)
-    echo(f"scale {similarity.scale:.6g}, origin {' '.join(f'{x:.6g}' for x in similarity.origin)}")
+    length = unit or "units of the files"
+    one = f"1 {unit}" if unit else "1 unit of the files"
+    echo(
+        f"distances of orders are in {one}; the radius of {visible(b.name)} is {radius:.6g}"
+        if no_scaling
+        else f"distances of orders are in radii of {visible(b.name)}, {radius:.6g} {length} each "
+        f"(scale {similarity.scale:.6g}, origin {' '.join(f'{x:.6g}' for x in similarity.origin)})"
+    )
     if nearness is not None:
-        echo(
-            f"Hausdorff at least {nearness.hausdorff:.2e}, "
-            f"Chamfer {nearness.chamfer:.4e} ± {nearness.chamfer_error:.0e} (s.e.)"
-        )
+        _print_proximity(nearness, (first, second), length)
     if witness_path is not None:
         echo(write_difference(first, second, witness_path, orders[0], scaling=not no_scaling, subject=a.name))
+
+
+def _remarks(meshes: Mapping[str, Mesh], doubt: str | None, size: float, unit: str | None) -> Iterator[str]:
+    """Yield what may make one doubt a comparison: defects of meshes, their places, and a unit far from their size."""
+    yield from (f"{name}: {', '.join(mesh.defects)}" for name, mesh in meshes.items() if mesh.defects)
+    first = next(iter(meshes))
+    if doubt is not None:
+        yield f"{first}: {doubt}"
+    if not 1 / _FAR_UNIT < size < _FAR_UNIT:
+        yield (
+            f"without scaling, wavelengths above 1 {unit or 'unit of the files'} weigh alike and shorter ones less, "
+            f"and the reference has a radius of {size:.4g}; leave out --no-scaling to weigh them against it"
+        )
+
+
+def _print_proximity(found: Mapping[str, float], meshes: tuple[Mesh, Mesh], unit: str) -> None:
+    """Print the usual distances in both directions, what is made of them, and the shapes of both meshes."""
+    from sobolev_batch.results.tables.text import printed_table, with_error
+
+    names = {"hausdorff": "Hausdorff, at least", "mean": "mean", "rms": "RMS", "p50": "50 % within"}
+    names |= {
+        "p95": "95 % within",
+        "p99": "99 % within",
+        "normal_mean": "normals, mean",
+        "normal_max": "normals, largest",
+    }
+    rows = []
+    for name, title in names.items():
+        ending = " deg" if name.startswith("normal") else ""
+        rows.append([title, *(f"{found[f'{name}{way}']:.4g}{ending}" for way in ("_forward", "_backward", ""))])
+    echo_lines(printed_table(rows, [f"in {unit}", "A to B", "B to A", "larger"], "text"))
+    echo(f"Chamfer, the sum of both means: {with_error(found['chamfer'], found['chamfer_error'])} (s.e.)")
+    echo(
+        f"F-score at {found['threshold']:.4g}: {100 * found['fscore']:.4g} % "
+        f"({100 * found['precision']:.4g} % of A, {100 * found['recall']:.4g} % of B)"
+    )
+    for label, mesh in zip("AB", meshes, strict=True):
+        volume = "not closed" if math.isnan(mesh.volume) else f"volume {mesh.volume:.6g}"
+        angle, ratio = mesh.smallest_angles.min(), mesh.aspect_ratios.max()
+        echo(
+            f"{label}: {volume}, area {mesh.area:.6g}, smallest angle {angle:.3g} deg, aspect ratio at most {ratio:.3g}"
+        )
 
 
 def _print_answers(name: str, reference: str, results: xr.Dataset, area_change: float, rtol: float | None) -> None:

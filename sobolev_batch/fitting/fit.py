@@ -58,7 +58,7 @@ class FitQuality:
     Attributes:
         distance: Sobolev distance, in the square root of a unit length.
         error: Error of the distance.
-        hausdorff: Hausdorff distance, a lower bound in units of length; NaN without VTK or a target of triangles.
+        hausdorff: Hausdorff distance, a lower bound in units of length; NaN without a target of triangles.
         chamfer: Chamfer distance, in units of length; NaN likewise.
         smallest_angle: Smallest angle of all triangles, in degrees.
         relative: Distance over the norm of the target.
@@ -284,11 +284,8 @@ def measure_quality(problem: FitProblem, mesh: Mesh) -> FitQuality:
     quality = FitQuality(**numbers, smallest_angle=float(mesh.smallest_angles.min()))
     if not isinstance(target, Mesh):
         return quality
-    try:
-        near = proximity(mesh, target)
-    except InputError:
-        return quality
-    return replace(quality, hausdorff=near.hausdorff, chamfer=near.chamfer)
+    near = proximity(mesh, target)
+    return replace(quality, hausdorff=near["hausdorff"], chamfer=near["chamfer"])
 
 
 def start_quality(problem: FitProblem) -> FitQuality:

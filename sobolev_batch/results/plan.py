@@ -199,7 +199,7 @@ def _study_lines(plan: Plan) -> Iterator[tuple[str, str]]:
     if study.commands:
         yield "", "they run only with --allow-commands (in Python: allow_commands=True)"
     if study.proximity is not None:
-        yield "proximity", f"Hausdorff and Chamfer distances, from {study.proximity:,} points on each mesh"
+        yield "proximity", f"Hausdorff and Chamfer distances, from {study.proximity.points:,} points on each mesh"
 
 
 def _task_lines(

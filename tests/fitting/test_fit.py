@@ -66,7 +66,9 @@ def test_it_keeps_the_triangles_turns_none_over_and_reports_distances_of_points(
     assert fitted.after.smallest_angle > 0.3 * fitted.before.smallest_angle
     near = sb.proximity(fitted.mesh, TARGET)
     # Points are drawn on meshes that were moved to a common centre.
-    assert (fitted.after.hausdorff, fitted.after.chamfer) == pytest.approx((near.hausdorff, near.chamfer), rel=1e-3)
+    assert (fitted.after.hausdorff, fitted.after.chamfer) == pytest.approx(
+        (near["hausdorff"], near["chamfer"]), rel=1e-3
+    )
     assert fitted.remarks == ()
 
 

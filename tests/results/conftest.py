@@ -54,7 +54,10 @@ def tree() -> xr.DataTree:
         {"fourier": (("mesh", "xi_x", "xi_y", "xi_z"), values)},
         coords={"mesh": MESHES, "xi_x": axis, "xi_y": axis, "xi_z": axis[2:], "quality": ("mesh", [QUALITY] * 4)},
     )
-    return xr.DataTree.from_dict({"/convergence": convergence, "/meshes": meshes, "/fourier": fourier})
+    tree: xr.DataTree = xr.DataTree.from_dict({"/convergence": convergence, "/meshes": meshes, "/fourier": fourier})
+    study = {"name": "made", "table": {"study": {"name": "made"}}}
+    tree.attrs = {"study": study, "similarity": {"scale": 1.0, "origin": [0.0, 0.0, 0.0]}}
+    return tree
 
 
 @pytest.fixture
@@ -68,5 +71,7 @@ def near(tree: xr.DataTree) -> xr.DataTree:
     }
     reason = ["", "its file has changed", "", ""]
     variables = {name: ("mesh", values) for name, values in {**columns, "reason": reason}.items()}
-    proximity = xr.Dataset(variables, coords={"mesh": MESHES})
-    return xr.DataTree.from_dict({**tree.to_dict(), "/proximity": proximity})
+    proximity = xr.Dataset(variables, coords={"mesh": MESHES}, attrs={"metrics": ["hausdorff", "chamfer"]})
+    made: xr.DataTree = tree.assign({}).copy()
+    made["proximity"] = xr.DataTree(proximity)
+    return made

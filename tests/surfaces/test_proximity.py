@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 import sobolev_batch as sb
-from sobolev_batch.surfaces.proximity import MOST_POINTS, proximity
+from sobolev_batch.surfaces.proximity import MOST_POINTS, proximity, vertex_distances
 
 
 def square(side: float, height: float = 0.0, *, stray: tuple[float, float, float] | None = None) -> sb.Mesh:
@@ -29,30 +29,62 @@ def square(side: float, height: float = 0.0, *, stray: tuple[float, float, float
 )
 def test_surfaces_that_are_parallel_or_the_same(a: sb.Mesh, b: sb.Mesh, hausdorff: float, chamfer: float) -> None:
     found = proximity(a, b, points=500)
-    assert found.hausdorff == pytest.approx(hausdorff, rel=1e-12, abs=1e-15)
-    assert found.chamfer == pytest.approx(chamfer, rel=1e-12, abs=1e-15)
-    assert found.chamfer_error < 1e-12
+    assert found["hausdorff"] == pytest.approx(hausdorff, rel=1e-12, abs=1e-15)
+    assert found["chamfer"] == pytest.approx(chamfer, rel=1e-12, abs=1e-15)
+    assert found["chamfer_error"] < 1e-12
 
 
 @pytest.mark.slow
 def test_a_square_within_a_larger_one() -> None:
-    found = proximity(square(2.0), square(4.0), points=200_000)
+    found = proximity(square(2.0), square(4.0), points=200_000, threshold=0.5)
     # The corner of the larger is the farthest point; from the smaller one all distances are zero.
-    assert found.hausdorff == pytest.approx(np.sqrt(2), rel=1e-12)
+    assert found["hausdorff"] == found["hausdorff_backward"] == pytest.approx(np.sqrt(2), rel=1e-12)
+    assert found["hausdorff_forward"] == found["mean_forward"] == 0
     # Mean over the square [-2, 2]²: four strips of mean 1/2 and four corner squares of mean
-    # (√2 + asinh 1)/3, over 16.
+    # (√2 + asinh 1)/3, over 16. Squares have the mean 1/3 in a strip and 2/3 in a corner.
     exact = (4 * 2 * 0.5 + 4 * (np.sqrt(2) + np.arcsinh(1)) / 3) / 16
-    assert 0 < found.chamfer_error < 0.01
-    assert abs(found.chamfer - exact) < 4 * found.chamfer_error
-    assert proximity(square(4.0), square(2.0), points=200_000).hausdorff == found.hausdorff
+    assert 0 < found["chamfer_error"] < 0.01
+    assert abs(found["chamfer"] - exact) < 4 * found["chamfer_error"]
+    assert abs(found["rms"] - np.sqrt(1 / 3)) < 4 * found["rms_error"] < 0.01
+    # A square with round corners is within the threshold.
+    recall = (4 + 4 * 2 * 0.5 + np.pi * 0.5**2) / 16
+    assert found["precision"] == 1
+    assert found["recall"] == pytest.approx(recall, abs=5e-3)
+    assert found["fscore"] == pytest.approx(2 * recall / (1 + recall), abs=5e-3)
+    # A quarter of the area is at a distance of 0, so half of it within the distance with (2 + 2d)² - (4 - π) d² = 8.
+    assert (4 + 8 * found["p50"] + np.pi * found["p50"] ** 2) / 16 == pytest.approx(0.5, abs=5e-3)
+    assert proximity(square(4.0), square(2.0), points=200_000)["hausdorff"] == found["hausdorff"]
+
+
+@pytest.mark.parametrize("flipped", [False, True])
+def test_planes_at_an_angle(flipped: bool) -> None:
+    flat, angle = square(2.0), np.radians(20)
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    tilted = sb.Mesh(flat.vertices @ turn, flat.triangles[:, ::-1] if flipped else flat.triangles)
+    found = proximity(tilted, flat, points=100)
+    assert (found["normal_mean"], found["normal_max"]) == pytest.approx((20, 20), rel=1e-12)
+    # The farthest point of the one is over the other, the mean height is half of it.
+    assert found["hausdorff_forward"] == pytest.approx(np.sin(angle), rel=1e-12)
+
+
+def test_concentric_spheres() -> None:
+    inner, outer = (
+        sb.Mesh(radius * sb.shapes.icosphere(5).vertices, sb.shapes.icosphere(5).triangles) for radius in (1, 1.5)
+    )
+    found = proximity(outer, inner, points=2000, threshold=0.4)
+    for name in ("hausdorff", "mean", "rms", "p50", "p99", "mean_forward", "mean_backward"):
+        assert found[name] == pytest.approx(0.5, abs=2e-3)
+    assert (found["fscore"], proximity(outer, inner, points=2000, threshold=0.6)["fscore"]) == (0, 1)
+    # Facets of 2.4 degrees or less.
+    assert found["normal_max"] < 2.5
 
 
 @pytest.mark.slow
 def test_the_error_is_that_of_the_drawing() -> None:
     a, b = square(2.0), square(4.0)
-    exact = proximity(a, b, points=400_000).chamfer
+    exact = proximity(a, b, points=400_000)["chamfer"]
     drawn = [proximity(a, b, points=400, seed=seed) for seed in range(60)]
-    deviations = np.array([found.chamfer - exact for found in drawn]) / [found.chamfer_error for found in drawn]
+    deviations = np.array([found["chamfer"] - exact for found in drawn]) / [found["chamfer_error"] for found in drawn]
     assert 0.7 < deviations.std() < 1.4
     assert abs(deviations.mean()) < 0.5
 
@@ -70,7 +102,20 @@ def test_distances_of_vertices_as_another_search_finds_them() -> None:
         _, distances, _ = trimesh.proximity.closest_point_naive(surface, on_mesh)
         farthest = max(farthest, float(distances.max()))
     found = proximity(a, b, points=2000)
-    assert farthest - 1e-12 <= found.hausdorff < 1.3 * farthest
+    assert farthest - 1e-12 <= found["hausdorff"] < 1.3 * farthest
+
+
+def test_triangles_of_all_sizes_are_searched() -> None:
+    rng = np.random.default_rng(8)
+    sizes = 10.0 ** rng.uniform(-3, 1, size=(400, 1, 1))
+    corners = rng.normal(size=(400, 1, 3)) + sizes * rng.normal(size=(400, 3, 3)) * [1, 1, 0.01]
+    many = sb.Mesh(corners.reshape(-1, 3), np.arange(1200).reshape(-1, 3))
+    points = sb.Mesh(np.vstack([3 * rng.normal(size=(300, 3)), [[9.0, 9.0, 9.0]]]), np.arange(300).reshape(-1, 3))
+    surface = trimesh.Trimesh(many.vertices, many.triangles, process=False)
+    _, expected, _ = trimesh.proximity.closest_point_naive(surface, points.vertices[:300])
+    found = vertex_distances(points, many)
+    assert found[:300] == pytest.approx(expected, rel=1e-9, abs=1e-12)
+    assert np.isnan(found[300])
 
 
 @pytest.mark.parametrize("scale", [1e-60, 1e-12, 1.0, 1e12, 1e60])
@@ -78,14 +123,15 @@ def test_lengths_scale(scale: float) -> None:
     a, b = square(2.0), square(3.0, 0.25)
     plain = proximity(a, b, points=300)
     scaled = proximity(*(sb.Mesh(scale * mesh.vertices, mesh.triangles) for mesh in (a, b)), points=300)
-    assert scaled.hausdorff == pytest.approx(scale * plain.hausdorff, rel=1e-9)
-    assert scaled.chamfer == pytest.approx(scale * plain.chamfer, rel=1e-9)
+    assert scaled["hausdorff"] == pytest.approx(scale * plain["hausdorff"], rel=1e-9)
+    assert scaled["chamfer"] == pytest.approx(scale * plain["chamfer"], rel=1e-9)
 
 
 @pytest.mark.parametrize(
     ("key", "values", "message"),
     [
         ("points", [0, 1, -5, MOST_POINTS + 1, 2.5, True], "points must be an integer"),
+        ("threshold", [0, -1.0, np.nan, np.inf, "1"], "threshold must be a positive number"),
         ("seed", [-1, 0.5, "1", True, None], "seed must be a whole number from 0 on"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Hausdorff and Chamfer distances of meshes from the reference, where a study requests them.
+"""Hausdorff and other usual distances of meshes from the reference, where a study requests them.
 
 One task measures those of a mesh, from both meshes and no field, and adds them to the mesh's completion record. A
 table is made from the records.
@@ -11,7 +11,7 @@ import json
 import logging
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -27,14 +27,21 @@ from sobolev_batch.batch.study.plan import Row
 from sobolev_batch.batch.workspace import Workspace
 from sobolev_batch.errors import InputError, MeshError, StoreError, one_line
 from sobolev_batch.spectral.metrics.datasets import describe
-from sobolev_batch.surfaces.proximity import POINT_BYTES, TRIANGLE_BYTES, Proximity, proximity
+from sobolev_batch.surfaces.proximity import (
+    LENGTHS,
+    NUMBERS,
+    POINT_BYTES,
+    TRIANGLE_BYTES,
+    WORKING_BYTES,
+    proximity,
+)
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Similarity
 
 _log = logging.getLogger(__name__)
 
 # Raise it whenever the distances come out differently: they are then measured again.
-_VERSION = 2
+_VERSION = 3
 _GROUP = "proximity"
 
 
@@ -62,7 +69,9 @@ def measure_proximities(cluster: Cluster, workspace: Workspace) -> None:
 
 def _measure(cluster: Cluster, workspace: Workspace, keys: Mapping[int, str]) -> None:
     plan, complete, reference = workspace.plan, workspace.complete, workspace.reference
-    points = plan.study.proximity or 0
+    requested = plan.study.proximity
+    if requested is None:
+        return
     loading_bytes = {
         i: max(workspace.rows[i].member.expected_size().projected_bytes, MESH_BYTES * complete[i].facts.triangles)
         for i in (reference, *keys)
@@ -70,9 +79,9 @@ def _measure(cluster: Cluster, workspace: Workspace, keys: Mapping[int, str]) ->
     tasks = []
     for i, key in keys.items():
         triangles = complete[i].facts.triangles + complete[reference].facts.triangles
-        search_bytes = TRIANGLE_BYTES * triangles + 2 * POINT_BYTES * points
+        search_bytes = TRIANGLE_BYTES * triangles + 2 * POINT_BYTES * requested.points + WORKING_BYTES
         pair = tuple((workspace.rows[row], complete[row].facts.digest) for row in (i, reference))
-        arguments = workspace.store, i, complete[i], key, pair, plan.similarity, points
+        arguments = workspace.store, i, complete[i], key, pair, plan.similarity, requested.points, requested.threshold
         projected_bytes = loading_bytes[i] + loading_bytes[reference] + search_bytes
         tasks.append(
             Task(measure_proximity, arguments, projected_bytes, row=i, label=workspace.labels[i], stage="proximity")
@@ -97,6 +106,7 @@ def measure_proximity(
     pair: Sequence[tuple[Row, str]],
     similarity: Similarity,
     points: int,
+    threshold: float | None = None,
 ) -> Record:
     """Measure the distances of a mesh from the reference, and write its record with them, unless it has them.
 
@@ -112,8 +122,10 @@ def measure_proximity(
         return stored
     started = time.perf_counter()
     try:
-        distances = proximity(*(_load(*mesh, similarity) for mesh in pair), points=points)
-        measured = ProximityRecord(key, "", **asdict(distances))
+        limit = None if threshold is None else threshold * similarity.scale
+        found = proximity(*(_load(*mesh, similarity) for mesh in pair), points=points, threshold=limit)
+        lengths = {name: found[name] / similarity.scale for name in LENGTHS}
+        measured = ProximityRecord(key, "", {**found, **lengths})
     except StoreError:
         raise
     except Exception as error:
@@ -138,11 +150,12 @@ def _load(row: Row, digest: str, similarity: Similarity) -> Mesh:
 
 def _keys(workspace: Workspace) -> dict[int, str]:
     """Return the key of the distances of each mesh that the study requests: a digest of all they depend on."""
-    points, complete, reference = workspace.plan.study.proximity, workspace.complete, workspace.reference
-    if points is None or reference not in complete:
+    requested, complete, reference = workspace.plan.study.proximity, workspace.complete, workspace.reference
+    if requested is None or reference not in complete:
         return {}
+    settings = requested.points, requested.threshold, workspace.plan.similarity.scale
     inputs = {
-        i: [_VERSION, record.facts.digest, complete[reference].facts.digest, points]
+        i: [_VERSION, record.facts.digest, complete[reference].facts.digest, *settings]
         for i, record in complete.items()
         # Closed forms have no triangles.
         if i != reference and record.facts.triangles
@@ -159,16 +172,16 @@ def _pending(workspace: Workspace) -> dict[int, str]:
 
 
 def _dataset(workspace: Workspace) -> xr.Dataset:
-    """Return the numbers of `Proximity` (mesh), and `reason` where they are NaN, in the order of tables."""
+    """Return the numbers of `proximity` (mesh), and `reason` where they are NaN, in the order of tables."""
     labels, records = _current(workspace)
     columns: dict[str, Any] = {
-        name: [np.nan if record is None else getattr(record, name) for record in records]
-        for name in (field.name for field in fields(Proximity))
+        name: [np.nan if record is None else record.numbers.get(name, np.nan) for record in records] for name in NUMBERS
     }
     columns["reason"] = np.array([record.reason if record else "" for record in records], dtype=object)
+    requested = workspace.plan.study.proximity
     attributes = {
         "reference": workspace.plan.reference,
-        "points": workspace.plan.study.proximity,
+        **({} if requested is None else {"points": requested.points, "metrics": list(requested.metrics)}),
         "digest": _digest(workspace),
     }
     variables = {name: ("mesh", values) for name, values in columns.items()}
@@ -186,4 +199,6 @@ def _current(workspace: Workspace) -> tuple[list[str], list[ProximityRecord | No
 
 def _digest(workspace: Workspace) -> str:
     lines = [[label, record and asdict(record)] for label, record in zip(*_current(workspace), strict=True)]
-    return hashlib.sha256(json.dumps(lines).encode()).hexdigest()
+    requested = workspace.plan.study.proximity
+    shown = [] if requested is None else requested.metrics
+    return hashlib.sha256(json.dumps([shown, lines]).encode()).hexdigest()

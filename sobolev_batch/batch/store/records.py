@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Hashable
-from dataclasses import asdict, dataclass
+from collections.abc import Hashable, Mapping
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from typing import Any, ClassVar, Literal, Self, TypeVar, cast
 
@@ -80,20 +80,18 @@ class Facts:
 
 @dataclass(frozen=True)
 class ProximityRecord:
-    """Hausdorff and Chamfer distances of a mesh from the reference, see `Proximity`.
+    """The usual distances of a mesh from the reference, see `proximity`.
 
     Attributes:
         key: Digest of all that they depend on.
         reason: Reason of a failure; empty otherwise.
-        hausdorff, chamfer, chamfer_error: Distances in the study's unit of length; NaN after a failure.
+        numbers: What `proximity` returns, in the unit of length of the files; empty after a failure.
         seconds: Time spent in their task.
     """
 
     key: str
     reason: str = ""
-    hausdorff: float = float("nan")
-    chamfer: float = float("nan")
-    chamfer_error: float = float("nan")
+    numbers: Mapping[str, float] = field(default_factory=dict)
     seconds: float = 0.0
 
     def completes(self, key: str) -> bool:

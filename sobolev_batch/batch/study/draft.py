@@ -58,8 +58,8 @@ _TAIL = """
 # [compare]
 # pairs = "all"            # the distance of every mesh to every other, not to the reference alone
 
-# [proximity]              # Hausdorff and Chamfer distances beside ours; needs the extra "vtk"
-# points = 10000
+# [proximity]              # the usual distances beside ours, also "mean", "rms", "percentiles", "fscore", "normals"
+# metrics = ["hausdorff", "chamfer"]
 """
 _REFERENCE_SECTION = """\
 [reference]                # {remark}

@@ -38,7 +38,7 @@ from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.lattice import Lattice, check_orders
 from sobolev_batch.spectral.transform import TransformSettings
 from sobolev_batch.surfaces.formats.parsing import open_regular
-from sobolev_batch.surfaces.proximity import DEFAULT_POINTS, MOST_POINTS
+from sobolev_batch.surfaces.proximity import DEFAULT_POINTS, METRICS, MOST_POINTS
 from sobolev_batch.surfaces.shapes.surface import Similarity
 from sobolev_batch.surfaces.sources.command import function_version
 from sobolev_batch.surfaces.sources.files import MeshTable, checked_list
@@ -47,6 +47,7 @@ from sobolev_batch.surfaces.sources.registry import Source, at_most, parse_sourc
 
 # "auto" leaves it to each worker.
 Backends = Literal["auto", "cpu", "gpu"]
+Metric = Literal["hausdorff", "mean", "rms", "percentiles", "chamfer", "fscore", "normals", "volume", "triangles"]
 
 # Deeper tables are mistakes.
 _DEEPEST = 20
@@ -123,6 +124,7 @@ class Section(BaseModel):
 class _Header(Section):
     name: Name
     title: Annotated[str, _line_of_text(1000)] | None = None
+    length_unit: Annotated[str, _line_of_text(20)] | None = None
 
 
 class _LatticeSection(Section):
@@ -180,8 +182,21 @@ class _ScalingSection(Section):
         return Similarity(1.0 if self.scale is None else self.scale, self.origin or (0.0, 0.0, 0.0))
 
 
-class _ProximitySection(Section):
+class ProximitySection(Section):
+    """The usual distances of meshes from the reference.
+
+    Attributes:
+        points: Number of points that are drawn on each mesh.
+        threshold: Threshold of the F-score, in the unit of length of the files; None for 1 % of the reference's radius.
+        metrics: What tables show.
+    """
+
     points: Annotated[int, Field(ge=2, le=MOST_POINTS)] = DEFAULT_POINTS
+    threshold: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    metrics: Annotated[tuple[Metric, ...], Field(strict=False, min_length=1), at_most(len(METRICS))] = (
+        "hausdorff",
+        "chamfer",
+    )
 
 
 class FamilyReference(Section):
@@ -283,7 +298,7 @@ class StudyDocument(Section):
     reference: Annotated[FamilyReference | SerializeAsAny[Source] | None, BeforeValidator(_reference)]
     family: list[Family]
     scaling: _ScalingSection = _ScalingSection()
-    proximity: _ProximitySection | None = None
+    proximity: ProximitySection | None = None
     object: Annotated[list[ObjectSection], Field(min_length=1, max_length=_MOST_OBJECTS)] | None = None
     objects: dict[Literal["meshes"], Annotated[str | tuple[MeshTable, ...], BeforeValidator(checked_list)]] = {}
 

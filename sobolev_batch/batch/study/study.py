@@ -20,6 +20,7 @@ from sobolev_batch.batch.study.schema import (
     Family,
     FamilyReference,
     ObjectSection,
+    ProximitySection,
     StudyDocument,
     known_names,
     plain_tables,
@@ -68,8 +69,7 @@ class Study:
         families: Families of surfaces to compare.
         reference: Surface that they are compared with.
         scaling: Similarity transform of all surfaces; None takes the reference's bounding sphere to the unit sphere.
-        proximity: Number of points that are drawn on each mesh for its Hausdorff and Chamfer distances from the
-            reference; None if these are not requested.
+        proximity: How the usual distances of each mesh from the reference are measured; None if they are not requested.
         folder: Folder in which relative paths start.
         table: The study as it was written.
         largest_chunk_bytes: Size above which a stored field is split into blocks, one chunk each.
@@ -100,7 +100,7 @@ class Study:
     families: tuple[Family, ...]
     reference: Source | FamilyReference
     scaling: Similarity | None
-    proximity: int | None
+    proximity: ProximitySection | None
     folder: Path
     table: Mapping[str, Any]
     largest_chunk_bytes: int = 256 << 20
@@ -114,8 +114,7 @@ class Study:
     @property
     def libraries(self) -> tuple[str, ...]:
         """Distributions that its surfaces need besides those that this package requires."""
-        own = () if self.proximity is None else ("vtk",)
-        return tuple(sorted({*own, *(library for source in self._sources for library in source.libraries)}))
+        return tuple(sorted({library for source in self._sources for library in source.libraries}))
 
     @property
     def commands(self) -> tuple[str, ...]:
@@ -183,7 +182,7 @@ class Study:
             families=tuple(families),
             reference=reference,
             scaling=document.scaling.settings(),
-            proximity=None if document.proximity is None else document.proximity.points,
+            proximity=document.proximity,
             folder=Path(folder),
             octaves=document.lattice.octaves if document.lattice else 0,
             table=_as_written(values),

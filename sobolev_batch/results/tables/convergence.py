@@ -42,6 +42,7 @@ from sobolev_batch.results.tables.text import (
 from sobolev_batch.spectral.budget import PARTS
 from sobolev_batch.spectral.lattice import Orders
 from sobolev_batch.spectral.metrics.datasets import observed_rates, parts_as_variables
+from sobolev_batch.surfaces.proximity import METRICS, OF_ONE_MESH
 from sobolev_batch.surfaces.sources.mesh_cache import Cost
 
 _ABOUT = ("family", "name", "level", "rank", "ordered_by", "status", "reason", "triangles", "vertices", "seconds")
@@ -63,20 +64,21 @@ _NUMBERS = (
 _MADE = tuple(item.name for item in fields(Cost))
 # Integers, or missing where a mesh failed.
 _COUNTS = ("triangles", "vertices")
-# Where the study requests them.
-_PROXIMITIES = ("hausdorff", "chamfer", "chamfer_error")
 _NOTE = """\
 Relative distances are fractions of the reference's norm. Errors are meant as bounds,
 the sums of truncation (frequencies beyond the highest one), aliasing (spacing of the
 lattice), discretisation (quadrature and NUFFT) and chance (random frequencies, if the
-study samples octaves). Lengths are in the study's unit. A distance marked * is not
+study samples octaves). A distance marked * is not
 larger than its error, and gives no rate. The column "area" is the share of the squared
 distance that a change of total area alone explains."""
+_UNIT_NOTE = """\
+Edges and other lengths are in {}.
+Distances of orders are computed in units of {}."""
 _PROXIMITY_NOTE = """\
-Hausdorff and Chamfer distances are for orientation, and the same at all orders.
-Hausdorff is a lower bound: the largest distance from any vertex or sampled point to
-the other mesh. Chamfer is the mean distance of sampled points, both ways, with its
-standard error."""
+Other distances are the same at all orders. They are those of sampled points to the
+other mesh, the larger of both ways, with standard errors. Hausdorff is a lower bound: the
+largest distance of any vertex or sampled point. Chamfer is the sum of the mean distances
+of both ways. Normals are compared as lines, in degrees."""
 _ACCURACY_NOTE = """\
 The study requests an error of at most {rtol:g} of each distance; a distance
 marked ! has a larger one."""
@@ -100,9 +102,18 @@ _COLUMNS = (
     Column("rate", "rate", with_error, "rate_error"),
     Column("area_fraction", "area", lambda fraction: f"{100 * fraction:.0f} %"),
 )
-_PROXIMITY_COLUMNS = (
+_METRIC_COLUMNS = (
     Column("hausdorff", "Hausdorff ≥", "{:.3g}".format),
+    Column("mean", "mean ± s.e.", with_error, "mean_error"),
+    Column("rms", "RMS ± s.e.", with_error, "rms_error"),
+    *(Column(f"p{percent}", f"{percent} % ≤", "{:.3g}".format) for percent in (50, 95, 99)),
     Column("chamfer", "Chamfer ± s.e.", with_error, "chamfer_error"),
+    Column("fscore", "F-score", lambda score: f"{100 * score:.1f} %"),
+    Column("normal_mean", "normals", "{:.2g}°".format),
+    Column("normal_max", "at most", "{:.2g}°".format),
+    Column("volume", "volume", "{:.4g}".format),
+    Column("smallest_angle", "angles ≥", "{:.2g}°".format),
+    Column("aspect_ratio", "aspect ≤", "{:.3g}".format),
 )
 _SMALLEST_COLUMNS = (
     Column("family", "family"),
@@ -127,7 +138,7 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
             or "seconds" (spent on its Fourier field), or one of the metadata that the study gives its meshes.
 
     Returns:
-        One row for each mesh and order. Lengths are in the study's unit. The columns:
+        One row for each mesh and order. Lengths of a mesh are in the study's unit. The columns:
 
         - order, mesh, family, name, level; rank, the place in the family from coarse to fine, and ordered_by, what
           decides on it (level, triangles, names or time);
@@ -141,7 +152,8 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
         - rate, the observed order of convergence, and rate_error: distance ~ edge_length^rate, or distance ~ x^-rate
           for another x, since the others grow;
         - resolved (the distance exceeds its error) and within (the error is as small as the study requests);
-        - where the study requests [proximity]: hausdorff, chamfer and chamfer_error.
+        - where the study requests [proximity]: the numbers of its metrics, by their names in `proximity`, and volume,
+          smallest_angle and aspect_ratio; their lengths are in the unit of the files.
 
         Numbers of a mesh that failed are NaN. The frame's ``attrs`` have the
         reference's label, and where there are any, the study's rtol, as ``metadata`` the names of the metadata, and as
@@ -172,7 +184,11 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
     nearness = {}
     if has_proximity(tree):
         proximity = finished_group(tree, "proximity").sel(mesh=labels[others])
-        nearness = {key: proximity[key].values for key in _PROXIMITIES}
+        asked = [f"{name}{way}" for name in _metrics_of(tree) for way in ("", "_forward", "_backward")]
+        nearness = {name: proximity[name].values for name in asked if name in proximity}
+        nearness |= {name: meshes[name].values[others] for name in asked if name in OF_ONE_MESH}
+        if "volume" in nearness:
+            nearness["volume"] = nearness["volume"] * _unit(tree)[1] ** 3
     frames = []
     for s in dict.fromkeys(convergence["order"].values.tolist()):
         row = parts_as_variables(convergence.sel(order=s))
@@ -181,6 +197,7 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
     frame = pd.concat(frames, ignore_index=True).astype(dict.fromkeys(_COUNTS, "Int64"))
     kept = ("reference", "rtol", "computed")
     frame.attrs = {key: convergence.attrs[key] for key in kept if key in convergence.attrs}
+    frame.attrs["unit_length"] = _unit(tree)[1]
     if known := metadata_of(tree):
         frame.attrs["metadata"] = known
     return frame if x == EDGE_LENGTH else _with_rates(frame, x)
@@ -234,7 +251,7 @@ def _tables(tree: xr.DataTree, frame: pd.DataFrame, style: Format) -> Iterator[s
         yield section(caption, [_table(rows, _COLUMNS, style)], _nearest(rows), style)
     if has_proximity(tree):
         once = marked[marked["order"] == marked["order"].iloc[0]]
-        table = _table(once, (_MESH, *_PROXIMITY_COLUMNS), style)
+        table = _table(once, (_MESH, *_metric_columns(tree)), style)
         yield section("Other distances, the same at all orders", [table], [], style)
 
 
@@ -275,17 +292,38 @@ def _nearest(frame: pd.DataFrame) -> list[str]:
     return [f"Nearest: {best['mesh']}, which differs by {amount}{doubt}."]
 
 
+def _metrics_of(tree: xr.DataTree) -> list[str]:
+    """Return the names of the numbers, besides distances of orders, that the study shows in its tables."""
+    metrics = finished_group(tree, "proximity").attrs["metrics"] if has_proximity(tree) else []
+    return [name for metric in metrics for name in METRICS.get(metric, ())]
+
+
+def _metric_columns(tree: xr.DataTree) -> list[Column]:
+    shown = _metrics_of(tree)
+    return [column for column in _METRIC_COLUMNS if column.name in shown]
+
+
+def _unit(tree: xr.DataTree) -> tuple[str, float]:
+    """Return the name of the unit of length of the files, and the study's unit in terms of it."""
+    header = tree.attrs.get("study", {}).get("table", {}).get("study", {})
+    return header.get("length_unit", "units of the files"), 1 / tree.attrs.get("similarity", {"scale": 1.0})["scale"]
+
+
 def page_columns(tree: xr.DataTree) -> tuple[Column, ...]:
     """Return the columns whose numbers an open store has, for a page, which may be narrow."""
-    columns = [*_COLUMNS, *(_PROXIMITY_COLUMNS if has_proximity(tree) else ())]
+    columns = [*_COLUMNS, *_metric_columns(tree)]
     return tuple(sorted(columns, key=lambda column: (column is not _MESH, not column.is_marked)))
 
 
 def with_remarks(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return rows of `table` with fractions of area, a mark of each distance, and why a mesh is absent."""
+    """Return rows of `table` with edges in the unit of the files, fractions of area, and marks of distances.
+
+    The column absent says why a mesh has no distance.
+    """
     resolved, within = (frame[name].astype(bool) for name in ("resolved", "within"))
     shares = (frame["area_part"] / frame["distance"].where(frame["distance"] > 0)) ** 2
     return frame.assign(
+        edge_length=frame["edge_length"] * frame.attrs["unit_length"],
         area_fraction=shares.where(resolved),
         mark=np.where(~resolved, "below its error", np.where(within, "", "above rtol")),
         absent=frame["status"].where(frame["status"] != "complete", ""),
@@ -295,6 +333,9 @@ def with_remarks(frame: pd.DataFrame) -> pd.DataFrame:
 def _notes(trees: Sequence[xr.DataTree], frames: Sequence[pd.DataFrame], x: str) -> list[str]:
     """Return what the numbers of all tables mean."""
     notes = [*_NOTE.splitlines(), *([] if x == EDGE_LENGTH else [f"Rates are those of distance ~ ({x})^-rate."])]
+    units, sizes = (sorted(set(values)) for values in zip(*map(_unit, trees), strict=True))
+    size = f"{sizes[0]:.4g} of them" if len(sizes) == 1 else "their own for each object"
+    notes += _UNIT_NOTE.format(", ".join(map(str, units)), size).splitlines()
     if any(map(has_proximity, trees)):
         notes += _PROXIMITY_NOTE.splitlines()
     for rtol in dict.fromkeys(frame.attrs["rtol"] for frame in frames if "rtol" in frame.attrs):

@@ -16,6 +16,7 @@ from sobolev_batch.surfaces.shapes.surface import Reals
 KERNEL = "weight (1 + |xi|^2)^s, xi in cycles per unit length"
 LENGTH, AREA, VOLUME = "unit length", "unit length squared", "unit length cubed"
 FREQUENCY, NUMBER, ANGLE = "cycles per unit length", "1", "degree"
+FILE_LENGTH = "unit length of the files"
 # ||a||_s² = ∫ (1 + |ξ|²)^s |a^|² dξ is an area squared per volume.
 NORM = "unit length^(1/2)"
 
@@ -98,9 +99,30 @@ VARIABLES: Mapping[str, Mapping[str, str]] = {
     "make_cpu_seconds": described("processor time that making the mesh took", "s"),
     "make_peak_bytes": described("largest memory of the program that made the mesh", "byte"),
     "exit_status": described("exit status of the program that made the mesh; negative for a signal", NUMBER),
-    "hausdorff": described("Hausdorff distance, a lower bound", LENGTH),
-    "chamfer": described("Chamfer distance", LENGTH),
-    "chamfer_error": described("standard error of the Chamfer distance", LENGTH),
+    **{
+        f"{name}{way}": described(f"{title}, {whose}", ANGLE if name.startswith("normal") else FILE_LENGTH)
+        for name, title in (
+            ("hausdorff", "Hausdorff distance, a lower bound"),
+            ("mean", "mean distance"),
+            ("rms", "root mean square of distances"),
+            *((f"p{percent}", f"distance within which {percent} % of the area are") for percent in (50, 95, 99)),
+            ("normal_mean", "mean angle between normals"),
+            ("normal_max", "largest angle between normals that was found"),
+        )
+        for way, whose in (
+            ("", "the larger of both directions"),
+            ("_forward", "from the mesh to the reference"),
+            ("_backward", "from the reference to the mesh"),
+        )
+    },
+    "mean_error": described("standard error of the mean distance", FILE_LENGTH),
+    "rms_error": described("standard error of the root mean square", FILE_LENGTH),
+    "chamfer": described("Chamfer distance: the sum of both mean distances", FILE_LENGTH),
+    "chamfer_error": described("standard error of the Chamfer distance", FILE_LENGTH),
+    "fscore": described("F-score, the harmonic mean of precision and recall", NUMBER),
+    "precision": described("fraction of the mesh within the threshold of the reference", NUMBER),
+    "recall": described("fraction of the reference within the threshold of the mesh", NUMBER),
+    "threshold": described("threshold of the F-score", FILE_LENGTH),
 }
 
 

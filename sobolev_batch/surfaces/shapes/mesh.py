@@ -165,6 +165,28 @@ class Mesh:
             "inconsistent_edges": inconsistent,
         }
 
+    @property
+    def defects(self) -> tuple[str, ...]:
+        """What keeps the mesh from being a closed surface that faces outwards, in words; empty if nothing does.
+
+        >>> import sobolev_batch as sb
+        >>> sphere = sb.shapes.icosphere(1)
+        >>> sb.Mesh(sphere.vertices, sphere.triangles[1:]).defects
+        ('3 open edges',)
+        >>> sb.Mesh(sphere.vertices, sphere.triangles[:, ::-1]).defects
+        ('all triangles face inwards',)
+        """
+        words = {
+            "boundary_edges": ("open edge", ""),
+            "nonmanifold_edges": ("edge", " of more than two triangles"),
+            "inconsistent_edges": ("edge", " at which normals flip"),
+            "duplicate_triangles": ("duplicate triangle", ", counted twice"),
+            "zero_area_triangles": ("triangle", " without area"),
+        }
+        found = {key: self.counts[key] for key in words if self.counts[key]}
+        texts = [f"{n:,} {words[key][0]}{'s' * (n != 1)}{words[key][1]}" for key, n in found.items()]
+        return (*texts, *(["all triangles face inwards"] if self.volume < 0 else []))
+
     @cached_property
     def volume(self) -> float:
         """Enclosed volume, in cubed units of length; negative where triangles, seen from outside, run clockwise.

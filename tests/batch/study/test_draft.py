@@ -162,7 +162,8 @@ def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
     offers = [line.removeprefix("# ") for line in text.splitlines() if not line.startswith("# More")]
     (tmp_path / "more.toml").write_text("\n".join(line for line in offers if not line.startswith(("`", "Compare"))))
     more = sb.Study.from_toml(tmp_path / "more.toml")
-    assert more.proximity == 10_000
+    assert more.proximity is not None
+    assert more.proximity.metrics == ("hausdorff", "chamfer")
     assert [family.name for family in more.families] == ["meshes", "quadric decimation"]
 
 

@@ -97,7 +97,9 @@ def test_its_example_and_the_workflows_are_valid(tmp_path: Path) -> None:
     assert reference.paths == ("bunny.ply",)
     assert read(study).title == "Scans of a statue, decimated"
     assert read(study.replace("[accuracy]\nrtol = 1e-3\n", lattice)).lattice == Lattice(5.0, 64)
-    assert read(f"{study}\n{besides}").proximity == 20_000
+    measured = read(f"{study}\n{besides}").proximity
+    assert measured is not None
+    assert (measured.points, measured.metrics) == (20_000, ("hausdorff", "rms", "fscore"))
     coarse, fine = read(f"{study}\n{listed}").families[1].source.members(tmp_path)
     assert (coarse.name, fine.name, dict(fine.metadata)["tool_seconds"]) == ("coarse", "fine", 12.1)
     for name in ("icosphere", "cortex", "torus"):

@@ -7,6 +7,7 @@ import re
 from itertools import product
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
@@ -58,7 +59,10 @@ def test_every_order_gets_a_table_and_small_numbers_are_formulas_of_latex(tree: 
 
 def test_programs_get_frames_nulls_and_blanks_for_missing_numbers(tree: xr.DataTree) -> None:
     frame = table(tree)
-    assert (frame.attrs, frame["mesh"].tolist()) == ({"reference": "reference"}, ["f_1/0", "f_1/1", "f_1/2"] * 2)
+    assert (frame.attrs, frame["mesh"].tolist()) == (
+        {"reference": "reference", "unit_length": 1.0},
+        ["f_1/0", "f_1/1", "f_1/2"] * 2,
+    )
     assert frame.query("order == -10 and level == 1")["relative"].item() == pytest.approx(0.025)
     records = json.loads(format_table(tree, "json", [-10.0]))
     assert (records[1]["rate"], records[2]["distance"]) == (2.0, None)
@@ -84,6 +88,18 @@ def test_proximities_have_columns_of_their_own(tree: xr.DataTree, near: xr.DataT
         assert r"f\_1/1" if style == "latex" else "f_1/1" in table_of_both
     first, second = json.loads(format_table(near, "json"))[:2]
     assert (first["hausdorff"], first["chamfer"], second["hausdorff"]) == (0.25, 0.125, None)
+
+
+def test_lengths_are_in_the_unit_of_the_files(near: xr.DataTree) -> None:
+    near.attrs["similarity"] = {"scale": 0.02, "origin": [0.0, 0.0, 0.0]}
+    near.attrs["study"]["table"]["study"]["length_unit"] = "mm"
+    near["proximity"].attrs["metrics"] = ["hausdorff", "volume"]
+    volumes = ("mesh", [4.0, np.nan, np.nan, np.nan])
+    near["meshes"] = xr.DataTree(near["meshes"].to_dataset().assign(volume=volumes))
+    first = format_table(near).partition("f_1/0")[2].split()
+    assert (first[:2], table(near)["edge_length"][0]) == (["20", "10"], 0.2)
+    assert re.search("other lengths are in mm\\.\n.* in units of 50 of them", format_table(near))
+    assert re.search(r"f_1/0 +0\.25 +5e\+05\n", format_table(near))
 
 
 def test_notes_are_those_of_all_objects(tree: xr.DataTree, near: xr.DataTree) -> None:

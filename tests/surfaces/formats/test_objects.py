@@ -118,7 +118,7 @@ USES: dict[str, Callable[[Any, xr.DataArray], Any]] = {
     "spectrum": lambda mesh, _: sb.spectrum(mesh, None, -2.0, lattice=LATTICE)["total"].item(),
     "witness": lambda mesh, target: sb.witness(mesh, target, -2.0, [[0, 0, 0]]).item(),
     "fourier_transform": lambda mesh, _: abs(sb.fourier_transform(mesh, LATTICE)).sum().item(),
-    "proximity": lambda mesh, _: sb.proximity(mesh, BALL, points=10).hausdorff,
+    "proximity": lambda mesh, _: sb.proximity(mesh, BALL, points=10)["hausdorff"],
     "gradient": lambda mesh, target: sb.fitting.gradient(mesh, target, -2.0, threads=1)["squared_distance"].item(),
     "target": lambda mesh, _: sb.fitting.SquaredDistance.for_mesh(BALL, mesh, -2.0, lattice=LATTICE).value(
         BALL.vertices
