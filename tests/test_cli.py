@@ -172,6 +172,19 @@ def test_compare_names_units_and_defects(folder: Path) -> None:
     assert "in 1 mm; the radius of inverted.off is 100\n" in kept
 
 
+@pytest.mark.slow
+def test_compare_aligns_first(folder: Path) -> None:
+    first = sb.shapes.Ellipsoid((3.0, 2.0, 1.0)).mesh(2)
+    turned = first.vertices @ [[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0], [0.0, 0.0, 1.0]] + [0.5, 0.0, 0.2]
+    sb.write_mesh(sb.Mesh(turned, first.triangles), folder / "turned.off")
+    sb.write_mesh(first, folder / "still.off")
+    shown = output("compare", "turned.off", "still.off", "--order=-4", "--align", folder=folder)
+    assert float(re.findall(r"^where it is in the file: (\S+) % ±", shown, re.M)[0]) > 10
+    # Half a turn around an axis of the ellipsoid may be added.
+    assert re.search(r"^moved: rotated by (36\.8699|143\.13|180) degrees", shown, re.M)
+    assert re.search(r"^turned\.off (differs from|and) still\.off .*(equal up to|less than \S+⁻)", shown, re.M)
+
+
 def test_the_exit_status_of_a_verdict(folder: Path) -> None:
     # As exactly as the package itself computes it.
     first, third = (sb.read_mesh(folder / name) for name in ("1.off", "3.off"))

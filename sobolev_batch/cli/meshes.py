@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
     from sobolev_batch.fitting.fit import FitProgress, FitQuality
     from sobolev_batch.surfaces.shapes.mesh import Mesh
-    from sobolev_batch.surfaces.shapes.surface import Similarity
+    from sobolev_batch.surfaces.shapes.surface import Reals, Similarity
 
 _STATUSES = {"same": 0, "different": EXIT_DIFFERENT, "undecided": EXIT_UNDECIDED}
 # Options of compare that a verdict knows; it chooses the accuracy of the distance itself.
@@ -97,6 +97,7 @@ _below_option = click.option(
 @click.option(
     "--threshold", type=float, help="Take this length for the F-score of --proximity. [default: 1 % of the radius of B]"
 )
+@click.option("--align", "with_motion", is_flag=True, help="First move A rigidly to where it is nearest to B.")
 @click.option("--unit", metavar="NAME", help="Name the unit of length of both files, such as mm.")
 @click.option(
     "--witness",
@@ -123,6 +124,7 @@ def compare_command(
     with_yardsticks: bool,
     with_proximity: bool,
     threshold: float | None,
+    with_motion: bool,
     unit: str | None,
     witness_path: Path | None,
     no_scaling: bool,
@@ -135,6 +137,8 @@ def compare_command(
     of the squared distance that a change of area explains. With --below, print one line on whether both are the same
     surface. The exit status is then 0 if they are, 1 if they are not, 4 if that cannot be told, and 2 after any error.
     """
+    from sobolev_batch.fitting.align import align, moved_by
+    from sobolev_batch.results.tables.text import percent
     from sobolev_batch.spectral.lattice import Lattice
     from sobolev_batch.spectral.metrics.datasets import parts_as_variables
     from sobolev_batch.spectral.metrics.norms import distance, yardsticks
@@ -155,7 +159,14 @@ def compare_command(
     first, second = read_mesh(a), read_mesh(b)
     if witness_path is not None:
         require_place(witness_path)
+    orders = orders or (DEFAULT_ORDER,)
+    accuracy: dict[str, Any] = {"lattice": lattice, "rtol": rtol, "memory": memory, "best_effort": best_effort}
     similarity = Similarity() if no_scaling else Similarity.to_unit_ball(second)
+    motion = before = None
+    if with_motion:
+        before = distance(similarity.apply(first), similarity.apply(second), orders[0], **accuracy)
+        motion = align(first, second, order=orders[0])
+        first = moved_by(first, motion)
     pair = similarity.apply(first), similarity.apply(second)
     doubt = placement_doubt(*(surface.extent for surface in pair))
     radius = second.bounding_sphere[1]
@@ -163,8 +174,6 @@ def compare_command(
         echo(f"note: {line}", err=True)
     # Bad settings are refused before a long computation.
     nearness = proximity(first, second, threshold=threshold) if with_proximity else None
-    orders = orders or (DEFAULT_ORDER,)
-    accuracy: dict[str, Any] = {"lattice": lattice, "rtol": rtol, "memory": memory, "best_effort": best_effort}
     results = yardsticks(*pair, orders, **accuracy) if with_yardsticks else distance(*pair, orders, **accuracy)
     area_change = first.area / second.area - 1
     if style == "json":
@@ -172,9 +181,16 @@ def compare_command(
             write_difference(first, second, witness_path, orders[0], scaling=not no_scaling, subject=a.name)
         rows = parts_as_variables(results).to_dataframe().reset_index().to_dict(orient="records")
         defects = {"a": first.defects, "b": second.defects}
-        more = {"settings": results.attrs, "proximity": nearness, "doubt": doubt, "defects": defects, "unit": unit}
+        more = {
+            "motion": None if motion is None else motion.tolist(),
+            "before": None if before is None else before["relative"].item(),
+        }
+        more |= {"settings": results.attrs, "proximity": nearness, "doubt": doubt, "defects": defects, "unit": unit}
         echo_json({"a": a, "b": b, "area_change": area_change, **vars(similarity), "orders": rows, **more})
         return
+    if motion is not None and before is not None:
+        echo(f"where it is in the file: {percent(before['relative'].item(), before['relative_error'].item())}")
+        echo(_motion_text(motion))
     _print_answers(a.name, b.name, results, area_change, rtol)
     length = unit or "units of the files"
     one = f"1 {unit}" if unit else "1 unit of the files"
@@ -188,6 +204,16 @@ def compare_command(
         _print_proximity(nearness, (first, second), length)
     if witness_path is not None:
         echo(write_difference(first, second, witness_path, orders[0], scaling=not no_scaling, subject=a.name))
+
+
+def _motion_text(motion: Reals) -> str:
+    """Return a rigid motion (4, 4) in words, with its numbers."""
+    from scipy.spatial.transform import Rotation
+
+    vector = Rotation.from_matrix(motion[:3, :3]).as_rotvec(degrees=True)
+    angle = math.hypot(*vector)
+    axis, shift = (" ".join(f"{x:.6g}" for x in numbers) for numbers in (vector / (angle or 1.0), motion[:3, 3]))
+    return f"moved: rotated by {angle:.6g} degrees around ({axis}) through the origin, then shifted by ({shift})"
 
 
 def _remarks(meshes: Mapping[str, Mesh], doubt: str | None, size: float, unit: str | None) -> Iterator[str]:

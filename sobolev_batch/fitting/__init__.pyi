@@ -1,4 +1,5 @@
 # The public names of this package: each is imported from its module when it is first asked for.
+from .align import align as align
 from .derivatives import SquaredDistance as SquaredDistance
 from .derivatives import gradient as gradient
 from .derivatives import jax_function as jax_function
