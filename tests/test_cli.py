@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from distributed import Client
+from plyfile import PlyData
 
 import sobolev_batch as sb
 from sobolev_batch.results.tables import FORMATS
@@ -152,6 +153,10 @@ def test_compare_to_an_accuracy_and_on_a_lattice(folder: Path) -> None:
     assert re.search(rf"^Chamfer, the sum of both means: {near['chamfer']:.3f}\d* ± \S+ \(s\.e\.\)$", shown, re.M)
     for written, own in (("new/w-a.ply", "1.off"), ("new/w-b.ply", "3.off")):
         assert np.array_equal(sb.read_mesh(folder / written).vertices, sb.read_mesh(folder / own).vertices)
+        distances = PlyData.read(folder / written)["vertex"].data["distance"]
+        # Both are inscribed in one sphere.
+        assert 0 <= distances.max() <= near["hausdorff"]
+        assert ("a.ply" in written) == bool((distances < 1e-9).all())
 
 
 def test_compare_names_units_and_defects(folder: Path) -> None:

@@ -105,7 +105,7 @@ _below_option = click.option(
     type=PATH,
     metavar="PATH",
     help="Write both meshes with the witness function of the first order at their vertices, for MeshLab: into "
-    "PATH-a.ply and PATH-b.ply.",
+    "PATH-a.ply and PATH-b.ply; with --proximity also distances.",
 )
 @click.option("--no-scaling", is_flag=True, help="Keep the files' unit. Otherwise B is scaled to the unit sphere.")
 @_below_option
@@ -176,9 +176,10 @@ def compare_command(
     nearness = proximity(first, second, threshold=threshold) if with_proximity else None
     results = yardsticks(*pair, orders, **accuracy) if with_yardsticks else distance(*pair, orders, **accuracy)
     area_change = first.area / second.area - 1
+    files: dict[str, Any] = {"scaling": not no_scaling, "subject": a.name, "distances": with_proximity}
     if style == "json":
         if witness_path is not None:
-            write_difference(first, second, witness_path, orders[0], scaling=not no_scaling, subject=a.name)
+            write_difference(first, second, witness_path, orders[0], **files)
         rows = parts_as_variables(results).to_dataframe().reset_index().to_dict(orient="records")
         defects = {"a": first.defects, "b": second.defects}
         more = {
@@ -203,7 +204,7 @@ def compare_command(
     if nearness is not None:
         _print_proximity(nearness, (first, second), length)
     if witness_path is not None:
-        echo(write_difference(first, second, witness_path, orders[0], scaling=not no_scaling, subject=a.name))
+        echo(write_difference(first, second, witness_path, orders[0], **files))
 
 
 def _motion_text(motion: Reals) -> str:

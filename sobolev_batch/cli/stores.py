@@ -318,6 +318,7 @@ def plot_command(
     show_default=True,
     help="Write ply for MeshLab and similar programs, or vtp for ParaView.",
 )
+@click.option("--distances", is_flag=True, help="Also write the distance of each vertex from the reference.")
 @output_option("Write the files into this folder.", ".")
 @folder_option
 @click.pass_context
@@ -327,6 +328,7 @@ def witness_command(
     meshes: tuple[str, ...],
     orders: tuple[float, ...],
     style: str,
+    distances: bool,
     output: Path,
     folder: Path,
 ) -> None:
@@ -350,7 +352,7 @@ def witness_command(
             is_complete = False
             continue
         path = output / f"{made.stem(label)}.{style}"
-        made.write(path, label, mesh, values, chosen)
+        made.write(path, label, mesh, values, chosen, distances=distances)
         echo(path)
     if not is_complete:
         context.exit(EXIT_SOME_FAILED)

@@ -19,6 +19,7 @@ from sobolev_batch.spectral.budget import Support
 from sobolev_batch.spectral.fields import fourier_transform
 from sobolev_batch.spectral.lattice import single_order
 from sobolev_batch.surfaces.formats.readers import SurfaceLike, as_surface
+from sobolev_batch.surfaces.proximity import vertex_distances
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import (
     Extent,
@@ -245,13 +246,21 @@ def require_place(path: Path) -> None:
 
 
 def write_difference(
-    a: Surface, b: Surface, path: Path, order: float, *, scaling: bool = True, subject: str = "a"
+    a: Surface,
+    b: Surface,
+    path: Path,
+    order: float,
+    *,
+    scaling: bool = True,
+    subject: str = "a",
+    distances: bool = False,
 ) -> str:
     """Write the meshes among two surfaces, each with the witness function of a against b at its vertices.
 
-    The path is the beginning of those of the files, to which "-a.ply" and "-b.ply" are added. Return where the surfaces
-    differ most, and the files, as the end of a line in which a surface has the name of the subject. StoreError where a
-    file cannot be written; see also `require_place`.
+    If requested, each vertex also has its distance from the other mesh. The path is the beginning of those of the
+    files, to which "-a.ply" and "-b.ply" are added. Return where the surfaces differ most, and the files, as the end of
+    a line in which a surface has the name of the subject. StoreError where a file cannot be written; see also
+    `require_place`.
     """
     # Files load what reads stores, which a verdict does without.
     from sobolev_batch.results.figures.meshes import witness_at_vertices, write_vertex_values
@@ -265,7 +274,7 @@ def write_difference(
     fields = [fourier_transform(surface, lattice, _EPS, dtype="complex64", order=order) for surface in centered]
     require_place(path)
     written, greatest, place = [], 0.0, (0.0, 0.0, 0.0)
-    for label, own, mesh in zip("ab", (a, b), centered, strict=True):
+    for label, own, other, mesh in zip("ab", (a, b), (b, a), centered, strict=True):
         if not isinstance(own, Mesh) or not isinstance(mesh, Mesh):
             continue
         values = witness_at_vertices(fields[0], fields[1], (order,), mesh, dtype="complex64")
@@ -274,7 +283,10 @@ def write_difference(
             greatest, place = float(values[0, vertex]), tuple(own.vertices[vertex].tolist())
         file = path.with_name(f"{path.name}-{label}.ply")
         title = f"{label} against b, comparison {path.name}"
-        write_vertex_values(file, own, values, (order,), title, 1 / similarity.scale, context="comparison")
+        lengths = vertex_distances(own, other) if distances and isinstance(other, Mesh) else None
+        write_vertex_values(
+            file, own, values, (order,), title, 1 / similarity.scale, context="comparison", distances=lengths
+        )
         written.append(file)
     if not written:
         return "no witness: neither surface is a mesh"

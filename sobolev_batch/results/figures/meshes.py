@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from functools import cached_property
 from pathlib import Path
 from typing import Self
 
@@ -22,6 +23,7 @@ from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.lattice import Orders, check_orders
 from sobolev_batch.spectral.metrics.causes import witness
 from sobolev_batch.surfaces.formats.plain_formats import write_ply
+from sobolev_batch.surfaces.proximity import vertex_distances
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Reals, Similarity
 from sobolev_batch.surfaces.sources.mesh_cache import MeshCache
@@ -90,10 +92,22 @@ class StudyMeshes:
         with fields_read(self.tree):
             return own, witness_at_vertices(*fields_of(self.tree, label), orders, scaled)
 
-    def write(self, path: Path, label: str, mesh: Mesh, values: Reals, orders: Sequence[float]) -> None:
-        """Write what `with_witness` returns; see `write_vertex_values`."""
+    @cached_property
+    def reference(self) -> Mesh:
+        """The reference in its own unit; InputError where it is no mesh, or see `make`."""
+        label = reference_of(self.tree)
+        try:
+            return self.make(label)[0]
+        except SobolevBatchError as error:
+            raise InputError(f"distances from the reference {label!r} cannot be written: {error}") from error
+
+    def write(
+        self, path: Path, label: str, mesh: Mesh, values: Reals, orders: Sequence[float], *, distances: bool = False
+    ) -> None:
+        """Write what `with_witness` returns, and distances from the reference; see `write_vertex_values`."""
+        lengths = vertex_distances(mesh, self.reference) if distances else None
         title = f"{label} against {reference_of(self.tree)}, study {self.tree.attrs['study']['name']}"
-        write_vertex_values(path, mesh, values, orders, title, 1 / self.similarity.scale)
+        write_vertex_values(path, mesh, values, orders, title, 1 / self.similarity.scale, distances=lengths)
 
     def stem(self, label: str) -> str:
         """Return the file name of a mesh without suffix: its number in the store and the plain letters of its label."""
@@ -175,7 +189,13 @@ def exported(
 
 
 def write_witness(
-    store: AnyStore, mesh: str, path: str | Path, order: Orders | None = None, folder: str | Path = "."
+    store: AnyStore,
+    mesh: str,
+    path: str | Path,
+    order: Orders | None = None,
+    folder: str | Path = ".",
+    *,
+    distances: bool = False,
 ) -> Path:
     """Write a mesh of a store with its witness function against the reference at its vertices.
 
@@ -190,6 +210,8 @@ def write_witness(
         path: File to write; its suffix is .ply or .vtp. The latter needs the extra "vtk".
         order: One order below -1/2, or several; by default those of the study.
         folder: Folder where relative paths in the study start.
+        distances: Also write the distance of each vertex from the closest point of the reference, as ``distance``, in
+            the mesh's own unit.
 
     Returns:
         The path of the file. Its values are in 1 / unit length of the study, positive where the mesh has area
@@ -211,17 +233,25 @@ def write_witness(
     made, labels, orders = exported(store, [mesh], order, folder)
     if len(labels) > 1:
         raise InputError(f"{mesh!r} stands for several meshes, and one is written; give its label")
-    made.write(path, labels[0], *made.with_witness(labels[0], orders), orders)
+    made.write(path, labels[0], *made.with_witness(labels[0], orders), orders, distances=distances)
     return path
 
 
 def write_vertex_values(
-    path: Path, mesh: Mesh, values: Reals, orders: Sequence[float], title: str, unit: float, context: str = "study"
+    path: Path,
+    mesh: Mesh,
+    values: Reals,
+    orders: Sequence[float],
+    title: str,
+    unit: float,
+    context: str = "study",
+    distances: Reals | None = None,
 ) -> None:
     """Write a mesh with its witness function, in the format of the path's suffix, one of `SUFFIXES`.
 
     The mesh is in its own unit of length; the values (orders, vertices) are in 1 / unit length of the context, a
-    "study" or a "comparison", whose unit is given in that of the mesh. The title says what was compared with what.
+    "study" or a "comparison", whose unit is given in that of the mesh. Distances (vertices,) from the reference are in
+    the unit of the mesh. The title says what was compared with what.
     StoreError where the file cannot be written.
     """
     escaped = title.encode("unicode_escape").decode("ascii")
@@ -231,7 +261,10 @@ def write_vertex_values(
         f"in 1 / unit length of the {context}, orders " + ", ".join(map(_number, orders)),
         f"coordinates are in the unit of the mesh; one unit of the {context} is {unit!r} of them",
     ]
-    data = (_ply if path.suffix == ".ply" else _vtp)(mesh, dict(zip(orders, values, strict=True)), notes)
+    if distances is not None:
+        notes.append("distance to the closest point of the reference, in the unit of the mesh")
+    others = {} if distances is None else {"distance": distances}
+    data = (_ply if path.suffix == ".ply" else _vtp)(mesh, dict(zip(orders, values, strict=True)), others, notes)
     try:
         path.write_bytes(data)
     except OSError as error:
@@ -242,21 +275,23 @@ def _number(order: float) -> str:
     return repr(float(order)).removesuffix(".0")
 
 
-def _ply(mesh: Mesh, values: Mapping[float, Reals], notes: Sequence[str]) -> bytes:
+def _ply(mesh: Mesh, values: Mapping[float, Reals], others: Mapping[str, Reals], notes: Sequence[str]) -> bytes:
     # Letters, digits and underscores, which readers of PLY accept.
     rows = {f"witness_minus_{_number(-order)}".replace(".", "_").replace("+", ""): row for order, row in values.items()}
     first = next(iter(rows))
     # The quality is the scalar that MeshLab and similar programs show.
     quality = {"quality": rows[first].astype(np.float32)}
-    return write_ply(mesh, {**quality, **rows}, [*notes, f"quality repeats {first}"])
+    return write_ply(mesh, {**quality, **rows, **others}, [*notes, f"quality repeats {first}"])
 
 
-def _vtp(mesh: Mesh, values: Mapping[float, Reals], notes: Sequence[str]) -> bytes:
+def _vtp(mesh: Mesh, values: Mapping[float, Reals], others: Mapping[str, Reals], notes: Sequence[str]) -> bytes:
     with from_extra("vtk", "a .vtp file needs"):
         from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
     surface = mesh.to_pyvista()
     for order, row in values.items():
         surface.point_data[f"witness, order {_number(order)}"] = row
+    for name, row in others.items():
+        surface.point_data[name] = row
     surface.point_data.active_scalars_name = f"witness, order {_number(next(iter(values)))}"
     surface.field_data["notes"] = list(notes)
     # In memory: VTK does not report a full disk.

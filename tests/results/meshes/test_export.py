@@ -48,8 +48,9 @@ def evaluated(place: str, label: str, points: np.ndarray) -> np.ndarray:
 @pytest.mark.slow
 def test_ply_holds_the_mesh_of_the_file_and_its_witness(spheres: Spheres, tmp_path: Path) -> None:
     place, folder = spheres
+    reference = trimesh.load(folder / "large.obj", process=False)
     for label in LABELS:
-        path = sb.write_witness(place, label, tmp_path / "a.ply", folder=folder)
+        path = sb.write_witness(place, label, tmp_path / "a.ply", folder=folder, distances=True)
         there = trimesh.load(path, process=False)
         own = sb.read_mesh(folder / f"{label.removeprefix('files/')}.obj")
         assert (there.vertices == own.vertices).all()
@@ -59,6 +60,8 @@ def test_ply_holds_the_mesh_of_the_file_and_its_witness(spheres: Spheres, tmp_pa
         for name, values in zip(("witness_minus_4", "witness_minus_2_5"), expected, strict=True):
             assert columns[name].dtype == np.dtype("<f8")
             assert columns[name] == pytest.approx(values, rel=1e-9, abs=1e-9 * np.abs(values).max())
+        nearest = trimesh.proximity.closest_point_naive(reference, own.vertices)[1]
+        assert columns["distance"] == pytest.approx(nearest, rel=1e-9)
         assert columns["quality"] == pytest.approx(columns["witness_minus_4"], rel=1e-6)
         (unit,) = re.findall(rb"one unit of the study is (\S+)", path.read_bytes())
         assert float(unit) == pytest.approx(RADIUS)
