@@ -102,7 +102,7 @@ def test_its_example_and_the_workflows_are_valid(tmp_path: Path) -> None:
     assert (measured.points, measured.metrics) == (20_000, ("hausdorff", "rms", "fscore"))
     coarse, fine = read(f"{study}\n{listed}").families[1].source.members(tmp_path)
     assert (coarse.name, fine.name, dict(fine.metadata)["tool_seconds"]) == ("coarse", "fine", 12.1)
-    for name in ("icosphere", "cortex", "torus"):
+    for name in ("icosphere", "cortex", "cortex-fitted", "torus"):
         assert Study.from_toml(ROOT / "workflows" / f"{name}.toml").name == name
 
 
