@@ -16,7 +16,15 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.results.figures.selection import spread
 from sobolev_batch.results.open import finished_group, has_proximity, open_store, placement_doubts
 from sobolev_batch.results.status import Status
-from sobolev_batch.results.tables.convergence import nearest, page_columns, smallest_of, table, tables_of, with_remarks
+from sobolev_batch.results.tables.convergence import (
+    nearest,
+    page_columns,
+    smallest_of,
+    table,
+    tables_of,
+    unit_notes,
+    with_remarks,
+)
 from sobolev_batch.results.tables.league import (
     LEAGUE_COLUMNS,
     LEAGUE_NOTE,
@@ -305,6 +313,7 @@ def study_content(tree: xr.DataTree, status: Status) -> dict[str, Any]:
         "doubtful": reasons_table("doubtful", "mesh", placement_doubts(tree)),
         "rtol": convergence.attrs.get("rtol"),
         "has_proximity": has_proximity(tree),
+        "units": " ".join(unit_notes([tree])),
     }
 
 

@@ -68,17 +68,18 @@ _NOTE = """\
 Relative distances are fractions of the reference's norm. Errors are meant as bounds,
 the sums of truncation (frequencies beyond the highest one), aliasing (spacing of the
 lattice), discretisation (quadrature and NUFFT) and chance (random frequencies, if the
-study samples octaves). A distance marked * is not
-larger than its error, and gives no rate. The column "area" is the share of the squared
-distance that a change of total area alone explains."""
+study samples octaves). A distance marked * is not larger than its error, and gives no
+rate. The column "area" is the share of the squared distance that a change of total area
+alone explains."""
+_UNNAMED = "units of the files"
 _UNIT_NOTE = """\
 Edges and other lengths are in {}.
 Distances of orders are computed in units of {}."""
 _PROXIMITY_NOTE = """\
-Other distances are the same at all orders. They are those of sampled points to the
-other mesh, the larger of both ways, with standard errors. Hausdorff is a lower bound: the
+Other distances are the same at all orders. They are those of sampled points to the other
+mesh, the larger of both directions, with standard errors. Hausdorff is a lower bound: the
 largest distance of any vertex or sampled point. Chamfer is the sum of the mean distances
-of both ways. Normals are compared as lines, in degrees."""
+of both directions. Normals are compared as lines."""
 _ACCURACY_NOTE = """\
 The study requests an error of at most {rtol:g} of each distance; a distance
 marked ! has a larger one."""
@@ -91,6 +92,8 @@ A mesh is below the bound if its relative distance and the error of that are tog
 Meshes that are smaller, and that the errors leave open, are named as undecided."""
 
 _UNKNOWN: dict[str, Any] = {"mesh": "", "triangles": pd.NA, "relative": math.nan, "relative_error": math.nan}
+# Of other distances beside each other, so that lines fit.
+_MOST_COLUMNS = 5
 _MESH = Column("mesh", "mesh", kind="label")
 _TRIANGLES = Column("triangles", "triangles", count)
 _COLUMNS = (
@@ -110,7 +113,7 @@ _METRIC_COLUMNS = (
     Column("chamfer", "Chamfer ± s.e.", with_error, "chamfer_error"),
     Column("fscore", "F-score", lambda score: f"{100 * score:.1f} %"),
     Column("normal_mean", "normals", "{:.2g}°".format),
-    Column("normal_max", "at most", "{:.2g}°".format),
+    Column("normal_max", "largest", "{:.2g}°".format),
     Column("volume", "volume", "{:.4g}".format),
     Column("smallest_angle", "angles ≥", "{:.2g}°".format),
     Column("aspect_ratio", "aspect ≤", "{:.3g}".format),
@@ -251,8 +254,10 @@ def _tables(tree: xr.DataTree, frame: pd.DataFrame, style: Format) -> Iterator[s
         yield section(caption, [_table(rows, _COLUMNS, style)], _nearest(rows), style)
     if has_proximity(tree):
         once = marked[marked["order"] == marked["order"].iloc[0]]
-        table = _table(once, (_MESH, *_metric_columns(tree)), style)
-        yield section("Other distances, the same at all orders", [table], [], style)
+        columns = _metric_columns(tree)
+        parts = [columns[first : first + _MOST_COLUMNS] for first in range(0, len(columns), _MOST_COLUMNS)]
+        tables = [_table(once, (_MESH, *part), style) for part in parts]
+        yield section("Other distances, the same at all orders", tables, [], style)
 
 
 def _table(frame: pd.DataFrame, columns: Sequence[Column], style: Format) -> str:
@@ -306,7 +311,7 @@ def _metric_columns(tree: xr.DataTree) -> list[Column]:
 def _unit(tree: xr.DataTree) -> tuple[str, float]:
     """Return the name of the unit of length of the files, and the study's unit in terms of it."""
     header = tree.attrs.get("study", {}).get("table", {}).get("study", {})
-    return header.get("length_unit", "units of the files"), 1 / tree.attrs.get("similarity", {"scale": 1.0})["scale"]
+    return header.get("length_unit", _UNNAMED), 1 / tree.attrs.get("similarity", {"scale": 1.0})["scale"]
 
 
 def page_columns(tree: xr.DataTree) -> tuple[Column, ...]:
@@ -333,14 +338,21 @@ def with_remarks(frame: pd.DataFrame) -> pd.DataFrame:
 def _notes(trees: Sequence[xr.DataTree], frames: Sequence[pd.DataFrame], x: str) -> list[str]:
     """Return what the numbers of all tables mean."""
     notes = [*_NOTE.splitlines(), *([] if x == EDGE_LENGTH else [f"Rates are those of distance ~ ({x})^-rate."])]
-    units, sizes = (sorted(set(values)) for values in zip(*map(_unit, trees), strict=True))
-    size = f"{sizes[0]:.4g} of them" if len(sizes) == 1 else "their own for each object"
-    notes += _UNIT_NOTE.format(", ".join(map(str, units)), size).splitlines()
+    notes += unit_notes(trees)
     if any(map(has_proximity, trees)):
         notes += _PROXIMITY_NOTE.splitlines()
     for rtol in dict.fromkeys(frame.attrs["rtol"] for frame in frames if "rtol" in frame.attrs):
         notes += _ACCURACY_NOTE.format(rtol=rtol).splitlines()
     return notes
+
+
+def unit_notes(trees: Sequence[xr.DataTree]) -> list[str]:
+    """Return the units of lengths and of distances in the tables of open stores, each in a sentence."""
+    units, sizes = (sorted(set(values)) for values in zip(*map(_unit, trees), strict=True))
+    size = "their own for each object"
+    if len(sizes) == 1:
+        size = f"{sizes[0]:.4g} {units[0] if units[0] != _UNNAMED else 'of them'}"
+    return _UNIT_NOTE.format(", ".join(map(str, units)), size).splitlines()
 
 
 def _failures(tree: xr.DataTree, frame: pd.DataFrame) -> list[str]:

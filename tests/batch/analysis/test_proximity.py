@@ -34,6 +34,8 @@ class Killed(Exception):  # noqa: N818  # it stands for an end without a word, n
 
 def study_of(folder: Path = Path(), **changes: Any) -> sb.Study:
     asked = {"reference": {"source": "icosphere", "levels": [4]}, "proximity": {"points": 300}}
+    # Numbers are in the unit of the files, whatever that of the study is.
+    asked["scaling"] = {"mode": "fixed", "scale": 0.5}
     return sb.Study.from_table(small_table(**{**asked, **changes}), folder=folder)
 
 
@@ -89,6 +91,9 @@ def test_what_a_change_of_the_study_measures(store: Path, threads: Client) -> No
     assert_right(store, grown)
     assert measured(study_of(proximity={"points": 200}), store, threads) == [*MESHES]
     assert_right(store, study_of(proximity={"points": 200}))
+    # What tables show was measured already.
+    assert measured(study_of(proximity={"points": 200, "metrics": ["rms", "volume"]}), store, threads) == []
+    assert {"rms", "rms_backward", "volume"} <= set(sb.table(store)) - {"hausdorff"}
     # The study's unit stays, and so do the fields of the meshes.
     other = study_of(reference={"source": "icosphere", "levels": [3]}, scaling={"mode": "none"})
     assert measured(other, store, threads) == [*MESHES]
