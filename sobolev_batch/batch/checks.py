@@ -165,7 +165,7 @@ def _test_warnings(collection: StudyCollection, objects: int) -> Iterator[str]:
         shown = shown if objects == count else f"{objects} of {shown} that have all methods at common sizes"
         yield (
             f"the test of a league cannot tell {len(methods)} methods from chance with {shown}; "
-            f"take {least} objects or more, or compare fewer methods (league --method)"
+            f"take {least} objects or more, or compare fewer methods (table league --family)"
         )
 
 

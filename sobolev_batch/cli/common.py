@@ -100,10 +100,10 @@ def orders_option(text: str, default: str) -> Callable[[Command], Command]:
     )
 
 
-def meshes_option(name: str, text: str, default: str) -> Callable[[Command], Command]:
-    """Return an option that takes labels of meshes."""
+def meshes_option(text: str, default: str) -> Callable[[Command], Command]:
+    """Return the option --mesh of a command, which takes labels of meshes."""
     return click.option(
-        *(name, "meshes"),
+        *("--mesh", "meshes"),
         multiple=True,
         metavar="MESH",
         help=f"{text} A pattern such as 'scans/*' stands for several. The option may be repeated. [default: {default}]",
@@ -117,7 +117,8 @@ def location(value: Any) -> Location:
     return Location.parse(value)
 
 
-def _memory_size(value: Any) -> int:
+def memory_size(value: Any) -> int:
+    """Return the bytes of a size such as 4GB."""
     from sobolev_batch.parameters import byte_count
 
     return byte_count(value)
@@ -176,16 +177,15 @@ def output_option(text: str, default: str) -> Callable[[Command], Command]:
     return click.option("--output", type=PATH, default=default, show_default=True, help=text)
 
 
-def memory_option(text: str) -> Callable[[Command], Command]:
-    """Return the option --memory of a command."""
-    return click.option("--memory", type=_memory_size, metavar="SIZE", help=text)
+def below_option(text: str, *, required: bool = False) -> Callable[[Command], Command]:
+    """Return the option --below of a command: a fraction of the norm of the reference, such as 0.01 or 1%."""
 
+    def fraction_of_norm(value: str) -> float:
+        from sobolev_batch.parameters import fraction
 
-def fraction_of_norm(text: str) -> float:
-    """Return a number such as 0.01 or 1%."""
-    from sobolev_batch.parameters import fraction
+        return fraction(value)
 
-    return fraction(text)
+    return click.option("--below", type=fraction_of_norm, metavar="FRACTION", required=required, help=text)
 
 
 def echo(line: object = "", *, err: bool = False) -> None:

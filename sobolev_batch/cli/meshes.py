@@ -18,14 +18,14 @@ from sobolev_batch.cli.common import (
     EXIT_DIFFERENT,
     EXIT_UNDECIDED,
     PATH,
+    below_option,
     best_effort_option,
     cli,
     echo,
     echo_json,
     echo_lines,
-    fraction_of_norm,
     json_option,
-    memory_option,
+    memory_size,
     orders_option,
     progress_bar,
 )
@@ -53,13 +53,6 @@ _DEFAULT_RTOL = 1e-2
 # In radii of the target; distances have about as many digits.
 _MOST_ROUNDING = 1e-6
 
-_below_option = click.option(
-    "--below",
-    type=fraction_of_norm,
-    metavar="FRACTION",
-    help="Tell whether the distance is below FRACTION of the norm of B, such as 1e-3 or 0.1%, by the exit status.",
-)
-
 
 @cli.command("compare")
 @click.argument("a", type=PATH)
@@ -68,7 +61,9 @@ _below_option = click.option(
 @click.option(
     "--rtol", type=float, help="Reach this relative error at most. [default: 1e-2, or the nearest attainable]"
 )
-@memory_option("Limit the memory of a transform for --rtol. [default: 2GB]")
+@click.option(
+    "--memory", type=memory_size, metavar="SIZE", help="Limit the memory of a transform for --rtol. [default: 2GB]"
+)
 @best_effort_option
 @click.option(
     "--xi-max",
@@ -108,7 +103,7 @@ _below_option = click.option(
     "PATH-a.ply and PATH-b.ply; with --proximity also distances.",
 )
 @click.option("--no-scaling", is_flag=True, help="Keep the files' unit. Otherwise B is scaled to the unit sphere.")
-@_below_option
+@below_option("Tell whether the distance is below FRACTION of the norm of B, such as 1e-3 or 0.1%, by the exit status.")
 @json_option
 @click.pass_context
 def compare_command(

@@ -1,4 +1,4 @@
-"""Commands that read a store: status, verify, unlock, table, plot, witness, report, league."""
+"""Commands that read a store, besides its tables: status, verify, unlock, plot, witness, report."""
 
 from __future__ import annotations
 
@@ -18,10 +18,7 @@ from sobolev_batch.cli.common import (
     echo_json,
     echo_lines,
     folder_option,
-    format_option,
-    fraction_of_norm,
     json_option,
-    location,
     meshes_option,
     orders_option,
     output_option,
@@ -31,7 +28,6 @@ from sobolev_batch.cli.common import (
     up_option,
 )
 from sobolev_batch.errors import InputError, SobolevBatchError, StoreError, from_extra
-from sobolev_batch.results.tables import Format
 
 if TYPE_CHECKING:
     from sobolev_batch.batch.storage.location import Location
@@ -141,76 +137,6 @@ def unlock_command(store: Location, force: bool) -> None:
         echo(f"{store}: unlocked; {lock.driver} had locked it since {lock.since}")
 
 
-@cli.command("table")
-@store_argument
-@format_option
-@orders_option("Print the tables of this order, which may be any below -1/2.", "the study's")
-@click.option(
-    "--x",
-    default="edge_length",
-    show_default=True,
-    help="Observe rates in edge_length, triangles, vertices, seconds, or a number among the metadata of the meshes.",
-)
-@click.option("--matrix", is_flag=True, help="Print the distances of every mesh to every other instead.")
-@click.option("--over-time", is_flag=True, help="Print the distances of meshes that move, over time, instead.")
-@click.option(
-    "--below",
-    type=fraction_of_norm,
-    metavar="FRACTION",
-    help="Print the smallest mesh of each family with a relative distance below FRACTION, such as 1%, instead.",
-)
-@click.option(
-    "--truth",
-    metavar="FAMILY",
-    help="Measure --over-time from this family, which is the true surface. [default: the reference]",
-)
-@click.option(
-    "--factor",
-    type=click.FloatRange(min=1.0, min_open=True),
-    help="Say for --over-time when the distance has grown by this factor. [default: 2]",
-)
-def table_command(
-    store: Location,
-    style: Format,
-    orders: tuple[float, ...],
-    x: str,
-    matrix: bool,
-    over_time: bool,
-    below: float | None,
-    truth: str | None,
-    factor: float | None,
-) -> None:
-    """Print the tables or distance matrices of STORE. A collection has those of all its objects.
-
-    Orders that the study lacks are computed from its stored fields. The table says what they rest on.
-    """
-    if matrix + over_time + (below is not None) > 1:
-        raise click.UsageError("--matrix, --over-time and --below are different tables: choose one")
-    for name, is_given in (("--truth", truth is not None), ("--factor", factor is not None)):
-        if is_given and not over_time:
-            raise click.UsageError(f"{name} belongs to --over-time")
-    from sobolev_batch.batch.collection_store import CollectionStore
-    from sobolev_batch.results.open import open_store
-    from sobolev_batch.results.tables.convergence import format_smallest, format_table
-    from sobolev_batch.results.tables.evolution import REMESHING_FACTOR, format_evolution
-    from sobolev_batch.results.tables.matrix import format_matrix
-
-    chosen = orders or None
-    collection = CollectionStore.read(store)
-    if collection is not None:
-        if matrix or over_time or below is not None:
-            raise click.UsageError(f"name the store of one object, such as {store}/{collection.objects[0]}")
-        echo_lines(format_table(collection.existing_stores, style, chosen, x=x))
-        return
-    tree = open_store(store)
-    if over_time:
-        echo_lines(format_evolution(tree, style, chosen, truth=truth, factor=factor or REMESHING_FACTOR))
-    elif below is not None:
-        echo_lines(format_smallest(tree, style, chosen, below=below))
-    else:
-        echo_lines(format_matrix(tree, style, chosen) if matrix else format_table(tree, style, chosen, x=x))
-
-
 @cli.command("plot")
 @store_argument
 @output_option("Write the pictures into this folder.", ".")
@@ -236,7 +162,7 @@ def table_command(
     help="Draw convergence over this: edge_length, triangles, vertices, seconds, or a number among the metadata of the "
     "meshes. [default: edge_length, triangles for a league]",
 )
-@meshes_option("--witness", "Draw this mesh with its witness function.", "a few")
+@meshes_option("Draw this mesh with its witness function.", "a few")
 @folder_option
 @up_option
 @click.pass_context
@@ -275,7 +201,7 @@ def plot_command(
     _require_folder(output)
     if CollectionStore.read(store) is not None:
         if meshes:
-            raise click.UsageError("--witness draws meshes of one object: name its store, such as STORE/OBJECT")
+            raise click.UsageError("--mesh draws meshes of one object: name its store, such as STORE/OBJECT")
         chosen, figures = orders or None, {}
         with drawing(panel):
             # Where no cost is known, there is no league by cost.
@@ -309,7 +235,7 @@ def plot_command(
 
 @cli.command("witness")
 @store_argument
-@meshes_option("--mesh", "Write this mesh.", "all")
+@meshes_option("Write this mesh.", "all")
 @orders_option("Write witness functions of this order, which may be any below -1/2.", "the study's")
 @click.option(
     *("--format", "style"),
@@ -363,7 +289,7 @@ def witness_command(
 @output_option("Write the page to this file.", "report.html")
 @folder_option
 @up_option
-@meshes_option("--witness", "Show this mesh with its witness function.", "a few")
+@meshes_option("Show this mesh with its witness function.", "a few")
 def report_command(store: Location, output: Path, folder: Path, up: Axis, meshes: tuple[str, ...]) -> None:
     """Write the results of STORE as one HTML page.
 
@@ -377,43 +303,3 @@ def report_command(store: Location, output: Path, folder: Path, up: Axis, meshes
     echo(output)
     for omission in omissions:
         echo(f"left out: {omission}", err=True)
-
-
-@cli.command("league")
-@store_argument
-@format_option
-@orders_option("Compare at this order.", "all of the stores")
-@click.option(
-    "--by",
-    type=click.Choice(["size", "cost"]),
-    default="size",
-    show_default=True,
-    help="Compare at equal sizes, or list the meshes that no other beats in distance and cost.",
-)
-@click.option("--x", help="Take this size or cost of a mesh. [default: triangles by size, make_seconds by cost]")
-@click.option("--method", "methods", multiple=True, help="Compare this method; may be repeated. [default: all]")
-@click.option("--against", type=location, metavar="STORE", help="Compare with this earlier study instead.")
-def league_command(
-    store: Location,
-    style: Format,
-    orders: tuple[float, ...],
-    by: str,
-    x: str | None,
-    methods: tuple[str, ...],
-    against: Location | None,
-) -> None:
-    """Rank the methods of a collection's STORE over its objects.
-
-    With --by cost, STORE may also be that of one object. With --against, compare each method with itself in an earlier
-    study instead.
-    """
-    from sobolev_batch.results.tables.costs import format_cost_leagues
-    from sobolev_batch.results.tables.league import compare_studies, format_changes, format_league, league
-
-    if by == "cost" and against is None:
-        leagues = league(store, orders or None, by="cost", x=x, methods=methods or None)
-        echo_lines(format_cost_leagues(leagues, style))
-    elif against is not None:
-        echo_lines(format_changes(compare_studies(store, against, orders or None), style))
-    else:
-        echo_lines(format_league(league(store, orders or None, x=x, methods=methods or None), style))

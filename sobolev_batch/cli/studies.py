@@ -20,7 +20,7 @@ from sobolev_batch.cli.common import (
     echo_json,
     echo_lines,
     json_option,
-    memory_option,
+    memory_size,
     progress_reports,
     store_option,
     study_argument,
@@ -72,7 +72,12 @@ def init_command(folder: Path, output: Path) -> None:
     metavar="N",
     help="Start N processes on this machine. [default: one per core]",
 )
-@memory_option("Limit the memory of each process, such as 4GB. [default: equal parts]")
+@click.option(
+    *("--worker-memory", "memory"),
+    type=memory_size,
+    metavar="SIZE",
+    help="Limit the memory of each process, such as 4GB. [default: equal parts]",
+)
 @allow_commands_option
 @click.pass_context
 def run_command(
@@ -100,7 +105,7 @@ def run_command(
 
     if scheduler and (workers or memory):
         raise click.UsageError(
-            "--workers and --memory are for a cluster on this machine; the workers of a scheduler have their own"
+            "--workers and --worker-memory are for a cluster on this machine; the workers of a scheduler have their own"
         )
     parsed = as_study(study)
     with progress_reports() as show:

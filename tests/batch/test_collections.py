@@ -81,7 +81,7 @@ def test_tables_of_a_collection_are_those_of_its_objects(store: Path) -> None:
     text = call("table", store, "--order", "-3").stdout
     assert [text.count(part) for part in ("Object ", "Relative distances are fractions")] == [2, 1]
     assert call("table", store, "--format", "csv").stdout.startswith("object,order,mesh")
-    refused = call("table", store, "--matrix")
+    refused = call("table", "matrix", store)
     assert refused.returncode == 2
     assert "name the store of one object, such as" in refused.stderr
 

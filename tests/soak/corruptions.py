@@ -156,7 +156,7 @@ def _command(*arguments: str) -> Callable[[Path], dict[str, str]]:
 
 def _page(store: Path) -> dict[str, str]:
     page = store.with_name("page.html")
-    said = _command("report", "STORE", "--witness", "ico/0", "--output", str(page))(store)
+    said = _command("report", "STORE", "--mesh", "ico/0", "--output", str(page))(store)
     return said | {"page": _MOMENTS.sub("", page.read_text(encoding="utf-8"))}
 
 

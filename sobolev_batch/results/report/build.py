@@ -239,7 +239,7 @@ def chart_omissions(
     if spectra is not None and spectra.omission:
         yield f"spectra: only those of {spectra.omission} are shown"
     if 0 < len(views) < compared:
-        yield f"witness functions: only {len(views)} of {compared:,} meshes are drawn; --witness chooses them"
+        yield f"witness functions: only {len(views)} of {compared:,} meshes are drawn; --mesh chooses them"
     for label, reason in missing.items():
         yield f"the witness function of {label}: {reason}"
 

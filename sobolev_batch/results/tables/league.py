@@ -340,7 +340,7 @@ def _league(
         reasons = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:3])
         raise InputError(
             f"no object can serve to compare the methods {', '.join(methods)} ({reasons}); compare fewer methods, "
-            'or compare them by cost (league --by cost, in Python by="cost")'
+            'or compare them by cost (table league --by cost, in Python by="cost")'
         )
     arrays = (np.array(parts) for parts in zip(*rows.values(), strict=True))
     return League(order, x, tuple(rows), tuple(methods), left_out, *arrays)

@@ -140,7 +140,7 @@ def test_what_fits_into_no_worker_is_refused_with_both_numbers(
 def test_a_lattice_that_fits_into_no_worker_is_refused_with_both_numbers(tmp_path: Path) -> None:
     study = write_toml(tmp_path)
     study.write_text(study.read_text().replace("M = 16", "M = 1024"))
-    done = call("run", study, "--store", tmp_path / "large.zarr", "--workers", "1", "--memory", "700MB")
+    done = call("run", study, "--store", tmp_path / "large.zarr", "--workers", "1", "--worker-memory", "700MB")
     assert done.returncode == 1
     expected = r"it takes about 777\.6MB in one task, and no worker has more than 295\.0MB"
     assert re.search(expected, " ".join(done.stderr.split())), done.stderr

@@ -232,7 +232,7 @@ def test_the_axis_that_points_upwards(up: Literal["x", "y", "z"], spheres: Spher
 def test_plot_draws_the_meshes_that_are_asked_for(spheres: Spheres, tmp_path: Path) -> None:
     place, folder = spheres
     plot = partial(call, "plot", place, "--output", tmp_path, "--folder")
-    done = plot(folder, "--witness", LABELS[1], "--witness", "closed/sphere")
+    done = plot(folder, "--mesh", LABELS[1], "--mesh", "closed/sphere")
     assert done.returncode == 3
     assert done.stderr == (
         "convergence: not drawn: 1 not computed, 1 without edges; families not drawn: closed\n"

@@ -72,7 +72,7 @@ def page(store: str, folder: Path) -> Path:
     done = CliRunner().invoke(cli, ["report", store, "--output", str(path), "--folder", str(folder)])
     assert done.stdout.strip() == str(path)
     # By default those at the ends of each family.
-    assert done.stderr.startswith("left out: witness functions: only 3 of 4 meshes are drawn; --witness chooses them")
+    assert done.stderr.startswith("left out: witness functions: only 3 of 4 meshes are drawn; --mesh chooses them")
     return path
 
 

@@ -198,7 +198,7 @@ def test_a_study_of_remeshers_keeps_what_fails_apart(tmp_path: Path) -> None:
         league.meshes["make_seconds"].tolist()
         == sb.table(store, -3.0).dropna(subset="distance")["make_seconds"].tolist()
     )
-    assert "front of the means" in call("league", store, "--by", "cost", "--x", "make_cpu_seconds").stdout
+    assert "front of the means" in call("table", "league", store, "--by", "cost", "--x", "make_cpu_seconds").stdout
     # What is stored names the function, whose meshes are found without it.
     assert json.dumps(tree.attrs["study"]["table"]["family"][2]["function"]).endswith('halved"')
     from sobolev_batch.results.figures.meshes import StudyMeshes
@@ -222,8 +222,7 @@ def test_methods_without_a_size_in_common_have_a_plot_by_cost(tmp_path: Path) ->
     done = call("plot", place, "--output", tmp_path)
     assert done.stdout == f"{tmp_path / 'league-by-cost.png'}\n"
     assert "no common range of sizes" in done.stderr
-    assert "compare them by cost (league --by cost" in done.stderr
+    assert "compare them by cost (table league --by cost" in done.stderr
     assert call("plot", place, "--output", tmp_path, "--x", "triangles").returncode == 2
-    assert (
-        "coarse is left out: no mesh has a distance and make_seconds." in call("league", place, "--by", "cost").stdout
-    )
+    by_cost = call("table", "league", place, "--by", "cost").stdout
+    assert "coarse is left out: no mesh has a distance and make_seconds." in by_cost
