@@ -70,6 +70,7 @@ def test_run_prints_tables_and_plain_progress(folder: Path) -> None:
     shown, progress = (folder / "run.txt").read_text().split("\0")
     assert re.search(r"^ico/1 +80 +0\.5823 +\S+ % ± \S+ % +\S+ ± \S+ +\S+ ± \S+ +\d+ %$", shown, re.M)
     assert f"3 computed, 0 reused, 0 failed; store: {STORE}" in shown
+    assert re.search(r"^below 5 %: ico ", shown, re.M)
     assert max(map(len, shown.splitlines())) <= 100
     assert re.search(r"http://127\.0\.0\.1:\d+/status", progress)
     assert re.search(r"^\[3/3\] \S+: complete, \d+\.\d\d s$", progress, re.M)

@@ -102,6 +102,7 @@ def run_command(
     from sobolev_batch.batch.study.study import Study, as_study
     from sobolev_batch.results.open import open_store
     from sobolev_batch.results.tables.convergence import format_table
+    from sobolev_batch.results.tables.verdict import format_verdict
 
     if scheduler and (workers or memory):
         raise click.UsageError(
@@ -116,7 +117,10 @@ def run_command(
             limit = None if memory is None else f"{memory}B"
             summary = run(parsed, store, workers=workers, memory=limit, on_progress=show, allow_commands=allow_commands)
     if isinstance(parsed, Study):
-        echo_lines(format_table(open_store(summary.store)))
+        tree = open_store(summary.store)
+        echo_lines(format_table(tree))
+        echo()
+        echo_lines(format_verdict(tree))
     else:
         _print_league(summary.store)
     echo()

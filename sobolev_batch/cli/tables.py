@@ -90,6 +90,15 @@ def matrix_command(store: Location, style: Format, orders: tuple[float, ...]) ->
     echo_lines(format_matrix(_tree_of_one(store), style, orders or None))
 
 
+@table_command.command("verdict")
+@_table_options
+def verdict_command(store: Location, style: Format, orders: tuple[float, ...]) -> None:
+    """Print the nearest mesh at each size, and the smallest below 5 % and 1 %."""
+    from sobolev_batch.results.tables.verdict import format_verdict
+
+    echo_lines(format_verdict(_tree_of_one(store), style, orders or None))
+
+
 @table_command.command("time")
 @_table_options
 @click.option(

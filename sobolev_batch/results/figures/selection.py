@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self, TypeVar
+from typing import Self
 
 import numpy as np
 import xarray as xr
@@ -25,11 +25,10 @@ from sobolev_batch.results.open import (
     reference_of,
 )
 from sobolev_batch.results.store_accessor import StoreAccessor
+from sobolev_batch.results.tables.text import spread
 from sobolev_batch.spectral.lattice import Orders, check_orders
 from sobolev_batch.spectral.metrics.causes import spectrum
 from sobolev_batch.surfaces.shapes.surface import Reals
-
-Item = TypeVar("Item")
 
 # A field is read for each mesh; one of 17 MB takes about a quarter of a second.
 MOST_SPECTRA = 24
@@ -156,8 +155,3 @@ class Spectra:
             f"> {short:.3g}" if np.isinf(long) else f"{long:.3g} – {short:.3g}"
             for long, short in zip(self.longest, self.shortest, strict=True)
         )
-
-
-def spread(items: Sequence[Item], most: int) -> list[Item]:
-    """Return a limited number of items: the first, the last, and others evenly between."""
-    return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int))]

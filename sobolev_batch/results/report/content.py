@@ -13,18 +13,9 @@ import xarray as xr
 
 from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.errors import InputError
-from sobolev_batch.results.figures.selection import spread
 from sobolev_batch.results.open import finished_group, has_proximity, open_store, placement_doubts
 from sobolev_batch.results.status import Status
-from sobolev_batch.results.tables.convergence import (
-    nearest,
-    page_columns,
-    smallest_of,
-    table,
-    tables_of,
-    unit_notes,
-    with_remarks,
-)
+from sobolev_batch.results.tables.convergence import page_columns, table, tables_of, unit_notes, with_remarks
 from sobolev_batch.results.tables.league import (
     LEAGUE_COLUMNS,
     LEAGUE_NOTE,
@@ -36,15 +27,12 @@ from sobolev_batch.results.tables.league import (
     pair_lines,
     percent_text,
 )
-from sobolev_batch.results.tables.text import Column, count, duration, minus, percent
+from sobolev_batch.results.tables.text import Column, duration, minus, percent
+from sobolev_batch.results.tables.verdict import MOST_NAMED, VERDICT_COLUMNS, Row, study_verdict
 from sobolev_batch.spectral.lattice import Lattice
 
 # Rows of all convergence tables together, of the table of meshes, and of reasons; browsers become slow beyond.
 MOST_CONVERGENCE_ROWS, MOST_MESH_ROWS, _MOST_REASONS = 10_000, 5_000, 2_000
-
-# A row of a table: a record of a frame. It may also have its "order"; a "mark", a short remark about its marked number;
-# the number of its "color"; and the text "absent" in place of all numbers, with the section "reasons" that explains it.
-Row = Mapping[Any, Any]
 
 
 @dataclass(frozen=True)
@@ -151,161 +139,20 @@ def _run_facts(status: Status) -> Iterator[tuple[str, str]]:
             yield "error", status.run.error
 
 
-_BOUNDS = (0.05, 0.01)
-# Meshes whose numbers of triangles differ by no more than this factor are of one size.
-_SAME_SIZE = 1.2
-# More rows are no verdict any more.
-_MOST_SIZES = 8
-_MOST_FAMILIES = 6
-_MOST_NAMED = 3
-
-_COLUMNS = (
-    Column("verdict", "verdict", kind="label"),
-    Column("mesh", "mesh", kind="text"),
-    Column("relative", "relative", percent, "relative_error"),
-    Column("triangles", "triangles", count),
-    Column("remark", "remark", kind="text"),
-)
-
-
-def study_verdict(frame: pd.DataFrame, failed: Mapping[str, str]) -> tuple[tuple[str, ...], PageTable, str]:
-    """Return the verdict on a study at each order, from the rows of `table` and the reasons of meshes that are missing.
-
-    It is a sentence for each order; the table of nearest meshes, smallest meshes below bounds, and meshes that are
-    missing or imprecise; and a note on the sizes and families that the table leaves out, empty where it has all.
-    """
-    groups = [(float(order), rows) for order, rows in frame.groupby("order", sort=False)]
-    sizes = _sizes(groups[0][1])
-    shown_sizes = spread(sizes, _MOST_SIZES)
-    sized = frame[frame["triangles"] > 0]["family"].unique().tolist()
-    lines: list[Row] = []
-    for order, rows in groups:
-        at_sizes = [rows[rows["mesh"].isin(labels)] for labels in shown_sizes]
-        nearest_rows, smallest_rows = _nearest_rows(rows, at_sizes), _smallest_rows(rows, sized[:_MOST_FAMILIES])
-        of_order = (*nearest_rows, *smallest_rows, *_doubtful_rows(rows, failed))
-        lines += [{**line, "order": order} for line in of_order]
-    omitted = [
-        f"{shown} of {total} {things}"
-        for shown, total, things in (
-            (len(shown_sizes), len(sizes), "sizes"),
-            (min(len(sized), _MOST_FAMILIES), len(sized), "families"),
-        )
-        if shown < total
-    ]
-    sentences = tuple(_sentence(order, rows, frame.attrs["reference"]) for order, rows in groups)
-    table = PageTable("verdict", _COLUMNS, lines, [order for order, _ in groups], is_sortable=False)
-    return sentences, table, " and ".join(omitted)
-
-
-def _sentence(order: float, rows: pd.DataFrame, reference: str) -> str:
-    """Return a sentence on one order."""
-    name, at_order = "the reference" if reference == "reference" else reference, minus(f"at order {order:g}")
-    closest, compared = nearest(rows), int(rows["distance"].notna().sum())
-    if compared == 0:
-        return f"No mesh could be compared with {name}."
-    if closest is None:
-        return f"No distance to {name} is above its error {at_order}: the meshes may be equal to it."
-    best, rivals = closest
-    # On one line, in a sentence.
-    amount = percent(best["relative"], best["relative_error"]).replace(" ", "\N{NO-BREAK SPACE}")
-    doubt = f", and the errors leave open whether {rivals[0]} is nearer" if rivals else ""
-    if compared == 1:
-        return f"{best['mesh']} differs from {name} by {amount} {at_order}."
-    return f"Of {compared:,} meshes, {best['mesh']} is nearest to {name} {at_order}: it differs by {amount}{doubt}."
-
-
-def _sizes(rows: pd.DataFrame) -> list[list[str]]:
-    """Return the labels of meshes of about as many triangles, where these are of several families."""
-    known = rows[rows["triangles"] > 0].sort_values("triangles", kind="stable")
-    sizes: list[pd.DataFrame] = []
-    while len(known):
-        is_same = known["triangles"] <= _SAME_SIZE * known["triangles"].iloc[0]
-        sizes.append(known[is_same])
-        known = known[~is_same]
-    return [size["mesh"].tolist() for size in sizes if size["family"].nunique() > 1]
-
-
-def _nearest_rows(rows: pd.DataFrame, at_sizes: Sequence[pd.DataFrame]) -> Iterator[Row]:
-    """Yield the nearest mesh of all, and those of each size."""
-    yield _nearest_row("nearest of all", rows)
-    for members in at_sizes:
-        low, high = int(members["triangles"].min()), int(members["triangles"].max())
-        counts = f"{low:,}" if low == high else f"{low:,} to {high:,}"
-        yield _nearest_row(f"{counts} triangles", members)
-
-
-def _nearest_row(label: str, members: pd.DataFrame) -> Row:
-    closest = nearest(members)
-    if closest is None:
-        is_known = members["distance"].notna().any()
-        return _absent(label, "no distance is above its error" if is_known else "no distance is known")
-    best, rivals = closest
-    return _row(label, best, f"errors leave open {_names(rivals)}" if rivals else _lead(best, members))
-
-
-def _lead(best: pd.Series, members: pd.DataFrame) -> str:
-    """Return by how much the nearest mesh is nearer than the next one of another family."""
-    others = members[(members["family"] != best["family"]) & members["distance"].notna()]
-    if not len(others):
-        return ""
-    second = others.loc[others["distance"].idxmin()]
-    ratio = second["distance"] / best["distance"]
-    return f"{ratio:.3g} times nearer than {second['mesh']}" if ratio < 100 else f"far nearer than {second['mesh']}"
-
-
-def _smallest_rows(rows: pd.DataFrame, families: Sequence[str]) -> Iterator[Row]:
-    """Yield the smallest mesh of each family below each bound."""
-    for bound in _BOUNDS:
-        frame = smallest_of(rows, bound)
-        for row in frame[frame["family"].isin(families)].to_dict(orient="records"):
-            label = f"below {100 * bound:g} %: {row['family']}"
-            open_ones = f"errors leave open {_names(row['undecided'])}" if row["undecided"] else ""
-            if row["mesh"]:
-                yield _row(label, row, open_ones)
-            else:
-                amount = percent(row["nearest_relative"], row["nearest_relative_error"])
-                closest = f"{row['nearest']} has {amount}" if row["nearest"] else ""
-                yield _absent(label, "; ".join(filter(None, ("none", closest, open_ones))))
-
-
-def _doubtful_rows(rows: pd.DataFrame, failed: Mapping[str, str]) -> Iterator[Row]:
-    """Yield the meshes whose distances have larger errors than the study requests, and those that failed."""
-    short = rows[rows["resolved"].astype(bool) & ~rows["within"].astype(bool) & rows["distance"].notna()]
-    if len(short):
-        yield _absent("above rtol", _names(short["mesh"].tolist()))
-    if failed:
-        yield {**_absent("missing", _names(list(failed))), "reasons": "failed"}
-
-
-def _row(label: str, mesh: Mapping[str, Any] | pd.Series, remark: str) -> Row:
-    numbers = {name: mesh[name] for name in ("mesh", "relative", "relative_error", "triangles")}
-    return {"verdict": label, **numbers, "remark": remark}
-
-
-def _absent(label: str, text: str) -> Row:
-    """Return a row with a text in place of numbers."""
-    return {"verdict": label, "absent": text}
-
-
-def _names(labels: Sequence[str]) -> str:
-    """Return a few labels, and how many more there are."""
-    more = len(labels) - _MOST_NAMED
-    return ", ".join(labels[:_MOST_NAMED]) + (f" and {more:,} more" if more > 0 else "")
-
-
 def study_content(tree: xr.DataTree, status: Status) -> dict[str, Any]:
     """Return what the template of an open store takes, nothing escaped; InputError where it has no tables yet."""
     meshes, convergence = finished_group(tree, "meshes"), finished_group(tree, "convergence")
     attributes: Mapping[str, Any] = {str(key): value for key, value in tree.attrs.items()}
     families = tuple(dict.fromkeys(meshes["family"].values.tolist()))
     frame, failed, study = table(tree), _failures(meshes), attributes["study"]["table"]
-    sentences, verdict, omitted = study_verdict(frame, failed)
+    sentences, rows, omitted = study_verdict(frame, failed)
+    orders = frame["order"].drop_duplicates().tolist()
     return {
         **common_content(attributes["title"], study, {"": frame}, status, failed, attributes["versions"]),
         "reference": convergence.attrs["reference"],
         "settings": dict(_settings(attributes)),
         "sentences": sentences,
-        "verdict": verdict,
+        "verdict": PageTable("verdict", VERDICT_COLUMNS, rows, orders, is_sortable=False),
         "verdict_omitted": omitted,
         "convergence": convergence_table(tree, frame, families, MOST_CONVERGENCE_ROWS // convergence.sizes["order"]),
         "meshes": _meshes_table(meshes, families),
@@ -448,7 +295,7 @@ def sentence_of(league: League) -> str:
     if count == 1:
         return f"{first} is nearest {over} {at_order}: it differs by {amount}. One object ranks no methods."
     names = f"{', '.join(leaders[:-1])} and {leaders[-1]}"
-    if len(leaders) > _MOST_NAMED:
+    if len(leaders) > MOST_NAMED:
         names = f"{len(leaders)} of {len(table)} methods"
     return f"The intervals do not separate {names} {over} {at_order}. {first} has the smallest mean, {amount}."
 

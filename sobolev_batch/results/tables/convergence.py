@@ -38,6 +38,7 @@ from sobolev_batch.results.tables.text import (
     prose,
     section,
     with_error,
+    wrapped,
 )
 from sobolev_batch.spectral.budget import PARTS
 from sobolev_batch.spectral.lattice import Orders
@@ -123,7 +124,7 @@ _SMALLEST_COLUMNS = (
     _MESH,
     _TRIANGLES,
     Column("relative", "relative", percent, "relative_error"),
-    Column("remark", "remark"),
+    Column("remark", "remark", kind="text"),
 )
 # Of distances, in texts.
 _MARKS = {"": "", "below its error": "*", "above rtol": "!"}
@@ -251,7 +252,7 @@ def _tables(tree: xr.DataTree, frame: pd.DataFrame, style: Format) -> Iterator[s
     marked = with_remarks(frame)
     for order, rows in marked.groupby("order", sort=False):
         caption = f"Sobolev distance of order {order:g} to {frame.attrs['reference']}"
-        yield section(caption, [_table(rows, _COLUMNS, style)], _nearest(rows), style)
+        yield section(caption, [_table(rows, _COLUMNS, style)], [], style)
     if has_proximity(tree):
         once = marked[marked["order"] == marked["order"].iloc[0]]
         columns = _metric_columns(tree)
@@ -284,17 +285,6 @@ def nearest(frame: pd.DataFrame) -> tuple[pd.Series, tuple[str, ...]] | None:
     others = rows[rows["mesh"] != best["mesh"]]
     rivals = others[others["distance"] - others["error"] < best["distance"] + best["error"]]
     return best, tuple(rivals["mesh"])
-
-
-def _nearest(frame: pd.DataFrame) -> list[str]:
-    """Return a sentence about the mesh that is nearest to the reference at one order, if one is known to be."""
-    closest = nearest(frame)
-    if closest is None:
-        return []
-    best, rivals = closest
-    amount = percent(best["relative"], best["relative_error"])
-    doubt = f"; its errors leave open whether {rivals[0]} is nearer" if rivals else ""
-    return [f"Nearest: {best['mesh']}, which differs by {amount}{doubt}."]
 
 
 def _metrics_of(tree: xr.DataTree) -> list[str]:
@@ -337,12 +327,12 @@ def with_remarks(frame: pd.DataFrame) -> pd.DataFrame:
 
 def _notes(trees: Sequence[xr.DataTree], frames: Sequence[pd.DataFrame], x: str) -> list[str]:
     """Return what the numbers of all tables mean."""
-    notes = [*_NOTE.splitlines(), *([] if x == EDGE_LENGTH else [f"Rates are those of distance ~ ({x})^-rate."])]
-    notes += unit_notes(trees)
+    notes = [*wrapped(_NOTE), *([] if x == EDGE_LENGTH else [f"Rates are those of distance ~ ({x})^-rate."])]
+    notes += wrapped(" ".join(unit_notes(trees)))
     if any(map(has_proximity, trees)):
-        notes += _PROXIMITY_NOTE.splitlines()
+        notes += wrapped(_PROXIMITY_NOTE)
     for rtol in dict.fromkeys(frame.attrs["rtol"] for frame in frames if "rtol" in frame.attrs):
-        notes += _ACCURACY_NOTE.format(rtol=rtol).splitlines()
+        notes += wrapped(_ACCURACY_NOTE.format(rtol=rtol))
     return notes
 
 
@@ -441,7 +431,7 @@ def format_smallest(
             {**row, "mesh": row["mesh"] or "none", "remark": _remark(row)} for row in rows.to_dict(orient="records")
         ]
         sections.append(section(caption, [column_table(_SMALLEST_COLUMNS, cells, style)], [], style))
-    return "\n\n".join([*sections, prose(_SMALLEST_NOTE.splitlines(), style)])
+    return "\n\n".join([*sections, prose(wrapped(_SMALLEST_NOTE), style)])
 
 
 def _smallest(members: pd.DataFrame, most: float) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sobolev_batch.errors import InputError
 from sobolev_batch.results.open import EDGE_LENGTH, sizes_of
 from sobolev_batch.results.tables import Format
-from sobolev_batch.results.tables.text import Column, column_table, machine_table, percent, prose, section
+from sobolev_batch.results.tables.text import Column, column_table, machine_table, percent, prose, section, wrapped
 from sobolev_batch.spectral.adaptive.tolerance import NEXT_TO_EQUAL
 
 DEFAULT_COST = "make_seconds"
@@ -211,7 +211,7 @@ def format_cost_leagues(leagues: Sequence[CostLeague], style: Format = "text") -
         )
         tables = [methods, *([column_table(columns, rows, style)] if rows else [])]
         sections.append(section(one.caption, tables, _front_lines(one), style))
-    notes = [*_NOTE.splitlines(), *(f"{name} is left out: {why}." for name, why in leagues[0].left_out.items())]
+    notes = [*wrapped(_NOTE), *(f"{name} is left out: {why}." for name, why in leagues[0].left_out.items())]
     return "\n\n".join([*sections, prose(notes, style)])
 
 

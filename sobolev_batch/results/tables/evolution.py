@@ -13,7 +13,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.results.open import AnyStore, as_tree, complete_meshes, finished_group, has_times, reference_of
 from sobolev_batch.results.store_accessor import StoreAccessor, convergence_at
 from sobolev_batch.results.tables import Format
-from sobolev_batch.results.tables.text import machine_table, printed_table, prose, section, with_error
+from sobolev_batch.results.tables.text import machine_table, printed_table, prose, section, with_error, wrapped
 from sobolev_batch.spectral.lattice import Orders, check_orders
 from sobolev_batch.spectral.metrics.datasets import NUMBER, VARIABLES, described
 from sobolev_batch.surfaces.sources.names import quoted
@@ -114,7 +114,7 @@ def format_evolution(
         caption = f"Sobolev distance of order {order:g} to {truth or reference_of(tree)} over time, in % of its norm"
         moments = [f"{family}: {_moment(rows.sel(family=family), factor)}" for family in families]
         sections.append(section(caption, [printed_table(cells, ["time", *families], style)], moments, style))
-    return "\n\n".join([*sections, prose(_NOTE.format(factor=factor).splitlines(), style)])
+    return "\n\n".join([*sections, prose(wrapped(_NOTE.format(factor=factor)), style)])
 
 
 def _labels_by_time(tree: xr.DataTree, truth: str | None) -> tuple[dict[str, dict[float, str]], dict[float, str]]:

@@ -31,7 +31,7 @@ from sobolev_batch.results.tables.statistics import (
     sign_flip_test,
     within_objects,
 )
-from sobolev_batch.results.tables.text import Column, column_table, machine_table, prose, section
+from sobolev_batch.results.tables.text import Column, column_table, machine_table, prose, section, wrapped
 from sobolev_batch.spectral.adaptive.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.spectral.lattice import Orders
 from sobolev_batch.surfaces.sources.names import quoted
@@ -467,7 +467,7 @@ def format_league(leagues: Sequence[League], style: Format = "text") -> str:
     for one in leagues:
         rows = column_table(LEAGUE_COLUMNS[:-1], one.table.to_dict(orient="records"), style)
         sections.append(section(one.caption, [rows], pair_lines(one), style))
-    notes = LEAGUE_NOTE.format(x=leagues[0].x).splitlines()
+    notes = wrapped(LEAGUE_NOTE.format(x=leagues[0].x))
     notes += [f"{name} is left out{where}: {reason}." for name, where, reason in left_out(leagues)]
     return "\n\n".join([*sections, prose(notes, style)])
 
@@ -492,7 +492,7 @@ def format_changes(changes: pd.DataFrame, style: Format = "text") -> str:
         rows = column_table(_CHANGE_COLUMNS, frame.to_dict(orient="records"), style)
         sections.append(section(f"New study against the old one at order {order:g}", [rows], [], style))
     units = "objects" if (changes["objects"] > 1).all() else "meshes"
-    notes = _CHANGES_NOTE.format(units=units).splitlines()
+    notes = wrapped(_CHANGES_NOTE.format(units=units))
     least = least_objects(changes["method"].nunique())
     if (changes[units] < least).any():
         notes.append(f"With fewer than {least} {units}, the test decides nothing; look at the intervals.")

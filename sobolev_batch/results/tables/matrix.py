@@ -15,7 +15,7 @@ from sobolev_batch.results.open import AnyStore, as_tree, complete_meshes, finis
 from sobolev_batch.results.store_accessor import distances_at, norms_at, order_note
 from sobolev_batch.results.tables import Format
 from sobolev_batch.results.tables.text import (
-    LINE_LENGTH,
+    line_length,
     machine_table,
     middle_cut,
     printed_table,
@@ -161,7 +161,7 @@ def _tables(distances: xr.Dataset, numbers: Reals, errors: Reals, style: Format)
     room = max(1, len(columns))
     if style == "text":
         cell_width = max((len(row[j]) for row in cells for j in columns), default=0) + 2
-        room = max(1, (LINE_LENGTH - max(map(len, names)) - 2) // cell_width)
+        room = max(1, (line_length() - max(map(len, names)) - 2) // cell_width)
     tables = []
     for group in [columns[start : start + room] for start in range(0, max(1, len(columns)), room)]:
         # The mesh of the first column has no cells below the diagonal, and is named all the same.

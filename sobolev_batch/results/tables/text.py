@@ -6,10 +6,13 @@ import json
 import math
 import os
 import re
+import shutil
+import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
+import numpy as np
 import pandas as pd
 from tabulate import tabulate
 
@@ -18,6 +21,8 @@ from sobolev_batch.visible import visible
 
 if TYPE_CHECKING:
     import xarray as xr
+
+Item = TypeVar("Item")
 
 
 # More digits are hard to read, whatever the error.
@@ -133,6 +138,11 @@ def minus(text: str) -> str:
     return text.replace("-", "−")
 
 
+def spread(items: Sequence[Item], most: int) -> list[Item]:
+    """Return a limited number of items: the first, the last, and others evenly between."""
+    return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int))]
+
+
 def middle_cut(label: str, longest: int) -> str:
     """Return a label that is cut in its middle: labels of one family differ at their ends."""
     return label if len(label) <= longest else f"{label[: longest // 2]}…{label[1 - longest // 2 :]}"
@@ -234,9 +244,8 @@ def _power(power: int) -> str:
 
 _TABULATE_FORMATS = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
 
-# Longest line of text tables, and the least that remains of a label.
-LINE_LENGTH = 100
-_SHORTEST_LABEL = 20
+# Length of lines without a terminal, longest line of prose, and the least that remains of a label or a text.
+_LINE_LENGTH, _LONGEST_PROSE, _SHORTEST_TEXT = 100, 100, 20
 # Spaces between columns, and beside headers, by tabulate.
 _GAP, _PADDING = 2, 2
 # Spreadsheets take texts that begin so for formulas, and run them; those of East Asia also take the wide ones.
@@ -279,7 +288,8 @@ class Column:
 def column_table(columns: Sequence[Column], rows: Iterable[Mapping[Any, Any]], style: Format) -> str:
     """Return rows of a frame as a table for people; see `printed_table`."""
     cells = [[column.text(row) for column in columns] for row in rows]
-    return printed_table(cells, [column.header for column in columns], style)
+    texts = [number for number, column in enumerate(columns) if column.kind == "text"]
+    return printed_table(cells, [column.header for column in columns], style, texts)
 
 
 def section(caption: str, tables: Iterable[str], sentences: Iterable[str], style: Format) -> str:
@@ -308,36 +318,102 @@ def _plain(value: Any) -> Any:
     return os.fspath(value) if isinstance(value, os.PathLike) else asdict(value)
 
 
-def printed_table(rows: Sequence[Sequence[str]], headers: Sequence[str], style: Format) -> str:
-    """Return cells as a table whose columns are aligned to the right, but for the first.
+def line_length() -> int:
+    """Return the length of a line: that of the terminal where there is one."""
+    return shutil.get_terminal_size((_LINE_LENGTH, 0)).columns
 
-    In a text the labels of the first column are cut in their middle where lines would be too long. LaTeX's special
-    characters are escaped by tabulate.
+
+def printed_table(
+    rows: Sequence[Sequence[str]], headers: Sequence[str], style: Format, texts: Sequence[int] = ()
+) -> str:
+    """Return cells as a table whose columns are aligned to the right, but for the first and for those of texts.
+
+    In a text, labels of the first column and texts give way where lines would be too long: labels lose what they
+    repeat and then their middle, and texts are wrapped. Columns that still have no room follow in a table of their own.
+    LaTeX's special characters are escaped by tabulate.
     """
     rows, headers = (
         [[_escaped(cell, style) for cell in row] for row in rows],
         [_escaped(text, style) for text in headers],
     )
+    groups: list[list[int]] = [list(range(1, len(headers)))]
     if style == "text":
-        rows = _with_short_labels(rows, headers)
-    table = str(
-        tabulate(
-            rows,
-            headers=headers,
-            tablefmt=_TABULATE_FORMATS[style],
-            disable_numparse=True,
-            colalign=("left", *["right"] * (len(headers) - 1)),
+        rows = _with_short_texts(rows, headers, texts)
+        groups, room = [], 0
+        first, *widths = _widths(rows, headers)
+        for column, width in enumerate(widths, 1):
+            if not groups or width + _GAP > room:
+                groups.append([])
+                room = line_length() - first
+            groups[-1].append(column)
+            room -= width + _GAP
+    tables = [
+        str(
+            tabulate(
+                [[row[0], *(row[column] for column in group)] for row in rows],
+                headers=[headers[0], *(headers[column] for column in group)],
+                tablefmt=_TABULATE_FORMATS[style],
+                disable_numparse=True,
+                colalign=("left", *("left" if column in texts else "right" for column in group)),
+            )
         )
-    )
+        for group in groups
+    ]
+    table = "\n\n".join(tables)
     return _LATEX_OPTIONS.sub(r"\1{}", latex_powers(table)) if style == "latex" else table
 
 
-def _with_short_labels(rows: Sequence[Sequence[str]], headers: Sequence[str]) -> Sequence[Sequence[str]]:
-    """Return rows with labels that are cut so that lines fit, unless two labels would then be the same."""
-    widths = [max(len(header) + _PADDING, *map(len, column)) for header, *column in zip(headers, *rows, strict=True)]
-    room = LINE_LENGTH - sum(widths[1:]) - _GAP * (len(widths) - 1)
-    cut = [[middle_cut(row[0], max(room, _SHORTEST_LABEL)), *row[1:]] for row in rows]
-    return cut if len({row[0] for row in cut}) == len({row[0] for row in rows}) else rows
+def _widths(rows: Sequence[Sequence[str]], headers: Sequence[str]) -> list[int]:
+    return [
+        max(len(header) + _PADDING, *(len(line) for cell in column for line in cell.split("\n")))
+        for header, *column in zip(headers, *rows, strict=True)
+    ]
+
+
+def _with_short_texts(
+    rows: Sequence[Sequence[str]], headers: Sequence[str], texts: Sequence[int]
+) -> Sequence[Sequence[str]]:
+    """Return rows whose labels and texts are shortened so that lines fit, unless two labels would then be the same."""
+
+    def missing() -> int:
+        widths = _widths(rows, headers)
+        return sum(widths) + _GAP * (len(widths) - 1) - line_length()
+
+    for column in texts:
+        if (lacking := missing()) > 0:
+            width = max(_widths(rows, headers)[column] - lacking, _SHORTEST_TEXT)
+            cells = ["\n".join(textwrap.wrap(row[column], width, break_long_words=False)) for row in rows]
+            rows = [[*row[:column], cell, *row[column + 1 :]] for row, cell in zip(rows, cells, strict=True)]
+    for shorten in (_without_repeats, _cut):
+        if (lacking := missing()) > 0:
+            labels = [row[0] for row in rows]
+            shorter = shorten(labels, max(_widths(rows, headers)[0] - lacking, _SHORTEST_TEXT))
+            if len(set(shorter)) == len(set(labels)):
+                rows = [[label, *row[1:]] for label, row in zip(shorter, rows, strict=True)]
+    return rows
+
+
+def _without_repeats(labels: Sequence[str], _longest: int) -> list[str]:
+    """Return labels FAMILY/NAME without the family, or the beginning of all names, at the beginning of the name."""
+    parts = [label.partition("/") for label in labels]
+    names = {name for _, slash, name in parts if slash}
+    common = os.path.commonprefix([*names]) if len(names) > 1 else ""  # noqa: RUF071 -- of characters
+    # Words and numbers stay whole.
+    common = common[: max(map(common.rfind, "_-. ")) + 1]
+    shorter = []
+    for family, slash, name in parts:
+        rest = name.removeprefix(family if name.startswith(family) else common)
+        shorter.append(f"{family}/…{rest}" if slash and rest and len(name) - len(rest) > 1 else family + slash + name)
+    return shorter
+
+
+def _cut(labels: Sequence[str], longest: int) -> list[str]:
+    return [middle_cut(label, longest) for label in labels]
+
+
+def wrapped(text: str) -> list[str]:
+    """Return the lines of a paragraph that fits the terminal."""
+    return textwrap.wrap(" ".join(text.split()), min(line_length(), _LONGEST_PROSE))
 
 
 def prose(lines: Iterable[str], style: Format) -> str:

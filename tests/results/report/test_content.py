@@ -8,8 +8,9 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from sobolev_batch.results.report.content import convergence_table, study_verdict
+from sobolev_batch.results.report.content import convergence_table
 from sobolev_batch.results.tables.convergence import table
+from sobolev_batch.results.tables.verdict import VERDICT_COLUMNS, study_verdict
 
 
 def cells(tree: xr.DataTree, order: float) -> list[dict[str, str]]:
@@ -52,10 +53,9 @@ def frame(meshes: Meshes, error: float = 1e-3, **changes: Any) -> pd.DataFrame:
 
 def verdict_on(made: pd.DataFrame, failed: dict[str, str] | None = None) -> tuple[str, dict[str, list[str]], str]:
     """Return the sentence at the first order, the texts of its rows, and what the table leaves out."""
-    sentences, table, omitted = study_verdict(made, failed or {})
-    (_, _, rows), *_ = table.bodies
+    sentences, rows, omitted = study_verdict(made, failed or {})
     texts = {
-        row["verdict"]: [row["absent"]] if "absent" in row else [column.text(row) for column in table.columns[1:]]
+        row["verdict"]: [row["absent"]] if "absent" in row else [column.text(row) for column in VERDICT_COLUMNS[1:]]
         for row in rows
     }
     return sentences[0], texts, omitted

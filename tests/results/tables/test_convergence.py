@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from io import StringIO
 from itertools import product
 from typing import Any
 
@@ -18,10 +19,12 @@ from sobolev_batch.batch.store.store import Store
 from sobolev_batch.errors import InputError
 from sobolev_batch.results.tables.convergence import format_smallest, format_table
 from sobolev_batch.results.tables.matrix import format_matrix
+from sobolev_batch.results.tables.text import printed_table
+from sobolev_batch.results.tables.verdict import format_verdict
 from tests.support.studies import small_table
 
 
-def test_text_shows_values_rates_what_is_missing_and_the_nearest_mesh(tree: xr.DataTree) -> None:
+def test_text_shows_values_rates_what_is_missing_and_a_verdict(tree: xr.DataTree) -> None:
     text = format_table(tree, "text", [-2.5])
     assert text.splitlines()[0] == "Sobolev distance of order -2.5 to reference"
     rows = [line.split() for line in text.splitlines() if line.startswith("f_1")]
@@ -30,9 +33,12 @@ def test_text_shows_values_rates_what_is_missing_and_the_nearest_mesh(tree: xr.D
     assert rows[2] == ["f_1/2", *["missing"] * 6]
     assert "\n\nf_1/2 failed: no 50% of it | is <there>\n\n" in text
     # A mesh whose distance is not larger than its error may be nearer.
-    unsure = "\n\nNearest: f_1/0, which differs by 20.00 % ± 0.02 %; its errors leave open whether f_1/1 is nearer."
-    assert unsure in text
-    assert "\n\nNearest: f_1/1, which differs by 2.500 % ± 0.003 %.\n\n" in format_table(tree, "text", [-10.0])
+    unsure, sure = (format_verdict(tree, "text", [order]).splitlines() for order in (-2.5, -10.0))
+    assert " ".join(unsure[4].split()) == "nearest of all f_1/0 20.00 % ± 0.02 % 20 errors leave open f_1/1"
+    assert " ".join(sure[4].split()) == "nearest of all f_1/1 2.500 % ± 0.003 % 1,280"
+    assert sure[-1].split() == ["missing", "f_1/2"]
+    frame = pd.read_csv(StringIO(format_verdict(tree, "csv", [-10.0])))
+    assert frame.loc[0, ["verdict", "mesh", "triangles"]].tolist() == ["nearest of all", "f_1/1", 1280]
 
 
 def test_lines_stay_readable(tree: xr.DataTree, near: xr.DataTree) -> None:
@@ -42,10 +48,30 @@ def test_lines_stay_readable(tree: xr.DataTree, near: xr.DataTree) -> None:
     groups = {name: group for name, group in tree.to_dict().items() if "mesh" in group.coords}
     renamed = xr.DataTree.from_dict({name: group.assign_coords(mesh=labels) for name, group in groups.items()})
     text = format_table(renamed, "text", [-10.0])
-    assert max(map(len, text.split("Nearest")[0].splitlines())) <= 100
+    assert max(map(len, text.splitlines())) <= 100
     assert re.search(r"^f_1/x+…x+/0 +20 ", text, re.MULTILINE)
     # Other programs set tables themselves.
     assert "x" * 60 in format_table(renamed, "markdown", [-10.0]).splitlines()[4]
+
+
+@pytest.mark.parametrize("columns", [80, 120])
+def test_tables_fit_the_terminal(columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", str(columns))
+    labels = ["koala_qem/koala_qem_4500", "mmg/koala_900", "reference"]
+    numbers = [f"{label}'s {'number' * 2}" for label in "abc"]
+    remark = " ".join(["errors leave open"] * 4)
+    text = printed_table([[label, *numbers, remark] for label in labels], ["mesh", *"xyz", "remark"], "text", [4])
+    assert max(map(len, text.splitlines())) <= columns
+    # Nothing is lost, and labels are cut only where there is no room.
+    assert text.count("errors leave open") == 3 * 4
+    assert all(text.count(number) == len(labels) for number in numbers)
+    assert (labels[0] in text) == (columns == 120)
+    wide = [[label, *numbers, "number " * 5] for label in labels]
+    text = printed_table(wide, ["mesh", *"xyz", "last"], "text")
+    assert max(map(len, text.splitlines())) <= columns
+    expected = labels[:2] if columns == 120 else ["koala_qem/…_4500", "mmg/…900"]
+    assert [line.split()[0] for line in text.splitlines() if "/" in line][:2] == expected
+    assert all(text.count(number) == len(labels) for number in numbers)
 
 
 def test_every_order_gets_a_table_and_small_numbers_are_formulas_of_latex(tree: xr.DataTree) -> None:
@@ -108,8 +134,8 @@ def test_notes_are_those_of_all_objects(tree: xr.DataTree, near: xr.DataTree) ->
     for objects in ({"a": near, "b": precise}, {"b": precise, "a": near}):
         text = format_table(objects, x="triangles")
         assert re.findall(r"^Object (.)$", text, re.MULTILINE) == list(objects)
-        assert "Hausdorff is a lower bound" in text
-        assert "an error of at most 0.02" in text
+        assert "Hausdorff is a lower bound" in " ".join(text.split())
+        assert "an error of at most 0.02" in " ".join(text.split())
         # Failures follow the table of their own object.
         a, b = (text.index(f"Object {name}") for name in "ab")
         assert text.index("f_1/1 has no proximity") > a
