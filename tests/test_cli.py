@@ -93,6 +93,19 @@ def test_a_second_run_reuses_everything_as_plan_and_status_say(folder: Path) -> 
     assert len(re.findall("^chosen: ", output("plan", "asking.toml", folder=folder), re.M)) == 3
 
 
+def test_a_part_of_a_study_and_then_the_rest(folder: Path) -> None:
+    arguments = ("run", "study.toml", "--store", "part.zarr", "--workers", "1")
+    shown = output(*arguments, "--only", "ico/[0]", folder=folder)
+    assert "2 computed, 0 reused, 0 failed" in shown
+    assert re.search(r"^ico/0 +20 ", shown, re.M)
+    assert re.search(r"^ico/1( +missing){6}$", shown, re.M)
+    assert "2 of 3 complete, 0 failed, 1 to go" in output("status", "part.zarr", folder=folder, status=3)
+    assert "1 computed, 2 reused, 0 failed" in output(*arguments, folder=folder)
+    columns = ["mesh", "order", "distance", "error", "rate"]
+    part, whole = (sb.table(folder / store)[columns] for store in ("part.zarr", STORE))
+    pd.testing.assert_frame_equal(part, whole, rtol=1e-12)
+
+
 def test_tables_in_every_format_at_lists_of_orders(folder: Path) -> None:
     frames = {
         style: output("table", STORE, "--format", style, "--order=-3, -10", "--order", "-3.7,-3", folder=folder)
@@ -322,6 +335,7 @@ REFUSED = [
     ("run study.toml --store 1.off", "it is a file"),
     ("run study.toml --store /proc/x.zarr", "/proc/x.zarr: the store cannot be written"),
     (f"run other.toml --store {STORE}", "it holds a store of another study"),
+    ("run study.toml --only ico/11 --store none.zarr", "is 'ico/11'; did you mean ico/1?"),
     ("run greedy.toml", "memory of 1.0PB is more than there is"),
     ("run lacking.toml --store none.zarr", "matches no file"),
     ("status nothing.zarr", "it holds no store of a study"),

@@ -5,17 +5,19 @@ from __future__ import annotations
 import logging
 import math
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
 from sobolev_batch.batch.analysis.pairs import PAIR_BYTES
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.study.plan import members_of
+from sobolev_batch.batch.study.schema import known_names
 from sobolev_batch.batch.study.study import REFERENCE_LABEL, AnyStudy, Study, StudyCollection, StudyLike, as_study
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.parameters import format_bytes
 from sobolev_batch.surfaces.sources.mesh_cache import MeshCache
+from sobolev_batch.surfaces.sources.names import quoted
 from sobolev_batch.surfaces.sources.registry import ExpectedSize, Member
 
 _log = logging.getLogger(__name__)
@@ -44,8 +46,15 @@ def settled(study: StudyLike, store: StoreLike, *, may_run: bool) -> tuple[AnySt
     return study.with_cache(MeshCache(location.absolute().beside(_MADE_MESHES), may_run)), location
 
 
-def ready_to_run(study: StudyLike, store: StoreLike, *, allow_commands: bool) -> tuple[AnyStudy, Location]:
-    """Return a study that may run, and the place of its store; log what would make the run useless."""
+def ready_to_run(
+    study: StudyLike, store: StoreLike, *, allow_commands: bool, only: Sequence[str] = ()
+) -> tuple[AnyStudy, Location]:
+    """Return a study that may run, of which only a part may be chosen, and the place of its store.
+
+    What would make the run useless is logged.
+    """
+    study = as_study(study).with_only(tuple(only))
+    _require_members(study, only)
     study, location = settled(study, store, may_run=True)
     require_permission(study, allow_commands)
     if store is None:
@@ -55,6 +64,21 @@ def ready_to_run(study: StudyLike, store: StoreLike, *, allow_commands: bool) ->
     for text in warnings_of(study, location):
         _log.warning("%s", text)
     return study, location
+
+
+def _require_members(study: AnyStudy, only: Sequence[str]) -> None:
+    """Refuse names of families and members that no object of a study has."""
+    families: dict[str, str] = {}
+    studies = [study] if isinstance(study, Study) else [*study.studies.values()]
+    for one in studies if only else ():
+        # The run reports what cannot be listed.
+        with suppress(InputError):
+            families |= {label: family for label, (family, _) in members_of(one).items()}
+    for name in only:
+        alone = studies[0].with_only((name,))
+        if not any(alone.chooses(family, label) for label, family in families.items()):
+            known = dict.fromkeys([*families.values(), *families])
+            raise StudyError(f"no family or member of the study is {quoted(name)}; {known_names(name, known)}")
 
 
 def require_permission(study: AnyStudy, allow_commands: bool) -> None:

@@ -95,6 +95,7 @@ def run(
     memory: float | str | None = None,
     on_progress: Notify | None = None,
     allow_commands: bool = False,
+    only: Sequence[str] = (),
 ) -> Summary:
     """Compute the fields that a store lacks of a study, then norms, distances and convergence tables.
 
@@ -111,6 +112,8 @@ def run(
         memory: Memory of each of them, in bytes or as a text such as "4GB"; by default equal parts of the machine's.
         on_progress: Callback for each step, such as `print`; it is called in this thread.
         allow_commands: True if the study may run its commands on the workers and here: you trust its file.
+        only: Families or members FAMILY/MEMBER to compute, or patterns such as "mmg/0.0*", with the reference; default
+            all. Tables have the others as missing, until a run without it computes them.
 
     Returns:
         Meshes that were computed, that were reused, and that failed. A mesh that fails does not raise. In a collection,
@@ -140,7 +143,7 @@ def run(
     """
     if client is not None:
         require_blocking(client)
-    study, location = ready_to_run(study, store, allow_commands=allow_commands)
+    study, location = ready_to_run(study, store, allow_commands=allow_commands, only=only)
     location = location if client is None else location.absolute()
     notify = on_progress or _ignore
     with ExitStack() as stack:
@@ -303,7 +306,7 @@ def _summary(workspace: Workspace, computed: set[int]) -> Summary:
     return Summary(
         workspace.store.path,
         tuple(label for i, label in labels.items() if i in computed and label not in failed),
-        tuple(label for i, label in labels.items() if i not in computed),
+        tuple(label for i, label in labels.items() if i not in computed and i in workspace.complete),
         failed,
         not_compared,
         _imprecise(workspace),

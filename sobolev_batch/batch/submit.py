@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
@@ -58,7 +58,14 @@ class Submission:
     refused: Mapping[str, str] = field(default_factory=dict)
 
 
-def submit(study: StudyLike, store: StoreLike, client: Client, *, allow_commands: bool = False) -> Submission:
+def submit(
+    study: StudyLike,
+    store: StoreLike,
+    client: Client,
+    *,
+    allow_commands: bool = False,
+    only: Sequence[str] = (),
+) -> Submission:
     """Hand a study over to a cluster and return; it goes on without this process.
 
     One of the workers drives it, in a thread besides those for tasks; should that worker be lost,
@@ -71,6 +78,7 @@ def submit(study: StudyLike, store: StoreLike, client: Client, *, allow_commands
             for storage/NAME.zarr.
         client: Client of the cluster; it may be closed afterwards.
         allow_commands: True if the study may run its commands on the workers and here: you trust its file.
+        only: See `run`.
 
     Raises:
         StudyError, MeshError, LatticeError, AccuracyError, StoreError: See `run`; nothing was handed over.
@@ -82,7 +90,7 @@ def submit(study: StudyLike, store: StoreLike, client: Client, *, allow_commands
     2
     """
     require_blocking(client)
-    study, location = ready_to_run(study, store, allow_commands=allow_commands)
+    study, location = ready_to_run(study, store, allow_commands=allow_commands, only=only)
     location = location.absolute()
     if isinstance(study, Study):
         return _submit(study, location, client)

@@ -63,17 +63,16 @@ class Workspace:
     @property
     def pending(self) -> list[int]:
         """Rows whose fields are to be computed."""
-        records = {i: self.records[i] for i in self.rows}
+        records = {i: self.records[i] for i, row in self.rows.items() if row.is_chosen}
         return [i for i, record in records.items() if record is None or not record.completes(self.rows[i].key)]
 
     @property
     def failures(self) -> dict[str, str]:
-        """Reason of each row without a field, by its label."""
-        records = {row.label: self.records[i] for i, row in self.rows.items()}
+        """Reason of each row without a field, by its label; those that a run leaves out have not failed."""
         return {
-            label: record.reason if record else "not computed"
-            for label, record in records.items()
-            if record is None or record.status == "failed"
+            row.label: record.reason if record else "not computed"
+            for row, record in ((row, self.records[i]) for i, row in self.rows.items())
+            if (record is None and row.is_chosen) or (record is not None and record.status == "failed")
         }
 
     def withdraw_lost_fields(self) -> None:

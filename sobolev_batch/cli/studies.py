@@ -40,6 +40,14 @@ def _scheduler_option(*, required: bool = False) -> Callable[[Command], Command]
     return click.option("--scheduler", metavar="ADDRESS", required=required, help=text)
 
 
+_only_option = click.option(
+    "--only",
+    multiple=True,
+    metavar="FAMILY[/MEMBER]",
+    help="Compute this part with the reference; patterns such as 'mmg/0.0*' work. The option may be repeated.",
+)
+
+
 @cli.command("init", short_help="Write a study file for a folder of meshes.")
 @click.argument("folder", type=PATH, default=".")
 @click.option(
@@ -79,6 +87,7 @@ def init_command(folder: Path, output: Path) -> None:
     help="Limit the memory of each process, such as 4GB. [default: equal parts]",
 )
 @allow_commands_option
+@_only_option
 @click.pass_context
 def run_command(
     context: click.Context,
@@ -89,6 +98,7 @@ def run_command(
     workers: int | None,
     memory: int | None,
     allow_commands: bool,
+    only: tuple[str, ...],
 ) -> None:
     """Compute what is missing of STUDY and print its tables.
 
@@ -112,10 +122,12 @@ def run_command(
     with progress_reports() as show:
         if scheduler:
             with remote_client(scheduler, trust_network) as client:
-                summary = run(parsed, store, client, on_progress=show, allow_commands=allow_commands)
+                summary = run(parsed, store, client, on_progress=show, allow_commands=allow_commands, only=only)
         else:
             limit = None if memory is None else f"{memory}B"
-            summary = run(parsed, store, workers=workers, memory=limit, on_progress=show, allow_commands=allow_commands)
+            summary = run(
+                parsed, store, workers=workers, memory=limit, on_progress=show, allow_commands=allow_commands, only=only
+            )
     if isinstance(parsed, Study):
         tree = open_store(summary.store)
         echo_lines(format_table(tree))
@@ -145,6 +157,7 @@ def run_command(
 @trust_option
 @store_option
 @allow_commands_option
+@_only_option
 @click.pass_context
 def submit_command(
     context: click.Context,
@@ -153,6 +166,7 @@ def submit_command(
     trust_network: bool,
     store: Location | None,
     allow_commands: bool,
+    only: tuple[str, ...],
 ) -> None:
     """Hand STUDY over to a cluster and return.
 
@@ -162,7 +176,7 @@ def submit_command(
     from sobolev_batch.batch.submit import submit
 
     with remote_client(scheduler, trust_network) as client:
-        submission = submit(study, store, client, allow_commands=allow_commands)
+        submission = submit(study, store, client, allow_commands=allow_commands, only=only)
 
     for name, one in (submission.objects or {"": submission}).items():
         where = f"{name}: " if name else ""

@@ -40,6 +40,7 @@ class Row:
         label: Family/name, or "reference"; unique in the study.
         fingerprint: Digest of the member, see `Member.fingerprint_digest`; empty if one of its files cannot be read.
         key: SHA-256 of all that its field depends on; empty if the fingerprint is.
+        is_chosen: True if a run computes it; see `Study.only`.
     """
 
     label: str
@@ -47,6 +48,7 @@ class Row:
     member: Member
     fingerprint: str
     key: str = ""
+    is_chosen: bool = True
 
 
 @dataclass(frozen=True)
@@ -132,7 +134,16 @@ def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan
             "proximity: Hausdorff and Chamfer distances are measured between meshes, and the reference is not one "
             f"but a {type(surface).__name__}; take a fine mesh of it for the reference, or leave [proximity] out"
         )
-    rows = (Row(label, family, member, _fingerprint(label, member)) for label, (family, member) in members.items())
+    rows = (
+        Row(
+            label,
+            family,
+            member,
+            _fingerprint(label, member),
+            is_chosen=label == reference or study.chooses(family, label),
+        )
+        for label, (family, member) in members.items()
+    )
     sample = None
     if study.accuracy is not None:
         sample = Sample.from_surface(surface, draws_for([surface], choice.lattice, study.orders, USUAL_DEGREE))

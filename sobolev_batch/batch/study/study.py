@@ -9,6 +9,7 @@ import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from functools import partial
 from glob import has_magic
 from itertools import islice
@@ -75,6 +76,7 @@ class Study:
         largest_chunk_bytes: Size above which a stored field is split into blocks, one chunk each.
         cache: Where meshes are kept that take long to make; None if the study makes none, or has no store yet.
         part: Name of the object, in the study of an object of a collection; else empty.
+        only: Families and members FAMILY/MEMBER that a run computes, or patterns of these; empty for all.
 
     >>> import sobolev_batch as sb
     >>> study = sb.Study.from_table({
@@ -107,9 +109,15 @@ class Study:
     octaves: int = 0
     cache: MeshCache | None = None
     part: str = ""
+    only: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_orders(self.orders)
+
+    def chooses(self, family: str, label: str) -> bool:
+        """Return whether a run computes a member, where only a part is chosen."""
+        names = (family, label)
+        return not self.only or any(name == one or fnmatchcase(name, one) for one in self.only for name in names)
 
     @property
     def libraries(self) -> tuple[str, ...]:
@@ -195,6 +203,10 @@ class Study:
         families = tuple(f.model_copy(update={"source": f.source.with_cache(cache)}) for f in self.families)
         reference = self.reference.with_cache(cache) if isinstance(self.reference, Source) else self.reference
         return replace(self, families=families, reference=reference, cache=cache)
+
+    def with_only(self, only: tuple[str, ...]) -> Self:
+        """Return the study of which a run computes a part, see `only`."""
+        return replace(self, only=only)
 
 
 def _as_written(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -306,6 +318,10 @@ class StudyCollection:
     def with_cache(self, cache: MeshCache) -> Self:
         """Return the collection with the place where its meshes are kept that take long to make."""
         return replace(self, studies={name: study.with_cache(cache) for name, study in self.studies.items()})
+
+    def with_only(self, only: tuple[str, ...]) -> Self:
+        """Return the collection of which a run computes a part of each study."""
+        return replace(self, studies={name: study.with_only(only) for name, study in self.studies.items()})
 
 
 def is_collection(table: Mapping[str, Any]) -> bool:
