@@ -10,6 +10,7 @@ import select
 import signal
 import subprocess
 import sys
+from importlib.util import find_spec
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import dask
 import numpy as np
 import pandas as pd
 import pytest
+import xarray as xr
 from distributed import Client
 from plyfile import PlyData
 
@@ -104,6 +106,29 @@ def test_a_part_of_a_study_and_then_the_rest(folder: Path) -> None:
     columns = ["mesh", "order", "distance", "error", "rate"]
     part, whole = (sb.table(folder / store)[columns] for store in ("part.zarr", STORE))
     pd.testing.assert_frame_equal(part, whole, rtol=1e-12)
+
+
+def test_tables_as_files_of_other_programs(folder: Path, tmp_path: Path) -> None:
+    whole = sb.table(folder / STORE)
+    output("export", STORE, str(tmp_path / "t.csv"), "--to", "csv", folder=folder)
+    frame = pd.read_csv(tmp_path / "t.csv")
+    assert frame.columns.tolist() == whole.columns.tolist()
+    assert frame["distance"].tolist() == whole["distance"].tolist()
+    for style, library in (("parquet", "pyarrow"), ("netcdf", "h5netcdf")):
+        path = tmp_path / f"t.{style}"
+        if find_spec(library) is None:
+            done = call("export", STORE, path, "--to", style, folder=folder)
+            assert done.returncode == 2
+            assert f"{library}" in done.stderr
+            assert "pip install 'sobolev-batch[export]'" in done.stderr
+        elif style == "parquet":
+            output("export", STORE, str(path), "--to", style, folder=folder)
+            pd.testing.assert_frame_equal(pd.read_parquet(path), whole, check_dtype=False)
+        else:
+            output("export", STORE, str(path), "--to", style, folder=folder)
+            tree = xr.open_datatree(path, engine=library)
+            assert tree["convergence"].to_dataset()["family"].values.tolist() == ["ico", "ico", "reference"]
+            assert json.loads(tree.attrs["study"])["name"] == "cli"
 
 
 def test_tables_in_every_format_at_lists_of_orders(folder: Path) -> None:
@@ -364,6 +389,7 @@ MISUSED = [
     (f"table {STORE} --below 1%", "No such option"),
     (f"table smallest {STORE}", "Missing option '--below'"),
     (f"table time {STORE} --factor 1", "1.0 is not in the range x>1.0"),
+    (f"export {STORE} t.nc --to netcdf --order -3", "netcdf has the orders of the study"),
     (f"plot {STORE} --format gif", "'gif' is not one of 'png', 'svg', 'pdf'"),
     ("compare 1.off 3.off --rtol 1e-3 --M 64", "--rtol chooses the lattice"),
     ("compare 1.off 3.off --below 0.1 --proximity --rtol 0.1", "leave out --proximity, --rtol"),
@@ -412,7 +438,7 @@ def test_nothing_answers_at_the_scheduler(folder: Path) -> None:
     assert not (folder / "new.zarr").exists()
 
 
-COMMANDS = "compare fit init plan plot report run status submit table unlock verify witness"
+COMMANDS = "compare export fit init plan plot report run status submit table unlock verify witness"
 # Libraries that take long to import.
 NUMERICS = "numpy scipy pandas xarray dask distributed zarr fsspec pydantic matplotlib finufft psutil tabulate"
 HELP = """

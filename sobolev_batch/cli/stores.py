@@ -13,6 +13,7 @@ import click
 from sobolev_batch.cli.common import (
     EXIT_OTHER,
     EXIT_SOME_FAILED,
+    PATH,
     cli,
     echo,
     echo_json,
@@ -31,6 +32,7 @@ from sobolev_batch.errors import InputError, SobolevBatchError, StoreError, from
 
 if TYPE_CHECKING:
     from sobolev_batch.batch.storage.location import Location
+    from sobolev_batch.results.export import ExportFormat
     from sobolev_batch.results.figures.style import PictureFormat
     from sobolev_batch.results.figures.views import Axis
 
@@ -135,6 +137,26 @@ def unlock_command(store: Location, force: bool) -> None:
         echo(f"{store}: not locked by any run")
     else:
         echo(f"{store}: unlocked; {lock.driver} had locked it since {lock.since}")
+
+
+@cli.command("export")
+@store_argument
+@click.argument("output", type=PATH)
+@click.option(
+    *("--to", "style"),
+    type=click.Choice(["parquet", "netcdf", "csv"]),
+    required=True,
+    help="Write a long table, or with netcdf the groups of tables. The first two need the extra export.",
+)
+@orders_option("Write the table of this order, for parquet and csv.", "the study's")
+def export_command(store: Location, output: Path, style: ExportFormat, orders: tuple[float, ...]) -> None:
+    """Write the tables of STORE to the file OUTPUT, with their coordinates."""
+    from sobolev_batch.results.export import export
+
+    if orders and style == "netcdf":
+        raise click.UsageError("--order is for parquet and csv; netcdf has the orders of the study")
+    export(store, output, style, orders or None)
+    echo(output)
 
 
 @cli.command("plot")
