@@ -438,7 +438,7 @@ def test_nothing_answers_at_the_scheduler(folder: Path) -> None:
     assert not (folder / "new.zarr").exists()
 
 
-COMMANDS = "compare export fit init plan plot report run status submit table unlock verify witness"
+COMMANDS = "compare export fit init plan plot prune report run status submit table unlock verify witness"
 # Libraries that take long to import.
 NUMERICS = "numpy scipy pandas xarray dask distributed zarr fsspec pydantic matplotlib finufft psutil tabulate"
 HELP = """

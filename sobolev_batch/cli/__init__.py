@@ -22,7 +22,7 @@ __all__ = ["cli", "main"]
 # What to know about commands that were asked to end.
 _REMARKS = {"run": "; the same command continues from the store"}
 # They give up their lock of a store, which takes until the storage has answered.
-_SECONDS_WITH_LOCK = dict.fromkeys(("run", "submit", "verify", "unlock"), 30.0)
+_SECONDS_WITH_LOCK = dict.fromkeys(("run", "submit", "verify", "prune", "unlock"), 30.0)
 
 
 def main() -> None:

@@ -139,6 +139,29 @@ def unlock_command(store: Location, force: bool) -> None:
         echo(f"{store}: unlocked; {lock.driver} had locked it since {lock.since}")
 
 
+@cli.command("prune")
+@store_argument
+@click.option("--yes", is_flag=True, help="Remove it. Otherwise only count its bytes.")
+def prune_command(store: Location, yes: bool) -> None:
+    """Remove what STORE keeps and no record needs.
+
+    These are fields of meshes that are no longer in the study, leftovers of killed runs, and tables that are not
+    listed. Meshes that commands made are kept: other stores may use them.
+    """
+    from sobolev_batch.batch.collection_store import CollectionStore
+    from sobolev_batch.batch.prune import prune
+    from sobolev_batch.parameters import format_bytes
+
+    collection = CollectionStore.read(store)
+    total = 0
+    for name, place in ({"": store} if collection is None else collection.existing_stores).items():
+        for kind, size in prune(place, is_dry=not yes).items():
+            total += size
+            if size:
+                echo(f"{name + ': ' * bool(name)}{kind}: {format_bytes(size)}")
+    echo(f"{format_bytes(total)} {'removed' if yes else 'can be removed: give --yes'}")
+
+
 @cli.command("export")
 @store_argument
 @click.argument("output", type=PATH)

@@ -36,7 +36,7 @@ _FOLDER_SCHEMES = ("file", "local")
 _BUCKET_SCHEMES = ("s3", "s3a", "gs", "gcs")
 _EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs"}
 # Names that zarr gives to files until they are complete.
-_PARTIAL_FILE = re.compile(r"\.[0-9a-f]{32}\.partial")
+PARTIAL_FILE = re.compile(r"\.[0-9a-f]{32}\.partial")
 # A run that cannot go on should say so within a minute.
 _ANSWER_SECONDS = 30.0
 _SLOWEST_BYTES_PER_SECOND = 500_000
@@ -171,7 +171,7 @@ class Location:
         """Remove what writers left behind that were killed in the middle of a key. No other run may be writing."""
         with self.access("written"):
             for file in () if self.scheme else _files_below(self.name):
-                if _PARTIAL_FILE.search(file.name):
+                if PARTIAL_FILE.search(file.name):
                     # It may have got its final name since, from a task that outlived its run.
                     Path(file.path).unlink(missing_ok=True)
 
@@ -195,7 +195,7 @@ class Location:
             if not parent.is_dir():
                 raise StoreError(f"{path}: there is no folder {parent} to hold the store; make it first")
         # A driver that was killed while it wrote the first key leaves a partial file.
-        if any(name not in besides and not _PARTIAL_FILE.search(name) for name in self.names()):
+        if any(name not in besides and not PARTIAL_FILE.search(name) for name in self.names()):
             raise StoreError(f"{self}: the folder is not empty and holds no store; name another")
 
     @contextmanager

@@ -48,7 +48,7 @@ def study_verdict(frame: pd.DataFrame, failed: Mapping[str, str]) -> tuple[tuple
     """Return the verdict on a study at each order, from the rows of `table` and the reasons of meshes that are missing.
 
     It is a sentence for each order; rows of nearest meshes, smallest meshes below bounds, and meshes that are missing
-    or imprecise, with their order; and a note on the sizes and families that are left out, empty where all are there.
+    or imprecise, with their order; and a note on the sizes and families that are left out, empty where none is.
     """
     groups = [(float(order), rows) for order, rows in frame.groupby("order", sort=False)]
     sizes = _sizes(groups[0][1])

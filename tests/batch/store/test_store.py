@@ -15,15 +15,18 @@ import pytest
 import zarr
 from distributed import Client
 
-from sobolev_batch import Study, open_store, run
+from sobolev_batch import Study, open_store, run, verify
+from sobolev_batch.batch.prune import prune
+from sobolev_batch.batch.storage.location import Location
+from sobolev_batch.batch.storage.lock import Lock, locked
 from sobolev_batch.batch.store import metadata as documents
 from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import Plan, make_plan
-from sobolev_batch.errors import StoreError
+from sobolev_batch.errors import LockError, StoreError
 from sobolev_batch.results.status import Status
-from tests.support.commands import COMMAND, finished
+from tests.support.commands import COMMAND, call, finished
 from tests.support.repository import ROOT, blocks, install
 from tests.support.stores import READER, contents
 from tests.support.studies import small_table
@@ -243,3 +246,35 @@ def test_code_that_a_codec_names_is_not_imported(copy: Path, tmp_path: Path) -> 
     assert not (tmp_path / "imported").exists()
     finished(sys.executable, "-c", f"import zarr; zarr.open({str(copy)!r})['records/record']", env=environment)
     assert (tmp_path / "imported").exists()
+
+
+def test_what_no_record_needs_is_counted_and_then_removed(copy: Path, threads: Client) -> None:
+    whole = Study.from_table(small_table())
+    family = small_table()["family"][0]
+    part = Study.from_table(small_table(family=[{**family, "levels": family["levels"][:-1]}]))
+    assert run(part, copy, threads).computed == ()
+    sound = contents(copy)
+    (row,) = (row for row, label in enumerate(Store.open(copy).labels()) if label in Store.open(copy).removed)
+    chunks = copy / "fourier" / "fourier" / "c"
+    lost = sum(path.stat().st_size for path in (chunks / str(row)).rglob("*") if path.is_file())
+    # A killed run leaves a field without a record, a part of a file, and tables without their metadata.
+    (chunks / "99").mkdir()
+    (chunks / "99" / "0").write_bytes(b"12345")
+    (copy / "meshes" / f"x.{'0' * 32}.partial").write_bytes(b"123")
+    (copy / "earlier").mkdir()
+    (copy / "earlier" / "zarr.json").write_bytes(b"1")
+    before = contents(copy)
+    counted = call("prune", copy)
+    assert list(prune(Location.parse(copy)).values()) == [lost, 8, 1]
+    assert contents(copy) == before
+    assert "can be removed: give --yes" in counted.stdout
+    assert "removed" in call("prune", copy, "--yes").stdout
+    left = contents(copy)
+    assert {path for path in sound if path not in left} == {path for path in sound if chunks / str(row) in path.parents}
+    assert left.keys() <= sound.keys() | {copy / f"records/record/c/{row}"}
+    assert sum(prune(Location.parse(copy)).values()) == 0
+    assert verify(copy).is_sound
+    assert run(part, copy, threads).computed == ()
+    assert len(run(whole, copy, threads).computed) == 1
+    with locked(Location.parse(copy), Lock.of_this_process()), pytest.raises(LockError):
+        prune(Location.parse(copy), is_dry=False)

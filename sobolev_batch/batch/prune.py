@@ -1,0 +1,62 @@
+"""Pruning: what a store keeps and no record needs, counted and removed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from contextlib import nullcontext
+
+from sobolev_batch.batch.storage.location import PARTIAL_FILE, Location
+from sobolev_batch.batch.storage.lock import LOCK_KEYS, Lock, locked
+from sobolev_batch.batch.store.store import FIELD, OCTAVES, ROOT, Store
+from sobolev_batch.batch.workspace import complete_records
+from sobolev_batch.errors import StoreError
+
+_LOST, _KILLED, _UNLISTED = (
+    "fields of meshes that are no longer in the study",
+    "leftovers of runs that were killed",
+    "tables that the store does not list",
+)
+
+
+def prune(location: Location, *, is_dry: bool = True) -> dict[str, int]:
+    """Remove what a store keeps and no record needs, and return its bytes by kind.
+
+    These are fields of meshes that the study has lost, which would serve again if the meshes came back; what runs left
+    that were killed; and tables that are not listed. A dry run counts alone.
+
+    Raises:
+        StoreError: The location has no store of a study, or cannot be written.
+        DamageError: Its labels or metadata are damaged.
+        LockError: A run is going on in it.
+    """
+    with nullcontext() if is_dry else locked(location, Lock.of_this_process()):
+        store = Store.open(location)
+        if store.is_unfinished:
+            raise StoreError(f"{location}: its creation was not finished; run the study again")
+        labels, removed, records = store.labels(), store.removed, store.records()
+        lost = {row for row, label in enumerate(labels) if label in removed}
+        kept = complete_records(records).keys() - lost
+        listed = {name.split("/")[0] for name in store.documents} | {ROOT, *LOCK_KEYS}
+        counts: Counter[str] = Counter()
+        prefixes = set()
+        for key, size in location.sizes("").items():
+            array = next((name for name in (FIELD, OCTAVES) if key.startswith(f"{name}/c/")), "")
+            if PARTIAL_FILE.search(key):
+                counts[_KILLED] += size
+            elif array:
+                row = int(key.removeprefix(f"{array}/c/").split("/")[0])
+                if row not in kept:
+                    counts[_LOST if row in lost else _KILLED] += size
+                    prefixes.add(f"{array}/c/{row}")
+            elif (group := key.split("/")[0]) not in listed:
+                counts[_UNLISTED] += size
+                prefixes.add(group)
+        if not is_dry:
+            # First: a record without its field would be damage.
+            for row in lost:
+                if records[row] is not None:
+                    store.write_record(row, None)
+            location.remove_partial_files()
+            for prefix in prefixes:
+                location.remove(prefix)
+    return {kind: counts[kind] for kind in (_LOST, _KILLED, _UNLISTED)}
