@@ -282,6 +282,23 @@ def test_json_of_studies_and_stores(folder: Path) -> None:
     assert (checked["is_sound"], checked["total"], checked["fields"]) == (True, 3, {})
 
 
+def test_what_mesh_files_hold(folder: Path) -> None:
+    whole = ball(1)
+    sb.write_mesh(sb.Mesh(whole.vertices, whole.triangles[2:]), folder / "open.off")
+    shown = output("info", "1.off", "open.off", folder=folder)
+    assert re.findall(r"^(\S+): (\d+) triangles, 42 vertices$", shown, re.M) == [("1.off", "80"), ("open.off", "78")]
+    assert "closed, all triangles face outwards" in shown
+    assert "none: it is not closed" in shown
+    closed, opened = document("info", "1.off", "open.off", folder=folder)["files"]
+    assert [closed["area"], closed["volume"]] == pytest.approx([whole.area, whole.volume])
+    assert closed["box"] == pytest.approx(np.array([whole.vertices.min(axis=0), whole.vertices.max(axis=0)]))
+    assert closed["smallest_angle"] == pytest.approx(whole.smallest_angles.min())
+    assert closed["aspect_ratio"] == pytest.approx(whole.aspect_ratios.max())
+    assert (closed["boundary_edges"], opened["volume"]) == (0, None)
+    assert opened["boundary_edges"] > 0
+    assert f"{opened['boundary_edges']} open edges" in shown
+
+
 def test_an_error_is_no_difference(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object, **__: object) -> None:
         raise RuntimeError("broken")
@@ -438,7 +455,7 @@ def test_nothing_answers_at_the_scheduler(folder: Path) -> None:
     assert not (folder / "new.zarr").exists()
 
 
-COMMANDS = "compare export fit init plan plot prune report run status submit table unlock verify witness"
+COMMANDS = "compare export fit info init plan plot prune report run status submit table unlock verify witness"
 # Libraries that take long to import.
 NUMERICS = "numpy scipy pandas xarray dask distributed zarr fsspec pydantic matplotlib finufft psutil tabulate"
 HELP = """

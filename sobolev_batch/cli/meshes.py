@@ -1,4 +1,4 @@
-"""Commands on two mesh files: compare, with a verdict as exit status where asked, and fit."""
+"""Commands on mesh files: compare, with a verdict as exit status where asked, fit, and info."""
 
 from __future__ import annotations
 
@@ -434,3 +434,51 @@ def _text(quality: FitQuality, scale: float) -> str:
         parts.append(f"Hausdorff ≥ {quality.hausdorff / scale:.3g}")
         parts.append(f"Chamfer {quality.chamfer / scale:.3g}")
     return ", ".join([*parts, f"smallest angle {quality.smallest_angle:.3g} degrees"])
+
+
+@cli.command("info")
+@click.argument("files", type=PATH, nargs=-1, required=True, metavar="FILE...")
+@json_option
+def info_command(files: tuple[Path, ...], style: str) -> None:
+    """Print what mesh files hold: counts, size, and what is unusual.
+
+    Lengths are in the unit of each file. Edges of one triangle are open. The aspect ratio of an equilateral triangle
+    is 1.
+    """
+    from sobolev_batch.surfaces.formats.readers import read_mesh
+
+    facts = [_facts(path, read_mesh(path)) for path in files]
+    if style == "json":
+        echo_json({"files": facts})
+    for one in facts if style == "text" else ():
+        box = ", ".join(f"{axis} {low:.6g} to {high:.6g}" for axis, low, high in zip("xyz", *one["box"], strict=True))
+        volume = "none: it is not closed" if math.isnan(one["volume"]) else f"{one['volume']:.6g}"
+        echo(f"{one['file']}: {one['triangles']:,} triangles, {one['vertices']:,} vertices")
+        echo(f"  area {one['area']:.6g}, volume {volume}")
+        echo(f"  box {box}")
+        echo(
+            f"  smallest angle {one['smallest_angle']:.3g}° (median {one['smallest_angle_median']:.3g}°), "
+            f"aspect ratio up to {one['aspect_ratio']:.3g} (median {one['aspect_ratio_median']:.3g})"
+        )
+        echo(f"  {'; '.join(one['defects']) or 'closed, all triangles face outwards'}")
+
+
+def _facts(path: Path, mesh: Mesh) -> dict[str, Any]:
+    """Return what is known of a mesh by itself, lengths in its own unit."""
+    import numpy as np
+
+    angles, ratios = mesh.smallest_angles, mesh.aspect_ratios
+    return {
+        "file": path,
+        "vertices": len(mesh.vertices),
+        "triangles": len(mesh.triangles),
+        "area": mesh.area,
+        "volume": mesh.volume,
+        "box": [end.tolist() for end in mesh.extent.box],
+        "smallest_angle": float(angles.min()),
+        "smallest_angle_median": float(np.median(angles)),
+        "aspect_ratio": float(ratios.max()),
+        "aspect_ratio_median": float(np.median(ratios)),
+        **mesh.counts,
+        "defects": mesh.defects,
+    }
