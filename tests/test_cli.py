@@ -282,6 +282,12 @@ def test_json_of_studies_and_stores(folder: Path) -> None:
     assert (checked["is_sound"], checked["total"], checked["fields"]) == (True, 3, {})
 
 
+def test_a_command_that_is_silent_says_that_it_goes_on(folder: Path) -> None:
+    done = call("compare", "1.off", "3.off", folder=folder, patience_seconds=0.0)
+    assert done.stdout == output("compare", "1.off", "3.off", folder=folder)
+    assert re.fullmatch(r"compare: \d+ s so far\n", done.stderr)
+
+
 def test_what_mesh_files_hold(folder: Path) -> None:
     whole = ball(1)
     sb.write_mesh(sb.Mesh(whole.vertices, whole.triangles[2:]), folder / "open.off")

@@ -49,7 +49,7 @@ def settled(study: StudyLike, store: StoreLike, *, may_run: bool) -> tuple[AnySt
 def ready_to_run(
     study: StudyLike, store: StoreLike, *, allow_commands: bool, only: Sequence[str] = ()
 ) -> tuple[AnyStudy, Location]:
-    """Return a study that may run, of which only a part may be chosen, and the place of its store.
+    """Return a study that may run, or a part of it, and the place of its store.
 
     What would make the run useless is logged.
     """

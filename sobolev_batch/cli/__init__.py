@@ -5,14 +5,14 @@ from __future__ import annotations
 import signal
 import sys
 import traceback
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from typing import NoReturn
 
 import click
 
 # Importing these modules adds their commands to the group.
 from sobolev_batch.cli import meshes, stores, studies, tables  # noqa: F401
-from sobolev_batch.cli.common import EXIT_INPUT, EXIT_OTHER, cli, echo, echo_lines, show_usage_error
+from sobolev_batch.cli.common import EXIT_INPUT, EXIT_OTHER, cli, echo, echo_lines, patience, show_usage_error
 from sobolev_batch.cli.interruption import SECONDS_TO_END, Deadline, end_process, ignore_requests
 from sobolev_batch.errors import InputError, SobolevBatchError
 from sobolev_batch.visible import make_messages_visible
@@ -21,6 +21,8 @@ __all__ = ["cli", "main"]
 
 # What to know about commands that were asked to end.
 _REMARKS = {"run": "; the same command continues from the store"}
+# These show their own.
+_WITH_PROGRESS = ("run", "fit", "status", "verify", "")
 # They give up their lock of a store, which takes until the storage has answered.
 _SECONDS_WITH_LOCK = dict.fromkeys(("run", "submit", "verify", "prune", "unlock"), 30.0)
 
@@ -37,7 +39,8 @@ def main() -> None:
     deadline.start()
     make_messages_visible()
     try:
-        status = cli.main(standalone_mode=False)
+        with nullcontext() if command in _WITH_PROGRESS else patience(command):
+            status = cli.main(standalone_mode=False)
     except click.ClickException as error:
         show_usage_error(error)
         sys.exit(error.exit_code)

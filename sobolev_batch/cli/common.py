@@ -11,6 +11,8 @@ from __future__ import annotations
 import logging
 import shutil
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from io import StringIO
@@ -35,6 +37,10 @@ PATH = click.Path(path_type=Path)
 _DRIVERS = ("aiobotocore", "botocore", "s3fs", "gcsfs", "google", "urllib3", "azure")
 
 _CLEAR_LINE = "\r\x1b[K"
+# Time after which a silent command says that it goes on, and that between such lines without a terminal.
+_PATIENCE_SECONDS, _SECONDS_BETWEEN_LINES = 2.0, 30.0
+_is_answered = threading.Event()
+_reporter: threading.Thread | None = None
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -188,13 +194,46 @@ def below_option(text: str, *, required: bool = False) -> Callable[[Command], Co
     return click.option("--below", type=fraction_of_norm, metavar="FRACTION", required=required, help=text)
 
 
+@contextmanager
+def patience(command: str) -> Iterator[None]:
+    """Report on standard error, from two seconds on and until something is printed, that a command goes on."""
+    global _reporter
+    began, is_terminal = time.monotonic(), sys.stderr.isatty()
+
+    def report() -> None:
+        wait, shown = _PATIENCE_SECONDS, False
+        while not _is_answered.wait(wait):
+            text = f"{command}: {time.monotonic() - began:.0f} s so far"
+            click.echo(f"{_CLEAR_LINE}{text}" if is_terminal else text, nl=not is_terminal, err=True)
+            wait, shown = 1.0 if is_terminal else _SECONDS_BETWEEN_LINES, True
+        if shown and is_terminal:
+            click.echo(_CLEAR_LINE, nl=False, err=True)
+
+    _is_answered.clear()
+    _reporter = threading.Thread(target=report, name="sobolev-batch-patience", daemon=True)
+    _reporter.start()
+    try:
+        yield
+    finally:
+        _answer()
+
+
+def _answer() -> None:
+    """End the report of `patience`, whose line would be in the way."""
+    _is_answered.set()
+    if _reporter is not None:
+        _reporter.join()
+
+
 def echo(line: object = "", *, err: bool = False) -> None:
     """Print one line, on standard error if asked."""
+    _answer()
     click.echo(visible(str(line)), err=err)
 
 
 def echo_lines(text: object, *, err: bool = False) -> None:
     """Print a text of several lines, whose names are visible already."""
+    _answer()
     click.echo(visible_lines(str(text)), err=err)
 
 
@@ -202,7 +241,7 @@ def echo_json(result: Any, **more: Any) -> None:
     """Print a result and what follows from it as one JSON document; docs/commands.md lists the keys."""
     from sobolev_batch.results.tables.text import json_text
 
-    click.echo(json_text((result if isinstance(result, dict) else vars(result)) | more))
+    echo_lines(json_text((result if isinstance(result, dict) else vars(result)) | more))
 
 
 def overwrite(line: str = "") -> None:

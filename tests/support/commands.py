@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 
 from sobolev_batch import cli
+from sobolev_batch.cli import common
 from sobolev_batch.cli.interruption import Deadline
 
 # The study of small_table, and a smaller one.
@@ -47,7 +48,7 @@ def write_toml(folder: Path) -> Path:
     return path
 
 
-def call(*arguments: object, folder: Path = Path()) -> subprocess.CompletedProcess[str]:
+def call(*arguments: object, folder: Path = Path(), patience_seconds: float = 1e6) -> subprocess.CompletedProcess[str]:
     """Run a command to its end within this process, which has imported already what a new one takes seconds for."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -56,6 +57,8 @@ def call(*arguments: object, folder: Path = Path()) -> subprocess.CompletedProce
         # its own.
         patch.setattr(Deadline, "start", lambda deadline: None)
         patch.setattr(cli, "make_messages_visible", lambda: None)
+        # How long it takes decides whether it says that it goes on.
+        patch.setattr(common, "_PATIENCE_SECONDS", patience_seconds)
         patch.setattr(logging.root, "handlers", [])
         patch.setattr(logging.root, "level", logging.root.level)
         # It tells of connections that earlier tests of this process left open.

@@ -205,7 +205,7 @@ class Study:
         return replace(self, families=families, reference=reference, cache=cache)
 
     def with_only(self, only: tuple[str, ...]) -> Self:
-        """Return the study of which a run computes a part, see `only`."""
+        """Return the study for a run of a part; see `only`."""
         return replace(self, only=only)
 
 
@@ -320,7 +320,7 @@ class StudyCollection:
         return replace(self, studies={name: study.with_cache(cache) for name, study in self.studies.items()})
 
     def with_only(self, only: tuple[str, ...]) -> Self:
-        """Return the collection of which a run computes a part of each study."""
+        """Return the collection for a run of a part of each study."""
         return replace(self, studies={name: study.with_only(only) for name, study in self.studies.items()})
 
 
