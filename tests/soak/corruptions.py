@@ -6,7 +6,7 @@ import random
 import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping
-from itertools import islice
+from itertools import combinations, islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -63,7 +63,20 @@ class Corruption(NamedTuple):
     answers: Mapping[str, str]
 
 
+Damages = Iterator[tuple[str, dict[str, bytes | None]]]
+
+
 def corruptions(folder: Path, count: int, seed: int) -> Iterator[Corruption]:
+    """Damage a finished store some times, by a seed, and yield what that led to."""
+    yield from _damaged(folder, lambda states: islice(damages(states, random.Random(seed)), count))
+
+
+def mixed_states(folder: Path) -> Iterator[Corruption]:
+    """Restore each subset of the groups of a finished store to an earlier state, and yield what that led to."""
+    yield from _damaged(folder, restorations)
+
+
+def _damaged(folder: Path, choose: Callable[[Mapping[str, Mapping[str, bytes]]], Damages]) -> Iterator[Corruption]:
     stores = finished_stores(folder)
     store = stores["whole"]
     truths = {name: read(store) for name, read in WAYS.items()}
@@ -71,11 +84,12 @@ def corruptions(folder: Path, count: int, seed: int) -> Iterator[Corruption]:
         name: {path.relative_to(place).as_posix(): content for path, content in contents(place).items()}
         for name, place in stores.items()
     }
-    for number, (kind, changes) in enumerate(islice(damages(states, random.Random(seed)), count)):
+    for number, (kind, changes) in enumerate(choose(states)):
         with put_back(store):
             for key, content in changes.items():
-                (store / key).unlink()
+                (store / key).unlink(missing_ok=True)
                 if content is not None:
+                    (store / key).parent.mkdir(parents=True, exist_ok=True)
                     (store / key).write_bytes(content)
             answers = {
                 name: _answer(read, store, truths[name])
@@ -87,9 +101,17 @@ def corruptions(folder: Path, count: int, seed: int) -> Iterator[Corruption]:
         yield Corruption(kind, tuple(changes), answers)
 
 
-def damages(
-    states: Mapping[str, Mapping[str, bytes]], chance: random.Random
-) -> Iterator[tuple[str, dict[str, bytes | None]]]:
+def restorations(states: Mapping[str, Mapping[str, bytes]]) -> Damages:
+    """Yield each set of groups that differ between a whole store and an earlier state, and their earlier files."""
+    whole, earlier = states["whole"], states["earlier"]
+    changed = [key for key in sorted({*whole, *earlier}) if whole.get(key) != earlier.get(key)]
+    groups = sorted({key.partition("/")[0] for key in changed})
+    for size in range(1, len(groups)):
+        for chosen in combinations(groups, size):
+            yield ", ".join(chosen), {key: earlier.get(key) for key in changed if key.partition("/")[0] in chosen}
+
+
+def damages(states: Mapping[str, Mapping[str, bytes]], chance: random.Random) -> Damages:
     """Yield kinds of damage to the files of a whole store, and what changed files then hold: None if they are gone."""
     whole = states["whole"]
     while True:
