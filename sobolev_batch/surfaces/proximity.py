@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sobolev_batch.errors import InputError
@@ -49,7 +48,7 @@ OF_ONE_MESH = ("volume", "smallest_angle", "aspect_ratio")
 # Memory of a search: for each triangle of either mesh, for each point, and of its temporary arrays.
 TRIANGLE_BYTES, POINT_BYTES, WORKING_BYTES = 500.0, 250.0, 2e8
 # Boxes in a box; points that are searched at a time, and pairs of a point and a box, which are split if they are more.
-_FAN, _CHUNK, _MOST_PAIRS = 8, 1 << 13, 1 << 18
+_FAN, _CHUNK, _MOST_PAIRS = 8, 1 << 11, 1 << 18
 
 
 def proximity(
@@ -176,18 +175,19 @@ def _angles(first: Reals, second: Reals) -> Reals:
 class Triangles:
     """The triangles of a mesh with a hierarchy of boxes, in which the closest one to a point is found.
 
-    Triangles of one size that are near to each other share boxes: they are sorted along a curve (G. M. Morton, "A
-    computer oriented geodetic data base", 1966).
+    Triangles of about one size that are near to each other, in the order of a tree of their centers, share boxes.
     """
 
     def __init__(self, corners: Reals, scale: float) -> None:
         """Sort corners (3, 3, m): of each triangle's corners the three coordinates, in units of the scale."""
         low, high = corners.min(axis=0), corners.max(axis=0)
-        self.order, self.scale = _along_curve(low, high), scale
+        sizes, self.scale = (high - low).max(axis=0), scale
+        self.centers = cKDTree(corners.mean(axis=0).T)
+        classes = np.floor(np.log2(np.maximum(sizes, np.finfo(float).tiny)) / 2)
+        self.order = self.centers.indices[np.argsort(classes[self.centers.indices], kind="stable")]
+        self.places = np.argsort(self.order)
         self.corners = np.ascontiguousarray(corners[..., self.order])
-        low, high = low[:, self.order], high[:, self.order]
-        self.centers = cKDTree(self.corners.mean(axis=0).T)
-        sizes, largest = (high - low).max(axis=0), np.arange(low.shape[1])
+        low, high, sizes, largest = low[:, self.order], high[:, self.order], sizes[self.order], np.arange(len(sizes))
         # From a box of all to the boxes of single triangles, with the largest triangle of each box.
         self.levels = [(low, high, largest)]
         while low.shape[1] > 1:
@@ -220,7 +220,7 @@ class Triangles:
     def _closest(self, points: Reals) -> tuple[Reals, Indices] | None:
         """Return squared distances of points (3, n), and triangles; None where there are too many pairs with boxes."""
         count = points.shape[1]
-        triangles = np.asarray(self.centers.query(points.T)[1], dtype=np.int64)
+        triangles = self.places[self.centers.query(points.T)[1]]
         best = _squares(points, self.corners[..., triangles])
         of, boxes = np.arange(count), np.zeros(count, dtype=np.int64)
         for level, (low, high, largest) in enumerate(self.levels):
@@ -276,19 +276,6 @@ def _squares(points: Reals, corners: Reals) -> Reals:
         is_above &= _dot(_cross(side, arm), normal) >= 0
     heights = np.divide(_dot(points - a, normal) ** 2, size, out=np.zeros_like(size), where=size > 0)
     return np.where(is_above, np.minimum(best, heights), best)
-
-
-def _along_curve(low: Reals, high: Reals) -> Indices:
-    """Return the order of boxes (3, m) along a curve that stays near to where it was, the sizes apart."""
-    centers = (low + high) / 2
-    span = float(np.ptp(centers, axis=1).max()) or 1.0
-    cells = ((centers - centers.min(axis=1, keepdims=True)) * (1023 / span)).astype(np.int64)
-    code: NDArray[np.int64] = np.zeros(cells.shape[1], dtype=np.int64)
-    for bit in range(10):
-        for axis in range(3):
-            code |= ((cells[axis] >> bit) & 1) << (3 * bit + axis)
-    sizes = np.floor(np.log2(np.maximum((high - low).max(axis=0), np.finfo(float).tiny)) / 2)
-    return np.lexsort((code, sizes))
 
 
 def _dot(first: Reals, second: Reals) -> Reals:
