@@ -20,6 +20,8 @@ from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.status import Status
 
 _WORKERS = 2
+# Meshes that are added to those that are there.
+_ADDED = 100
 
 
 def tiny_meshes(effort: Effort) -> Iterator[Row]:
@@ -44,6 +46,11 @@ def tiny_meshes(effort: Effort) -> Iterator[Row]:
         status = elapsed_seconds(lambda: Status.from_store(store))
         again = elapsed_seconds(lambda: sb.run(study, store, client))
         opened = elapsed_seconds(lambda: sb.open_store(store)["convergence"]["distance"].load())
+        sobolev = sb.open_store(store).sobolev
+        every = elapsed_seconds(lambda: sobolev.distance(-2.5))
+        pair = elapsed_seconds(lambda: sobolev.distance(-3.5, "icosahedra/0000001", "icosahedra/0000002"))
+        _write_icosahedra(folder, _ADDED, first=count)
+        added = elapsed_seconds(lambda: sb.run(sb.Study.from_table(_STUDY, folder=folder), store, client))
     fields = marks["fields ends"] - marks["fields begins"]
 
     def row(what: str, seconds: float) -> Row:
@@ -57,7 +64,10 @@ def tiny_meshes(effort: Effort) -> Iterator[Row]:
     yield row("reduction and tables", ended - marks["reduction begins"])
     yield row("status", status)
     yield row("a run that finds everything there", again)
+    yield row(f"{_ADDED} more", added)
     yield Row("scale", "open the store and read a table of it", f"{opened:.3g} s")
+    yield Row("scale", "distances of all meshes to the reference at a new order", f"{every:.3g} s")
+    yield Row("scale", "distance of two meshes at a new order", f"{pair:.3g} s")
     yield Row("scale", "peak memory of driver, client and scheduler in one process", f"{peak_bytes / 1e6:.3g} MB")
 
 
@@ -70,10 +80,10 @@ _STUDY: dict[str, Any] = {
 }
 
 
-def _write_icosahedra(folder: Path, count: int) -> None:
+def _write_icosahedra(folder: Path, count: int, first: int = 0) -> None:
     mesh = sb.shapes.icosphere(0)
     faces = "".join(f"3 {a} {b} {c}\n" for a, b, c in mesh.triangles.tolist())
-    rng = np.random.default_rng(0)
-    for number in range(count):
+    rng = np.random.default_rng(first)
+    for number in range(first, first + count):
         vertices = "".join(f"{x!r} {y!r} {z!r}\n" for x, y, z in (mesh.vertices * rng.uniform(0.8, 1)).tolist())
         (folder / f"{number:07}.off").write_text(f"OFF\n12 20 0\n{vertices}{faces}")

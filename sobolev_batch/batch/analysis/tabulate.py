@@ -50,6 +50,8 @@ _SOME = {"time", *(item.name for item in fields(Cost))}
 
 Reals = NDArray[np.float64]
 Criterion = Literal["level", "triangles", "names", "time"]
+# A row, its place in its family, and what orders that.
+Placed = tuple[int, int, Criterion]
 
 # Criteria of families that go from coarse to fine.
 _FROM_COARSE_TO_FINE = ("level", "triangles")
@@ -61,7 +63,9 @@ _MOST_OF_ONE_SIZE = 10
 
 def tabulate_fields(cluster: Cluster, workspace: Workspace) -> NormEstimate | None:
     """Write the tables, and return the distances to the reference, or None where the tables were there."""
-    if are_tabulated(workspace):
+    placed = table_order(workspace)
+    digest = _digest(workspace, placed)
+    if are_tabulated(workspace, digest):
         return None
     plan, complete = workspace.plan, workspace.complete
     qualities = {row: Quality.from_json(record.quality) for row, record in complete.items()}
@@ -71,7 +75,7 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> NormEstimate | No
     )
     # A larger task is tried all the same, with nothing beside it.
     projected_bytes = min(reducer.task_bytes, cluster.workers.largest_allowed_bytes)
-    keys, meshes = _spectrum_keys(workspace), _meshes_table(workspace)
+    keys, meshes = _spectrum_keys(workspace), _meshes_table(workspace, placed)
     chunks = stale_chunks(workspace.store, keys)
     pairs, tiles, replaced = _pairs(workspace), list[tuple[int, int]](), list[str]()
     if pairs is not None:
@@ -98,7 +102,7 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> NormEstimate | No
         for _ in cluster.results(tasks, projected_bytes):
             advance("", None)
     results = Results.from_spectra(reducer, meshes, plan.reference)
-    _write_tables(workspace, results, replaced)
+    _write_tables(workspace, results, digest, replaced)
     return NormEstimate(*results.to_reference)
 
 
@@ -227,7 +231,7 @@ def coordinates_of(meshes: xr.Dataset, orders: Sequence[float]) -> xr.Dataset:
     )
 
 
-def _write_tables(workspace: Workspace, results: Results, replaced: Sequence[str]) -> None:
+def _write_tables(workspace: Workspace, results: Results, digest: str, replaced: Sequence[str]) -> None:
     store = workspace.store
     replaced = [*replaced, *(hide_tables(store) if _pairs(workspace) is None else ())]
     store.write(QUALITY, ..., np.array(_qualities(workspace), dtype=object))
@@ -238,17 +242,17 @@ def _write_tables(workspace: Workspace, results: Results, replaced: Sequence[str
             store.location.remove(DISTANCES)
         write_table(store, DISTANCES, results.distances_table())
     # Written last: its digest says that all tables belong to the fields that are stored.
-    convergence = results.convergence_table(workspace.plan.study.accuracy).assign_attrs(digest=_digest(workspace))
+    convergence = results.convergence_table(workspace.plan.study.accuracy).assign_attrs(digest=digest)
     write_table(store, "convergence", convergence)
     for name in set(replaced) - store.documents.keys():
         store.location.remove(name)
     store.consolidate()
 
 
-def are_tabulated(workspace: Workspace) -> bool:
-    """Return True where the tables of a store belong to its fields and to the plan."""
+def are_tabulated(workspace: Workspace, digest: str = "") -> bool:
+    """Return True where the tables of a store belong to its fields and to the plan, by their digest if it is known."""
     attributes = table_attributes(workspace.store, "convergence")
-    if attributes is None or attributes.get("digest") != _digest(workspace):
+    if attributes is None or attributes.get("digest") != (digest or _digest(workspace, table_order(workspace))):
         return False
     if stale_chunks(workspace.store, _spectrum_keys(workspace)):
         return False
@@ -265,10 +269,10 @@ def _qualities(workspace: Workspace) -> list[str]:
     return [record.quality if record else "" for record in workspace.records]
 
 
-def _digest(workspace: Workspace) -> str:
+def _digest(workspace: Workspace, placed: Sequence[Placed]) -> str:
     """Return the SHA-256 of all that the tables depend on."""
     plan = workspace.plan
-    shown = [(workspace.rows[i], workspace.records[i]) for i, _, _ in table_order(workspace)]
+    shown = [(workspace.rows[i], workspace.records[i]) for i, _, _ in placed]
     rows = [
         [
             *(row.label, row.family, row.member.time, row.member.metadata),
@@ -287,12 +291,12 @@ def _digest(workspace: Workspace) -> str:
     return hashlib.sha256(json.dumps(inputs).encode()).hexdigest()
 
 
-def table_order(workspace: Workspace) -> list[tuple[int, int, Criterion]]:
+def table_order(workspace: Workspace) -> list[Placed]:
     """Return the rows of the study in the order of tables, each with its place in its family and what orders that."""
     families: dict[str, list[int]] = {row.family: [] for row in workspace.plan.rows}
     for i, row in workspace.rows.items():
         families[row.family].append(i)
-    placed: list[tuple[int, int, Criterion]] = []
+    placed: list[Placed] = []
     for family, numbers in families.items():
         rows, records = [workspace.rows[i] for i in numbers], [workspace.records[i] for i in numbers]
         criterion = _criterion(workspace.plan.study, family, rows, records)
@@ -301,9 +305,9 @@ def table_order(workspace: Workspace) -> list[tuple[int, int, Criterion]]:
     return placed
 
 
-def _meshes_table(workspace: Workspace) -> xr.Dataset:
+def _meshes_table(workspace: Workspace, placed: Sequence[Placed]) -> xr.Dataset:
     """Return for each mesh family, level, rank, status, reason, counts, sizes, digests, seconds, worker, backend."""
-    numbers, ranks, criteria = zip(*table_order(workspace), strict=True)
+    numbers, ranks, criteria = zip(*placed, strict=True)
     rows, records = [workspace.rows[i] for i in numbers], [workspace.records[i] for i in numbers]
     filled = [record or Record(key="", status="failed", reason="not computed") for record in records]
     columns: dict[str, NDArray[np.generic]] = {
