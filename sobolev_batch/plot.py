@@ -159,7 +159,8 @@ def witness(
     ax: Axes | None = None,
     *,
     folder: str | Path = ".",
-    up: Axis = "z",
+    up: Axis | None = None,
+    limit: float | None = None,
 ) -> Axes:
     """Plot a mesh coloured by its witness function: red where it has area that the reference lacks, else blue.
 
@@ -173,7 +174,8 @@ def witness(
         order: Order of the norm.
         ax: Axes to draw on; its figure gets a colour bar.
         folder: Folder where relative paths in the study start.
-        up: Axis that points upwards in the mesh's own coordinates.
+        up: Axis that points upwards in the mesh's own coordinates; default the one that it seems to rest on, y or z.
+        limit: End of the scale of colours, in 1 / unit length of the study. Meshes are compared on a common one.
 
     Raises:
         InputError: The label is unknown, or the mesh cannot be made again, or is not the one that was computed.
@@ -189,7 +191,7 @@ def witness(
         raise InputError(f"{mesh!r} stands for several meshes, and one is plotted; give its label")
     for label, reason in missing.items():
         raise InputError(f"{label}: {reason}")
-    return draw_witness(views[0], ax)
+    return draw_witness(views[0], ax, limit)
 
 
 def _plot(kind: str, selection: Selection, axes: Axes | None) -> Axes:

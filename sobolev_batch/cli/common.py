@@ -172,9 +172,7 @@ folder_option = click.option(
 up_option = click.option(
     "--up",
     type=click.Choice(["x", "y", "z"]),
-    default="z",
-    show_default=True,
-    help="Draw the meshes with this axis pointing up.",
+    help="Draw the meshes with this axis pointing up. [default: y or z, what they seem to rest on]",
 )
 
 

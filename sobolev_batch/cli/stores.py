@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from sobolev_batch.batch.storage.location import Location
     from sobolev_batch.results.export import ExportFormat
     from sobolev_batch.results.figures.style import PictureFormat
-    from sobolev_batch.results.figures.views import Axis
+    from sobolev_batch.results.figures.views import Axis, Colors
 
 _FOLLOW_SECONDS = 2.0
 
@@ -210,6 +210,13 @@ def export_command(store: Location, output: Path, style: ExportFormat, orders: t
 @meshes_option("Draw this mesh with its witness function.", "a few")
 @folder_option
 @up_option
+@click.option(
+    "--colors",
+    type=click.Choice(["own", "common"]),
+    default="own",
+    show_default=True,
+    help="Give each mesh its own scale of colours, or all a common one.",
+)
 @click.pass_context
 def plot_command(
     context: click.Context,
@@ -222,7 +229,8 @@ def plot_command(
     x: str | None,
     meshes: tuple[str, ...],
     folder: Path,
-    up: Axis,
+    up: Axis | None,
+    colors: Colors,
 ) -> None:
     """Draw the results of STORE as pictures.
 
@@ -265,7 +273,7 @@ def plot_command(
     with fields_read(store):
         selection = Selection.from_store(store, orders or None, families or None, x or EDGE_LENGTH)
         # First, since a label may be wrong.
-        witness_paths, missing = write_witness_plots(selection, output, folder, meshes, up, formats, panel)
+        witness_paths, missing = write_witness_plots(selection, output, folder, meshes, up, colors, formats, panel)
         paths, omissions = write_plots(selection, output, formats, panel)
     for path in (*paths, *witness_paths):
         echo(path)
@@ -335,7 +343,7 @@ def witness_command(
 @folder_option
 @up_option
 @meshes_option("Show this mesh with its witness function.", "a few")
-def report_command(store: Location, output: Path, folder: Path, up: Axis, meshes: tuple[str, ...]) -> None:
+def report_command(store: Location, output: Path, folder: Path, up: Axis | None, meshes: tuple[str, ...]) -> None:
     """Write the results of STORE as one HTML page.
 
     The page needs no other files and makes no requests. What it leaves out is listed. The page of a collection has its

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
@@ -17,6 +18,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
 
 from sobolev_batch.errors import InputError, SobolevBatchError
 from sobolev_batch.results.figures.meshes import StudyMeshes, fields_of, matching_labels, witness_at_vertices
@@ -48,6 +50,8 @@ Triangles = NDArray[np.int32]
 
 Axis = Literal["x", "y", "z"]
 _AXES: tuple[Axis, ...] = get_args(Axis)
+# Scales of colours of several meshes: one for each, or one for all.
+Colors = Literal["own", "common"]
 
 # Unit vector to the viewer of the usual view, with the third axis upwards.
 FRONT: Reals = np.array([1.25, -1.4, 0.8]) / np.linalg.norm([1.25, -1.4, 0.8])
@@ -58,6 +62,10 @@ _POWER = 4
 # The worst places face one way if the mean of their normals is as long, and the usual view shows them if the cosine
 # between both is as large. A view that is steeper than this height of the unit vector is turned to the usual one.
 _ONE_WAY, _SHOWN, _STEEPEST = 0.5, 0.4, 0.9
+
+# Points belong to the base that a mesh rests on up to this fraction of its height. The y axis points up only if the
+# base below it covers this fraction of the bounding box, and more than the factor times what that of the z axis covers.
+_BASE, _BROAD, _BROADER = 0.03, 0.1, 2.0
 
 # Of a plot: its height, orders of one mesh, panels in a row, and meshes beside each other.
 _HEIGHT_INCHES, MOST_ORDERS, _PANELS_IN_A_ROW, _MOST_COMPARED = 5.0, 6, 3, 9
@@ -146,16 +154,17 @@ def make_views(
     folder: str | Path,
     meshes: Sequence[str] = (),
     limits: tuple[int, int, int] = PAGE_LIMITS,
-    up: Axis = "z",
+    up: Axis | None = None,
     orders: Sequence[float] | None = None,
     family: Families = None,
 ) -> tuple[list[MeshView], dict[str, str]]:
     """Make a few meshes of a store again, by its study, and evaluate their witness functions on them.
 
     Without labels or patterns of meshes, they are the closest mesh of each chosen family at the first order, and the
-    farthest ones. The limits are those of `PAGE_LIMITS`, and the folder is where relative paths in the study start.
-    Return views in the order of the study, and the reason for each requested mesh without one, by its label. InputError
-    where a label or family is unknown, or more meshes are named than may be shown.
+    farthest ones. The limits are those of `PAGE_LIMITS`, and the folder is where relative paths in the study start. The
+    axis that points upwards is by default that of `up_axis`. Return views in the order of the study, and the reason for
+    each requested mesh without one, by its label. InputError where a label or family is unknown, or more meshes are
+    named than may be shown.
     """
     most_meshes, most_triangles, most_values = limits
     named = matching_labels(tree, meshes)
@@ -173,10 +182,37 @@ def make_views(
     for label in labels:
         try:
             _, mesh = study_meshes.make(label, _LARGEST_MADE)
-            views.append(_view(tree, label, mesh, chosen, most_triangles, up))
+            views.append(_view(tree, label, mesh, chosen, most_triangles))
         except SobolevBatchError as error:
             missing[label] = str(error)
+    if views:
+        # A cyclic permutation of the axes, which does not mirror the meshes.
+        turn = _AXES.index("z") - _AXES.index(up or up_axis(np.concatenate([view.vertices for view in views])))
+        views = [replace(view, vertices=np.roll(view.vertices, turn, axis=1)).towards_worst() for view in views]
     return views, missing
+
+
+def up_axis(points: Reals) -> Axis:
+    """Return "y" if points (n, 3) stand firmly along the y axis, and not along the z axis; else "z".
+
+    What rests on feet or on a flat base touches the ground over most of its breadth; from its other sides, a snout or
+    a tail does. The measure is the area of the convex hull of the lowest points over that of the bounding box.
+    """
+    low, extent = points.min(axis=0), np.ptp(points, axis=0)
+    if not extent.all():
+        return "z"
+    y, z = (_support((points - low) / extent, axis) for axis in (1, 2))
+    return "y" if y > max(_BROAD, _BROADER * z) else "z"
+
+
+def _support(points: Reals, axis: int) -> float:
+    """Return the area of the convex hull of the lowest points along an axis, of points in the unit cube."""
+    lowest = np.delete(points[points[:, axis] <= _BASE], axis, axis=1)
+    try:
+        return float(ConvexHull(lowest).volume)
+    except (QhullError, ValueError):
+        # Points on a line, or fewer than three, have no area.
+        return 0.0
 
 
 def _extremes(tree: xr.DataTree, order: float, families: Sequence[str]) -> Iterator[str]:
@@ -188,7 +224,7 @@ def _extremes(tree: xr.DataTree, order: float, families: Sequence[str]) -> Itera
     yield from frame.loc[list(dict.fromkeys(extremes))[:_MOST_EXTREMES], "mesh"]
 
 
-def _view(tree: xr.DataTree, label: str, mesh: Mesh, orders: tuple[float, ...], most: int, up: Axis) -> MeshView:
+def _view(tree: xr.DataTree, label: str, mesh: Mesh, orders: tuple[float, ...], most: int) -> MeshView:
     used = mesh.used_vertices
     number = np.empty(len(mesh.vertices), dtype=np.int32)
     number[used] = np.arange(len(used))
@@ -200,9 +236,7 @@ def _view(tree: xr.DataTree, label: str, mesh: Mesh, orders: tuple[float, ...], 
         # Collapsed edges may leave the period by a hair where the mesh fills it.
         vertices = np.clip(vertices, own.min(axis=0), own.max(axis=0))
         values = witness(*fields_of(tree, label), list(orders), vertices, dtype="complex64").to_numpy()
-    # A cyclic permutation of the axes, which does not mirror the mesh.
-    upright = np.roll(vertices, _AXES.index("z") - _AXES.index(up), axis=1)
-    return MeshView(label, upright, triangles, values, orders, len(corners)).towards_worst()
+    return MeshView(label, vertices, triangles, values, orders, len(corners))
 
 
 def _for_display(vertices: Reals, triangles: Triangles, most: int) -> tuple[Reals, Triangles]:
@@ -249,12 +283,13 @@ def _mapping(limit: float) -> ScalarMappable:
     return ScalarMappable(Normalize(-limit, limit), "RdBu_r")
 
 
-def draw_witness(view: MeshView, axes: Axes | None = None) -> Axes:
+def draw_witness(view: MeshView, axes: Axes | None = None, limit: float | None = None) -> Axes:
     """Draw a mesh at its first order on axes, or on those of a new figure, with its label above and a colour bar."""
     axes = axes or Figure(figsize=(WIDTH_INCHES, _HEIGHT_INCHES), layout="constrained").subplots()
-    draw_mesh(axes, view)
+    limit = view.color_limits[0] if limit is None else limit
+    draw_mesh(axes, view, limit=limit)
     set_title(axes, escaped(view.label), _seen(view))
-    _add_colorbar(axes.figure, axes, [view], view.color_limits[0], 0)  # type: ignore[arg-type]
+    _add_colorbar(axes.figure, axes, [view], limit, 0)  # type: ignore[arg-type]
     return axes
 
 
@@ -263,69 +298,83 @@ def write_witness_plots(
     output_folder: str | Path,
     folder: str | Path = ".",
     meshes: Sequence[str] = (),
-    up: Axis = "z",
+    up: Axis | None = None,
+    colors: Colors = "own",
     formats: Sequence[PictureFormat] = ("png",),
     size: Size | None = None,
 ) -> tuple[tuple[Path, ...], Mapping[str, str]]:
     """Draw meshes of an open store, coloured by their witness functions, into a folder; see `make_views`.
 
-    Each mesh gets a file witness-* with colours and a view of its own; several are also drawn beside each other in the
-    file witness, seen from the front and on one scale of colours, at the first order. Return the paths of the pictures,
-    and the reason for each mesh without one.
+    Each mesh gets a file witness-* with a view of its own; several are also drawn beside each other in the file
+    witness, seen from the front, at the first order. Meshes have their own scales of colours, or a common one for each
+    order. Return the paths of the pictures, and the reason for each mesh without one.
     """
     tree = selection.tree
     views, missing = make_views(tree, folder, meshes, PICTURE_LIMITS, up, selection.orders, selection.families)
     numbers = {label: i for i, label in enumerate(finished_group(tree, "meshes")["mesh"].values.tolist())}
-    compared = [replace(view, eye=FRONT) for view in views[:_MOST_COMPARED]]
+    common = np.max([view.color_limits for view in views], axis=0) if views and colors == "common" else None
     with drawing(size):
         figures = {
-            f"witness-{file_stem(numbers[view.label], view.label)}": witness_figure(view, size) for view in views
+            f"witness-{file_stem(numbers[view.label], view.label)}": witness_figure(view, size, common)
+            for view in views
         }
-        if len(compared) > 1:
-            figures["witness"] = _comparison_figure(compared, len(views), size)
+        if len(views) > 1:
+            figures["witness"] = _comparison_figure(views, size, None if common is None else common[0])
     return write_figures(figures, output_folder, formats, size), missing
 
 
-def witness_figure(view: MeshView, size: Size | None = None) -> Figure:
+def witness_figure(view: MeshView, size: Size | None = None, limits: Reals | None = None) -> Figure:
     """Return a mesh seen from one side, with a panel for each of its first orders."""
     count = min(len(view.orders), MOST_ORDERS)
+    limits = view.color_limits if limits is None else limits
     # Below each panel its colours, above all of them the name of the mesh.
-    figure, panels = _panels(count, size, above=0.3, beside=0.7)
+    figure, panels = _panels(count, size, above=0.3, beside=0.8)
     for i, axes in enumerate(panels):
-        draw_mesh(axes, view, i)
-        _add_colorbar(figure, axes, [view], view.color_limits[i], i)
+        draw_mesh(axes, view, i, limits[i])
+        _add_colorbar(figure, axes, [view], limits[i], i)
     omission = f"{count} of {len(view.orders)} orders" if count < len(view.orders) else ""
     figure.suptitle("\n".join(filter(None, (escaped(view.label), _seen(view), omission))), fontsize="medium")
     return figure
 
 
-def _panels(count: int, size: Size | None, *, above: float, beside: float) -> tuple[Figure, Sequence[Axes]]:
-    """Return a figure with panels beside each other, of a size, or with inches for what is above and in each row."""
-    columns = min(_PANELS_IN_A_ROW, count)
-    rows = -(-count // columns)
-    height = above + rows * (beside + min(WIDTH_INCHES / columns, _HEIGHT_INCHES))
+def _panels(count: int, size: Size | None, *, above: float, beside: float) -> tuple[Figure, list[Axes]]:
+    """Return a figure with panels in rows, of a size, or with inches for what is above and in each row.
+
+    The panels of a row fill its width, so that no place remains empty.
+    """
+    rows = -(-count // _PANELS_IN_A_ROW)
+    in_rows = [len(row) for row in np.array_split(np.arange(count), rows)]
+    height = above + rows * (beside + min(WIDTH_INCHES / in_rows[0], _HEIGHT_INCHES))
     figure = Figure(figsize=size or (WIDTH_INCHES, height), layout="constrained")
-    panels = figure.subplots(rows, columns, squeeze=False).ravel().tolist()
+    columns = math.lcm(*in_rows)
+    grid = figure.add_gridspec(rows, columns)
+    panels = []
+    for i, in_row in enumerate(in_rows):
+        width = columns // in_row
+        panels += [figure.add_subplot(grid[i, k * width : (k + 1) * width]) for k in range(in_row)]
     for axes in panels:
         axes.set_axis_off()
-    return figure, panels[:count]
+    return figure, panels
 
 
 def _seen(view: MeshView) -> str:
     return "" if np.array_equal(view.eye, FRONT) else "seen from the side of the largest values"
 
 
-def _comparison_figure(views: Sequence[MeshView], total: int, size: Size | None) -> Figure:
-    """Return meshes beside each other, with their witness functions of the first order on one scale."""
-    omission = f"{len(views)} of {total} meshes" if len(views) < total else ""
-    figure, panels = _panels(len(views), size, above=0.8 + 0.3 * bool(omission), beside=0.3)
-    limit = max(view.color_limits[0] for view in views)
-    for axes, view in zip(panels, views, strict=True):
-        draw_mesh(axes, view, limit=limit)
+def _comparison_figure(views: Sequence[MeshView], size: Size | None, limit: float | None) -> Figure:
+    """Return meshes beside each other, with their witness functions of the first order, on one scale if it is given."""
+    shown = views[:_MOST_COMPARED]
+    omission = f"{len(shown)} of {len(views)} meshes" if len(shown) < len(views) else ""
+    figure, panels = _panels(len(shown), size, above=0.8 + 0.3 * bool(omission), beside=0.3 if limit else 0.8)
+    for axes, view in zip(panels, shown, strict=True):
+        draw_mesh(axes, replace(view, eye=FRONT), limit=limit)
         axes.set_title(f"{shortened(view.label)}\n{view.original_triangles:,} triangles", fontsize="small")
+        if limit is None:
+            _add_colorbar(figure, axes, [view], view.color_limits[0], 0)
     if omission:
         figure.suptitle(omission, fontsize="medium")
-    _add_colorbar(figure, panels, views, limit, 0)
+    if limit is not None:
+        _add_colorbar(figure, panels, shown, limit, 0)
     return figure
 
 
@@ -350,6 +399,7 @@ def _add_colorbar(
         extend=EXTENDS[ends],
     )
     beyond = f"\narrows: up to {1 - COVERED_AREA:.0%} of the area" if any(ends) else ""
-    bar.set_label(f"witness, order {views[0].orders[index]:g}{beyond}", fontsize="small")
+    order = f"witness, order {views[0].orders[index]:g}"
+    bar.set_label(f"missing area \N{LEFT RIGHT ARROW} extra area\n{order}{beyond}", fontsize="small")
     bar.ax.tick_params(labelsize="x-small")
     bar.ax.xaxis.get_offset_text().set_fontsize("x-small")

@@ -60,7 +60,12 @@ Page = tuple[str, tuple[str, ...]]
 
 
 def report(
-    store: AnyStore, path: str | Path, *, folder: str | Path = ".", witnesses: Sequence[str] = (), up: Axis = "z"
+    store: AnyStore,
+    path: str | Path,
+    *,
+    folder: str | Path = ".",
+    witnesses: Sequence[str] = (),
+    up: Axis | None = None,
 ) -> Path:
     """Write the report of a store as one HTML page, with tables, plots and meshes, that makes no requests.
 
@@ -73,7 +78,7 @@ def report(
         folder: Folder where relative paths in the study start; the study makes some meshes again, to be shown.
         witnesses: Labels of those meshes, in the store of one object, or patterns such as "scans/*"; by default a few
             that are chosen by their distances.
-        up: Axis that points upwards in the meshes' own coordinates.
+        up: Axis that points upwards in the meshes' own coordinates; default the one that they seem to rest on, y or z.
 
     Returns:
         The path of the page.
@@ -100,7 +105,9 @@ def write_page(path: Path, text: str) -> None:
         raise StoreError(f"{path}: the report cannot be written there: {error.strerror or error}") from error
 
 
-def make_report(store: AnyStore, *, folder: str | Path = ".", witnesses: Sequence[str] = (), up: Axis = "z") -> Page:
+def make_report(
+    store: AnyStore, *, folder: str | Path = ".", witnesses: Sequence[str] = (), up: Axis | None = None
+) -> Page:
     """Return the report of a store, and what it leaves out; see `report`."""
     collection = CollectionStore.read(Location.parse(location_of(store)))
     if collection is None:
@@ -114,7 +121,7 @@ def make_report(store: AnyStore, *, folder: str | Path = ".", witnesses: Sequenc
     return _filled("league", content, league_data(content["leagues"], content["name"], content["orders"]))
 
 
-def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], up: Axis) -> Page:
+def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], up: Axis | None) -> Page:
     tree = as_tree(store)
     content = study_content(tree, Status.from_store(store))
     selection = Selection.from_store(tree)
@@ -334,6 +341,8 @@ def _view(view: MeshView) -> Json:
         "points": [_packed(axis, "<f4") for axis in view.vertices.T],
         "corners": [_packed(corner, index) for corner in view.triangles.T],
         "values": [_packed(values, "<f4") for values in view.values],
+        "limits": _numbers(view.color_limits),
+        "extent": _numbers(np.ptp(view.vertices, axis=0)),
     }
 
 

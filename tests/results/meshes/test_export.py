@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import re
 import shutil
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 import pyvista
 import trimesh
+import xarray as xr
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imread
@@ -21,9 +23,17 @@ from plyfile import PlyData
 
 import sobolev_batch as sb
 from sobolev_batch import open_store
+from sobolev_batch.results.figures import views
 from sobolev_batch.results.figures.meshes import StudyMeshes, fields_of, witness_at_vertices
 from sobolev_batch.results.figures.selection import Selection
-from sobolev_batch.results.figures.views import FRONT, MeshView, draw_mesh, make_views, write_witness_plots
+from sobolev_batch.results.figures.views import (
+    FRONT,
+    MeshView,
+    draw_mesh,
+    make_views,
+    up_axis,
+    write_witness_plots,
+)
 from sobolev_batch.shapes import icosphere
 from tests.support.commands import call
 from tests.support.spheres import LABELS, LONG, ORDERS, RADIUS, RIGHT, STRANGE
@@ -160,9 +170,9 @@ def test_what_cannot_be_asked_for(spheres: Spheres, tmp_path: Path, monkeypatch:
     assert os.listdir(tmp_path) == ["taken"]
 
 
-def sphere_view(factors: tuple[float, ...] = (1.0,)) -> MeshView:
+def sphere_view(factors: tuple[float, ...] = (1.0,), level: int = 4) -> MeshView:
     """A sphere that is red to the right and blue to the left."""
-    ball = icosphere(4)
+    ball = icosphere(level)
     values = np.outer(factors, ball.vertices @ RIGHT)
     return MeshView("a", ball.vertices, ball.triangles.astype(np.int32), values, (-2.0, -4.0), len(ball.triangles))
 
@@ -225,6 +235,52 @@ def test_the_axis_that_points_upwards(up: Literal["x", "y", "z"], spheres: Spher
     # Turned, not mirrored.
     volumes = [np.linalg.det(vertices[[0, 100, 300]]) for vertices in (plain, turned)]
     assert volumes[1] == pytest.approx(volumes[0], rel=1e-9)
+
+
+FEET = np.array([[x, 0, z] for x in (0, 1) for z in (0, 2)])
+# With a head in front and a tail behind.
+TABLE = np.vstack([FEET, np.add(FEET, [0, 1, 0]), [[0.5, 1.4, 2.6], [0.5, 1, -0.4]]])
+
+
+@pytest.mark.parametrize(
+    ("points", "up"),
+    [
+        pytest.param(TABLE, "y", id="on four feet"),
+        pytest.param(np.roll(TABLE, 1, axis=1), "z", id="the same, turned"),
+        pytest.param(icosphere(3).vertices, "z", id="round"),
+        pytest.param(TABLE * [1, 0, 1], "z", id="flat"),
+    ],
+)
+def test_the_axis_that_points_upwards_is_found_by_what_a_mesh_stands_on(points: np.ndarray, up: str) -> None:
+    assert up_axis(points.astype(float)) == up
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("colors", ["own", "common"])
+@pytest.mark.parametrize("count", [4, 5])
+def test_panels_fill_their_rows_and_have_scales_of_their_own_or_one(
+    colors: Literal["own", "common"], count: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    made = [dataclasses.replace(sphere_view((10.0**-i, 1.0), level=1), label=f"a/{i}") for i in range(count)]
+    figures: dict[str, Figure] = {}
+    monkeypatch.setattr(views, "make_views", lambda *_: (made, {}))
+    monkeypatch.setattr(views, "write_figures", lambda named, *_: figures.update(named) or ())
+    tree = xr.DataTree.from_dict({"meshes": xr.Dataset({"mesh": [view.label for view in made]})})
+    write_witness_plots(Selection(tree, (-4.0, -2.0), ("a",)), tmp_path, colors=colors)
+    end = made[0].color_limits[0]
+    # The second order of each mesh has the same values.
+    expected = {"witness": [end * 10.0**-i for i in range(count)] if colors == "own" else [end]}
+    expected |= {f"witness-{i:04}-a-{i}": [end * (10.0**-i if colors == "own" else 1), end] for i in range(count)}
+    found = {}
+    for name, figure in figures.items():
+        figure.draw_without_rendering()
+        bars = [axes for axes in figure.axes if axes.get_label() == "<colorbar>"]
+        found[name] = [bar.get_xlim()[1] for bar in bars]
+        boxes = [box for axes in figure.axes if axes not in bars and (box := axes.get_subplotspec())]
+        cells = [(row, k) for box in boxes for row in box.rowspan for k in box.colspan]
+        rows, columns = boxes[0].get_gridspec().get_geometry()
+        assert sorted(cells) == [(row, k) for row in range(rows) for k in range(columns)]
+    assert found == {name: pytest.approx(ends) for name, ends in expected.items()}
 
 
 @pytest.mark.all

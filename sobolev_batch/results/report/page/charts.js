@@ -25,7 +25,7 @@
   const flat = [["toImage", "zoomIn2d", "zoomOut2d", "resetScale2d"]];
   const space = [["toImage", "resetCameraDefault3d"]];
   const viridis = [[0, "#440154"], [0.25, "#3b528b"], [0.5, "#21918c"], [0.75, "#5ec962"], [1, "#fde725"]];
-  const state = { order: 0, view: 0, clustered: true };
+  const state = { order: 0, view: 0, clustered: true, common: false };
 
   // Plotly interprets a few tags in any text; names must be shown unchanged.
   const plain = (text) => String(text).replaceAll("&", "&amp;").replaceAll("<", "&lt;").replaceAll(">", "&gt;");
@@ -235,23 +235,30 @@
   };
 
   const witness = () => {
-    const { label, points: [x, y, z], corners: [i, j, k], values, triangles, shown } = data.witness[state.view];
+    const { label, points: [x, y, z], corners: [i, j, k], values, extent, triangles, shown } = data.witness[state.view];
+    const ends = (state.common ? data.witness : [data.witness[state.view]]).map(({ limits }) => limits[state.order]);
+    const limit = Math.max(...ends);
     const whole = triangles.toLocaleString("en");
     document.getElementById("size").textContent = shown < triangles
       ? `Shown with ${shown.toLocaleString("en")} of ${whole} triangles.`
       : `It has ${whole} triangles.`;
     const hidden = { visible: false, showbackground: false };
+    const height = narrow() ? 420 : 560;
+    // A mesh whose bounding box has this diagonal is seen whole from the camera, wherever it turns to.
+    const diagonal = 1.35 * Math.min(1, document.getElementById("chart-witness").clientWidth / height);
+    const sides = extent.map((side) => Math.max(side, 1e-3 * Math.hypot(...extent)) * diagonal / Math.hypot(...extent));
     draw("witness", [{
-      type: "mesh3d", x, y, z, i, j, k, intensity: values[state.order], cmid: 0, hoverinfo: "x+y+z+text",
+      type: "mesh3d", x, y, z, i, j, k, intensity: values[state.order], cmin: -limit, cmax: limit, hoverinfo: "x+y+z+text",
       hovertemplate: `${plain(label).replaceAll("%", "&#37;")}<br>%{intensity:.3g}<extra></extra>`, flatshading: false,
       colorscale: [[0, color("less")], [0.5, color("neutral")], [1, color("more")]],
       lighting: { ambient: 0.8, diffuse: 0.45, specular: 0.08, roughness: 0.8 },
       colorbar: { outlinewidth: 0, thickness: 12, exponentformat: "power", len: 0.8,
         ...(narrow() ? { orientation: "h", y: -0.05, yanchor: "top" } : {}) },
     }], {
-      height: narrow() ? 420 : 560, margin: { l: 0, r: 0, t: 0, b: 0 },
+      height, margin: { l: 0, r: 0, t: 0, b: 0 },
       scene: {
-        xaxis: hidden, yaxis: hidden, zaxis: hidden, aspectmode: "data",
+        xaxis: hidden, yaxis: hidden, zaxis: hidden, aspectmode: "manual",
+        aspectratio: { x: sides[0], y: sides[1], z: sides[2] },
         camera: { eye: { x: 1.1, y: -1.25, z: 0.7 } }, uirevision: "kept",
       },
     }, space);
@@ -266,6 +273,10 @@
   document.getElementById("clustered")?.addEventListener("change", (event) => {
     state.clustered = event.target.checked;
     matrix();
+  });
+  document.getElementById("common")?.addEventListener("change", (event) => {
+    state.common = event.target.checked;
+    witness();
   });
   document.getElementById("view")?.addEventListener("change", (event) => {
     state.view = Number(event.target.value);
