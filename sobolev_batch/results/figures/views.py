@@ -16,7 +16,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, ScalarFormatter
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
@@ -274,7 +274,8 @@ def draw_mesh(axes: Axes, view: MeshView, index: int = 0, limit: float | None = 
             list(corners[order, :, :2]), facecolors=colors[order], edgecolors="face", linewidths=0.3, rasterized=True
         )
     )
-    axes.set_aspect("equal")
+    # Axes that shrink to the mesh would mislead the layout, which then cuts their titles off.
+    axes.set_aspect("equal", adjustable="datalim")
     axes.autoscale_view()
     axes.set_axis_off()
 
@@ -382,8 +383,6 @@ def _add_colorbar(
     figure: Figure, panels: Axes | Sequence[Axes], views: Sequence[MeshView], limit: float, index: int
 ) -> None:
     """Add the colours of some meshes at one of their orders, with arrows where values lie beyond them."""
-    numbers = ScalarFormatter()
-    numbers.set_powerlimits((-2, 3))
     ends = (
         min(view.values[index].min() for view in views) < -limit,
         max(view.values[index].max() for view in views) > limit,
@@ -394,7 +393,7 @@ def _add_colorbar(
         shrink=0.8,
         orientation="horizontal",
         ticks=MaxNLocator(4, symmetric=True),
-        format=numbers,
+        format="{x:.4g}",
         aspect=20 if isinstance(panels, Axes) else 50,
         extend=EXTENDS[ends],
     )
@@ -402,4 +401,3 @@ def _add_colorbar(
     order = f"witness, order {views[0].orders[index]:g}"
     bar.set_label(f"missing area \N{LEFT RIGHT ARROW} extra area\n{order}{beyond}", fontsize="small")
     bar.ax.tick_params(labelsize="x-small")
-    bar.ax.xaxis.get_offset_text().set_fontsize("x-small")

@@ -257,11 +257,14 @@ def test_the_axis_that_points_upwards_is_found_by_what_a_mesh_stands_on(points: 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("colors", ["own", "common"])
-@pytest.mark.parametrize("count", [4, 5])
+@pytest.mark.parametrize("count", [3, 4, 5])
 def test_panels_fill_their_rows_and_have_scales_of_their_own_or_one(
     colors: Literal["own", "common"], count: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    made = [dataclasses.replace(sphere_view((10.0**-i, 1.0), level=1), label=f"a/{i}") for i in range(count)]
+    balls = [sphere_view((10.0**-i, 1.0), level=1) for i in range(count)]
+    made = [
+        dataclasses.replace(ball, label=f"a/{i}", vertices=ball.vertices * [1, 1, 1.5]) for i, ball in enumerate(balls)
+    ]
     figures: dict[str, Figure] = {}
     monkeypatch.setattr(views, "make_views", lambda *_: (made, {}))
     monkeypatch.setattr(views, "write_figures", lambda named, *_: figures.update(named) or ())
@@ -274,6 +277,10 @@ def test_panels_fill_their_rows_and_have_scales_of_their_own_or_one(
     found = {}
     for name, figure in figures.items():
         figure.draw_without_rendering()
+        drawn_box, page = figure.get_tightbbox(), figure.bbox_inches
+        assert min(drawn_box.xmin, drawn_box.ymin) >= 0
+        assert drawn_box.xmax <= page.xmax
+        assert drawn_box.ymax <= page.ymax
         bars = [axes for axes in figure.axes if axes.get_label() == "<colorbar>"]
         found[name] = [bar.get_xlim()[1] for bar in bars]
         boxes = [box for axes in figure.axes if axes not in bars and (box := axes.get_subplotspec())]
