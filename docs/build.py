@@ -26,31 +26,27 @@ API = "sobolev_batch"
 MODULES = ("plot", "shapes", "fitting", "sources", "testing", "result_types", "errors")
 APIS = (API, *(f"{API}.{name}" for name in MODULES))
 
+# Pages by group, as in the README; the API follows the pages of the reference.
+GROUPS = {
+    "": ("README",),
+    "Learn": ("docs/tutorial", "docs/walkthroughs", "docs/gallery", "workflows/README"),
+    "Reference": (
+        *("docs/studies", "docs/remeshers", "docs/leagues", "docs/commands", "docs/formats", "docs/surfaces"),
+        *("docs/store", "docs/queries", "docs/testing", "docs/fitting", "docs/moving", "docs/reconstruction"),
+    ),
+    "Operate": ("docs/clusters", "docs/scale", "docs/reliability"),
+    "Project": ("docs/numerics", "docs/design", "benchmarks/RESULTS", "docs/stability", "CHANGELOG"),
+}
+ADDRESSES = {
+    "README": "index.html",
+    "workflows/README": "workflows.html",
+    "benchmarks/RESULTS": "benchmarks.html",
+    "CHANGELOG": "changelog.html",
+}
 PAGES = {
-    "README.md": "index.html",
-    **{
-        f"docs/{name}.md": f"{name}.html"
-        for name in (
-            *(
-                "walkthroughs",
-                "gallery",
-                "tutorial",
-                "commands",
-                "studies",
-                "leagues",
-                "remeshers",
-                "formats",
-                "surfaces",
-                "fitting",
-                "reconstruction",
-                "moving",
-            ),
-            *("testing", "queries", "store", "numerics", "clusters", "scale", "reliability", "stability", "design"),
-        )
-    },
-    "workflows/README.md": "workflows.html",
-    "benchmarks/RESULTS.md": "benchmarks.html",
-    "CHANGELOG.md": "changelog.html",
+    f"{name}.md": ADDRESSES.get(name) or f"{name.removeprefix('docs/')}.html"
+    for names in GROUPS.values()
+    for name in names
 }
 
 
@@ -63,18 +59,23 @@ def build(output: Path) -> None:
         docformat="google", search=False, show_source=False, template_directory=ROOT / "docs" / "templates"
     )
     pages = {PAGES[source]: title[1] if title else source for source, title in titles.items()}
+    groups = {
+        group: {PAGES[f"{name}.md"]: pages[PAGES[f"{name}.md"]] for name in names} for group, names in GROUPS.items()
+    }
     packages = {name: import_module(name) for name in APIS}
     for package in packages.values():
         inspect.getmembers(package)  # pdoc sees only names that were asked for once
     modules = {name: Module(package) for name, package in packages.items()}
     addresses = {name: f"{name.replace('.', '/')}.html" for name in modules}
-    pages |= {address: name.replace(API, "API").replace(".", ": ") for name, address in addresses.items()}
+    groups["Reference"] |= {address: name.replace(API, "API").replace(".", ": ") for name, address in addresses.items()}
     (output / API).mkdir(exist_ok=True)
     for name, module in modules.items():
         up = "../" * name.count(".")
-        env.globals["pages"] = {up + address: title for address, title in pages.items()}
+        env.globals["groups"] = {
+            group: {up + address: title for address, title in entries.items()} for group, entries in groups.items()
+        }
         write(output / addresses[name], pdoc.render.html_module(module, modules))
-    env.globals["pages"] = pages
+    env.globals["groups"] = groups
     page = env.get_template("page.html.jinja2")
     for source, text in texts.items():
         rendered, address = to_html(text), PAGES[source]
