@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import platform
 import shutil
 import signal
@@ -48,6 +49,8 @@ def pytest_configure() -> None:
     """Let processes that tests start hear Ctrl-C, and refuse to start any in tests without the marker for it."""
     # Imports make much that stays: to look it through again and again takes a fifth of the time of collection.
     gc.disable()
+    # The width of tables is not that of the terminal in which tests run.
+    os.environ["COLUMNS"] = "100"
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     # Dask asks for it once in each process, for which Python starts another.

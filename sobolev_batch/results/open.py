@@ -62,7 +62,8 @@ def open_store(store: str | Path | Location | Sequence[str | Path | Location]) -
 
     Groups: fourier (the fields), spectra, meshes, norms, distances, convergence, records; where the study requests it
     also octaves and proximity. docs/store.md lists their variables with dimensions and units. All stay on disk until
-    you ask for values of them. Fields and spectra are Dask arrays; fields have the accessor `field.sobolev`.
+    you ask for values of them. Fields and spectra are Dask arrays, unless the store is in memory; fields have the
+    accessor `field.sobolev`.
 
     Several stores open as one, without copies of their fields. They need the same lattice, similarity and reference.
     Their meshes follow each other, with the name of their `study` as a coordinate, which begins labels and families if
@@ -100,7 +101,8 @@ def open_store(store: str | Path | Location | Sequence[str | Path | Location]) -
     with opened.location.access("read"):
         try:
             tree = xr.open_datatree(keys, engine="zarr", consolidated=True, zarr_format=3)
-            for group in _LARGE.intersection(tree.children):
+            # The processes of a Dask client do not see the memory of this one.
+            for group in () if opened.location.is_in_memory else _LARGE.intersection(tree.children):
                 lazy = xr.open_dataset(keys, group=group, engine="zarr", consolidated=True, zarr_format=3, chunks={})
                 # Coordinates are small.
                 tree[group].dataset = tree[group].to_dataset().assign(lazy.data_vars)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import re
+import shutil
 import subprocess
 import sys
 import tracemalloc
@@ -18,6 +20,7 @@ import xarray as xr
 
 import sobolev_batch as sb
 from sobolev_batch.batch.store.store import Store
+from sobolev_batch.errors import StoreError
 from sobolev_batch.results import store_accessor
 from sobolev_batch.results.accessor import SobolevAccessor
 from sobolev_batch.spectral.fields import Quality
@@ -67,6 +70,14 @@ def test_one_pair_reads_no_other_mesh(finished_store: Path, monkeypatch: pytest.
 def test_a_tree_that_xarray_has_opened_answers_too(finished_store: Path) -> None:
     plain, own = xr.open_datatree(finished_store, engine="zarr"), sb.open_store(finished_store)
     xr.testing.assert_equal(plain.sobolev.distance(-3.5)["distance"], own.sobolev.distance(-3.5)["distance"])
+
+
+def test_fields_of_a_store_that_is_not_there_are_not_missing_values(copy: Path) -> None:
+    fields = variable(sb.open_store(copy), "fourier", "fourier")
+    shutil.rmtree(copy)
+    # As for a worker on another machine.
+    with pytest.raises(StoreError, match=f"^{re.escape(str(copy))}: it is not there for process"):
+        fields.sel(mesh="ico/1").load()
 
 
 def test_stacks_are_taken_one_by_one(finished_store: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 import xarray as xr
 
 import sobolev_batch as sb
+from sobolev_batch.batch.cluster.clients import thread_client
 from sobolev_batch.errors import InputError, StoreError
 from tests.support.studies import small_table, variable
 
@@ -19,21 +21,23 @@ pytestmark = pytest.mark.slow
 OCTAVES = {"xi_max": 3.0, "M": 16, "octaves": 1}
 
 
-def stored(name: str, radii: list[float], **changes: Any) -> str:
-    """Run a study of balls, and return the URL of its store in memory."""
-    path = f"memory://many-{name}.zarr"
+def stored(folder: Path, name: str, radii: list[float], **changes: Any) -> str:
+    """Run a study of balls, and return the path of its store."""
+    path = str(folder / f"{name}.zarr")
     families = [{"name": f"b{radius:g}", "source": "sphere", "radius": radius} for radius in radii]
     study = {**small_table()["study"], "name": changes.pop("study", name)}
-    sb.run(sb.Study.from_table(small_table(study=study, family=families, **changes)), path, workers=1)
+    with thread_client(1) as client:
+        sb.run(sb.Study.from_table(small_table(study=study, family=families, **changes)), path, client)
     return path
 
 
 @pytest.fixture(scope="module", params=["lattice", "octaves"])
-def stores(request: pytest.FixtureRequest) -> tuple[str, str, str]:
+def stores(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str, str]:
     """Return two stores, and that of one study with the meshes of both."""
     changes = {"lattice": OCTAVES} if request.param == "octaves" else {}
+    folder = tmp_path_factory.mktemp("many")
     radii = {"a": [0.5, 0.6], "b": [0.7, 0.8, 0.9], "all": [0.5, 0.6, 0.7, 0.8, 0.9]}
-    one, other, every = (stored(f"{name}-{request.param}", part, **changes) for name, part in radii.items())
+    one, other, every = (stored(folder, f"{name}-{request.param}", part, **changes) for name, part in radii.items())
     return one, other, every
 
 
@@ -96,9 +100,9 @@ def test_a_label_that_comes_twice_begins_with_its_study(stores: tuple[str, str, 
         ("smaller", {"reference": {"source": "sphere", "radius": 0.95}}, "similarity, reference"),
     ],
 )
-def test_what_differs_is_named(name: str, changes: dict[str, Any], difference: str) -> None:
-    first = stored("first", [0.5])
-    second = stored(name, [0.6], **changes)
+def test_what_differs_is_named(name: str, changes: dict[str, Any], difference: str, tmp_path: Path) -> None:
+    first = stored(tmp_path, "first", [0.5])
+    second = stored(tmp_path, name, [0.6], **changes)
     with pytest.raises(
         StoreError, match=f"^{re.escape(second)}: .* as one with {re.escape(first)}: they differ in {difference}$"
     ):

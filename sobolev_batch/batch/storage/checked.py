@@ -7,6 +7,8 @@ is damaged.
 from __future__ import annotations
 
 import math
+import os
+import socket
 from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any, Self
@@ -19,7 +21,7 @@ from zarr.abc.store import Store as ZarrStore
 from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import LocalStore, WrapperStore
 
-from sobolev_batch.errors import DamageError
+from sobolev_batch.errors import DamageError, StoreError
 
 CHANGED = "it is not what was written"
 CHECKSUM_BYTES = 4
@@ -57,6 +59,12 @@ class CheckedStore(WrapperStore[ZarrStore]):
         content = None if problem else await super().get(key, prototype)
         if content is not None:
             problem = problem_of_chunk(content.as_numpy_array(), document)
+        elif not problem and not await self._store.exists("zarr.json"):
+            # All its values would read as missing ones.
+            raise StoreError(
+                f"{self._name}: it is not there for process {os.getpid()} of {socket.gethostname()}; a worker of your "
+                'Dask client needs the same path, or compute with scheduler="threads"'
+            )
         if problem:
             place = key.removeprefix(f"{array}/c").removeprefix("/")
             raise DamageError(

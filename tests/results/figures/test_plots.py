@@ -26,6 +26,13 @@ from tests.support.trees import distances_of, tree_of
 
 
 @pytest.fixture
+def tree(tree: xr.DataTree) -> xr.DataTree:
+    """The same without fields that spectra could be made of."""
+    del tree.attrs["similarity"]
+    return tree
+
+
+@pytest.fixture
 def pairs(tree: xr.DataTree) -> xr.DataTree:
     """The same with the distances of all pairs, and names that matplotlib would take for a formula, or for hidden."""
     labels, families = ["$^$/0", "$^$/1", "_f/2", "reference"], ["$^$", "$^$", "_f", "reference"]
