@@ -35,6 +35,7 @@ from sobolev_batch.results.open import (
 )
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables.convergence import table
+from sobolev_batch.results.tables.costs import CostLeague
 from sobolev_batch.results.tables.evolution import evolution
 from sobolev_batch.results.tables.league import League
 from sobolev_batch.results.tables.matrix import pairs_of
@@ -118,7 +119,9 @@ def make_report(
             f"{collection.location.below(collection.objects[0])}"
         )
     content = league_content(collection, Status.of_collection(collection))
-    return _filled("league", content, league_data(content["leagues"], content["name"], content["orders"]))
+    charts = league_data(content["leagues"], content["name"], content["orders"])
+    families = content["costs"][0].methods if content["costs"] else charts["families"]
+    return _filled("league", content, {**charts, "families": list(families), "costs": cost_data(content["costs"])})
 
 
 def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], up: Axis | None) -> Page:
@@ -128,7 +131,7 @@ def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], u
     spectra = selection.spectra if selection.has_spectra else None
     with fields_read(store):
         views, missing = make_views(tree, folder, witnesses, up=up)
-    charts = chart_data(tree, spectra, views)
+    charts = {**chart_data(tree, spectra, views), "costs": cost_data(content["costs"])}
     content["omissions"] += chart_omissions(tree, charts, spectra, views, missing)
     page = _filled("study", content, charts, spectra=spectra, views=views, missing=missing)
     require_unchanged(tree)
@@ -224,6 +227,20 @@ def league_data(leagues: Sequence[League], name: str, orders: Sequence[str]) -> 
             for league in leagues
         ],
     }
+
+
+def cost_data(leagues: Sequence[CostLeague]) -> list[Json] | None:
+    """Return for each order the members that all objects have, method by method, and their front; None without any."""
+    return [
+        {
+            "lines": [
+                _line(method, rows[league.x], rows["relative"], rows["relative_error"], labels=rows["member"].tolist())
+                for method, rows in league.means.groupby("method", sort=False)
+            ],
+            "front": {"x": _numbers(league.front[league.x]), "y": _numbers(league.front["relative"])},
+        }
+        for league in leagues
+    ] or None
 
 
 def _line(family: str, places: Any, values: Any, errors: Any, **others: Any) -> Json:

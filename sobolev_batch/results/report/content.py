@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -16,6 +17,14 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.results.open import finished_group, has_proximity, open_store, placement_doubts
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables.convergence import page_columns, table, tables_of, unit_notes, with_remarks
+from sobolev_batch.results.tables.costs import (
+    COST_NOTE,
+    DEFAULT_COST,
+    METHOD_COLUMNS,
+    CostLeague,
+    cost_leagues_of,
+    front_columns,
+)
 from sobolev_batch.results.tables.league import (
     LEAGUE_COLUMNS,
     LEAGUE_NOTE,
@@ -149,6 +158,7 @@ def study_content(tree: xr.DataTree, status: Status) -> dict[str, Any]:
     orders = frame["order"].drop_duplicates().tolist()
     return {
         **common_content(attributes["title"], study, {"": frame}, status, failed, attributes["versions"]),
+        **cost_content({str(study["study"]["name"]): frame}, families),
         "reference": convergence.attrs["reference"],
         "settings": dict(_settings(attributes)),
         "sentences": sentences,
@@ -263,9 +273,11 @@ def league_content(collection: CollectionStore, status: Status) -> dict[str, Any
     by_order = {league.order: league for league in leagues}
     objects = [row for s in orders for row in _object_rows(tables, s, by_order.get(s))]
     ranked, pairs = ([row for league in leagues for row in _rows(league, name)] for name in ("table", "pairs"))
+    methods = leagues[0].methods if leagues else list(dict.fromkeys(pd.concat(tables.values())["family"]))
     versions = open_store(collection.location.below(next(iter(tables)))).attrs["versions"]
     return {
         **common_content(collection.title, collection.table, tables, status, status.failed, versions),
+        **cost_content(tables, methods),
         "leagues": leagues,
         "no_league": no_league,
         "sentences": tuple(map(sentence_of, leagues)) or (_NO_LEAGUE,) * len(orders),
@@ -278,6 +290,21 @@ def league_content(collection: CollectionStore, status: Status) -> dict[str, Any
             f"single meshes: each object has a report of its own, such as that of {one}",
             *(f"{name}, from the league{where}: {why}" for name, where, why in left_out(leagues)),
         ],
+    }
+
+
+def cost_content(tables: Mapping[str, pd.DataFrame], methods: Sequence[str]) -> dict[str, Any]:
+    """Return the leagues by cost of objects, from the rows of `table` of each; none where no cost is known."""
+    leagues: Sequence[CostLeague] = ()
+    with suppress(InputError):
+        leagues = cost_leagues_of(tables, list(tables), DEFAULT_COST, methods)
+    found = {name: [row for one in leagues for row in _rows(one, name)] for name in ("table", "front")}
+    orders = [one.order for one in leagues]
+    return {
+        "costs": leagues,
+        "cost_methods": PageTable("cost-methods", METHOD_COLUMNS, found["table"], orders),
+        "cost_front": PageTable("cost-front", front_columns(DEFAULT_COST), found["front"], orders),
+        "cost_note": COST_NOTE.replace("\n", " "),
     }
 
 
@@ -300,10 +327,10 @@ def sentence_of(league: League) -> str:
     return f"The intervals do not separate {names} {over} {at_order}. {first} has the smallest mean, {amount}."
 
 
-def _rows(league: League, name: Literal["table", "pairs"]) -> list[Row]:
+def _rows(league: League | CostLeague, name: Literal["table", "pairs", "front"]) -> list[Row]:
     """Return the rows of a table of a league, with the colours of the methods."""
     frame: pd.DataFrame = getattr(league, name)
-    colors = frame["method"].map(league.methods.index)
+    colors = frame["method"].map(list(league.methods).index)
     return list(frame.assign(order=league.order, color=colors).to_dict(orient="records"))
 
 

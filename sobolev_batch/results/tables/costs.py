@@ -21,13 +21,13 @@ DEFAULT_COST = "make_seconds"
 _MOST_MEMBERS, _MOST_OBJECTS = 4, 10
 # Costs from it on, such as bytes, are shown as integers.
 _LARGE = 1000.0
-_NOTE = """\
+COST_NOTE = """\
 A mesh is on the front of its object unless another one, at no more cost, is nearer to the
 reference or as near at less cost. It is undecided where the errors of the distances leave that
 open. Costs are taken as measured. Means over objects are geometric, and those of members that all
 objects have."""
 
-_METHOD_COLUMNS = (
+METHOD_COLUMNS = (
     Column("method", "method", kind="label"),
     Column("front", "on the front", "{} of {}".format, "objects"),
     Column("undecided", "undecided"),
@@ -43,6 +43,7 @@ class CostLeague:
         order: Sobolev order s.
         x: What is the cost: a column of `table`, such as "make_seconds".
         objects: Names of the objects.
+        methods: Names of the methods, also of those without meshes.
         left_out: Why other objects, and methods, are not there, by name.
         meshes: The meshes of all objects, a row each. Columns: object; method; member, the name of the mesh within its
             method, with {object} for the name of the object where only this makes names alike; mesh, its label; the
@@ -58,6 +59,7 @@ class CostLeague:
     order: float
     x: str
     objects: tuple[str, ...]
+    methods: tuple[str, ...]
     left_out: Mapping[str, str]
     meshes: pd.DataFrame
 
@@ -116,6 +118,12 @@ class CostLeague:
         found = found[members["object"].nunique() == len(self.objects)].sort_values([self.x, "relative"], kind="stable")
         return found.assign(front=_is_unbeaten(found[self.x], found["relative"], found["relative"])).reset_index()
 
+    @property
+    def front(self) -> pd.DataFrame:
+        """Rows of `means` on the front, where member begins with its method; and objects, the number of all."""
+        means = self.means[self.means["front"]]
+        return means.assign(member=means["method"] + "/" + means["member"], objects=len(self.objects))
+
     def _repr_html_(self) -> str:
         # pandas escapes the names.
         tables = "".join(frame.to_html(index=False, float_format="{:.3g}".format) for frame in (self.table, self.means))
@@ -140,7 +148,7 @@ def cost_leagues_of(
     left_out |= {name: f"no mesh has a distance and {x}" for name in tables if name not in set(frame["object"])}
     left_out |= {name: f"no mesh has a distance and {x}" for name in methods if name not in set(frame["family"])}
     orders = dict.fromkeys(s for table in tables.values() for s in table["order"])
-    return tuple(_cost_league(frame[frame["order"] == s], s, x, left_out) for s in orders)
+    return tuple(_cost_league(frame[frame["order"] == s], s, x, methods, left_out) for s in orders)
 
 
 def _costs(frame: pd.DataFrame, x: str) -> pd.Series | float:
@@ -151,7 +159,9 @@ def _costs(frame: pd.DataFrame, x: str) -> pd.Series | float:
         return np.nan
 
 
-def _cost_league(frame: pd.DataFrame, order: float, x: str, left_out: Mapping[str, str]) -> CostLeague:
+def _cost_league(
+    frame: pd.DataFrame, order: float, x: str, methods: Sequence[str], left_out: Mapping[str, str]
+) -> CostLeague:
     # A name that objects do not share may hold that of its object.
     is_own = (frame.groupby("mesh")["object"].transform("nunique") == 1) & (frame["object"].nunique() > 1)
     names = [mesh.removeprefix(f"{family}/") for mesh, family in zip(frame["mesh"], frame["family"], strict=True)]
@@ -172,7 +182,7 @@ def _cost_league(frame: pd.DataFrame, order: float, x: str, left_out: Mapping[st
         parts.append(own.assign(front=front, undecided=at_worst != at_best))
     columns = ["object", "method", "member", "mesh", x, "relative", "relative_error", "front", "undecided"]
     made = pd.concat(parts, ignore_index=True)[columns]
-    return CostLeague(order, x, tuple(dict.fromkeys(made["object"])), left_out, made)
+    return CostLeague(order, x, tuple(dict.fromkeys(made["object"])), tuple(methods), left_out, made)
 
 
 def _is_unbeaten(costs: pd.Series, own: pd.Series, others: pd.Series) -> NDArray[np.bool_]:
@@ -199,20 +209,22 @@ def format_cost_leagues(leagues: Sequence[CostLeague], style: Format = "text") -
         return machine_table(frame[["order", *frame.columns.drop("order")]], style)
     sections = []
     for one in leagues:
-        methods = column_table(_METHOD_COLUMNS, one.table.to_dict(orient="records"), style)
-        means = one.means[one.means["front"]]
-        members = means["method"] + "/" + means["member"]
-        rows = means.assign(member=members, objects=len(one.objects)).to_dict(orient="records")
-        columns = (
-            Column("member", "front of the means", kind="label"),
-            Column(one.x, one.x, lambda cost: f"{cost:,.0f}" if cost >= _LARGE else f"{cost:.3g}"),
-            Column("relative", "relative", percent, "relative_error"),
-            Column("fronts", "on the front", "{} of {}".format, "objects"),
-        )
-        tables = [methods, *([column_table(columns, rows, style)] if rows else [])]
+        methods = column_table(METHOD_COLUMNS, one.table.to_dict(orient="records"), style)
+        rows = one.front.to_dict(orient="records")
+        tables = [methods, *([column_table(front_columns(one.x), rows, style)] if rows else [])]
         sections.append(section(one.caption, tables, _front_lines(one), style))
-    notes = [*wrapped(_NOTE), *(f"{name} is left out: {why}." for name, why in leagues[0].left_out.items())]
+    notes = [*wrapped(COST_NOTE), *(f"{name} is left out: {why}." for name, why in leagues[0].left_out.items())]
     return "\n\n".join([*sections, prose(notes, style)])
+
+
+def front_columns(x: str) -> tuple[Column, ...]:
+    """Return the columns of `CostLeague.front`, with a cost of this name."""
+    return (
+        Column("member", "front of the means", kind="label"),
+        Column(x, x, lambda cost: f"{cost:,.0f}" if cost >= _LARGE else f"{cost:.3g}"),
+        Column("relative", "relative", percent, "relative_error"),
+        Column("fronts", "on the front", "{} of {}".format, "objects"),
+    )
 
 
 def _front_lines(league: CostLeague) -> list[str]:

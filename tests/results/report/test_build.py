@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
@@ -149,9 +150,17 @@ def test_mesh_and_distance_are_seen_at_every_width(reader: Browser, page: Path, 
     reader.open(page, width=width, height=740)
     assert reader.tell("innerWidth") == width
     assert reader.tell("document.documentElement.scrollWidth") <= width
-    assert reader.relative_columns() == {"table-verdict": True, "table-convergence": True}
-    is_scrolled = reader.tell("[...document.querySelectorAll('.scroll')].some(e => e.scrollWidth > e.clientWidth)")
-    assert is_scrolled or width > 400
+    row = "#table-convergence tbody:not([hidden]) tr:not(.of-order) "
+    if width > 700:
+        assert reader.relative_columns() == {"table-verdict": True, "table-convergence": True}
+        return
+    # Each row is a card: its label, and below it each number with its name.
+    assert not reader.tell("[...document.querySelectorAll('.scroll')].some(e => e.scrollWidth > e.clientWidth)")
+    assert reader.texts("thead th") == []
+    tops = reader.tell(f"[...document.querySelector('{row}').children].map(e => e.getBoundingClientRect().top)")
+    assert tops == sorted(set(tops))
+    names = reader.tell(f"[...document.querySelectorAll('{row} td')].map(e => getComputedStyle(e, '::before').content)")
+    assert '"relative"' in names
 
 
 def test_csv_has_all_orders_and_all_digits(reader: Browser, store: str, tmp_path: Path) -> None:
@@ -329,6 +338,19 @@ def test_the_page_of_a_collection_opens_with_the_league(collection: str, tmp_pat
         assert reader.relative_columns() == {"table-league": True, "table-objects": True}
         assert reader.texts("#failed tbody th") == ["gone"]
         assert reader.texts("#table-objects tbody:not([hidden]) th.label") == ["ball", "large"]
+
+
+def test_a_study_with_costs_has_its_league_by_cost(store: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert 'id="costs"' not in make_report(store)[0]
+    monkeypatch.setattr(content, "DEFAULT_COST", "triangles")
+    text = make_report(store)[0]
+    expected = sb.league(store, by="cost", x="triangles")
+    data = json.loads(text.split('id="data">')[1].split("</script>")[0])["costs"]
+    for league, drawn in zip(expected, data, strict=True):
+        assert drawn["front"]["x"] == pytest.approx(league.means[league.means["front"]]["triangles"], rel=1e-3)
+        assert sum(len(line["y"]) for line in drawn["lines"]) == len(league.means)
+    table = text.split('id="table-cost-methods"')[1].split("</table>")[0]
+    assert table.count('<th scope="row"') == sum(len(league.table) for league in expected)
 
 
 @pytest.mark.slow

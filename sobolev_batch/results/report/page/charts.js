@@ -105,18 +105,20 @@
       hoverinfo: "text",
     }));
     const all = (key) => families.flatMap((line) => line[key]);
+    const slope = [];
     if (all("x").length) {
       const middle = (values) => Math.exp(values.reduce((sum, x) => sum + Math.log(x), 0) / values.length);
       const ends = [Math.min(...all("x")), Math.max(...all("x"))];
       const [size, value] = [middle(all("x")), middle(all("y"))];
+      slope.push(...ends.map((x) => value * (x / size) ** 2));
       traces.push({
-        type: "scatter", mode: "lines", name: "slope 2", x: ends, y: ends.map((x) => value * (x / size) ** 2),
+        type: "scatter", mode: "lines", name: "slope 2", x: ends, y: slope,
         line: { color: color("soft"), width: 1.2, dash: "dot" }, hoverinfo: "skip",
       });
     }
     draw("convergence", traces, {
       xaxis: { type: "log", ...(all("x").length ? ticks(all("x")) : {}), title: { text: "mean edge length" } },
-      yaxis: { type: "log", ...(all("y").length ? ticks(all("y")) : {}), title: { text: narrow() ? "" : "relative distance" } },
+      yaxis: { type: "log", ...(slope.length ? ticks([...all("y"), ...slope]) : {}), title: { text: narrow() ? "" : "relative distance" } },
     });
   };
 
@@ -133,6 +135,25 @@
     draw("league", traces, {
       xaxis: { type: "log", ...ticks(methods.flatMap(({ x }) => x)), title: { text: plain(data.size) } },
       yaxis: { type: "log", ...ticks(methods.flatMap(({ y }) => y)), title: { text: narrow() ? "" : "mean relative distance" } },
+    });
+  };
+
+  const costs = () => {
+    const { lines, front } = data.costs[state.order];
+    const traces = lines.map(({ family, labels, x, y, errors }) => ({
+      type: "scatter", mode: "markers", name: short(family, 40), x, y, error_y: bars(y, errors),
+      marker: { color: series(family), symbol: symbol(family), size: 8 },
+      text: y.map((value, i) => `${plain(family)}/${plain(labels[i])}<br>${number(x[i])} seconds` +
+        `<br>relative distance ${number(100 * value)} %`),
+      hoverinfo: "text",
+    }));
+    traces.push({
+      type: "scatter", mode: "lines", name: "front", ...front,
+      line: { color: color("soft"), width: 1.2, dash: "dot", shape: "hv" }, hoverinfo: "skip",
+    });
+    draw("costs", traces, {
+      xaxis: { type: "log", ...ticks(lines.flatMap(({ x }) => x)), title: { text: "seconds to make the mesh" } },
+      yaxis: { type: "log", ...ticks(lines.flatMap(({ y }) => y)), title: { text: narrow() ? "" : "relative distance" } },
     });
   };
 
@@ -245,7 +266,7 @@
     const hidden = { visible: false, showbackground: false };
     const height = narrow() ? 420 : 560;
     // A mesh whose bounding box has this diagonal is seen whole from the camera, wherever it turns to.
-    const diagonal = 1.35 * Math.min(1, document.getElementById("chart-witness").clientWidth / height);
+    const diagonal = 1.5 * Math.min(1, 1.1 * document.getElementById("chart-witness").clientWidth / height);
     const sides = extent.map((side) => Math.max(side, 1e-3 * Math.hypot(...extent)) * diagonal / Math.hypot(...extent));
     draw("witness", [{
       type: "mesh3d", x, y, z, i, j, k, intensity: values[state.order], cmin: -limit, cmax: limit, hoverinfo: "x+y+z+text",
@@ -264,7 +285,7 @@
     }, space);
   };
 
-  const drawings = [data.convergence && convergence, data.league?.length && league, data.evolution && evolution,
+  const drawings = [data.convergence && convergence, data.league?.length && league, data.costs && costs, data.evolution && evolution,
     data.matrix && matrix, data.spectrum && spectrum, data.energy && energy,
     data.witness?.length && witness].filter(Boolean);
   const redraw = () => { for (const drawing of drawings) drawing(); };
