@@ -1,6 +1,6 @@
 """Sobolev distances of negative order between surface meshes, for thousands of meshes at once.
 
-A study file names families of meshes, a reference and a frequency lattice. Each mesh becomes a Dask
+A study file names families of meshes, a reference, and an accuracy or a frequency lattice. Each mesh becomes a Dask
 task; a reduction over the stored fields makes the tables. Data flows one way through the folders:
 
     surfaces   study file -> sources -> Mesh or closed-form surface -> one similarity transform
