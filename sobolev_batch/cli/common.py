@@ -59,13 +59,13 @@ def cli(context: click.Context, debug: bool) -> None:
     another error, 130 after Ctrl-C and 143 after SIGTERM. `compare --below` has its own.
     """
     context.obj = debug
-    for level in (logging.WARNING, logging.ERROR):
-        logging.addLevelName(level, logging.getLevelName(level).lower())
     logging.basicConfig(
         level=logging.DEBUG if debug else logging.WARNING,
-        format="%(levelname)s %(name)s: %(message)s" if debug else "%(levelname)s: %(message)s",
+        format="%(kind)s %(name)s: %(message)s" if debug else "%(kind)s: %(message)s",
         stream=sys.stderr,
     )
+    for handler in logging.root.handlers:
+        handler.addFilter(_with_kind)
     if debug:
         # At debug level they log requests with their signatures and session tokens.
         for driver in _DRIVERS:
@@ -74,6 +74,12 @@ def cli(context: click.Context, debug: bool) -> None:
         # Not by the level of its logger, which the cluster sets itself when it is imported.
         for handler in logging.root.handlers:
             handler.addFilter(_is_shown)
+
+
+def _with_kind(record: logging.LogRecord) -> bool:
+    """Add the level of a message as commands print it."""
+    record.kind = record.levelname.lower()
+    return True
 
 
 def _is_shown(record: logging.LogRecord) -> bool:

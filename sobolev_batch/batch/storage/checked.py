@@ -59,8 +59,8 @@ class CheckedStore(WrapperStore[ZarrStore]):
         content = None if problem else await super().get(key, prototype)
         if content is not None:
             problem = problem_of_chunk(content.as_numpy_array(), document)
-        elif not problem and not await self._store.exists("zarr.json"):
-            # All its values would read as missing ones.
+        elif not problem and document["data_type"] != "string" and not await self._store.exists("zarr.json"):
+            # All its numbers would read as missing ones.
             raise StoreError(
                 f"{self._name}: it is not there for process {os.getpid()} of {socket.gethostname()}; a worker of your "
                 'Dask client needs the same path, or compute with scheduler="threads"'
