@@ -198,12 +198,12 @@ def _share_text(result: xr.Dataset | Mapping[str, float], area_change: float) ->
     if not error <= _LARGEST_SHARE_ERROR:
         return ""
     if share + error < _WHOLE_PERCENT:
-        return "; less than 1 % of it is a change of area"
+        return "; a uniform change of area explains less than 1 % of the squared distance"
     # A moved surface has lost no area, though a smaller multiple of the reference fits it best.
     if share <= error or not area_change / excess >= _LEAST_CHANGE:
         return ""
     amount = rounded(100 * share, 100 * max(error, _WHOLE_PERCENT), " %")
-    return f"; {amount} of it is {'lost' if excess < 0 else 'gained'} area"
+    return f"; a uniform {'loss' if excess < 0 else 'gain'} of area explains {amount} of the squared distance"
 
 
 def _last_digit(value: float, error: float) -> int:

@@ -74,10 +74,14 @@ def said(area_change: float = -0.008, **changes: float) -> str:
 @pytest.mark.parametrize(
     ("changes", "area_change", "share"),
     [
-        ({}, -0.008, "; 56 % of it is lost area"),
-        ({"excess": 0.007}, 0.02, "; 56 % of it is gained area"),
-        ({"area_share_error": 0.1}, -0.008, "; 60 % of it is lost area"),
-        ({"area_share": 0.004, "area_share_error": 1e-3}, 0.0, "; less than 1 % of it is a change of area"),
+        ({}, -0.008, "a uniform loss of area explains 56 %"),
+        ({"excess": 0.007}, 0.02, "a uniform gain of area explains 56 %"),
+        ({"area_share_error": 0.1}, -0.008, "a uniform loss of area explains 60 %"),
+        (
+            {"area_share": 0.004, "area_share_error": 1e-3},
+            0.0,
+            "a uniform change of area explains less than 1 %",
+        ),
         # Not resolved, not known, or no area that was really lost: the surface was moved, or has become rough.
         ({"area_share_error": 0.2}, -0.008, ""),
         (UNKNOWN, -0.008, ""),
@@ -86,7 +90,8 @@ def said(area_change: float = -0.008, **changes: float) -> str:
     ],
 )
 def test_shares_of_area(changes: dict[str, float], area_change: float, share: str) -> None:
-    assert said(area_change, **changes) == f"a.obj differs from b.obj by 1.02 % ± 0.01 % at order -2{share}."
+    remark = f"; {share} of the squared distance" if share else ""
+    assert said(area_change, **changes) == f"a.obj differs from b.obj by 1.02 % ± 0.01 % at order -2{remark}."
 
 
 def test_distances_that_cannot_be_told_from_zero_and_unknown_errors() -> None:
