@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: study icosphere league test test-fast test-all durations coverage soak mutants check bench gpu docs audit format clean
+.PHONY: study icosphere league test test-fast test-all durations coverage soak mutants check bench gpu docs pictures audit format clean
 
 study: $(READY)  ## run the real study (a cortical surface) and print its table
 	$(BIN)/sobolev-batch run workflows/cortex.toml
@@ -62,6 +62,9 @@ gpu: $(READY)  ## where there is a GPU: its tests, and its times into storage/gp
 docs: $(READY)  ## the API from its docstrings and the pages of docs/, as HTML in site/
 	$(BIN)/python docs/build.py site
 	@echo "open site/index.html"
+
+pictures: $(READY)  ## draw the stale pictures of docs/ anew; those of Spot the cow need MESHES=FOLDER with its files
+	$(BIN)/python -m benchmarks.pictures $(if $(MESHES),--meshes $(MESHES))
 
 audit: $(READY)  ## look the installed packages up among known vulnerabilities; asks a service on the internet
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[audit]'

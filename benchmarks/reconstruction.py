@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -129,7 +129,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="small sizes that only show that everything works")
     options = parser.parse_args()
     effort = Effort(1, options.quick, large=False)
-    targets = {path.stem: partial(_unit, path) for path in options.files} or {
+    targets = {path.stem: partial(unit_mesh, path) for path in options.files} or {
         "ears": partial(head_with_ears, 3 if effort.quick else 6)
     }
     rows: list[Row] = []
@@ -146,21 +146,29 @@ def main() -> None:
     print(format_table(rows))
 
 
-def _unit(path: Path) -> sb.Mesh:
+def unit_mesh(path: Path) -> sb.Mesh:
+    """The mesh of a file, moved into the unit ball."""
     mesh = sb.read_mesh(path)
     return sb.shapes.Similarity.to_unit_ball(mesh).apply(mesh)
 
 
 def _draw(reconstruction: Reconstruction, order: float, effort: Effort, path: Path, up: str) -> None:
     steps = _STAGES[:1] if effort.quick else _STAGES
-    meshes = {
-        "start": reconstruction.start(),
-        **{
-            f"{some} steps": fit.mesh
-            for some, fit in zip(steps, reconstruction.stages(order, steps, effort), strict=True)
-        },
-        "target": reconstruction.target(),
-    }
+    fits = zip(steps, reconstruction.stages(order, steps, effort), strict=True)
+    meshes = {f"{some} steps": fit.mesh for some, fit in fits}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draw_row({"start": reconstruction.start(), **meshes, "target": reconstruction.target()}, path, up)
+
+
+def reconstructed(target: sb.Mesh, order: float, steps: int) -> sb.Mesh:
+    """A ball that was fitted to the field of a target."""
+    effort = Effort(1, quick=False, large=False)
+    (fit,) = Reconstruction("", lambda: target, partial(_ball, effort)).stages(order, [steps], effort)
+    return fit.mesh
+
+
+def draw_row(meshes: Mapping[str, sb.Mesh], path: Path, up: str) -> None:
+    """Draw meshes of the unit ball, by name, beside each other."""
     figure = Figure(figsize=(2.5 * len(meshes), 3.0))
     axes = figure.add_axes((0.0, 0.0, 1.0, 0.85))
     axes.margins(0.01)
@@ -169,7 +177,6 @@ def _draw(reconstruction: Reconstruction, order: float, effort: Effort, path: Pa
         place = ((i + 0.5) / len(meshes), 1.0)
         text = f"{name}\n{len(mesh.triangles):,} triangles"
         axes.annotate(text, place, xycoords="axes fraction", ha="center", va="bottom", fontsize=9)
-    path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
 
 
