@@ -1,4 +1,4 @@
-"""The pages run as printed, and do what they say: README, tutorial, gallery, queries, fitting, moving, testing."""
+"""The pages run as printed, and do what they say: README, tutorial, queries, fitting, moving, testing."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ import pytest
 from distributed import Client
 
 import sobolev_batch as sb
-from sobolev_batch.batch.study.plan import members_of
 from sobolev_batch.cli import cli
 from tests.support.commands import call
 from tests.support.repository import ROOT, blocks, run_blocks, run_icospheres
@@ -81,7 +80,6 @@ def test_the_table_of_weights() -> None:
     [
         ("README.md", ["mine"]),
         ("docs/tutorial.md", ["given", "decimated"]),
-        ("docs/gallery.md", ["decimated", "noisy", "covered"]),
         ("docs/fitting.md", ["decimated", "fitted"]),
     ],
 )
@@ -114,20 +112,6 @@ def test_commands_of_the_gallery_take_their_options() -> None:
             assert program == "sobolev-batch"
             # Options and arguments are parsed, and nothing is run.
             cli.commands[name].make_context(name, arguments).close()
-
-
-def test_the_code_of_the_gallery_runs(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run_icospheres(tmp_path, client)
-    monkeypatch.chdir(tmp_path)
-    # A cow that is a ball through the place of the patch.
-    sb.write_mesh(sb.shapes.Similarity(0.38).apply(sb.shapes.icosphere(3)), "spot.obj")
-    results = run_blocks("docs/gallery.md")
-    assert sb.read_mesh("twice.ply").area == pytest.approx(results["twice"].area)
-    assert {path.stem for path in tmp_path.glob("*.png")} == {"matrix", "spectrum"}
-    (study,) = blocks("docs/gallery.md", "toml")
-    (tmp_path / "study.toml").write_text(study)
-    labels = ["decimated/1360", "noisy/0.0015", "covered/twice", "reference"]
-    assert list(members_of(sb.Study.from_toml("study.toml"))) == labels
 
 
 def test_every_query_runs_and_answers(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
