@@ -159,7 +159,8 @@ def prune_command(store: Location, yes: bool) -> None:
             total += size
             if size:
                 echo(f"{name + ': ' * bool(name)}{kind}: {format_bytes(size)}")
-    echo(f"{format_bytes(total)} {'removed' if yes else 'can be removed: give --yes'}")
+    remark = "removed" if yes else "can be removed: give --yes"
+    echo(f"{format_bytes(total)} {remark}" if total else "nothing to remove")
 
 
 @cli.command("export")
@@ -238,7 +239,7 @@ def plot_command(
     league.
 
     Meshes are coloured by their witness functions, which show where they differ from the reference. They are rebuilt
-    from the study; drawing needs the extra "vtk". By default a few are chosen by their distances.
+    from the study. Pictures need the extra "plot". By default a few are chosen by their distances.
     """
     from sobolev_batch.batch.collection_store import CollectionStore
     from sobolev_batch.results.open import EDGE_LENGTH, fields_read

@@ -167,7 +167,7 @@ class Mesh:
 
     @property
     def defects(self) -> tuple[str, ...]:
-        """What keeps the mesh from being a closed surface that faces outwards, in words; empty if nothing does.
+        """Defects in words: all that keeps the mesh from being a closed surface that faces outwards; empty without any.
 
         >>> import sobolev_batch as sb
         >>> sphere = sb.shapes.icosphere(1)
