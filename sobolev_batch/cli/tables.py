@@ -72,13 +72,9 @@ def convergence_command(store: Location, style: Format, orders: tuple[float, ...
 
     A collection has the tables of all its objects.
     """
-    from sobolev_batch.batch.collection_store import CollectionStore
-    from sobolev_batch.results.open import open_store
     from sobolev_batch.results.tables.convergence import format_table
 
-    collection = CollectionStore.read(store)
-    stores = open_store(store) if collection is None else collection.existing_stores
-    echo_lines(format_table(stores, style, orders or None, x=x))
+    echo_lines(format_table(store, style, orders or None, x=x))
 
 
 @table_command.command("matrix")

@@ -7,10 +7,8 @@ from typing import Literal
 
 import xarray as xr
 
-from sobolev_batch.batch.collection_store import CollectionStore
-from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.errors import StoreError, from_extra
-from sobolev_batch.results.open import AnyStore, as_tree, finished_group
+from sobolev_batch.results.open import AnyStore, as_tree, finished_group, stores_of
 from sobolev_batch.results.tables.convergence import table
 from sobolev_batch.results.tables.text import json_text, machine_table
 from sobolev_batch.spectral.lattice import Orders
@@ -41,10 +39,8 @@ def export(store: AnyStore, path: Path, style: ExportFormat, order: Orders | Non
 
 
 def _groups_of(store: AnyStore) -> xr.DataTree:
-    collection = None if isinstance(store, xr.DataTree) else CollectionStore.read(Location.parse(store))
-    stores: dict[str, AnyStore] = {"": store} if collection is None else {**collection.existing_stores}
     groups = {}
-    for name, place in stores.items():
+    for name, place in stores_of(store).items():
         tree = as_tree(place)
         # Without tables it says so.
         finished_group(tree, "meshes", load=False)

@@ -15,6 +15,7 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
+from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.store import DIGEST, OCTAVES_GROUP, RECORDS, SPECTRA_GROUP, JoinedStore, Store
 from sobolev_batch.batch.store.tables import lost_tables
@@ -34,7 +35,7 @@ _GROWING = ("triangles", "vertices", "seconds", "make_seconds", "make_cpu_second
 _FROM_COARSE_TO_FINE = ("level", "triangles")
 
 _LABELS = {
-    EDGE_LENGTH: "mean edge length in the study's unit",
+    EDGE_LENGTH: "mean edge length in {unit}",
     "triangles": "number of triangles",
     "vertices": "number of vertices",
     "seconds": "computing time of the mesh in seconds",
@@ -42,7 +43,7 @@ _LABELS = {
     "make_cpu_seconds": "processor time of making the mesh in seconds",
     "make_peak_bytes": "memory of making the mesh in bytes",
 }
-
+_STUDY_UNIT = "the study's unit"
 
 # A store as functions for its readers take it.
 AnyStore = str | Path | Location | xr.DataTree
@@ -219,6 +220,14 @@ def as_tree(store: AnyStore) -> xr.DataTree:
     return store if isinstance(store, xr.DataTree) else open_store(store)
 
 
+def stores_of(store: AnyStore | Mapping[str, AnyStore]) -> Mapping[str, AnyStore]:
+    """Return the stores of the objects of a collection by name, which they may be already; "" names one study."""
+    if isinstance(store, Mapping) and not isinstance(store, xr.DataTree):
+        return store
+    collection = None if isinstance(store, xr.DataTree) else CollectionStore.read(Location.parse(store))
+    return {"": store} if collection is None else {**collection.existing_stores}
+
+
 def source_of(tree: xr.DataTree) -> str | None:
     """Return the path or URL at which a tree was opened by `open_store`, or all of them; None for other trees."""
     if _PARTS in tree.encoding:
@@ -356,9 +365,21 @@ def placement_doubts(tree: xr.DataTree) -> dict[str, str]:
     return {label: doubt for label, doubt in doubts.items() if doubt is not None}
 
 
-def label_of(x: str) -> str:
+def unit_of(tree: xr.DataTree) -> tuple[str, float]:
+    """Return the name of the unit of length of the files, if it is known, and the study's unit in terms of it."""
+    header = tree.attrs.get("study", {}).get("table", {}).get("study", {})
+    return header.get("length_unit", ""), 1 / tree.attrs.get("similarity", {"scale": 1.0})["scale"]
+
+
+def study_unit(tree: xr.DataTree) -> str:
+    """Return the study's unit of length in words, by the unit of the files where that has a name."""
+    name, size = unit_of(tree)
+    return f"units of {size:.4g} {name}" if name else _STUDY_UNIT
+
+
+def label_of(x: str, unit: str = _STUDY_UNIT) -> str:
     """Return the label of an axis of sizes; one of the metadata has its name."""
-    return _LABELS.get(x, x)
+    return _LABELS[x].format(unit=unit) if x in _LABELS else x
 
 
 def sizes_of(frame: pd.DataFrame, x: str) -> Reals:

@@ -23,7 +23,7 @@ from sobolev_batch.batch.study.plan import Plan, Row, make_plan
 from sobolev_batch.batch.study.study import Study, StudyCollection, StudyLike
 from sobolev_batch.batch.workspace import complete_records
 from sobolev_batch.parameters import available_cores, format_bytes
-from sobolev_batch.results.tables.text import duration
+from sobolev_batch.results.tables.text import beside, duration
 from sobolev_batch.spectral.fields import Quality
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.values import SurfaceSize
@@ -158,7 +158,7 @@ class StudyPlan:
         return {**numbers, "study": self.study.name, "total_bytes": self.total_bytes}
 
     def __str__(self) -> str:
-        return "\n".join(visible(f"{name + ':' * bool(name):<14} {text}") for name, text in self._shown)
+        return "\n".join(beside(f"{name + ':' * bool(name):<14} ", text) for name, text in self._shown)
 
     @property
     def _shown(self) -> tuple[tuple[str, str], ...]:
@@ -272,8 +272,8 @@ class CollectionPlan:
 
     def __str__(self) -> str:
         lines = [f"{visible(name)}:\n{one}" for name, one in self.objects.items()]
-        lines += [visible(f"{name}: {reason}") for name, reason in self.refused.items()]
-        lines += [visible(f"warning: {text}") for text in self.warnings]
+        lines += [beside(f"{visible(name)}: ", reason) for name, reason in self.refused.items()]
+        lines += [beside("warning: ", text) for text in self.warnings]
         return "\n".join([*lines, self.total])
 
 

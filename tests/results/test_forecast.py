@@ -174,13 +174,23 @@ def test_pairs_that_the_disk_has_no_place_for_are_told(tmp_path: Path, monkeypat
     assert found(0) == ()
 
 
+def test_a_plan_fits_the_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "60")
+    title = " ".join(["several words"] * 9)
+    found = sb.plan(sb.Study.from_table(small_table(study={"name": "small", "title": title})), tmp_path / ("x" * 60))
+    lines = str(found).splitlines()
+    assert {len(line) > 60 for line in lines if "x" * 60 not in line} == {False}
+    assert " ".join(str(found).split()).startswith(f"study: {title}")
+    assert lines[1].startswith(" " * 15)
+
+
 def test_warnings_come_first_in_commands_and_in_python(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "study.toml"
     path.write_text(tomli_w.dumps(small_table(object=balls(a=1.0), family=methods_of())))
     plan, run = (call(word, path, "--store", f"memory://warnings-{word}") for word in ("plan", "run"))
     (warning,) = sb.plan(path, "memory://warnings-python").warnings
     assert warning.startswith(f"{FEW} 1 object; ")
-    assert f"warning: {warning}\n" in plan.stdout
+    assert f"warning: {warning} " in f"{' '.join(plan.stdout.split())} "
     assert run.stderr.startswith(f"warning: {warning}\n")
     sb.run(path, "memory://warnings-python")
     assert caplog.messages[0] == warning

@@ -42,6 +42,7 @@ from sobolev_batch.results.open import (
     label_of,
     reference_of,
     sizes_of,
+    study_unit,
 )
 from sobolev_batch.results.tables.convergence import table
 from sobolev_batch.results.tables.costs import CostLeague
@@ -86,7 +87,7 @@ def draw_convergence(selection: Selection, order: float, axes: Axes) -> None:
         axes.text(0.5, 0.5, "no mesh to draw", transform=axes.transAxes, ha="center")
     gone = [name for name in frame["family"].drop_duplicates() if name not in set(drawn["family"])]
     set_title(axes, f"order {order:g}", _absent(frame, selection.x), _named("families not drawn: ", gone))
-    axes.set_xlabel(escaped(label_of(selection.x)))
+    axes.set_xlabel(escaped(label_of(selection.x, study_unit(selection.tree))))
     axes.set_ylabel("relative Sobolev distance")
 
 
@@ -223,7 +224,7 @@ def draw_spectrum(selection: Selection, order: float, axes: Axes) -> None:
     )
     labels = [shortened(label) for label in spectra.labels]
     axes.set_yticks(range(len(labels)), labels, fontsize=min(_LABEL_POINTS, row_points))
-    axes.set_xlabel("wavelength in the study's unit")
+    axes.set_xlabel(escaped(f"wavelength in {study_unit(selection.tree)}"))
     set_title(axes, f"differences by wavelength, order {order:g}", spectra.omission)
     hide_frame(axes)
 
@@ -249,7 +250,7 @@ def draw_energy(selection: Selection, _item: object, axes: Axes) -> None:
             draw_curve(axes, spectra.wavelengths[drawn], energies[drawn], errors[drawn], selection.styles[family], name)
             named.add(family)
     axes.invert_xaxis()
-    axes.set_xlabel("wavelength in the study's unit")
+    axes.set_xlabel(escaped(f"wavelength in {study_unit(selection.tree)}"))
     axes.set_ylabel("energy over its limit")
 
 
@@ -290,7 +291,8 @@ def draw_matrix(selection: Selection, order: float, axes: Axes) -> None:
         return
     low, high, extend = _color_range(values[values > 0])
     image = axes.imshow(np.ma.masked_less_equal(values, 0), norm=LogNorm(low, high), cmap="viridis", aspect="equal")
-    bar = axes.figure.colorbar(image, ax=axes, shrink=0.8, label="distance in the study's unit", extend=extend)
+    label = escaped(f"distance in {study_unit(tree)}")
+    bar = axes.figure.colorbar(image, ax=axes, shrink=0.8, label=label, extend=extend)
     bar.ax.tick_params(which="both", labelsize="small")
     labels = [shortened(meshes[i]) for i in arrangement]
     # Below the matrix, the longest label takes its part of the height.

@@ -32,6 +32,7 @@ from sobolev_batch.results.open import (
     location_of,
     reference_of,
     require_unchanged,
+    study_unit,
 )
 from sobolev_batch.results.status import Status
 from sobolev_batch.results.tables.convergence import table
@@ -201,6 +202,7 @@ def chart_data(tree: xr.DataTree, spectra: Spectra | None, views: Sequence[MeshV
     return {
         "name": tree.attrs["study"]["table"]["study"]["name"],
         "orders": [minus(f"{order:g}") for order in orders],
+        "unit": study_unit(tree),
         "families": list(dict.fromkeys(families_of(tree).values())),
         "convergence": _convergence(tree, orders, MOST_POINTS // len(orders)),
         "evolution": _evolution(tree, MOST_POINTS // len(orders)),

@@ -11,8 +11,6 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from sobolev_batch.batch.collection_store import CollectionStore
-from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.errors import InputError
 from sobolev_batch.parameters import fraction
 from sobolev_batch.results.open import (
@@ -25,6 +23,8 @@ from sobolev_batch.results.open import (
     metadata_of,
     placement_doubts,
     sizes_of,
+    stores_of,
+    unit_of,
 )
 from sobolev_batch.results.store_accessor import convergence_at, order_note
 from sobolev_batch.results.tables import Format
@@ -72,7 +72,6 @@ lattice), discretisation (quadrature and NUFFT) and chance (random frequencies, 
 study samples octaves). A distance marked * is not larger than its error, and gives no
 rate. The column "area" is the share of the squared distance that a change of total area
 alone explains."""
-_UNNAMED = "units of the files"
 _UNIT_NOTE = """\
 Edges and other lengths are in {}.
 Distances of orders are computed in units of {}."""
@@ -93,8 +92,6 @@ A mesh is below the bound if its relative distance and the error of that are tog
 Meshes that are smaller, and that the errors leave open, are named as undecided."""
 
 _UNKNOWN: dict[str, Any] = {"mesh": "", "triangles": pd.NA, "relative": math.nan, "relative_error": math.nan}
-# Of other distances beside each other, so that lines fit.
-_MOST_COLUMNS = 5
 _MESH = Column("mesh", "mesh", kind="label")
 _TRIANGLES = Column("triangles", "triangles", count)
 _COLUMNS = (
@@ -176,9 +173,9 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
     >>> frame.set_index("mesh")["rate"].round(1).to_dict()
     {'icosphere/0': nan, 'icosphere/1': 2.0, 'icosphere/2': 2.0, 'icosphere/3': 2.0}
     """
-    collection = None if isinstance(store, xr.DataTree) else CollectionStore.read(Location.parse(store))
-    if collection is not None:
-        return _joined(tables_of(collection.existing_stores, order, x=x))
+    stores = stores_of(store)
+    if "" not in stores:
+        return _joined(tables_of(stores, order, x=x))
     tree = as_tree(store)
     convergence, meshes = convergence_at(tree, order), finished_group(tree, "meshes")
     labels = convergence["mesh"].values
@@ -192,7 +189,7 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
         nearness = {name: proximity[name].values for name in asked if name in proximity}
         nearness |= {name: meshes[name].values[others] for name in asked if name in OF_ONE_MESH}
         if "volume" in nearness:
-            nearness["volume"] = nearness["volume"] * _unit(tree)[1] ** 3
+            nearness["volume"] = nearness["volume"] * unit_of(tree)[1] ** 3
     frames = []
     for s in dict.fromkeys(convergence["order"].values.tolist()):
         row = parts_as_variables(convergence.sel(order=s))
@@ -201,7 +198,7 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
     frame = pd.concat(frames, ignore_index=True).astype(dict.fromkeys(_COUNTS, "Int64"))
     kept = ("reference", "rtol", "computed")
     frame.attrs = {key: convergence.attrs[key] for key in kept if key in convergence.attrs}
-    frame.attrs["unit_length"] = _unit(tree)[1]
+    frame.attrs["unit_length"] = unit_of(tree)[1]
     if known := metadata_of(tree):
         frame.attrs["metadata"] = known
     return frame if x == EDGE_LENGTH else _with_rates(frame, x)
@@ -224,15 +221,14 @@ def tables_of(
 
 
 def format_table(
-    stores: xr.DataTree | Mapping[str, AnyStore],
+    store: AnyStore | Mapping[str, AnyStore],
     style: Format = "text",
     orders: Sequence[float] | None = None,
     *,
     x: str = EDGE_LENGTH,
 ) -> str:
-    """Return the convergence tables of an open store, or of several objects by their names, as text; see `table`."""
-    named = {"": stores} if isinstance(stores, xr.DataTree) else stores
-    trees = {name: as_tree(place) for name, place in named.items()}
+    """Return the convergence tables of a store, or of several objects by their names, as text; see `table`."""
+    trees = {name: as_tree(place) for name, place in stores_of(store).items()}
     frames = tables_of(trees, orders, x=x)
     if style in ("csv", "json"):
         return machine_table(frames[""] if "" in frames else _joined(frames), style)
@@ -255,10 +251,8 @@ def _tables(tree: xr.DataTree, frame: pd.DataFrame, style: Format) -> Iterator[s
         yield section(caption, [_table(rows, _COLUMNS, style)], [], style)
     if has_proximity(tree):
         once = marked[marked["order"] == marked["order"].iloc[0]]
-        columns = _metric_columns(tree)
-        parts = [columns[first : first + _MOST_COLUMNS] for first in range(0, len(columns), _MOST_COLUMNS)]
-        tables = [_table(once, (_MESH, *part), style) for part in parts]
-        yield section("Other distances, the same at all orders", tables, [], style)
+        others = _table(once, (_MESH, *_metric_columns(tree)), style)
+        yield section("Other distances, the same at all orders", [others], [], style)
 
 
 def _table(frame: pd.DataFrame, columns: Sequence[Column], style: Format) -> str:
@@ -298,12 +292,6 @@ def _metric_columns(tree: xr.DataTree) -> list[Column]:
     return [column for column in _METRIC_COLUMNS if column.name in shown]
 
 
-def _unit(tree: xr.DataTree) -> tuple[str, float]:
-    """Return the name of the unit of length of the files, and the study's unit in terms of it."""
-    header = tree.attrs.get("study", {}).get("table", {}).get("study", {})
-    return header.get("length_unit", _UNNAMED), 1 / tree.attrs.get("similarity", {"scale": 1.0})["scale"]
-
-
 def page_columns(tree: xr.DataTree) -> tuple[Column, ...]:
     """Return the columns whose numbers an open store has, for a page, which may be narrow."""
     columns = [*_COLUMNS, *_metric_columns(tree)]
@@ -338,17 +326,16 @@ def _notes(trees: Sequence[xr.DataTree], frames: Sequence[pd.DataFrame], x: str)
 
 def unit_notes(trees: Sequence[xr.DataTree]) -> list[str]:
     """Return the units of lengths and of distances in the tables of open stores, each in a sentence."""
-    units, sizes = (sorted(set(values)) for values in zip(*map(_unit, trees), strict=True))
-    size = "their own for each object"
-    if len(sizes) == 1:
-        size = f"{sizes[0]:.4g} {units[0] if units[0] != _UNNAMED else 'of them'}"
-    return _UNIT_NOTE.format(", ".join(map(str, units)), size).splitlines()
+    units, sizes = (sorted(set(values)) for values in zip(*map(unit_of, trees), strict=True))
+    size = f"{sizes[0]:.4g} {units[0] or 'of them'}" if len(sizes) == 1 else "their own for each object"
+    return _UNIT_NOTE.format(", ".join(unit or "units of the files" for unit in units), size).splitlines()
 
 
 def _failures(tree: xr.DataTree, frame: pd.DataFrame) -> list[str]:
-    rows = frame.drop_duplicates("mesh").query("status != 'complete'")
-    words = {"failed": "failed", "missing": "is missing"}
-    failures = [f"{row.mesh} {words[row.status]}: {row.reason}" for row in rows.itertuples(index=False)]
+    rows = frame.drop_duplicates("mesh")
+    failures = [f"{row.mesh} failed: {row.reason}" for row in rows.query("status == 'failed'").itertuples(index=False)]
+    if missing := int((rows["status"] == "missing").sum()):
+        failures.append(f"{missing:,} of {len(rows):,} meshes are not computed; run the whole study to add them")
     if has_proximity(tree):
         reasons = finished_group(tree, "proximity")["reason"].to_series()
         failures += [f"{mesh} has no proximity: {reason}" for mesh, reason in reasons.items() if reason]

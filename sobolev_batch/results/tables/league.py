@@ -18,7 +18,7 @@ from sobolev_batch.batch.checks import SIGNIFICANCE, gap_of, least_objects
 from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.errors import InputError, StoreError
-from sobolev_batch.results.open import EDGE_LENGTH, AnyStore, as_tree, finished_group, reference_of
+from sobolev_batch.results.open import EDGE_LENGTH, AnyStore, as_tree, finished_group, reference_of, stores_of
 from sobolev_batch.results.tables import Format
 from sobolev_batch.results.tables.convergence import table, tables_of
 from sobolev_batch.results.tables.costs import DEFAULT_COST, CostLeague, cost_leagues_of
@@ -381,7 +381,7 @@ def compare_studies(
     >>> same[["method", "meshes", "ratio", "verdict"]].to_dict("records")
     [{'method': 'icosphere', 'meshes': 4, 'ratio': 1.0, 'verdict': 'undecided'}]
     """
-    news, olds = _stores(new), _stores(old)
+    news, olds = stores_of(new), stores_of(old)
     common = [name for name in news if name in olds]
     if not common:
         raise InputError(
@@ -401,14 +401,6 @@ def compare_studies(
     words = np.where(result["ratio"] < 1, "nearer", "farther")
     result.insert(8, "verdict", np.where(result["p"] < SIGNIFICANCE, words, "undecided"))
     return result
-
-
-def _stores(store: AnyCollection | AnyStore) -> Mapping[str, AnyStore]:
-    """Return the store of each object that has one, by its name; a store of one object has an empty name."""
-    if isinstance(store, Mapping) and not isinstance(store, xr.DataTree):
-        return store
-    collection = None if isinstance(store, xr.DataTree) else CollectionStore.read(Location.parse(store))
-    return {"": store} if collection is None else dict(collection.existing_stores)
 
 
 def _joined(name: str, new: AnyStore, old: AnyStore, order: Orders | None) -> pd.DataFrame:

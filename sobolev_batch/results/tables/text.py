@@ -416,6 +416,13 @@ def wrapped(text: str) -> list[str]:
     return textwrap.wrap(" ".join(text.split()), min(line_length(), _LONGEST_PROSE))
 
 
+def beside(name: str, text: str) -> str:
+    """Return a text beside its name, on lines that fit the terminal; paths and words stay whole."""
+    indent = " " * min(len(name), _SHORTEST_TEXT)
+    wrapper = textwrap.TextWrapper(line_length(), name, indent, break_long_words=False, break_on_hyphens=False)
+    return wrapper.fill(visible(text))
+
+
 def prose(lines: Iterable[str], style: Format) -> str:
     """Return lines printed beside tables; LaTeX takes them as comments."""
     return "\n".join(f"{'% ' * (style == 'latex')}{_escaped(line, style)}" for line in lines)

@@ -214,6 +214,13 @@ def test_few_outliers_do_not_take_the_colours_of_a_matrix() -> None:
         assert (image.colorbar.extend, bar.get_ylabel()) == (extend, "distance in the study's unit")
 
 
+def test_axes_name_the_unit_of_the_files(tree: xr.DataTree) -> None:
+    tree.attrs["similarity"] = {"scale": 0.02, "origin": [0.0, 0.0, 0.0]}
+    tree.attrs["study"]["table"]["study"]["length_unit"] = "$mm$"
+    assert sb.plot.convergence(tree).get_xlabel() == r"mean edge length in units of 50 \$mm\$"
+    assert sb.plot.convergence(tree, x="triangles").get_xlabel() == "number of triangles"
+
+
 def test_groups_stand_together() -> None:
     places = np.array([0.0, 10.0, 0.2, 10.1, 0.1, 9.9])[:, None]
     sorted_places = places[clustered_order(cdist(places, places)), 0]

@@ -74,6 +74,16 @@ def test_tables_fit_the_terminal(columns: int, monkeypatch: pytest.MonkeyPatch) 
     assert all(text.count(number) == len(labels) for number in numbers)
 
 
+def test_meshes_that_are_not_computed_are_counted_on_one_line(tree: xr.DataTree) -> None:
+    status = ("mesh", ["missing", "missing", "failed", "complete"])
+    tree["meshes"] = xr.DataTree(tree["meshes"].to_dataset().assign(status=status))
+    lines = format_table(tree).splitlines()
+    assert "2 of 3 meshes are not computed; run the whole study to add them" in lines
+    assert [line for line in lines if line.startswith("f_1/") and ":" in line] == [
+        "f_1/2 failed: no 50% of it | is <there>"
+    ]
+
+
 def test_every_order_gets_a_table_and_small_numbers_are_formulas_of_latex(tree: xr.DataTree) -> None:
     for style in ("text", "markdown", "latex"):
         text = format_table(tree, style)

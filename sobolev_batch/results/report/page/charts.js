@@ -225,7 +225,7 @@
       ...(crowded ? { margin: { l: 10, r: 45, t: 30, b: 10 } } : {}),
       xaxis: {
         side: "top", showgrid: false, ticks: "", tickvals: bands.map((_, j) => j), ticktext: bands.map(plain),
-        title: { text: narrow() ? "" : "wavelength in the study’s unit" }, tickangle: crowded ? -60 : 0,
+        title: { text: narrow() ? "" : `wavelength in ${plain(data.unit)}` }, tickangle: crowded ? -60 : 0,
       },
       yaxis: {
         autorange: "reversed", showgrid: false, zeroline: false, ticks: "", tickvals: labels.map((_, i) => i),
@@ -250,7 +250,7 @@
       line: { color: color("soft"), width: 1.2, dash: "dot" }, hoverinfo: "skip",
     });
     draw("energy", traces, {
-      xaxis: { type: "log", autorange: "reversed", ...ticks(wavelengths), title: { text: "wavelength in the study’s unit" } },
+      xaxis: { type: "log", autorange: "reversed", ...ticks(wavelengths), title: { text: `wavelength in ${plain(data.unit)}` } },
       yaxis: { type: "log", dtick: 1, exponentformat: "power", title: { text: narrow() ? "" : "energy over its limit" } },
     });
   };
