@@ -66,6 +66,8 @@ _GROWTH = 4.0
 _OCTAVE_SECONDS, _MOST_SECONDS = 20.0, 200.0
 # Random points of a remainder at most, and how many more than needed are taken.
 _MOST_POINTS, _MORE_POINTS = 60_000, 1.3
+# How many times as many points a remainder gets that octaves contradict.
+_MORE_CHECKED = 4
 # Nodes that a parametrised surface may have; beyond the frequency that they resolve it has no octaves.
 _MOST_SMOOTH_NODES = 2e6
 
@@ -160,15 +162,19 @@ class State:
     @cached_property
     def tail(self) -> Tail:
         """All beyond the core. What two ways to it disagree about counts as uncertain."""
-        orders, sums = self.problem.orders, [octave.sums for octave in self.octaves]
-        tail = Tail.from_sums(sums, *self.remainders[-1].at(orders))
-        disagreement = np.zeros(len(orders))
-        for number, beyond in enumerate(self.remainders[:-1]):
-            outer = Tail.from_sums(sums[number:], tail.beyond, tail.uncertainty)
-            value, error = beyond.at(orders)
-            off = np.abs(outer.squares - value) - outer.statistical - outer.uncertainty - error
-            disagreement = np.maximum(disagreement, off)
-        return replace(tail, uncertainty=tail.uncertainty + disagreement)
+        last = self.remainders[-1].at(self.problem.orders)
+        tail = Tail.from_sums([octave.sums for octave in self.octaves], *last)
+        return replace(tail, uncertainty=tail.uncertainty + self.disagreements.max(axis=0))
+
+    @cached_property
+    def disagreements(self) -> Reals:
+        """How far each remainder is from what was measured beyond it, outside of both errors (remainders, orders)."""
+        orders, disagreements = self.problem.orders, []
+        for number, beyond in enumerate(self.remainders):
+            sums = [octave.sums for octave in self.octaves[number:]]
+            outer, (value, error) = Tail.from_sums(sums, *self.remainders[-1].at(orders)), beyond.at(orders)
+            disagreements.append(np.abs(outer.squares - value) - outer.statistical - outer.uncertainty - error)
+        return np.maximum(disagreements, 0.0)
 
     @cached_property
     def squares(self) -> Reals:
@@ -225,6 +231,13 @@ class State:
         """Predict the time of the samples of an octave, without those that are known."""
         return sum(size.sampling_seconds(sampling, known) for size in self.sizes)
 
+    def redrawn(self, number: int, points: int) -> State:
+        """Return the state after a step that estimates one remainder from new points."""
+        problem, known = self.problem, list(self.remainders)
+        cutoff, seconds, seed = known[number].cutoff, known[number].seconds(points), self.seed + self.steps + 1
+        known[number] = remainder(problem.surfaces, problem.signs, cutoff, problem.orders, points, seed)
+        return self.advanced(seconds, remainders=tuple(known))
+
     def advanced(self, seconds: float, **changes: object) -> State:
         """Return the state after a step of some predicted time."""
         return replace(self, seconds=self.seconds + seconds, steps=self.steps + 1, **changes)  # type: ignore[arg-type]
@@ -276,10 +289,7 @@ def farther_out(state: State) -> State | None:
     sampling = _first_sampling(state, octave) if can_go_on else None
     seconds = np.inf if sampling is None else state.sampling_seconds(sampling) + beyond.seconds(beyond.points) / 4
     if not state.for_others and points <= _MOST_POINTS and beyond.seconds(points) < min(seconds, _MOST_SECONDS):
-        better = remainder(
-            problem.surfaces, problem.signs, beyond.cutoff, problem.orders, points, state.seed + state.steps + 1
-        )
-        return state.advanced(beyond.seconds(points), remainders=(*state.remainders[:-1], better))
+        return state.redrawn(len(state.octaves), points)
     if sampling is None:
         return None
     measured = _measured(state, sampling)
@@ -300,12 +310,26 @@ def refined(state: State) -> State | None:
     if state.seconds + seconds > _MOST_SECONDS:
         finer, seconds = {}, 0.0
     if core is state.core and not finer:
-        return None
+        return _checked_again(state)
     octaves = tuple(
         _measured(state, finer[number], octave) if number in finer else octave
         for number, octave in enumerate(state.octaves)
     )
     return state.advanced(seconds, core=core, octaves=octaves)
+
+
+def _checked_again(state: State) -> State | None:
+    """Return a state whose worst disagreement is judged by more and new points; None where it cannot be chance."""
+    # Each check is at 99 %, and a study makes many: some fail by chance. Checks at a higher level would see less. So
+    # one that fails is made again, from new points with half the error, where a real difference fails again. More than
+    # twice the error, five standard deviations, is real.
+    relative = state.disagreements / state.permitted
+    number, order = np.unravel_index(np.argmax(relative), relative.shape)
+    beyond = state.remainders[number]
+    points, (_, errors) = _MORE_CHECKED * beyond.points, beyond.at(state.problem.orders)
+    is_affordable = points <= _MOST_POINTS and state.seconds + beyond.seconds(points) <= _MOST_SECONDS
+    may_be_chance = 0 < state.disagreements[number, order] < errors[order]
+    return state.redrawn(int(number), points) if is_affordable and may_be_chance else None
 
 
 def _measured(state: State, sampling: OctaveSampling, known: MeasuredOctave | None = None) -> MeasuredOctave:

@@ -124,3 +124,31 @@ def test_a_remainder_that_inner_ones_contradict_is_no_accuracy(monkeypatch: pyte
     monkeypatch.setattr(octaves, "remainder", misjudged)
     with pytest.raises(AccuracyError, match="out of reach"):
         distance(a.mesh(), b.mesh(), -1.0, rtol=0.01)
+
+
+@pytest.mark.parametrize("is_chance", [True, False])
+def test_other_points_confirm_a_disagreement_or_show_that_it_was_chance(
+    monkeypatch: pytest.MonkeyPatch, is_chance: bool
+) -> None:
+    a, b = MOVED_BOX
+    seeds, first = [], dict[float, Remainder]()
+
+    def shifted(surfaces: Any, signs: Any, cutoff: float, *others: Any, **options: Any) -> Remainder:
+        """Return 1.5 times a large error too much beyond the first cutoff: by chance, from the first points only."""
+        beyond = remainder(surfaces, signs, cutoff, *others, **options)
+        if cutoff != next(iter(first), cutoff):
+            return beyond
+        seeds.append(options.get("seed", others[-1]))
+        usual = first.setdefault(cutoff, beyond)
+        error = 10 * usual.errors[0]
+        energy = usual.energies[0] if is_chance and len(seeds) > 1 else usual.energies[0] + 1.5 * error
+        return replace(beyond, energies=(energy,), errors=(error * np.sqrt(usual.points / beyond.points),))
+
+    monkeypatch.setattr(octaves, "remainder", shifted)
+    if is_chance:
+        found, exact = distance(a.mesh(), b.mesh(), -1.0, rtol=0.02), a.distance(b, [-1.0]).item()
+        assert abs(found["distance"].item() - exact) <= found["error"].item() <= 0.02 * exact
+    else:
+        with pytest.raises(AccuracyError, match="out of reach"):
+            distance(a.mesh(), b.mesh(), -1.0, rtol=0.02)
+    assert len(seeds) == len(set(seeds)) == 2
