@@ -406,7 +406,9 @@ class _Curve:
     def _power(self, gaps: dict[float, float]) -> float:
         """Return the power of the amount that the distance grows with near the one wanted."""
         if len(gaps) > 1:
-            first, second = sorted(gaps, key=lambda one: abs(gaps[one]))[:2]
+            first, *others = sorted(gaps, key=lambda one: abs(gaps[one]))
+            # Two amounts on the same side may lie close together, where the distance need not be monotonic.
+            second = next((one for one in others if gaps[one] * gaps[first] < 0), others[0])
             power = (gaps[second] - gaps[first]) / math.log(second / first)
             if power / self.slope > _LEAST_POWER:
                 return power
