@@ -97,6 +97,15 @@ def one_line(error: BaseException) -> str:
 
 
 @contextmanager
+def refused_by_pydantic() -> Iterator[None]:
+    """Turn an InputError into the ValueError by which pydantic knows a refusal."""
+    try:
+        yield
+    except InputError as error:
+        raise ValueError(str(error)) from error
+
+
+@contextmanager
 def from_extra(extra: str, purpose: str, kind: type[InputError] = InputError) -> Iterator[None]:
     """Turn an import that fails into an error that names its purpose, and the extra that has the library."""
     try:

@@ -25,7 +25,6 @@ class Workspace:
 
     Attributes:
         store: Store, laid out for the plan.
-        plan: Plan of the study.
         labels: Label of each row of the store.
         rows: Rows of the plan, by their number in the store. The store may have others, of meshes that the study
             has lost: their fields stay, in case the meshes come back.

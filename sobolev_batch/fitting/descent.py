@@ -53,13 +53,8 @@ _END_OF_STATUS = {0: End.CONVERGED, 1: End.STEPS}
 class Descent:
     """The descent of a squared distance by L-BFGS, with a small penalty for triangles that lose their shape.
 
-    Args:
-        objective: Squared distance, or a weighted sum of several.
-        vertices: Positions (n, 3) to start from, in units of length; later the last ones that were accepted.
-        smoothing: Smoothing of the steps.
-        floor: Squared distance below which nothing is left to gain.
-        unit: Length of a long step, such as that of an edge.
-        notify: Called with the positions and the objective after each step.
+    It goes on from positions (n, 3) in units of length, until the squared distance is below a floor. The unit is the
+    length of a long step, such as that of an edge. After each step, the positions and the objective are notified.
 
     Source: R. Byrd, P. Lu, J. Nocedal, C. Zhu, "A limited memory algorithm for bound constrained optimization"
     (1995), doi:10.1137/0916069; by scipy.

@@ -88,11 +88,7 @@ class FitSource(NestedSource):
 
 
 class RefineSource(FitSource):
-    """Finer versions of one mesh, with edges split where that brings it nearer to a surface: see `refine`.
-
-    Attributes:
-        triangles: Numbers of triangles to reach.
-    """
+    """Finer versions of one mesh, with edges split where that brings it nearer to a surface: see `refine`."""
 
     triangles: Several[Annotated[int, Field(ge=1, le=MOST_TRIANGLES)]]
 

@@ -42,18 +42,11 @@ _FEWEST_RECORDS = 3
 def forecast(
     plan: Plan, stored: Mapping[str, Record], workers: Workers, client: Client | None, planning_seconds: float
 ) -> tuple[float, float, list[str]]:
-    """Predict the time of a run.
+    """Predict the time of a run on workers, without the fields that are stored, by label.
 
-    Args:
-        plan: Plan of the study.
-        stored: Records of fields that are stored, and not to be computed again, by label.
-        workers: Workers to compute on.
-        client: Client of their cluster; None if the run starts them on this machine.
-        planning_seconds: Time of planning, which a run does again; 0 where it takes the choice of its store.
-
-    Returns:
-        Seconds from the start to the end, if the workers have their cores for themselves; seconds of a processor, of
-        all tasks and processes; and lines that show both.
+    The client is that of the workers' cluster; None if the run starts them on this machine. A run plans again, unless
+    it takes the choice of its store. Return the seconds from the start to the end, if the workers have their cores for
+    themselves; seconds of a processor, of all tasks and processes; and lines that show both.
     """
     missing = [row.label for row in plan.rows if row.label not in stored]
     if not missing:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from sobolev_batch.batch.collection_store import CollectionStore
+from sobolev_batch.batch.collection_store import CollectionStore, labelled
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, age_seconds, utc_now
 from sobolev_batch.batch.store.heartbeat import LOST_AFTER_SECONDS
@@ -107,7 +107,7 @@ class Status:
         latest = max(parts.values(), key=_urgency, default=None)
         current = latest if latest and latest.going_on else None
         waiting = [name for name in collection.objects if name not in parts]
-        failed = {f"{name}/{label}": why for name, one in parts.items() for label, why in one.failed.items()}
+        failed = labelled({name: one.failed for name, one in parts.items()})
         if current is None:
             # Otherwise its turn may come.
             failed |= dict.fromkeys(waiting, "it has no results; run the study again to see why")
@@ -116,7 +116,7 @@ class Status:
             sum(one.complete for one in parts.values()),
             sum(one.total for one in parts.values()) + len(waiting),
             failed,
-            {f"{name}/{label}": why for name, one in parts.items() for label, why in one.not_compared.items()},
+            labelled({name: one.not_compared for name, one in parts.items()}),
             latest.run if latest else None,
             not waiting and all(one.reduced for one in parts.values()),
             latest.silence_seconds if latest else 0.0,

@@ -223,16 +223,9 @@ class StoreAccessor:
 def stored_reducer(tree: xr.DataTree, order: Orders, *meshes: str) -> tuple[Reducer, list[int]]:
     """Return the reducer of an open store for any orders, and the rows of some meshes.
 
-    Args:
-        tree: Open store.
-        order: One order s < -1/2, or several.
-        meshes: Labels of meshes. No record of others is read, and distances are to the last one. Without any, all are
-            read, and distances are to the reference.
-
-    Raises:
-        InputError: The tree does not say where it was opened, or no mesh with a field has that label.
-        OrderError: An order is not below -1/2.
-        DamageError: The record of a mesh is not the one that the tables were made from.
+    No record of other meshes is read, and distances are to the last one. Without labels, all records are read, and
+    distances are to the reference. InputError where no mesh with a field has a label, DamageError where the record of a
+    mesh is not the one that the tables were made from.
     """
     store, orders = store_of(tree), check_orders(order)
     labels, removed, chosen = store.labels(), store.removed, set(meshes)
@@ -262,13 +255,7 @@ def stored_reducer(tree: xr.DataTree, order: Orders, *meshes: str) -> tuple[Redu
 def _computed(tree: xr.DataTree, orders: tuple[float, ...], meshes: Meshes = None) -> Results:
     """Return norms, and distances to the reference, of an open store at other orders than its own, from spectra.
 
-    Args:
-        tree: Open store.
-        orders: Orders s.
-        meshes: Meshes that are needed, and the reference with them; default all.
-
-    Raises:
-        DamageError: Spectra are not those of the fields that the tables were made from.
+    Those of the meshes that are needed, default all. DamageError where spectra are not those of the stored fields.
     """
     store, reference = store_of(tree), reference_of(tree)
     table = finished_group(tree, "meshes", load=False)
@@ -293,19 +280,11 @@ def _computed(tree: xr.DataTree, orders: tuple[float, ...], meshes: Meshes = Non
 
 
 def convergence_at(tree: xr.DataTree, order: Orders | None, meshes: Meshes = None) -> xr.Dataset:
-    """Return the convergence table of an open store at some orders, in memory.
+    """Return the convergence table of an open store at some orders, of the store or not, in memory.
 
-    Args:
-        tree: Open store.
-        order: One order s < -1/2, or several, of the store or not; default all of the store. The attribute
-            ``computed`` of the table lists those that were computed from radial spectra.
-        meshes: Labels of meshes that are needed; default all. The table may have others.
-
-    Raises:
-        InputError: The store has no tables yet; or other orders are requested, and the tree does not say where it was
-            opened.
-        OrderError: An order is not below -1/2.
-        DamageError: A field is not what was stored.
+    The attribute ``computed`` of the table lists the orders that were computed from radial spectra. The table may have
+    more meshes than those that are needed. InputError where the store has no tables yet, or other orders are requested
+    and the tree does not say where it was opened; DamageError where a field is not what was stored.
     """
     stored = finished_group(tree, "convergence", load=False)
     chosen, others = _divided(stored, order)

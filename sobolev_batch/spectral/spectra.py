@@ -192,7 +192,6 @@ class RadialAxis:
     The shells |k|² = 0, 1, ... of the lattice come first, then the radii of each group of samples of each octave.
 
     Attributes:
-        lattice: Lattice of the fields.
         sampling: Samples of the octaves; None without any.
     """
 
@@ -259,13 +258,10 @@ class RadialAxis:
         return {"octave": octaves, "lattice": lattices}
 
     def spectra(self, shell_sums: Reals, octaves: Reals, *, is_square: bool = True) -> Spectra:
-        """Return the spectra of fields.
+        """Return the spectra of fields from sums over the shells of the lattice (fields, shells).
 
-        Args:
-            shell_sums: Sums over the shells of the lattice (fields, shells).
-            octaves: |field|² at all samples of octaves (fields, samples), or a product of two fields; (fields, 0)
-                without octaves.
-            is_square: False for products: they need no errors, and have no moments and peaks.
+        At all samples of octaves they have |field|² (fields, samples), or a product of two fields, which needs no
+        errors, and has no moments and peaks.
         """
         sums, moments, peaks = [shell_sums], [np.zeros((len(shell_sums), 0))], [np.zeros((len(shell_sums), 0))]
         for part in self.parts:

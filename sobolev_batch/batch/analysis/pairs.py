@@ -47,10 +47,8 @@ class Pairs:
     """The distances of all pairs of a study's meshes in a store.
 
     Attributes:
-        store: Store.
         rows: Row of each mesh in the order of the matrix, that in which the meshes were added.
         keys: What each row with a field was computed from, by the row; see `Record`.
-        orders: Sobolev orders s.
         reference: Row of the reference.
     """
 

@@ -60,10 +60,7 @@ class Reducer:
     """The input that all tiles of one reduction share.
 
     Attributes:
-        store: Store of the fields.
-        lattice: Lattice of the fields.
         blocks: Blocks of the lattice, one chunk each.
-        orders: Sobolev orders s.
         reference: Row of the reference, or None if it has no field.
         areas: Area of every row's surface (rows,), NaN without a field.
         errors: Norms of the fields' own errors (orders, rows), likewise.
@@ -183,12 +180,8 @@ class Reducer:
         """Return norms of rows, distances to the reference, and parts of both, each over (orders, rows).
 
         The four parts are the distance's area part and shape part, see `area_and_shape`, and what lies beyond the last
-        octave in the squared norm and in the squared distance. Without the reference's field, distances are NaN.
-
-        Args:
-            rows: Rows.
-            spectra: Their spectra.
-            reference: Spectrum of the norm of the reference, (1, radii); None without its field.
+        octave in the squared norm and in the squared distance. Without the field of the reference, its spectrum
+        (1, radii) is None, and distances are NaN.
         """
         rows, has_octaves = list(rows), self.sampling is not None
         own_tail = self._tail(spectra.norm, [self.qualities[row].own for row in rows]) if has_octaves else None

@@ -128,9 +128,6 @@ class Results:
     """The results of a reduction in the order of tables, NaN where there are none.
 
     Attributes:
-        meshes: Table of the meshes.
-        reference: Label of the reference.
-        orders: Sobolev orders s.
         norms: (5, orders, meshes), norms and their errors; see `NormEstimate`.
         to_reference: (5, orders, meshes), distances to the reference.
         parts: (4, orders, meshes), see `Reducer.norms`.

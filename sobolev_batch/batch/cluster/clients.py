@@ -41,12 +41,8 @@ _LOST_WORKER_SECONDS = 10**7
 def local_client(workers: int | None = None, memory: float | str | None = None) -> Iterator[Client]:
     """Give a client of a new cluster of single-threaded worker processes, reachable from this machine only.
 
-    Args:
-        workers: Number of workers; by default one for each core that this process may use.
-        memory: Memory of each, in bytes or as a text such as "4GB"; by default the machine's, divided equally.
-
-    Raises:
-        InputError: See `memory_limit`.
+    There is a worker for each core that this process may use, and they share the memory of the machine equally, unless
+    their number, or the memory of each, is given. InputError where `memory_limit` refuses it.
     """
     count = workers or available_cores()
     # Dask's own default knows no limit of an inner control group.

@@ -32,7 +32,6 @@ class Progress:
             tables are computed, "proximity" while Hausdorff and Chamfer distances are measured.
         done, total: Steps of the stage.
         label: Label of the mesh that was finished, or address of the cluster's dashboard; else empty.
-        record: Completion record of that mesh.
         part: Object of a collection that is worked on, and its number, such as "cow, 2 of 8"; else empty.
     """
 
@@ -63,7 +62,6 @@ class Task:
     """A call of a function on a worker.
 
     Attributes:
-        function: Function to call.
         arguments: Arguments of the call. Results take the place of tasks among them, also within a list.
         projected_bytes: Memory that the call takes at most.
         needs_gpu: True where the call has to run on a worker with a GPU.
@@ -96,7 +94,6 @@ class Cluster:
     """A cluster that computes a study.
 
     Attributes:
-        client: Client of the cluster.
         workers: Workers that the cluster had when the study began.
         notify: Callback for each step of progress.
         in_flight: Number of small tasks that the scheduler knows of at a time, at least: enough to keep workers

@@ -47,9 +47,6 @@ class Job:
     """The field of one row, and where it is stored.
 
     Attributes:
-        store: Store of the field.
-        index: Index of the row in the store.
-        row: Row of the plan.
         lattice, transform, orders, similarity, backend, tail: What all rows share; see `Plan`.
         distance_target: Accuracy that the field is computed for, if the study has one.
         allowed_bytes: Memory that one transform may take besides its mesh and its block.

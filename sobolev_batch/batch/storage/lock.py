@@ -47,7 +47,6 @@ class Lock:
     Attributes:
         run: Run that it belongs to. A process that knows it may take the lock over, as a worker does from the
             process that submitted the run, or from a worker that was lost.
-        holder: Identifier of the holder.
         driver: Description of the holder: its process and host.
         since: Time at which it was acquired, in UTC.
         process: Mark of the holder's process, see `_process_mark`; empty if the lock outlives it.

@@ -33,7 +33,6 @@ class Heartbeat:
 
     Attributes:
         cluster: Address of the scheduler, once there is one.
-        stage: Current stage.
         find_obstacle: Function that is called at each beat and returns what keeps the run from going on, if anything.
     """
 

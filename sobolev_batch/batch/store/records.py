@@ -86,7 +86,6 @@ class ProximityRecord:
         key: Digest of all that they depend on.
         reason: Reason of a failure; empty otherwise.
         numbers: What `proximity` returns, in the unit of length of the files; empty after a failure.
-        seconds: Time spent in their task.
     """
 
     key: str
@@ -109,13 +108,10 @@ class Record:
         key: Key of the row when the surface was computed: a digest of all that its field depends on.
         status: "complete" or "failed".
         reason: Reason of the failure; empty otherwise.
-        facts: Properties of the surface.
         quality: Data of the field from which errors of norms are computed, see `Quality.to_json`.
         checksums: Checksums of the field's blocks, see `Store.write_field`. A field with others is damaged, or was
             written by another task.
-        seconds: Time spent in its tasks.
         worker: Address of the worker that finished it.
-        backend: Backend of the transform.
         finished: Time at which it was finished, in UTC.
         proximity: Hausdorff and Chamfer distances from the reference, where the study requests them.
         cost: What making the surface took, where that is known.
@@ -174,7 +170,6 @@ class RunRecord:
         driver: Description of the driver: its process and host, and its cluster.
         started: Time of the start, in UTC.
         seen: Time of the driver's latest heartbeat, in UTC.
-        stage: Current stage.
         error: Reason of the failure, or obstacle to the run; empty otherwise.
     """
 

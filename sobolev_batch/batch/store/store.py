@@ -71,7 +71,6 @@ class Store:
     store to see what other processes have changed of them. Chunks are read anew each time.
 
     Attributes:
-        location: Location of the store.
         documents: Metadata documents by the path of their node. That of the root, under "", lacks the others.
     """
 
@@ -439,15 +438,8 @@ class Store:
     def read_fields(self, rows: Sequence[int], place: Place, checksums: Sequence[int] | None = None) -> NDArray[Any]:
         """Return the values of several rows at a place, complex (len(rows), ...).
 
-        Args:
-            rows: Rows to read.
-            place: Slices of a block of the lattice, or the slice of all samples of octaves.
-            checksums: Checksum of each row's values, which the tasks returned. Without them, missing values read as
-                NaN.
-
-        Raises:
-            DamageError: Values are damaged, lost, or others; the error names their row.
-            StoreError: The store cannot be read.
+        They are compared with the checksums that the tasks returned; without these, missing values read as NaN. A
+        DamageError names the row whose values are damaged, lost, or others.
         """
         array = self.array(_array_at(place))
         values = np.empty((len(rows), *(axis.stop - axis.start for axis in place)), dtype=array.dtype)

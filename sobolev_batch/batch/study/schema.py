@@ -30,7 +30,7 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails, PydanticKnownError
 
-from sobolev_batch.errors import InputError, StudyError
+from sobolev_batch.errors import StudyError, refused_by_pydantic
 from sobolev_batch.parameters import byte_count
 from sobolev_batch.spectral import DEFAULT_ORDER
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
@@ -114,10 +114,8 @@ class Section(BaseModel):
     @model_validator(mode="after")
     def _is_possible(self) -> Self:
         """Refuse values that are wrong together."""
-        try:
+        with refused_by_pydantic():
             self.settings()
-        except InputError as error:
-            raise ValueError(str(error)) from error
         return self
 
 
@@ -236,20 +234,17 @@ def with_named_meshes(table: Any, meshes: Mapping[str, Any], above: tuple[str, .
 
 def _source(table: object, info: ValidationInfo) -> Source:
     """Return what the table of a source, or the name of a mesh, describes."""
-    try:
+    with refused_by_pydantic():
         table = with_named_meshes(table, info.context or {})
         if not isinstance(table, dict):
             raise PydanticKnownError("dict_type")
         return parse_source(table)
-    except InputError as error:
-        raise ValueError(str(error)) from error
 
 
 class Family(Section):
     """A named source of surfaces.
 
     Attributes:
-        name: Name of the family.
         source: Source of its surfaces. In a study file its keys are beside the others.
         order_by: What orders its meshes in tables, if the study says so: their triangles, or the natural order of their
             names, in which they are no sequence from coarse to fine and have no rates.

@@ -41,7 +41,6 @@ class StudyMeshes:
 
     Attributes:
         members: Family and member of each surface that the study lists on this machine, by label.
-        table: Table of the store about its meshes.
         similarity: Similarity from the meshes' own unit of length to the study's.
     """
 

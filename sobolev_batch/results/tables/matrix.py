@@ -15,7 +15,6 @@ from sobolev_batch.results.open import AnyStore, as_tree, complete_meshes, finis
 from sobolev_batch.results.store_accessor import distances_at, norms_at, order_note
 from sobolev_batch.results.tables import Format
 from sobolev_batch.results.tables.text import (
-    line_length,
     machine_table,
     middle_cut,
     printed_table,
@@ -123,7 +122,7 @@ def format_matrix(tree: xr.DataTree, style: Format = "text", orders: Sequence[fl
     for order in chosen:
         values, errors, unit = _shown_numbers(tree, distances.sel(order=order).load())
         caption = f"Sobolev distances of order {order:g}, {unit}"
-        sections.append(section(caption, _tables(distances, values, errors, style), [], style))
+        sections.append(section(caption, [_table(distances, values, errors, style)], [], style))
     notes = [_NOTE]
     if "computed" in distances.attrs:
         notes += order_note(tree, distances.attrs["computed"])
@@ -141,35 +140,19 @@ def _shown_numbers(tree: xr.DataTree, distances: xr.Dataset) -> tuple[Reals, Rea
     return values, errors, "in the square root of a unit length"
 
 
-def _tables(distances: xr.Dataset, numbers: Reals, errors: Reals, style: Format) -> list[str]:
-    """Return a matrix as tables that follow each other, each with as many columns as a line of text has room for.
-
-    A symmetric matrix has only the cells below its diagonal.
-    """
+def _table(distances: xr.Dataset, numbers: Reals, errors: Reals, style: Format) -> str:
+    """Return a matrix as a table; a symmetric one has only the cells below its diagonal."""
     labels, others = (distances[name].values.tolist() for name in ("mesh", "other"))
     is_symmetric = labels == others
     numbers_of = {label: str(i) for i, label in enumerate(labels, 1)}
-    names = [f"{i} {middle_cut(label, _LONGEST_LABEL)}" for i, label in enumerate(labels, 1)]
-    cells = [
-        [
+    rows = [
+        [f"{i + 1} {middle_cut(label, _LONGEST_LABEL)}"]
+        + [
             "" if is_symmetric and i <= j else with_error(float(numbers[i, j]), float(errors[i, j])) or "missing"
             for j in range(len(others))
         ]
-        for i in range(len(labels))
+        for i, label in enumerate(labels)
     ]
-    columns = [j for j in range(len(others)) if any(row[j] for row in cells)]
-    room = max(1, len(columns))
-    if style == "text":
-        cell_width = max((len(row[j]) for row in cells for j in columns), default=0) + 2
-        room = max(1, (line_length() - max(map(len, names)) - 2) // cell_width)
-    tables = []
-    for group in [columns[start : start + room] for start in range(0, max(1, len(columns)), room)]:
-        # The mesh of the first column has no cells below the diagonal, and is named all the same.
-        named = group[:1] if is_symmetric else []
-        rows = [
-            [name, *(row[j] for j in group)]
-            for i, (name, row) in enumerate(zip(names, cells, strict=True))
-            if i in named or any(row[j] for j in group)
-        ]
-        tables.append(printed_table(rows, ["", *(numbers_of[others[j]] for j in group)], style))
-    return tables
+    kept = [0, *(column for column in range(1, 1 + len(others)) if any(row[column] for row in rows))]
+    headers = ["", *(numbers_of[label] for label in others)]
+    return printed_table([[row[k] for k in kept] for row in rows], [headers[k] for k in kept], style)

@@ -121,12 +121,9 @@ class Interval:
 
     @classmethod
     def from_values(cls, values: Reals, errors: Reals, spread: float | None = None) -> Interval:
-        """Return the interval of the mean by Student's t.
+        """Return the interval of the mean by Student's t, from values and bounds on their errors (n,).
 
-        Args:
-            values: One value for each object (n,).
-            errors: Bounds on their errors (n,).
-            spread: Standard deviation of the values; by default their own.
+        The spread is the standard deviation of the values, by default their own.
         """
         count = len(values)
         if count == 0:

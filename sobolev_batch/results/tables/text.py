@@ -263,7 +263,6 @@ class Column:
 
     Attributes:
         name: Column of the frame that has its values, and its name in the CSV of a page.
-        header: Header of the column.
         format: Function that returns the text of a value, and of the error where there is one.
         error: Column of the frame with the errors, or with other second numbers; empty where there are none.
         kind: "label" for the first column of a page, else what the cells hold.
@@ -329,7 +328,8 @@ def printed_table(
     """Return cells as a table whose columns are aligned to the right, but for the first and for those of texts.
 
     In a text, labels of the first column and texts give way where lines would be too long: labels lose what they
-    repeat and then their middle, and texts are wrapped. Columns that still have no room follow in a table of their own.
+    repeat and then their middle, and texts are wrapped. Columns that still have no room follow in a table of their own,
+    without rows that have no cells there.
     LaTeX's special characters are escaped by tabulate.
     """
     rows, headers = (
@@ -350,7 +350,11 @@ def printed_table(
     tables = [
         str(
             tabulate(
-                [[row[0], *(row[column] for column in group)] for row in rows],
+                [
+                    [row[0], *(row[column] for column in group)]
+                    for row in rows
+                    if group is groups[0] or any(row[column] for column in group)
+                ],
                 headers=[headers[0], *(headers[column] for column in group)],
                 tablefmt=_TABULATE_FORMATS[style],
                 disable_numparse=True,

@@ -74,7 +74,6 @@ class Frequencies:
     """A lattice of the innermost frequencies, and octaves beyond it.
 
     Attributes:
-        octaves: The octaves, which may be none.
         widths: Widths of all surfaces together, see `Support`.
         has_tail: True where all that lies beyond the lattice is known, from octaves.
     """

@@ -199,15 +199,8 @@ def observed_rates(distances: Reals, errors: Reals, sizes: Reals) -> tuple[Reals
     """Return the observed order p in distance ~ size^p between each mesh and a coarser one, with its error.
 
     The coarser one is the next whose size is larger by a tenth at least: between nearly equal sizes chance decides.
-
-    Args:
-        distances: Distances to the reference (n,), NaN where missing.
-        errors: Errors of the distances (n,).
-        sizes: Mean edge lengths (n,), in units of length, NaN where missing.
-
-    Returns:
-        log(d_coarse/d)/log(h_coarse/h) and its error, (n,) each, in the order of the arguments. NaN for the
-        coarsest meshes, for meshes without a distance or size, and for distances below their error.
+    From distances, their errors and mean edge lengths (n,) follow log(d_coarse/d)/log(h_coarse/h) and its error, (n,)
+    each: NaN for the coarsest meshes, for meshes without a distance or size, and for distances below their error.
 
     >>> sizes = np.array([0.4, 0.2, 0.1])
     >>> observed_rates(3 * sizes**2, np.zeros(3), sizes)[0].round(6)

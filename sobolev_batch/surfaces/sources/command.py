@@ -25,7 +25,7 @@ from typing import Annotated, Any, Self
 import pandas as pd
 from pydantic import BeforeValidator, ConfigDict, Field, PrivateAttr, model_validator
 
-from sobolev_batch.errors import InputError, MeshError, StudyError, one_line
+from sobolev_batch.errors import MeshError, StudyError, one_line, refused_by_pydantic
 from sobolev_batch.parameters import byte_count
 from sobolev_batch.surfaces.formats.readers import as_mesh
 from sobolev_batch.surfaces.shapes.mesh import Mesh
@@ -68,10 +68,8 @@ def _seconds(value: object) -> float:
 
 
 def _bytes(value: object) -> int:
-    try:
+    with refused_by_pydantic():
         return byte_count(value)  # type: ignore[arg-type]
-    except InputError as error:
-        raise ValueError(str(error)) from error
 
 
 def _file_suffix(value: object) -> str:

@@ -16,7 +16,7 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from sobolev_batch.errors import InputError, MeshError, from_extra
+from sobolev_batch.errors import MeshError, from_extra, refused_by_pydantic
 from sobolev_batch.surfaces.shapes.closed_forms import MOST_TRIANGLES, Ellipsoid, Sphere, Torus
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.subdivision import FINEST_LEVEL, icosphere
@@ -60,10 +60,8 @@ class ClosedFormSource(Source, ABC):
 
     @model_validator(mode="after")
     def _check_shape(self) -> Self:
-        try:
+        with refused_by_pydantic():
             _ = self.shape
-        except InputError as error:
-            raise ValueError(str(error)) from error
         return self
 
     def members(self, folder: Path) -> tuple[Member, ...]:
