@@ -64,10 +64,8 @@ _CURVED_DEVIATION, _FLAT_DEVIATION = 1.3, 3.0
 _GROWTH = 4.0
 # Predicted seconds that the first samples of an octave may take if drawn, and all of the samples together.
 _OCTAVE_SECONDS, _MOST_SECONDS = 20.0, 200.0
-# Random points of a remainder at most, and how many more than needed are taken.
-_MOST_POINTS, _MORE_POINTS = 60_000, 1.3
-# How many times as many points a remainder gets that octaves contradict.
-_MORE_CHECKED = 4
+# Random points of a remainder at most, how many more than needed are taken, and how many more to check it again.
+_MOST_POINTS, _MORE_POINTS, _MORE_TO_CHECK = 60_000, 1.3, 4
 # Nodes that a parametrised surface may have; beyond the frequency that they resolve it has no octaves.
 _MOST_SMOOTH_NODES = 2e6
 
@@ -326,7 +324,7 @@ def _checked_again(state: State) -> State | None:
     relative = state.disagreements / state.permitted
     number, order = np.unravel_index(np.argmax(relative), relative.shape)
     beyond = state.remainders[number]
-    points, (_, errors) = _MORE_CHECKED * beyond.points, beyond.at(state.problem.orders)
+    points, (_, errors) = _MORE_TO_CHECK * beyond.points, beyond.at(state.problem.orders)
     is_affordable = points <= _MOST_POINTS and state.seconds + beyond.seconds(points) <= _MOST_SECONDS
     may_be_chance = 0 < state.disagreements[number, order] < errors[order]
     return state.redrawn(int(number), points) if is_affordable and may_be_chance else None
