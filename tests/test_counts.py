@@ -115,9 +115,9 @@ def work_of(call: Callable[[], object]) -> dict[str, int]:
             return super().execute(*arguments, **settings)
 
     def counting(exact: Callable[..., Any]) -> Callable[..., Any]:
-        def transform(mesh: sb.Mesh, frequencies: Any) -> Any:
+        def transform(mesh: sb.Mesh, frequencies: Any, *backend: Any) -> Any:
             events.append(("exact", len(mesh.triangles) * len(frequencies)))
-            return exact(mesh, frequencies)
+            return exact(mesh, frequencies, *backend)
 
         return transform
 

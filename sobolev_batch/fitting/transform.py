@@ -93,9 +93,10 @@ class MeshTransform:
         """Return the transform on the half lattice, complex128; see `nodes` for the positions."""
         nodes, backend = self.nodes(vertices), self.execution.backend
         spec = NufftSpec(self.lattice.shape, self.eps, threads=self.execution.threads)
-        points = WeightedPoints(backend.upload(nodes.coordinates), backend.upload(nodes.weights))
-        values, _ = transform_points([points], self.lattice, self.lattice.half, spec, backend)
-        return np.asarray(backend.download(values))
+        with backend.work():
+            points = WeightedPoints(backend.upload(nodes.coordinates), backend.upload(nodes.weights))
+            values, _ = transform_points([points], self.lattice, self.lattice.half, spec, backend)
+            return np.asarray(backend.download(values))
 
     def derivative(self, vertices: Reals, coefficients: Complexes) -> Reals:
         """Return the derivative of Re Σ conj(c(ξ)) μ^(ξ) over the half lattice with respect to the vertices, (n, 3).
@@ -123,12 +124,13 @@ class MeshTransform:
         x, y, z = np.ix_(axis, axis, axis)
         spec = NufftSpec(whole.shape, self.eps, threads=self.execution.threads)
         points = nodes.coordinates
-        plan = backend.plan(backend.costs.with_oversampling(spec, points.shape[1]), adjoint=True)
-        # setpts keeps references, not copies: the angles live until both functions are evaluated.
-        angles = [backend.upload(row) for row in 2 * np.pi * lattice.spacing * points]
-        plan.setpts(*angles)
         pairs = (whole * (1 - x), whole * (1j * y - z))
-        first, second = (backend.download(plan.execute(backend.upload(pair))) for pair in pairs)
+        with backend.work():
+            plan = backend.plan(backend.costs.with_oversampling(spec, points.shape[1]), adjoint=True)
+            # setpts keeps references, not copies: the angles live until both functions are evaluated.
+            angles = [backend.upload(row) for row in 2 * np.pi * lattice.spacing * points]
+            plan.setpts(*angles)
+            first, second = (backend.download(plan.execute(backend.upload(pair))) for pair in pairs)
         return first.real, np.stack([first.imag, second.real, second.imag], axis=1)
 
     def _from_areas(self, vertices: Reals, slopes: Reals) -> Reals:

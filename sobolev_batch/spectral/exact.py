@@ -27,15 +27,24 @@ from numpy.typing import NDArray
 from scipy.special import gamma, kv
 
 from sobolev_batch.errors import OrderError
-from sobolev_batch.spectral.backends import cosine_and_sine
+from sobolev_batch.spectral.backends import (
+    CPU,
+    Array,
+    Backend,
+    combine,
+    compute_on,
+    cosine_and_sine,
+    row_dots,
+    sums_at,
+)
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.mesh import Corners, Mesh, cross_lengths
-from sobolev_batch.surfaces.shapes.surface import Indices, Reals
+from sobolev_batch.surfaces.shapes.surface import Reals
 
 Complexes = NDArray[np.complex128]
 # A number as a rounded value and what it lacks.
-Pair = tuple[Reals, Reals]
+Pair = tuple[Array, Array]
 
 # Gaps below this (radians) go through the series, which then needs at most 19 terms and a fraction of the time of the
 # quotient.
@@ -44,46 +53,55 @@ _SERIES_GAP = 2.0
 _PLAIN_CYCLES = 16.0
 # Triangles whose area is a smaller fraction of a squared edge lose digits in a plain cross product.
 _FLATNESS = 1e-2
-# Triangles at a time: their temporaries stay in cache.
-_BATCH = 1 << 13
-# Pairs of a triangle and a frequency for each pass: with fewer, calls of NumPy take longer than their work.
-_PAIRS = 1 << 11
+# Triangles at a time: their temporaries stay in a processor's cache.
+_BATCH = {"cpu": 1 << 13, "gpu": 1 << 18}
+# Pairs of a triangle and a frequency for each pass: with fewer, calls of NumPy and CuPy take longer than their work.
+_PAIRS = {"cpu": 1 << 11, "gpu": 1 << 21}
+# With fewer pairs a GPU takes longer than the processor.
+_FEWEST_FOR_GPU = 1 << 15
 # Splits a double into halves of 26 bits each.
 _SPLITTER = 2.0**27 + 1
 
 
-def exact_transform(mesh: Mesh, frequencies: Reals) -> Complexes:
+def exact_transform(mesh: Mesh, frequencies: Reals, backend: Backend = CPU) -> Complexes:
     """Return the transform ∫ exp(-2πi ξ·x) dμ(x) of a mesh's area measure, free of quadrature error.
 
     For ξ, float64 (P, 3), in cycles per unit length, it is complex128 (P,). The error of each triangle is about 1e-15
-    of its contribution, or of its area if that is smaller; the area itself is exact to rounding even on slivers.
+    of its contribution, or of its area if that is smaller; the area itself is exact to rounding even on slivers. A GPU
+    changes the last digits.
     """
     frequencies = np.asarray(frequencies, dtype=np.float64)
     columns = [np.ascontiguousarray(column) for column in mesh.vertices.T]
 
-    def batch_sums(start: int) -> Complexes:
-        a, b, c = (
-            np.stack([column[index] for column in columns])
-            for index in np.ascontiguousarray(mesh.triangles[start : start + _BATCH].T)
-        )
-        return _sums((a, b, c), frequencies)
+    def sums(backend: Backend) -> Complexes:
+        batch = _BATCH[backend.name]
+        parts = []
+        for start in range(0, len(mesh.triangles), batch):
+            rows = np.ascontiguousarray(mesh.triangles[start : start + batch].T)
+            corners = np.stack([[column[index] for column in columns] for index in rows])
+            parts.append(_sums(corners, frequencies, backend))
+        return np.asarray(np.sum(parts, axis=0, dtype=np.complex128))
 
-    sums = [batch_sums(start) for start in range(0, len(mesh.triangles), _BATCH)]
-    return np.asarray(np.sum(sums, axis=0, dtype=np.complex128))
+    return compute_on(_faster(backend, mesh, frequencies), sums)
 
 
-def second_difference(ab: Reals, ac: Reals) -> Complexes:
+def _faster(backend: Backend, mesh: Mesh, frequencies: Reals) -> Backend:
+    return backend if len(mesh.triangles) * len(frequencies) >= _FEWEST_FOR_GPU else CPU
+
+
+def second_difference(ab: Array, ac: Array) -> Array:
     """Return the second divided difference of exp at imaginary nodes iα, iβ, iγ whose mean is zero, complex128 (n,).
 
     The gaps are β - α and γ - α in radians (n,). Form them from edge vectors: differences of phases have lost the
     digits that the phases share. If the three nodes coincide, the value is 1/2.
     """
     widest = np.maximum(np.maximum(np.abs(ab), np.abs(ac)), np.abs(ac - ab))
-    close = widest < _SERIES_GAP
-    if close.all():
-        real, imaginary = _series(ab, ac, float(widest.max(initial=0.0)))
+    most = float(widest.max()) if len(widest) else 0.0
+    if most < _SERIES_GAP:
+        real, imaginary = _series(ab, ac, most)
         return real + 1j * imaginary
-    values = np.empty(len(ab), dtype=np.complex128)
+    close = widest < _SERIES_GAP
+    values = np.empty(len(ab), dtype=np.complex128, like=ab)
     real, imaginary = _series(ab[close], ac[close], _SERIES_GAP)
     values[close] = real + 1j * imaginary
     apart = ~close
@@ -119,35 +137,36 @@ def _doubled_areas_of_flat(corners: Corners) -> Reals:
     return np.asarray(np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2))
 
 
-def _sums(corners: Corners, frequencies: Reals) -> Complexes:
-    """Return the transform (P,) of a batch of triangles, from their corners (3, k) each."""
+def _sums(corners: Reals, frequencies: Reals, backend: Backend) -> Complexes:
+    """Return the transform (P,) of a batch of triangles, from their corners (3, 3, k): corner, axis, triangle."""
     a, b, c = corners
     ab, ac = b - a, c - a
-    doubled = doubled_areas(corners)
     longest = np.sqrt(max(float(np.einsum("ij,ij->j", side, side).max()) for side in (ab, ac, c - b)))
     centroids = a + (ab + ac) / 3
     farthest = float(np.abs(centroids).max()) + longest
-    transforms = np.empty(len(frequencies), dtype=np.complex128)
+    doubled = backend.upload(doubled_areas((a, b, c)))
+    points, edges = (backend.upload(np.stack(rows)) for rows in ((centroids, a, b, c), (ab, ac)))
+    parts = []
     # For few triangles, take several frequencies at a time.
-    step = max(1, _PAIRS // len(doubled))
+    step = max(1, _PAIRS[backend.name] // len(doubled))
     for first in range(0, len(frequencies), step):
         group = frequencies[first : first + step]
         plain = farthest * float(np.abs(group).sum(axis=1).max()) <= _PLAIN_CYCLES
         widest = 2 * np.pi * float(np.linalg.norm(group, axis=1).max()) * longest
         if len(group) == 1:
-            contributions = _contributions(doubled, (centroids, a, b, c), (ab, ac), group[0], plain, widest)
+            contributions = _contributions(doubled, points, edges, group[0], plain, widest)
         else:
-            points, edges = (list(np.tile(rows, len(group))) for rows in ((centroids, a, b, c), (ab, ac)))
-            repeated = np.repeat(group.T, len(doubled), axis=1)
-            contributions = _contributions(np.tile(doubled, len(group)), points, edges, repeated, plain, widest)
+            all_points, all_edges = (np.tile(rows, len(group)) for rows in (points, edges))
+            repeated = np.repeat(backend.upload(group).T, len(doubled), axis=1)
+            contributions = _contributions(np.tile(doubled, len(group)), all_points, all_edges, repeated, plain, widest)
         real, imaginary = (values.reshape(len(group), -1).sum(axis=1) for values in contributions)
-        transforms[first : first + step] = real + 1j * imaginary
-    return transforms
+        parts.append(backend.download(real + 1j * imaginary))
+    return np.concatenate(parts) if parts else np.empty(0, dtype=np.complex128)
 
 
 def _contributions(
-    doubled: Reals, points: Sequence[Reals], edges: Sequence[Reals], frequency: Reals, plain: bool, widest: float
-) -> tuple[Reals, Reals]:
+    doubled: Array, points: Array, edges: Array, frequency: Array, plain: bool, widest: float
+) -> tuple[Array, Array]:
     """Return real and imaginary parts of the transform of each triangle, at ξ (3,) for all or (3, k) for each.
 
     The points are centroids and the three corners, the edges those from the first corner, (3, k) each. Phases are
@@ -170,32 +189,32 @@ def _contributions(
     return real, imaginary
 
 
-def _near(doubled: Reals, phases: Reals, ab: Reals, ac: Reals, widest: float) -> tuple[Reals, Reals]:
+def _near(doubled: Array, phases: Array, ab: Array, ac: Array, widest: float) -> tuple[Array, Array]:
     """Return the same for triangles with small gaps, from the phases of their centroids."""
     cosines, sines = (doubled * values for values in cosine_and_sine(phases))
     real, imaginary = _series(ab, ac, widest)
     return cosines * real - sines * imaginary, cosines * imaginary + sines * real
 
 
-def _dots(direction: Reals, points: Reals) -> Reals:
+def _dots(direction: Array, points: Array) -> Array:
     """Return dot products of points (3, k) with one vector (3,) or one each (3, k), without a BLAS and its threads."""
-    return np.asarray(direction[0] * points[0] + direction[1] * points[1] + direction[2] * points[2])
+    return direction[0] * points[0] + direction[1] * points[1] + direction[2] * points[2]
 
 
-def _phases(points: Reals, frequency: Reals, plain: bool) -> Reals:
+def _phases(points: Array, frequency: Array, plain: bool) -> Array:
     """Return -2π ξ·p at points (3, k), in radians; unless ``plain``, whole cycles are subtracted before rounding."""
     if plain:
         return _dots(-2 * np.pi * frequency, points)
-    cycles: Pair = (np.zeros(points.shape[1]), np.zeros(points.shape[1]))
+    cycles: Pair = (np.zeros_like(points[0]), np.zeros_like(points[0]))
     for axis in range(3):
-        high, low = _two_product(points[axis], np.broadcast_to(frequency[axis], points.shape[1]))
+        high, low = _two_product(points[axis], frequency[axis])
         high -= np.rint(high)  # exact, and whole cycles do not change the exponential
         total, error = _two_sum(cycles[0], high)
         cycles = total, cycles[1] + (error + low)
-    return np.asarray(-2 * np.pi * (cycles[0] + cycles[1]))
+    return -2 * np.pi * (cycles[0] + cycles[1])
 
 
-def _series(ab: Reals, ac: Reals, widest: float) -> tuple[Reals, Reals]:
+def _series(ab: Array, ac: Array, widest: float) -> tuple[Array, Array]:
     """Return real and imaginary part of Σ_n i^n h_n / (n+2)!, h_n the complete homogeneous symmetric polynomials.
 
     As the nodes' mean is zero, h_n = p h_(n-2) + q h_(n-3) for p = Σ node²/2 and q their product.
@@ -216,17 +235,18 @@ def _series(ab: Reals, ac: Reals, widest: float) -> tuple[Reals, Reals]:
     return real, imaginary
 
 
-def _quotient(exponentials: Sequence[Complexes], ab: Reals, ac: Reals) -> Complexes:
+def _quotient(exponentials: Sequence[Array], ab: Array, ac: Array) -> Array:
     """Return the difference quotient of the two first differences that meet across the widest gap."""
     a, b, c = exponentials
-    gaps = np.stack([ab, ac, ac - ab])
-    of_ab, of_ac, of_bc = _first_difference(a, b, ab), _first_difference(a, c, ac), _first_difference(b, c, gaps[2])
-    numerators = np.stack([of_bc - of_ac, of_bc - of_ab, of_ac - of_ab])
-    widest = (np.abs(gaps).argmax(axis=0), np.arange(len(ab)))
-    return np.asarray(numerators[widest] / (1j * gaps[widest]))
+    bc = ac - ab
+    of_ab, of_ac, of_bc = _first_difference(a, b, ab), _first_difference(a, c, ac), _first_difference(b, c, bc)
+    across_ab = np.abs(ab) >= np.maximum(np.abs(ac), np.abs(bc))
+    across_ac = np.abs(ac) >= np.abs(bc)
+    numerator = np.where(across_ab, of_bc - of_ac, np.where(across_ac, of_bc - of_ab, of_ac - of_ab))
+    return numerator / (1j * np.where(across_ab, ab, np.where(across_ac, ac, bc)))
 
 
-def _first_difference(a: Complexes, b: Complexes, gap: Reals) -> Complexes:
+def _first_difference(a: Array, b: Array, gap: Array) -> Array:
     """Return the first divided difference (exp(iβ) - exp(iα)) / (i (β - α))."""
     wide = np.abs(gap) > 1
     denominator = np.where(wide, gap, 1.0)
@@ -234,14 +254,14 @@ def _first_difference(a: Complexes, b: Complexes, gap: Reals) -> Complexes:
     return np.where(wide, (b - a) / (1j * denominator), near)
 
 
-def _two_sum(a: Reals, b: Reals) -> Pair:
+def _two_sum(a: Array, b: Array) -> Pair:
     """Return the rounded sum and its rounding error: a + b = high + low exactly."""
     high = a + b
     shadow = high - a
     return high, (a - (high - shadow)) + (b - shadow)
 
 
-def _two_product(a: Reals, b: Reals) -> Pair:
+def _two_product(a: Array, b: Array) -> Pair:
     """Return the rounded product and its rounding error: a * b = high + low exactly."""
     high = a * b
     a_high, a_low = _halves(a)
@@ -261,7 +281,7 @@ def _subtract(a: Pair, b: Pair) -> Pair:
     return _two_sum(high, low + (a[1] - b[1]))
 
 
-def _halves(a: Reals) -> Pair:
+def _halves(a: Array) -> Pair:
     shifted = _SPLITTER * a
     high = shifted - (shifted - a)
     return high, a - high
@@ -271,12 +291,12 @@ def _halves(a: Reals) -> Pair:
 _LEAST_PRODUCT = 2e-3
 # If the longest edge is below this many radians, most triangles would go through the stable form.
 _FINE_MESH = 0.5
-# Most pairs of a triangle and a frequency at a time, and most triangles: their temporaries stay in cache. Those
-# of all triangles of a fine mesh, on every thread, would take gigabytes.
-_SAMPLED_PAIRS = 1 << 14
+# Most pairs of a triangle and a frequency at a time, and most triangles: their temporaries stay in a processor's cache.
+# Those of all triangles of a fine mesh, on every thread, would take gigabytes.
+_SAMPLED_PAIRS = {"cpu": 1 << 14, "gpu": 1 << 22}
 
 
-def sampled_transform(mesh: Mesh, frequencies: Reals, threads: int = 1) -> Complexes:
+def sampled_transform(mesh: Mesh, frequencies: Reals, threads: int = 1, backend: Backend = CPU) -> Complexes:
     """Return the transform ∫ exp(-2πi ξ·x) dμ(x) of a mesh at single frequencies (P, 3), fast and to fewer digits.
 
     Away from small gaps the divided difference of exp at the corners is a plain sum of their exponentials, which
@@ -288,41 +308,48 @@ def sampled_transform(mesh: Mesh, frequencies: Reals, threads: int = 1) -> Compl
     lengths = np.linalg.norm(frequencies, axis=1)
     fine = 2 * np.pi * lengths * mesh.edge_length_range[1] < _FINE_MESH
     values = np.empty(len(frequencies), dtype=np.complex128)
-    values[fine] = exact_transform(mesh, frequencies[fine])
-    parts = np.array_split(frequencies[~fine], threads)
-    others = np.zeros(np.count_nonzero(~fine), dtype=np.complex128)
-    if others.size:
-        with ThreadPoolExecutor(threads) as pool:
-            for _, batch in mesh.batches(_SAMPLED_PAIRS):
-                others += np.concatenate(list(pool.map(partial(_plain_sums, *_face_arrays(batch)), parts)))
-    values[~fine] = others
+    values[fine] = exact_transform(mesh, frequencies[fine], backend)
+    others = frequencies[~fine]
+
+    def sums(backend: Backend) -> Complexes:
+        # The threads are the processor's.
+        parts = np.array_split(others, threads if backend is CPU else 1)
+        total = np.zeros(len(others), dtype=np.complex128)
+        with ThreadPoolExecutor(len(parts)) as pool:
+            for _, batch in mesh.batches(_SAMPLED_PAIRS[backend.name]):
+                total += np.concatenate(list(pool.map(partial(_plain_sums, _faces(batch, backend), backend), parts)))
+        return total
+
+    values[~fine] = compute_on(_faster(backend, mesh, others), sums) if len(others) else 0
     return values
 
 
-def _face_arrays(mesh: Mesh) -> tuple[Reals, Indices, Reals, tuple[Reals, Reals]]:
-    """Return vertices (3, n), indices of corners (3, m), twice the areas (m,), and the first two edges (3, m) each."""
+# Vertices (3, n), indices of corners (3, m), twice the areas (m,), and the first two edges (2, 3, m).
+_Faces = tuple[Array, Array, Array, Array]
+
+
+def _faces(mesh: Mesh, backend: Backend) -> _Faces:
     corners = np.ascontiguousarray(mesh.triangles.T)
     a, b, c = np.moveaxis(mesh.vertices.T[:, corners], 1, 0)
-    return np.ascontiguousarray(mesh.vertices.T), corners, doubled_areas((a, b, c)), (b - a, c - b)
+    arrays = np.ascontiguousarray(mesh.vertices.T), corners, doubled_areas((a, b, c)), np.stack([b - a, c - b])
+    vertices, indices, doubled, edges = map(backend.upload, arrays)
+    return vertices, indices, doubled, edges
 
 
-def _plain_sums(
-    vertices: Reals, corners: Indices, doubled: Reals, edges: tuple[Reals, Reals], frequencies: Reals
-) -> Complexes:
-    """Return the transform (P,) from the `_face_arrays` of a mesh, a few frequencies at a time."""
-    step = max(1, _SAMPLED_PAIRS // len(doubled))
+def _plain_sums(faces: _Faces, backend: Backend, frequencies: Reals) -> Complexes:
+    """Return the transform (P,) of some faces, a few frequencies at a time."""
+    step = max(1, _SAMPLED_PAIRS[backend.name] // len(faces[2]))
     groups = [frequencies[first : first + step] for first in range(0, len(frequencies), step)]
-    sums = [_group_sums(vertices, corners, doubled, edges, group) for group in groups]
+    sums = [backend.download(_group_sums(faces, group)) for group in groups]
     return np.concatenate(sums or [np.empty(0, complex)])
 
 
-def _group_sums(
-    vertices: Reals, corners: Indices, doubled: Reals, edges: tuple[Reals, Reals], frequencies: Reals
-) -> Complexes:
+def _group_sums(faces: _Faces, frequencies: Reals) -> Array:
+    vertices, (a, b, c), doubled, edges = faces
     directions = -2 * np.pi * frequencies
-    phases = directions @ vertices
+    phases = combine(directions, vertices)
     # Of one edge, of the next, and of both.
-    first, second = directions @ edges[0], directions @ edges[1]
+    first, second = combine(directions, edges[0]), combine(directions, edges[1])
     both = first + second
     product = first * second
     product *= both
@@ -330,7 +357,6 @@ def _group_sums(
     product[close] = np.inf
     factors = doubled / product
     # The divided difference is (e_a g_bc + e_b g_ca + e_c g_ab) / (g_ab g_bc g_ca); the gaps g add up to zero.
-    a, b, c = corners
     parts = []
     for values in cosine_and_sine(phases):
         middle = np.take(values, b, axis=1)
@@ -340,15 +366,15 @@ def _group_sums(
         after -= middle
         after *= first
         before += after
-        parts.append(np.einsum("pt,pt->p", before, factors))
+        parts.append(row_dots(before, factors))
     sums = -(parts[0] + 1j * parts[1])
     rows, columns = np.nonzero(close)
     gaps = first[rows, columns], both[rows, columns]
     means = phases[rows, b[columns]] + (gaps[1] - 2 * gaps[0]) / 3
     cosines, sines = cosine_and_sine(means)
     terms = doubled[columns] * (cosines + 1j * sines) * second_difference(*gaps)
-    sums += np.bincount(rows, terms.real, len(sums)) + 1j * np.bincount(rows, terms.imag, len(sums))
-    return np.asarray(sums)
+    real, imaginary = (sums_at(rows, values, len(sums)) for values in (terms.real, terms.imag))
+    return sums + (real + 1j * imaginary)
 
 
 # Of a series, relative to its sum.

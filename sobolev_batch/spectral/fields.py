@@ -191,8 +191,7 @@ def compute_field(
 ) -> Field:
     """Return the field of a surface by given settings, with its probe for some orders; see `transform_block`.
 
-    A sample of the surface, drawn for these orders and `USUAL_DEGREE`, saves time. The exact values of the probe are
-    always computed on the processor.
+    A sample of the surface, drawn for these orders and `USUAL_DEGREE`, saves time.
     """
     block = lattice.half
     plan = settings.plan(surface, lattice)
@@ -204,7 +203,7 @@ def compute_field(
         probe = measure(sample.draws, values[sample.draws.places(block)], sample.exact)
     else:
         draws = draws_for([surface], lattice, orders, plan.lowest_degree)
-        probe = probe_block(surface, lattice, settings, block, values, draws)
+        probe = probe_block(surface, lattice, settings, block, values, draws, execution.backend)
     quality = Quality.from_surface(surface, probe)
     return Field(values, transformed.points, transformed.backend, quality, settings)
 

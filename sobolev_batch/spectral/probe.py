@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.spectral.backends import Complexes
+from sobolev_batch.spectral.backends import CPU, Backend, Complexes
 from sobolev_batch.spectral.kinds import kind_of
 from sobolev_batch.spectral.lattice import Block, Lattice, SobolevWeights, shell_volumes
 from sobolev_batch.spectral.transform import TransformSettings
@@ -153,9 +153,9 @@ class Sample:
     exact: NDArray[np.complex128]
 
     @classmethod
-    def from_surface(cls, surface: Surface, draws: Draws) -> Sample:
+    def from_surface(cls, surface: Surface, draws: Draws, backend: Backend = CPU) -> Sample:
         """Return the sample of a surface at given draws."""
-        return cls(draws, kind_of(surface).exact_values(draws.frequencies))
+        return cls(draws, kind_of(surface).exact_values(draws.frequencies, backend))
 
 
 def draws_for(surfaces: Sequence[Surface], lattice: Lattice, orders: Sequence[float], degree: int) -> Draws:
@@ -170,7 +170,13 @@ def draws_for(surfaces: Sequence[Surface], lattice: Lattice, orders: Sequence[fl
 
 
 def probe_block(
-    surface: Surface, lattice: Lattice, settings: TransformSettings, block: Block, values: Complexes, draws: Draws
+    surface: Surface,
+    lattice: Lattice,
+    settings: TransformSettings,
+    block: Block,
+    values: Complexes,
+    draws: Draws,
+    backend: Backend = CPU,
 ) -> Probe:
     """Compare one block of a field with the exact transform, at the draws that fall into the block.
 
@@ -182,7 +188,7 @@ def probe_block(
     offsets = draws.indices - block.start
     inside = np.all((offsets >= 0) & (offsets < block.shape), axis=1)
     draws = Draws(draws.indices[inside], draws.frequencies[inside], draws.scales[inside])
-    probe = measure(draws, values[draws.places(block)], Sample.from_surface(surface, draws).exact)
+    probe = measure(draws, values[draws.places(block)], Sample.from_surface(surface, draws, backend).exact)
     change = settings.plan(surface, lattice).change
     # Once for the whole field.
     if change and block.start == lattice.half.start:

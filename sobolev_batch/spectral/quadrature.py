@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.spectral.backends import Array, Backend, combine, sums_of_runs
+from sobolev_batch.spectral.backends import Array, Backend, combine, sums_at, sums_of_runs
 from sobolev_batch.spectral.exact import second_difference
 from sobolev_batch.spectral.lattice import FrequencyLattice
 from sobolev_batch.surfaces.shapes.mesh import Mesh
@@ -315,7 +315,7 @@ def assign_rules(
         keys[batch] = splits * len(rules) + choice
     return tuple(
         RuleUse(rules[key % len(rules)], key // len(rules), np.flatnonzero(keys == key).astype(np.uint32))
-        for key in np.unique(keys).tolist()
+        for key in np.flatnonzero(np.bincount(keys)).tolist()
     )
 
 
@@ -324,10 +324,13 @@ def choose_rules(sizes: Reals, ranges: Reals) -> tuple[Indices, Indices]:
 
     The sizes are 2π|ξ|ρ (n,), in radians.
     """
-    splits = np.ceil(np.log2(np.maximum(sizes / ranges[-1], 1.0))).astype(np.int64)
+    splits = np.zeros(sizes.shape, dtype=np.int64)
+    large = sizes > ranges[-1]
+    if large.any():
+        splits[large] = np.ceil(np.log2(sizes[large] / ranges[-1]))
+        sizes = np.ldexp(sizes, -splits)
     # Rounding of the logarithm may leave a size just beyond the last range.
-    choice = np.minimum(np.searchsorted(ranges, sizes / 2.0**splits), len(ranges) - 1)
-    return splits, choice
+    return splits, np.minimum(np.searchsorted(ranges, sizes), len(ranges) - 1)
 
 
 def _quarters(corners: _Corners) -> tuple[_Corners, _Corners, _Corners, _Corners]:
@@ -341,7 +344,7 @@ def merged_corners(mesh: FaceArrays, members: Array) -> tuple[Array, Array]:
     """Return the corners of some triangles (3, n), each with a third of the areas that meet there (n,)."""
     vertices, triangles, areas = mesh
     thirds = np.repeat(areas[members] / 3, 3)
-    weights = np.bincount(triangles[members].ravel(), weights=thirds).astype(np.float64, copy=False)
+    weights = sums_at(triangles[members].ravel(), thirds, len(vertices))
     corners = np.flatnonzero(weights)
     return np.ascontiguousarray(vertices[corners].T, like=weights), weights[corners]
 

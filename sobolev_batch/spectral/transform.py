@@ -221,8 +221,11 @@ def transform_block(
     low, high = surface.extent.box
     fill = min(1.0, float(np.prod((high - low) / (2 * lattice.half_period))))
 
+    # Rules are chosen while other threads have the device.
+    points = plan.expected_points if isinstance(execution.backend, Gpu) else math.inf
+
     def fitting(costs: Costs, allowed_bytes: float) -> tuple[NufftSpec, int]:
-        workload = Workload(triangles=plan.triangles, fill=fill)
+        workload = Workload(points, triangles=plan.triangles, fill=fill)
         if costs.projected_bytes(whole, workload) > allowed_bytes:
             # Only now do the points need counting.
             workload = replace(workload, points=plan.expected_points, largest_points=plan.largest_points)

@@ -9,6 +9,7 @@ import sys
 import textwrap
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
@@ -21,6 +22,7 @@ from sobolev_batch.errors import BackendError, InputError
 from sobolev_batch.shapes import Sphere, icosphere
 from sobolev_batch.spectral import backends
 from sobolev_batch.spectral.backends import CPU, GPU_COSTS, Gpu, backend_named, gpu_backend, try_out
+from sobolev_batch.spectral.exact import exact_transform, sampled_transform
 from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice, OctaveLattice
 from sobolev_batch.spectral.quadrature import assign_rules, corner_rule, midpoint_rule
@@ -147,7 +149,7 @@ def test_out_of_memory_is_tried_again_in_smaller_parts(
         (Device(failures=[("execute", "memory")] * 20), "out of memory", 3),
         # Too small for anything, and not tried.
         (Device(capacity=1e6), "out of memory", 1),
-        *((Device(failures=[(where, "error")]), "Error ", 1) for where in ("plan", "setpts", "execute")),
+        *((Device(failures=[(where, "error")] * 2), "Error ", 1) for where in ("plan", "setpts", "execute")),
     ],
 )
 def test_the_processor_steps_in(device: Device, reason: str, warnings: int, caplog: pytest.LogCaptureFixture) -> None:
@@ -169,10 +171,57 @@ def test_arrays_that_run_out_of_memory_count_too(monkeypatch: pytest.MonkeyPatch
 
 def test_a_failure_that_is_not_explained_counts_as_memory_where_little_is_left() -> None:
     mesh, lattice = icosphere(2), Lattice(5.0, 64)
-    device = Device(capacity=2e8, failures=[("plan", "error")])
+    device = Device(capacity=2e8, failures=[("plan", "error")] * 2)
     found = transform_block(mesh, lattice, lattice.half, ROUGH, Execution(device.backend()))
     assert found.backend == "cufinufft"
-    assert len(device.options) == 2
+    assert [options["gpu_method"] for options in device.options] == [3, 0, 3]
+
+
+def test_a_device_without_the_shared_memory_for_the_fastest_method_uses_another() -> None:
+    mesh, device = icosphere(2), Device(failures=[("plan", "error")])
+    assert_agree(on(device.backend(), mesh), on(CPU, mesh), mesh)
+    assert [options["gpu_method"] for options in device.options] == [3, 0]
+
+
+def test_a_plan_serves_the_meshes_that_follow_until_memory_is_short() -> None:
+    device = Device()
+    backend = device.backend()
+    for level in (1, 2, 3):
+        mesh = icosphere(level)
+        assert_agree(on(backend, mesh), on(CPU, mesh), mesh)
+    assert len(device.options) == 1
+    # Another accuracy needs another plan, and only one is kept.
+    kept = device.used
+    for settings in (ROUGH, DOUBLE):
+        on(backend, mesh, settings)
+    assert (len(device.options), device.used) == (3, kept)
+    # What is kept counts as free, and is given up for what needs the memory.
+    assert backend.free_bytes > device.capacity - device.used
+    backend.release_memory(device.capacity)
+    assert device.used == 0
+
+
+# Close to the lattice's highest frequency, and where triangles span many waves.
+@pytest.mark.parametrize("device", ["fake", "gpu"])
+@pytest.mark.parametrize("highest", [0.05, 5.0, 80.0])
+def test_exact_transforms_agree(
+    request: pytest.FixtureRequest, device: str, highest: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    backend = Device().backend() if device == "fake" else request.getfixturevalue("gpu")
+    mesh = MESHES["uneven"]
+    frequencies = np.random.default_rng(0).uniform(-highest, highest, (32, 3))
+    for transform in (exact_transform, partial(sampled_transform, threads=2)):
+        found, expected = (transform(mesh, frequencies, backend=each) for each in (backend, CPU))
+        assert np.abs(found - expected).max() < 1e-13 * mesh.area
+    # Else the processor may have been compared with itself.
+    assert not caplog.records
+
+
+def test_the_processor_computes_exact_transforms_where_a_gpu_fails(caplog: pytest.LogCaptureFixture) -> None:
+    mesh, frequencies = icosphere(3), np.full((32, 3), 1.5)
+    found = exact_transform(mesh, frequencies, Device(capacity=1e4).backend())
+    assert np.array_equal(found, exact_transform(mesh, frequencies))
+    assert "the GPU fails: Out of memory" in caplog.text
 
 
 def test_memory_bounds_the_processor_that_steps_in() -> None:
@@ -309,6 +358,7 @@ def test_cupy_answers_what_the_fake_answers(real_cupy: Any) -> None:
     assert {name for name in vars(Array) if not name.startswith("_")} <= set(dir(real_cupy.ndarray))
 
 
+@pytest.mark.process
 def test_cufinufft_is_loaded_with_what_it_needs_and_says_what_is_missing(real_cupy: Any) -> None:
     done = run_program(
         """
@@ -325,6 +375,7 @@ def test_cufinufft_is_loaded_with_what_it_needs_and_says_what_is_missing(real_cu
     assert not done.stderr
 
 
+@pytest.mark.process
 def test_a_plan_that_cannot_be_made_leaves_nothing_behind_and_options_are_those_of_the_fake(real_cupy: Any) -> None:
     # cuFINUFFT knows no oversampling of 1.5, whether or not there is a device.
     done = run_program("""

@@ -24,14 +24,15 @@ from sobolev_batch.spectral.backends import Gpu
 # What CuPy answers when NumPy's function of that name is called. `ones` and `full` are not among them:
 # with like= NumPy passes on a keyword that CuPy's do not know.
 FUNCTIONS = {
-    "arange", "ascontiguousarray", "asarray", "bincount", "concatenate", "cumsum", "empty", "flatnonzero", "repeat",
-    "stack", "tile", "unique", "zeros",
+    "arange", "ascontiguousarray", "asarray", "bincount", "concatenate", "cumsum", "empty", "empty_like", "flatnonzero",
+    "nonzero", "ones_like", "repeat", "sinc", "stack", "take", "tile", "unique", "where", "zeros", "zeros_like",
 }  # fmt: skip
 # Of its universal functions, those that the package needs. matmul is not among them, since it needs cuBLAS,
 # nor is any reduceat, since CuPy's loses digits.
 UFUNCS = {
-    "absolute", "add", "bitwise_and", "bitwise_or", "cos", "divide", "exp", "left_shift", "maximum", "minimum",
-    "multiply", "negative", "not_equal", "right_shift", "rint", "subtract", "tan",
+    "absolute", "add", "bitwise_and", "bitwise_or", "cos", "divide", "exp", "greater", "greater_equal", "invert",
+    "left_shift", "less", "maximum", "minimum", "multiply", "negative", "not_equal", "right_shift", "rint", "subtract",
+    "tan",
 }  # fmt: skip
 # The fields of the options structure of cuFINUFFT 2.5.1.
 OPTIONS = {
@@ -120,10 +121,15 @@ class Device:
             Stream=SimpleNamespace(null=nullcontext()),
         )
         pool = SimpleNamespace(free_bytes=lambda: 0, free_all_blocks=lambda: None)
-        calls = {"asarray": self.upload, "asnumpy": lambda array: array.host.copy()}
+        calls = {"asarray": self.upload, "asnumpy": _copied}
         cupy = SimpleNamespace(cuda=cuda, get_default_memory_pool=lambda: pool, **calls)
         plan = SimpleNamespace(Plan=type("Plan", (_Plan,), {"device": self}))
         return Gpu(cupy, plan, SimpleNamespace(cudaGetLastError=self.forget))
+
+
+def _copied(array: Array, out: Any) -> Any:
+    out[...] = array.host
+    return out
 
 
 def _attribute(name: str) -> Any:
@@ -155,6 +161,8 @@ class Array(NDArrayOperatorsMixin):
         raise TypeError("Implicit conversion to a NumPy array is not allowed. Please use `.get()`")
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
+        if (ufunc.__name__, method) == ("add", "at"):
+            return ufunc.at(*map(_operand, inputs))
         if ufunc.__name__ not in UFUNCS or method != "__call__" or not kwargs.keys() <= {"out", "casting", "dtype"}:
             raise TypeError(f"not for devices: {ufunc.__name__}.{method} with {kwargs.keys()}")
         (out,) = kwargs.pop("out", (None,))
@@ -194,6 +202,15 @@ class Array(NDArrayOperatorsMixin):
 
     def astype(self, dtype: Any, copy: bool = True) -> Array:
         return self if not copy and self.dtype == dtype else Array(self.device, self.host.astype(dtype))
+
+    def sum(self, axis: int) -> Array:
+        return Array(self.device, self.host.sum(axis=axis))
+
+    def max(self) -> Array:
+        return Array(self.device, self.host.max())
+
+    def __float__(self) -> float:
+        return float(self.host)
 
     def sort(self) -> None:
         if not self.host.flags.c_contiguous:

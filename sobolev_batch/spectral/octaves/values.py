@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from sobolev_batch.spectral.backends import ComplexDtype
+from sobolev_batch.spectral.backends import Backend, ComplexDtype
 from sobolev_batch.spectral.budget import NormEstimate, change_of_root
 from sobolev_batch.spectral.kinds import kind_of
 from sobolev_batch.spectral.lattice import OctaveLattice
@@ -107,16 +107,21 @@ def octave_values(
             continue
         lattice = None if part.is_drawn else sampling.lattices[number]
         if lattice is None or SurfaceSize.from_surface(surface).prefers_exact(lattice):
-            values.append(kind_of(surface).sampled_values(sampling.frequencies[part.samples], execution.threads))
+            frequencies = sampling.frequencies[part.samples]
+            values.append(kind_of(surface).sampled_values(frequencies, execution.threads, execution.backend))
         else:
             block = transform_block(surface, lattice, lattice.half, settings(surface, lattice), execution).values
             values.append(block.ravel()[part.places])
     joined = np.concatenate(values)
-    return OctaveValues(sampling, joined, *_compared(surface, sampling, joined, orders))
+    return OctaveValues(sampling, joined, *_compared(surface, sampling, joined, orders, execution.backend))
 
 
 def _compared(
-    surface: Surface, sampling: OctaveSampling, values: NDArray[np.complexfloating], orders: Sequence[float]
+    surface: Surface,
+    sampling: OctaveSampling,
+    values: NDArray[np.complexfloating],
+    orders: Sequence[float],
+    backend: Backend,
 ) -> tuple[Reals, Reals]:
     """Compare values on lattices with exact ones at a few samples, drawn by their weights for all orders.
 
@@ -137,7 +142,8 @@ def _compared(
         chosen.append(part.samples.start + drawn)
         scales.append(weights[drawn] / (count * chances[drawn]))
     places = np.concatenate(chosen)
-    differences = values[places] - kind.sampled_values(sampling.frequencies[places], ON_CPU.threads)
+    exact = kind.sampled_values(sampling.frequencies[places], ON_CPU.threads, backend)
+    differences = values[places] - exact
     return sampling.radii[places], np.concatenate(scales) * np.abs(differences) ** 2
 
 
