@@ -30,23 +30,13 @@ def is_whole_number(value: object) -> TypeGuard[int]:
 
 
 def check_seed(seed: object) -> None:
-    """Refuse anything but a whole number from 0 on.
-
-    Raises:
-        InputError: It is none.
-    """
+    """Refuse anything but a whole number from 0 on, by an InputError."""
     if not is_whole_number(seed) or seed < 0:
         raise InputError(f"seed must be a whole number from 0 on, found {seed!r}")
 
 
 def byte_count(memory: float | str) -> int:
-    """Return a size of memory in bytes.
-
-    Args:
-        memory: Number of bytes, or a text such as "4GB" or "800MiB".
-
-    Raises:
-        InputError: It is neither, or not positive.
+    """Return a size of memory in bytes, from their number or a text; InputError where it is neither, or not positive.
 
     >>> byte_count("4GB"), byte_count("800MiB"), byte_count(2e9)
     (4000000000, 838860800, 2000000000)
@@ -64,13 +54,7 @@ def byte_count(memory: float | str) -> int:
 
 
 def fraction(value: float | str) -> float:
-    """Return a positive fraction, given as a number or in per cent.
-
-    Args:
-        value: Number such as 0.01, or a text such as "0.01", "1%" or "1 %".
-
-    Raises:
-        InputError: It is neither, or not positive.
+    """Return a positive fraction, given as a number or in per cent; InputError where it is neither, or not positive.
 
     >>> fraction("1%"), fraction("0.01"), fraction(0.01)
     (0.01, 0.01, 0.01)

@@ -82,11 +82,7 @@ def _require_members(study: AnyStudy, only: Sequence[str]) -> None:
 
 
 def require_permission(study: AnyStudy, allow_commands: bool) -> None:
-    """Refuse a study that runs commands and may not.
-
-    Raises:
-        StudyError: It does.
-    """
+    """Refuse a study that runs commands and may not, by a StudyError."""
     if study.commands and not allow_commands:
         raise StudyError(
             f"the study runs commands: {', '.join(study.commands[:_MOST_COMMANDS])}; if you trust it, allow them by "

@@ -76,11 +76,8 @@ def for_each_object(
 ) -> tuple[dict[str, Result], dict[str, str]]:
     """Act on the name, the study and the store of each object. An object that cannot be carried out stops no other.
 
-    Returns:
-        Results by the name of the object, and the reason for each object that has none.
-
-    Raises:
-        StoreError: A store cannot be used; that of the next object would not fare better.
+    Return results by the name of the object, and the reason for each object that has none. A StoreError ends it: the
+    store of the next object would not fare better.
     """
     results: dict[str, Result] = {}
     refused: dict[str, str] = {}

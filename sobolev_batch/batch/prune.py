@@ -19,15 +19,11 @@ _LOST, _KILLED, _UNLISTED = (
 
 
 def prune(location: Location, *, is_dry: bool = True) -> dict[str, int]:
-    """Remove what a store keeps and no record needs, and return its bytes by kind.
+    """Remove what a store keeps and no record needs, and return its bytes by kind; a dry run counts alone.
 
     These are fields of meshes that the study has lost, which would serve again if the meshes came back; what runs left
-    that were killed; and tables that are not listed. A dry run counts alone.
-
-    Raises:
-        StoreError: The location has no store of a study, or cannot be written.
-        DamageError: Its labels or metadata are damaged.
-        LockError: A run is going on in it.
+    that were killed; and tables that are not listed. StoreError where the location has no store of a study, cannot be
+    written, is damaged, or a run is going on in it.
     """
     with nullcontext() if is_dry else locked(location, Lock.of_this_process()):
         store = Store.open(location)

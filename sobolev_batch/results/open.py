@@ -239,8 +239,7 @@ def source_of(tree: xr.DataTree) -> str | None:
 def require_unchanged(tree: xr.DataTree) -> None:
     """Check that no run has changed a store since it was opened: then all that was read is one state of it.
 
-    Raises:
-        StoreError: Its tables are not those that it had, or it is gone.
+    StoreError where its tables are not those that it had, or it is gone.
     """
     for part, _ in tree.encoding.get(_PARTS, ()):
         require_unchanged(part)
@@ -257,11 +256,7 @@ def require_unchanged(tree: xr.DataTree) -> None:
 
 
 def location_of(store: AnyStore) -> str | Path | Location:
-    """Return the path or URL of a store, which may be open.
-
-    Raises:
-        InputError: A DataTree that does not say where it was opened, or of several stores.
-    """
+    """Return the path or URL of a store; InputError for a DataTree of several stores, or from elsewhere."""
     if not isinstance(store, xr.DataTree):
         return store
     if _PARTS in store.encoding:
@@ -277,11 +272,7 @@ def location_of(store: AnyStore) -> str | Path | Location:
 
 @contextmanager
 def fields_read(store: AnyStore) -> Iterator[None]:
-    """Explain a checksum error that reading a field of an open store raises.
-
-    Raises:
-        DamageError: The bytes of a field are not those that were stored.
-    """
+    """Turn a checksum error that reading a field of an open store raises into a DamageError."""
     try:
         yield
     except ValueError as error:
@@ -383,11 +374,7 @@ def label_of(x: str, unit: str = _STUDY_UNIT) -> str:
 
 
 def sizes_of(frame: pd.DataFrame, x: str) -> Reals:
-    """Return the sizes of the meshes of a table, a column of `table`; NaN where they are not known.
-
-    Raises:
-        InputError: The table has no such column of numbers.
-    """
+    """Return a column of `table`, NaN where sizes are not known; InputError where it has no such numbers."""
     if x not in frame or not pd.api.types.is_numeric_dtype(frame[x]):
         numbers = [name for name in (EDGE_LENGTH, *_GROWING) if name in frame]
         given = [name for name in frame.attrs.get("metadata", ()) if pd.api.types.is_numeric_dtype(frame[name])]

@@ -130,12 +130,7 @@ class Pairs:
 
 
 def fill_tile(reducer: Reducer, pairs: Pairs, tile: tuple[int, int]) -> None:
-    """Compute a tile of distances, and write it with its mirror image.
-
-    Raises:
-        DamageError: The field of a row is not what was stored.
-        StoreError: The store cannot be read or written.
-    """
+    """Compute a tile of distances, and write it with its mirror image; DamageError where a field was changed."""
     sides = [pairs.tile_rows(number) for number in tile]
     complete = [[row for row in side if row in pairs.keys] for side in sides]
     places = np.ix_(*([place for place, row in enumerate(side) if row in pairs.keys] for side in sides))

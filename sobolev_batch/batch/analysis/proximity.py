@@ -111,10 +111,7 @@ def measure_proximity(
     """Measure the distances of a mesh from the reference, and write its record with them, unless it has them.
 
     A mesh that cannot be measured does not raise: the reason is part of the record. The pair is the row of the mesh and
-    that of the reference, each with the digest of the mesh whose field is stored.
-
-    Raises:
-        StoreError: The store cannot be read or written, which is not the mesh's fault.
+    that of the reference, each with the digest of the mesh whose field is stored. A StoreError is not the mesh's fault.
     """
     # Dask has a task done again whose worker was lost with the result.
     stored = store.read_record(index)

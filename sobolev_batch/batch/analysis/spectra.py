@@ -54,9 +54,7 @@ def _stored_keys(store: Store, rows: range) -> dict[int, str]:
 def fill_chunk(reducer: Reducer, number: int, keys: Mapping[int, str]) -> None:
     """Compute the spectra of a chunk's rows, but for those that it has with these keys, and write the chunk.
 
-    Raises:
-        DamageError: The field of a row is not what was stored.
-        StoreError: The store cannot be read or written.
+    DamageError where the field of a row is not what was stored.
     """
     store, rows = reducer.store, list(chunks_of_spectra(reducer.store))[number]
     widths = {f"{SPECTRA_GROUP}/{name}": width for name, (width, *_) in reducer.axis.arrays().items()}

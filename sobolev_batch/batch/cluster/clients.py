@@ -144,11 +144,7 @@ def thread_client(workers: int | None = None) -> Iterator[Client]:
 
 
 def require_blocking(client: Client) -> None:
-    """Refuse a client whose answers would have to be awaited.
-
-    Raises:
-        InputError: It is asynchronous.
-    """
+    """Refuse an asynchronous client, whose answers would have to be awaited, by an InputError."""
     if client.asynchronous:
         raise InputError(
             "the client is asynchronous, and studies wait for its answers; give a Client without asynchronous=True, "
@@ -172,14 +168,9 @@ def memory_limit(memory: float | str, workers: int) -> int:
 def remote_client(address: str, trust_network: bool = False) -> Iterator[Client]:
     """Give a client of the scheduler at an address, for which it waits as long as Dask is set up to connect.
 
-    Args:
-        address: Address of the scheduler, such as tls://host:8786.
-        trust_network: True to go on where scheduler or workers are neither encrypted nor on loopback: whoever
-            reaches their ports can run programs there and read the meshes.
-
-    Raises:
-        InputError: The address is malformed, or its network would have to be trusted.
-        ClusterError: Nothing answers there, or Dask's configuration does not fit.
+    The network has to be trusted where scheduler or workers are neither encrypted nor on loopback: whoever reaches
+    their ports can run programs there and read the meshes. InputError where it is not, or the address is malformed;
+    ClusterError where nothing answers there, or Dask's configuration does not fit.
     """
     require_private(address, "the scheduler", trust_network)
     seconds = parse_timedelta(dask.config.get("distributed.comm.timeouts.connect"))

@@ -58,11 +58,7 @@ class Watch:
 
     @contextmanager
     def kept(self) -> Iterator[Watch]:
-        """Keep the watch.
-
-        Raises:
-            ClusterError: The scheduler was silent for too long.
-        """
+        """Keep the watch; ClusterError where the scheduler was silent for too long."""
         self._thread.start()
         try:
             yield self

@@ -42,9 +42,7 @@ _LARGEST_REFERENCE = 3 << 20
 def compute_fields(cluster: Cluster, workspace: Workspace, pending: Sequence[int]) -> None:
     """Compute the fields of rows, and take their records into the workspace.
 
-    Raises:
-        StoreError: The store could not be written, which is no failure of a mesh.
-        ClusterError: The scheduler was lost, or the lattice fits into no worker.
+    A StoreError is no failure of a mesh; ClusterError where the scheduler was lost, or the lattice fits into no worker.
     """
     plan, store, rows = workspace.plan, workspace.store, workspace.rows
     advance = cluster.count_steps("fields", len(pending))

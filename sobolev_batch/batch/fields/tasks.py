@@ -98,12 +98,7 @@ class Job:
         return Execution(worker_backend(self.backend), allowed_bytes=self.allowed_bytes)
 
     def load(self) -> Surface:
-        """Load the surface, in the study's unit.
-
-        Raises:
-            MeshError: It cannot be loaded, or is not the one that the study was planned with: its field would be
-                recorded under the key of another.
-        """
+        """Load the surface, in the study's unit; MeshError where it is not the one that the study was planned with."""
         return self._loaded(self.row)
 
     def load_reference(self) -> Surface | None:
@@ -168,10 +163,7 @@ def compute_mesh(job: Job, blocks: Sequence[Block]) -> Record:
     """Compute and store the whole field of a mesh, then its completion record, unless that exists.
 
     A mesh that cannot be loaded or transformed does not raise: the reason goes into its record, so that one bad mesh
-    stops nothing else.
-
-    Raises:
-        StoreError: The store cannot be written, which is not the mesh's fault.
+    stops nothing else. A StoreError is not the mesh's fault.
     """
     stored = compute_parts(job, blocks, octaves=job.tail is not None)
     return stored if isinstance(stored, Record) else _finished(job, stored)
@@ -180,9 +172,8 @@ def compute_mesh(job: Job, blocks: Sequence[Block]) -> Record:
 def compute_parts(job: Job, blocks: Sequence[Block] = (), octaves: bool = False) -> list[StoredBlocks] | Record:
     """Compute and store some blocks of a mesh's field, and its values in octaves; see `compute_mesh`.
 
-    Returns:
-        What was stored, the first with the time, or with the reason of a failure. The completion record of the mesh if
-        it exists: then nothing is computed.
+    Return what was stored, the first with the time, or with the reason of a failure; or else the completion record of
+    the mesh, if it exists: then nothing is computed.
     """
     if record := job.stored_record():
         return record

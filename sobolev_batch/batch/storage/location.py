@@ -59,11 +59,7 @@ class Location:
 
     @classmethod
     def parse(cls, store: str | Path | Location) -> Location:
-        """Return the location that a path or URL names.
-
-        Raises:
-            StoreError: The URL holds credentials or cannot name a store. The message does not repeat secrets.
-        """
+        """Return the location that a path or URL names; StoreError, without secrets, where it cannot name a store."""
         if isinstance(store, Location):
             return store
         url = _URL.match(str(store))
@@ -200,13 +196,10 @@ class Location:
 
     @contextmanager
     def access(self, verb: str) -> Iterator[None]:
-        """Turn failures of the storage into a `StoreError` that says why it cannot be read or written.
+        """Turn failures of the storage into a `StoreError` that says why it cannot be "read" or "written".
 
-        Put nothing but access to the location inside. Drivers of object storage have exceptions without a common
-        base, so every exception counts as a failure of the access.
-
-        Args:
-            verb: Kind of access: "read", or "written", which the fence has to allow.
+        Put nothing but access to the location inside. Drivers of object storage have exceptions without a common base,
+        so every exception counts as a failure of the access. The fence has to allow what is written.
         """
         if verb == "written" and self.fence is not None:
             self.fence(self)

@@ -136,12 +136,7 @@ def locked(location: Location, lock: Lock) -> Iterator[None]:
 
 
 def acquire(location: Location, lock: Lock) -> None:
-    """Acquire the lock on a store, or take over the one of the same run.
-
-    Raises:
-        LockError: Another run has the store; the message names its driver.
-        StoreError: The store cannot be read or written.
-    """
+    """Acquire the lock on a store, or take over the one of the same run; LockError where another run has it."""
     lock = replace(lock, folder="" if location.is_folder() else "made")
     current = None
     # The current lock may be released between two attempts.

@@ -65,11 +65,8 @@ def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
     """Create the store of a plan, or open it and add rows for new meshes. Rows that the study has lost stay.
 
     If tables, coordinates or metadata are not those that were written, all of them are made again, and the fields stay.
-
-    Raises:
-        StoreError: The location cannot be read or written, or holds something else or the store of another study,
-            which then stays as it is.
-        DamageError: The metadata at the root are damaged, and no field of the study is found.
+    A StoreError leaves the location as it is: it cannot be written, holds something else or the store of another study;
+    or its root is damaged, and no field of the study is found (DamageError).
     """
     store = Store(location)
     try:
@@ -116,8 +113,7 @@ _ALTERED = DamageError("the metadata at the root are damaged", "they are not wha
 def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:
     """Return a store with new metadata, coordinates and labels, and without tables, around its fields and records.
 
-    Raises:
-        DamageError: With this damage it may be the store of another study, and no field in it is one of this study.
+    DamageError where, with this damage, it may be the store of another study: no field in it is one of this study.
     """
     stored: tuple[str, ...] = ()
     with suppress(StoreError, ValueError, TypeError, KeyError):

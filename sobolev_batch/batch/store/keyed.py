@@ -56,8 +56,7 @@ def damaged_chunks(store: Store) -> Iterator[tuple[str, Index, str]]:
 def read_chunk(store: Store, keys: str, index: Index) -> tuple[list[str], dict[str, NDArray[np.float64]]]:
     """Return a chunk of keys, flattened, and of the arrays that they are for, by name.
 
-    Raises:
-        DamageError: A chunk cannot be read, or has other values than those that its keys were written with.
+    DamageError where a chunk cannot be read, or has other values than those that its keys were written with.
     """
     sealed = np.asarray(store.read(keys, _region(store, keys, index)))
     arrays = {name: np.asarray(store.read(name, _region(store, name, index))) for name in arrays_of(store, keys)}

@@ -142,11 +142,7 @@ class Record:
 
     @classmethod
     def from_json(cls, text: str, row: int) -> Self | None:
-        """Return the record of a row that a line holds, or None if the line is empty or says that there is none.
-
-        Raises:
-            DamageError: The line is not a record, or that of another row.
-        """
+        """Return the record of a row that a line holds, if any; DamageError where it holds something else."""
         if text in ("", WITHDRAWN):
             return None
         name = "a completion record"

@@ -219,10 +219,7 @@ def write_figures(
 
 
 def parse_size(text: str) -> Size:
-    """Return a size in inches from a text such as "8.4x6cm", "84x60mm" or "3.3x2.4in".
-
-    Raises:
-        InputError: It is no size, or below 1 or above 40 inches.
+    """Return a size in inches from a text; InputError where it is none, or below 1 or above 40 inches.
 
     >>> parse_size("3.3x2.4in"), parse_size("25.4x50.8mm")
     ((3.3, 2.4), (1.0, 2.0))

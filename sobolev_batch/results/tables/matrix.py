@@ -104,9 +104,7 @@ def matrix_frame(distances: xr.Dataset, order: float) -> pd.DataFrame:
 def format_matrix(tree: xr.DataTree, style: Format = "text", orders: Sequence[float] | None = None) -> str:
     """Return the distance matrices of an open store as text.
 
-    Raises:
-        InputError: The store has no tables yet, or has more meshes than a printed matrix can show.
-        OrderError: An order is not below -1/2.
+    InputError where the store has no tables yet, or has more meshes than a printed matrix can show.
     """
     distances = distances_at(tree, orders)
     chosen = list(dict.fromkeys(distances["order"].values.tolist()))

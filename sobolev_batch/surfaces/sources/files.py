@@ -332,10 +332,9 @@ def names_of_files(paths: list[Path]) -> list[str]:
 
 
 def file_digest(path: Path) -> str:
-    """Return the SHA-256 of a file's bytes, in hexadecimal. A file that has not changed is not read again.
+    """Return the SHA-256 of a file's bytes, in hexadecimal; MeshError where it cannot be read.
 
-    Raises:
-        MeshError: The file cannot be read.
+    A file that has not changed is not read again.
     """
     try:
         with open_regular(path) as file:
