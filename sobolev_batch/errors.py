@@ -106,6 +106,15 @@ def refused_by_pydantic() -> Iterator[None]:
 
 
 @contextmanager
+def written(place: object, what: str, kind: type[InputError] = StoreError) -> Iterator[None]:
+    """Turn a failure to write a file into an error that says what cannot be written, where, and why."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"{place}: {what} cannot be written there: {error.strerror or error}") from error
+
+
+@contextmanager
 def from_extra(extra: str, purpose: str, kind: type[InputError] = InputError) -> Iterator[None]:
     """Turn an import that fails into an error that names its purpose, and the extra that has the library."""
     try:

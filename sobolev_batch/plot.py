@@ -75,12 +75,8 @@ def over_time(
 ) -> Axes:
     """Plot the distances of meshes that move, with a dotted line at the first time at which a new mesh pays.
 
-    Args:
-        store: Path, URL or opened DataTree of the store.
-        order: Order of the norm.
-        ax: Axes to draw on.
-        family: Families to draw.
-        truth: Family of the true surface at the same times; default the study's reference.
+    The truth is the family of the true surface at the same times; default the study's reference. The other parameters
+    are those of `convergence`.
 
     >>> import sobolev_batch as sb
     >>> sb.plot.over_time("storage/icosphere.zarr", order=-10)

@@ -87,23 +87,7 @@ class SquaredDistance:
         threads: int | None = None,
         backend: Literal["cpu", "gpu", "auto"] = "cpu",
     ) -> Self:
-        """Return the function for a mesh and its target.
-
-        Args:
-            mesh: Mesh whose vertices will move, in units of length, or what `as_mesh` makes one of.
-            target: Surface, what `as_mesh` makes one of, or a field from `fourier_transform` or a store.
-            order: Order s < -1/2.
-            lattice: Lattice to compare on. A field brings its own.
-            eps: Accuracy of transforms relative to the area. Default 1e-9.
-            threads: Threads of the NUFFT; one per core by default.
-            backend: "cpu", "gpu", or "auto" for a GPU if one is usable.
-
-        Raises:
-            OrderError: The order is not below -1/2.
-            LatticeError: Fields lie on different lattices, or a surface does not fit into the lattice.
-            InputError: The mesh is none, there is no lattice, or settings are out of range.
-            BackendError: "gpu", and no GPU is usable.
-        """
+        """Return the function for a mesh whose vertices will move, with the parameters of `gradient`."""
         mesh = as_mesh(mesh)
         orders = (single_order(order),)
         field = field_of(target, common_lattice((target,), lattice), orders)

@@ -7,7 +7,7 @@ from typing import Literal
 
 import xarray as xr
 
-from sobolev_batch.errors import StoreError, from_extra
+from sobolev_batch.errors import from_extra, written
 from sobolev_batch.results.open import AnyStore, as_tree, finished_group, stores_of
 from sobolev_batch.results.tables.convergence import table
 from sobolev_batch.results.tables.text import json_text, machine_table
@@ -24,7 +24,7 @@ def export(store: AnyStore, path: Path, style: ExportFormat, order: Orders | Non
     groups of their objects in a collection; attributes that are tables or lists are JSON. InputError where a library
     is not installed, StoreError where the file cannot be written.
     """
-    try:
+    with written(path, "the file"):
         if style == "csv":
             path.write_text(machine_table(table(store, order), "csv") + "\n", encoding="utf-8")
         elif style == "parquet":
@@ -34,8 +34,6 @@ def export(store: AnyStore, path: Path, style: ExportFormat, order: Orders | Non
             with from_extra("export", "a NetCDF file needs"):
                 import h5netcdf  # noqa: F401
             _groups_of(store).to_netcdf(path, engine="h5netcdf")
-    except OSError as error:
-        raise StoreError(f"{path}: the file cannot be written: {error.strerror or error}") from error
 
 
 def _groups_of(store: AnyStore) -> xr.DataTree:

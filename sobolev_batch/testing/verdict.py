@@ -188,18 +188,10 @@ def assert_same_surface(
 
     A test passes if they are proven to be the same: an undecided comparison fails too, with a message that says so.
 
-    Args:
-        a: Surface; see `same_surface`.
-        b: Reference, likewise.
-        tolerance: See `same_surface`.
-        order: See `same_surface`.
-        scaling: See `same_surface`.
-        memory: See `same_surface`.
-        seed: See `same_surface`.
-        witness: Beginning of the paths of files to write unless the surfaces are the same, such as "failures/part";
-            default a new temporary folder. Meshes are written as failures/part-a.ply and failures/part-b.ply, with the
-            witness function of a against b at their vertices: positive where a has area that b lacks. The message
-            names them, and the place where it is largest.
+    The parameters are those of `same_surface`, and ``witness``: the beginning of the paths of files to write unless the
+    surfaces are the same, such as "failures/part"; default a new temporary folder. Meshes are written as
+    failures/part-a.ply and failures/part-b.ply, with the witness function of a against b at their vertices: positive
+    where a has area that b lacks. The message names them, and the place where it is largest.
 
     Returns:
         The verdict, which is "same".

@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 from sobolev_batch.batch.study.plan import members_of
 from sobolev_batch.batch.study.schema import RESERVED
 from sobolev_batch.batch.study.study import METHOD, OBJECT, REFERENCE_LABEL, Study, StudyCollection, is_collection
-from sobolev_batch.errors import MeshError, StudyError
+from sobolev_batch.errors import MeshError, StudyError, written
 from sobolev_batch.surfaces.formats.readers import expected_size, is_mesh_name, mesh_stem, read_mesh
 from sobolev_batch.surfaces.sources.files import MOST_MESHES, matching_files
 from sobolev_batch.surfaces.sources.names import caseless_key, label_problem, name_problem, natural_key, quoted
@@ -174,11 +174,8 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
         StudyCollection.from_table(table, folder=base)
     else:
         members_of(Study.from_table(table, folder=base))
-    try:
-        with output.open("x", encoding="utf-8", newline="\n") as file:
-            file.write(text)
-    except OSError as error:
-        raise StudyError(f"{output}: no study can be written there: {error.strerror}") from error
+    with written(output, "the study", StudyError), output.open("x", encoding="utf-8", newline="\n") as file:
+        file.write(text)
     return StudyDraft(output, summary, left_out)
 
 

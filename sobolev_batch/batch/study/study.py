@@ -262,26 +262,14 @@ class StudyCollection:
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Self:
-        """Read a study file with several objects. Relative paths in it start from its folder.
-
-        Args:
-            path: Path of the file. docs/leagues.md describes its sections.
-
-        Raises:
-            StudyError: The file cannot be read, or is no collection. The message lists every offender.
-        """
+        """Read a study file with several objects, as `Study.from_toml` does; docs/leagues.md describes its sections."""
         return _parsed_file(path, cls.from_table)
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any], *, folder: str | Path = ".") -> Self:
-        """Validate a collection given as nested tables, with the keys of the study file.
+        """Validate a collection given as nested tables, as `Study.from_table` does.
 
-        Args:
-            table: Sections of the study file. A pandas.DataFrame may take the place of ``meshes`` of objects.
-            folder: Folder in which relative paths start.
-
-        Raises:
-            StudyError: See `from_toml`.
+        A pandas.DataFrame may take the place of ``meshes`` of objects.
         """
         folder = Path(folder)
         # Objects and lists may bring references and families.

@@ -17,7 +17,7 @@ import xarray as xr
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.study.plan import members_of
 from sobolev_batch.batch.study.study import Study
-from sobolev_batch.errors import InputError, SobolevBatchError, StoreError, from_extra
+from sobolev_batch.errors import InputError, SobolevBatchError, from_extra, written
 from sobolev_batch.results.open import AnyStore, as_tree, fields_read, finished_group, reference_of
 from sobolev_batch.spectral.backends import ComplexDtype
 from sobolev_batch.spectral.lattice import Orders, check_orders
@@ -264,10 +264,8 @@ def write_vertex_values(
         notes.append("distance to the closest point of the reference, in the unit of the mesh")
     others = {} if distances is None else {"distance": distances}
     data = (_ply if path.suffix == ".ply" else _vtp)(mesh, dict(zip(orders, values, strict=True)), others, notes)
-    try:
+    with written(path, "the witness"):
         path.write_bytes(data)
-    except OSError as error:
-        raise StoreError(f"{path}: the witness cannot be written there: {error.strerror or error}") from error
 
 
 def _number(order: float) -> str:

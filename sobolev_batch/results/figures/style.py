@@ -17,7 +17,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 
-from sobolev_batch.errors import InputError, StoreError
+from sobolev_batch.errors import InputError, written
 from sobolev_batch.results.tables.text import middle_cut
 from sobolev_batch.surfaces.shapes.surface import Reals
 from sobolev_batch.surfaces.sources.names import quoted
@@ -204,7 +204,7 @@ def write_figures(
     They have no date. Characters that a font lacks become boxes.
     """
     folder, paths = Path(folder), []
-    try:
+    with written(folder, "pictures"):
         folder.mkdir(parents=True, exist_ok=True)
         for stem, figure in figures.items():
             for style in formats:
@@ -213,8 +213,6 @@ def write_figures(
                 with drawing(size), mpl.rc_context(_SAVING), warnings.catch_warnings():
                     warnings.filterwarnings("ignore", message="Glyph .* missing from")
                     figure.savefig(paths[-1], dpi=dpi, metadata=_METADATA.get(style))
-    except OSError as error:
-        raise StoreError(f"{folder}: pictures cannot be written there: {error.strerror or error}") from error
     return tuple(paths)
 
 

@@ -18,7 +18,7 @@ import xarray as xr
 from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import utc_now
-from sobolev_batch.errors import InputError, StoreError, from_extra
+from sobolev_batch.errors import InputError, from_extra, written
 from sobolev_batch.results.open import (
     AnyStore,
     as_tree,
@@ -101,10 +101,8 @@ def report(
 
 def write_page(path: Path, text: str) -> None:
     """Write a page; StoreError where that cannot be done."""
-    try:
+    with written(path, "the report"):
         path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise StoreError(f"{path}: the report cannot be written there: {error.strerror or error}") from error
 
 
 def make_report(

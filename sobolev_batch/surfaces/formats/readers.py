@@ -19,7 +19,7 @@ from uuid import uuid4
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sobolev_batch.errors import InputError, MeshError
+from sobolev_batch.errors import InputError, MeshError, written
 from sobolev_batch.surfaces.formats.parsing import (
     Raw,
     checked_length,
@@ -322,10 +322,8 @@ def _new_file_beside(path: Path) -> Iterator[IO[bytes]]:
     """Open a file that may replace another one, and is gone at the end unless it has; MeshError where that fails."""
     place = path.parent / f".{uuid4().hex}{path.suffix}"
     try:
-        with place.open("xb") as file:
+        with written(path, "the mesh", MeshError), place.open("xb") as file:
             yield file
-    except OSError as error:
-        raise MeshError(f"{path}: the mesh cannot be written there: {error.strerror or error}") from error
     finally:
         place.unlink(missing_ok=True)
 

@@ -180,7 +180,7 @@ def test_folders_without_meshes_are_refused(tmp_path: Path) -> None:
     ):
         sb.init_study(tmp_path, tmp_path / "study.toml")
     write(tmp_path / "c.ply", 1)
-    with pytest.raises(sb.errors.StudyError, match="no study can be written there: No such file"):
+    with pytest.raises(sb.errors.StudyError, match="the study cannot be written there: No such file"):
         sb.init_study(tmp_path, tmp_path / "nowhere" / "study.toml")
 
 
