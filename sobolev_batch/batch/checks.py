@@ -49,10 +49,7 @@ def settled(study: StudyLike, store: StoreLike, *, may_run: bool) -> tuple[AnySt
 def ready_to_run(
     study: StudyLike, store: StoreLike, *, allow_commands: bool, only: Sequence[str] = ()
 ) -> tuple[AnyStudy, Location]:
-    """Return a study that may run, or a part of it, and the place of its store.
-
-    What would make the run useless is logged.
-    """
+    """Return a study that may run, or a part of it, and its place; log what would make the run useless."""
     study = as_study(study).with_only(tuple(only))
     _require_members(study, only)
     study, location = settled(study, store, may_run=True)

@@ -218,10 +218,7 @@ def carry_out(
     start: Callable[[], Client],
     notify: Notify = _ignore,
 ) -> Summary:
-    """Run a study in a store that this process has locked.
-
-    The client of the cluster is requested if anything is missing.
-    """
+    """Run a study in a store that this process has locked; a cluster starts if anything is missing."""
     plan = make_plan(study, stored_choice(location))
     # Planning may take minutes.
     lock.require(location)
@@ -278,10 +275,7 @@ def _compute(cluster: Cluster, heartbeat: Heartbeat, workspace: Workspace) -> Su
 def _compute_repairing(
     cluster: Cluster, workspace: Workspace, rows: Sequence[int]
 ) -> tuple[set[int], NormEstimate | None]:
-    """Compute the fields of rows and the tables, and again the fields that turn out damaged.
-
-    Return the rows that were damaged, and the distances to the reference if they are new.
-    """
+    """Compute fields and tables, and damaged fields again; return their rows, and distances if they are new."""
     repaired: set[int] = set()
     for attempts_left in reversed(range(_MOST_REPAIRS + 1)):
         try:

@@ -129,10 +129,7 @@ def _submit(study: Study, location: Location, client: Client) -> Submission:
 
 
 def drive(study: Study, store: str, run: str) -> None:
-    """Run a study from a worker of the cluster that computes it, with the lock of its submission.
-
-    This does not raise: the store says what went wrong, and trying again would not help.
-    """
+    """Run a study from a worker, with the lock of its submission; the store says what went wrong, nothing is raised."""
     location = Location.parse(store)
     lock = Lock.of_this_process(run, outlives_process=True)
     try:

@@ -331,10 +331,7 @@ class _Difference:
         return np.stack([self._truncation(support), self._aliasing(support, gradients), of_field, none], axis=1)
 
     def _truncation(self, support: Support) -> Reals:
-        """Estimate the derivative of what lies beyond the lattice.
-
-        It is to that of the outer half of the lattice as the squared distances are.
-        """
+        """Estimate the derivative of the tail: to that of the outer half lattice it is as the squares are."""
         lattice = self.weights.lattice
         outer = self.factors * (lattice.shells(lattice.half) >= (lattice.M // 4) ** 2)
         sums = sums_of_shells(shell_sums(self.values, None, lattice, lattice.half), self.weights)

@@ -226,10 +226,7 @@ class FitRun:
         return self
 
     def _stages(self) -> list[tuple[OrderWeights, float, int]]:
-        """Return shares of orders, smoothing and largest number of steps of each stage, from coarse to fine.
-
-        A far mesh comes near at a coarse order first.
-        """
+        """Return shares of orders, smoothing and steps of each stage; a far mesh comes near at a coarse order first."""
         settings = self.problem.settings
         stages: list[tuple[OrderWeights, float, int]] = []
         smoothing, left = settings.smoothing, settings.steps

@@ -177,10 +177,7 @@ class FitProblem:
         return float(np.sqrt(self.squares(np.asarray(self.start.vertices), [order])[0] / norm))
 
     def objective(self, vertices: Reals, weights: OrderWeights) -> tuple[SquaredDistance, float]:
-        """Return the weighted sum of squared distances, and the value down to which its fields can be trusted.
-
-        Quadrature and eps follow from the value at the vertices: the farther away, the coarser.
-        """
+        """Return the weighted sum of squared distances, as exact as they need, and its least value that counts."""
         orders, factors = (tuple(numbers) for numbers in zip(*weights, strict=True))
         distances = np.sqrt(np.maximum(self.squares(vertices, orders), np.finfo(np.float64).tiny))
         target = ErrorTarget(orders, tuple((_MESH_FRACTION * distances).tolist()))

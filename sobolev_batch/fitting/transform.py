@@ -149,10 +149,7 @@ def normals(vertices: Reals, triangles: Indices) -> Reals:
 
 
 def area_derivatives(vertices: Reals, triangles: Indices) -> list[Reals]:
-    """Return the derivatives of the areas of triangles with respect to each of the three corners, (m, 3) each.
-
-    At a triangle without an area, the area has no derivative; take zero.
-    """
+    """Return derivatives of the areas of triangles by each corner, (m, 3) each; zero for those without an area."""
     units, corners = normals(vertices, triangles), [vertices[corner] for corner in triangles.T]
     units /= np.maximum(np.linalg.norm(units, axis=1), np.finfo(np.float64).tiny)[:, None]
     return [np.cross(units, corners[corner - 1] - corners[corner - 2]) / 2 for corner in range(3)]

@@ -237,10 +237,7 @@ def source_of(tree: xr.DataTree) -> str | None:
 
 
 def require_unchanged(tree: xr.DataTree) -> None:
-    """Check that no run has changed a store since it was opened: then all that was read is one state of it.
-
-    StoreError where its tables are not those that it had, or it is gone.
-    """
+    """Check that all that was read of a store is one state of it; StoreError where a run has changed it since."""
     for part, _ in tree.encoding.get(_PARTS, ()):
         require_unchanged(part)
     if _PARTS in tree.encoding:

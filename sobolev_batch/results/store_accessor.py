@@ -253,10 +253,7 @@ def stored_reducer(tree: xr.DataTree, order: Orders, *meshes: str) -> tuple[Redu
 
 
 def _computed(tree: xr.DataTree, orders: tuple[float, ...], meshes: Meshes = None) -> Results:
-    """Return norms, and distances to the reference, of an open store at other orders than its own, from spectra.
-
-    Those of the meshes that are needed, default all. DamageError where spectra are not those of the stored fields.
-    """
+    """Return norms, and distances to the reference, of meshes at orders that an open store lacks, from spectra."""
     store, reference = store_of(tree), reference_of(tree)
     table = finished_group(tree, "meshes", load=False)
     if meshes is not None:
@@ -296,10 +293,7 @@ def convergence_at(tree: xr.DataTree, order: Orders | None, meshes: Meshes = Non
 
 
 def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
-    """Return the distances of a store's meshes at some orders, lazily if it has them all; see `convergence_at`.
-
-    The meshes are in the order of the other tables.
-    """
+    """Return the distances of a store's meshes, in the order of tables; lazily if it has all orders."""
     meshes = finished_group(tree, "meshes", load=False)
     labels, stored = meshes["mesh"].values, finished_group(tree, "distances", load=False)
     has_every_pair = stored.sizes["other"] == stored.sizes["mesh"]

@@ -224,10 +224,7 @@ def area_bounds(area: float, order: float) -> list[tuple[float, float]]:
 
 
 def modulus_bound(area: float, orders: Reals, highest: float) -> Reals:
-    """Return what no squared norm beyond a frequency exceeds (orders,), since no transform exceeds the area.
-
-    It is infinite from order -3/2 on.
-    """
+    """Return what no squared norm beyond a frequency exceeds (orders,), by the area; infinite from order -3/2 on."""
     powers = -2 * orders - 3
     with np.errstate(divide="ignore", over="ignore"):
         return np.where(powers > 0, 4 * np.pi * area**2 * highest**-powers / np.maximum(powers, 0.0), np.inf)

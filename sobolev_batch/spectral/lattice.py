@@ -69,10 +69,7 @@ class Block:
         )
 
     def tiles(self, shape: tuple[int, int, int]) -> Iterator[tuple[Block, tuple[slice, slice, slice]]]:
-        """Yield blocks of one shape that cover this one, each with its slices of an array of this one.
-
-        Those at the high ends may extend beyond it.
-        """
+        """Yield blocks of one shape that cover this one or more, each with its slices of an array of this one."""
         for offsets in product(*(range(0, count, step) for count, step in zip(self.shape, shape, strict=True))):
             i, j, k = (first + offset for first, offset in zip(self.start, offsets, strict=True))
             x, y, z = (

@@ -55,10 +55,7 @@ class Probe:
     sums: tuple[float, ...] = ()
 
     def norms(self, weights: SobolevWeights) -> Reals:
-        """Return the norm of the field's error for each order (orders,), raised for the small sample.
-
-        It is zero for a closed form, which has no draws.
-        """
+        """Return norms of the field's error (orders,), raised for the small sample; zero without one."""
         if not self.shells:
             return np.zeros(len(weights.orders))
         return norms_of_draws(weights.per_shell[:, list(self.shells)] * np.array(self.sums))
@@ -75,10 +72,7 @@ def norms_of_draws(parts: Reals) -> Reals:
 
 
 def norms_of_checks(radii: Reals, squares: Reals, orders: Sequence[float]) -> Reals:
-    """Return norms of an error (orders,) from checks at some |ξ| (P,), raised.
-
-    Their contributions to the squared norm come without the weight of an order.
-    """
+    """Return norms of an error (orders,) from checks at some |ξ| (P,), not weighted by an order yet, raised."""
     weights = np.array([(1 + radii**2) ** order for order in orders])
     return norms_of_draws(weights * squares)
 
@@ -159,10 +153,7 @@ class Sample:
 
 
 def draws_for(surfaces: Sequence[Surface], lattice: Lattice, orders: Sequence[float], degree: int) -> Draws:
-    """Draw the frequencies to probe fields of surfaces at, by the lowest degree of their triangle rules.
-
-    They are fewer where each costs more. The same surfaces get the same ones.
-    """
+    """Draw the frequencies to probe fields of surfaces at, by their lowest degree: fewer where each costs more."""
     terms = max(max(kind_of(surface).triangles, 1) for surface in surfaces)
     count = int(np.clip(_PAIRS // terms, _FEWEST_DRAWS, _MOST_DRAWS))
     seed = int(np.float64(sum(surface.area for surface in surfaces)).view(np.uint64))
@@ -197,10 +188,7 @@ def probe_block(
 
 
 def needs_probe(surface: Surface, settings: TransformSettings) -> bool:
-    """Tell whether a field computed with these settings can differ noticeably from the exact transform.
-
-    Closed forms in double precision are exact.
-    """
+    """Tell whether a field can differ noticeably from the exact transform; closed forms in double precision cannot."""
     return not kind_of(surface).is_closed_form or settings.dtype == "complex64"
 
 

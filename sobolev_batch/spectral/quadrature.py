@@ -84,10 +84,7 @@ def symmetric_rule(degree: int) -> TriangleRule:
 
 @cache
 def gauss_rule(points: int = 8) -> TriangleRule:
-    """Return the product of two Gauss-Legendre rules, collapsed onto the triangle: points² nodes.
-
-    With 8 points it is the rule of K. Koga's paper: 64 nodes for every triangle.
-    """
+    """Return the product of two Gauss-Legendre rules on the triangle: points² nodes, 64 in K. Koga's paper."""
     nodes, weights = np.polynomial.legendre.leggauss(points)
     u, v = np.meshgrid((1 + nodes) / 2, (1 + nodes) / 2, indexing="ij")
     products = np.outer(weights, weights) / 4 * 2 * (1 - u)
@@ -320,10 +317,7 @@ def assign_rules(
 
 
 def choose_rules(sizes: Reals, ranges: Reals) -> tuple[Indices, Indices]:
-    """Return how often to halve the edges of triangles, and the index of the rule that follows; see `rule_ranges`.
-
-    The sizes are 2π|ξ|ρ (n,), in radians.
-    """
+    """Return how often to halve edges, and the index of the rule then, by sizes 2π|ξ|ρ (n,); see `rule_ranges`."""
     splits = np.zeros(sizes.shape, dtype=np.int64)
     large = sizes > ranges[-1]
     if large.any():

@@ -68,10 +68,7 @@ class Pairs:
         return cls(store, tuple(sorted(rows)), complete, tuple(study["orders"]), reference)
 
     def lay_out(self, coordinates: xr.Dataset) -> None:
-        """Lay out the arrays in the store, with the coordinates of tables. Tiles that exist stay.
-
-        Readers find the arrays after `Store.consolidate`.
-        """
+        """Lay out the arrays, with coordinates of tables, for `Store.consolidate`; tiles that exist stay."""
         labels = self.store.labels()
         meshes = coordinates.sel(mesh=[labels[row] for row in self.rows])
         count, side = len(self.rows), self.side
@@ -159,10 +156,7 @@ def _write_key(store: Store, tile: tuple[int, ...], text: str) -> None:
 
 
 def pair_distances(reducer: Reducer, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
-    """Return distances over (orders, rows, others); the others are the rows, or none of them.
-
-    Those to the reference come from spectra: its row of a matrix has the numbers of the other tables.
-    """
+    """Return distances over (orders, rows, others), the same or no rows; those to the reference come from spectra."""
     distances = np.stack(list(reducer.pairs(rows, others)))
     reference = reducer.reference
     if reference is not None:

@@ -98,10 +98,7 @@ class Reducer:
         reference: int,
         compared_with: int | None = None,
     ) -> Self:
-        """Return the reducer of the rows whose qualities are known; distances are to the reference, or another row.
-
-        Spectra that are stored need no checksums.
-        """
+        """Return the reducer of rows with known qualities; distances are to the reference, or another row."""
         count = sum(part.row_count for _, part in store.parts)
         areas, errors = np.full(count, np.nan), np.full((len(orders), count), np.nan)
         weights = SobolevWeights(choice.lattice, orders, None if choice.tail is None else choice.tail.cutoff)
@@ -255,10 +252,7 @@ class Reducer:
         return ComparedSpectra.joined(parts)
 
     def pairs(self, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
-        """Return distances over (orders, rows, others), in batches of rows that fit into a task's memory.
-
-        The others are the rows, or none of them. The fields of the others are read once for each batch.
-        """
+        """Return distances over (orders, rows, others), in batches that fit a task; others are rows, or none."""
         distances, is_square = np.zeros((5, len(self.orders), len(rows), len(others))), tuple(rows) == tuple(others)
         for batch in _slices(len(rows), max(1, self._capacity - self._group - self._read_at_once)):
             first = batch.start if is_square else 0

@@ -52,10 +52,7 @@ def _stored_keys(store: Store, rows: range) -> dict[int, str]:
 
 
 def fill_chunk(reducer: Reducer, number: int, keys: Mapping[int, str]) -> None:
-    """Compute the spectra of a chunk's rows, but for those that it has with these keys, and write the chunk.
-
-    DamageError where the field of a row is not what was stored.
-    """
+    """Compute the spectra of a chunk's rows, but for those that it has with these keys, and write the chunk."""
     store, rows = reducer.store, list(chunks_of_spectra(reducer.store))[number]
     widths = {f"{SPECTRA_GROUP}/{name}": width for name, (width, *_) in reducer.axis.arrays().items()}
     arrays = {name: np.full((len(rows), widths[name]), np.nan) for name in arrays_of(store, SPECTRA_KEYS)}

@@ -40,10 +40,7 @@ _LARGEST_REFERENCE = 3 << 20
 
 
 def compute_fields(cluster: Cluster, workspace: Workspace, pending: Sequence[int]) -> None:
-    """Compute the fields of rows, and take their records into the workspace.
-
-    A StoreError is no failure of a mesh; ClusterError where the scheduler was lost, or the lattice fits into no worker.
-    """
+    """Compute the fields of rows, and take their records into the workspace; a StoreError is no mesh's failure."""
     plan, store, rows = workspace.plan, workspace.store, workspace.rows
     advance = cluster.count_steps("fields", len(pending))
     workers = cluster.workers.with_backend(plan.study.backend)

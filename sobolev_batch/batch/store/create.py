@@ -159,10 +159,7 @@ def _create(store: Store, plan: Plan) -> None:
 
 
 def _lay_out(store: Store, plan: Plan, labels: Sequence[str], qualities: Sequence[str]) -> None:
-    """Write the metadata and coordinates of all arrays that tasks fill, with qualities of the first rows.
-
-    Their chunks and the tables stay.
-    """
+    """Write metadata and coordinates of all arrays that tasks fill, and first qualities; chunks and tables stay."""
     rows, mesh = len(labels), np.array(labels, dtype=object)
     padded = np.array([*qualities, *[""] * (rows - len(qualities))], dtype=object)
     # Whoever reads the field of one mesh reads the qualities of few.
@@ -269,10 +266,7 @@ def _root(attributes: dict[str, Any]) -> dict[str, Any]:
 
 
 def _require_same_samples(store: Store, plan: Plan, *, is_trusted: bool) -> None:
-    """Check that octaves were sampled at the frequencies that this program draws.
-
-    Where coordinates may be damaged, and are not trusted, one axis of three is enough.
-    """
+    """Check that octaves have the frequencies that are drawn here; of coordinates not trusted, one axis is enough."""
     agree = []
     for name, expected in zip(AXES, () if plan.tail is None else plan.tail.frequencies.T, strict=False):
         with suppress(StoreError, ValueError, TypeError, KeyError):

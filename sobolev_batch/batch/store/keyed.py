@@ -54,10 +54,7 @@ def damaged_chunks(store: Store) -> Iterator[tuple[str, Index, str]]:
 
 
 def read_chunk(store: Store, keys: str, index: Index) -> tuple[list[str], dict[str, NDArray[np.float64]]]:
-    """Return a chunk of keys, flattened, and of the arrays that they are for, by name.
-
-    DamageError where a chunk cannot be read, or has other values than those that its keys were written with.
-    """
+    """Return a chunk of keys, flattened, and of their arrays by name; DamageError where they do not match."""
     sealed = np.asarray(store.read(keys, _region(store, keys, index)))
     arrays = {name: np.asarray(store.read(name, _region(store, name, index))) for name in arrays_of(store, keys)}
     # A single key is for the whole of a chunk, others are for its rows.

@@ -495,10 +495,7 @@ class Store:
 
 
 class JoinedStore(Store):
-    """Stores of one lattice and one reference, for reading fields and spectra: the rows of one follow those of another.
-
-    Metadata are those of the first one.
-    """
+    """Stores of one lattice and one reference, read as one: rows follow each other, metadata are the first one's."""
 
     def __init__(self, stores: Sequence[Store], labels: Sequence[str]) -> None:
         super().__init__(stores[0].location)
@@ -535,10 +532,7 @@ def _digest_of(table: Any) -> str:
 
 
 def stored_choice(store: str | Path | Location) -> LatticeChoice | None:
-    """Return the lattice that was chosen for a store; None without one, or if its study gave the lattice.
-
-    From damaged metadata it is None.
-    """
+    """Return the lattice that was chosen for a store; None where its study gave it, or metadata are damaged."""
     existing = Store(store)
     with suppress(DamageError):
         if existing.exists() and not existing.is_unfinished and existing.attributes()["study"].get("choice"):

@@ -446,10 +446,7 @@ def _families(family: Mapping[str, Any], names: Sequence[str], folder: Path) -> 
 
 
 def _files(template: str, names: Sequence[str], folder: Path) -> Iterator[tuple[str, str, str]]:
-    """Yield object, method and path of the files that match a template.
-
-    A file is of the object with the longest name that fits, and the method is as long as it can be.
-    """
+    """Yield object, method and path of the files that match a template; the longest names that fit count."""
     texts = {name: template.replace(OBJECT, name) for name in sorted(names, key=len, reverse=True)}
     if not has_magic(_glob(template.replace(OBJECT, ""))):
         # The files need not exist yet.

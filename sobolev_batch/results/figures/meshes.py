@@ -156,10 +156,7 @@ def fields_of(tree: xr.DataTree, label: str) -> tuple[xr.DataArray, xr.DataArray
 def witness_at_vertices(
     a: xr.DataArray, b: xr.DataArray, orders: Sequence[float], mesh: Mesh, dtype: ComplexDtype = "complex128"
 ) -> Reals:
-    """Return the witness function of two fields, (orders, n), at a mesh's own vertices.
-
-    Vertices that no triangle uses have NaN: they may lie beyond the lattice's period.
-    """
+    """Return the witness function of two fields, (orders, n), at a mesh's vertices; NaN where no triangle uses them."""
     used = mesh.used_vertices
     values = np.full((len(orders), len(mesh.vertices)), np.nan)
     values[:, used] = witness(a, b, list(orders), mesh.vertices[used], dtype=dtype)

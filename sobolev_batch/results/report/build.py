@@ -192,10 +192,7 @@ def _digest(script: str) -> str:
 
 
 def chart_data(tree: xr.DataTree, spectra: Spectra | None, views: Sequence[MeshView]) -> Json:
-    """Return the data of all charts of an open store.
-
-    Texts are not escaped; the page does so. Missing numbers are null.
-    """
+    """Return the data of all charts of an open store, with texts not escaped, and null for missing numbers."""
     orders = finished_group(tree, "convergence")["order"].values.tolist()
     return {
         "name": tree.attrs["study"]["table"]["study"]["name"],

@@ -267,10 +267,7 @@ def _cell(column: Column, row: Mapping[Any, Any]) -> str:
 
 
 def nearest(frame: pd.DataFrame) -> tuple[pd.Series, tuple[str, ...]] | None:
-    """Return the nearest mesh among rows of `table` of one order; None where no distance is above its error.
-
-    Beside its row are the labels of meshes that may be nearer within the errors, the nearest first.
-    """
+    """Return the nearest mesh of one order, and labels that may be nearer; None if all are below their errors."""
     rows = frame[frame["distance"].notna()].sort_values("distance", kind="stable")
     resolved = rows[rows["resolved"].astype(bool)]
     if not len(resolved):
@@ -299,10 +296,7 @@ def page_columns(tree: xr.DataTree) -> tuple[Column, ...]:
 
 
 def with_remarks(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return rows of `table` with edges in the unit of the files, fractions of area, and marks of distances.
-
-    The column absent says why a mesh has no distance.
-    """
+    """Return rows of `table` with edges in the unit of the files, shares of area, marks, and why they are absent."""
     resolved, within = (frame[name].astype(bool) for name in ("resolved", "within"))
     shares = (frame["area_part"] / frame["distance"].where(frame["distance"] > 0)) ** 2
     return frame.assign(
@@ -389,10 +383,7 @@ def smallest_below(store: AnyStore, relative: float | str, order: Orders | None 
 
 
 def smallest_of(frame: pd.DataFrame, most: float) -> pd.DataFrame:
-    """Return the smallest mesh of each family below a bound, of rows of `table`; see `smallest_below`.
-
-    The labels in `undecided` are tuples here. There are no rows for families without meshes of triangles.
-    """
+    """Return the smallest mesh of each family of triangles below a bound, of rows of `table`; see `smallest_below`."""
     with_triangles = frame[frame["triangles"] > 0]
     rows = [
         {"order": s, "family": family, **_smallest(members, most)}

@@ -102,10 +102,7 @@ def matrix_frame(distances: xr.Dataset, order: float) -> pd.DataFrame:
 
 
 def format_matrix(tree: xr.DataTree, style: Format = "text", orders: Sequence[float] | None = None) -> str:
-    """Return the distance matrices of an open store as text.
-
-    InputError where the store has no tables yet, or has more meshes than a printed matrix can show.
-    """
+    """Return the distance matrices of an open store as text; InputError where they are too large for people."""
     distances = distances_at(tree, orders)
     chosen = list(dict.fromkeys(distances["order"].values.tolist()))
     if style in ("csv", "json"):

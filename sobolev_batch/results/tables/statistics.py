@@ -121,10 +121,7 @@ class Interval:
 
     @classmethod
     def from_values(cls, values: Reals, errors: Reals, spread: float | None = None) -> Interval:
-        """Return the interval of the mean by Student's t, from values and bounds on their errors (n,).
-
-        The spread is the standard deviation of the values, by default their own.
-        """
+        """Return the interval of the mean by Student's t, from values and bounds on errors (n,), with a spread."""
         count = len(values)
         if count == 0:
             return cls(math.nan, math.nan, math.nan)

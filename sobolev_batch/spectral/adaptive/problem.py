@@ -61,10 +61,7 @@ class Problem:
     def from_surfaces(
         cls, surfaces: Sequence[Surface], orders: tuple[float, ...], accuracy: Accuracy, label: str, threads: int
     ) -> Self:
-        """Return the problem for surfaces alone, moved together to the centre of the lattice's period.
-
-        Triangles that both surfaces have cancel, and are left out; none may remain.
-        """
+        """Return the problem for surfaces, moved to the centre, without triangles that both have; none may remain."""
         pair = tuple(surfaces) if len(surfaces) == _PAIR else ()
         different = _without_common_parts(surfaces)
         if not different:

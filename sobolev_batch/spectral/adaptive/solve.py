@@ -140,10 +140,7 @@ def _largest_share(solution: Solution) -> float:
 
 
 def _in_coarser_octaves(problem: Problem, seed: int) -> list[Solution]:
-    """Return what octaves reach that aim at less than a problem requires.
-
-    They come nearer than those that aim too high, which stop far below the frequencies that matter.
-    """
+    """Return what octaves reach that aim at less than required: aiming too high, they would stop far too early."""
     found = []
     for rtol in coarser_than(problem.accuracy.rtol):
         try:

@@ -176,10 +176,7 @@ def _fields(problem: Problem, lattice: Lattice, target: ErrorTarget) -> tuple[Fi
 
 
 def _brought_near(surface: Surface, reference: Surface) -> Surface:
-    """Return a surface moved towards the reference while they are too far apart to feel each other.
-
-    This leaves their distance as it is, and needs a much smaller lattice.
-    """
+    """Return a surface moved towards a reference too far away to feel it; their distance stays, the lattice shrinks."""
     (low, high), (other_low, other_high) = surface.extent.box, reference.extent.box
     above, below = np.maximum(low - other_high - _FAR, 0.0), np.maximum(other_low - high - _FAR, 0.0)
     x, y, z = (above - below).tolist()

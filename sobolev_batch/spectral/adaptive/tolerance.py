@@ -86,10 +86,7 @@ class Accuracy:
             raise InputError(f"memory must be a positive number of bytes, found {self.allowed_bytes!r}")
 
     def met(self, estimate: NormEstimate) -> NDArray[np.bool_]:
-        """Tell which numbers have an error within rtol of them, or of the floor.
-
-        Without a floor, a zero does only if its error is zero.
-        """
+        """Tell which numbers have an error within rtol of them, or of the floor; for zero without one, no error."""
         return np.asarray(estimate.errors <= self.rtol * self.scale(estimate.values))
 
     def scale(self, values: Reals) -> Reals:

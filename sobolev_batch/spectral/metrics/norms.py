@@ -189,10 +189,7 @@ def _refuse_settings_of_rtol(memory: float | str | None, *, best_effort: bool) -
 def to_accuracy(
     name: str, operands: Sequence[OperandLike], order: Orders, lattice: Lattice | None, accuracy: Accuracy, seed: int
 ) -> tuple[xr.Dataset, Reference | None]:
-    """Compute a norm or distance to an accuracy; the attributes hold the settings that were chosen.
-
-    The reference comes with a distance between surfaces that are not equal.
-    """
+    """Compute a norm or distance, and its reference, to an accuracy; attributes hold the settings that were chosen."""
     orders = check_orders(order)
     surfaces = [as_surface(operand) for operand in operands if not isinstance(operand, xr.DataArray)]
     if lattice is not None or len(surfaces) < len(operands):

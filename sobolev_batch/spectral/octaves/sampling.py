@@ -370,10 +370,7 @@ class TailSampling:
         return cls(cutoff, tuple(octaves))
 
     def refined(self, factor: float, more_octaves: int, largest: int, seed: int) -> TailSampling:
-        """Return a sampling with about ``factor`` times as many samples in each octave, and further octaves.
-
-        No lattice gets an M above ``largest``.
-        """
+        """Return a sampling with about ``factor`` times the samples, and further octaves; no M is above ``largest``."""
         rng, samplings = np.random.default_rng(seed), []
         for one in self.octaves:
             sizes = [min(2 * round(it.M * factor ** (1 / 3) / 2), max(largest, it.M)) for it in one.lattices]

@@ -123,10 +123,7 @@ def _compared(
     orders: Sequence[float],
     backend: Backend,
 ) -> tuple[Reals, Reals]:
-    """Compare values on lattices with exact ones at a few samples, drawn by their weights for all orders.
-
-    There are fewer where each costs more, and none for closed forms.
-    """
+    """Compare values on lattices with exact ones at a few samples, drawn by weight; fewer where each costs more."""
     kind = kind_of(surface)
     count = 0 if kind.is_closed_form else int(np.clip(_PAIRS // max(kind.triangles, 1), _FEWEST_CHECKS, _MOST_CHECKS))
     chosen, scales = [np.zeros(0, dtype=np.int64)], [np.zeros(0)]

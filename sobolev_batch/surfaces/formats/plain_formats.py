@@ -289,10 +289,7 @@ def _stl_text_corners(data: bytes) -> Reals:
 
 
 def _announced(header: bytes) -> tuple[dict[str, int], int, bool]:
-    """Return the number of entries of each element, their smallest possible length, and whether they are text.
-
-    The library complains of malformed lines.
-    """
+    """Return the number of entries of each element, their smallest possible length, and whether they are text."""
     counts: dict[str, int] = {}
     row_bytes: dict[str, int] = {}
     element, is_text = "", False

@@ -187,10 +187,7 @@ class FileSource(Source):
         return self
 
     def members(self, folder: Path) -> tuple[Member, ...]:
-        """Return one member per file, sorted by path or time, and named by the file's stem where that is unique.
-
-        The meshes of a list keep its order.
-        """
+        """Return one member per file, sorted by path or time, or as listed, named by the stem where that is unique."""
         if self.meshes is not None:
             return _listed_members(self.meshes, folder)
         given = self.paths or ()
@@ -332,10 +329,7 @@ def names_of_files(paths: list[Path]) -> list[str]:
 
 
 def file_digest(path: Path) -> str:
-    """Return the SHA-256 of a file's bytes, in hexadecimal; MeshError where it cannot be read.
-
-    A file that has not changed is not read again.
-    """
+    """Return the SHA-256 of a file's bytes, read again only if it has changed; MeshError where it cannot be read."""
     try:
         with open_regular(path) as file:
             checked_length(file)
