@@ -14,10 +14,15 @@ from sobolev_batch.batch.cluster.execution import Cluster, Task
 from sobolev_batch.batch.collection_store import CollectionStore, labelled
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.storage.lock import Lock, acquire, release
-from sobolev_batch.batch.store.keyed import damaged_chunks, withdraw_chunk
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import LABELS, PAIRS_KEYS, QUALITY, RECORDS, ROOT, SPECTRA_KEYS, Store
-from sobolev_batch.batch.store.tables import damaged_tables, rows_unlike_tables, table_attributes
+from sobolev_batch.batch.store.tables import (
+    damaged_chunks,
+    damaged_tables,
+    rows_unlike_tables,
+    table_attributes,
+    withdraw_chunk,
+)
 from sobolev_batch.batch.workspace import Workspace, complete_records
 from sobolev_batch.errors import DamageError, LockError, StoreError
 from sobolev_batch.parameters import available_cores

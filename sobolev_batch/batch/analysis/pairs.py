@@ -16,9 +16,8 @@ import xarray as xr
 
 from sobolev_batch.batch.analysis.reducer import Reducer
 from sobolev_batch.batch.analysis.spectra import read_spectra
-from sobolev_batch.batch.store.keyed import key_in, key_of, missing_chunks, seal
 from sobolev_batch.batch.store.store import DISTANCES, PAIRS_KEYS, Store
-from sobolev_batch.batch.store.tables import array_keys, dataset_keys
+from sobolev_batch.batch.store.tables import array_keys, dataset_keys, key_in, key_of, missing_chunks, seal
 from sobolev_batch.errors import DamageError
 from sobolev_batch.spectral.budget import PARTS, NormEstimate
 from sobolev_batch.spectral.metrics.datasets import VARIABLES, describe

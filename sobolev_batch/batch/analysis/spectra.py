@@ -8,8 +8,8 @@ from contextlib import suppress
 import numpy as np
 
 from sobolev_batch.batch.analysis.reducer import Reducer
-from sobolev_batch.batch.store.keyed import arrays_of, key_in, key_of, missing_chunks, read_chunk, seal
 from sobolev_batch.batch.store.store import SPECTRA_GROUP, SPECTRA_KEYS, Store
+from sobolev_batch.batch.store.tables import arrays_of, key_in, key_of, missing_chunks, read_chunk, seal
 from sobolev_batch.errors import DamageError
 from sobolev_batch.spectral.spectra import ComparedSpectra
 from sobolev_batch.surfaces.shapes.surface import Reals

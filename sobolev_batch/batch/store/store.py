@@ -169,7 +169,7 @@ class Store:
         return self.documents.get(name, {}).get("node_type") == "array"
 
     def keyed_arrays(self) -> list[str]:
-        """Return the names of the arrays that tasks of the reduction fill, and of their keys; see `keyed`."""
+        """Return the names of the arrays that tasks of the reduction fill, and of their keys; see `tables`."""
         groups = [keys.split("/")[0] for keys in (SPECTRA_KEYS, PAIRS_KEYS) if keys in self.documents]
         names = (name for name in self.documents if "/" in name and name.split("/")[0] in groups)
         return [name for name in names if name.endswith("/key") or len(self.documents[name]["shape"]) > 1]

@@ -1,4 +1,9 @@
-"""Tables: the small arrays of a store. Each group of them is written, listed and hidden as a whole.
+"""Arrays of a store besides fields and records: tables, and those that tasks of the reduction fill, chunk by chunk.
+
+Tables are small. Each group of them is written, listed and hidden as a whole. Spectra, and distances of all pairs, have
+an array of keys, with a chunk for each chunk of the others along the meshes. Keys tell which fields the numbers were
+computed from, so that they are computed again only where a field has changed. They are stored with checksums of the
+numbers: a chunk that took the place of another is found.
 
 Keys of new arrays are made in memory and then written as a whole: zarr and xarray look at a store again and again while
 they create arrays, and on object storage each look is a request.
@@ -6,16 +11,20 @@ they create arrays, and on object storage each look is a request.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+import hashlib
+import math
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 import xarray as xr
 import zarr
+from numpy.typing import NDArray
 from zarr.abc.buffer import Buffer
 from zarr.codecs import Crc32cCodec
 from zarr.storage import MemoryStore
 
+from sobolev_batch.batch.storage.checked import CHANGED, checksum_of
 from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import (
     FIELD,
@@ -171,3 +180,85 @@ def _incomplete(store: Store, names: Iterable[str]) -> list[str]:
     prefixes = {name if group in _GROUPS_OF_TASKS else group for name, group in groups.items()}
     sizes = {key: size for prefix in prefixes for key, size in store.location.sizes(prefix).items()}
     return [name for name in arrays if store.incomplete_chunks(name, sizes)]
+
+
+# Raise it where other numbers are computed from the same fields: all chunks are then stale.
+_VERSION = "2"
+# Place of a chunk of keys, counted in chunks.
+Index = tuple[int, ...]
+
+
+def key_of(parts: Iterable[str]) -> str:
+    """Return the key for what a chunk's numbers depend on."""
+    return hashlib.sha256(" ".join([_VERSION, *parts]).encode()).hexdigest()[:32]
+
+
+def arrays_of(store: Store, keys: str) -> list[str]:
+    """Return the names of the arrays that an array of keys is for, sorted."""
+    group = keys.split("/")[0]
+    return sorted(name for name in store.keyed_arrays() if name.startswith(f"{group}/") and name != keys)
+
+
+def missing_chunks(store: Store, keys: str) -> set[Index]:
+    """Return the places that are not there as a whole. No chunk is read."""
+    sizes, axes = store.location.sizes(keys.split("/")[0]), len(store.document(keys)["shape"])
+    names = [keys, *arrays_of(store, keys)]
+    return {index[:axes] for name in names for index in store.incomplete_chunks(name, sizes)}
+
+
+def damaged_chunks(store: Store) -> Iterator[tuple[str, Index, str]]:
+    """Yield the array of keys, place and damage of each chunk that is not what was written."""
+    for keys in store.keyed_arrays():
+        if keys.endswith("/key"):
+            for index in np.ndindex(*_counts(store, keys)):
+                try:
+                    read_chunk(store, keys, index)
+                except DamageError as error:
+                    yield keys, index, error.what
+
+
+def read_chunk(store: Store, keys: str, index: Index) -> tuple[list[str], dict[str, NDArray[np.float64]]]:
+    """Return a chunk of keys, flattened, and of their arrays by name; DamageError where they do not match."""
+    sealed = np.asarray(store.read(keys, _region(store, keys, index)))
+    arrays = {name: np.asarray(store.read(name, _region(store, name, index))) for name in arrays_of(store, keys)}
+    # A single key is for the whole of a chunk, others are for its rows.
+    is_for_rows = sealed.ndim == 1
+    for number, text in enumerate(sealed.ravel().tolist()):
+        if text and text != seal(
+            key_in(text), [values[number] if is_for_rows else values for values in arrays.values()]
+        ):
+            raise DamageError(f"{store.path}: chunk {index} of {keys.split('/')[0]} is damaged ({CHANGED})", CHANGED)
+    return [key_in(text) for text in sealed.ravel().tolist()], arrays
+
+
+def seal(key: str, arrays: Iterable[NDArray[np.float64]]) -> str:
+    """Return a key with the checksums of the values that it is for, in the order of `arrays_of`."""
+    return " ".join([key, *(str(checksum_of(np.ascontiguousarray(values))) for values in arrays)])
+
+
+def key_in(text: str) -> str:
+    """Return the key of a `seal`, or none of an empty text."""
+    return text.partition(" ")[0]
+
+
+def withdraw_chunk(store: Store, keys: str, index: Index) -> None:
+    """Erase the keys of a damaged chunk: the next run computes it again."""
+    region = _region(store, keys, index)
+    shape = [axis.stop - axis.start for axis in region]
+    store.write(keys, region, np.full(shape, "", dtype=object))
+
+
+def _counts(store: Store, name: str) -> list[int]:
+    document = store.document(name)
+    steps = document["chunk_grid"]["configuration"]["chunk_shape"]
+    return [math.ceil(length / step) for length, step in zip(document["shape"], steps, strict=True)]
+
+
+def _region(store: Store, name: str, index: Index) -> tuple[slice, ...]:
+    """Return the place of an array's chunk along the axes of its keys."""
+    document = store.document(name)
+    steps = document["chunk_grid"]["configuration"]["chunk_shape"]
+    return tuple(
+        slice(step * number, min(step * (number + 1), length))
+        for number, step, length in zip(index, steps, document["shape"], strict=False)
+    )

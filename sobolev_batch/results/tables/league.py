@@ -24,10 +24,10 @@ from sobolev_batch.results.tables.convergence import table, tables_of
 from sobolev_batch.results.tables.costs import DEFAULT_COST, CostLeague, cost_leagues_of
 from sobolev_batch.results.tables.statistics import (
     Curve,
-    Interval,
     Reals,
     adjusted,
     common_sizes,
+    interval,
     sign_flip_test,
     within_objects,
 )
@@ -50,6 +50,8 @@ the level of 5 % for all methods together."""
 
 # The store of a collection, or stores of single objects by their names.
 AnyCollection = str | Path | Location | Mapping[str, AnyStore]
+# Columns of the ends of an interval.
+_ENDS = ("low", "high")
 # Of the rows that two studies have in common.
 _KEYS = ["order", "mesh"]
 
@@ -160,14 +162,11 @@ class League:
         """
         count = len(self.objects)
         spreads = within_objects(self.values) if count > 1 else np.full(len(self.methods), np.nan)
-        rows = []
-        for k, method in enumerate(self.methods):
-            interval = Interval.from_values(self.values[:, k], self.errors[:, k], spreads[k]).exp()
-            known = self.slopes[np.isfinite(self.slopes[:, k, 0]), k]
-            rate = Interval.from_values(known[:, 0], known[:, 1])
-            about = {"method": method, "objects": count}
-            rows.append({**about, **interval.named("relative"), **rate.named("rate", "rate_")})
-        frame = pd.DataFrame(rows).sort_values("relative", kind="stable", ignore_index=True)
+        slopes = [of_method[np.isfinite(of_method[:, 0])] for of_method in self.slopes.swapaxes(0, 1)]
+        frame = pd.DataFrame({"method": self.methods, "objects": count})
+        frame[["relative", *_ENDS]] = np.exp(list(map(interval, self.values.T, self.errors.T, spreads)))
+        frame[["rate", "rate_low", "rate_high"]] = [interval(*known.T) for known in slopes]
+        frame = frame.sort_values("relative", kind="stable", ignore_index=True)
         low, high = frame["low"].to_numpy(), frame["high"].to_numpy()
         # Where there are no intervals, any place is possible.
         frame.insert(0, "rank", [1 + int(np.sum(high < end)) for end in low])
@@ -186,11 +185,9 @@ class League:
         for i, j in combinations(range(len(self.methods)), 2):
             differences = self.values[:, i] - self.values[:, j]
             errors = self.errors[:, i] + self.errors[:, j]
-            ratio = Interval.from_values(differences, errors).exp().named("ratio")
-            pair = {"method": self.methods[i], "other": self.methods[j]}
-            rows.append({**pair, **ratio, "p": sign_flip_test(differences, errors)})
-        columns = ["method", "other", "ratio", "low", "high", "p"]
-        frame = pd.DataFrame(rows, columns=columns)
+            ratio = np.exp(interval(differences, errors))
+            rows.append([self.methods[i], self.methods[j], *ratio, sign_flip_test(differences, errors)])
+        frame = pd.DataFrame(rows, columns=["method", "other", "ratio", *_ENDS, "p"])
         frame["p"] = adjusted(frame["p"].to_numpy(dtype=np.float64))
         nearer = np.where(frame["ratio"] < 1, frame["method"], frame["other"])
         frame["nearer"] = np.where(frame["p"] < SIGNIFICANCE, nearer, "")
@@ -437,12 +434,11 @@ def _change(meshes: pd.DataFrame) -> dict[str, object]:
     by_object = meshes.groupby("object", sort=False)[["log_ratio", "log_error"]].mean()
     units = by_object if len(by_object) > 1 else meshes
     ratios, errors = units["log_ratio"].to_numpy(), units["log_error"].to_numpy()
-    interval = Interval.from_values(ratios, errors).exp()
     worst = meshes.loc[meshes["log_ratio"].idxmax()]
     return {
         "objects": len(by_object),
         "meshes": len(meshes),
-        **interval.named("ratio"),
+        **dict(zip(("ratio", *_ENDS), np.exp(interval(ratios, errors)), strict=True)),
         "p": sign_flip_test(ratios, errors),
         "worst": f"{worst['object']}/{worst['mesh']}".lstrip("/"),
         "worst_ratio": float(np.exp(worst["log_ratio"])),

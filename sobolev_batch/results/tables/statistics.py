@@ -105,40 +105,17 @@ def common_sizes(curves: Sequence[Curve]) -> Reals | None:
     return None if common is None else np.linspace(*common, _SIZES)
 
 
-@dataclass(frozen=True)
-class Interval:
-    """A mean and where it lies.
+def interval(values: Reals, errors: Reals, spread: float | None = None) -> Reals:
+    """Return a mean and the ends of its interval by Student's t (3,), widened by the mean of errors (n,) of values.
 
-    Attributes:
-        mean: Mean.
-        low, high: Ends of its confidence interval, widened by the errors of what was averaged; NaN where there is but
-            one value, which says nothing of the spread.
+    The spread is the standard deviation of the values (n,), by default their own. One value says nothing of it: NaN.
     """
-
-    mean: float
-    low: float
-    high: float
-
-    @classmethod
-    def from_values(cls, values: Reals, errors: Reals, spread: float | None = None) -> Interval:
-        """Return the interval of the mean by Student's t, from values and bounds on errors (n,), with a spread."""
-        count = len(values)
-        if count == 0:
-            return cls(math.nan, math.nan, math.nan)
-        mean = float(np.mean(values))
-        if count == 1:
-            return cls(mean, math.nan, math.nan)
-        deviation = float(np.std(values, ddof=1)) if spread is None else spread
-        half = float(stdtrit(count - 1, (1 + CONFIDENCE) / 2)) * deviation / math.sqrt(count) + float(np.mean(errors))
-        return cls(mean, mean - half, mean + half)
-
-    def named(self, name: str, prefix: str = "") -> dict[str, float]:
-        """Return the columns of a table: the mean by a name, and the ends low and high, with a prefix."""
-        return {name: self.mean, f"{prefix}low": self.low, f"{prefix}high": self.high}
-
-    def exp(self) -> Interval:
-        """Return the interval of the geometric mean, where this is one of logarithms."""
-        return Interval(*(float(np.exp(value)) for value in (self.mean, self.low, self.high)))
+    count = len(values)
+    if count < 2:
+        return np.array([*values, *[math.nan] * (3 - count)])
+    deviation = float(np.std(values, ddof=1)) if spread is None else spread
+    half = float(stdtrit(count - 1, (1 + CONFIDENCE) / 2)) * deviation / math.sqrt(count) + float(np.mean(errors))
+    return np.asarray(np.mean(values) + np.array([0.0, -half, half]))
 
 
 def within_objects(values: Reals) -> Reals:
