@@ -88,11 +88,7 @@ def require_permission(study: AnyStudy, allow_commands: bool) -> None:
 
 
 def warnings_of(study: AnyStudy, store: Location) -> tuple[str, ...]:
-    """Return a line for each thing that would make a run of a study fail late, or useless. No surface is made.
-
-    They are sizes without a common range, too few objects for the test of a league, and distances of all pairs for
-    which the disk has no place.
-    """
+    """Return a line for each thing that makes a run fail late, or useless: sizes, too few objects, or no space."""
     if isinstance(study, Study) and study.pairs != "all" and len(study.families) == 1:
         return ()
     collection = study if isinstance(study, StudyCollection) else None

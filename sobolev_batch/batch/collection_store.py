@@ -74,10 +74,9 @@ class CollectionStore:
 def for_each_object(
     collection: StudyCollection, location: Location, act: Callable[[str, Study, Location], Result]
 ) -> tuple[dict[str, Result], dict[str, str]]:
-    """Act on the name, the study and the store of each object. An object that cannot be carried out stops no other.
+    """Act on the name, the study and the store of each object; return results, and why others have none, by name.
 
-    Return results by the name of the object, and the reason for each object that has none. A StoreError ends it: the
-    store of the next object would not fare better.
+    A StoreError ends it: the store of the next object would not fare better.
     """
     results: dict[str, Result] = {}
     refused: dict[str, str] = {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,7 +30,6 @@ from sobolev_batch.cli.common import (
 
 if TYPE_CHECKING:
     from sobolev_batch.batch.storage.location import Location
-    from sobolev_batch.batch.study.study import Study, StudyCollection
 
 # Lines about distances that are less accurate than requested.
 _MOST_IMPRECISE = 10
@@ -119,15 +119,10 @@ def run_command(
             "--workers and --worker-memory are for a cluster on this machine; the workers of a scheduler have their own"
         )
     parsed = as_study(study)
-    with progress_reports() as show:
-        if scheduler:
-            with remote_client(scheduler, trust_network) as client:
-                summary = run(parsed, store, client, on_progress=show, allow_commands=allow_commands, only=only)
-        else:
-            limit = None if memory is None else f"{memory}B"
-            summary = run(
-                parsed, store, workers=workers, memory=limit, on_progress=show, allow_commands=allow_commands, only=only
-            )
+    connected = remote_client(scheduler, trust_network) if scheduler else nullcontext()
+    compute = partial(run, parsed, store, workers=workers, memory=memory, allow_commands=allow_commands, only=only)
+    with progress_reports() as show, connected as client:
+        summary = compute(client=client, on_progress=show)
     if isinstance(parsed, Study):
         tree = open_store(summary.store)
         echo_lines(format_table(tree))
@@ -146,7 +141,8 @@ def run_command(
         echo(f"{label}: its distance has an error of {100 * error:.2g} %, more than the rtol of the study", err=True)
     if len(summary.imprecise) > _MOST_IMPRECISE:
         echo(f"and {len(summary.imprecise) - _MOST_IMPRECISE} more distances", err=True)
-    is_short = bool(summary.imprecise) and not _is_best_effort(parsed)
+    accuracies = [one.accuracy for one in ([parsed] if isinstance(parsed, Study) else parsed.studies.values())]
+    is_short = bool(summary.imprecise) and not any(one is not None and one.best_effort for one in accuracies)
     if summary.failed or summary.not_compared or is_short:
         context.exit(EXIT_SOME_FAILED)
 
@@ -221,13 +217,6 @@ def plan_command(
         echo_lines(made)
     if isinstance(made, CollectionPlan) and made.refused:
         context.exit(EXIT_SOME_FAILED)
-
-
-def _is_best_effort(study: Study | StudyCollection) -> bool:
-    from sobolev_batch.batch.study.study import Study
-
-    studies = [study] if isinstance(study, Study) else study.studies.values()
-    return any(one.accuracy is not None and one.accuracy.best_effort for one in studies)
 
 
 def _print_league(place: str) -> None:

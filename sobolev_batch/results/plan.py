@@ -42,11 +42,10 @@ _FEWEST_RECORDS = 3
 def forecast(
     plan: Plan, stored: Mapping[str, Record], workers: Workers, client: Client | None, planning_seconds: float
 ) -> tuple[float, float, list[str]]:
-    """Predict the time of a run on workers, without the fields that are stored, by label.
+    """Predict the time of a run on workers, of a client if it does not start them, without the stored fields, by label.
 
-    The client is that of the workers' cluster; None if the run starts them on this machine. A run plans again, unless
-    it takes the choice of its store. Return the seconds from the start to the end, if the workers have their cores for
-    themselves; seconds of a processor, of all tasks and processes; and lines that show both.
+    Return the seconds from the start to the end, if the workers have their cores for themselves; seconds of a
+    processor, of all tasks and processes, planning included where a run plans again; and lines that show both.
     """
     missing = [row.label for row in plan.rows if row.label not in stored]
     if not missing:

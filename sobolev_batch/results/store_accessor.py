@@ -279,9 +279,8 @@ def _computed(tree: xr.DataTree, orders: tuple[float, ...], meshes: Meshes = Non
 def convergence_at(tree: xr.DataTree, order: Orders | None, meshes: Meshes = None) -> xr.Dataset:
     """Return the convergence table of an open store at some orders, of the store or not, in memory.
 
-    The attribute ``computed`` of the table lists the orders that were computed from radial spectra. The table may have
-    more meshes than those that are needed. InputError where the store has no tables yet, or other orders are requested
-    and the tree does not say where it was opened; DamageError where a field is not what was stored.
+    The attribute ``computed`` lists the orders that were computed from radial spectra. The table may have more meshes
+    than those that are needed. DamageError where a field is not what was stored.
     """
     stored = finished_group(tree, "convergence", load=False)
     chosen, others = _divided(stored, order)

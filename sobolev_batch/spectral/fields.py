@@ -241,11 +241,7 @@ def as_operand(a: OperandLike) -> Operand:
 def field_of(
     a: OperandLike, lattice: Lattice | None, orders: Sequence[float], eps: float | None = None
 ) -> xr.DataArray:
-    """Return a field as it is, or transform a surface on a lattice.
-
-    LatticeError where the field has other dimensions, or the surface does not fit into the lattice; InputError where
-    the argument is neither, the field is not complex, or a surface comes without a lattice.
-    """
+    """Return a field as it is, or transform a surface on a lattice; LatticeError or InputError where it is neither."""
     if isinstance(a, xr.DataArray):
         if a.dtype.kind != "c":
             raise InputError(f"a Fourier field has complex values, found {a.dtype}")

@@ -149,7 +149,8 @@ class _Part:
         differences = positions[:, None] - scale
         # A sample on a node takes that node's value: any tiny difference says so.
         differences[differences == 0] = np.finfo(np.float64).tiny
-        matrix = _barycentric_weights() / differences
+        signs = np.where(np.arange(_NODES) % 2, -1.0, 1.0)
+        matrix = signs * np.sin(np.pi * (np.arange(_NODES) + 0.5) / _NODES) / differences
         matrix /= matrix.sum(axis=1, keepdims=True)
         return np.asarray(matrix)
 
@@ -178,11 +179,6 @@ class _Part:
 
 def _chebyshev_points() -> Reals:
     return -np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
-
-
-def _barycentric_weights() -> Reals:
-    signs = np.where(np.arange(_NODES) % 2, -1.0, 1.0)
-    return signs * np.sin(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
 
 
 @dataclass(frozen=True, eq=False)

@@ -349,11 +349,6 @@ class Reducer:
         parts = () if self.sampling is None else self.sampling.split(squared_moduli(values))
         return [weights.sums(squares) for weights, squares in zip(self.octave_weights, parts, strict=True)]
 
-    def _tail_of_pair(self, row: int, other: int, difference: NDArray[np.complexfloating]) -> Tail:
-        sums = self.octave_sums(difference)
-        energies = [octave.energy for octave in sums]
-        return Tail.from_sums(sums, *self._remainder(row, other, energies).at(self.orders))
-
     def _tails_of_pairs(self, sampling: TailSampling, rows: Sequence[int], others: Sequence[int], shared: int) -> Tail:
         """Return the tails of squared distances (orders, rows, others); the first ``shared`` others are the rows."""
         parts = np.zeros((len(fields(Tail)), len(self.orders), len(rows), len(others)))
@@ -363,7 +358,9 @@ class Reducer:
                 values = held[j] if j < shared and j in held else self.read_octaves(others[j])
                 for i, own in held.items():
                     if i < j or j >= shared:
-                        parts[..., i, j] = astuple(self._tail_of_pair(rows[i], others[j], own - values))
+                        sums = self.octave_sums(own - values)
+                        beyond = self._remainder(rows[i], others[j], [octave.energy for octave in sums])
+                        parts[..., i, j] = astuple(Tail.from_sums(sums, *beyond.at(self.orders)))
         if shared:
             parts[..., :shared] += np.swapaxes(np.triu(parts[..., :shared], 1), -1, -2)
         return Tail(*parts)

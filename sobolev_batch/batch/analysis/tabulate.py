@@ -157,10 +157,6 @@ class Results:
                     array[..., of_rows] = numbers
         return cls(meshes, reference, reducer.orders, *arrays)
 
-    @property
-    def _reference_place(self) -> int:
-        return int(self.meshes.indexes["mesh"].get_loc(self.reference))
-
     def norms_table(self) -> xr.Dataset:
         """Return `norm` (mesh, order) with its error."""
         columns = {**NormEstimate(*self.norms).named("norm"), "beyond": self.parts[2]}
@@ -175,7 +171,8 @@ class Results:
     def convergence_table(self, accuracy: Accuracy | None) -> xr.Dataset:
         """Return distances to the reference, relative ones and their parts, and observed orders of convergence."""
         to_reference = NormEstimate(*self.to_reference)
-        sizes, reference = self.meshes["edge_length_mean"].to_numpy(), self._reference_place
+        sizes = self.meshes["edge_length_mean"].to_numpy()
+        reference = self.meshes.indexes["mesh"].get_loc(self.reference)
         distances, errors = to_reference.values, to_reference.errors
         rates, rate_errors = (np.full_like(distances, np.nan) for _ in range(2))
         for family in self._sequences():

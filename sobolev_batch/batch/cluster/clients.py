@@ -41,8 +41,7 @@ _LOST_WORKER_SECONDS = 10**7
 def local_client(workers: int | None = None, memory: float | str | None = None) -> Iterator[Client]:
     """Give a client of a new cluster of single-threaded worker processes, reachable from this machine only.
 
-    There is a worker for each core that this process may use, and they share the memory of the machine equally, unless
-    their number, or the memory of each, is given. InputError where `memory_limit` refuses it.
+    By default there is one for each core, and they share the memory equally; InputError where there is too little.
     """
     count = workers or available_cores()
     # Dask's own default knows no limit of an inner control group.

@@ -162,8 +162,8 @@ class StoredBlocks:
 def compute_mesh(job: Job, blocks: Sequence[Block]) -> Record:
     """Compute and store the whole field of a mesh, then its completion record, unless that exists.
 
-    A mesh that cannot be loaded or transformed does not raise: the reason goes into its record, so that one bad mesh
-    stops nothing else. A StoreError is not the mesh's fault.
+    The reason of a failure goes into the record, so that one bad mesh stops nothing else. A StoreError is not its
+    fault.
     """
     stored = compute_parts(job, blocks, octaves=job.tail is not None)
     return stored if isinstance(stored, Record) else _finished(job, stored)
@@ -172,8 +172,7 @@ def compute_mesh(job: Job, blocks: Sequence[Block]) -> Record:
 def compute_parts(job: Job, blocks: Sequence[Block] = (), octaves: bool = False) -> list[StoredBlocks] | Record:
     """Compute and store some blocks of a mesh's field, and its values in octaves; see `compute_mesh`.
 
-    Return what was stored, the first with the time, or with the reason of a failure; or else the completion record of
-    the mesh, if it exists: then nothing is computed.
+    Return what was stored, the first with the time or the reason of a failure; or the record of the mesh, if it exists.
     """
     if record := job.stored_record():
         return record

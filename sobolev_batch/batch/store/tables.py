@@ -12,7 +12,6 @@ they create arrays, and on object storage each look is a request.
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Any
 
@@ -210,7 +209,7 @@ def damaged_chunks(store: Store) -> Iterator[tuple[str, Index, str]]:
     """Yield the array of keys, place and damage of each chunk that is not what was written."""
     for keys in store.keyed_arrays():
         if keys.endswith("/key"):
-            for index in np.ndindex(*_counts(store, keys)):
+            for index in store.chunk_keys(keys).values():
                 try:
                     read_chunk(store, keys, index)
                 except DamageError as error:
@@ -246,12 +245,6 @@ def withdraw_chunk(store: Store, keys: str, index: Index) -> None:
     region = _region(store, keys, index)
     shape = [axis.stop - axis.start for axis in region]
     store.write(keys, region, np.full(shape, "", dtype=object))
-
-
-def _counts(store: Store, name: str) -> list[int]:
-    document = store.document(name)
-    steps = document["chunk_grid"]["configuration"]["chunk_shape"]
-    return [math.ceil(length / step) for length, step in zip(document["shape"], steps, strict=True)]
 
 
 def _region(store: Store, name: str, index: Index) -> tuple[slice, ...]:

@@ -177,11 +177,7 @@ def choice_basis(study: Study, accuracy: Accuracy, similarity: Similarity, refer
 def look_at_extents(
     members: Members, similarity: Similarity, reference: Extent
 ) -> tuple[dict[str, Extent], dict[str, str]]:
-    """Look at the surfaces that are quickly loaded, one after the other, as long as they take little memory together.
-
-    Return the extent of each in the study's unit, and the reason for each that cannot be compared with a reference of
-    this extent, by label.
-    """
+    """Return extents of quickly loaded surfaces, as memory permits, and why others cannot be compared, by label."""
     extents: dict[str, Extent] = {}
     set_aside: dict[str, str] = {}
     left = _MOST_BYTES
@@ -201,10 +197,7 @@ def look_at_extents(
 def choose_pilots(
     members: Members, similarity: Similarity, reference: Extent
 ) -> tuple[dict[str, Surface], dict[str, str]]:
-    """Return the coarsest and the finest surface of each of a few families, in the study's unit, by label.
-
-    Surfaces that cannot be compared with a reference of this extent are set aside; the reasons come second, by label.
-    """
+    """Return the coarsest and finest surface of a few families, and why others cannot be compared, by label."""
     families: dict[str, list[str]] = {}
     for label, (family, _) in members.items():
         families.setdefault(family, []).append(label)

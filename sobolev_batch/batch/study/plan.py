@@ -114,9 +114,8 @@ class Plan:
 def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan:
     """Plan a study: list its surfaces, choose its similarity and lattice, identify every field.
 
-    The reference is loaded, since the similarity depends on it, and a few pilots if an accuracy is requested. No other
-    surface is loaded. It fails like `members_of` and `choose_lattice`, with a MeshError where the reference cannot be
-    read, and with a LatticeError where it does not fit into the lattice's period.
+    Only the reference is loaded, and a few pilots for an accuracy. MeshError where the reference cannot be read,
+    LatticeError where it does not fit into the period; see also `members_of` and `choose_lattice`.
     """
     members = members_of(study)
     reference = _reference_label(study, members)

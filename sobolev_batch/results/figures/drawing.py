@@ -350,11 +350,7 @@ PLOTS: dict[str, Plot] = {
 def write_plots(
     selection: Selection, folder: str | Path, formats: Sequence[PictureFormat] = ("png",), size: Size | None = None
 ) -> tuple[tuple[Path, ...], Mapping[str, Sequence[str]]]:
-    """Write the plots of a store into a folder, each with a panel for each order.
-
-    The files are named after the kinds of `plot`; each kind that the store has results for is drawn in each format.
-    Return their paths, and what each of them leaves out, by its name.
-    """
+    """Write each kind of `plot` with results into a folder; return the paths, and what each leaves out, by name."""
     with drawing(size):
         figures = {
             name: kind.figure(selection, items, size)

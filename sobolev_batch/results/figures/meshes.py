@@ -116,8 +116,8 @@ class StudyMeshes:
 def matching_labels(tree: xr.DataTree, names: Sequence[str]) -> tuple[str, ...]:
     """Return the labels of an open store that are meant by labels or patterns such as ``scans/*``, each once.
 
-    A pattern stands for meshes that are computed and have triangles, and never for the reference. InputError, with a
-    suggestion, where the store has no such label.
+    A pattern stands for computed meshes with triangles but the reference. InputError, with a suggestion, without a
+    match.
     """
     meshes = finished_group(tree, "meshes")
     known: list[str] = meshes["mesh"].values.tolist()
@@ -168,8 +168,7 @@ def exported(
 ) -> tuple[StudyMeshes, tuple[str, ...], tuple[float, ...]]:
     """Return the meshes of a store, with the labels and the orders whose witness functions are to be written.
 
-    By default these are all computed meshes with triangles but the reference, and the orders of the study. InputError
-    where the store lacks tables, labels or the field of its reference, or its meshes cannot be listed on this machine.
+    By default these are all computed meshes with triangles but the reference, and the orders of the study.
     """
     tree = as_tree(store)
     of_study = finished_group(tree, "convergence")["order"].values.tolist()
@@ -245,10 +244,9 @@ def write_vertex_values(
 ) -> None:
     """Write a mesh with its witness function, in the format of the path's suffix, one of `SUFFIXES`.
 
-    The mesh is in its own unit of length; the values (orders, vertices) are in 1 / unit length of the context, a
-    "study" or a "comparison", whose unit is given in that of the mesh. Distances (vertices,) from the reference are in
-    the unit of the mesh. The title says what was compared with what.
-    StoreError where the file cannot be written.
+    The values (orders, vertices) are in 1 / unit length of the context, a "study" or a "comparison", whose unit is
+    given in that of the mesh, as are distances (vertices,) from the reference. The title says what was compared with
+    what.
     """
     escaped = title.encode("unicode_escape").decode("ascii")
     notes = [

@@ -160,11 +160,9 @@ def make_views(
 ) -> tuple[list[MeshView], dict[str, str]]:
     """Make a few meshes of a store again, by its study, and evaluate their witness functions on them.
 
-    Without labels or patterns of meshes, they are the closest mesh of each chosen family at the first order, and the
-    farthest ones. The limits are those of `PAGE_LIMITS`, and the folder is where relative paths in the study start. The
-    axis that points upwards is by default that of `up_axis`. Return views in the order of the study, and the reason for
-    each requested mesh without one, by its label. InputError where a label or family is unknown, or more meshes are
-    named than may be shown.
+    By default they are the closest mesh of each chosen family at the first order, and the farthest ones; limits are
+    those of `PAGE_LIMITS`. Return views in the order of the study, and the reason for each requested mesh without one,
+    by its label. InputError where a label or family is unknown, or more meshes are named than may be shown.
     """
     most_meshes, most_triangles, most_values = limits
     named = matching_labels(tree, meshes)
@@ -306,9 +304,8 @@ def write_witness_plots(
 ) -> tuple[tuple[Path, ...], Mapping[str, str]]:
     """Draw meshes of an open store, coloured by their witness functions, into a folder; see `make_views`.
 
-    Each mesh gets a file witness-* with a view of its own; several are also drawn beside each other in the file
-    witness, seen from the front, at the first order. Meshes have their own scales of colours, or a common one for each
-    order. Return the paths of the pictures, and the reason for each mesh without one.
+    Each mesh gets a file witness-*; several are also drawn beside each other in the file witness, seen from the front,
+    at the first order. Return the paths of the pictures, and the reason for each mesh without one.
     """
     tree = selection.tree
     views, missing = make_views(tree, folder, meshes, PICTURE_LIMITS, up, selection.orders, selection.families)

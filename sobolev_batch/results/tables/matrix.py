@@ -40,8 +40,7 @@ def pairs_of(
 ) -> xr.Dataset | None:
     """Return `distance` and `error` of one order between the computed meshes, over `mesh` and `other`, symmetric.
 
-    They may be limited to a number of meshes, the first ones and the reference, and to some labels beside it. None
-    where the study requests distances to the reference alone.
+    They may be limited to the first ones, or to some labels, and the reference. None without distances of all pairs.
     """
     stored = finished_group(tree, "distances", load=False)
     if stored.sizes["other"] != stored.sizes["mesh"]:

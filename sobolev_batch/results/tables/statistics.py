@@ -15,7 +15,6 @@ from scipy.special import stdtrit
 
 from sobolev_batch.batch.checks import Range, common_range
 from sobolev_batch.results.open import sizes_of
-from sobolev_batch.spectral.adaptive.tolerance import NEXT_TO_EQUAL
 
 Reals = NDArray[np.float64]
 
@@ -68,11 +67,6 @@ class Curve:
         """Errors (n,) of the distances themselves; where nothing bounds one, it is as large as the distance."""
         factors = np.where(np.isfinite(self.errors), np.expm1(np.minimum(self.errors, _LARGEST_ERROR)), 1.0)
         return np.exp(self.values) * factors
-
-    @property
-    def is_exact(self) -> bool:
-        """True if a mesh is next to equal to the object, so that its distance tells of rounding alone."""
-        return bool(np.any(self.values < np.log(NEXT_TO_EQUAL)))
 
     def at(self, sizes: Reals) -> tuple[Reals, Reals]:
         """Return the logarithms of the distances at some sizes, on straight lines between the meshes, with errors.

@@ -44,8 +44,7 @@ _PLAIN = {ord(raised): plain for plain, raised in zip("-0123456789", "⁻⁰¹²
 def with_error(value: float, error: float = math.nan, unit: str = "") -> str:
     """Return a number with the digits that its error leaves it, and its error; both have one power of ten.
 
-    The error has one digit and is rounded up, so that it stays a bound; it may be unknown (NaN). NaN gives an empty
-    text.
+    The error, unknown for NaN, has one digit and is rounded up, so that it stays a bound. NaN gives an empty text.
     """
     if not math.isfinite(value):
         return ""
@@ -327,10 +326,9 @@ def printed_table(
 ) -> str:
     """Return cells as a table whose columns are aligned to the right, but for the first and for those of texts.
 
-    In a text, labels of the first column and texts give way where lines would be too long: labels lose what they
-    repeat and then their middle, and texts are wrapped. Columns that still have no room follow in a table of their own,
-    without rows that have no cells there.
-    LaTeX's special characters are escaped by tabulate.
+    In a text, labels of the first column and texts give way where lines would be too long: labels lose what they repeat
+    and then their middle, and texts are wrapped. Columns that still have no room follow in a table of their own,
+    without rows that have no cells there. Tabulate escapes LaTeX's special characters.
     """
     rows, headers = (
         [[_escaped(cell, style) for cell in row] for row in rows],
@@ -388,7 +386,7 @@ def _with_short_texts(
             width = max(_widths(rows, headers)[column] - lacking, _SHORTEST_TEXT)
             cells = ["\n".join(textwrap.wrap(row[column], width, break_long_words=False)) for row in rows]
             rows = [[*row[:column], cell, *row[column + 1 :]] for row, cell in zip(rows, cells, strict=True)]
-    for shorten in (_without_repeats, _cut):
+    for shorten in (_without_repeats, lambda names, longest: [middle_cut(name, longest) for name in names]):
         if (lacking := missing()) > 0:
             labels = [row[0] for row in rows]
             shorter = shorten(labels, max(_widths(rows, headers)[0] - lacking, _SHORTEST_TEXT))
@@ -409,10 +407,6 @@ def _without_repeats(labels: Sequence[str], _longest: int) -> list[str]:
         rest = name.removeprefix(family if name.startswith(family) else common)
         shorter.append(f"{family}/…{rest}" if slash and rest and len(name) - len(rest) > 1 else family + slash + name)
     return shorter
-
-
-def _cut(labels: Sequence[str], longest: int) -> list[str]:
-    return [middle_cut(label, longest) for label in labels]
 
 
 def wrapped(text: str) -> list[str]:

@@ -200,11 +200,7 @@ def _differ_beyond(problem: Problem, lattice: Lattice) -> bool:
 
 
 def _solve_on_lattices(problem: Problem, lattice: Lattice, is_pilot: bool, *, before_octaves: bool = False) -> Solution:
-    """Return the first solution that meets the accuracy, else the last of a few rounds or of the largest lattice.
-
-    A pilot is a small lattice that only shows how large distances are. AccuracyError where the accuracy is out of
-    reach.
-    """
+    """Return the first solution that meets the accuracy, else the last one of a few rounds, or an AccuracyError."""
     values: Reals | None = None
     # Their fields may differ by a little more.
     equal = _near_duplicates(problem, lattice)

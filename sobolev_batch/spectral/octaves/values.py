@@ -318,11 +318,7 @@ class Tail:
         return self.octaves + self.beyond
 
     def estimate(self, core: Reals, images: Reals, discretisation: Reals) -> NormEstimate:
-        """Return norms with their errors, each (orders, ...).
-
-        They follow from the squared norm of the innermost frequencies, the bound on its change by the lattice's
-        spacing, and the norms of the errors of all values.
-        """
+        """Return norms (orders, ...) from squares of the innermost frequencies, images, and errors of all values."""
         squares = np.maximum(np.maximum(core, 0.0) + self.squares, 0.0)
         return NormEstimate(
             np.sqrt(squares),

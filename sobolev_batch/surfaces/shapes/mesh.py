@@ -429,11 +429,7 @@ def _duplicate_triangles(triangles: Indices) -> int:
 
 
 def shared_triangles(first: Reals, second: Reals) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which triangles of two meshes occur in both, in any orientation, each as often in one as in the other.
-
-    They have corners (m, 3, 3) and (n, 3, 3), and are compared by hashes of 64 bits, which a pair of different ones
-    shares with a probability of 5e-20.
-    """
+    """Return which triangles (m, 3, 3) and (n, 3, 3) occur in both, as often, by hashes of their corners of 64 bits."""
     hashes, other_hashes = _triangle_hashes(first), _triangle_hashes(second)
     return _matched(hashes, other_hashes), _matched(other_hashes, hashes)
 

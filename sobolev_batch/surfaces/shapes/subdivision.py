@@ -104,11 +104,7 @@ class Edges:
         return self._completed(order[:fewest])
 
     def split(self, marks: Marks) -> Mesh:
-        """Return the mesh with a new vertex at the middle of each marked edge.
-
-        New vertices follow those of the mesh, in the order of edges. A triangle becomes two, three or four; of two
-        ways to cut three, it takes the shorter diagonal.
-        """
+        """Return the mesh with new vertices, after its own, at the middles of marked edges; of two cuts the shorter."""
         count = len(self.mesh.vertices)
         middles = np.full(len(self.ends), -1, dtype=np.int64)
         middles[marks] = count + np.arange(np.count_nonzero(marks))

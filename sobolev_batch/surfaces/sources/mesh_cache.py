@@ -123,11 +123,7 @@ def environment() -> dict[str, str]:
 
 
 def run_command(mesh: Mesh, words: list[str], suffixes: tuple[str, str], timeout: float, largest_output: int) -> Made:
-    """Run a program that makes a mesh of another one, and return the mesh, or why it failed and what it said last.
-
-    Its words have {input} and {output} for files with the suffixes. It may take the timeout in seconds, and write the
-    largest output in bytes.
-    """
+    """Run a program on files {input} and {output}, and return its mesh, or why it failed and what it said last."""
     with tempfile.TemporaryDirectory(prefix="sobolev-batch-", ignore_cleanup_errors=True) as scratch:
         folder = Path(scratch)
         files = {name: folder / f"{name}{suffix}" for name, suffix in zip((INPUT, OUTPUT), suffixes, strict=True)}

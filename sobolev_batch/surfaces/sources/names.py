@@ -34,11 +34,7 @@ def quoted(value: object, longest: int = 80) -> str:
 
 
 def name_problem(text: str, longest: int, forbidden: str = "") -> str | None:
-    """Describe why a text cannot be a name; None where it can.
-
-    A name has 1 to ``longest`` characters. They are visible, or single blanks between visible ones, and
-    none of them is forbidden.
-    """
+    """Describe why a text is not 1 to ``longest`` visible characters, or single blanks between; None where it is."""
     if not text:
         return "it is empty"
     if len(text) > longest:
