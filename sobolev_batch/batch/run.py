@@ -294,13 +294,14 @@ def _compute_repairing(
 
 def _summary(workspace: Workspace, computed: set[int]) -> Summary:
     labels, failed = {i: row.label for i, row in workspace.rows.items()}, workspace.failures
+    complete = workspace.complete
     not_compared: Mapping[str, str] = {}
     if workspace.plan.study.proximity is not None:
-        not_compared = failed_proximities(dict(enumerate(workspace.labels)), workspace.complete)
+        not_compared = failed_proximities(dict(enumerate(workspace.labels)), complete)
     return Summary(
         workspace.store.path,
         tuple(label for i, label in labels.items() if i in computed and label not in failed),
-        tuple(label for i, label in labels.items() if i not in computed and i in workspace.complete),
+        tuple(label for i, label in labels.items() if i not in computed and i in complete),
         failed,
         not_compared,
         _imprecise(workspace),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,11 @@ import trimesh
 from distributed import Client
 
 import sobolev_batch as sb
+from sobolev_batch.batch import workspace
 from sobolev_batch.batch.analysis import tabulate
 from sobolev_batch.batch.cluster.clients import remote_client
 from sobolev_batch.batch.cluster.execution import Progress
+from sobolev_batch.batch.store.records import Record
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.results.status import Status
 from tests.support.commands import call, command, finished
@@ -89,6 +92,27 @@ def test_a_run_counts_its_steps_and_a_second_one_has_none(client: Client, study:
     with pytest.raises(sb.errors.StoreError, match="another study"):
         sb.run(sb.Study.from_table(small_table(study={"name": "other"})), store_path, client)
     assert stamps() == before
+
+
+def test_a_run_looks_through_its_records_as_often_with_more_meshes(
+    client: Client, store_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    passes: list[int] = []
+    complete = workspace.complete_records
+
+    def counted(records: Sequence[Record | None]) -> dict[int, Record]:
+        passes.append(len(records))
+        return complete(records)
+
+    monkeypatch.setattr(workspace, "complete_records", counted)
+    counts = []
+    for levels in ([0, 1], [0, 1, 2, 3]):
+        family = [{"name": "ico", "source": "icosphere", "levels": levels}]
+        for _ in range(2):
+            passes.clear()
+            sb.run(sb.Study.from_table(small_table(family=family)), store_path, client)
+        counts.append(len(passes))
+    assert counts[0] == counts[1] > 0
 
 
 def test_tables_of_an_older_version_are_made_anew(
