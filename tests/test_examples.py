@@ -14,9 +14,9 @@ from tests.support.repository import PACKAGE, run_icospheres
 FLAGS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
 FILES = [file for file in sorted(PACKAGE.rglob("*.py")) if ">>>" in file.read_text(encoding="utf-8")]
 NAMES = [".".join([PACKAGE.name, *file.relative_to(PACKAGE).with_suffix("").parts]) for file in FILES]
-BESIDE_A_STORE = tuple(f"{PACKAGE.name}.{layer}" for layer in ("results.", "cli.", "plot"))
-# They run studies on clusters of their own.
-WITH_CLUSTERS = {f"{PACKAGE.name}.batch.{name}" for name in ("run", "verify")}
+BESIDE_A_STORE = tuple(f"{PACKAGE.name}.{layer}" for layer in ("results.", "cli.", "plot", "batch.verify"))
+# It runs a study on a cluster of its own.
+WITH_CLUSTER = f"{PACKAGE.name}.batch.run"
 
 
 def run(name: str) -> None:
@@ -31,7 +31,7 @@ def run(name: str) -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=[pytest.mark.process] if name in WITH_CLUSTERS else [])
+        pytest.param(name, marks=[pytest.mark.process] if name == WITH_CLUSTER else [])
         for name in NAMES
         if not name.startswith(BESIDE_A_STORE)
     ],

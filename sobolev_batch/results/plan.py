@@ -109,16 +109,9 @@ class StudyPlan:
         warnings: What would make a run useless or end it, see `warnings_of`.
 
     >>> import sobolev_batch as sb
-    >>> study = sb.Study.from_table({
-    ...     "study": {"name": "spheres"},
-    ...     "lattice": {"xi_max": 2.0, "M": 8},
-    ...     "norm": {"orders": [-2.0]},
-    ...     "reference": {"source": "sphere"},
-    ...     "family": [{"name": "ico", "source": "icosphere", "levels": [0, 1]}],
-    ... })
-    >>> plan = sb.plan(study, "memory://forecast.zarr")
-    >>> plan.labels, plan.lattice, plan.stored
-    (('ico/0', 'ico/1', 'reference'), Lattice(xi_max=2.0, M=8), ())
+    >>> plan = sb.plan("workflows/icosphere.toml")
+    >>> plan.reference, plan.octaves, plan.dtype
+    ('reference', 0, 'complex128')
     """
 
     study: Study

@@ -45,17 +45,9 @@ class Status:
             that goes on computes them again.
 
     >>> import sobolev_batch as sb
-    >>> study = sb.Study.from_table({
-    ...     "study": {"name": "spheres"},
-    ...     "lattice": {"xi_max": 2.0, "M": 16},
-    ...     "norm": {"orders": [-2.0]},
-    ...     "reference": {"source": "sphere"},
-    ...     "family": [{"name": "ico", "source": "icosphere", "levels": [0, 1]}],
-    ... })
-    >>> summary = sb.run(study, "memory://progress.zarr")
-    >>> status = sb.status("memory://progress.zarr")
+    >>> status = sb.status("storage/icosphere.zarr")
     >>> status.complete, status.total, status.failed
-    (3, 3, {})
+    (5, 5, {})
     """
 
     store: str
