@@ -19,14 +19,8 @@ RunState = Literal["submitted", "running", "done", "failed"]
 _ROW = "row"
 # In JSON, in place of a record that a page holds and that counts no more.
 WITHDRAWN = "null"
-
-
 Kind = TypeVar("Kind")
-
-
-@cache
-def _adapter(kind: Any) -> TypeAdapter[Any]:
-    return TypeAdapter(kind)
+_adapter = cache(TypeAdapter)
 
 
 def record_from_table(kind: type[Kind], table: Any, name: str) -> Kind:

@@ -34,7 +34,6 @@ from sobolev_batch.results.tables.text import (
     count,
     machine_table,
     percent,
-    printed_table,
     prose,
     section,
     with_error,
@@ -123,8 +122,6 @@ _SMALLEST_COLUMNS = (
     Column("relative", "relative", percent, "relative_error"),
     Column("remark", "remark", kind="text"),
 )
-# Of distances, in texts.
-_MARKS = {"": "", "below its error": "*", "above rtol": "!"}
 
 
 def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH) -> pd.DataFrame:
@@ -248,22 +245,11 @@ def _tables(tree: xr.DataTree, frame: pd.DataFrame, style: Format) -> Iterator[s
     marked = with_remarks(frame)
     for order, rows in marked.groupby("order", sort=False):
         caption = f"Sobolev distance of order {order:g} to {frame.attrs['reference']}"
-        yield section(caption, [_table(rows, _COLUMNS, style)], [], style)
+        yield section(caption, [column_table(_COLUMNS, rows.to_dict(orient="records"), style)], [], style)
     if has_proximity(tree):
         once = marked[marked["order"] == marked["order"].iloc[0]]
-        others = _table(once, (_MESH, *_metric_columns(tree)), style)
+        others = column_table((_MESH, *_metric_columns(tree)), once.to_dict(orient="records"), style)
         yield section("Other distances, the same at all orders", [others], [], style)
-
-
-def _table(frame: pd.DataFrame, columns: Sequence[Column], style: Format) -> str:
-    cells = [[row["mesh"], *(_cell(column, row) for column in columns[1:])] for row in frame.to_dict(orient="records")]
-    return printed_table(cells, [column.header for column in columns], style)
-
-
-def _cell(column: Column, row: Mapping[Any, Any]) -> str:
-    if row["absent"]:
-        return "missing"
-    return column.text(row) + (_MARKS[row["mark"]] if column.is_marked else "")
 
 
 def nearest(frame: pd.DataFrame) -> tuple[pd.Series, tuple[str, ...]] | None:

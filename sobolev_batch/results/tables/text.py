@@ -241,6 +241,8 @@ def _power(power: int) -> str:
     return _POWER + str(power).translate(_SUPERSCRIPTS)
 
 
+# Of numbers, in texts.
+_MARKS = {"": "", "below its error": "*", "above rtol": "!"}
 _TABULATE_FORMATS = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
 
 # Length of lines without a terminal, longest line of prose, and the least that remains of a label or a text.
@@ -284,8 +286,16 @@ class Column:
 
 
 def column_table(columns: Sequence[Column], rows: Iterable[Mapping[Any, Any]], style: Format) -> str:
-    """Return rows of a frame as a table for people; see `printed_table`."""
-    cells = [[column.text(row) for column in columns] for row in rows]
+    """Return rows of a frame as a table for people, with marks, and where numbers are absent; see `printed_table`."""
+    cells = [
+        [
+            "missing"
+            if row.get("absent") and column.kind != "label"
+            else column.text(row) + (_MARKS[row.get("mark", "")] if column.is_marked else "")
+            for column in columns
+        ]
+        for row in rows
+    ]
     texts = [number for number, column in enumerate(columns) if column.kind == "text"]
     return printed_table(cells, [column.header for column in columns], style, texts)
 

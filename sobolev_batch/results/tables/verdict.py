@@ -179,6 +179,6 @@ def format_verdict(tree: xr.DataTree, style: Format = "text", orders: Sequence[f
     sections = []
     blank = {"mesh": "", "relative": math.nan, "triangles": pd.NA}
     for order in frame["order"].drop_duplicates():
-        own = [{**blank, "remark": row.get("absent", ""), **row} for row in rows if row["order"] == order]
+        own = [{**blank, "remark": row.get("absent", ""), **row, "absent": ""} for row in rows if row["order"] == order]
         sections.append(section(f"Verdict at order {order:g}", [column_table(VERDICT_COLUMNS, own, style)], [], style))
     return "\n\n".join([*sections, *([prose([f"Only {omitted} are shown."], style)] if omitted else [])])
