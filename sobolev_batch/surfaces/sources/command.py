@@ -321,6 +321,8 @@ class RemeshedMember(Member):
                 "--allow-commands (in Python: allow_commands=True) if you trust it"
             )
         made = self.make(load_mesh(self.original))
+        if self.fingerprint_digest() != digest:
+            raise MeshError("a file of it was changed while it was made; run the study again")
         self.cache.write(digest, made, {"made by": self.identity, "of": self.original.name})
         if isinstance(made[1], str):
             raise MeshError(made[1])

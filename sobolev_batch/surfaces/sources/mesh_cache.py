@@ -11,10 +11,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import IO, Any, Protocol
 
 import numpy as np
 import psutil
@@ -114,6 +114,8 @@ PLACEHOLDER = re.compile(r"\{(\w+)\}")
 _LONGEST_TAIL = 300
 # Seconds between looks at a program that runs: at first, and at most.
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.005, 0.1
+# It is told the number of a process, and kills its session and removes a folder when the writer ends, however it does.
+_GUARD = 'read -r number && { read -r _; kill -s KILL -- "-$number"; rm -rf -- "$1"; } 2> /dev/null'
 
 
 def environment() -> dict[str, str]:
@@ -123,48 +125,61 @@ def environment() -> dict[str, str]:
 
 
 def run_command(mesh: Mesh, words: list[str], suffixes: tuple[str, str], timeout: float, largest_output: int) -> Made:
-    """Run a program on files {input} and {output}, and return its mesh, or why it failed and what it said last."""
-    with tempfile.TemporaryDirectory(prefix="sobolev-batch-", ignore_cleanup_errors=True) as scratch:
-        folder = Path(scratch)
+    """Run a program on files {input} and {output}, and return its mesh, or why it failed and what it said last.
+
+    It ends with this process at the latest.
+    """
+    with ExitStack() as stack:
+        try:
+            scratch = tempfile.TemporaryDirectory(prefix="sobolev-batch-", ignore_cleanup_errors=True)
+            folder = Path(stack.enter_context(scratch))
+            # Without names, so that the program can neither remove nor replace them.
+            out, err = (stack.enter_context(tempfile.TemporaryFile()) for _ in range(2))
+            # In a session of its own, so that what kills this process does not kill it too.
+            watching = ["sh", "-c", _GUARD, "sh", str(folder)]
+            guard = subprocess.Popen(watching, stdin=subprocess.PIPE, bufsize=0, start_new_session=True)  # noqa: S603
+            stack.enter_context(guard)
+        except OSError as error:
+            return Cost(), f"it has no scratch folder: {one_line(error)}; set TMPDIR to one that can be written"
         files = {name: folder / f"{name}{suffix}" for name, suffix in zip((INPUT, OUTPUT), suffixes, strict=True)}
         try:
             _write(mesh, files[INPUT])
         except InputError as error:
             return Cost(), f"its input cannot be written: {error}"
         filled = [PLACEHOLDER.sub(lambda found: str(files.get(found[1], found[0])), word) for word in words]
-        said = folder / "stdout.txt", folder / "stderr.txt"
         started = time.perf_counter()
-        with said[0].open("wb") as out, said[1].open("wb") as err:
-            try:
-                process = subprocess.Popen(  # noqa: S603 -- the user permitted it
-                    filled,
-                    cwd=folder,
-                    env=environment(),
-                    stdin=subprocess.DEVNULL,
-                    stdout=out,
-                    stderr=err,
-                    start_new_session=True,
-                )
-            except (OSError, ValueError) as error:
-                return Cost(), f"{words[0]} cannot be started on this machine: {one_line(error)}"
-        problem, cpu_seconds, peak_bytes = _awaited(process, folder, timeout, largest_output)
+        try:
+            process = subprocess.Popen(  # noqa: S603 -- the user permitted it
+                filled,
+                cwd=folder,
+                env=environment(),
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=err,
+                start_new_session=True,
+            )
+        except (OSError, ValueError) as error:
+            return Cost(), f"{words[0]} cannot be started on this machine: {one_line(error)}"
+        if guard.stdin is not None:
+            guard.stdin.write(b"%d\n" % process.pid)
+        problem, cpu_seconds, peak_bytes = _awaited(process, folder, (out, err), timeout, largest_output)
         status = process.returncode
         cost = Cost(time.perf_counter() - started, cpu_seconds, peak_bytes, status)
         if not problem and status:
             name = signal.Signals(-status).name if status < 0 else ""
             problem = f"{words[0]} was ended by {name}" if name else f"{words[0]} ended with exit status {status}"
-        if not problem and not files[OUTPUT].is_file():
+        if not problem and not os.path.isfile(files[OUTPUT]):
             problem = f"{words[0]} wrote no mesh (output{suffixes[1]})"
         if not problem:
             try:
                 return cost, _read(files[OUTPUT])
             except InputError as error:
                 problem = f"{words[0]} wrote no mesh: {str(error).removeprefix(f'{files[OUTPUT]}: ')}"
-        return cost, ": ".join(filter(None, (problem, _tail(*said[::-1]))))
+        return cost, ": ".join(filter(None, (problem, _tail(err, out))))
 
 
 def _awaited(
-    process: subprocess.Popen[bytes], folder: Path, timeout: float, largest_output: int
+    process: subprocess.Popen[bytes], folder: Path, said: tuple[IO[bytes], ...], timeout: float, largest_output: int
 ) -> tuple[str, float, float]:
     """Wait for a program, and return why it was ended before its time, its processor time and its largest memory."""
     problem, pause, deadline, peak_bytes = "", _FIRST_PAUSE, time.monotonic() + timeout, float("nan")
@@ -179,7 +194,7 @@ def _awaited(
             peak_bytes = float(np.fmax(peak_bytes, _resident_bytes(process.pid)))
             if time.monotonic() > deadline:
                 problem = f"it was ended after {timeout:g} s, its timeout"
-            elif (written := _bytes_below(folder)) > largest_output:
+            elif (written := _bytes_below(folder) + sum(map(_size, said))) > largest_output:
                 problem = f"it was ended after it had written {format_bytes(written)}"
             if problem:
                 _end(process)
@@ -215,12 +230,15 @@ def _bytes_below(folder: Path) -> int:
     return total
 
 
-def _tail(*files: Path) -> str:
+def _size(file: IO[bytes]) -> int:
+    return os.fstat(file.fileno()).st_size
+
+
+def _tail(*files: IO[bytes]) -> str:
     """Return the end of the first file that says something, on one line."""
     for file in files:
-        with file.open("rb") as opened:
-            opened.seek(max(0, file.stat().st_size - 4 * _LONGEST_TAIL))
-            text = " ".join(opened.read().decode(errors="replace").split())
+        file.seek(max(0, _size(file) - 4 * _LONGEST_TAIL))
+        text = " ".join(file.read(4 * _LONGEST_TAIL).decode(errors="replace").split())
         if text:
             return text if len(text) <= _LONGEST_TAIL else f"... {text[-_LONGEST_TAIL:]}"
     return ""

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 import sobolev_batch as sb
@@ -16,6 +20,7 @@ from sobolev_batch.surfaces.sources.mesh_cache import MeshCache
 from sobolev_batch.surfaces.sources.registry import Member, parse_source
 from tests.support.commands import call
 from tests.support.members import BALL, listed, loaded
+from tests.support.processes import wait_until
 from tests.support.studies import balls, small_table
 
 COPY: dict[str, Any] = {"source": "command", "mesh": BALL, "command": ["cp", "{input}", "{output}"]}
@@ -130,6 +135,8 @@ def test_all_that_a_mesh_depends_on_is_in_its_fingerprint(tmp_path: Path) -> Non
         ("sleep 1000 & sleep 1000", r"it was ended after 0\.3 s, its timeout"),
         ("yes > flood", "it was ended after it had written"),
         ("yes", "it was ended after it had written"),
+        ("rm -r $PWD; echo gone >&2; exit 7", "sh ended with exit status 7: gone"),
+        ("rm -r $PWD; echo done", r"sh wrote no mesh \(output\.ply\): done"),
     ],
 )
 def test_a_program_that_fails_says_why(tmp_path: Path, command: str, reason: str) -> None:
@@ -141,6 +148,42 @@ def test_a_program_that_fails_says_why(tmp_path: Path, command: str, reason: str
     cost = member.cost()
     assert cost is not None
     assert cost.exit_status != 0 or "done" in command or "nonsense" in command
+
+
+@pytest.mark.process
+def test_a_program_ends_with_the_process_that_waits_for_it(tmp_path: Path) -> None:
+    script = f"echo $$ > {tmp_path / 'begun'}; mv {tmp_path / 'begun'} {tmp_path / 'number'}; sleep 1000 & sleep 1000"
+    run = (
+        "import sobolev_batch as sb; from sobolev_batch.surfaces.sources.mesh_cache import run_command; "
+        f"run_command(sb.shapes.icosphere(0), ['sh', '-c', {script!r}], ('.ply', '.ply'), 1000.0, 10**9)"
+    )
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    waiting = subprocess.Popen([sys.executable, "-c", run], env=os.environ | {"TMPDIR": str(scratch)})
+    wait_until((tmp_path / "number").exists)
+    assert len(list(scratch.iterdir())) == 1
+    waiting.kill()
+    waiting.wait()
+    wait_until(lambda: not list(scratch.iterdir()))
+    number = int((tmp_path / "number").read_text())
+    assert not psutil.pid_exists(number) or psutil.Process(number).status() == psutil.STATUS_ZOMBIE
+
+
+@pytest.mark.process
+def test_a_mesh_whose_files_changed_while_it_was_made_is_not_kept(tmp_path: Path) -> None:
+    (tmp_path / "copy.sh").write_text("cp $1 $2; echo >> $0")
+    table = {**COPY, "command": ["sh", "{folder}/copy.sh", "{input}", "{output}"]}
+    member = made(table, tmp_path / "kept", folder=tmp_path)[0]
+    with pytest.raises(sb.errors.MeshError, match="changed while it was made; run the study again"):
+        member.load()
+    assert not (tmp_path / "kept").exists()
+
+
+@pytest.mark.process
+def test_a_program_without_a_scratch_folder_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "gone"))
+    with pytest.raises(sb.errors.MeshError, match=r"no scratch folder: .*gone.*set TMPDIR"):
+        made(COPY, tmp_path)[0].load()
 
 
 @pytest.mark.process
