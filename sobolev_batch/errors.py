@@ -10,6 +10,9 @@ __all__ = [
     *("MeshError", "OrderError", "SobolevBatchError", "StoreError", "StudyError"),
 ]
 
+# Characters of another library's message that are worth keeping.
+_LONGEST = 2000
+
 
 class SobolevBatchError(Exception):
     """Base of every error that the package raises on purpose.
@@ -90,9 +93,10 @@ class ClusterError(SobolevBatchError):
 def one_line(error: BaseException) -> str:
     """Return the message of an error on one line, or the name of its type if it has none.
 
-    Line breaks of our own messages are those of names, and stay visible.
+    Line breaks of our own messages are those of names, and stay visible. Only the beginning of a long message of
+    another library is kept.
     """
-    message = str(error) if isinstance(error, SobolevBatchError) else " ".join(str(error).split())
+    message = str(error) if isinstance(error, SobolevBatchError) else " ".join(str(error)[:_LONGEST].split())
     return visible(message) or type(error).__name__
 
 

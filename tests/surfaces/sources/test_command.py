@@ -203,11 +203,19 @@ def test_formats_of_other_remeshers(tmp_path: Path) -> None:
         made({**COPY, "input": ".nope"}, tmp_path)[0].load()
 
 
-def test_a_function_that_raises_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (RuntimeError("no convergence"), "broken: RuntimeError: no convergence$"),
+        (SystemExit(3), "broken: SystemExit: 3$"),
+        (RuntimeError("long " * 10**6), "^.{1000,3000}$"),
+    ],
+)
+def test_a_function_that_raises_is_named(tmp_path: Path, error: BaseException, reason: str) -> None:
     def broken(mesh: sb.Mesh) -> sb.Mesh:
-        raise RuntimeError("no convergence")
+        raise error
 
-    with pytest.raises(sb.errors.MeshError, match="broken: RuntimeError: no convergence"):
+    with pytest.raises(sb.errors.MeshError, match=reason):
         made({**HALVED, "function": broken}, tmp_path)[0].load()
 
 
