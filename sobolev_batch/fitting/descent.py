@@ -144,7 +144,6 @@ class Smoothing:
     doi:10.1145/3478513.3480501.
 
     Attributes:
-        graph: Graph Laplacian of all vertices.
         free: Indices of the vertices that may move.
         amount: λ; zero for steps without smoothing.
     """

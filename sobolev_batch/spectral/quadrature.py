@@ -238,7 +238,6 @@ class RuleUse:
     """Triangles of a mesh that share a rule, each to be split into 4^splits similar ones.
 
     Attributes:
-        splits: Number of times that edges are halved.
         members: uint32 (k,), the triangles.
         path: Quarter of the quarter ... of each triangle that is meant; empty for the whole triangle.
     """

@@ -60,7 +60,6 @@ class Reducer:
     """The input that all tiles of one reduction share.
 
     Attributes:
-        blocks: Blocks of the lattice, one chunk each.
         reference: Row of the reference, or None if it has no field.
         areas: Area of every row's surface (rows,), NaN without a field.
         errors: Norms of the fields' own errors (orders, rows), likewise.

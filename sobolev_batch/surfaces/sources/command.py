@@ -295,7 +295,6 @@ class RemeshedMember(Member):
     """A mesh that a remesher makes, unless it is kept.
 
     Attributes:
-        make: Function that makes it of the original.
         identity: The remesher, its parameters and its version.
         files: Files that the remesher reads besides, by their names in the command.
         cache: Where it is kept; None if nothing may run.

@@ -63,9 +63,6 @@ class MeshCache:
     """A folder of meshes that programs or functions made, and whether these may run.
 
     A mesh is the file DIGEST.ply; DIGEST.json beside it says what made it and what that took.
-
-    Attributes:
-        may_run: True if what is not there may be made.
     """
 
     folder: Folder
