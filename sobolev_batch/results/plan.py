@@ -178,7 +178,7 @@ def _study_lines(plan: Plan) -> Iterator[tuple[str, str]]:
         allowed = f"{format_bytes(accuracy.allowed_bytes)} for a transform, M <= {accuracy.largest_intervals}"
         yield "accuracy", f"rtol {accuracy.rtol:g} of every distance to {plan.reference}; {allowed}"
         yield from (("chosen", reason) for reason in plan.choice.reasons)
-        yield "transform", f"{plan.choice.dtype}, eps and quadrature for each surface from its distance"
+        yield "transform", f"{transform.dtype}, eps and quadrature for each surface from its distance"
     yield "backend", study.backend
     yield from (("command", command) for command in study.commands)
     if study.commands:

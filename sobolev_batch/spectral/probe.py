@@ -189,7 +189,7 @@ def probe_block(
 
 def needs_probe(surface: Surface, settings: TransformSettings) -> bool:
     """Tell whether a field can differ noticeably from the exact transform; closed forms in double precision cannot."""
-    return not kind_of(surface).is_closed_form or settings.dtype == "complex64"
+    return not kind_of(surface).is_closed_form or settings.stored == "complex64"
 
 
 def estimate(samples: Sequence[Sample], orders: Sequence[float]) -> Reals:

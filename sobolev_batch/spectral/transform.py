@@ -59,12 +59,14 @@ class TransformSettings:
         quadrature: Rules for triangles: see `fixed_rule`.
         tolerance: Largest error of the rule on any one triangle, relative to its area, or of the nodes of a
             parametrised surface, relative to the whole area; eps by default.
+        stored: Dtype that values are rounded to once they are computed; by default that of the computation.
     """
 
     eps: float
     dtype: ComplexDtype
     quadrature: str | int
     tolerance: float
+    stored: ComplexDtype
 
     def __init__(
         self,
@@ -72,6 +74,7 @@ class TransformSettings:
         dtype: ComplexDtype = "complex128",
         quadrature: str | int = "auto",
         tolerance: float | None = None,
+        stored: ComplexDtype | None = None,
     ) -> None:
         if dtype not in get_args(ComplexDtype):
             raise InputError(f"dtype must be 'complex128' or 'complex64', found {dtype!r}")
@@ -83,6 +86,7 @@ class TransformSettings:
         object.__setattr__(self, "dtype", dtype)
         object.__setattr__(self, "quadrature", quadrature)
         object.__setattr__(self, "tolerance", eps if tolerance is None else tolerance)
+        object.__setattr__(self, "stored", stored or dtype)
 
     def plan(self, surface: Surface, lattice: FrequencyLattice) -> SurfaceKind:
         """Return a surface with quadrature points for a lattice."""
@@ -215,7 +219,7 @@ def transform_block(
     if isinstance(lattice, Lattice):
         require_inside(surface, lattice)
     if kind.is_closed_form:
-        return Transformed(_closed_form(kind, lattice, block, settings.dtype), 0, "closed form")
+        return Transformed(_closed_form(kind, lattice, block, settings.stored), 0, "closed form")
     plan = plan or settings.plan(surface, lattice)
     whole = NufftSpec(block.shape, settings.eps, settings.dtype, threads=execution.threads, batch=execution.batch)
     low, high = surface.extent.box
@@ -234,7 +238,7 @@ def transform_block(
 
     def compute(backend: Backend, spec: NufftSpec) -> Transformed:
         values, points = transform_points(plan.batches(spec.batch, backend), lattice, block, spec, backend)
-        return Transformed(backend.download(values), points, backend.library)
+        return Transformed(backend.download(values.astype(settings.stored, copy=False)), points, backend.library)
 
     # Before the GPU is tried: the memory must be enough for the processor that may have to step in.
     spec = whole if execution.allowed_bytes is None else fitting(CPU.costs, execution.allowed_bytes)[0]

@@ -15,7 +15,7 @@ from typing import Any, TypeGuard
 from sobolev_batch.errors import StoreError
 
 # Version of the layout that docs/store.md describes.
-SCHEMA_VERSION = 9
+SCHEMA_VERSION = 10
 
 Document = dict[str, Any]
 

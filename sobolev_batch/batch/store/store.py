@@ -137,7 +137,8 @@ class Store:
     def choice(self) -> LatticeChoice:
         """Return the lattice of all fields, with the octaves beside it."""
         study = self.attributes()["study"]
-        given = {**study["lattice"], "dtype": study["dtype"], "closest": (), "reasons": (), "basis": ""}
+        dtypes = {"dtype": study["dtype"], "transform_dtype": study["dtype"]}
+        given = {**study["lattice"], **dtypes, "closest": (), "reasons": (), "basis": ""}
         return LatticeChoice.from_table(study.get("choice") or given, study.get("octaves"))
 
     @property

@@ -60,11 +60,16 @@ _PILOT_FRACTION = 0.7
 _MOST_RETRIES = 2
 
 
+_DTYPES = ("dtype", "transform_dtype")
+
+
 @dataclass(frozen=True)
 class LatticeChoice:
     """Lattice and dtype of all fields of a study.
 
     Attributes:
+        dtype: Dtype of the fields in the store.
+        transform_dtype: Dtype in which they are computed.
         closest: Smallest distance to the reference among the pilots, for each order; empty if the lattice was given.
         reasons: Reasons of the choice, one line each.
         basis: Digest of the data that the choice was made from; empty if the lattice was given.
@@ -73,6 +78,7 @@ class LatticeChoice:
 
     lattice: Lattice
     dtype: ComplexDtype
+    transform_dtype: ComplexDtype
     closest: tuple[float, ...] = ()
     reasons: tuple[str, ...] = ()
     basis: str = ""
@@ -85,7 +91,7 @@ class LatticeChoice:
 
     def to_table(self) -> dict[str, Any]:
         """Return the choice as a table, without the octaves."""
-        others = {name: getattr(self, name) for name in ("dtype", "closest", "reasons", "basis")}
+        others = {name: getattr(self, name) for name in (*_DTYPES, "closest", "reasons", "basis")}
         return {"xi_max": self.lattice.xi_max, "M": self.lattice.M, **others}
 
     @classmethod
@@ -93,7 +99,9 @@ class LatticeChoice:
         """Return the choice that a table holds, with its `octaves`."""
         lattice = Lattice(table["xi_max"], table["M"])
         tail = None if octaves is None else TailSampling.from_table(octaves)
-        return cls(lattice, table["dtype"], tuple(table["closest"]), tuple(table["reasons"]), table["basis"], tail)
+        dtype, transform_dtype = (table[name] for name in _DTYPES)
+        reasons = tuple(table["closest"]), tuple(table["reasons"]), table["basis"]
+        return cls(lattice, dtype, transform_dtype, *reasons, tail)
 
     def grown(self, distances: NormEstimate, orders: Sequence[float], accuracy: Accuracy) -> LatticeChoice | None:
         """Return a choice of more frequencies for distances (orders, meshes) that miss an accuracy; NaN do not count.
@@ -415,10 +423,16 @@ def _choice(
     problem: Problem,
     tail: TailSampling | None,
 ) -> LatticeChoice:
-    """Return a choice in the dtype that was requested, or in single precision where no pair needs more."""
-    dtype = dtype or ("complex128" if "complex128" in needed else "complex64")
+    """Return a choice in the dtype that was requested, or in single precision where no pair needs more.
+
+    Rounding a value once takes fewer digits than a transform in single precision.
+    """
+    computed = dtype or ("complex128" if "complex128" in needed else "complex64")
+    target = error_target(closest, problem.orders, problem.accuracy, problem.area)
+    stored = dtype or ("complex64" if problem.permits_single_storage(lattice, target) else computed)
     distances = ", ".join(
         f"{value:.2g} at order {order:g}" for value, order in zip(closest.tolist(), problem.orders, strict=True)
     )
-    reason = f"{dtype} for the smallest distance of a pilot, about {distances}"
-    return LatticeChoice(lattice, dtype, tuple(closest.tolist()), (*reasons, reason), tail=tail)
+    dtypes = computed if stored == computed else f"{computed}, stored as {stored},"
+    reason = f"{dtypes} for the smallest distance of a pilot, about {distances}"
+    return LatticeChoice(lattice, stored, computed, tuple(closest.tolist()), (*reasons, reason), tail=tail)

@@ -75,8 +75,10 @@ class Plan:
     @property
     def transform(self) -> TransformSettings:
         """Settings of the transforms. If an accuracy is requested, eps and tolerance are chosen for each field."""
-        given = self.study.transform
-        return given if self.study.accuracy is None else TransformSettings(None, self.choice.dtype, given.quadrature)
+        given, choice = self.study.transform, self.choice
+        if self.study.accuracy is None:
+            return given
+        return TransformSettings(None, choice.transform_dtype, given.quadrature, stored=choice.dtype)
 
     @cached_property
     def blocks(self) -> tuple[Block, ...]:
@@ -160,7 +162,7 @@ def _lattice_choice(
 ) -> LatticeChoice:
     if study.lattice is not None:
         tail = TailSampling.usual(study.lattice.xi_max, study.octaves, [surface]) if study.octaves else None
-        return LatticeChoice(study.lattice, study.transform.dtype, tail=tail)
+        return LatticeChoice(study.lattice, study.transform.dtype, study.transform.dtype, tail=tail)
     if study.accuracy is None:
         raise ValueError("a study has a lattice or an accuracy")
     basis = choice_basis(study, study.accuracy, similarity, members[reference][1].fingerprint())
@@ -234,7 +236,7 @@ def _key(study: Study, similarity: Similarity, choice: LatticeChoice, fingerprin
         "surface": fingerprint,
         "similarity": [similarity.scale, *similarity.origin],
         "lattice": [choice.lattice.xi_max, choice.lattice.M],
-        "transform": [study.transform.eps, choice.dtype, study.transform.quadrature],
+        "transform": [study.transform.eps, choice.transform_dtype, choice.dtype, study.transform.quadrature],
         "numerics": NUMERICS_VERSION,
         # The target of a field follows from its distance to the reference.
         "accuracy": choice.basis,

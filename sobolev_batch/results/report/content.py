@@ -238,7 +238,8 @@ def _settings(attributes: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
             f"{len(octaves['octaves'])} beyond the lattice, at random frequencies up to {highest:.4g} cycles per unit "
             f"length: wavelengths down to {1 / highest:.4g} units",
         )
-    dtype = {"complex128": "double", "complex64": "single"}[study["dtype"]]
+    computed = (study["choice"] or {"transform_dtype": study["dtype"]})["transform_dtype"]
+    dtype = {"complex128": "double", "complex64": "single"}[computed]
     eps = "" if study["eps"] is None else f", nonuniform FFT accurate to {study['eps']:g}"
     yield "arithmetic", f"{dtype} precision{eps}"
     scale, origin = attributes["similarity"]["scale"], attributes["similarity"]["origin"]

@@ -17,7 +17,7 @@ from sobolev_batch.spectral.fields import USUAL_DEGREE, Field, field_for
 from sobolev_batch.spectral.lattice import Lattice, SobolevWeights, shell_sums
 from sobolev_batch.spectral.octaves.sampling import OctaveSampling
 from sobolev_batch.spectral.octaves.values import OctaveValues
-from sobolev_batch.spectral.probe import Sample, draws_for, needs_probe
+from sobolev_batch.spectral.probe import Sample, draws_for, estimate, needs_probe
 from sobolev_batch.spectral.transform import ErrorTarget, Execution, TransformSettings, permits_single
 from sobolev_batch.surfaces.shapes.mesh import Mesh, shared_triangles
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent, Reals, Surface, centering
@@ -29,6 +29,8 @@ ESTIMATE_CAUTION = 0.7
 # No field is exact to less than this fraction of its area. Near-duplicates are that close, and have no
 # relative accuracy.
 _ROUNDING = 1e-13
+# What rounding to single precision changes a value by, relative to it, and the fraction of an error that it may take.
+_STORED_ROUNDING, _STORED_FRACTION = 6e-8, 0.1
 # Surfaces whose common centre is no further from the origin, relative to their extent, stay where they are.
 OFF_CENTER = 1e-3
 _PAIR = 2
@@ -112,6 +114,11 @@ class Problem:
         """Return the cheapest dtype that meets a target."""
         single = all(permits_single(surface, lattice, target) for surface in self.surfaces)
         return "complex64" if single else "complex128"
+
+    def permits_single_storage(self, lattice: Lattice, target: ErrorTarget) -> bool:
+        """Tell whether fields meet a target once each value is rounded to single precision."""
+        norms = [estimate([sample], self.orders) for sample in self.samples(lattice)]
+        return bool(np.all(_STORED_ROUNDING * np.array(norms) <= _STORED_FRACTION * np.array(target.norms)))
 
     def fields(self, lattice: Lattice, samples: Samples, target: ErrorTarget, dtype: ComplexDtype) -> tuple[Field, ...]:
         """Return the fields of all surfaces, each with an error within a target."""

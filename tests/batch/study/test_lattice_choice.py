@@ -51,6 +51,7 @@ def asking(rtol: float = RTOL, **changes: Any) -> sb.Study:
 def test_every_distance_to_the_reference_is_as_accurate_as_asked(client: Client, store_path: Path) -> None:
     sb.run(asking(), store_path, client)
     tree = sb.open_store(store_path)
+    assert tree["fourier"]["fourier"].dtype == np.complex64
     convergence = tree["convergence"].to_dataset().drop_sel(mesh="reference")
     assert convergence["within"].all()
     assert (convergence["error"] <= RTOL * convergence["distance"]).all()
@@ -61,6 +62,17 @@ def test_every_distance_to_the_reference_is_as_accurate_as_asked(client: Client,
         assert (gap <= here["error"] + truth["error"].values).all()
     assert "!" not in format_table(tree).split("marked !")[0]
     assert f"at most {RTOL:g} of each distance" in format_table(tree)
+
+
+@pytest.mark.parametrize(
+    ("rtol", "dtypes"),
+    [(1e-2, ("complex64", "complex64")), (RTOL, ("complex64", "complex128")), (1e-5, ("complex128", "complex128"))],
+)
+def test_fields_are_stored_in_single_precision_where_that_loses_no_digit(rtol: float, dtypes: tuple[str, str]) -> None:
+    choice = make_plan(asking(rtol, norm={"orders": [-4.0]})).choice
+    assert (choice.dtype, choice.transform_dtype) == dtypes
+    asked = make_plan(asking(rtol, norm={"orders": [-4.0]}, transform={"dtype": "complex128"})).choice
+    assert (asked.dtype, asked.transform_dtype) == ("complex128", "complex128")
 
 
 def test_the_choice_is_kept_when_meshes_are_added(client: Client, store_path: Path, tmp_path: Path) -> None:
@@ -123,7 +135,7 @@ def test_what_cannot_be_met_is_refused_before_anything_is_written(client: Client
 
 
 def test_growth_goes_by_what_is_short() -> None:
-    choice = LatticeChoice(sb.Lattice(3.0, 32), "complex128", (1.0,), (), "basis")
+    choice = LatticeChoice(sb.Lattice(3.0, 32), "complex64", "complex128", (1.0,), (), "basis")
 
     def grown(truncation: float, aliasing: float, unknown: float = 0.0, most: float = 1e9) -> LatticeChoice | None:
         parts = [np.array([[value]]) for value in (1.0, truncation, aliasing, unknown)]
