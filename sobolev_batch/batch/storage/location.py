@@ -10,6 +10,7 @@ the store. So no link below its folder is followed: checksums would reveal a wro
 from __future__ import annotations
 
 import asyncio
+import errno
 import inspect
 import os
 import re
@@ -211,6 +212,8 @@ class Location:
             if not self.scheme and not isinstance(error, OSError):
                 raise  # a defect
             text = " ".join((getattr(error, "strerror", None) or str(error) or type(error).__name__).split())
+            if getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT):
+                text += "; make room there"
             if self.scheme:
                 # The address of a server may contain a password.
                 text = self._explain(error, re.sub(r"//[^/\s]*@", "//", text))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import pickle
 import shutil
@@ -94,6 +95,7 @@ def test_documents_of_a_folder_and_of_a_url(place: str, tmp_path: Path) -> None:
         (PermissionError("Access\nDenied"), r"access is denied \(Access Denied\); check the credentials"),
         (TimeoutError(), "nothing answers there within"),
         (FileNotFoundError("b"), r"there is no bucket 'bucket' \(b\)"),
+        (OSError(errno.ENOSPC, "No space left"), "No space left; make room there$"),
         (ZeroDivisionError("of a driver"), "of a driver"),
     ],
 )
