@@ -228,6 +228,13 @@ def test_compare_aligns_first(folder: Path) -> None:
     assert re.search(r"^moved: rotated by (36\.8699|143\.13|180) degrees", shown, re.M)
     # Which sentence follows depends on rounding.
     assert shown.index("moved: ") < shown.index("turned.off ")
+    # Rounding is no rotation, and without symmetry no turn serves as well.
+    coarse = sb.shapes.icosphere(1)
+    lopsided = coarse.vertices * (1 + coarse.vertices @ [[0.3], [0.2], [0.1]])
+    for name, shift in (("lopsided", 0.0), ("shifted", 0.25)):
+        sb.write_mesh(sb.Mesh(np.add(lopsided, [shift, 0.0, 0.0]), coarse.triangles), folder / f"{name}.off")
+    shown = output("compare", "shifted.off", "lopsided.off", "--order=-4", "--align", folder=folder)
+    assert "moved: shifted by (-0.25 0 0)\n" in shown
     found = document("compare", "turned.off", "still.off", "--order=-4", "--align", folder=folder)
     assert found["before"] > 0.1
     assert found["orders"][0]["relative"] < 1e-9

@@ -204,11 +204,16 @@ def compare_command(
 
 def _motion_text(motion: Reals) -> str:
     """Return a rigid motion (4, 4) in words, with its numbers."""
+    import numpy as np
     from scipy.spatial.transform import Rotation
 
     vector = Rotation.from_matrix(motion[:3, :3]).as_rotvec(degrees=True)
     angle = math.hypot(*vector)
-    axis, shift = (" ".join(f"{x:.6g}" for x in numbers) for numbers in (vector / (angle or 1.0), motion[:3, 3]))
+    # What rounding makes of zero would be read as a motion.
+    moved = np.where(np.abs(motion[:3, 3]) < 1e-9 * np.abs(motion[:3, 3]).max(), 0.0, motion[:3, 3])
+    axis, shift = (" ".join(f"{x:.6g}" for x in numbers) for numbers in (vector / (angle or 1.0), moved))
+    if angle < 1e-9:
+        return f"moved: shifted by ({shift})"
     return f"moved: rotated by {angle:.6g} degrees around ({axis}) through the origin, then shifted by ({shift})"
 
 

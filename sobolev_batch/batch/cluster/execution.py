@@ -214,7 +214,8 @@ class Cluster:
     def _outcomes(self, futures: Sequence[Future]) -> list[Any]:
         """Fetch the results of futures that have ended, or their exceptions, all at once."""
         lost = (
-            f"the scheduler at {self.client.scheduler.address} was lost; the same command goes on from what is stored"
+            f"the scheduler at {self.client.scheduler.address} was lost; the same command goes on from what is stored, "
+            "after `sobolev-batch unlock` where it was submit"
         )
         if self.client.status != "running" or any(future.cancelled() for future in futures):
             raise ClusterError(lost)
