@@ -233,19 +233,22 @@ def format_table(
     for name, frame in frames.items():
         tree = trees[name]
         sections += [prose([f"Object {name}"], style)] if name else []
-        sections += _tables(tree, frame, style)
+        sections += _tables(tree, frame, style, x)
         computed = order_note(tree, frame.attrs["computed"]) if "computed" in frame.attrs else []
         doubts = [f"{mesh}: {doubt}" for mesh, doubt in placement_doubts(tree).items()]
         sections += [prose(lines, style) for lines in (computed, [*_failures(tree, frame), *doubts]) if lines]
     return "\n\n".join([*sections, prose(_notes([trees[name] for name in frames], list(frames.values()), x), style)])
 
 
-def _tables(tree: xr.DataTree, frame: pd.DataFrame, style: Format) -> Iterator[str]:
+def _tables(tree: xr.DataTree, frame: pd.DataFrame, style: Format, x: str) -> Iterator[str]:
     """Yield the table of each order with its caption, and that of other distances where there are any."""
     marked = with_remarks(frame)
+    columns = list(_COLUMNS)
+    if x not in {column.name for column in columns}:
+        columns.insert(2, Column(x, x, "{:.4g}".format))
     for order, rows in marked.groupby("order", sort=False):
         caption = f"Sobolev distance of order {order:g} to {frame.attrs['reference']}"
-        yield section(caption, [column_table(_COLUMNS, rows.to_dict(orient="records"), style)], [], style)
+        yield section(caption, [column_table(columns, rows.to_dict(orient="records"), style)], [], style)
     if has_proximity(tree):
         once = marked[marked["order"] == marked["order"].iloc[0]]
         others = column_table((_MESH, *_metric_columns(tree)), once.to_dict(orient="records"), style)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 import sobolev_batch as sb
 from sobolev_batch.errors import StudyError
+from sobolev_batch.results.tables.convergence import format_table
 from sobolev_batch.surfaces.sources.files import FileMember, FileSource, read_mesh_list
 from tests.support.studies import small_table
 
@@ -111,6 +113,8 @@ def test_metadata_become_coordinates_and_sizes_of_rates(tmp_path: Path) -> None:
     by_effort = sb.table("memory://mesh-lists.zarr", -3, x="effort")
     fall = np.log(by_effort["distance"][0] / by_effort["distance"][1]) / np.log(4)
     assert by_effort["rate"][1] == pytest.approx(fall)
+    shown = format_table("memory://mesh-lists.zarr", orders=[-3.0], x="effort")
+    assert re.search(r"^mesh +triangles +effort .*\n.*\n.*\nf/1 +80 +4 ", shown, re.M)
     with pytest.raises(sb.errors.InputError, match=r"known are edge_length, triangles, vertices, seconds, effort$"):
         sb.table("memory://mesh-lists.zarr", x="tool")
 
