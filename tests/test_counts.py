@@ -13,7 +13,7 @@ import finufft
 import pytest
 
 import sobolev_batch as sb
-from sobolev_batch.spectral import exact, kinds
+from sobolev_batch.spectral import kinds
 from tests.support.studies import SMALL_LATTICE, small_table
 
 COARSE, FINE, SPHERE = sb.shapes.icosphere(1), sb.shapes.icosphere(2), sb.shapes.Sphere()
@@ -114,17 +114,17 @@ def work_of(call: Callable[[], object]) -> dict[str, int]:
             events.extend((("transforms", 1), ("points", self.point_count)))
             return super().execute(*arguments, **settings)
 
-    def counting(exact: Callable[..., Any]) -> Callable[..., Any]:
-        def transform(mesh: sb.Mesh, frequencies: Any, *backend: Any) -> Any:
+    def counting(values: Callable[..., Any]) -> Callable[..., Any]:
+        def transform(mesh: sb.Mesh, frequencies: Any, *others: Any) -> Any:
             events.append(("exact", len(mesh.triangles) * len(frequencies)))
-            return exact(mesh, frequencies, *backend)
+            return values(mesh, frequencies, *others)
 
         return transform
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(finufft, "Plan", Plan)
-        for module in (kinds, exact):
-            patch.setattr(module, "exact_transform", counting(module.exact_transform))
+        for name in ("exact_transform", "sampled_transform"):
+            patch.setattr(kinds, name, counting(getattr(kinds, name)))
         call()
     return {name: sum(count for kind, count in events if kind == name) for name in ("transforms", "points", "exact")}
 
