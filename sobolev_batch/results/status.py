@@ -205,7 +205,9 @@ class Status:
 
     def _run_lines(self, run: RunRecord) -> Iterator[str]:
         start = f"by {run.driver}, begun {run.started}"
-        age = f"{duration(round(self.silence_seconds))} ago"
+        is_ahead = self.silence_seconds < -LOST_AFTER_SECONDS
+        direction = "ahead of the clock here" if is_ahead else "ago"
+        age = f"{duration(round(abs(self.silence_seconds)))} {direction}"
         store = self.run_store or self.store
         if run.state == "submitted":
             yield f"submitted {age}, no worker has taken it up yet; {start}"
@@ -215,6 +217,8 @@ class Status:
             yield f"running: {run.stage or _PLANNING}; {start}, last sign of life {age}"
             if run.error:
                 yield run.error
+            if is_ahead:
+                yield f"whether it goes on is unknown; if it is gone: sobolev-batch unlock {store} --force"
             if self.lost:
                 yield "its process is probably gone; run or submit the study again, and it continues from the store"
                 yield f"if the store turns out to be locked: sobolev-batch unlock {store}"

@@ -18,7 +18,7 @@ from uuid import uuid4
 import pytest
 from distributed import Client
 
-from sobolev_batch import Study, run, unlock
+from sobolev_batch import Study, run, status, unlock
 from sobolev_batch.batch import run as run_module
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.storage.location import Location
@@ -137,7 +137,14 @@ def test_the_lock_of_another_machine_is_unlocked_by_hand_unless_its_run_gave_a_s
     there.write_run(replace(latest, driver="process 12 on far.example, cluster c", state="running", seen=utc_now()))
     with pytest.raises(LockError, match=r"process 12 on far\.example was alive \d+ s ago"):
         unlock(store_path)
+    there.write_run(replace(latest, state="running", started="2999-01-01T00:00:00Z", seen="2999-01-01T00:00:00Z"))
+    assert "ahead of the clock here" in str(status(store_path))
+    assert "whether it goes on is unknown" in str(status(store_path))
     assert unlock(store_path, force=True) == ELSEWHERE
+    location.create(LOCK_KEY, replace(ELSEWHERE, since="2999-01-01T00:00:00Z").to_json())
+    with pytest.raises(LockError, match=r"process 12 on far\.example is \d+ s ahead of the clock here"):
+        unlock(store_path)
+    assert unlock(store_path, force=True) is not None
     # A lock that was just taken, before any sign of life; a store that cannot be read.
     (store_path / "zarr.json").write_text("")
     location.create(LOCK_KEY, replace(ELSEWHERE, since=utc_now()).to_json())

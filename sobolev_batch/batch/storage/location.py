@@ -212,6 +212,8 @@ class Location:
             if not self.scheme and not isinstance(error, OSError):
                 raise  # a defect
             text = " ".join((getattr(error, "strerror", None) or str(error) or type(error).__name__).split())
+            if not self.scheme and getattr(error, "filename", None):
+                text += f": {getattr(error, 'filename', None)}"
             if getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT):
                 text += "; make room there"
             if self.scheme:
@@ -323,8 +325,8 @@ def _files_below(folder: str | Path) -> Iterator[os.DirEntry[str]]:
     """Yield what lies below a folder and is no folder: in half of the time that os.walk takes for many small ones."""
     folders = [os.fspath(folder)]
     while folders:
-        # It may be removed meanwhile, or be no folder.
-        with suppress(OSError), os.scandir(folders.pop()) as entries:
+        # It may be removed meanwhile, or be no folder. What cannot be read is not missing.
+        with suppress(*_ABSENT), os.scandir(folders.pop()) as entries:
             for entry in entries:
                 if entry.is_dir(follow_symlinks=False):
                     folders.append(entry.path)

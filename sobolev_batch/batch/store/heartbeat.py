@@ -131,6 +131,11 @@ def unlock(store: str | Path | Location, *, force: bool = False) -> Lock | None:
     if not force and lock.holder_is_alive:
         raise LockError(f"{location}: {lock.driver} is alive; stop it, or unlock the store all the same by --force")
     silence = math.inf if force or lock.holder_is_gone else _silence_seconds(location, lock)
+    if silence < -LOST_AFTER_SECONDS:
+        raise LockError(
+            f"{location}: the last sign of life of {lock.driver} is {-silence:.0f} s ahead of the clock here, so its "
+            "age is unknown; stop it, or if it is gone, unlock the store by --force"
+        )
     if silence < LOST_AFTER_SECONDS:
         raise LockError(
             f"{location}: {lock.driver} was alive {max(silence, 0):.0f} s ago; stop it, or wait until it has been "

@@ -110,6 +110,15 @@ def test_reasons_in_one_line(error: Exception, reason: str) -> None:
             raise error
 
 
+def test_what_cannot_be_read_is_not_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(folder: str) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", folder)
+
+    monkeypatch.setattr(os, "scandir", refused)
+    with pytest.raises(StoreError, match=rf"the store cannot be read: Permission denied: {tmp_path}"):
+        Location(str(tmp_path)).sizes("")
+
+
 LEADS_OUT = "a link, which may lead out of the store"
 
 
