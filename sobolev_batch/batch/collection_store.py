@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.metadata import SCHEMA_VERSION
-from sobolev_batch.batch.store.store import COLLECTION, ROOT, Store
+from sobolev_batch.batch.store.store import COLLECTION, DIGEST, ROOT, Store, digest_of
 from sobolev_batch.batch.study.study import Study, StudyCollection
-from sobolev_batch.errors import InputError, StoreError
+from sobolev_batch.errors import DamageError, InputError, StoreError
 
 Result = TypeVar("Result")
 
@@ -33,26 +34,41 @@ class CollectionStore:
 
     @property
     def existing_stores(self) -> dict[str, Location]:
-        """Stores of the objects that have one, by name: none has until its reference was made."""
+        """Stores of the objects that have one, by name: none has until its reference was made.
+
+        A store that is another object's raises a DamageError.
+        """
         stores = {name: Store(place) for name, place in self.stores.items()}
-        return {name: store.location for name, store in stores.items() if store.exists() and not store.is_unfinished}
+        found = {name: store for name, store in stores.items() if store.exists() and not store.is_unfinished}
+        for name, store in found.items():
+            study = store.attributes()["study"]["name"]
+            if study != f"{self.name} {name}":
+                problem = f"it holds the study {study!r}, not that of the object {name!r}"
+                raise DamageError(f"{store.path}: {problem}; put the store of this object back, or remove it", problem)
+        return {name: store.location for name, store in found.items()}
 
     @classmethod
     def read(cls, location: Location) -> CollectionStore | None:
-        """Return the store of a collection at a location; None where there is none."""
+        """Return the store of a collection at a location, None where there is none; DamageError if it was altered."""
         try:
             table = json.loads(location.read(ROOT) or b"")["attributes"][COLLECTION]
-            return cls(location, table["title"], table["name"], tuple(table["objects"]), table["table"])
-        except (ValueError, TypeError, KeyError):
+        except (ValueError, TypeError, KeyError, RecursionError):
             # There is nothing, or the store of one study.
             return None
+        if not isinstance(table, dict) or table.pop(DIGEST, "") != digest_of(table):
+            problem = "the list of its objects is not what was written"
+            raise DamageError(f"{location}: {problem}; run the study again", problem)
+        return cls(location, table["title"], table["name"], tuple(table["objects"]), table["table"])
 
     @classmethod
     def prepared(cls, location: Location, collection: StudyCollection) -> CollectionStore:
         """Write down at a location which objects a collection has, and return its store."""
-        present = cls.read(location)
+        present = None
+        with suppress(DamageError):
+            present = cls.read(location)
         if present is None:
-            location.require_free()
+            # Where it is damaged, the stores of the objects are still there.
+            location.require_free({ROOT, *collection.studies})
         elif present.name != collection.name:
             raise StoreError(
                 f"{location}: it holds the store of another collection, {present.name!r}, not {collection.name!r}; "
@@ -65,6 +81,7 @@ class CollectionStore:
             "lacking": {name: list(methods) for name, methods in collection.lacking.items()},
             "table": dict(collection.table),
         }
+        entry[DIGEST] = digest_of(entry)
         attributes = {"title": collection.title, "schema_version": SCHEMA_VERSION, COLLECTION: entry}
         root = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
         location.write({ROOT: json.dumps(root).encode()})

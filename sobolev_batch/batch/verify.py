@@ -95,9 +95,10 @@ def verify(store: str | Path | Location, on_progress: Callable[[int, int], None]
     collection = CollectionStore.read(Location.parse(store))
     if collection is None:
         return _verify_study(store, on_progress)
+    existing = collection.existing_stores
     verified = {
         name: _verify_study(place, on_progress)
-        if Store(place).exists()
+        if name in existing
         else Verification(str(place), 0, 0, {}, {}, withdrawn=False)
         for name, place in collection.stores.items()
     }

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 import tomli_w
 import xarray as xr
@@ -71,6 +72,21 @@ def test_what_is_damaged_is_named_with_its_object(changeable: Path) -> None:
     ]
     assert damaged.startswith("b/ico/2: ")
     assert last == "1 surfaces and 0 arrays of tables are damaged; run the study again to repair it"
+
+
+def test_objects_that_were_altered_or_traded_are_damage(changeable: Path, client: Client) -> None:
+    before, root = sb.table(changeable), changeable / "zarr.json"
+    for damaged in ("", root.read_text().replace('"objects": ["a", ', '"objects": ["../a", ')):
+        root.write_text(damaged)
+        with pytest.raises(sb.errors.DamageError):
+            sb.table(changeable)
+        assert sb.run(collection([*balls(a=1.0), GONE, *balls(b=1.1)]), changeable, client).computed == ()
+        pd.testing.assert_frame_equal(sb.table(changeable), before)
+    for names in (("a", "other"), ("b", "a"), ("other", "b")):
+        (changeable / names[0]).rename(changeable / names[1])
+    for read in (sb.table, sb.verify):
+        with pytest.raises(sb.errors.DamageError, match="not that of the object 'a'"):
+            read(changeable)
 
 
 def test_tables_of_a_collection_are_those_of_its_objects(store: Path) -> None:

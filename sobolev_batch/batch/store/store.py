@@ -116,9 +116,9 @@ class Store:
             raise StoreError(f"{self.path}: it holds no store of a study")
         attributes: dict[str, Any] = self.documents[""].get("attributes", {})
         if COLLECTION in attributes:
-            names = ", ".join(attributes[COLLECTION].get("objects", ())[:3])
             raise StoreError(
-                f"{self.path}: the store of a collection; each of its objects has a store of its own below it: {names}"
+                f"{self.path}: the store of a collection; each of its objects has its own, {self.path}/NAME; "
+                "sobolev-batch status shows their names"
             )
         if self.is_unfinished:
             raise StoreError(
@@ -261,7 +261,7 @@ class Store:
             contents = pool.map(self.location.read, unknown, unknown.values())
             for key, content in zip(unknown, contents, strict=True):
                 self._hashes[key] = hashlib.sha256(content or b"").hexdigest()
-        return _digest_of([root, {key: self._hashes[key] for key in keys}])
+        return digest_of([root, {key: self._hashes[key] for key in keys}])
 
     def _forget(self, name: str) -> None:
         self._hashes = {key: value for key, value in self._hashes.items() if not key.startswith(f"{name}/")}
@@ -396,7 +396,7 @@ class Store:
         if table is None:
             return None
         digest = table.pop(DIGEST, "")
-        if digest != _digest_of(table):
+        if digest != digest_of(table):
             raise DamageError(f"{self.path}: the record of the latest run is damaged ({CHANGED}): {table}", CHANGED)
         return record_from_table(RunRecord, table, f"{self.path}: the record of the latest run")
 
@@ -404,7 +404,7 @@ class Store:
         """Replace the record of the latest run: an attribute of the group of records, in one key."""
         document = self.document(RECORDS)
         # Not remembered: consolidated metadata would tell readers of a run that ended long ago.
-        run = {**asdict(record), DIGEST: _digest_of(asdict(record))}
+        run = {**asdict(record), DIGEST: digest_of(asdict(record))}
         changed = {**document, "attributes": {**document.get("attributes", {}), _RUN: run}}
         self.location.write({f"{RECORDS}/{ROOT}": json.dumps(changed).encode()})
 
@@ -527,7 +527,7 @@ def _array_at(place: Place) -> str:
     return FIELD if len(place) == len(AXES) else OCTAVES
 
 
-def _digest_of(table: Any) -> str:
+def digest_of(table: Any) -> str:
     """Return the SHA-256 of a table, however its JSON is spelled."""
     return hashlib.sha256(json.dumps(table, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
