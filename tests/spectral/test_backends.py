@@ -382,7 +382,7 @@ def test_a_plan_that_cannot_be_made_leaves_nothing_behind_and_options_are_those_
         backends._require_device = lambda cupy: None
         backend = backends.Gpu.load()
         try:
-            backend.plan(backends.NufftSpec((8, 8, 8), 1e-9, oversampling=1.5))
+            backend._new_plan(backends.NufftSpec((8, 8, 8), 1e-9, oversampling=1.5), adjoint=False, method=0)
         except RuntimeError as error:
             print(error, backend.is_out_of_memory(error))
         from cufinufft._cufinufft import NufftOpts
