@@ -37,10 +37,11 @@ durations: $(READY)  ## run the tests and record the seconds of each file in tes
 coverage: $(READY)  ## reported errors against true ones, over hundreds of random pairs
 	$(BIN)/python -m tests.coverage
 
-soak: $(READY)  ## 2,000 meshes while processes are killed and the storage fails, 30 struck clusters, 1,000 damaged files; two to three hours
+soak: $(READY)  ## 2,000 meshes while processes are killed and the storage fails, 30 struck clusters, 1,000 damaged files, 510 mixed states; three hours
 	$(BIN)/python -m tests.soak --sequences 1 --meshes 2000 --strikes 40 --rate 0.05
 	$(BIN)/python -m tests.soak --sequences 30
 	$(BIN)/python -m tests.soak --corruptions 1000
+	$(BIN)/python -m tests.soak --mixed-states
 
 mutants: $(READY)  ## take out each guard of stores, batch and readers, and see whether a test fails; hours
 	$(BIN)/python -m tests.mutants
