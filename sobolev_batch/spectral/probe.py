@@ -182,7 +182,7 @@ def probe_block(
     offsets = draws.indices - block.start
     inside = np.all((offsets >= 0) & (offsets < block.shape), axis=1)
     draws = Draws(draws.indices[inside], draws.frequencies[inside], draws.scales[inside])
-    # A field is never as exact as that.
+    # What a fast sample is off by can only make the field look worse.
     exact = Sample.from_surface(surface, draws, backend, fast=True).exact
     probe = measure(draws, values[draws.places(block)], exact)
     change = settings.plan(surface, lattice).change

@@ -100,8 +100,8 @@ class LatticeChoice:
         lattice = Lattice(table["xi_max"], table["M"])
         tail = None if octaves is None else TailSampling.from_table(octaves)
         dtype, transform_dtype = (table[name] for name in _DTYPES)
-        reasons = tuple(table["closest"]), tuple(table["reasons"]), table["basis"]
-        return cls(lattice, dtype, transform_dtype, *reasons, tail)
+        closest, reasons = tuple(table["closest"]), tuple(table["reasons"])
+        return cls(lattice, dtype, transform_dtype, closest, reasons, table["basis"], tail)
 
     def grown(self, distances: NormEstimate, orders: Sequence[float], accuracy: Accuracy) -> LatticeChoice | None:
         """Return a choice of more frequencies for distances (orders, meshes) that miss an accuracy; NaN do not count.

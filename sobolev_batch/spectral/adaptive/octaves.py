@@ -166,7 +166,7 @@ class State:
 
     @cached_property
     def disagreements(self) -> Reals:
-        """How far each remainder is from what was measured beyond it, outside of both errors (remainders, orders)."""
+        """Gap of each remainder to what was measured beyond it, outside of both errors (remainders, orders)."""
         orders, disagreements = self.problem.orders, []
         for number, beyond in enumerate(self.remainders):
             sums = [octave.sums for octave in self.octaves[number:]]
