@@ -1,7 +1,7 @@
 """Make the pictures of docs/pictures anew: ``python -m benchmarks.pictures``, or ``make pictures``.
 
-Studies run into storage/, where finished ones are kept. Pictures of Spot the cow need a folder with spot_23k.obj and
-spot_1k7.obj; without it they are skipped. The file digests.json has a digest of what each picture was drawn from, which
+Studies run into storage/, where finished ones are kept. Pictures of Spot the cow need a folder with spot_23k.obj;
+without it they are skipped. The file digests.json has a digest of what each picture was drawn from, which
 tests/test_pictures.py compares: the study, and the code that draws, without its comments and docstrings.
 """
 
@@ -195,16 +195,6 @@ def _draw_one_per_cent(meshes: Path, path: Path) -> None:
         _draw_witnesses(store, Path(made), ["decimated/*", "noisy/*", "duplicated/*"], -2.0, "common", path)
 
 
-def _draw_two_cows(meshes: Path, path: Path) -> None:
-    study = _cow_study(
-        "spot",
-        [-4.0],
-        {"name": "given", "source": "files", "paths": ["spot_1k7.obj"]},
-        {"name": "decimated", "source": "decimate", "mesh": "cow", "triangles": [1000]},
-    )
-    _draw_witnesses(_store(study, meshes), meshes, ["given/*", "decimated/1000"], -4.0, "own", path)
-
-
 def _draw_usual_distances(_: Path, path: Path) -> None:
     from matplotlib.figure import Figure
 
@@ -288,7 +278,6 @@ PICTURES = {
     ),
     "report": Picture(_draw_report, ("benchmarks.pictures:_draw_report",), (_CORTEX, *_PAGE)),
     "one-per-cent": Picture(_draw_one_per_cent, ("benchmarks.pictures:_draw_one_per_cent", *_WITNESS), is_cow=True),
-    "spot-witness": Picture(_draw_two_cows, ("benchmarks.pictures:_draw_two_cows", *_WITNESS), is_cow=True),
     "reconstruction": Picture(_draw_head, ("benchmarks.pictures:_draw_head", *_ROW)),
     "reconstruction-stages": Picture(_draw_stages, ("benchmarks.pictures:_draw_stages", *_ROW), is_cow=True),
 }
@@ -319,7 +308,7 @@ def main() -> None:
     """Draw the pictures that are named, by default the stale ones."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.pictures", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help="pictures [the stale ones]")
-    parser.add_argument("--meshes", type=Path, metavar="FOLDER", help="folder with spot_23k.obj and spot_1k7.obj")
+    parser.add_argument("--meshes", type=Path, metavar="FOLDER", help="folder with spot_23k.obj")
     options = parser.parse_args()
     if unknown := set(options.names) - set(PICTURES):
         parser.error(f"no picture is named {', '.join(unknown)}; known are {', '.join(PICTURES)}")

@@ -53,11 +53,7 @@ def test_the_tutorial_runs_and_is_right(client: Client, tmp_path: Path, monkeypa
 
     results = run_blocks("docs/tutorial.md")
     assert results["certain"] is True
-    assert results["rates"].index.tolist() == ["icosphere/1", "icosphere/2", "icosphere/3"]
-    assert results["rates"].to_numpy() == pytest.approx(2, abs=0.05)
     assert results["excess"] < 0
-    assert 0.5 < results["longest"] < 1
-    assert (results["w"].values < 0).all()
 
     # The description of stores has every group and every variable of a store.
     text = (ROOT / "docs" / "store.md").read_text(encoding="utf-8")
@@ -79,7 +75,6 @@ def test_the_table_of_weights() -> None:
     ("page", "families"),
     [
         ("README.md", ["mine"]),
-        ("docs/tutorial.md", ["given", "decimated"]),
         ("docs/fitting.md", ["decimated", "fitted"]),
     ],
 )
@@ -128,7 +123,7 @@ def test_every_query_runs_and_answers(client: Client, tmp_path: Path, monkeypatc
     frame = sb.table("storage/icosphere.zarr", -10).set_index("mesh").loc[levels]
     assert found["fewest"].sel(family="icosphere") == frame["triangles"][frame["relative"] < 0.05].min() == 320
     assert found["best"] == levels[3]
-    assert found["rates"].sel(family="icosphere") == pytest.approx(frame["rate"].median())
+    assert found["rates"].sel(family="icosphere") == pytest.approx(frame["rate"].median()) == pytest.approx(2, abs=0.05)
     assert found["winners"].values.tolist() == levels[3:] * len(study.orders)
     assert found["area_share"].values == pytest.approx((frame["area_part"] / frame["distance"]) ** 2)
     assert found["certain"].values == pytest.approx(frame["distance"].where(frame["resolved"]), nan_ok=True)
