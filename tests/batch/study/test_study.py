@@ -6,6 +6,7 @@ import os
 import re
 import sys
 import time
+import tomllib
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -65,26 +66,35 @@ def test_reads_every_key(tmp_path: Path) -> None:
     assert study.folder == tmp_path
 
 
-def keys_of(model: type[BaseModel]) -> set[str]:
-    """Of a section and those below it."""
-    below = (part for field in model.model_fields.values() for part in models_in(field.annotation))
-    return set(model.model_fields).union(*(keys_of(part) for part in below if not issubclass(part, Source)))
+def keys_of(model: type[BaseModel]) -> dict[str, Any]:
+    """Return the keys of a section and those below it, with their defaults."""
+    keys = {name: field.default for name, field in model.model_fields.items()}
+    for part in (part for field in model.model_fields.values() for part in models_in(field.annotation)):
+        keys |= {} if issubclass(part, Source) else keys_of(part)
+    return keys
 
 
-def test_the_reference_of_study_files_names_every_key_and_source() -> None:
+def test_the_reference_of_study_files_names_every_key_and_source_with_its_defaults() -> None:
     text = (ROOT / "docs" / "studies.md").read_text(encoding="utf-8")
     keys = keys_of(StudyDocument)
-    assert {"rtol", "backend", "origin", "member"} < keys
+    assert {"rtol", "backend", "origin", "member"} < set(keys)
     rows = {row[0]: row[1] for row in re.findall(r"^\| `([\w-]+)` \|(.*)$", text, re.MULTILINE)}
     for key in keys:
         assert re.search(rf"[`\[]{key}[`\]]", text), key
     for name in {str(table["source"]) for table in KINDS.values()}:
         for key in source_type_of(name).model_fields:
             assert f"`{key}`" in rows[name], (name, key)
+        for key, default in re.findall(r"`(\w+)` = (-?[\d.]+)", rows[name]):
+            assert source_type_of(name).model_fields[key].default == float(default), (name, key)
+    defaults = re.findall(r"^\| `(\w+)` \| `(.+?)` \|", text.partition("## Sources")[0], re.MULTILINE)
+    assert len(defaults) > 8
+    for key, default in defaults:
+        value = keys[key]
+        assert (list(value) if isinstance(value, tuple) else value) == tomllib.loads(f"x = {default}")["x"], key
 
 
 def test_its_example_and_the_workflows_are_valid(tmp_path: Path) -> None:
-    study, lattice, named, listed, besides = blocks("docs/studies.md", "toml")
+    study, lattice, named, listed = blocks("docs/studies.md", "toml")
     (tmp_path / "remeshed.csv").write_text(blocks("docs/studies.md", "csv")[0])
 
     def read(text: str) -> Study:
@@ -97,9 +107,6 @@ def test_its_example_and_the_workflows_are_valid(tmp_path: Path) -> None:
     assert reference.paths == ("bunny.ply",)
     assert read(study).title == "Scans of a statue, decimated"
     assert read(study.replace("[accuracy]\nrtol = 1e-3\n", lattice)).lattice == Lattice(5.0, 64)
-    measured = read(f"{study}\n{besides}").proximity
-    assert measured is not None
-    assert (measured.points, measured.metrics) == (20_000, ("hausdorff", "rms", "fscore"))
     coarse, fine = read(f"{study}\n{listed}").families[1].source.members(tmp_path)
     assert (coarse.name, fine.name, dict(fine.metadata)["tool_seconds"]) == ("coarse", "fine", 12.1)
     for name in ("icosphere", "cortex", "cortex-fitted", "torus"):
