@@ -75,7 +75,7 @@ def test_the_table_of_weights() -> None:
     ("page", "families"),
     [
         ("README.md", ["mine"]),
-        ("docs/fitting.md", ["decimated", "fitted"]),
+        ("docs/fitting.md", ["fitted"]),
     ],
 )
 def test_the_study_of_a_page_is_valid(page: str, families: list[str], tmp_path: Path) -> None:
@@ -152,15 +152,14 @@ def test_every_query_runs_and_answers(client: Client, tmp_path: Path, monkeypatc
 @pytest.mark.all
 def test_the_page_about_fits_runs_and_comes_nearer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert len(blocks("docs/fitting.md", "python")) == 4
+    assert len(blocks("docs/fitting.md", "python")) == 3
     results = run_blocks("docs/fitting.md")
     fitted = results["fitted"]
     assert fitted.after.distance < fitted.before.distance / 4
     assert sb.read_mesh(tmp_path / "fitted.ply").area == pytest.approx(fitted.mesh.area)
     assert results["refined"].after.distance < fitted.after.distance
-    # Inscribed, the mesh lacks area everywhere: the distance falls outwards.
-    outwards = (results["found"]["gradient"].sel(order=-4.0).values * results["start"].vertices).sum(axis=1)
-    assert (outwards < 0).all()
+    value, _ = results["squared"](results["start"].vertices.ravel())
+    assert results["found"].fun < value / 10
 
 
 @pytest.mark.all
