@@ -2,7 +2,7 @@
 
 Truncation (frequencies beyond the cube) and aliasing (images of the surfaces at the lattice's period)
 follow from the same sums as the number itself; discretisation comes from the probes of the fields.
-docs/numerics.md explains the laws and how well they hold.
+docs/numerics.md says how well these estimates hold.
 """
 
 from __future__ import annotations

@@ -1,4 +1,9 @@
-"""Norms and distances whose tail is measured: a small lattice, octaves around it, and what lies beyond them."""
+"""Norms and distances whose tail is measured: a small lattice, octaves around it, and what lies beyond them.
+
+Random points measure the part beyond the lattice, and beyond each octave (see `remainder`). It must agree with the
+octaves farther out: a difference outside both errors counts as an error, unless more and new points remove it. Until
+the accuracy is met, octaves get more samples, or more points are drawn, or an octave is added, whichever is cheapest.
+"""
 
 from __future__ import annotations
 
