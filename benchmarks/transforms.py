@@ -22,7 +22,7 @@ XI_MAX = 5.0
 _EPS: dict[ComplexDtype, float] = {"complex128": 1e-9, "complex64": 1e-6}
 # The norm of the field's own error over the distance. What it does to the distance is less, and measured.
 _FIELD_ERROR = 6e-6
-_SPEED_UP = at_least(18)
+_SPEED_UP, _BY_DEFAULT = at_least(18), at_least(8)
 _SAME_DISTANCE = at_most(2e-6)
 # Relative to the area. The direct sum's guard keeps some eleven digits.
 _DIRECT_AGREES = 1e-9
@@ -113,8 +113,17 @@ def our_transform(mesh: sb.Mesh, lattice: sb.Lattice, threads: int) -> Complexes
 
 
 def against_the_paper(effort: Effort) -> Iterator[Row]:
-    """Item 1: the finest icosphere of the paper in double precision."""
+    """Item 1: the finest icosphere of the paper in double precision, with a loose rule and with the default one."""
     yield from _speed_up_and_distance("1", "complex128", effort)
+    level, intervals = (4, 32) if effort.quick else (7, 128)
+    case = Case.from_level(level, intervals, effort)
+
+    def ours(mesh: sb.Mesh) -> Complexes:
+        return our_transform(mesh, case.lattice, effort.threads)
+
+    fast, slow = take_turns([ours, case.papers], case.fresh_mesh, effort.repeats)
+    what = f"T_{level}, M = {intervals}, default settings: transform"
+    yield Row("1", what, as_seconds(fast), as_seconds(slow), slow / fast, _BY_DEFAULT)
 
 
 def as_in_the_paper(effort: Effort) -> Iterator[Row]:

@@ -54,7 +54,7 @@ class MeshTransform:
         cls, mesh: Mesh, lattice: Lattice, settings: TransformSettings, execution: Execution = ON_CPU
     ) -> Self:
         """Return the transform of a mesh, with the triangle rules that its present shape needs."""
-        uses = assign_rules(mesh, lattice.highest_frequency, settings.tolerance, settings.quadrature)
+        uses = assign_rules(mesh, lattice.highest_frequency, settings.eps, settings.quadrature, settings.tolerance)
         of_vertices, of_areas = zip(*(_node_matrices(mesh, use) for use in uses), strict=True)
         triangles = np.asarray(mesh.triangles, dtype=np.int64)
         return cls(

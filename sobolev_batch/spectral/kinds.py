@@ -170,19 +170,24 @@ class SurfaceKind(ABC):
     Attributes:
         surface: Surface in units of length.
         highest_frequency: Largest |ξ| at which the points stand for the surface, in cycles per unit length.
-        tolerance: Largest quadrature error at any such frequency, relative to the area. Only "auto" and parametrised
+        eps: Largest quadrature error at any such frequency, relative to the area. Only "auto" and parametrised
             surfaces observe it.
         quadrature: Method to choose the rules of triangles: see `fixed_rule`.
+        tolerance: Largest error of the rule on any one triangle, relative to its area, or of the nodes of a
+            parametrised surface, relative to the whole area; None for what eps needs.
     """
 
     surface: Any
     highest_frequency: float = 0.0
-    tolerance: float = 0.0
+    eps: float = 0.0
     quadrature: str | int = "auto"
+    tolerance: float | None = None
 
-    def plan(self, highest_frequency: float, tolerance: float, quadrature: str | int = "auto") -> Self:
+    def plan(
+        self, highest_frequency: float, eps: float, quadrature: str | int = "auto", tolerance: float | None = None
+    ) -> Self:
         """Return the surface with points up to a frequency; see the attributes."""
-        return replace(self, highest_frequency=highest_frequency, tolerance=tolerance, quadrature=quadrature)
+        return replace(self, highest_frequency=highest_frequency, eps=eps, quadrature=quadrature, tolerance=tolerance)
 
     @property
     def is_closed_form(self) -> bool:
@@ -244,7 +249,7 @@ class _Triangles(SurfaceKind):
     @cached_property
     def uses(self) -> tuple[RuleUse, ...]:
         """Rules of the triangles, which take four bytes for each."""
-        return assign_rules(self.surface, self.highest_frequency, self.tolerance, self.quadrature)
+        return assign_rules(self.surface, self.highest_frequency, self.eps, self.quadrature, self.tolerance)
 
     @property
     def triangles(self) -> int:
@@ -297,7 +302,7 @@ class _Parametrised(SurfaceKind):
     @property
     def resolution(self) -> tuple[Counts, float]:
         """Nodes along both parameters, and the change of the transform when they are doubled."""
-        return resolution_of(self.surface, self.highest_frequency, self.tolerance)
+        return resolution_of(self.surface, self.highest_frequency, self.tolerance or self.eps)
 
     @property
     def expected_points(self) -> float:

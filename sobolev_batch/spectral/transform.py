@@ -58,14 +58,14 @@ class TransformSettings:
         dtype: "complex128" or "complex64".
         quadrature: Rules for triangles: see `fixed_rule`.
         tolerance: Largest error of the rule on any one triangle, relative to its area, or of the nodes of a
-            parametrised surface, relative to the whole area; eps by default.
+            parametrised surface, relative to the whole area; by default what eps needs.
         stored: Dtype that values are rounded to once they are computed; by default that of the computation.
     """
 
     eps: float
     dtype: ComplexDtype
     quadrature: str | int
-    tolerance: float
+    tolerance: float | None
     stored: ComplexDtype
 
     def __init__(
@@ -85,12 +85,12 @@ class TransformSettings:
         object.__setattr__(self, "eps", eps)
         object.__setattr__(self, "dtype", dtype)
         object.__setattr__(self, "quadrature", quadrature)
-        object.__setattr__(self, "tolerance", eps if tolerance is None else tolerance)
+        object.__setattr__(self, "tolerance", tolerance)
         object.__setattr__(self, "stored", stored or dtype)
 
     def plan(self, surface: Surface, lattice: FrequencyLattice) -> SurfaceKind:
         """Return a surface with quadrature points for a lattice."""
-        return kind_of(surface).plan(lattice.highest_frequency, self.tolerance, self.quadrature)
+        return kind_of(surface).plan(lattice.highest_frequency, self.eps, self.quadrature, self.tolerance)
 
 
 def thread_count(threads: int | None) -> int:
@@ -176,7 +176,7 @@ def _nufft_eps(
 
 # Raise it whenever the numbers for a given surface and settings change: stored fields of another version are then
 # computed again instead of being compared with new ones.
-NUMERICS_VERSION = 3
+NUMERICS_VERSION = 4
 
 # The smallest batch holds eight node sets of the largest triangle rule.
 _SMALLEST_BATCH = 1 << 12

@@ -260,6 +260,6 @@ class Solution:
             "highest_frequency": max([self.lattice.xi_max, *(one.octave.highest for one in self.octaves)]),
             "dtype": settings[0].dtype,
             "eps": [setting.eps for setting in settings],
-            "quadrature_eps": [setting.tolerance for setting in settings],
+            "quadrature_eps": [setting.tolerance or setting.eps for setting in settings],
             "points": [field.points for field in fields],
         }

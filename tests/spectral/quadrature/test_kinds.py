@@ -112,18 +112,67 @@ def test_batches_hold_the_area_and_the_second_moments(method: str | int, capacit
         assert weights @ coordinates[0] ** 2 == pytest.approx(b * c * a**2 / 2 + a**3 / 6 * (b + c), rel=1e-13)
 
 
-def points_per_triangle(method: str | int, mesh: Mesh, tolerance: float) -> float:
-    batches = kind_of(mesh).plan(8.66, tolerance, method).batches(1 << 22)
-    return sum(len(batch.weights) for batch in batches) / len(mesh.triangles)
-
-
-def test_small_triangles_get_few_points() -> None:
+@pytest.mark.parametrize(
+    ("method", "eps", "tolerance", "most"),
+    [
+        ("auto", 1e-9, None, 12),
+        ("auto", 1e-9, 1e-9, 15),
+        ("auto", 1e-4, 1e-4, 6),
+        ("auto", 1e-5, None, 1.5),
+        ("auto", 1e-2, 1e-2, 1.5),
+        ("auto", 1e-2, None, 0.7),
+        ("gauss8", 1e-9, None, 64),
+    ],
+)
+def test_small_triangles_get_few_points(method: str | int, eps: float, tolerance: float | None, most: float) -> None:
     fine = icosphere(6)
-    assert points_per_triangle("auto", fine, 1e-9) <= 15
-    assert points_per_triangle("auto", fine, 1e-4) <= 6
-    assert points_per_triangle("auto", fine, 1e-2) == 1.5
-    assert points_per_triangle("auto", fine, 0.2) == pytest.approx(0.5, abs=1e-4)
-    assert points_per_triangle("gauss8", fine, 1e-9) == 64
+    batches = kind_of(fine).plan(8.66, eps, method, tolerance).batches(1 << 22)
+    assert sum(len(batch.weights) for batch in batches) / len(fine.triangles) <= most
+
+
+RNG = np.random.default_rng(9)
+
+
+def random_triangles(count: int) -> Mesh:
+    corners = RNG.normal(size=(count, 1, 3)) + 0.05 * RNG.normal(size=(count, 3, 3))
+    return Mesh(corners.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3))
+
+
+def grid(disorder: float) -> Mesh:
+    """A square of 30 x 30 squares, each of two triangles, with its vertices moved by parts of an edge."""
+    count = 30
+    corners = np.stack([*np.meshgrid(*(np.arange(count + 1.0),) * 2, indexing="ij"), np.zeros((count + 1,) * 2)], 2)
+    corners[:, :, :2] += disorder * RNG.normal(size=(count + 1, count + 1, 2))
+    first = (np.arange(count)[:, None] * (count + 1) + np.arange(count)).ravel()
+    lower, upper = (0, count + 1, count + 2), (0, count + 2, 1)
+    return Mesh(corners.reshape(-1, 3) / count, np.concatenate([first[:, None] + np.array(t) for t in (lower, upper)]))
+
+
+# 3.63: the wavelength is an edge of the grid, where equal triangles add up.
+@pytest.mark.parametrize("size", [0.03, 0.3, 1.0, 1.8, 3.63])
+@pytest.mark.parametrize("eps", [1e-9, 1e-5])
+@pytest.mark.parametrize(
+    "mesh",
+    [icosphere(3), BOX, random_triangles(300), random_triangles(20), grid(0.0), grid(0.2)],
+    ids=["icosphere", "box", "random", "few", "grid", "disorder"],
+)
+def test_a_whole_mesh_keeps_eps_with_fewer_points_than_each_of_its_triangles(
+    mesh: Mesh, eps: float, size: float
+) -> None:
+    highest = size / (2 * np.pi * mesh.centroid_radii.max())
+    directions = np.concatenate([np.eye(3), [[1, 1, 0]], RNG.normal(size=(16, 3))])
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    frequencies = highest * np.concatenate([directions, RNG.random((10, 1)) * directions[:10]])
+    plan = kind_of(mesh).plan(highest, eps)
+    assert plan.expected_points <= kind_of(mesh).plan(highest, eps, "auto", eps).expected_points
+    found = sum(
+        (
+            points.weights @ np.exp(-2j * np.pi * (frequencies @ points.coordinates).T)
+            for points in plan.batches(1 << 22)
+        ),
+        np.zeros(len(frequencies)),
+    )
+    assert np.abs(found - exact_transform(mesh, frequencies)).max() <= 1.2 * eps * mesh.area
 
 
 @pytest.mark.parametrize("surface", [BOX, icosphere(3), Torus(1.0, 0.4)], ids=["box", "icosphere", "torus"])
