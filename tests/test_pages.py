@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import runpy
 import shlex
 import tomllib
 from pathlib import Path
@@ -76,6 +77,7 @@ def test_the_table_of_weights() -> None:
     [
         ("README.md", ["mine"]),
         ("docs/fitting.md", ["fitted"]),
+        ("docs/remeshers.md", ["mmg"]),
     ],
 )
 def test_the_study_of_a_page_is_valid(page: str, families: list[str], tmp_path: Path) -> None:
@@ -89,6 +91,35 @@ def test_the_study_of_a_page_is_valid(page: str, families: list[str], tmp_path: 
         )
         (tmp_path / "study.toml").write_text(on_lattice)
         assert sb.Study.from_toml(tmp_path / "study.toml").lattice == sb.Lattice(5.0, 64)
+
+
+def test_the_studies_of_leagues_are_valid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("objects/cow.ply", "objects/statue.ply", "out/quick/cow_500.ply"):
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        Path(name).touch()
+    by_names, one_object, meshes = blocks("docs/leagues.md", "toml")
+    Path("meshes.csv").write_text(blocks("docs/leagues.md", "csv")[0])
+    found = [
+        sb.StudyCollection.from_table(tomllib.loads(text))
+        for text in (by_names, by_names + one_object, by_names.partition("[reference]")[0] + meshes)
+    ]
+    assert [list(one.studies) for one in found] == [["cow", "statue"], ["cow"], ["cow"]]
+    assert [[family.name for family in one.studies["cow"].families] for one in found] == [
+        ["quick", "decimated"],
+        ["quick", "decimated"],
+        ["quick"],
+    ]
+    assert dict(found[0].lacking) == {"statue": ("quick",)}
+
+
+@pytest.mark.slow
+def test_the_page_about_remeshers_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    # A file, since a study needs the source of its function.
+    (tmp_path / "squeezed.py").write_text(blocks("docs/remeshers.md", "python")[0])
+    runpy.run_path(str(tmp_path / "squeezed.py"))
+    text = (ROOT / "docs" / "remeshers.md").read_text(encoding="utf-8")
+    assert f"\n    {capsys.readouterr().out}" in text
 
 
 def test_pictures_of_the_gallery_are_described_and_small() -> None:
