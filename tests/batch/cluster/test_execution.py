@@ -10,7 +10,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from distributed import Client, Future, KilledWorker
+from distributed import Client, Future, KilledWorker, LocalCluster
 from distributed.utils import key_split
 
 from sobolev_batch import Study, StudyCollection, plan, run, submit
@@ -21,7 +21,6 @@ from sobolev_batch.batch.store.store import Store
 from sobolev_batch.errors import ClusterError, DamageError, InputError, StoreError
 from sobolev_batch.results.status import Status
 from tests.support.processes import tcp_cluster
-from tests.support.repository import run_blocks
 from tests.support.studies import balls, methods_of, small_table
 
 
@@ -181,11 +180,16 @@ def test_an_asynchronous_client_is_refused_before_anything_is_made() -> None:
             act(Study.from_table(small_table()), "memory://asynchronous.zarr", client)
 
 
-def test_the_page_of_clusters_runs_a_study_by_a_client_of_the_user(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_blocks("docs/clusters.md")["summary"].computed == ("ico/0", "ico/1", "reference")
-    first, start, *fields, _, last = capsys.readouterr().out.splitlines()
-    assert (first[:22], start, last) == ("dashboard: http://127.", "0 of 3 transforms", "1 of 1 tables reduced")
-    assert re.fullmatch(r"\[1/3\] \S+: complete, \d\.\d\d s", fields[0])
+def test_a_run_prints_its_progress(capsys: pytest.CaptureFixture[str]) -> None:
+    with (
+        LocalCluster(processes=False, dashboard_address="127.0.0.1:0") as cluster,
+        Client(cluster) as client,
+    ):
+        run(Study.from_table(small_table()), "memory://progress.zarr", client, on_progress=print)
+    first, start, *fields = capsys.readouterr().out.splitlines()
+    assert first.startswith("dashboard: http://")
+    assert start == "0 of 5 transforms"
+    assert re.fullmatch(r"\[1/5\] \S+: complete, \d\.\d\d s", fields[0])
 
 
 def test_a_failure_of_the_storage_is_not_blamed_on_a_scheduler_that_answers(threads: Client) -> None:
