@@ -192,6 +192,9 @@ def fitted_mesh(
         run = FitRun(make(mesh)).finish()
     else:
         run = _refine(_first_problem(mesh, triangles, make), triangles, make)
+    if run.end is End.INTERRUPTED:
+        # A mesh of a study is the whole fit.
+        raise KeyboardInterrupt
     return run.problem.given_mesh(run.mesh)
 
 
@@ -222,7 +225,7 @@ class FitRun:
             self.end = End.INTERRUPTED
         else:
             if after > before:
-                self.vertices, self.end = start, End.FARTHER
+                self.vertices, self.end = start, self.end if self.end is End.INTERRUPTED else End.FARTHER
         return self
 
     def _stages(self) -> list[tuple[OrderWeights, float, int]]:
@@ -435,6 +438,8 @@ def _split(mesh: Mesh, triangles: int, make: Make) -> Mesh:
 
 def largest_while_refining(count: int, triangles: int) -> int:
     """Return the most triangles on the way from a count to another: scores come from a mesh of four times as many."""
+    # Nothing is known of a file that cannot be read, or of what a program will make.
+    count = max(count, 1)
     *before, last = [count, *_goals(count, triangles)]
     return max([last, *(4 * number for number in before)])
 

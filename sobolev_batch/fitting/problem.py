@@ -60,6 +60,8 @@ _ALIASING, _ROOM = 1e-2, 1.2
 _TARGET_FRACTION, _MESH_FRACTION = 2e-3, 0.02
 # A distance of this many errors of its fields is not lowered any further.
 _LEAST_ERRORS = 5.0
+# Beyond, steps lose their digits.
+MOST_SMOOTHING = 1e12
 
 
 @dataclass(frozen=True)
@@ -76,8 +78,8 @@ class FitSettings:
         if not is_whole_number(self.steps) or self.steps < 1:
             raise InputError(f"steps must be a whole number from 1 on, found {self.steps!r}")
         object.__setattr__(self, "steps", int(self.steps))
-        if not is_finite_number(self.smoothing) or self.smoothing < 0:
-            raise InputError(f"smoothing must be a number from 0 on, found {self.smoothing!r}")
+        if not is_finite_number(self.smoothing) or not 0 <= self.smoothing <= MOST_SMOOTHING:
+            raise InputError(f"smoothing must be a number from 0 to {MOST_SMOOTHING:g}, found {self.smoothing!r}")
         object.__setattr__(self, "smoothing", float(self.smoothing))
         if not isinstance(self.keep_boundary, bool):
             raise InputError(f"keep_boundary must be True or False, found {self.keep_boundary!r}")

@@ -12,7 +12,7 @@ from pydantic import Field
 from sobolev_batch.errors import InputError, MeshError, StudyError
 from sobolev_batch.fitting import DEFAULT_SMOOTHING, DEFAULT_STEPS
 from sobolev_batch.fitting.fit import MOST_TRIANGLES, fitted_mesh, largest_while_refining
-from sobolev_batch.fitting.problem import FitSettings
+from sobolev_batch.fitting.problem import MOST_SMOOTHING, FitSettings
 from sobolev_batch.spectral import DEFAULT_ORDER
 from sobolev_batch.spectral.transform import Execution
 from sobolev_batch.surfaces.shapes.mesh import Mesh
@@ -54,7 +54,7 @@ class FitSource(NestedSource):
     target: OtherSource | None = None
     order: Annotated[float, Field(lt=-0.5, ge=-100.0, strict=False)] = DEFAULT_ORDER
     steps: Annotated[int, Field(ge=1, le=100_000)] = DEFAULT_STEPS
-    smoothing: Annotated[float, Field(ge=0.0, allow_inf_nan=False, strict=False)] = DEFAULT_SMOOTHING
+    smoothing: Annotated[float, Field(ge=0.0, le=MOST_SMOOTHING, strict=False)] = DEFAULT_SMOOTHING
     keep_boundary: bool = False
 
     def with_reference(self, reference: Source) -> Source:
@@ -114,9 +114,11 @@ class FittedMember(Member):
         """Return the fitted mesh, that of an earlier call in this process if there is one; MeshError where it fails."""
         digest = self.fingerprint_digest()
         fitted = _fits.get(digest) or self._fit()
-        _fits[digest] = fitted
-        if len(_fits) > _KEPT:
-            _fits.pop(next(iter(_fits)), None)
+        # A file of it may have been changed meanwhile.
+        if self.fingerprint_digest() == digest:
+            _fits[digest] = fitted
+        for old in [*_fits][:-_KEPT]:
+            _fits.pop(old, None)
         return fitted
 
     def _fit(self) -> Mesh:

@@ -206,7 +206,7 @@ def test_no_triangle_is_turned_over_on_the_way(distance: float) -> None:
         ({"order": -0.5}, "finite only for orders below -1/2, found -0.5"),
         ({"order": [-2.0, -3.0]}, "one order is needed, found 2"),
         ({"steps": 0}, "steps must be a whole number from 1 on, found 0"),
-        ({"smoothing": np.nan}, "smoothing must be a number from 0 on, found nan"),
+        ({"smoothing": np.nan}, "smoothing must be a number from 0 to 1e+12, found nan"),
         ({"keep_boundary": "no"}, "keep_boundary must be True or False, found 'no'"),
         ({"threads": 10**6}, "threads must be a whole number from 1 to 1,024, found 1000000"),
         ({"order": "a"}, "an order is a number, such as -2.0, or a list of numbers; found 'a'"),

@@ -8,13 +8,17 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from distributed import Client
 
 import sobolev_batch as sb
+from sobolev_batch.batch.study.plan import members_of
 from sobolev_batch.fitting import sources
+from sobolev_batch.fitting.fit import FitRun
+from sobolev_batch.fitting.problem import FitProblem
 from sobolev_batch.surfaces.sources.registry import parse_source
 from tests.support.members import listed, loaded, members
 
@@ -89,6 +93,52 @@ def test_one_process_fits_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert pickle.loads(pickle.dumps(member)).load() is first
 
 
+@pytest.mark.parametrize("table", [FIT, REFINE])
+def test_an_interrupted_fit_is_no_mesh(monkeypatch: pytest.MonkeyPatch, table: dict[str, Any]) -> None:
+    member = members({**table, "target": SPHERE, "steps": 3})[0]
+    monkeypatch.setattr(FitRun, "_descend", Mock(side_effect=KeyboardInterrupt))
+    # That it lies farther away at last does not hide the interrupt.
+    monkeypatch.setattr(FitProblem, "squares", Mock(side_effect=[[1.0], [1.0], [2.0]]))
+    with pytest.raises(KeyboardInterrupt):
+        member.load()
+    assert member.fingerprint_digest() not in sources._fits
+
+
+def test_a_fit_of_a_file_that_is_changed_meanwhile_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def change(*_: object) -> sb.Mesh:
+        sb.write_mesh(sb.shapes.icosphere(1), tmp_path / "a.ply")
+        return sb.shapes.icosphere(0)
+
+    sb.write_mesh(sb.shapes.icosphere(0), tmp_path / "a.ply")
+    (member,) = members({**FIT, "mesh": {"source": "files", "paths": ["a.ply"]}, "target": SPHERE}, tmp_path)
+    before, kept = member.fingerprint_digest(), dict(sources._fits)
+    monkeypatch.setattr(sources, "fitted_mesh", change)
+    member.load()
+    assert member.fingerprint_digest() != before
+    assert sources._fits == kept
+
+
+def test_a_fit_of_what_no_one_knows_the_size_of_has_a_size() -> None:
+    (member,) = members(
+        {**REFINE, "mesh": {"source": "files", "paths": ["gone.ply"]}, "target": SPHERE, "triangles": [90]}
+    )
+    size = member.expected_size()
+    assert size.triangles == 90
+    assert size.projected_bytes < 1e9
+
+
+def test_fits_have_the_parameters_of_the_remesher_before_them() -> None:
+    sphere = {"source": "icosphere", "levels": [1]}
+    remeshed = {
+        "source": "command",
+        "mesh": sphere,
+        "command": ["true", "{input}", "{output}", "{triangles}"],
+        "triangles": [9],
+    }
+    study = sb.Study.from_table(table(mesh={**FIT, "mesh": remeshed}))
+    assert members_of(study)["fitted/9"][1].metadata == (("target_triangles", 9.0),)
+
+
 def test_the_reference_is_handed_down_to_nested_sources() -> None:
     nested = parse_source({"source": "fit", "mesh": {**FIT, "steps": 1}, "steps": 1})
     found = nested.with_reference(parse_source(SPHERE)).members(Path())
@@ -112,7 +162,10 @@ def test_a_mesh_that_cannot_be_fitted_is_named() -> None:
 @pytest.mark.parametrize(
     ("fit", "message"),
     [
-        *(({key: value}, key) for key, value in (("order", -0.5), ("steps", 0), ("smoothing", -1), ("speed", 1))),
+        *(
+            ({key: value}, key)
+            for key, value in (("order", -0.5), ("steps", 0), ("smoothing", -1), ("smoothing", 1e300), ("speed", 1))
+        ),
         ({"target": 3}, "must be a table that names a source"),
         ({"mesh": "ball.ply"}, "no mesh is named 'ball.ply'"),
     ],

@@ -15,6 +15,7 @@ from sobolev_batch.batch.study.lattice_choice import LatticeChoice, Members, cho
 from sobolev_batch.batch.study.schema import FamilyReference
 from sobolev_batch.batch.study.study import REFERENCE_LABEL, Study
 from sobolev_batch.errors import InputError, MeshError, StudyError
+from sobolev_batch.fitting.sources import FittedMember
 from sobolev_batch.spectral.adaptive.solve import DistanceTarget
 from sobolev_batch.spectral.fields import USUAL_DEGREE
 from sobolev_batch.spectral.kinds import kind_of
@@ -184,7 +185,10 @@ def members_of(study: Study) -> dict[str, tuple[str, Member]]:
             label = f"{family.name}/{member.name}"
             if label in members:
                 raise StudyError(f"two surfaces of the study have the label {label!r}")
-            if isinstance(member, RemeshedMember):
+            made = member
+            while isinstance(made, FittedMember):
+                made = made.start
+            if isinstance(made, RemeshedMember):
                 # What was wanted, beside what came of it.
                 named = ((f"target_{name}" if name in TAKEN_NAMES else name, value) for name, value in member.metadata)
                 member = replace(member, metadata=tuple(named))
