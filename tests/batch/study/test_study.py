@@ -94,17 +94,16 @@ def test_the_reference_of_study_files_names_every_key_and_source_with_its_defaul
 
 
 def test_its_example_and_the_workflows_are_valid(tmp_path: Path) -> None:
-    study, lattice, named, listed = blocks("docs/studies.md", "toml")
+    study, lattice, listed = blocks("docs/studies.md", "toml")
     (tmp_path / "remeshed.csv").write_text(blocks("docs/studies.md", "csv")[0])
 
     def read(text: str) -> Study:
         (tmp_path / "study.toml").write_text(text)
         return Study.from_toml(tmp_path / "study.toml")
 
-    rest = 'study.name = "x"\nlattice = { xi_max = 3.0, M = 16 }\nnorm.orders = [-2.0]\n'
-    reference = read(rest + named).reference
+    reference = read(study).reference
     assert isinstance(reference, FileSource)
-    assert reference.paths == ("bunny.ply",)
+    assert reference.paths == ("original.ply",)
     assert read(study).title == "Scans of a statue, decimated"
     assert read(study.replace("[accuracy]\nrtol = 1e-3\n", lattice)).lattice == Lattice(5.0, 64)
     coarse, fine = read(f"{study}\n{listed}").families[1].source.members(tmp_path)
