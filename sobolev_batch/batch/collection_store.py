@@ -34,18 +34,21 @@ class CollectionStore:
 
     @property
     def existing_stores(self) -> dict[str, Location]:
-        """Stores of the objects that have one, by name: none has until its reference was made.
+        """Stores of the objects that have one, by name; see `existing_store`."""
+        found = {name: self.existing_store(name) for name in self.objects}
+        return {name: place for name, place in found.items() if place is not None}
 
-        A store that is another object's raises a DamageError.
-        """
-        stores = {name: Store(place) for name, place in self.stores.items()}
-        found = {name: store for name, store in stores.items() if store.exists() and not store.is_unfinished}
-        for name, store in found.items():
-            study = store.attributes()["study"]["name"]
-            if study != f"{self.name} {name}":
-                problem = f"it holds the study {study!r}, not that of the object {name!r}"
-                raise DamageError(f"{store.path}: {problem}; put the store of this object back, or remove it", problem)
-        return {name: store.location for name, store in found.items()}
+    def existing_store(self, name: str) -> Location | None:
+        """Return the store of an object, None before its reference was made; DamageError where it is another's."""
+        store = Store(self.location.below(name))
+        if not store.exists() or store.is_unfinished:
+            return None
+        study = store.attributes()["study"]["name"]
+        if study != f"{self.name} {name}":
+            problem = f"it holds the study {study!r}, not that of the object {name!r}"
+            problem += "; put the store of this object back, or remove it"
+            raise DamageError(f"{store.path}: {problem}", problem)
+        return store.location
 
     @classmethod
     def read(cls, location: Location) -> CollectionStore | None:

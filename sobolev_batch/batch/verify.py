@@ -95,13 +95,14 @@ def verify(store: str | Path | Location, on_progress: Callable[[int, int], None]
     collection = CollectionStore.read(Location.parse(store))
     if collection is None:
         return _verify_study(store, on_progress)
-    existing = collection.existing_stores
-    verified = {
-        name: _verify_study(place, on_progress)
-        if name in existing
-        else Verification(str(place), 0, 0, {}, {}, withdrawn=False)
-        for name, place in collection.stores.items()
-    }
+    verified: dict[str, Verification] = {}
+    for name, path in collection.stores.items():
+        try:
+            place = collection.existing_store(name)
+            none = Verification(str(path), 0, 0, {}, {}, withdrawn=False)
+            verified[name] = none if place is None else _verify_study(place, on_progress)
+        except DamageError as error:
+            verified[name] = Verification(str(path), 0, 0, {}, {ROOT: error.what}, withdrawn=True)
     damaged = [one for one in verified.values() if not one.is_sound]
     return Verification(
         str(collection.location),

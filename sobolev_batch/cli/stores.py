@@ -108,7 +108,8 @@ def verify_command(context: click.Context, store: Location, style: str) -> None:
         context.exit(0 if result.is_sound else EXIT_OTHER)
     for name, one in (result.objects or {str(store): result}).items():
         counts = f"{one.complete} of {one.total} surfaces complete, their fields read back"
-        echo(f"{name}: {counts if one.total else 'it has no results yet'}")
+        nothing = "its store cannot be read" if one.tables else "it has no results yet"
+        echo(f"{name}: {counts if one.total else nothing}")
     tables = {f"table {name}": damage for name, damage in result.tables.items()}
     for name, damage in (*result.fields.items(), *tables.items()):
         echo(f"{name}: {damage}")

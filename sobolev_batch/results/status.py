@@ -14,6 +14,7 @@ from sobolev_batch.batch.store.records import Record, RunRecord
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.store.tables import rows_unlike_tables, table_attributes
 from sobolev_batch.batch.workspace import complete_records, failed_proximities
+from sobolev_batch.errors import DamageError
 from sobolev_batch.results.open import AnyStore, location_of
 from sobolev_batch.results.tables.text import duration
 from sobolev_batch.visible import reasons, table_html, visible
@@ -94,23 +95,29 @@ class Status:
 
         The run is one that goes on, or else one that failed or was lost, or else the latest.
         """
-        found = {name: cls._of_object(place) for name, place in collection.stores.items()}
-        parts = {name: one for name, one in found.items() if one is not None}
+        parts: dict[str, Status] = {}
+        damaged: dict[str, str] = {}
+        for name in collection.objects:
+            try:
+                if part := cls._of_object(collection, name):
+                    parts[name] = part
+            except DamageError as error:
+                damaged[name] = str(error)
         latest = max(parts.values(), key=_urgency, default=None)
         current = latest if latest and latest.going_on else None
-        waiting = [name for name in collection.objects if name not in parts]
-        failed = labelled({name: one.failed for name, one in parts.items()})
+        waiting = [name for name in collection.objects if name not in parts | damaged]
+        failed = labelled({name: one.failed for name, one in parts.items()}) | damaged
         if current is None:
             # Otherwise its turn may come.
             failed |= dict.fromkeys(waiting, "it has no results; run the study again to see why")
         return cls(
             str(collection.location),
             sum(one.complete for one in parts.values()),
-            sum(one.total for one in parts.values()) + len(waiting),
+            sum(one.total for one in parts.values()) + len(waiting) + len(damaged),
             failed,
             labelled({name: one.not_compared for name, one in parts.items()}),
             latest.run if latest else None,
-            not waiting and all(one.reduced for one in parts.values()),
+            not waiting and not damaged and all(one.reduced for one in parts.values()),
             latest.silence_seconds if latest else 0.0,
             current.rate if current else math.nan,
             latest.store if latest else "",
@@ -118,9 +125,10 @@ class Status:
         )
 
     @classmethod
-    def _of_object(cls, place: Location) -> Status | None:
+    def _of_object(cls, collection: CollectionStore, name: str) -> Status | None:
         """Return the status of an object of a collection; None before a run takes it up."""
-        if Store(place).exists():
+        place = collection.stores[name]
+        if collection.existing_store(name) is not None:
             return cls.from_store(place)
         # Only a run locks a place without a store: it plans, and has no heartbeat yet.
         lock = Lock.read(place)

@@ -84,9 +84,26 @@ def test_objects_that_were_altered_or_traded_are_damage(changeable: Path, client
         pd.testing.assert_frame_equal(sb.table(changeable), before)
     for names in (("a", "other"), ("b", "a"), ("other", "b")):
         (changeable / names[0]).rename(changeable / names[1])
-    for read in (sb.table, sb.verify):
-        with pytest.raises(sb.errors.DamageError, match="not that of the object 'a'"):
-            read(changeable)
+    require_named_damage(changeable, ["a", "b"], "not that of the object 'a'")
+
+
+def test_an_object_that_lost_its_root_is_damage(changeable: Path, client: Client) -> None:
+    before = sb.table(changeable)
+    (changeable / "b/zarr.json").unlink()
+    require_named_damage(changeable, ["b"], "zarr.json, the metadata at the root, is gone")
+    assert sb.run(collection([*balls(a=1.0), GONE, *balls(b=1.1)]), changeable, client).computed == ()
+    pd.testing.assert_frame_equal(sb.table(changeable), before)
+
+
+def require_named_damage(path: Path, objects: list[str], what: str) -> None:
+    """Check that no reader of a collection passes over objects whose stores cannot be read."""
+    with pytest.raises(sb.errors.DamageError, match=what):
+        sb.table(path)
+    verified, status = sb.verify(path), sb.status(path)
+    assert [*verified.tables] == [f"{name}/zarr.json" for name in objects]
+    assert what in verified.tables[f"{objects[0]}/zarr.json"]
+    assert {*status.failed} == {*objects, "gone"}
+    assert what in status.failed[objects[0]]
 
 
 def test_tables_of_a_collection_are_those_of_its_objects(store: Path) -> None:

@@ -98,10 +98,13 @@ class Store:
         return self.location.name
 
     def exists(self) -> bool:
-        """Return whether a zarr hierarchy exists."""
+        """Return whether a zarr hierarchy exists; DamageError where only its root is gone, which is written first."""
         if "" not in self.documents:
             root = self._read_document("")
             if root is None:
+                if self.stored_document(RECORDS) is not None:
+                    problem = f"{ROOT}, the metadata at the root, is gone"
+                    raise DamageError(f"{self.path}: {problem}; run the study again", problem)
                 return False
             for name, document in (root.pop("consolidated_metadata", None) or {}).get("metadata", {}).items():
                 # zarr repeats in each group what the root has.
