@@ -58,7 +58,7 @@ WORK: dict[str, tuple[Callable[[], object], int, int, int, str]] = {
         "the lattice is chosen from exact values, before one coarse field of each mesh",
     ),
     "distance to a high accuracy": (
-        lambda: sb.distance(sb.shapes.icosphere(4), SPHERE, -10.0, rtol=1e-3),
+        lambda: sb.distance(sb.shapes.icosphere(4), SPHERE, -10.0, rtol=7e-4),
         *(2, 23_040, 327_680),
         "one field, and a coarse one of the frequencies beyond, each probed at 32 of them",
     ),

@@ -63,23 +63,26 @@ _FEWEST_FOR_GPU = 1 << 15
 _SPLITTER = 2.0**27 + 1
 
 
-def exact_transform(mesh: Mesh, frequencies: Reals, backend: Backend = CPU) -> Complexes:
+def exact_transform(mesh: Mesh, frequencies: Reals, threads: int = 1, backend: Backend = CPU) -> Complexes:
     """Return the transform ∫ exp(-2πi ξ·x) dμ(x) of a mesh's area measure, free of quadrature error.
 
     For ξ, float64 (P, 3), in cycles per unit length, it is complex128 (P,). The error of each triangle is about 1e-15
-    of its contribution, or of its area if that is smaller; the area itself is exact to rounding even on slivers. A GPU
-    changes the last digits.
+    of its contribution, or of its area if that is smaller; the area itself is exact to rounding even on slivers. Any
+    number of threads gives the same digits, and a GPU changes the last ones.
     """
     frequencies = np.asarray(frequencies, dtype=np.float64)
     columns = [np.ascontiguousarray(column) for column in mesh.vertices.T]
 
     def sums(backend: Backend) -> Complexes:
         batch = _BATCH[backend.name]
-        parts = []
-        for start in range(0, len(mesh.triangles), batch):
+
+        def part(start: int) -> Complexes:
             rows = np.ascontiguousarray(mesh.triangles[start : start + batch].T)
-            corners = np.stack([[column[index] for column in columns] for index in rows])
-            parts.append(_sums(corners, frequencies, backend))
+            return _sums(np.stack([[column[index] for column in columns] for index in rows]), frequencies, backend)
+
+        # The threads are the processor's.
+        with ThreadPoolExecutor(threads if backend is CPU else 1) as pool:
+            parts = list(pool.map(part, range(0, len(mesh.triangles), batch)))
         return np.asarray(np.sum(parts, axis=0, dtype=np.complex128))
 
     return compute_on(_faster(backend, mesh, frequencies), sums)
@@ -308,7 +311,7 @@ def sampled_transform(mesh: Mesh, frequencies: Reals, threads: int = 1, backend:
     lengths = np.linalg.norm(frequencies, axis=1)
     fine = 2 * np.pi * lengths * mesh.edge_length_range[1] < _FINE_MESH
     values = np.empty(len(frequencies), dtype=np.complex128)
-    values[fine] = exact_transform(mesh, frequencies[fine], backend)
+    values[fine] = exact_transform(mesh, frequencies[fine], threads, backend)
     others = frequencies[~fine]
 
     def sums(backend: Backend) -> Complexes:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from sobolev_batch.spectral.backends import CPU, Backend, Complexes
 from sobolev_batch.spectral.kinds import kind_of
 from sobolev_batch.spectral.lattice import Block, Lattice, SobolevWeights, shell_volumes
-from sobolev_batch.spectral.transform import TransformSettings
+from sobolev_batch.spectral.transform import ON_CPU, Execution, TransformSettings
 from sobolev_batch.surfaces.shapes.surface import Indices, Reals, Surface
 
 # Draws of a small mesh, of a huge one, and pairs of a triangle (or point) and a frequency in between.
@@ -27,6 +27,8 @@ _MOST_DRAWS, _FEWEST_DRAWS, _PAIRS = 32, 8, 400_000
 # Standard errors by which the mean of few draws is raised, as some may carry it. Of 720 errors of NUFFTs of
 # smooth surfaces, five exceeded the mean by six of them, two by eight.
 _CAUTION = 8.0
+# Points of a quarter of the lattice's x and y that are looked at together for some shells.
+_CANDIDATES = 1 << 20
 # Ranges of |ξ| that represent an error of the same size at every frequency.
 _BANDS = 8
 
@@ -88,7 +90,7 @@ def draw(lattice: Lattice, orders: Sequence[float], degree: int, count: int, see
     # One draw in each of P equal intervals of the distribution: fewer gaps than independent draws leave.
     levels = (np.arange(count) + rng.random(count)) / count
     shells = np.searchsorted(np.cumsum(chances * shell_volumes(lattice)), levels * (1 - 1e-12))
-    indices = np.stack([_draw_point(lattice, int(shell), rng) for shell in shells])
+    indices = _draw_points(lattice, shells, rng)
     return Draws(indices, lattice.spacing * indices.astype(np.float64), 1 / (count * chances[shells]))
 
 
@@ -127,16 +129,27 @@ def _shell_chances(lattice: Lattice, orders: tuple[float, ...], degree: int) -> 
     return chances / (2 * len(orders))
 
 
-def _draw_point(lattice: Lattice, shell: int, rng: np.random.Generator) -> Indices:
-    """Draw a point of a shell, with a probability in proportion to its trapezoidal weight."""
-    indices = lattice.half.indices(0)
-    rest = shell - (indices[:, None] ** 2 + indices**2)
-    k = np.sqrt(np.maximum(rest, 0)).round().astype(np.int64)
-    i, j = np.nonzero((rest >= 0) & (k * k == rest) & (k <= lattice.M // 2))
-    x, y, z = lattice.axis_weights(lattice.half)
-    weights = x[i] * y[j] * z[k[i, j]]
-    chosen = rng.choice(len(i), p=weights / weights.sum())
-    return np.array([indices[i[chosen]], indices[j[chosen]], k[i[chosen], j[chosen]]])
+def _draw_points(lattice: Lattice, shells: Indices, rng: np.random.Generator) -> Indices:
+    """Draw a point of each shell (P,), with probabilities in proportion to its trapezoidal weights."""
+    axis = np.arange(lattice.M // 2 + 1)
+    x, _, z = lattice.axis_weights(lattice.half)
+    # Points with x and y below zero have the weights of those above.
+    x = x[lattice.M // 2 :] * np.where(axis > 0, 2, 1)
+    drawn = []
+    step = max(1, _CANDIDATES // len(axis) ** 2)
+    for first in range(0, len(shells), step):
+        rest = shells[first : first + step, None, None] - (axis[:, None] ** 2 + axis**2)
+        k = np.sqrt(np.maximum(rest, 0)).round().astype(np.int64)
+        numbers, i, j = np.nonzero((rest >= 0) & (k * k == rest) & (k <= axis[-1]))
+        points = np.stack([i, j, k[numbers, i, j]], axis=1)
+        sums = np.cumsum(x[i] * x[j] * z[points[:, 2]])
+        ends = np.searchsorted(numbers, np.arange(len(rest)), side="right") - 1
+        starts = np.concatenate([[0.0], sums[ends[:-1]]])
+        levels = starts + rng.random(len(rest)) * (sums[ends] - starts)
+        drawn.append(points[np.minimum(np.searchsorted(sums, levels, side="right"), ends)])
+    signs = rng.choice([-1, 1], size=(len(shells), 3))
+    signs[:, 2] = 1
+    return np.asarray(signs * np.concatenate(drawn))
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,12 +160,13 @@ class Sample:
     exact: NDArray[np.complex128]
 
     @classmethod
-    def from_surface(cls, surface: Surface, draws: Draws, backend: Backend = CPU, *, fast: bool = False) -> Sample:
+    def from_surface(
+        cls, surface: Surface, draws: Draws, threads: int = 1, backend: Backend = CPU, *, fast: bool = False
+    ) -> Sample:
         """Return the sample of a surface at given draws; a fast one may be off by some 1e-13 of the area."""
         kind = kind_of(surface)
-        if fast:
-            return cls(draws, kind.sampled_values(draws.frequencies, 1, backend))
-        return cls(draws, kind.exact_values(draws.frequencies, backend))
+        values = kind.sampled_values if fast else kind.exact_values
+        return cls(draws, values(draws.frequencies, threads, backend))
 
 
 def draws_for(surfaces: Sequence[Surface], lattice: Lattice, orders: Sequence[float], degree: int) -> Draws:
@@ -170,7 +184,7 @@ def probe_block(
     block: Block,
     values: Complexes,
     draws: Draws,
-    backend: Backend = CPU,
+    execution: Execution = ON_CPU,
 ) -> Probe:
     """Compare one block of a field with the exact transform, at the draws that fall into the block.
 
@@ -183,7 +197,7 @@ def probe_block(
     inside = np.all((offsets >= 0) & (offsets < block.shape), axis=1)
     draws = Draws(draws.indices[inside], draws.frequencies[inside], draws.scales[inside])
     # What a fast sample is off by can only make the field look worse.
-    exact = Sample.from_surface(surface, draws, backend, fast=True).exact
+    exact = Sample.from_surface(surface, draws, execution.threads, execution.backend, fast=True).exact
     probe = measure(draws, values[draws.places(block)], exact)
     change = settings.plan(surface, lattice).change
     # Once for the whole field.

@@ -14,6 +14,7 @@ from sobolev_batch.spectral.budget import NormEstimate, Sums, Support, truncated
 from sobolev_batch.spectral.exact import sphere_distance, sphere_inner_product
 from sobolev_batch.spectral.fields import Quality
 from sobolev_batch.spectral.lattice import SobolevWeights
+from sobolev_batch.spectral.probe import draw
 from sobolev_batch.surfaces.shapes.surface import Surface
 from tests.support.shapes import CENTRED_BOX as BOX
 
@@ -80,6 +81,18 @@ def test_probe_draws_depend_on_the_mesh_alone_and_leave_the_orders_open() -> Non
     other = Quality.from_json(fourier_transform(icosphere(1), lattice).attrs["quality"])
     assert other.probe.shells != first.probe.shells
     assert (first.probe.norms(SobolevWeights(lattice, (-1.3, -7.7))) > 0).all()
+
+
+def test_points_are_drawn_by_the_weights_of_the_trapezoidal_rule() -> None:
+    count, lattice = 40_000, Lattice(1.0, 8)
+    draws = draw(lattice, (-2.0,), 2, count, seed=3)
+    places = tuple((draws.indices - lattice.half.start).T)
+    found = np.zeros(lattice.half.shape)
+    np.add.at(found, places, draws.scales)
+    # The mean of each point is its weight, and its variance that of rare events of this scale.
+    weights = lattice.trapezoid_weights(lattice.half)
+    assert (np.abs(found - weights)[places] <= 6 * np.sqrt(weights[places] * draws.scales)).all()
+    assert len(np.unique(draws.indices, axis=0)) == weights.size
 
 
 def test_fields_of_unknown_origin_have_numbers_without_errors() -> None:

@@ -207,7 +207,7 @@ def test_single_precision_is_for_goals_above_its_rounding() -> None:
 
 
 @pytest.mark.parametrize("settings", [TransformSettings(dtype="complex64"), TransformSettings(stored="complex64")])
-@pytest.mark.parametrize("surface", [Sphere(), BOX])
+@pytest.mark.parametrize("surface", [Sphere(), icosphere(2)])
 def test_rounding_to_single_precision_is_an_error_like_any_other(
     surface: Sphere | Mesh, settings: TransformSettings
 ) -> None:
