@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 import socket
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from typing import Any, Self
 
@@ -40,14 +40,19 @@ def checksum_of(values: NDArray[Any]) -> int:
 
 
 class CheckedStore(WrapperStore[ZarrStore]):
-    """zarr's store whose chunks are checked as they are read, by the metadata documents of its arrays."""
+    """zarr's store whose chunks are checked as they are read, by the metadata documents of its arrays.
 
-    def __init__(self, store: ZarrStore, name: str, documents: Mapping[str, Mapping[str, Any]]) -> None:
+    Arrays in progress may lack chunks, which read as missing values.
+    """
+
+    def __init__(
+        self, store: ZarrStore, name: str, documents: Mapping[str, Mapping[str, Any]], in_progress: Collection[str]
+    ) -> None:
         super().__init__(store)
-        self._name, self._documents = name, documents
+        self._name, self._documents, self._in_progress = name, documents, in_progress
 
     def _with_store(self, store: ZarrStore) -> Self:
-        return type(self)(store, self._name, self._documents)
+        return type(self)(store, self._name, self._documents, self._in_progress)
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
         """Return the bytes of a key."""
@@ -65,6 +70,8 @@ class CheckedStore(WrapperStore[ZarrStore]):
                 f"{self._name}: it is not there for process {os.getpid()} of {socket.gethostname()}; a worker of your "
                 'Dask client needs the same path, or compute with scheduler="threads"'
             )
+        elif array not in self._in_progress:
+            problem = problem or "it is missing"
         if problem:
             place = key.removeprefix(f"{array}/c").removeprefix("/")
             raise DamageError(

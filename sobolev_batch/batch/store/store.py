@@ -59,8 +59,6 @@ DIGEST, UNFINISHED, COLLECTION, REMOVED = "digest", "unfinished", "collection", 
 _RUN = "run"
 # Written by tasks, and by themselves: the digest leaves them out. Qualities are a copy of what records have.
 _BESIDE_DIGEST = (FIELD, OCTAVES, RECORD, PAGE, QUALITY)
-# What tasks need of the metadata: tables have fifty times as much.
-_OF_TASKS = (FIELD, OCTAVES, RECORD, PAGE)
 _REQUESTS_AT_ONCE = 64
 
 
@@ -81,8 +79,7 @@ class Store:
         self._hashes: dict[str, str] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        names = [*_OF_TASKS, *self.keyed_arrays()]
-        carried = {name: document for name, document in self.documents.items() if name in names}
+        carried = {name: self.documents[name] for name in self._arrays_in_progress if name in self.documents}
         return {"location": self.location, "documents": carried, "_hashes": {}}
 
     @classmethod
@@ -178,6 +175,11 @@ class Store:
         names = (name for name in self.documents if "/" in name and name.split("/")[0] in groups)
         return [name for name in names if name.endswith("/key") or len(self.documents[name]["shape"]) > 1]
 
+    @property
+    def _arrays_in_progress(self) -> frozenset[str]:
+        """Names of the arrays that tasks fill, chunk by chunk: what they need of the metadata, a fiftieth of all."""
+        return frozenset({FIELD, OCTAVES, RECORD, PAGE, *self.keyed_arrays()})
+
     def array(self, name: str) -> zarr.Array[Any]:
         """Return an array, for reading and writing."""
         # The values of fields are compared with their records, which does more.
@@ -188,7 +190,7 @@ class Store:
 
     def checked_keys(self, largest: str = FIELD) -> ZarrStore:
         """Return the store that zarr and xarray take to read arrays up to the largest, whose chunks are checked."""
-        return CheckedStore(self._keys(largest), self.path, self.documents)
+        return CheckedStore(self._keys(largest), self.path, self.documents, self._arrays_in_progress)
 
     def _keys(self, largest: str) -> ZarrStore:
         chunk = self.document(largest)["chunk_grid"]["configuration"]["chunk_shape"]
