@@ -19,7 +19,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import cache, partial
 from itertools import pairwise
 
 import numpy as np
@@ -63,26 +63,23 @@ _FEWEST_FOR_GPU = 1 << 15
 _SPLITTER = 2.0**27 + 1
 
 
-def exact_transform(mesh: Mesh, frequencies: Reals, threads: int = 1, backend: Backend = CPU) -> Complexes:
+def exact_transform(mesh: Mesh, frequencies: Reals, backend: Backend = CPU) -> Complexes:
     """Return the transform ∫ exp(-2πi ξ·x) dμ(x) of a mesh's area measure, free of quadrature error.
 
     For ξ, float64 (P, 3), in cycles per unit length, it is complex128 (P,). The error of each triangle is about 1e-15
-    of its contribution, or of its area if that is smaller; the area itself is exact to rounding even on slivers. Any
-    number of threads gives the same digits, and a GPU changes the last ones.
+    of its contribution, or of its area if that is smaller; the area itself is exact to rounding even on slivers. A GPU
+    changes the last digits.
     """
     frequencies = np.asarray(frequencies, dtype=np.float64)
     columns = [np.ascontiguousarray(column) for column in mesh.vertices.T]
 
     def sums(backend: Backend) -> Complexes:
         batch = _BATCH[backend.name]
-
-        def part(start: int) -> Complexes:
+        parts = []
+        for start in range(0, len(mesh.triangles), batch):
             rows = np.ascontiguousarray(mesh.triangles[start : start + batch].T)
-            return _sums(np.stack([[column[index] for column in columns] for index in rows]), frequencies, backend)
-
-        # The threads are the processor's.
-        with ThreadPoolExecutor(threads if backend is CPU else 1) as pool:
-            parts = list(pool.map(part, range(0, len(mesh.triangles), batch)))
+            corners = np.stack([[column[index] for column in columns] for index in rows])
+            parts.append(_sums(corners, frequencies, backend))
         return np.asarray(np.sum(parts, axis=0, dtype=np.complex128))
 
     return compute_on(_faster(backend, mesh, frequencies), sums)
@@ -220,22 +217,40 @@ def _phases(points: Array, frequency: Array, plain: bool) -> Array:
 def _series(ab: Array, ac: Array, widest: float) -> tuple[Array, Array]:
     """Return real and imaginary part of Σ_n i^n h_n / (n+2)!, h_n the complete homogeneous symmetric polynomials.
 
-    As the nodes' mean is zero, h_n = p h_(n-2) + q h_(n-3) for p = Σ node²/2 and q their product.
+    As the nodes' mean is zero, h_n is the sum of C(j+k, k) p^j q^k over 2j + 3k = n, for p = Σ node²/2 and q their
+    product.
     """
     lowest = (ab + ac) / -3
     p = (ab * (ab - ac) + ac * ac) / 3
     q = lowest * (ab + lowest) * (ac + lowest)
-    before, previous, current = np.ones_like(ab), np.zeros_like(ab), p
-    real, imaginary = 0.5 - p / 24, np.zeros_like(ab)
-    factor, n = 1 / 24, 2
+    n = 2
     # |h_n| <= 2 (widest · 2/3)^n: stop where the next term is below half a rounding error of 1/2.
-    while 2 * (widest * 2 / 3) ** (n + 1) * factor / (n + 3) > 2e-17:
+    while 2 * (widest * 2 / 3) ** (n + 1) / math.factorial(n + 3) > 2e-17:
         n += 1
-        factor /= n + 2
-        before, previous, current = previous, current, p * previous + q * before
-        target = imaginary if n % 2 else real
-        target += (-factor if n % 4 >= 2 else factor) * current
-    return real, imaginary
+    # Powers of q with even exponents are real, the others imaginary; Horner's scheme in p, and then in q².
+    parts: list[Array] = [np.zeros_like(p), np.zeros_like(p)]
+    squares = q * q
+    for power, (last, *others) in reversed(list(enumerate(_coefficients(n)))):
+        values = np.zeros_like(p)
+        values += last
+        for coefficient in others:
+            values *= p
+            values += coefficient
+        parts[power % 2] *= squares
+        parts[power % 2] += values
+    return parts[0], parts[1] * q
+
+
+@cache
+def _coefficients(highest: int) -> list[list[float]]:
+    """Return the factors of p^j q^k in a series up to n, for each k those of the highest j first."""
+    return [
+        [
+            (-1) ** ((2 * j + 3 * k) // 2) * math.comb(j + k, k) / math.factorial(2 * j + 3 * k + 2)
+            for j in reversed(range((highest - 3 * k) // 2 + 1))
+        ]
+        for k in range(highest // 3 + 1)
+    ]
 
 
 def _quotient(exponentials: Sequence[Array], ab: Array, ac: Array) -> Array:
@@ -311,7 +326,7 @@ def sampled_transform(mesh: Mesh, frequencies: Reals, threads: int = 1, backend:
     lengths = np.linalg.norm(frequencies, axis=1)
     fine = 2 * np.pi * lengths * mesh.edge_length_range[1] < _FINE_MESH
     values = np.empty(len(frequencies), dtype=np.complex128)
-    values[fine] = exact_transform(mesh, frequencies[fine], threads, backend)
+    values[fine] = exact_transform(mesh, frequencies[fine], backend)
     others = frequencies[~fine]
 
     def sums(backend: Backend) -> Complexes:

@@ -203,7 +203,7 @@ def compute_field(
         probe = measure(sample.draws, values[sample.draws.places(block)], sample.exact)
     else:
         draws = draws_for([surface], lattice, orders, plan.lowest_degree)
-        probe = probe_block(surface, lattice, settings, block, values, draws, execution)
+        probe = probe_block(surface, lattice, settings, block, values, draws, execution.backend)
     quality = Quality.from_surface(surface, probe)
     return Field(values, transformed.points, transformed.backend, quality, settings)
 

@@ -229,8 +229,8 @@ class SurfaceKind(ABC):
         """Yield the points in nearly equal batches of at most a number, 8 times that of the largest rule or more."""
 
     @abstractmethod
-    def exact_values(self, frequencies: Reals, threads: int = 1, backend: Backend = CPU) -> Complexes:
-        """Return the exact transform at frequencies (P, 3), complex128 (P,). Threads or a backend may help."""
+    def exact_values(self, frequencies: Reals, backend: Backend = CPU) -> Complexes:
+        """Return the exact transform at frequencies (P, 3), complex128 (P,). A backend may help."""
 
     def sampled_values(self, frequencies: Reals, threads: int, backend: Backend = CPU) -> Complexes:
         """Return the transform at frequencies (P, 3) by the fastest formula, complex128 (P,)."""
@@ -285,8 +285,8 @@ class _Triangles(SurfaceKind):
         for _, group in groupby(zip(numbers, triangles, strict=True), key=itemgetter(0)):
             yield WeightedPoints.concatenated([batch.points(arrays, backend) for _, batch in group])
 
-    def exact_values(self, frequencies: Reals, threads: int = 1, backend: Backend = CPU) -> Complexes:
-        return exact_transform(self.surface, frequencies, threads, backend)
+    def exact_values(self, frequencies: Reals, backend: Backend = CPU) -> Complexes:
+        return exact_transform(self.surface, frequencies, backend)
 
     def sampled_values(self, frequencies: Reals, threads: int, backend: Backend = CPU) -> Complexes:
         return sampled_transform(self.surface, frequencies, threads, backend)
@@ -327,7 +327,7 @@ class _Parametrised(SurfaceKind):
             count += len(weights)
         yield WeightedPoints.concatenated(gathered)
 
-    def exact_values(self, frequencies: Reals, threads: int = 1, backend: Backend = CPU) -> Complexes:
+    def exact_values(self, frequencies: Reals, backend: Backend = CPU) -> Complexes:
         return exact_values(self.surface, frequencies)
 
     def loosest_tolerance(self, lattice: FrequencyLattice, orders: Sequence[float], norms: Reals) -> float:
@@ -342,7 +342,7 @@ class _ClosedForm(SurfaceKind):
     def batches(self, capacity: int, backend: Backend = CPU) -> Iterator[WeightedPoints]:
         yield from ()
 
-    def exact_values(self, frequencies: Reals, threads: int = 1, backend: Backend = CPU) -> Complexes:
+    def exact_values(self, frequencies: Reals, backend: Backend = CPU) -> Complexes:
         return sphere_transform(self.surface, frequencies)
 
     def block_values(self, lattice: FrequencyLattice, block: Block) -> Complexes:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from sobolev_batch.spectral.backends import CPU, Backend, Complexes
 from sobolev_batch.spectral.kinds import kind_of
 from sobolev_batch.spectral.lattice import Block, Lattice, SobolevWeights, shell_volumes
-from sobolev_batch.spectral.transform import ON_CPU, Execution, TransformSettings
+from sobolev_batch.spectral.transform import TransformSettings
 from sobolev_batch.surfaces.shapes.surface import Indices, Reals, Surface
 
 # Draws of a small mesh, of a huge one, and pairs of a triangle (or point) and a frequency in between.
@@ -160,13 +160,12 @@ class Sample:
     exact: NDArray[np.complex128]
 
     @classmethod
-    def from_surface(
-        cls, surface: Surface, draws: Draws, threads: int = 1, backend: Backend = CPU, *, fast: bool = False
-    ) -> Sample:
+    def from_surface(cls, surface: Surface, draws: Draws, backend: Backend = CPU, *, fast: bool = False) -> Sample:
         """Return the sample of a surface at given draws; a fast one may be off by some 1e-13 of the area."""
         kind = kind_of(surface)
-        values = kind.sampled_values if fast else kind.exact_values
-        return cls(draws, values(draws.frequencies, threads, backend))
+        if fast:
+            return cls(draws, kind.sampled_values(draws.frequencies, 1, backend))
+        return cls(draws, kind.exact_values(draws.frequencies, backend))
 
 
 def draws_for(surfaces: Sequence[Surface], lattice: Lattice, orders: Sequence[float], degree: int) -> Draws:
@@ -184,7 +183,7 @@ def probe_block(
     block: Block,
     values: Complexes,
     draws: Draws,
-    execution: Execution = ON_CPU,
+    backend: Backend = CPU,
 ) -> Probe:
     """Compare one block of a field with the exact transform, at the draws that fall into the block.
 
@@ -197,7 +196,7 @@ def probe_block(
     inside = np.all((offsets >= 0) & (offsets < block.shape), axis=1)
     draws = Draws(draws.indices[inside], draws.frequencies[inside], draws.scales[inside])
     # What a fast sample is off by can only make the field look worse.
-    exact = Sample.from_surface(surface, draws, execution.threads, execution.backend, fast=True).exact
+    exact = Sample.from_surface(surface, draws, backend, fast=True).exact
     probe = measure(draws, values[draws.places(block)], exact)
     change = settings.plan(surface, lattice).change
     # Once for the whole field.

@@ -219,7 +219,7 @@ def test_exact_transforms_agree(
 
 def test_the_processor_computes_exact_transforms_where_a_gpu_fails(caplog: pytest.LogCaptureFixture) -> None:
     mesh, frequencies = icosphere(3), np.full((32, 3), 1.5)
-    found = exact_transform(mesh, frequencies, backend=Device(capacity=1e4).backend())
+    found = exact_transform(mesh, frequencies, Device(capacity=1e4).backend())
     assert np.array_equal(found, exact_transform(mesh, frequencies))
     assert "the GPU fails: Out of memory" in caplog.text
 

@@ -165,8 +165,7 @@ def _fields(problem: Problem, lattice: Lattice, target: ErrorTarget) -> tuple[Fi
     execution = Execution(threads=max(1, problem.threads // len(problem.surfaces)))
 
     def field(surface: Surface) -> Field:
-        sample = Sample.from_surface(surface, draws, execution.threads)
-        settings = TransformSettings(dtype=dtype)
+        sample, settings = Sample.from_surface(surface, draws), TransformSettings(dtype=dtype)
         if needs_probe(surface, TransformSettings()):
             # Where the prediction fails, bounds are wider, and the next lattice gets a stricter target.
             settings = choose_settings(surface, lattice, target.tightened(_PREDICTION_CAUTION), settings)
