@@ -228,7 +228,8 @@ class Status:
             if is_ahead:
                 yield f"whether it goes on is unknown; if it is gone: sobolev-batch unlock {store} --force"
             if self.lost:
-                yield "its process is probably gone; run or submit the study again, and it continues from the store"
+                yield "its process is probably gone, or its clock is behind the one here"
+                yield "run or submit the study again, and it continues from the store"
                 yield f"if the store turns out to be locked: sobolev-batch unlock {store}"
         elif run.state == "failed":
             object_text = f" of {self.run_store}" if self.run_store else ""

@@ -17,6 +17,8 @@ from distributed import Client
 
 from sobolev_batch import Study, matrix, norm, open_store, run, status, verify
 from sobolev_batch.batch.cluster.execution import Progress
+from sobolev_batch.batch.storage.lock import utc_now
+from sobolev_batch.batch.store.records import RunRecord
 from sobolev_batch.batch.store.store import Store
 from sobolev_batch.errors import DamageError, StoreError
 from sobolev_batch.results.store_accessor import StoreAccessor
@@ -344,7 +346,13 @@ def test_a_root_that_cannot_be_read(damage: Damage, store: Path, threads: Client
 def test_the_record_of_a_run_that_was_altered(store: Path, study: Study, threads: Client) -> None:
     path = store / "records/zarr.json"
     path.write_text(path.read_text().replace('"state": "done"', '"state": "failed"'))
-    with pytest.raises(DamageError, match="the record of the latest run is damaged"):
+    with pytest.raises(
+        DamageError, match=r"records/zarr.json, the record of the latest run, is damaged .*run the study"
+    ):
+        status(store)
+    assert list(verify(store).tables) == ["records"]
+    Store.open(store).write_run(RunRecord("running", "process 1", utc_now(), "25:00 o'clock"))
+    with pytest.raises(DamageError, match=r"records/zarr.json, .* is damaged \(seen: .*o'clock"):
         status(store)
     assert list(verify(store).tables) == ["records"]
     run(study, store, threads)

@@ -200,7 +200,10 @@ def test_of_many_at_once_one_has_it(place: str, before: str | None, tmp_path: Pa
         location.discard(LOCK_KEY)
 
 
-@pytest.mark.parametrize("text", [b"", b"{", b"[1]", b'{"run": 3}', b'{"nothing": "known"}'])
+NONSENSE = b'{"run": "r", "holder": "h", "driver": "d", "since": "noon"}'
+
+
+@pytest.mark.parametrize("text", [b"", b"{", b"[1]", b'{"run": 3}', b'{"nothing": "known"}', NONSENSE])
 def test_a_lock_that_cannot_be_read_is_one(text: bytes, location: Location) -> None:
     location.create(LOCK_KEY, text)
     with pytest.raises(LockError, match="a process that has not written its name"):

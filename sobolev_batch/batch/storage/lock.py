@@ -80,7 +80,9 @@ class Lock:
             entries = json.loads(text)
             if not all(isinstance(entry, str) for entry in entries.values()):
                 raise TypeError("a lock holds texts")
-            return cls(**entries)
+            lock = cls(**entries)
+            age_seconds(lock.since)
+            return lock
         except (ValueError, TypeError, AttributeError):
             # Its holder was killed while it wrote this, or is still writing.
             return cls("", "", "a process that has not written its name", "an unknown time")
@@ -228,5 +230,5 @@ def utc_now() -> str:
 
 
 def age_seconds(moment: str) -> float:
-    """Return the seconds since a time that `utc_now` returned."""
+    """Return the seconds since a time that `utc_now` returned; ValueError where it is none."""
     return time.time() - calendar.timegm(time.strptime(moment, _TIME_FORMAT))

@@ -6,10 +6,11 @@ import json
 from collections.abc import Hashable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cache
-from typing import Any, ClassVar, Literal, Self, TypeVar, cast
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, cast
 
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import AfterValidator, ConfigDict, TypeAdapter, ValidationError
 
+from sobolev_batch.batch.storage.lock import age_seconds
 from sobolev_batch.errors import DamageError
 from sobolev_batch.surfaces.sources.mesh_cache import Cost
 
@@ -21,6 +22,14 @@ _ROW = "row"
 WITHDRAWN = "null"
 Kind = TypeVar("Kind")
 _adapter = cache(TypeAdapter)
+
+
+def _checked_time(text: str) -> str:
+    age_seconds(text)
+    return text
+
+
+Time = Annotated[str, AfterValidator(_checked_time)]
 
 
 def record_from_table(kind: type[Kind], table: Any, name: str) -> Kind:
@@ -35,7 +44,7 @@ def record_from_table(kind: type[Kind], table: Any, name: str) -> Kind:
 
 
 def _damage(name: str, problem: str, content: object) -> DamageError:
-    return DamageError(f"{name} is damaged ({problem}): {str(content)[:80]!r}", problem)
+    return DamageError(f"{name} is damaged ({problem}): {str(content)[:80]!r}; run the study again", problem)
 
 
 @dataclass(frozen=True)
@@ -122,7 +131,7 @@ class Record:
     seconds: float = 0.0
     worker: str = ""
     backend: str = ""
-    finished: str = ""
+    finished: Time | Literal[""] = ""
     proximity: ProximityRecord | None = None
     cost: Cost | None = None
 
@@ -165,7 +174,7 @@ class RunRecord:
 
     state: RunState
     driver: str
-    started: str
-    seen: str
+    started: Time
+    seen: Time
     stage: str = ""
     error: str = ""

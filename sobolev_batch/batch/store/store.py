@@ -400,10 +400,10 @@ class Store:
         table = document.get("attributes", {}).get(_RUN)
         if table is None:
             return None
-        digest = table.pop(DIGEST, "")
+        digest, name = table.pop(DIGEST, ""), f"{self.path}: {RECORDS}/{ROOT}, the record of the latest run,"
         if digest != digest_of(table):
-            raise DamageError(f"{self.path}: the record of the latest run is damaged ({CHANGED}): {table}", CHANGED)
-        return record_from_table(RunRecord, table, f"{self.path}: the record of the latest run")
+            raise DamageError(f"{name} is damaged ({CHANGED}): {table}; run the study again", CHANGED)
+        return record_from_table(RunRecord, table, name)
 
     def write_run(self, record: RunRecord) -> None:
         """Replace the record of the latest run: an attribute of the group of records, in one key."""
