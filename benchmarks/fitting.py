@@ -46,7 +46,7 @@ def _derivative(level: int, intervals: int, effort: Effort) -> Row:
     vertices = np.array(mesh.vertices)
     value, both = take_turns([squared.value, squared], lambda: vertices, effort.repeats)
     what = f"T_{level}, M = {intervals}: value and derivative, against the value"
-    return Row("11", what, as_seconds(both), as_seconds(value), both / value, at_most(3))
+    return Row("11", what, as_seconds(both), as_seconds(value), both / value, at_most(2.5))
 
 
 def _fit(

@@ -26,8 +26,8 @@ from sobolev_batch.spectral.lattice import SobolevWeights
 from sobolev_batch.spectral.transform import TransformSettings, transform_block
 
 _WORKERS = 2
-_OVERHEAD = at_most(1.15)
-_ALL_PAIRS = at_most(2)
+_OVERHEAD = at_most(1.1)
+_ALL_PAIRS = at_most(1.7)
 _ALL_PAIRS_BYTES = 2e9
 _XI_MAX = 5.0
 _SAMPLE_PER_WORKER = 8

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import platform
+import subprocess
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from datetime import date
 from importlib.metadata import version
 from pathlib import Path
 from statistics import median
@@ -69,11 +71,18 @@ def take_turns(
 
 
 def machine_facts() -> list[str]:
-    """The processor and the versions that times depend on, one line each."""
+    """The commit, the processor and the versions that times depend on, one line each."""
     return [
+        f"commit {_commit()}, {date.today()}",
         f"processor: {_processor()}, {os.cpu_count()} logical cores, {available_cores()} of them in use",
         f"python {platform.python_version()}, " + ", ".join(f"{name} {version(name)}" for name in _LIBRARIES),
     ]
+
+
+def _commit() -> str:
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=10"]
+    found = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
+    return found.stdout.strip() or "unknown"
 
 
 def _processor() -> str:
