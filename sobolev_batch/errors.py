@@ -1,7 +1,7 @@
 """Exceptions of the package: one tree, with plain messages, safe to pickle between processes."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from sobolev_batch.visible import visible
 
@@ -96,7 +96,11 @@ def one_line(error: BaseException) -> str:
     Line breaks of our own messages are those of names, and stay visible. Only the beginning of a long message of
     another library is kept.
     """
-    message = str(error) if isinstance(error, SobolevBatchError) else " ".join(str(error)[:_LONGEST].split())
+    message = ""
+    with suppress(Exception):  # a user's own may have no text
+        message = str(error)
+    if not isinstance(error, SobolevBatchError):
+        message = " ".join(message[:_LONGEST].split())
     return visible(message) or type(error).__name__
 
 

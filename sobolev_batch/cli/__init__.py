@@ -14,7 +14,7 @@ import click
 from sobolev_batch.cli import meshes, stores, studies, tables  # noqa: F401
 from sobolev_batch.cli.common import EXIT_INPUT, EXIT_OTHER, cli, echo, echo_lines, patience, show_usage_error
 from sobolev_batch.cli.interruption import SECONDS_TO_END, Deadline, end_process, ignore_requests
-from sobolev_batch.errors import InputError, SobolevBatchError
+from sobolev_batch.errors import InputError, SobolevBatchError, one_line
 from sobolev_batch.visible import make_messages_visible
 
 __all__ = ["cli", "main"]
@@ -56,7 +56,7 @@ def main() -> None:
             echo_lines(traceback.format_exc().removesuffix("\n"), err=True)
             sys.exit(other)
         is_ours = isinstance(error, SobolevBatchError)
-        message = str(error) if is_ours else f"{type(error).__name__}: {error} (--debug shows where)"
+        message = str(error) if is_ours else f"{type(error).__name__}: {one_line(error)} (--debug shows where)"
         echo(f"error: {message}", err=True)
         sys.exit(EXIT_INPUT if isinstance(error, InputError) else other)
     sys.exit(status or 0)

@@ -41,6 +41,13 @@ KINDS: dict[str, dict[str, Any]] = {
 }
 
 
+class SilentError(Exception):
+    """An error that has no text."""
+
+    def __str__(self) -> str:
+        raise RuntimeError("no text")
+
+
 def members(table: dict[str, Any], folder: Path = Path()) -> tuple[Member, ...]:
     return parse_source(table).members(folder)
 

@@ -30,7 +30,7 @@ from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.sampling import FaceNormals, OctaveSampling, TailSampling
 from sobolev_batch.spectral.probe import estimate
 from sobolev_batch.surfaces.shapes.surface import Extent, Reals, Similarity, Surface
-from sobolev_batch.surfaces.sources.registry import Member
+from sobolev_batch.surfaces.sources.registry import Member, surface_of
 
 # Family and member of each surface, by label.
 Members = Mapping[str, tuple[str, Member]]
@@ -234,7 +234,7 @@ def choose_pilots(
 
 def _comparable(member: Member, similarity: Similarity, reference: Extent) -> Surface:
     """Return a surface in the study's unit, unless it reaches much farther than the reference."""
-    surface = similarity.apply(member.load())
+    surface = similarity.apply(surface_of(member))
     times = surface.extent.reach / reference.reach
     if times > _FARTHEST:
         raise MeshError(f"its extent is {times:.3g} times that of the reference; are both in the same unit?")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import trimesh
@@ -11,6 +12,8 @@ import trimesh
 from sobolev_batch import Study
 from sobolev_batch.batch.study.plan import make_plan, members_of
 from sobolev_batch.errors import LatticeError, MeshError, StudyError
+from sobolev_batch.surfaces.sources.registry import SurfaceMember
+from tests.support.members import SilentError
 from tests.support.studies import small_table
 
 
@@ -116,3 +119,13 @@ def test_two_surfaces_of_one_label_are_refused(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(type(source), "members", lambda self, folder: [*members, members[0]])
     with pytest.raises(StudyError, match="two surfaces of the study have the label 'ico/0'"):
         members_of(study)
+
+
+def test_what_a_source_of_another_package_raises_stops_no_plan(monkeypatch: pytest.MonkeyPatch) -> None:
+    table = small_table(lattice=None, accuracy={"rtol": 0.3}, reference={"source": "icosphere", "levels": [2]})
+    table["family"].append({"name": "ball", "source": "sphere"})
+    for name in ("load", "fingerprint"):
+        monkeypatch.setattr(SurfaceMember, name, Mock(side_effect=SilentError))
+    assert {row.label for row in make_plan(Study.from_table(table)).rows if not row.key} == {"ball/sphere"}
+    with pytest.raises(MeshError, match="the reference cannot be made: SilentError"):
+        make_plan(Study.from_table({**table, "reference": {"source": "sphere"}}))

@@ -19,7 +19,7 @@ from sobolev_batch.surfaces.sources.command import RemeshedMember
 from sobolev_batch.surfaces.sources.mesh_cache import MeshCache
 from sobolev_batch.surfaces.sources.registry import Member, parse_source
 from tests.support.commands import call
-from tests.support.members import BALL, listed, loaded
+from tests.support.members import BALL, SilentError, listed, loaded
 from tests.support.processes import wait_until
 from tests.support.studies import balls, small_table
 
@@ -208,6 +208,7 @@ def test_formats_of_other_remeshers(tmp_path: Path) -> None:
     [
         (RuntimeError("no convergence"), "broken: RuntimeError: no convergence$"),
         (SystemExit(3), "broken: SystemExit: 3$"),
+        (SilentError(), "broken: SilentError: SilentError$"),
         (RuntimeError("long " * 10**6), "^.{1000,3000}$"),
     ],
 )
