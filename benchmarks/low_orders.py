@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sobolev_batch as sb
-from benchmarks.meshes import pair_of_cortex
+from benchmarks.meshes import pair_of_cortex, pair_of_parts
 from benchmarks.table import Row, as_seconds, at_most
 from benchmarks.timing import Effort
 
@@ -22,6 +22,7 @@ Sum = Callable[[Reals, Reals], float]
 # Order, rtol, and most processor seconds, for a coarse organic mesh against a fine one.
 _REQUESTS = ((-2.0, 1e-2, 3.0), (-2.0, 1e-3, 10.0), (-1.0, 1e-2, 20.0), (-0.6, 1e-1, 20.0))
 _OF_SPHERE = (-2.0, 1e-3, 10.0)
+_OF_PARTS = ((-2.0, 1e-2, 5.0), (-0.75, 1e-1, 30.0))
 
 
 def low_orders(effort: Effort) -> Iterator[Row]:
@@ -35,6 +36,11 @@ def low_orders(effort: Effort) -> Iterator[Row]:
     order, rtol, most = _OF_SPHERE
     level = 3 if effort.quick else 5
     yield _row(f"T_{level} against the sphere", sb.shapes.icosphere(level), sb.shapes.Sphere(), order, rtol, most)
+    for triangles in (1_500, 6_000):
+        part, original = pair_of_parts(effort, triangles)
+        name = f"a mechanical part, {len(part.triangles):,} against {len(original.triangles):,} triangles"
+        for order, rtol, most in _OF_PARTS:
+            yield _row(name, part, original, order, rtol, most)
     yield from _against_points(what, coarse, fine, effort)
 
 
