@@ -15,7 +15,8 @@ task; a reduction over the stored fields makes the tables. Data flows one way th
 The public names by subject:
 
 - Numbers with their errors, of surfaces and of fields: `distance`, `norm`. Their causes: `spectrum` (wavelengths),
-  `witness` (places). For orientation: `yardsticks`, and `proximity` (Hausdorff, Chamfer).
+  `witness` (places). For orientation: `yardsticks`, and `proximity` (Hausdorff, Chamfer) and
+  `vertex_distances`.
 - Meshes: `Mesh`, `as_mesh` (of paths, arrays and other libraries' meshes), `read_mesh`, `write_mesh`; `fit` moves the
   vertices of one towards a target.
 - Fields: `fourier_transform` on a `Lattice`; all of the above are methods of `field.sobolev`.

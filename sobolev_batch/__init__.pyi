@@ -36,6 +36,7 @@ from .surfaces.formats.readers import as_mesh as as_mesh
 from .surfaces.formats.readers import read_mesh as read_mesh
 from .surfaces.formats.readers import write_mesh as write_mesh
 from .surfaces.proximity import proximity as proximity
+from .surfaces.proximity import vertex_distances as vertex_distances
 from .surfaces.shapes.mesh import Mesh as Mesh
 
 __all__: list[str]

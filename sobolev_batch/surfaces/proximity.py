@@ -141,8 +141,27 @@ def proximity(
     }
 
 
-def vertex_distances(mesh: Mesh, other: Mesh) -> Reals:
-    """Return the distance of each vertex from the closest point of another mesh (n,); NaN where no triangle uses it."""
+def vertex_distances(mesh: MeshLike, other: MeshLike) -> Reals:
+    """Measure the distance of each vertex of a mesh from the closest point of another mesh.
+
+    Args:
+        mesh: Mesh whose vertices are measured, or what `as_mesh` makes one of.
+        other: Mesh from which they are measured, in the same unit of length, or what `as_mesh` makes one of.
+
+    Returns:
+        Distances (n,) of float64, unsigned, exact to rounding, in the unit of the meshes; NaN for a vertex that no
+        triangle uses.
+
+    Raises:
+        InputError: see `as_mesh`.
+
+    >>> import sobolev_batch as sb
+    >>> ball = sb.shapes.icosphere(3)
+    >>> distances = sb.vertex_distances(sb.Mesh(2 * ball.vertices, ball.triangles), ball)
+    >>> distances.shape, distances.round(12).min().item(), distances.round(12).max().item()
+    ((642,), 1.0, 1.0)
+    """
+    mesh, other = as_mesh(mesh), as_mesh(other)
     distances = np.full(len(mesh.vertices), np.nan)
     distances[mesh.used_vertices] = Triangles.of_mesh(other).closest(mesh.vertices[mesh.used_vertices])[0]
     return distances

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 import sobolev_batch as sb
-from sobolev_batch.surfaces.proximity import MOST_POINTS, proximity, vertex_distances
+from sobolev_batch.surfaces.proximity import MOST_POINTS, proximity
 
 
 def square(side: float, height: float = 0.0, *, stray: tuple[float, float, float] | None = None) -> sb.Mesh:
@@ -113,9 +113,34 @@ def test_triangles_of_all_sizes_are_searched() -> None:
     points = sb.Mesh(np.vstack([3 * rng.normal(size=(300, 3)), [[9.0, 9.0, 9.0]]]), np.arange(300).reshape(-1, 3))
     surface = trimesh.Trimesh(many.vertices, many.triangles, process=False)
     _, expected, _ = trimesh.proximity.closest_point_naive(surface, points.vertices[:300])
-    found = vertex_distances(points, many)
+    found = sb.vertex_distances(points, many)
     assert found[:300] == pytest.approx(expected, rel=1e-9, abs=1e-12)
     assert np.isnan(found[300])
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 25.4])
+def test_vertices_of_spheres_and_plates_have_distances_in_closed_form(unit: float) -> None:
+    ball = sb.shapes.icosphere(3)
+    inner, outer = (sb.Mesh(unit * radius * ball.vertices + 7 * unit, ball.triangles) for radius in (1.0, 1.5))
+    # The closest point of a convex body is its vertex on the same ray.
+    assert sb.vertex_distances(outer, inner) == pytest.approx(np.full(len(ball.vertices), 0.5 * unit), rel=1e-12)
+    # From within a convex body the closest plane of a triangle decides.
+    first, second, third = ball.corners()
+    normals = np.cross(second - first, third - first)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    heights = 1.5 * (normals * first).sum(axis=1) - ball.vertices @ normals.T
+    assert sb.vertex_distances(inner, outer) == pytest.approx(unit * heights.min(axis=1), rel=1e-12)
+    plate, raised = square(2.0 * unit), square(2.0 * unit, 0.25 * unit, stray=(9.0, 9.0, 9.0))
+    assert sb.vertex_distances(plate, raised) == pytest.approx(np.full(4, 0.25 * unit), rel=1e-12)
+    assert sb.vertex_distances(raised, plate)[:4] == pytest.approx(np.full(4, 0.25 * unit), rel=1e-12)
+    # A larger plate reaches beyond a smaller one: its corners have a diagonal to go.
+    larger = square(8.0 * unit, 4.0 * unit)
+    assert sb.vertex_distances(larger, plate) == pytest.approx(np.full(4, np.sqrt(9 + 9 + 16) * unit), rel=1e-12)
+
+
+def test_distances_of_vertices_are_measured_between_meshes_alone() -> None:
+    with pytest.raises(sb.errors.InputError, match="mesh"):
+        sb.vertex_distances(sb.shapes.icosphere(1), sb.shapes.Sphere())
 
 
 @pytest.mark.parametrize("scale", [1e-60, 1e-12, 1.0, 1e12, 1e60])
