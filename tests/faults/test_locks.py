@@ -94,7 +94,8 @@ def test_a_run_whose_store_was_unlocked_ends(
         unlocked = call("unlock", "--force", store_path)
         assert unlocked.returncode == 0
         assert f"unlocked; process {os.getpid()} on" in unlocked.stdout
-    with pytest.raises(LockError, match="nothing more is written by a run that no longer has the store"):
+    # Its heartbeat or a task notices first.
+    with pytest.raises(LockError, match=r"no longer (has the store|its own|that of this process)"):
         first.result()
 
 
