@@ -276,7 +276,8 @@ class _Triangles(SurfaceKind):
         triangles = [batch for use in self.uses for batch in use.split(capacity // (2 if use.rule.sharing > 1 else 8))]
         ends = np.cumsum([batch.largest_points for batch in triangles])
         total = int(ends[-1])
-        count = -(-total // (capacity - max(batch.largest_points for batch in triangles)))
+        margin = 0 if total <= capacity else max(batch.largest_points for batch in triangles)
+        count = -(-total // (capacity - margin))
         # A batch of triangles goes where its first point goes, so that each batch of points exceeds its equal
         # number by at most one batch of triangles.
         numbers = (np.concatenate([[0], ends[:-1]]) * count // total).tolist()

@@ -102,6 +102,8 @@ def test_batches_hold_the_area_and_the_second_moments(method: str | int, capacit
     assert max(sizes) <= capacity
     # They are nearly equal, up to a batch of triangles.
     assert max(sizes) < 2 * np.mean(sizes)
+    # Each batch takes an FFT: there is one where that will do.
+    assert len(list(kind_of(BOX).plan(8.0, 1e-10, method).batches(sum(sizes)))) == 1
     coordinates = np.concatenate([batch.coordinates for batch in batches], axis=1)
     weights = np.concatenate([batch.weights for batch in batches])
     assert (weights > 0).all()
