@@ -111,8 +111,21 @@ PLACEHOLDER = re.compile(r"\{(\w+)\}")
 _LONGEST_TAIL = 300
 # Seconds between looks at a program that runs: at first, and at most.
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.005, 0.1
-# It is told the number of a process, and kills its session and removes a folder when the writer ends, however it does.
-_GUARD = 'read -r number && { read -r _; kill -s KILL -- "-$number"; rm -rf -- "$1"; } 2> /dev/null'
+# Variable of a program's environment with its folder. On Linux it shows which processes left the program's session.
+_MARK = "SOBOLEV_BATCH_FOLDER"
+# It is told the number of a process. When the writer ends, however it does, it kills the session of the process and
+# those that left it, and removes the folder.
+_GUARD = f"""
+read -r number || exit
+exec 2> /dev/null
+read -r _
+kill -s KILL -- "-$number"
+for place in $(grep -lFzx -e "{_MARK}=$1" /proc/[0-9]*/environ); do
+    place=${{place%/environ}}
+    kill -s KILL "${{place#/proc/}}"
+done
+rm -rf -- "$1"
+"""
 
 
 def environment() -> dict[str, str]:
@@ -149,7 +162,7 @@ def run_command(mesh: Mesh, words: list[str], suffixes: tuple[str, str], timeout
             process = subprocess.Popen(  # noqa: S603 -- the user permitted it
                 filled,
                 cwd=folder,
-                env=environment(),
+                env=environment() | {_MARK: str(folder)},
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=err,

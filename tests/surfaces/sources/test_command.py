@@ -152,7 +152,9 @@ def test_a_program_that_fails_says_why(tmp_path: Path, command: str, reason: str
 
 @pytest.mark.process
 def test_a_program_ends_with_the_process_that_waits_for_it(tmp_path: Path) -> None:
-    script = f"echo $$ > {tmp_path / 'begun'}; mv {tmp_path / 'begun'} {tmp_path / 'number'}; sleep 1000 & sleep 1000"
+    apart = "setsid sh -c 'echo $$; sleep 1000'" if sys.platform == "linux" else "echo $$"
+    both = "until [ $(wc -l < begun) = 2 ]; do sleep 0.01; done; mv begun numbers"
+    script = f"cd {tmp_path}; echo $$ > begun; {apart} >> begun & sleep 1000 & {both}; sleep 1000"
     run = (
         "import sobolev_batch as sb; from sobolev_batch.surfaces.sources.mesh_cache import run_command; "
         f"run_command(sb.shapes.icosphere(0), ['sh', '-c', {script!r}], ('.ply', '.ply'), 1000.0, 10**9)"
@@ -160,13 +162,13 @@ def test_a_program_ends_with_the_process_that_waits_for_it(tmp_path: Path) -> No
     scratch = tmp_path / "scratch"
     scratch.mkdir()
     waiting = subprocess.Popen([sys.executable, "-c", run], env=os.environ | {"TMPDIR": str(scratch)})
-    wait_until((tmp_path / "number").exists)
+    wait_until((tmp_path / "numbers").exists)
     assert len(list(scratch.iterdir())) == 1
     waiting.kill()
     waiting.wait()
     wait_until(lambda: not list(scratch.iterdir()))
-    number = int((tmp_path / "number").read_text())
-    assert not psutil.pid_exists(number) or psutil.Process(number).status() == psutil.STATUS_ZOMBIE
+    for number in map(int, (tmp_path / "numbers").read_text().split()):
+        assert not psutil.pid_exists(number) or psutil.Process(number).status() == psutil.STATUS_ZOMBIE
 
 
 @pytest.mark.process
