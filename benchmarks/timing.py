@@ -31,7 +31,7 @@ class Effort:
         large: the sizes that take minutes or many gigabytes as well.
     """
 
-    repeats: int = 5
+    repeats: int = 3
     quick: bool = False
     large: bool = False
 
