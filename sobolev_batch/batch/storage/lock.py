@@ -12,18 +12,19 @@ stored something newer. Before each write it looks whether the lock is still tha
 from __future__ import annotations
 
 import calendar
-import json
 import logging
 import os
 import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
-from typing import Self
+from typing import Annotated, Self
 from uuid import uuid4
+
+from pydantic import AfterValidator, TypeAdapter, ValidationError
 
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.errors import LockError, StoreError
@@ -38,6 +39,15 @@ LOCK_KEY = "claim.json"
 # Held during a takeover, since several drivers may try.
 _TAKEOVER_KEY = "claim.succession.json"
 LOCK_KEYS = frozenset({LOCK_KEY, _TAKEOVER_KEY})
+
+
+def _checked_time(text: str) -> str:
+    age_seconds(text)
+    return text
+
+
+# A time that `utc_now` returned.
+Time = Annotated[str, AfterValidator(_checked_time)]
 
 
 @dataclass(frozen=True)
@@ -56,7 +66,7 @@ class Lock:
     run: str
     holder: str
     driver: str
-    since: str
+    since: Time
     process: str = ""
     folder: str = ""
 
@@ -68,22 +78,17 @@ class Lock:
 
     def to_json(self) -> bytes:
         """Return the lock as JSON."""
-        return json.dumps(asdict(self)).encode()
+        return _adapter().dump_json(self)
 
     @classmethod
-    def read(cls, location: Location) -> Self | None:
+    def read(cls, location: Location) -> Lock | None:
         """Return the lock on a store, or None if it has none."""
         text = location.read(LOCK_KEY)
         if text is None:
             return None
         try:
-            entries = json.loads(text)
-            if not all(isinstance(entry, str) for entry in entries.values()):
-                raise TypeError("a lock holds texts")
-            lock = cls(**entries)
-            age_seconds(lock.since)
-            return lock
-        except (ValueError, TypeError, AttributeError):
+            return _adapter().validate_json(text)
+        except ValidationError:
             # Its holder was killed while it wrote this, or is still writing.
             return cls("", "", "a process that has not written its name", "an unknown time")
 
@@ -117,6 +122,11 @@ class Lock:
         """Check that its holder still has the store."""
         if not self.is_held(location):
             raise LockError(f"{location}: the store was unlocked, or removed, and is no longer that of this process")
+
+
+@cache
+def _adapter() -> TypeAdapter[Lock]:
+    return TypeAdapter(Lock)
 
 
 def _require_run(run: str, location: Location) -> None:

@@ -147,15 +147,11 @@ def unlock(store: str | Path | Location, *, force: bool = False) -> Lock | None:
 
 def _silence_seconds(location: Location, lock: Lock) -> float:
     """Return the time since the latest heartbeat of a lock's holder."""
-    moments = [lock.since]
+    moments = [lock.since] if lock.run else []
     # If the store cannot be read, only the lock itself is known.
     with suppress(StoreError):
         store = Store(location)
         run = store.read_run() if store.exists() else None
         if run is not None and run.driver.startswith(lock.driver):
             moments.append(run.seen)
-    ages = []
-    for moment in moments:
-        with suppress(ValueError):  # not a time that this program writes
-            ages.append(age_seconds(moment))
-    return min(ages, default=math.inf)
+    return min(map(age_seconds, moments), default=math.inf)

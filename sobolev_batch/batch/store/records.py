@@ -6,11 +6,11 @@ import json
 from collections.abc import Hashable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cache
-from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, cast
+from typing import Any, ClassVar, Literal, Self, TypeVar, cast
 
-from pydantic import AfterValidator, ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from sobolev_batch.batch.storage.lock import age_seconds
+from sobolev_batch.batch.storage.lock import Time
 from sobolev_batch.errors import DamageError
 from sobolev_batch.surfaces.sources.mesh_cache import Cost
 
@@ -22,14 +22,6 @@ _ROW = "row"
 WITHDRAWN = "null"
 Kind = TypeVar("Kind")
 _adapter = cache(TypeAdapter)
-
-
-def _checked_time(text: str) -> str:
-    age_seconds(text)
-    return text
-
-
-Time = Annotated[str, AfterValidator(_checked_time)]
 
 
 def record_from_table(kind: type[Kind], table: Any, name: str) -> Kind:

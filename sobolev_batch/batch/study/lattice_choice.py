@@ -18,7 +18,7 @@ import numpy as np
 
 from sobolev_batch.batch.study.schema import MOST_OCTAVES
 from sobolev_batch.batch.study.study import Study
-from sobolev_batch.errors import AccuracyError, InputError, MeshError, StudyError
+from sobolev_batch.errors import AccuracyError, MeshError, StudyError, one_line
 from sobolev_batch.parameters import available_cores
 from sobolev_batch.spectral.adaptive.octaves import solve_in_octaves
 from sobolev_batch.spectral.adaptive.problem import ESTIMATE_CAUTION, Problem, error_target
@@ -30,7 +30,7 @@ from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.sampling import FaceNormals, OctaveSampling, TailSampling
 from sobolev_batch.spectral.probe import estimate
 from sobolev_batch.surfaces.shapes.surface import Extent, Reals, Similarity, Surface
-from sobolev_batch.surfaces.sources.registry import Member, surface_of
+from sobolev_batch.surfaces.sources.registry import Member
 
 # Family and member of each surface, by label.
 Members = Mapping[str, tuple[str, Member]]
@@ -197,8 +197,8 @@ def look_at_extents(
             break
         try:
             extents[label] = _comparable(member, similarity, reference).extent
-        except InputError as error:
-            set_aside[label] = str(error)
+        except Exception as error:  # its source may raise anything
+            set_aside[label] = one_line(error)
     return extents, set_aside
 
 
@@ -227,14 +227,14 @@ def choose_pilots(
                     if label not in pilots:
                         pilots[label] = _comparable(member, similarity, reference)
                     break
-                except InputError as error:
-                    set_aside[label] = str(error)
+                except Exception as error:
+                    set_aside[label] = one_line(error)
     return pilots, set_aside
 
 
 def _comparable(member: Member, similarity: Similarity, reference: Extent) -> Surface:
     """Return a surface in the study's unit, unless it reaches much farther than the reference."""
-    surface = similarity.apply(surface_of(member))
+    surface = similarity.apply(member.load())
     times = surface.extent.reach / reference.reach
     if times > _FARTHEST:
         raise MeshError(f"its extent is {times:.3g} times that of the reference; are both in the same unit?")

@@ -14,7 +14,7 @@ import numpy as np
 from sobolev_batch.batch.study.lattice_choice import LatticeChoice, Members, choice_basis, choose_lattice
 from sobolev_batch.batch.study.schema import FamilyReference
 from sobolev_batch.batch.study.study import REFERENCE_LABEL, Study
-from sobolev_batch.errors import InputError, MeshError, StudyError, one_line
+from sobolev_batch.errors import MeshError, StudyError, one_line
 from sobolev_batch.fitting.sources import FittedMember
 from sobolev_batch.spectral.adaptive.solve import DistanceTarget
 from sobolev_batch.spectral.fields import USUAL_DEGREE
@@ -28,7 +28,7 @@ from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Extent, Similarity, Surface
 from sobolev_batch.surfaces.sources.command import RemeshedMember
 from sobolev_batch.surfaces.sources.names import quoted
-from sobolev_batch.surfaces.sources.registry import Member, single_member, surface_of
+from sobolev_batch.surfaces.sources.registry import Member, single_member
 
 _log = logging.getLogger(__name__)
 
@@ -123,9 +123,9 @@ def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan
     members = members_of(study)
     reference = _reference_label(study, members)
     try:
-        own = surface_of(members[reference][1])
-    except InputError as error:
-        raise MeshError(f"the reference cannot be made: {error}") from error
+        own = members[reference][1].load()
+    except Exception as error:  # its source may raise anything
+        raise MeshError(f"the reference cannot be made: {one_line(error)}") from error
     similarity = study.scaling or Similarity.to_unit_ball(own)
     surface = similarity.apply(own)
     choice = _lattice_choice(study, similarity, members, reference, surface, earlier_choice)

@@ -193,32 +193,23 @@ def _awaited(
 ) -> tuple[str, float, float]:
     """Wait for a program, and return why it was ended before its time, its processor time and its largest memory."""
     problem, pause, deadline, peak_bytes = "", _FIRST_PAUSE, time.monotonic() + timeout, float("nan")
-    try:
-        while True:
-            # Nothing in subprocess tells the time of a single process. Its peak of memory would count this process,
-            # from which it was forked.
-            found, status, usage = os.wait4(process.pid, 0 if problem else os.WNOHANG)
-            if found:
-                process.returncode = os.waitstatus_to_exitcode(status)
-                return problem, usage.ru_utime + usage.ru_stime, peak_bytes
-            peak_bytes = float(np.fmax(peak_bytes, _resident_bytes(process.pid)))
-            if time.monotonic() > deadline:
-                problem = f"it was ended after {timeout:g} s, its timeout"
-            elif (written := _bytes_below(folder) + sum(map(_size, said))) > largest_output:
-                problem = f"it was ended after it had written {format_bytes(written)}"
-            if problem:
-                _end(process)
-            time.sleep(pause)
-            pause = min(2 * pause, _LONGEST_PAUSE)
-    finally:
-        # What it left running.
-        _end(process)
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """Kill all processes of a program's session."""
-    with suppress(ProcessLookupError, PermissionError):
-        os.killpg(process.pid, signal.SIGKILL)
+    while True:
+        # Nothing in subprocess tells the time of a single process. Its peak of memory would count this process, from
+        # which it was forked.
+        found, status, usage = os.wait4(process.pid, 0 if problem else os.WNOHANG)
+        if found:
+            process.returncode = os.waitstatus_to_exitcode(status)
+            return problem, usage.ru_utime + usage.ru_stime, peak_bytes
+        peak_bytes = float(np.fmax(peak_bytes, _resident_bytes(process.pid)))
+        if time.monotonic() > deadline:
+            problem = f"it was ended after {timeout:g} s, its timeout"
+        elif (written := _bytes_below(folder) + sum(map(_size, said))) > largest_output:
+            problem = f"it was ended after it had written {format_bytes(written)}"
+        if problem:
+            # What else is in its session ends with the guard.
+            os.kill(process.pid, signal.SIGKILL)
+        time.sleep(pause)
+        pause = min(2 * pause, _LONGEST_PAUSE)
 
 
 def _resident_bytes(pid: int) -> float:

@@ -22,7 +22,7 @@ from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, SerializeAsAny
 
-from sobolev_batch.errors import MeshError, SobolevBatchError, StudyError, one_line
+from sobolev_batch.errors import MeshError, StudyError
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Surface, is_finite_number
 from sobolev_batch.surfaces.sources.mesh_cache import Cost, MeshCache
@@ -391,16 +391,6 @@ def single_member(source: Source, folder: Path) -> Member:
         names = ", ".join(member.name for member in members[:5])
         raise StudyError(f"exactly one surface is needed here, but the source makes {len(members)}: {names}")
     return members[0]
-
-
-def surface_of(member: Member) -> Surface:
-    """Return the surface of a member; MeshError where it cannot be made, whatever its source raises."""
-    try:
-        return member.load()
-    except SobolevBatchError:
-        raise
-    except Exception as error:
-        raise MeshError(f"{type(error).__name__}: {one_line(error)}") from error
 
 
 def load_mesh(member: Member) -> Mesh:
