@@ -57,7 +57,7 @@ def convergence(
     >>> import sobolev_batch as sb
     >>> ax = sb.plot.convergence("storage/icosphere.zarr", order=-10)
     >>> ax.get_xlabel()
-    "mean edge length in the study's unit"
+    'mean edge length in file units'
     >>> ax.figure.savefig("convergence.pdf")
     >>> sb.plot.convergence("storage/icosphere.zarr", x="triangles", family="ico*").get_xlabel()
     'number of triangles'

@@ -174,7 +174,7 @@ def test_compare_is_exact_to_1_per_cent_without_options(folder: Path) -> None:
     # One digit is shown of the error, rounded up.
     assert error <= 0.02 * value
     assert re.search(r"^order -2: distance \S+ ± \S+ \(truncation", shown, re.M)
-    assert re.search(r"in radii of 3\.off, 30 units of the files each \(scale 0\.033\d*, origin 100 ", shown)
+    assert re.search(r"in radii of 3\.off, 30 file units each \(scale 0\.033\d*, origin 100 ", shown)
 
 
 def test_compare_to_an_accuracy_and_on_a_lattice(folder: Path) -> None:
@@ -213,7 +213,7 @@ def test_compare_names_units_and_defects(folder: Path) -> None:
     assert "distances of orders are in radii of inverted.off, 100 mm each" in scaled
     assert "wavelengths above 1 mm" not in scaled
     assert "wavelengths above 1 mm weigh alike" in kept
-    assert "in 1 mm; the radius of inverted.off is 100\n" in kept
+    assert "in mm; the radius of inverted.off is 100\n" in kept
 
 
 @pytest.mark.slow

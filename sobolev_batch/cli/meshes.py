@@ -133,7 +133,7 @@ def compare_command(
     surface. The exit status is then 0 if they are, 1 if they are not, 4 if that cannot be told, and 2 after any error.
     """
     from sobolev_batch.fitting.align import align, moved_by
-    from sobolev_batch.results.tables.text import percent
+    from sobolev_batch.results.tables.text import FILE_UNITS, percent
     from sobolev_batch.spectral.lattice import Lattice
     from sobolev_batch.spectral.metrics.datasets import parts_as_variables
     from sobolev_batch.spectral.metrics.norms import distance, yardsticks
@@ -188,10 +188,9 @@ def compare_command(
         echo(f"where it is in the file: {percent(before['relative'].item(), before['relative_error'].item())}")
         echo(_motion_text(motion))
     _print_answers(a.name, b.name, results, area_change, rtol)
-    length = unit or "units of the files"
-    one = f"1 {unit}" if unit else "1 unit of the files"
+    length = unit or FILE_UNITS
     echo(
-        f"distances of orders are in {one}; the radius of {visible(b.name)} is {radius:.6g}"
+        f"distances of orders are in {length}; the radius of {visible(b.name)} is {radius:.6g}"
         if no_scaling
         else f"distances of orders are in radii of {visible(b.name)}, {radius:.6g} {length} each "
         f"(scale {similarity.scale:.6g}, origin {' '.join(f'{x:.6g}' for x in similarity.origin)})"
@@ -225,7 +224,7 @@ def _remarks(meshes: Mapping[str, Mesh], doubt: str | None, size: float, unit: s
         yield f"{first}: {doubt}"
     if not 1 / _FAR_UNIT < size < _FAR_UNIT:
         yield (
-            f"without scaling, wavelengths above 1 {unit or 'unit of the files'} weigh alike and shorter ones less, "
+            f"without scaling, wavelengths above 1 {unit or 'file unit'} weigh alike and shorter ones less, "
             f"and the reference has a radius of {size:.4g}; leave out --no-scaling to weigh them against it"
         )
 

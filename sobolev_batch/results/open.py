@@ -20,6 +20,7 @@ from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.store import DIGEST, OCTAVES_GROUP, RECORDS, SPECTRA_GROUP, JoinedStore, Store
 from sobolev_batch.batch.store.tables import lost_tables
 from sobolev_batch.errors import DamageError, InputError, StoreError, one_line
+from sobolev_batch.results.tables.text import FILE_UNITS
 from sobolev_batch.spectral.fields import Quality
 from sobolev_batch.spectral.metrics.datasets import describe
 from sobolev_batch.surfaces.shapes.surface import placement_doubt
@@ -43,7 +44,6 @@ _LABELS = {
     "make_cpu_seconds": "processor time of making the mesh in seconds",
     "make_peak_bytes": "memory of making the mesh in bytes",
 }
-_STUDY_UNIT = "the study's unit"
 
 # A store as functions for its readers take it.
 AnyStore = str | Path | Location | xr.DataTree
@@ -354,18 +354,18 @@ def placement_doubts(tree: xr.DataTree) -> dict[str, str]:
 
 
 def unit_of(tree: xr.DataTree) -> tuple[str, float]:
-    """Return the name of the unit of length of the files, if it is known, and the study's unit in terms of it."""
+    """Return the name of the unit of length of the files, and the study's unit in terms of it."""
     header = tree.attrs.get("study", {}).get("table", {}).get("study", {})
-    return header.get("length_unit", ""), 1 / tree.attrs.get("similarity", {"scale": 1.0})["scale"]
+    return header.get("length_unit", FILE_UNITS), 1 / tree.attrs.get("similarity", {"scale": 1.0})["scale"]
 
 
 def study_unit(tree: xr.DataTree) -> str:
-    """Return the study's unit of length in words, by the unit of the files where that has a name."""
+    """Return the study's unit of length in words, by the unit of the files."""
     name, size = unit_of(tree)
-    return f"units of {size:.4g} {name}" if name else _STUDY_UNIT
+    return name if size == 1 else f"units of {size:.4g} {name}"
 
 
-def label_of(x: str, unit: str = _STUDY_UNIT) -> str:
+def label_of(x: str, unit: str = "each object's unit") -> str:
     """Return the label of an axis of sizes; one of the metadata has its name."""
     return _LABELS[x].format(unit=unit) if x in _LABELS else x
 

@@ -24,6 +24,7 @@ from sobolev_batch.results.open import (
     placement_doubts,
     sizes_of,
     stores_of,
+    study_unit,
     unit_of,
 )
 from sobolev_batch.results.store_accessor import convergence_at, order_note
@@ -73,7 +74,7 @@ rate. The column "area" is the share of the squared distance that a change of to
 alone explains."""
 _UNIT_NOTE = """\
 Edges and other lengths are in {}.
-Distances of orders are computed in units of {}."""
+Distances of orders are computed in {}."""
 _PROXIMITY_NOTE = """\
 Other distances are the same at all orders. They are those of sampled points to the other
 mesh, the larger of both directions, with standard errors. Hausdorff is a lower bound: the
@@ -309,9 +310,9 @@ def _notes(trees: Sequence[xr.DataTree], frames: Sequence[pd.DataFrame], x: str)
 
 def unit_notes(trees: Sequence[xr.DataTree]) -> list[str]:
     """Return the units of lengths and of distances in the tables of open stores, each in a sentence."""
-    units, sizes = (sorted(set(values)) for values in zip(*map(unit_of, trees), strict=True))
-    size = f"{sizes[0]:.4g} {units[0] or 'of them'}" if len(sizes) == 1 else "their own for each object"
-    return _UNIT_NOTE.format(", ".join(unit or "units of the files" for unit in units), size).splitlines()
+    units, studies = sorted({unit_of(tree)[0] for tree in trees}), {study_unit(tree) for tree in trees}
+    own = studies.pop() if len(studies) == 1 else "units of their own for each object"
+    return _UNIT_NOTE.format(", ".join(units), own).splitlines()
 
 
 def _failures(tree: xr.DataTree, frame: pd.DataFrame) -> list[str]:

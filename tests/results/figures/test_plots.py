@@ -211,13 +211,17 @@ def test_few_outliers_do_not_take_the_colours_of_a_matrix() -> None:
         low, high = image.get_clim()
         assert (low > 1e-3, high) == (True, cdist(chosen, chosen).max())
         assert image.colorbar is not None
-        assert (image.colorbar.extend, bar.get_ylabel()) == (extend, "distance in the study's unit")
+        assert (image.colorbar.extend, bar.get_ylabel()) == (extend, "distance in file units")
 
 
 def test_axes_name_the_unit_of_the_files(tree: xr.DataTree) -> None:
     tree.attrs["similarity"] = {"scale": 0.02, "origin": [0.0, 0.0, 0.0]}
     tree.attrs["study"]["table"]["study"]["length_unit"] = "$mm$"
     assert sb.plot.convergence(tree).get_xlabel() == r"mean edge length in units of 50 \$mm\$"
+    del tree.attrs["study"]["table"]["study"]["length_unit"]
+    assert sb.plot.convergence(tree).get_xlabel() == "mean edge length in units of 50 file units"
+    tree.attrs["similarity"]["scale"] = 1.0
+    assert sb.plot.convergence(tree).get_xlabel() == "mean edge length in file units"
     assert sb.plot.convergence(tree, x="triangles").get_xlabel() == "number of triangles"
 
 
