@@ -17,6 +17,8 @@ from typing import Any, TextIO
 
 # Control characters, separators of lines and paragraphs, marks that turn the direction of text, lone surrogates.
 HAZARDOUS = re.compile("[\0-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u206f\ud800-\udfff]")
+# The unit of length of files where it has no name.
+FILE_UNITS = "file units"
 # More rows of one kind would hide the others.
 _MOST_ALIKE = 20
 # Notebooks align the cells of tables to the right and keep them short.

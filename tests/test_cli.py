@@ -205,12 +205,18 @@ def test_compare_names_units_and_defects(folder: Path) -> None:
     sb.write_mesh(part, folder / "part.off")
     sb.write_mesh(inverted, folder / "inverted.off")
     files = ("part.off", "inverted.off", "--order=-4", "--unit", "mm")
-    done = [call("compare", *files, *more, folder=folder) for more in ((), ("--no-scaling",))]
+    picture = ("--proximity", "--witness", "new/where.svg")
+    done = [call("compare", *files, *more, folder=folder) for more in (picture, ("--no-scaling",))]
     scaled, kept = (one.stdout + one.stderr for one in done)
     for shown in (scaled, kept):
         assert re.search(r"part\.off: 3 open edges, .* 1 duplicate triangle, counted twice$", shown, re.M)
         assert "inverted.off: all triangles face inwards\n" in shown
     assert "distances of orders are in radii of inverted.off, 100 mm each" in scaled
+    assert scaled.index("witness: new/where.svg\n") > scaled.index("\nB: volume ")
+    drawn = (folder / "new" / "where.svg").read_text(encoding="utf-8")
+    assert {">part.off<", ">inverted.off<", ">distance to the closest point of the other mesh, in mm<"} <= set(
+        re.findall(r">[^<>]+<", drawn)
+    )
     assert "wavelengths above 1 mm" not in scaled
     assert "wavelengths above 1 mm weigh alike" in kept
     assert "in mm; the radius of inverted.off is 100\n" in kept

@@ -116,7 +116,7 @@ SEEN: dict[str, tuple[Callable[[Path], None], *tuple[str, ...]]] = {
     "A first look at two meshes": (
         statue,
         "simple.ply is as far from statue.ply as",
-        "witness: where-a.ply where-b.ply",
+        "witness: where.png",
     ),
     "A part in millimetres": (part, r"25\.4 times as small", "exported  exported/middle", "same surface"),
 }

@@ -33,7 +33,7 @@ from sobolev_batch.cli.interruption import Deadline
 from sobolev_batch.errors import InputError, MeshError
 from sobolev_batch.fitting import DEFAULT_SMOOTHING, DEFAULT_STEPS
 from sobolev_batch.spectral import DEFAULT_ORDER
-from sobolev_batch.visible import visible
+from sobolev_batch.visible import FILE_UNITS, visible
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -99,8 +99,8 @@ _MOST_ROUNDING = 1e-6
     "witness_path",
     type=PATH,
     metavar="PATH",
-    help="Write both meshes with the witness function of the first order at their vertices, for MeshLab: into "
-    "PATH-a.ply and PATH-b.ply; with --proximity also distances.",
+    help="Write both meshes with the witness function of the first order at their vertices, for MeshLab, into "
+    "PATH-a.ply and PATH-b.ply, or draw them if PATH ends in .png, .svg or .pdf. With --proximity also distances.",
 )
 @click.option("--no-scaling", is_flag=True, help="Keep the files' unit. Otherwise B is scaled to the unit sphere.")
 @below_option("Tell whether the distance is below FRACTION of the norm of B, such as 1e-3 or 0.1%, by the exit status.")
@@ -133,7 +133,7 @@ def compare_command(
     surface. The exit status is then 0 if they are, 1 if they are not, 4 if that cannot be told, and 2 after any error.
     """
     from sobolev_batch.fitting.align import align, moved_by
-    from sobolev_batch.results.tables.text import FILE_UNITS, percent
+    from sobolev_batch.results.tables.text import percent
     from sobolev_batch.spectral.lattice import Lattice
     from sobolev_batch.spectral.metrics.datasets import parts_as_variables
     from sobolev_batch.spectral.metrics.norms import distance, yardsticks
@@ -171,7 +171,9 @@ def compare_command(
     nearness = proximity(first, second, threshold=threshold) if with_proximity else None
     results = yardsticks(*pair, orders, **accuracy) if with_yardsticks else distance(*pair, orders, **accuracy)
     area_change = first.area / second.area - 1
-    files: dict[str, Any] = {"scaling": not no_scaling, "subject": a.name, "distances": with_proximity}
+    length = unit or FILE_UNITS
+    files: dict[str, Any] = {"scaling": not no_scaling, "names": (a.name, b.name)}
+    files |= {"distances": length} if with_proximity else {}
     if style == "json":
         if witness_path is not None:
             write_difference(first, second, witness_path, orders[0], **files)
@@ -188,7 +190,6 @@ def compare_command(
         echo(f"where it is in the file: {percent(before['relative'].item(), before['relative_error'].item())}")
         echo(_motion_text(motion))
     _print_answers(a.name, b.name, results, area_change, rtol)
-    length = unit or FILE_UNITS
     echo(
         f"distances of orders are in {length}; the radius of {visible(b.name)} is {radius:.6g}"
         if no_scaling

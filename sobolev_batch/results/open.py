@@ -20,11 +20,11 @@ from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.store import DIGEST, OCTAVES_GROUP, RECORDS, SPECTRA_GROUP, JoinedStore, Store
 from sobolev_batch.batch.store.tables import lost_tables
 from sobolev_batch.errors import DamageError, InputError, StoreError, one_line
-from sobolev_batch.results.tables.text import FILE_UNITS
 from sobolev_batch.spectral.fields import Quality
 from sobolev_batch.spectral.metrics.datasets import describe
 from sobolev_batch.surfaces.shapes.surface import placement_doubt
 from sobolev_batch.surfaces.sources.names import quoted
+from sobolev_batch.visible import FILE_UNITS
 
 Reals = NDArray[np.float64]
 # Names of families, or globs of names; None is all of them.

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from sobolev_batch.errors import InputError, SobolevBatchError, one_line
+from sobolev_batch.errors import InputError, SobolevBatchError, from_extra, one_line
 from sobolev_batch.parameters import available, available_cores, check_seed
 from sobolev_batch.results.tables.text import rounded_outwards, with_error
 from sobolev_batch.spectral import DEFAULT_ORDER
@@ -36,6 +36,7 @@ Outcome = Literal["same", "different", "undecided"]
 _DEFAULT_TOLERANCE = 1e-3
 # A larger relative error says less than the bounds themselves.
 _WIDEST = 0.25
+_PICTURES = (".png", ".svg", ".pdf")
 # From here on per cents are whole numbers.
 _WHOLE = 10
 # Accuracy of the fields and of images in files, which are to be looked at.
@@ -191,7 +192,8 @@ def assert_same_surface(
     The parameters are those of `same_surface`, and ``witness``: the beginning of the paths of files to write unless the
     surfaces are the same, such as "failures/part"; default a new temporary folder. Meshes are written as
     failures/part-a.ply and failures/part-b.ply, with the witness function of a against b at their vertices: positive
-    where a has area that b lacks. The message names them, and the place where it is largest.
+    where a has area that b lacks. A path that ends in .png, .svg or .pdf gets a picture of them. The message names the
+    files, and the place where it is largest.
 
     Returns:
         The verdict, which is "same".
@@ -229,6 +231,9 @@ def assert_same_surface(
 
 def require_place(path: Path) -> None:
     """Create the folder of the files that `write_difference` writes; InputError where that cannot be done."""
+    if path.suffix in _PICTURES:
+        with from_extra("plot", "a picture needs"):
+            from sobolev_batch.results.figures.views import write_difference_picture  # noqa: F401 -- at once
     if not path.name:
         raise InputError(f"{str(path)!r} names no file; files get {str(Path('failures', 'part'))!r} and an ending")
     try:
@@ -244,15 +249,15 @@ def write_difference(
     order: float,
     *,
     scaling: bool = True,
-    subject: str = "a",
-    distances: bool = False,
+    names: tuple[str, str] = ("a", "b"),
+    distances: str | None = None,
 ) -> str:
     """Write the meshes among two surfaces, each with the witness function of a against b at its vertices.
 
-    If requested, each vertex also has its distance from the other mesh. The path is the beginning of those of the
-    files, to which "-a.ply" and "-b.ply" are added. Return where the surfaces differ most, and the files, as the end of
-    a line in which a surface has the name of the subject. StoreError where a file cannot be written; see also
-    `require_place`.
+    If their unit is given, each vertex also has its distance from the other mesh. The path is that of a picture, .png,
+    .svg or .pdf, or the beginning of those of files, to which "-a.ply" and "-b.ply" are added. Return where the
+    surfaces differ most, and the files, as the end of a line in which surfaces have these names. StoreError where a
+    file cannot be written; see also `require_place`.
     """
     # Files load what reads stores, which a verdict does without.
     from sobolev_batch.results.figures.meshes import witness_at_vertices, write_vertex_values
@@ -263,25 +268,32 @@ def write_difference(
     extent = Extent.union([surface.extent for surface in centered])
     area = np.array(sum(surface.area for surface in centered))
     lattice = core_lattice(Support(area, extent.widths, extent.reach), (order,), Accuracy(_ACCURACY))
-    fields = [fourier_transform(surface, lattice, _EPS, dtype="complex64", order=order) for surface in centered]
+    of_a, of_b = (fourier_transform(surface, lattice, _EPS, dtype="complex64", order=order) for surface in centered)
     require_place(path)
-    written, greatest, place = [], 0.0, (0.0, 0.0, 0.0)
-    for label, own, other, mesh in zip("ab", (a, b), (b, a), centered, strict=True):
+    written, drawn, greatest, place = [], [], 0.0, (0.0, 0.0, 0.0)
+    for label, name, own, other, mesh in zip("ab", names, (a, b), (b, a), centered, strict=True):
         if not isinstance(own, Mesh) or not isinstance(mesh, Mesh):
             continue
-        values = witness_at_vertices(fields[0], fields[1], (order,), mesh, dtype="complex64")
+        values = witness_at_vertices(of_a, of_b, (order,), mesh, dtype="complex64")
         vertex = int(np.nanargmax(np.abs(values[0])))
         if abs(values[0, vertex]) > abs(greatest):
             greatest, place = float(values[0, vertex]), tuple(own.vertices[vertex].tolist())
+        if path.suffix in _PICTURES:
+            drawn.append((name, mesh))
+            continue
         file = path.with_name(f"{path.name}-{label}.ply")
         title = f"{label} against b, comparison {path.name}"
-        lengths = vertex_distances(own, other) if distances and isinstance(other, Mesh) else None
+        lengths = vertex_distances(own, other) if distances is not None and isinstance(other, Mesh) else None
         write_vertex_values(
             file, own, values, (order,), title, 1 / similarity.scale, context="comparison", distances=lengths
         )
         written.append(file)
+    if drawn:
+        from sobolev_batch.results.figures.views import write_difference_picture
+
+        written += write_difference_picture(path, drawn, (of_a, of_b), order, distances, similarity.scale)
     if not written:
         return "no witness: neither surface is a mesh"
     kind = "more" if greatest > 0 else "less"
-    near = f"{subject} has {kind} area near ({', '.join(f'{x:.4g}' for x in place)})"
+    near = f"{names[0]} has {kind} area near ({', '.join(f'{x:.4g}' for x in place)})"
     return f"{near if greatest else 'they differ nowhere'}; witness: {' '.join(map(str, written))}"

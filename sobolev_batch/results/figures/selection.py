@@ -101,7 +101,6 @@ class Spectra:
         shortest: Shortest wavelength (bands,) in the study's unit.
         energies: Energy ∫_{|ξ|=r} |a^ - b^|² dS of the difference, as a fraction of twice both areas (meshes, bands).
         energy_errors: Standard error of these, zero for bands of a lattice.
-        own: One unit of the study in the meshes' own unit of length.
     """
 
     labels: tuple[str, ...]
@@ -112,7 +111,6 @@ class Spectra:
     shortest: Reals
     energies: Reals
     energy_errors: Reals
-    own: float
 
     @classmethod
     def from_tree(cls, tree: xr.DataTree, orders: Sequence[float], meshes: Sequence[str]) -> Self:
@@ -121,7 +119,6 @@ class Spectra:
         fields = tree["fourier"].to_dataset()["fourier"]
         affordable = _MOST_SAMPLES // int(np.prod(fields.shape[1:]))
         labels = spread(meshes, max(1, min(MOST_SPECTRA, affordable)))
-        scale = tree.attrs["similarity"]["scale"]
         if "octaves" in tree:
             accessor = StoreAccessor(tree)
             spectra = [accessor.spectrum(orders, label, reference) for label in labels]
@@ -136,7 +133,7 @@ class Spectra:
         errors = np.zeros_like(energies)
         if "octaves" in tree:
             errors = np.stack([bands["energy_error"].to_numpy() for bands in spectra]) / limits[:, None]
-        return cls(tuple(labels), len(meshes), tuple(orders), shares, longest, shortest, energies, errors, 1 / scale)
+        return cls(tuple(labels), len(meshes), tuple(orders), shares, longest, shortest, energies, errors)
 
     @property
     def omission(self) -> str:

@@ -1,4 +1,4 @@
-"""Meshes of a store with their witness functions for display: simplified, and in plots."""
+"""Meshes with their witness functions, or distances of vertices, for display: simplified, and in plots."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LinearLocator, MaxNLocator
+from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from sobolev_batch.errors import InputError, SobolevBatchError
 from sobolev_batch.results.figures.meshes import StudyMeshes, fields_of, matching_labels, witness_at_vertices
@@ -41,12 +42,15 @@ from sobolev_batch.results.open import (
 )
 from sobolev_batch.results.tables.convergence import table
 from sobolev_batch.spectral.metrics.causes import witness
+from sobolev_batch.surfaces.proximity import vertex_distances
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.subdivision import subdivided
 from sobolev_batch.surfaces.shapes.surface import Reals
 from sobolev_batch.surfaces.sources.names import file_stem
 
 Triangles = NDArray[np.int32]
+# Of a surface and of what it is compared with.
+Fields = tuple[xr.DataArray, xr.DataArray]
 
 Axis = Literal["x", "y", "z"]
 _AXES: tuple[Axis, ...] = get_args(Axis)
@@ -89,16 +93,17 @@ _AMBIENT = 0.62
 
 @dataclass(frozen=True)
 class MeshView:
-    """A mesh with its witness function.
+    """A mesh with its witness function, or with the distances of its vertices from another mesh.
 
     Attributes:
         vertices: Points (n, 3) in the study's unit of length, turned so that the third axis points upwards.
         triangles: Indices of vertices, (m, 3).
         values: Witness function (orders, n), positive where the mesh has area that the reference lacks, in
-            1 / unit length.
+            1 / unit length; or distances (1, n).
         original_triangles: Number of triangles of the mesh itself; the view has fewer where it is a simplification,
             and more where it subdivides them.
         eye: Unit vector (3,) to the viewer of pictures.
+        unit: Unit of length of values that are distances; None for a witness function.
     """
 
     label: str
@@ -108,12 +113,14 @@ class MeshView:
     orders: tuple[float, ...]
     original_triangles: int
     eye: Reals = field(default_factory=FRONT.copy)
+    unit: str | None = None
 
     @property
     def color_limits(self) -> Reals:
         """Ends (orders,) of scales of colours on which a few outliers do not make the rest white.
 
         The modulus that is not exceeded on 99 % of the area, or the largest one if that is hardly larger; 1 for zeros.
+        For distances, the largest one.
         """
         # A third of each triangle belongs to each of its corners.
         areas = np.repeat(np.linalg.norm(self._normals, axis=1), 3)
@@ -121,7 +128,8 @@ class MeshView:
         limits = []
         for moduli in np.abs(self.values):
             covering, largest = np.quantile(moduli, COVERED_AREA, weights=areas, method="inverted_cdf"), moduli.max()
-            limits.append(largest if largest <= _OUTLYING * covering or covering == 0 else covering)
+            is_whole = self.unit is not None or largest <= _OUTLYING * covering or covering == 0
+            limits.append(largest if is_whole else covering)
         return np.array([float(limit) or 1.0 for limit in limits])
 
     def towards_worst(self) -> Self:
@@ -180,14 +188,16 @@ def make_views(
     for label in labels:
         try:
             _, mesh = study_meshes.make(label, _LARGEST_MADE)
-            views.append(_view(tree, label, mesh, chosen, most_triangles))
+            views.append(_view(label, fields_of(tree, label), mesh, chosen, most_triangles))
         except SobolevBatchError as error:
             missing[label] = str(error)
-    if views:
-        # A cyclic permutation of the axes, which does not mirror the meshes.
-        turn = _AXES.index("z") - _AXES.index(up or up_axis(np.concatenate([view.vertices for view in views])))
-        views = [replace(view, vertices=np.roll(view.vertices, turn, axis=1)).towards_worst() for view in views]
-    return views, missing
+    return _turned(views, up) if views else [], missing
+
+
+def _turned(views: Sequence[MeshView], up: Axis | None = None) -> list[MeshView]:
+    """Return views with one axis upwards, by a cyclic permutation of all, each from the side of its worst places."""
+    turn = _AXES.index("z") - _AXES.index(up or up_axis(np.concatenate([view.vertices for view in views])))
+    return [replace(view, vertices=np.roll(view.vertices, turn, axis=1)).towards_worst() for view in views]
 
 
 def up_axis(points: Reals) -> Axis:
@@ -222,19 +232,31 @@ def _extremes(tree: xr.DataTree, order: float, families: Sequence[str]) -> Itera
     yield from frame.loc[list(dict.fromkeys(extremes))[:_MOST_EXTREMES], "mesh"]
 
 
-def _view(tree: xr.DataTree, label: str, mesh: Mesh, orders: tuple[float, ...], most: int) -> MeshView:
+def _view(label: str, fields: Fields, mesh: Mesh, orders: tuple[float, ...], most: int) -> MeshView:
     used = mesh.used_vertices
     number = np.empty(len(mesh.vertices), dtype=np.int32)
     number[used] = np.arange(len(used))
     own, corners = mesh.vertices[used], number[mesh.triangles]
     vertices, triangles = _for_display(own, corners, most)
     if vertices is own:
-        values = witness_at_vertices(*fields_of(tree, label), orders, mesh)[:, used]
+        values = witness_at_vertices(*fields, orders, mesh)[:, used]
     else:
         # Collapsed edges may leave the period by a hair where the mesh fills it.
         vertices = np.clip(vertices, own.min(axis=0), own.max(axis=0))
-        values = witness(*fields_of(tree, label), list(orders), vertices, dtype="complex64").to_numpy()
+        values = witness(*fields, list(orders), vertices, dtype="complex64").to_numpy()
     return MeshView(label, vertices, triangles, values, orders, len(corners))
+
+
+def _with_distances(view: MeshView, mesh: Mesh, other: Mesh, unit: str, scale: float) -> MeshView:
+    """Return the view of a mesh with distances from another mesh in a unit, which is this scale in that of both."""
+    if len(view.triangles) >= view.original_triangles:
+        distances = vertex_distances(Mesh(view.vertices, view.triangles), other)
+    else:
+        # Simplification moves vertices by more than what is to be seen. No vertex of the mesh gets lost.
+        exact, own = vertex_distances(mesh, other)[mesh.used_vertices], mesh.vertices[mesh.used_vertices]
+        distances = exact[cKDTree(own).query(view.vertices)[1]]
+        np.maximum.at(distances, cKDTree(view.vertices).query(own)[1], exact)
+    return replace(view, values=distances[None] / scale, unit=unit)
 
 
 def _for_display(vertices: Reals, triangles: Triangles, most: int) -> tuple[Reals, Triangles]:
@@ -255,7 +277,7 @@ def draw_mesh(axes: Axes, view: MeshView, index: int = 0, limit: float | None = 
     """Draw a mesh on axes from the side of its eye, the farthest triangles first, so that nearer ones hide them.
 
     Red where the witness of the order of an index is positive and blue where it is negative: Matplotlib's "RdBu_r" from
-    minus to plus a limit, by default that of `color_limits`.
+    minus to plus a limit, by default that of `color_limits`. Distances go from pale to dark.
     """
     right = np.cross(_UP, view.eye)
     right /= np.linalg.norm(right)
@@ -265,7 +287,8 @@ def draw_mesh(axes: Axes, view: MeshView, index: int = 0, limit: float | None = 
     normals *= np.where(normals[:, 2:] < 0, -1, 1) / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     light = _AMBIENT + (1 - _AMBIENT) * np.clip(normals @ _LIGHT, 0, 1)
     values = view.values[index][view.triangles].mean(axis=1)
-    colors = _mapping(view.color_limits[index] if limit is None else limit).to_rgba(values)[:, :3] * light[:, None]
+    mapping = _mapping(view, view.color_limits[index] if limit is None else limit)
+    colors = mapping.to_rgba(values)[:, :3] * light[:, None]
     order = np.argsort(corners[:, :, 2].mean(axis=1))
     axes.add_collection(
         PolyCollection(
@@ -278,8 +301,9 @@ def draw_mesh(axes: Axes, view: MeshView, index: int = 0, limit: float | None = 
     axes.set_axis_off()
 
 
-def _mapping(limit: float) -> ScalarMappable:
-    return ScalarMappable(Normalize(-limit, limit), "RdBu_r")
+def _mapping(view: MeshView, limit: float) -> ScalarMappable:
+    low, colors = (-limit, "RdBu_r") if view.unit is None else (0.0, "YlOrRd")
+    return ScalarMappable(Normalize(low, limit), colors)
 
 
 def draw_witness(view: MeshView, axes: Axes | None = None, limit: float | None = None) -> Axes:
@@ -376,6 +400,36 @@ def _comparison_figure(views: Sequence[MeshView], size: Size | None, limit: floa
     return figure
 
 
+def write_difference_picture(
+    path: Path, meshes: Sequence[tuple[str, Mesh]], fields: Fields, order: float, distances: str | None, scale: float
+) -> tuple[Path, ...]:
+    """Draw one or two meshes with their names and the witness function of two fields, as a .png, .svg or .pdf.
+
+    If a unit of distances is given, which is this scale in that of the meshes, a second row has the distance of each
+    vertex from the other mesh. The meshes of a row have one scale of colours, and are seen from one side.
+    """
+    views = [_view(name, fields, mesh, (order,), PICTURE_LIMITS[1]) for name, mesh in meshes]
+    rows = [_turned(views)]
+    if distances is not None:
+        pairs = zip(views, [mesh for _, mesh in meshes], [mesh for _, mesh in reversed(meshes)], strict=True)
+        rows.append(_turned([_with_distances(*each, distances, scale) for each in pairs]))
+    with drawing(None):
+        figure, panels = _panels(len(rows) * len(views), None, above=0.0, beside=1.2)
+        for row in rows:
+            in_row, panels = panels[: len(row)], panels[len(row) :]
+            strongest = max(row, key=lambda view: float(view.color_limits[0]))
+            for axes, view in zip(in_row, row, strict=True):
+                draw_mesh(axes, replace(view, eye=strongest.eye), limit=strongest.color_limits[0])
+                largest = "" if view.unit is None else f"up to {view.values.max():.4g} {escaped(view.unit)}"
+                count = f"{view.original_triangles:,} triangles"
+                set_title(axes, shortened(view.label), largest or count, _seen(strongest))
+            for axes in in_row:
+                axes.update_datalim(Bbox.union([axes.dataLim for axes in in_row]).corners())
+                axes.autoscale_view()
+            _add_colorbar(figure, in_row, row, strongest.color_limits[0], 0)
+    return write_figures({path.stem: figure}, path.parent, [path.suffix[1:]], None)  # type: ignore[list-item]
+
+
 def _add_colorbar(
     figure: Figure, panels: Axes | Sequence[Axes], views: Sequence[MeshView], limit: float, index: int
 ) -> None:
@@ -384,17 +438,20 @@ def _add_colorbar(
         min(view.values[index].min() for view in views) < -limit,
         max(view.values[index].max() for view in views) > limit,
     )
+    unit = views[0].unit
     bar = figure.colorbar(
-        _mapping(limit),
+        _mapping(views[0], limit),
         ax=panels,
         shrink=0.8,
         orientation="horizontal",
-        ticks=MaxNLocator(4, symmetric=True),
+        ticks=MaxNLocator(4, symmetric=True) if unit is None else LinearLocator(5),
         format="{x:.4g}",
         aspect=20 if isinstance(panels, Axes) else 50,
         extend=EXTENDS[ends],
     )
     beyond = f"\narrows: up to {1 - COVERED_AREA:.0%} of the area" if any(ends) else ""
     order = f"witness, order {views[0].orders[index]:g}"
-    bar.set_label(f"missing area \N{LEFT RIGHT ARROW} extra area\n{order}{beyond}", fontsize="small")
+    areas = f"missing area \N{LEFT RIGHT ARROW} extra area\n{order}{beyond}"
+    distances = f"distance to the closest point of the other mesh, in {escaped(unit or '')}"
+    bar.set_label(areas if unit is None else distances, fontsize="small")
     bar.ax.tick_params(labelsize="x-small")

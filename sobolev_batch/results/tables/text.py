@@ -24,8 +24,7 @@ if TYPE_CHECKING:
 
 Item = TypeVar("Item")
 
-# What the unit of length of files is called where it has no name.
-FILE_UNITS = "file units"
+
 # More digits are hard to read, whatever the error.
 _MOST_DIGITS = 7
 _DIGITS_WITHOUT_ERROR = 4
