@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sobolev_batch.batch.collection_store import CollectionStore
 from sobolev_batch.batch.storage.location import Location
 from sobolev_batch.batch.store.store import DIGEST, OCTAVES_GROUP, RECORDS, SPECTRA_GROUP, JoinedStore, Store
-from sobolev_batch.batch.store.tables import lost_tables
+from sobolev_batch.batch.store.tables import table_attributes
 from sobolev_batch.errors import DamageError, InputError, StoreError, one_line
 from sobolev_batch.spectral.fields import Quality
 from sobolev_batch.spectral.metrics.datasets import describe
@@ -76,7 +76,7 @@ def open_store(store: str | Path | Location | Sequence[str | Path | Location]) -
     Raises:
         StoreError: The location has no store of a study, cannot be reached, or holds something else; or several stores
             do not fit together.
-        DamageError: Data of a table are missing. (Damaged data raise when they are read.)
+        DamageError: What is read at once is damaged. All else that is missing or damaged raises when it is read.
 
     >>> import sobolev_batch as sb
     >>> tree = sb.open_store("storage/icosphere.zarr")
@@ -90,15 +90,8 @@ def open_store(store: str | Path | Location | Sequence[str | Path | Location]) -
     # Else values that are read once the process has gone to another folder would be missing ones.
     location = Location.parse(store).absolute()
     opened = Store.open(location)
-    lost = lost_tables(opened)
-    if lost:
-        # Without this check they would read as NaN, zero or nothing, like data.
-        raise DamageError(
-            f"{opened.path}: the table {lost[0]} is missing or incomplete; run the study again to replace it",
-            "it is missing",
-        )
     # Left to itself, xarray looks for older formats, which nobody has checked, and lists keys again.
-    keys: Any = opened.checked_keys()
+    keys: Any = opened.checked_keys(has_tables=table_attributes(opened, "convergence") is not None)
     with opened.location.access("read"):
         try:
             tree = xr.open_datatree(keys, engine="zarr", consolidated=True, zarr_format=3)

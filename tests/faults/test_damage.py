@@ -168,7 +168,7 @@ def test_each_change_is_named_and_a_run_mends_all(
 
 
 def test_damaged_tables_are_never_read(store: Path) -> None:
-    for damage, key in SMALL:
+    for damage, key in (*SMALL, (delete, "spectra/norm/c/0/0"), (delete, "spectra/key/c/0")):
         with put_back(store):
             damage(store / key)
             with pytest.raises(DamageError):

@@ -59,6 +59,8 @@ DIGEST, UNFINISHED, COLLECTION, REMOVED = "digest", "unfinished", "collection", 
 _RUN = "run"
 # Written by tasks, and by themselves: the digest leaves them out. Qualities are a copy of what records have.
 _BESIDE_DIGEST = (FIELD, OCTAVES, RECORD, PAGE, QUALITY)
+# Arrays with chunks for rows, which need not be computed.
+_OF_ROWS = frozenset({FIELD, OCTAVES, RECORD, PAGE})
 _REQUESTS_AT_ONCE = 64
 
 
@@ -178,7 +180,7 @@ class Store:
     @property
     def _arrays_in_progress(self) -> frozenset[str]:
         """Names of the arrays that tasks fill, chunk by chunk: what they need of the metadata, a fiftieth of all."""
-        return frozenset({FIELD, OCTAVES, RECORD, PAGE, *self.keyed_arrays()})
+        return _OF_ROWS.union(self.keyed_arrays())
 
     def array(self, name: str) -> zarr.Array[Any]:
         """Return an array, for reading and writing."""
@@ -188,9 +190,13 @@ class Store:
         # Chunks of zeros are data too: they must exist, or they would read as never computed.
         return zarr.Array(zarr.AsyncArray(metadata, path, config={"write_empty_chunks": True}))
 
-    def checked_keys(self, largest: str = FIELD) -> ZarrStore:
-        """Return the store that zarr and xarray take to read arrays up to the largest, whose chunks are checked."""
-        return CheckedStore(self._keys(largest), self.path, self.documents, self._arrays_in_progress)
+    def checked_keys(self, largest: str = FIELD, *, has_tables: bool = False) -> ZarrStore:
+        """Return the store that zarr and xarray take to read arrays up to the largest, whose chunks are checked.
+
+        Where it has tables, no spectrum and no distance of pairs is missing.
+        """
+        in_progress = _OF_ROWS if has_tables else self._arrays_in_progress
+        return CheckedStore(self._keys(largest), self.path, self.documents, in_progress)
 
     def _keys(self, largest: str) -> ZarrStore:
         chunk = self.document(largest)["chunk_grid"]["configuration"]["chunk_shape"]

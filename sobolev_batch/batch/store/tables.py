@@ -129,13 +129,6 @@ def table_names(store: Store) -> list[str]:
     return [name for name in store.documents if name and name.split("/")[0] not in _GROUPS_OF_TASKS]
 
 
-def lost_tables(store: Store) -> list[str]:
-    """Return the arrays of tables with missing chunks. No chunk is read."""
-    names = table_names(store)
-    # Errors of norms need the qualities, which are written with the tables, as spectra are.
-    return _incomplete(store, [*names, QUALITY, *store.keyed_arrays()] if names else [])
-
-
 def damaged_tables(store: Store) -> dict[str, str]:
     """Return the damage of each small array, of tables and coordinates, that cannot be read."""
     keyed = store.keyed_arrays()
