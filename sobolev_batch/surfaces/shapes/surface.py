@@ -71,7 +71,8 @@ class Extent:
         """Return the extent of points (3, n), n > 0, one contiguous row an axis."""
         lowest, highest = np.full(len(DIRECTIONS), np.inf), np.full(len(DIRECTIONS), -np.inf)
         for start in range(0, coordinates.shape[1], _BATCH):
-            along = DIRECTIONS @ coordinates[:, start : start + _BATCH]
+            # Without a BLAS, whose threads would wait for those of a NUFFT.
+            along = np.einsum("ij,jk->ik", DIRECTIONS, coordinates[:, start : start + _BATCH])
             np.minimum(lowest, along.min(axis=1), out=lowest)
             np.maximum(highest, along.max(axis=1), out=highest)
         return cls(tuple(lowest.tolist()), tuple(highest.tolist()))
