@@ -291,7 +291,7 @@ def draw_matrix(selection: Selection, order: float, axes: Axes) -> None:
         return
     low, high, extend = _color_range(values[values > 0])
     image = axes.imshow(np.ma.masked_less_equal(values, 0), norm=LogNorm(low, high), cmap="viridis", aspect="equal")
-    label = escaped(f"distance in {study_unit(tree)}")
+    label = escaped(f"distance, computed in {study_unit(tree)}")
     bar = axes.figure.colorbar(image, ax=axes, shrink=0.8, label=label, extend=extend)
     bar.ax.tick_params(which="both", labelsize="small")
     labels = [shortened(meshes[i]) for i in arrangement]

@@ -211,7 +211,7 @@ def test_few_outliers_do_not_take_the_colours_of_a_matrix() -> None:
         low, high = image.get_clim()
         assert (low > 1e-3, high) == (True, cdist(chosen, chosen).max())
         assert image.colorbar is not None
-        assert (image.colorbar.extend, bar.get_ylabel()) == (extend, "distance in file units")
+        assert (image.colorbar.extend, bar.get_ylabel()) == (extend, "distance, computed in file units")
 
 
 def test_axes_name_the_unit_of_the_files(tree: xr.DataTree) -> None:

@@ -52,7 +52,7 @@
       hoverlabel: { align: "left", bgcolor: color("raised"), bordercolor: color("line"), font: { color: color("ink") } },
       modebar: { bgcolor: "rgba(0,0,0,0)", color: color("soft"), activecolor: color("accent") },
       legend: { orientation: "h", y: 1.02, yanchor: "bottom", x: 0 },
-      xaxis: { ...axis, ...xaxis }, yaxis: { ...axis, ...yaxis },
+      xaxis: { ...axis, ...xaxis }, yaxis: { ...axis, ...yaxis, title: { standoff: 14, ...yaxis?.title } },
       ...others,
     };
   };
@@ -117,7 +117,7 @@
       });
     }
     draw("convergence", traces, {
-      xaxis: { type: "log", ...(all("x").length ? ticks(all("x")) : {}), title: { text: "mean edge length" } },
+      xaxis: { type: "log", ...(all("x").length ? ticks(all("x")) : {}), title: { text: narrow() ? "mean edge length" : `mean edge length in ${plain(data.unit)}` } },
       yaxis: { type: "log", ...(slope.length ? ticks([...all("y"), ...slope]) : {}), title: { text: narrow() ? "" : "relative distance" } },
     });
   };
@@ -222,7 +222,7 @@
       hoverinfo: "text",
     }], {
       // Slanted labels reach beyond the last column.
-      ...(crowded ? { margin: { l: 10, r: 45, t: 30, b: 10 } } : {}),
+      ...(crowded ? { margin: { l: 10, r: 4 * Math.max(...bands.map((band) => band.length)), t: 30, b: 10 } } : {}),
       xaxis: {
         side: "top", showgrid: false, ticks: "", tickvals: bands.map((_, j) => j), ticktext: bands.map(plain),
         title: { text: narrow() ? "" : `wavelength in ${plain(data.unit)}` }, tickangle: crowded ? -60 : 0,
