@@ -28,11 +28,6 @@ class CollectionStore:
     table: Mapping[str, Any]
 
     @property
-    def stores(self) -> dict[str, Location]:
-        """Location of the store of each object, by its name."""
-        return {name: self.location.below(name) for name in self.objects}
-
-    @property
     def existing_stores(self) -> dict[str, Location]:
         """Stores of the objects that have one, by name; see `existing_store`."""
         found = {name: self.existing_store(name) for name in self.objects}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from sobolev_batch.batch.analysis.pairs import Pairs
@@ -96,13 +96,13 @@ def verify(store: str | Path | Location, on_progress: Callable[[int, int], None]
     if collection is None:
         return _verify_study(store, on_progress)
     verified: dict[str, Verification] = {}
-    for name, path in collection.stores.items():
+    for name in collection.objects:
+        verified[name] = Verification(str(collection.location.below(name)), 0, 0, {}, {}, withdrawn=False)
         try:
-            place = collection.existing_store(name)
-            none = Verification(str(path), 0, 0, {}, {}, withdrawn=False)
-            verified[name] = none if place is None else _verify_study(place, on_progress)
+            if place := collection.existing_store(name):
+                verified[name] = _verify_study(place, on_progress)
         except DamageError as error:
-            verified[name] = Verification(str(path), 0, 0, {}, {ROOT: error.what}, withdrawn=True)
+            verified[name] = replace(verified[name], tables={ROOT: error.what}, withdrawn=True)
     damaged = [one for one in verified.values() if not one.is_sound]
     return Verification(
         str(collection.location),

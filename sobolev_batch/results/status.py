@@ -127,7 +127,7 @@ class Status:
     @classmethod
     def _of_object(cls, collection: CollectionStore, name: str) -> Status | None:
         """Return the status of an object of a collection; None before a run takes it up."""
-        place = collection.stores[name]
+        place = collection.location.below(name)
         if collection.existing_store(name) is not None:
             return cls.from_store(place)
         # Only a run locks a place without a store: it plans, and has no heartbeat yet.

@@ -136,7 +136,12 @@ def damaged_tables(store: Store) -> dict[str, str]:
     others = {FIELD, OCTAVES, RECORD, PAGE, *written_with_tables}
     names = [name for name in filter(store.is_array, store.documents) if name not in others]
     expected = [*names, *written_with_tables] if table_names(store) else names
-    damage = dict.fromkeys(_incomplete(store, expected), "it is not there, or not all of it")
+    groups = {name: name.split("/")[0] for name in expected}
+    # Groups of tasks have the fields besides, which are many.
+    prefixes = {name if group in _GROUPS_OF_TASKS else group for name, group in groups.items()}
+    sizes = {key: size for prefix in prefixes for key, size in store.location.sizes(prefix).items()}
+    incomplete = (name for name in expected if store.is_array(name) and store.incomplete_chunks(name, sizes))
+    damage = dict.fromkeys(incomplete, "it is not there, or not all of it")
     for name in expected:
         if name not in damage and name not in keyed:
             try:
@@ -162,16 +167,6 @@ def rows_unlike_tables(
         elif record is not None and [record.status, record.key] != entry:
             unlike[row] = "its completion record is not the one that the tables were made from"
     return unlike
-
-
-def _incomplete(store: Store, names: Iterable[str]) -> list[str]:
-    """Return the arrays that have missing or short chunks."""
-    arrays = [name for name in names if store.is_array(name)]
-    groups = {name: name.split("/")[0] for name in arrays}
-    # Groups of tasks have the fields besides, which are many.
-    prefixes = {name if group in _GROUPS_OF_TASKS else group for name, group in groups.items()}
-    sizes = {key: size for prefix in prefixes for key, size in store.location.sizes(prefix).items()}
-    return [name for name in arrays if store.incomplete_chunks(name, sizes)]
 
 
 # Raise it where other numbers are computed from the same fields: all chunks are then stale.
