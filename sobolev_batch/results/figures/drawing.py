@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -193,8 +194,8 @@ COST_LEAGUE = Plot(draw_cost_league, lambda leagues: leagues, 3.6)
 
 # Smaller fractions are not written into their cells.
 _SMALLEST_SHARE = 0.005
-# Points of the largest font of labels and of shares.
-_LABEL_POINTS, _SHARE_POINTS = 7.5, 7.0
+# Points of the largest font of labels and of shares, of the colour bar beside them, and between slanted labels.
+_LABEL_POINTS, _SHARE_POINTS, _BAR_POINTS, _SLANTED_POINTS = 7.5, 7.0, 65.0, 12.0
 
 
 def draw_spectrum(selection: Selection, order: float, axes: Axes) -> None:
@@ -204,26 +205,30 @@ def draw_spectrum(selection: Selection, order: float, axes: Axes) -> None:
     image = axes.imshow(shares, vmin=0, cmap="Blues", aspect="auto")
     bar = axes.figure.colorbar(image, ax=axes, format=PercentFormatter(1.0, 0))
     bar.set_label("fraction of the\nsquared distance", fontsize="small")
-    row_points, column_points = 72 * 0.8 * height / len(shares), 72 * 0.85 * width / len(spectra.bands)
+    labels, row_points = [shortened(label) for label in spectra.labels], 72 * 0.8 * height / len(shares)
+    label_points = min(_LABEL_POINTS, row_points)
+    taken = _BAR_POINTS + _CHARACTER_WIDTH * label_points * max(map(len, labels))
+    # The margins of a subplot, 22 % of its width, are room for labels.
+    column_points = max(1.0, (72 * width / 0.78 - taken) / len(spectra.bands))
     font = min(_SHARE_POINTS, 0.75 * row_points, 0.4 * column_points)
     for i, fractions in enumerate(shares):
         if np.isnan(fractions).all():
             middle = (len(fractions) - 1) / 2
-            axes.text(middle, i, "equal to the reference", ha="center", va="center", fontsize=font)
+            axes.text(middle, i, "equal to the reference", ha="center", va="center", fontsize=label_points)
         for column, fraction in enumerate(fractions):
-            if fraction >= _SMALLEST_SHARE:
+            if fraction >= _SMALLEST_SHARE and font >= _SMALLEST_FONT:
                 color = "white" if fraction > 0.6 * np.nanmax(shares) else "black"
                 axes.text(column, i, f"{fraction:.0%}", ha="center", va="center", fontsize=font, color=color)
+    step = math.ceil(_SLANTED_POINTS / column_points)
     axes.set_xticks(
-        range(len(spectra.bands)),
-        spectra.bands,
+        range(0, len(spectra.bands), step),
+        spectra.bands[::step],
         fontsize=_LABEL_POINTS,
         rotation=40,
         ha="right",
         rotation_mode="anchor",
     )
-    labels = [shortened(label) for label in spectra.labels]
-    axes.set_yticks(range(len(labels)), labels, fontsize=min(_LABEL_POINTS, row_points))
+    axes.set_yticks(range(len(labels)), labels, fontsize=label_points)
     axes.set_xlabel(escaped(f"wavelength in {study_unit(selection.tree)}"))
     set_title(axes, f"differences by wavelength, order {order:g}", spectra.omission)
     hide_frame(axes)
@@ -291,8 +296,8 @@ def draw_matrix(selection: Selection, order: float, axes: Axes) -> None:
         return
     low, high, extend = _color_range(values[values > 0])
     image = axes.imshow(np.ma.masked_less_equal(values, 0), norm=LogNorm(low, high), cmap="viridis", aspect="equal")
-    label = escaped(f"distance, computed in {study_unit(tree)}")
-    bar = axes.figure.colorbar(image, ax=axes, shrink=0.8, label=label, extend=extend)
+    bar = axes.figure.colorbar(image, ax=axes, shrink=0.8, extend=extend)
+    bar.set_label(f"distance, computed in\n{escaped(study_unit(tree))}", fontsize="small")
     bar.ax.tick_params(which="both", labelsize="small")
     labels = [shortened(meshes[i]) for i in arrangement]
     # Below the matrix, the longest label takes its part of the height.

@@ -6,6 +6,7 @@ import struct
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import matplotlib as mpl
@@ -18,8 +19,8 @@ from matplotlib.lines import Line2D
 from scipy.spatial.distance import cdist
 
 import sobolev_batch as sb
-from sobolev_batch.results.figures.drawing import PLOTS, clustered_order, write_plots
-from sobolev_batch.results.figures.selection import Selection
+from sobolev_batch.results.figures.drawing import PLOTS, clustered_order, draw_spectrum, write_plots
+from sobolev_batch.results.figures.selection import Selection, Spectra
 from sobolev_batch.results.figures.style import Plot, drawing, notes_of, parse_size, set_log_scale, style_of
 from tests.support.commands import finished
 from tests.support.trees import distances_of, tree_of
@@ -105,6 +106,28 @@ def test_a_legend_hides_no_data_and_counts_what_it_leaves_out(count: int, size: 
     for axes in figure.axes:
         assert axes.bbox.height > 0.4 * figure.bbox.height / 2.2
         assert not box.overlaps(axes.get_tightbbox())  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("size", "step", "has_shares"), [((6.4, 4.0), 1, True), ((3.3, 2.4), 3, False)])
+def test_labels_of_wavelengths_do_not_overlap(size: tuple[float, float], step: int, has_shares: bool) -> None:
+    longest = np.asarray(2.0 ** -np.arange(12), dtype=np.float64)
+    shares, names = np.full((8, 1, 12), 1 / 12), tuple(f"a long name of a family/{i}" for i in range(8))
+    selection = SimpleNamespace(
+        tree=xr.DataTree(), spectra=Spectra(names, 8, (-2.0,), shares, longest, longest / 2, shares[:, 0], shares[:, 0])
+    )
+    with drawing(size):
+        figure = Plot(draw_spectrum, lambda _: (), 3.6).figure(selection, [-2.0], size)
+        figure.draw_without_rendering()
+    axes = figure.axes[0]
+    labels = [label.get_text() for label in axes.get_xticklabels()]
+    assert labels == list(selection.spectra.bands[::step])
+    assert len(axes.texts) == (96 if has_shares else 0)
+    places = axes.transData.transform(np.column_stack([axes.get_xticks(), axes.get_xticks()]))[:, 0]
+    apart = np.diff(places).min() * np.sin(np.radians(40)) * 72 / figure.dpi
+    assert apart > axes.get_xticklabels()[0].get_fontsize()
+    box, page = figure.get_tightbbox(), figure.bbox_inches
+    assert min(box.xmin, box.ymin) >= 0
+    assert (box.xmax <= page.xmax, box.ymax <= page.ymax) == (True, True)
 
 
 def test_forty_families_have_styles_of_their_own() -> None:
@@ -211,7 +234,7 @@ def test_few_outliers_do_not_take_the_colours_of_a_matrix() -> None:
         low, high = image.get_clim()
         assert (low > 1e-3, high) == (True, cdist(chosen, chosen).max())
         assert image.colorbar is not None
-        assert (image.colorbar.extend, bar.get_ylabel()) == (extend, "distance, computed in file units")
+        assert (image.colorbar.extend, bar.get_ylabel()) == (extend, "distance, computed in\nfile units")
 
 
 def test_axes_name_the_unit_of_the_files(tree: xr.DataTree) -> None:
