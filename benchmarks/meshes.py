@@ -34,7 +34,7 @@ def pair_of_parts(effort: Effort, triangles: int) -> tuple[sb.Mesh, sb.Mesh]:
     x, y, z = box.vertices.T
     vertices = np.stack([(x + 2) * np.cos(0.6 * y), (x + 2) * np.sin(0.6 * y), z * (1 + 0.3 * x)], axis=1)
     fine = sb.Mesh(vertices, box.faces)
-    return _in_unit_ball(decimated(fine, min(triangles, len(box.faces) // 8)), fine)
+    return _in_unit_ball(decimated(fine, len(box.faces) // 8 if effort.quick else triangles), fine)
 
 
 def _in_unit_ball(coarse: sb.Mesh, fine: sb.Mesh) -> tuple[sb.Mesh, sb.Mesh]:
