@@ -205,7 +205,7 @@ def _kernel(cutoff: float, order: float, reach: float) -> _Kernel:
         terms = weights * (1 - smooth_step(radii, cutoff)) * (1 + radii**2) ** order
         cycles = np.outer(distances[near], radii)
         fade = smooth_step(cycles, _CYCLES)
-        drops[near] += (1 - fade + 2 * fade * np.sin(np.pi * cycles) ** 2) @ terms
+        drops[near] += np.einsum("ij,j->i", 1 - fade + 2 * fade * np.sin(np.pi * cycles) ** 2, terms)
         drops[~near] += terms.sum()
         low *= 2
     drops, total = (drops + _power_integral(low, order)) / np.pi, total / np.pi

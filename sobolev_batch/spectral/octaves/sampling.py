@@ -19,6 +19,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from sobolev_batch.spectral.backends import combine
 from sobolev_batch.spectral.lattice import STEP_START, OctaveLattice, smooth_step
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Indices, Reals, Surface
@@ -84,11 +85,11 @@ class FaceNormals:
 
     def density(self, directions: Reals, radii: Reals) -> Reals:
         """Return the density per solid angle (n,) at unit directions (n, 3), for their |ξ| (n,)."""
-        total = np.zeros(len(radii))
+        total, columns = np.zeros(len(radii)), np.ascontiguousarray(directions.T)
         for axis, share, size in zip(self.directions, self.shares, self.sizes, strict=True):
             squares = self._concentrations(radii, size)
-            sines = np.maximum(1 - (directions @ axis) ** 2, 0.0)
-            total += share / (4 * np.pi) * (1 + squares) / (1 + squares * sines) ** 1.5
+            spread = 1 + squares * np.maximum(1 - combine(axis, columns) ** 2, 0.0)
+            total += share / (4 * np.pi) * (1 + squares) / (spread * np.sqrt(spread))
         return total
 
     @staticmethod
@@ -99,7 +100,7 @@ class FaceNormals:
 
 def without_sign(normals: Reals) -> Reals:
     """Return of each normal (n, 3) and its opposite the same one."""
-    return np.where((normals @ _UPWARDS < 0)[:, None], -normals, normals)
+    return np.where((combine(_UPWARDS, normals.T) < 0)[:, None], -normals, normals)
 
 
 def _main_normals(mesh: Mesh) -> tuple[Reals, Reals, Reals]:
@@ -331,9 +332,9 @@ def _lattice_samples(lattice: OctaveLattice) -> tuple[Reals, Reals, Indices, Ind
     order = np.argsort(sublattices, kind="stable")
     i, j, k = i[order], j[order], k[order]
     starts = np.searchsorted(sublattices[order], np.arange(_SUBLATTICES)).astype(np.int64)
-    own = np.stack([x[i], y[j], z[k]], axis=1)
+    own = np.stack([x[i], y[j], z[k]])
     places = np.ravel_multi_index((i, j, k), block.shape).astype(np.int64)
-    return own @ lattice.rotation, lattice.half_weights()[k], places, starts
+    return combine(lattice.rotation.T, own).T, lattice.half_weights()[k], places, starts
 
 
 @dataclass(frozen=True, eq=False)
