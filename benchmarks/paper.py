@@ -17,7 +17,7 @@ from benchmarks.timing import take_turns
 from sobolev_batch import Lattice, Mesh
 from sobolev_batch.shapes import Sphere
 from sobolev_batch.spectral.backends import ComplexDtype
-from sobolev_batch.spectral.quadrature import gauss_rule
+from sobolev_batch.spectral.rules import gauss_rule
 
 Complexes = NDArray[np.complexfloating[Any, Any]]
 Reals = NDArray[np.float64]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Self
@@ -14,7 +15,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.backends import Complexes, NufftSpec
 from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.nufft import transform_points
-from sobolev_batch.spectral.quadrature import RuleUse, WeightedPoints, assign_rules, corner_rule, midpoint_rule
+from sobolev_batch.spectral.quadrature import RuleUse, WeightedPoints, assign_rules
 from sobolev_batch.spectral.transform import ON_CPU, Execution, TransformSettings, require_points_inside
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Indices, Reals
@@ -55,7 +56,7 @@ class MeshTransform:
     ) -> Self:
         """Return the transform of a mesh, with the triangle rules that its present shape needs."""
         uses = assign_rules(mesh, lattice.highest_frequency, settings.eps, settings.quadrature, settings.tolerance)
-        of_vertices, of_areas = zip(*(_node_matrices(mesh, use) for use in uses), strict=True)
+        of_vertices, of_areas = zip(*(pair for use in uses for pair in _node_matrices(mesh, use)), strict=True)
         triangles = np.asarray(mesh.triangles, dtype=np.int64)
         return cls(
             triangles,
@@ -181,26 +182,33 @@ def _whole(half: Complexes) -> Complexes:
     return np.concatenate([inner[::-1, ::-1, ::-1].conj(), half[:, :, :1], inner], axis=2)
 
 
-def _node_matrices(mesh: Mesh, use: RuleUse) -> tuple[csr_array, csr_array]:
-    """Return the rows of both matrices for the nodes of some triangles; nodes that triangles share are merged."""
-    triangles = np.asarray(mesh.triangles[use.members], dtype=np.int64)
-    barycentric, weights = use.rule.barycentric, use.rule.weights
-    if not use.splits and use.rule is corner_rule():
-        used, nodes = np.unique(triangles, return_inverse=True)
-        of_vertices = np.arange(len(used)), used, np.ones(len(used))
-    elif not use.splits and use.rule is midpoint_rule():
-        edges = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
-        used, nodes = np.unique(edges, axis=0, return_inverse=True)
-        of_vertices = np.repeat(np.arange(len(used)), 2), used.ravel(), np.full(2 * len(used), 0.5)
-    else:
+def _node_matrices(mesh: Mesh, use: RuleUse) -> Iterator[tuple[csr_array, csr_array]]:
+    """Yield the rows of both matrices for the nodes of some triangles; nodes that triangles share are merged."""
+    triangles, rule = np.asarray(mesh.triangles[use.members], dtype=np.int64), use.rule
+    members, inner, inner_weights = use.members.astype(np.int64), *rule.inner_nodes
+    if use.splits:
+        inner, inner_weights = rule.barycentric, rule.weights
         for _ in range(use.splits):
-            barycentric = np.concatenate([barycentric @ quarter for quarter in _QUARTERS])
-            weights = np.tile(weights / 4, 4)
-        nodes = np.arange(len(weights) * len(triangles), dtype=np.int64)
-        columns = np.repeat(triangles, len(weights), axis=0).ravel()
-        of_vertices = np.repeat(nodes, 3), columns, np.tile(barycentric, (len(triangles), 1)).ravel()
-    of_areas = nodes.ravel(), np.repeat(use.members.astype(np.int64), len(weights)), np.tile(weights, len(triangles))
-    return _matrix(*of_vertices, len(mesh.vertices)), _matrix(*of_areas, len(mesh.triangles))
+            inner = np.concatenate([inner @ quarter for quarter in _QUARTERS])
+            inner_weights = np.tile(inner_weights / 4, 4)
+    elif rule.shares:
+        edges = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1), axis=2)
+        shared = [(triangles[:, :, None], np.ones(1), rule.corner_weight)] if rule.corner_weight else []
+        shared += [(edges, *node) for node in zip(*rule.edge_nodes, strict=True)]
+        for ends, coefficients, weight in shared:
+            used, nodes = np.unique(ends.reshape(-1, ends.shape[2]), axis=0, return_inverse=True)
+            of_vertices = np.repeat(np.arange(len(used)), used.shape[1]), used.ravel(), np.tile(coefficients, len(used))
+            of_areas = nodes.ravel(), np.repeat(members, 3), np.full(nodes.size, weight)
+            yield _matrix(*of_vertices, len(mesh.vertices)), _matrix(*of_areas, len(mesh.triangles))
+    if len(inner):
+        nodes = np.arange(len(inner) * len(triangles), dtype=np.int64)
+        of_vertices = (
+            np.repeat(nodes, 3),
+            np.repeat(triangles, len(inner), axis=0).ravel(),
+            np.tile(inner, (len(triangles), 1)).ravel(),
+        )
+        of_areas = nodes, np.repeat(members, len(inner)), np.tile(inner_weights, len(triangles))
+        yield _matrix(*of_vertices, len(mesh.vertices)), _matrix(*of_areas, len(mesh.triangles))
 
 
 def _matrix(rows: Indices, columns: Indices, values: Reals, width: int) -> csr_array:

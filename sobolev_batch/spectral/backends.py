@@ -238,8 +238,8 @@ def _grid_length(modes: int, sigma: float) -> int:
 
 CPU_COSTS = Costs(
     finest_eps={
-        "complex128": {2.0: 0.0, 1.75: 1e-12, 1.5: 1e-11, 1.25: 1e-7},
-        "complex64": {2.0: 0.0, 1.75: 3e-6, 1.5: 2e-5, 1.25: 1e-3},
+        "complex128": {2.0: 0.0, 1.65: 1e-12, 1.5: 1e-11, 1.25: 1e-7},
+        "complex64": {2.0: 0.0, 1.65: 3e-6, 1.5: 2e-5, 1.25: 1e-3},
     },
     point_nanoseconds=150.0,
     spread_nanoseconds=100.0,

@@ -273,18 +273,24 @@ class _Triangles(SurfaceKind):
 
     def batches(self, capacity: int, backend: Backend = CPU) -> Iterator[WeightedPoints]:
         # Nodes are merged within a batch of triangles: these are large where nodes are shared.
-        triangles = [batch for use in self.uses for batch in use.split(capacity // (2 if use.rule.sharing > 1 else 8))]
-        ends = np.cumsum([batch.largest_points for batch in triangles])
-        total = int(ends[-1])
-        margin = 0 if total <= capacity else max(batch.largest_points for batch in triangles)
-        count = -(-total // (capacity - margin))
+        fits = self.expected_points <= capacity
+        most = {True: capacity // (1 if fits else 2), False: capacity // 8}
+        triangles = [batch for use in self.uses for batch in use.split(most[use.rule.shares])]
+        expected = [batch.expected_points for batch in triangles]
+        ends = np.cumsum(expected)
+        total = float(ends[-1])
+        margin = 0 if fits else max(expected)
+        count = math.ceil(total / (capacity - margin))
         # A batch of triangles goes where its first point goes, so that each batch of points exceeds its equal
         # number by at most one batch of triangles.
-        numbers = (np.concatenate([[0], ends[:-1]]) * count // total).tolist()
+        numbers = (np.concatenate([[0], ends[:-1]]) * count // total).astype(int).tolist()
         mesh = self.surface
         arrays = backend.upload(mesh.vertices), backend.upload(mesh.triangles), backend.upload(mesh.areas)
         for _, group in groupby(zip(numbers, triangles, strict=True), key=itemgetter(0)):
-            yield WeightedPoints.concatenated([batch.points(arrays, backend) for _, batch in group])
+            points = WeightedPoints.concatenated([batch.points(arrays, backend) for _, batch in group])
+            # Where neighbours share fewer nodes than those of a closed mesh, there are more points than expected.
+            for first in range(0, len(points.weights), capacity):
+                yield points.part(slice(first, first + capacity))
 
     def exact_values(self, frequencies: Reals, backend: Backend = CPU) -> Complexes:
         return exact_transform(self.surface, frequencies, backend)

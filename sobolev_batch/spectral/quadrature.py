@@ -1,189 +1,27 @@
-"""Triangle meshes as weighted points: rules and that of each triangle, its points, and the error to be expected."""
+"""Triangle meshes as weighted points: the rule of each triangle, its points, and the error to be expected."""
 
 from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache, lru_cache
-from itertools import product
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.backends import Array, Backend, combine, sums_at, sums_of_runs
-from sobolev_batch.spectral.exact import second_difference
 from sobolev_batch.spectral.lattice import FrequencyLattice
+from sobolev_batch.spectral.rules import (
+    FINEST_TOLERANCE,
+    TriangleRule,
+    choose_rules,
+    fixed_rule,
+    rule_ranges,
+    typical_errors,
+)
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.surface import Indices, Reals
-
-HIGHEST_DEGREE = 50
-# Below this, rounding hides the error of a rule.
-FINEST_TOLERANCE = 1e-15
-# Sizes 2π|ξ|ρ of triangles (radians) at which the largest and the typical errors of rules are tabulated.
-_SIZES, _SIZES_ON_AVERAGE = np.geomspace(1e-4, 200.0, 160), np.geomspace(1e-3, 200.0, 64)
-_TABULATED = Path(__file__).with_name("rules.npz")
-
-
-@dataclass(frozen=True, eq=False)
-class TriangleRule:
-    """A quadrature rule on the triangle.
-
-    Attributes:
-        degree: Total degree up to which polynomials are integrated exactly.
-        barycentric: Barycentric coordinates of the nodes (n, 3); rows sum to 1.
-        weights: Positive weights (n,), to be multiplied by the area; they sum to 1.
-        sharing: Number of triangles of a closed mesh that share a node: 6 for corners, 2 for edges.
-    """
-
-    degree: int
-    barycentric: Reals
-    weights: Reals
-    sharing: int = 1
-
-    @property
-    def size(self) -> int:
-        """Number of nodes."""
-        return len(self.weights)
-
-    @property
-    def cost(self) -> float:
-        """Points for each triangle of a large closed mesh, once shared nodes are merged."""
-        return self.size / self.sharing
-
-
-@cache
-def corner_rule() -> TriangleRule:
-    """Return the rule of degree 1 whose nodes are the corners: half a point for each triangle."""
-    return TriangleRule(1, np.eye(3), np.full(3, 1 / 3), sharing=6)
-
-
-@cache
-def midpoint_rule() -> TriangleRule:
-    """Return the rule of degree 2 whose nodes are the edge midpoints: one and a half points for each triangle.
-
-    Source: P. C. Hammer, A. H. Stroud, "Numerical integration over simplexes" (1956).
-    """
-    return TriangleRule(2, np.array([[0.5, 0.5, 0.0], [0.0, 0.5, 0.5], [0.5, 0.0, 0.5]]), np.full(3, 1 / 3), sharing=2)
-
-
-@cache
-def symmetric_rule(degree: int) -> TriangleRule:
-    """Return the fully symmetric rule of a degree from 1 to 50, with positive weights and interior nodes.
-
-    Source: H. Xiao, Z. Gimbutas, "A numerical algorithm for the construction of efficient quadrature rules
-    in two and higher dimensions" (2010), doi:10.1016/j.camwa.2009.10.027.
-    """
-    found = tabulated()
-    end = int(found["sizes"][:degree].sum())
-    own = slice(end - int(found["sizes"][degree - 1]), end)
-    return TriangleRule(degree, found["nodes"][own], found["weights"][own])
-
-
-@cache
-def gauss_rule(points: int = 8) -> TriangleRule:
-    """Return the product of two Gauss-Legendre rules on the triangle: points² nodes, 64 in K. Koga's paper."""
-    nodes, weights = np.polynomial.legendre.leggauss(points)
-    u, v = np.meshgrid((1 + nodes) / 2, (1 + nodes) / 2, indexing="ij")
-    products = np.outer(weights, weights) / 4 * 2 * (1 - u)
-    second, third = u.ravel(), ((1 - u) * v).ravel()
-    return TriangleRule(2 * points - 2, np.stack([1 - second - third, second, third], axis=1), products.ravel())
-
-
-@lru_cache(maxsize=64)
-def rule_ranges(tolerance: float) -> tuple[tuple[TriangleRule, ...], Reals]:
-    """Return the rules of increasing cost that are worth using at a tolerance, and the range of each.
-
-    The tolerance is the largest error on one triangle, relative to its area, at every frequency. The range is the
-    largest 2π|ξ|ρ (radians; ρ is the distance from a triangle's centroid to its farthest corner) up to which a rule
-    keeps it for every shape of triangle and direction of ξ. Rules with a smaller range than a cheaper one are left out.
-    """
-    tolerance = max(tolerance, FINEST_TOLERANCE)
-    rules: list[TriangleRule] = []
-    ranges: list[float] = []
-    for rule, row in zip(candidate_rules(), tabulated()["largest"], strict=True):
-        beyond = np.flatnonzero(row > tolerance)
-        last = beyond[0] - 1 if beyond.size else len(_SIZES) - 1
-        limit = float(_SIZES[last]) if last >= 0 else 0.0
-        while rules and rules[-1].cost >= rule.cost and ranges[-1] <= limit:
-            rules.pop()
-            ranges.pop()
-        if not ranges or limit > ranges[-1]:
-            rules.append(rule)
-            ranges.append(limit)
-    return tuple(rules), np.array(ranges)
-
-
-def typical_errors(rule: TriangleRule) -> tuple[Reals, Reals, Reals]:
-    """Return sizes 2π|ξ|ρ (radians), and the rms errors of a candidate on one triangle there over all directions of ξ.
-
-    The even part (real, seen from the centroid) adds up over neighbouring triangles. The odd part changes sign between
-    neighbours that point opposite ways, and mostly cancels. Both are relative to the area, and each is the larger one
-    of the equilateral and the flat triangle.
-    """
-    stored, row = tabulated(), candidate_rules().index(rule)
-    return _SIZES_ON_AVERAGE, stored["even"][row], stored["odd"][row]
-
-
-@cache
-def candidate_rules() -> tuple[TriangleRule, ...]:
-    """Return the 52 rules from which each tolerance takes its own: corners, midpoints, and the symmetric ones."""
-    symmetric = [symmetric_rule(degree) for degree in range(1, HIGHEST_DEGREE + 1)]
-    return (corner_rule(), symmetric[0], midpoint_rule(), *symmetric[1:])
-
-
-@cache
-def tabulated() -> dict[str, Reals]:
-    """Return the symmetric rules and what was measured of each candidate, float64.
-
-    The "nodes" (n, 3) and "weights" (n,) of all degrees follow each other; "sizes" (50,) has the number of each. The
-    errors "largest" (52, 160), "even" and "odd" (52, 64) depend on the rules alone, and measuring takes a second of
-    each process, so the package carries them. `python -m sobolev_batch.spectral.quadrature` measures them anew.
-    """
-    with np.load(_TABULATED, allow_pickle=False) as stored:  # noqa: TID251
-        return {name: stored[name] for name in stored.files}
-
-
-def measure_largest_errors(rule: TriangleRule) -> Reals:
-    """Return the largest relative error of a rule on triangles of each size (160,).
-
-    On a plane wave the error of a rule depends only on the phases at the triangle's three corners. Measured from the
-    centroid they sum to zero, and the largest is at most 2π|ξ|ρ: a hexagon; symmetry leaves one twelfth of it to
-    sample.
-    """
-    fractions = np.linspace(0.5, 1.0, 5)
-    largest = np.repeat(_SIZES, len(fractions))
-    second = -largest * np.tile(fractions, len(_SIZES))
-    errors = np.abs(_rule_errors(rule, np.stack([largest, second, -largest - second])))
-    return np.asarray(errors.reshape(len(_SIZES), -1).max(axis=1))
-
-
-def measure_typical_errors(rule: TriangleRule) -> tuple[Reals, Reals]:
-    """Return the even and the odd part of a rule's error at each size (64,): see `typical_errors`."""
-    sizes = _SIZES_ON_AVERAGE
-    cosines, weights = np.polynomial.legendre.leggauss(4)
-    sines = np.sqrt(1 - ((1 + cosines) / 2) ** 2)
-    angles = (np.arange(4) + 0.5) * np.pi / 24
-    equilateral = np.cos(angles + 2 * np.pi / 3 * np.arange(3)[:, None])
-    flat = np.outer([1.0, -0.5, -0.5], np.cos((np.arange(4) + 0.5) * np.pi / 8))
-    even, odd = [], []
-    for shape in (equilateral, flat):
-        phases = (sizes[:, None, None] * sines[:, None]) * shape[:, None, None, :]
-        difference = _rule_errors(rule, phases.reshape(3, -1)).reshape(len(sizes), len(sines), -1)
-        even.append(np.sqrt(weights / 2 @ np.mean(difference.real**2, axis=2).T))
-        odd.append(np.sqrt(weights / 2 @ np.mean(difference.imag**2, axis=2).T))
-    return np.maximum(*even), np.maximum(*odd)
-
-
-def _rule_errors(rule: TriangleRule, phases: Reals) -> NDArray[np.complex128]:
-    """Return the error (n,) of a rule on exp(i phase), relative to the area, from the phases at the corners (3, n)."""
-    exact = 2 * second_difference(phases[1] - phases[0], phases[2] - phases[0])
-    return np.asarray(rule.weights @ np.exp(1j * (rule.barycentric @ phases)) - exact)
-
+from sobolev_batch.surfaces.shapes.surface import Reals
 
 _Corners = tuple[Array, Array, Array]
 # Vertices (n, 3), triangles (m, 3) and areas (m,) of a mesh, as arrays of a backend.
@@ -206,6 +44,21 @@ class WeightedPoints:
     weights: Array
 
     @staticmethod
+    def empty(count: int, like: Array) -> WeightedPoints:
+        """Return points to be placed, on the backend of an array."""
+        return WeightedPoints(np.empty((3, count), like=like), np.empty(count, like=like))
+
+    def part(self, part: slice) -> WeightedPoints:
+        """Return some of the points, which share their memory with these."""
+        return WeightedPoints(self.coordinates[:, part], self.weights[part])
+
+    def place(self, nodes: Reals, node_weights: Reals, places: Iterable[Sequence[Array]], areas: Array) -> None:
+        """Write the nodes (k, p) of p places for each of n triangles, from their coordinates (n,) axis by axis."""
+        for row, coordinates in zip(self.coordinates, places, strict=True):
+            combine(nodes, np.stack(coordinates), out=row.reshape(len(nodes), -1))
+        np.multiply(np.asarray(node_weights, like=areas)[:, None], areas, out=self.weights.reshape(len(nodes), -1))
+
+    @staticmethod
     def concatenated(batches: Sequence[WeightedPoints]) -> WeightedPoints:
         """Return the points of several batches as one."""
         if len(batches) == 1:
@@ -214,25 +67,6 @@ class WeightedPoints:
             np.concatenate([points.coordinates for points in batches], axis=1),
             np.concatenate([points.weights for points in batches]),
         )
-
-
-def fixed_rule(quadrature: str | int) -> TriangleRule | None:
-    """Return the rule that a method prescribes for all triangles, or None if the rule depends on their size.
-
-    The method "auto" gives every triangle the cheapest rule that keeps the tolerance at all frequencies of the lattice,
-    and splits triangles that are too large for any rule. An integer from 1 to 50 is the degree of one symmetric rule
-    with interior nodes for all triangles. "gauss8" is the 64-point product rule of K. Koga's paper. Any other method is
-    an InputError. Parametrised surfaces ignore the method.
-    """
-    if quadrature == "auto":
-        return None
-    if quadrature == "gauss8":
-        return gauss_rule(8)
-    if isinstance(quadrature, int) and not isinstance(quadrature, bool) and 1 <= quadrature <= HIGHEST_DEGREE:
-        return symmetric_rule(quadrature)
-    raise InputError(
-        f"quadrature must be 'auto', 'gauss8' or a degree from 1 to {HIGHEST_DEGREE}, found {quadrature!r}"
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,43 +91,37 @@ class RuleUse:
     @property
     def expected_points(self) -> float:
         """Number of points of a closed mesh, after shared ones are merged."""
-        return self.largest_points / (1 if self.splits else self.rule.sharing)
+        return len(self.members) * (self.rule.size << 2 * self.splits if self.splits else self.rule.cost)
 
-    def split(self, largest: int) -> Iterator[RuleUse]:
-        """Yield parts of at most ``largest`` points, or of one triangle without splits."""
-        points_each = self.rule.size << 2 * self.splits
-        if points_each > largest and self.splits:
+    def split(self, most: int) -> Iterator[RuleUse]:
+        """Yield parts whose expected points are at most a number, or of one triangle without splits."""
+        points_each = self.expected_points / len(self.members)
+        if points_each > most and self.splits:
             for quarter in range(4):
-                yield from RuleUse(self.rule, self.splits - 1, self.members, (*self.path, quarter)).split(largest)
+                yield from RuleUse(self.rule, self.splits - 1, self.members, (*self.path, quarter)).split(most)
             return
-        count = largest // points_each
-        step = max(1, count if self.rule.sharing > 1 else min(_TRIANGLES, count))
+        count = int(most / points_each)
+        step = max(1, count if self.rule.shares else min(_TRIANGLES, count))
         for first in range(0, len(self.members), step):
             yield RuleUse(self.rule, self.splits, self.members[first : first + step], self.path)
 
     def points(self, mesh: FaceArrays, backend: Backend) -> WeightedPoints:
         """Return the points, on the backend of the mesh's arrays."""
         vertices, all_triangles, all_areas = mesh
-        members = backend.upload(self.members.astype(np.int64))
+        members, rule = backend.upload(self.members.astype(np.int64)), self.rule
+        triangles, areas = all_triangles[members], all_areas[members]
         if not (self.splits or self.path):
-            if self.rule is corner_rule():
-                return WeightedPoints(*merged_corners(mesh, members))
-            if self.rule is midpoint_rule():
-                return WeightedPoints(*merged_midpoints(mesh, members))
-        triangles = all_triangles[members]
-        a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
-        areas = all_areas[members] / 4 ** len(self.path)
+            return _merged_points(vertices, triangles, areas, rule)
+        corners = tuple(vertices[triangles[:, corner]] for corner in range(3))
+        areas /= 4 ** len(self.path)
         for quarter in self.path:
-            a, b, c = _quarters((a, b, c))[quarter]
+            corners = _quarters(corners)[quarter]
         for _ in range(self.splits):
-            a, b, c = (np.concatenate(quarters) for quarters in zip(*_quarters((a, b, c)), strict=True))
+            corners = tuple(np.concatenate(quarters) for quarters in zip(*_quarters(corners), strict=True))
             areas = np.tile(areas / 4, 4)
-        rule = self.rule
-        coordinates = np.empty((3, rule.size, len(areas)), like=areas)
-        for axis in range(3):
-            combine(rule.barycentric, np.stack([a[:, axis], b[:, axis], c[:, axis]]), out=coordinates[axis])
-        weights = np.asarray(rule.weights, like=areas)[:, None] * areas
-        return WeightedPoints(coordinates.reshape(3, -1), weights.ravel())
+        points = WeightedPoints.empty(rule.size * len(areas), like=areas)
+        points.place(rule.barycentric, rule.weights, zip(*(corner.T for corner in corners), strict=True), areas)
+        return points
 
 
 def assign_rules(
@@ -320,17 +148,6 @@ def assign_rules(
     )
 
 
-def choose_rules(sizes: Reals, ranges: Reals) -> tuple[Indices, Indices]:
-    """Return how often to halve edges, and the index of the rule then, by sizes 2π|ξ|ρ (n,); see `rule_ranges`."""
-    splits = np.zeros(sizes.shape, dtype=np.int64)
-    large = sizes > ranges[-1]
-    if large.any():
-        splits[large] = np.ceil(np.log2(sizes[large] / ranges[-1]))
-        sizes = np.ldexp(sizes, -splits)
-    # Rounding of the logarithm may leave a size just beyond the last range.
-    return splits, np.minimum(np.searchsorted(ranges, sizes), len(ranges) - 1)
-
-
 def _quarters(corners: _Corners) -> tuple[_Corners, _Corners, _Corners, _Corners]:
     """Return the four similar triangles that edge midpoints split each triangle into."""
     a, b, c = corners
@@ -338,24 +155,34 @@ def _quarters(corners: _Corners) -> tuple[_Corners, _Corners, _Corners, _Corners
     return (a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)
 
 
-def merged_corners(mesh: FaceArrays, members: Array) -> tuple[Array, Array]:
-    """Return the corners of some triangles (3, n), each with a third of the areas that meet there (n,)."""
-    vertices, triangles, areas = mesh
-    thirds = np.repeat(areas[members] / 3, 3)
-    weights = sums_at(triangles[members].ravel(), thirds, len(vertices))
-    corners = np.flatnonzero(weights)
-    return np.ascontiguousarray(vertices[corners].T, like=weights), weights[corners]
+def _merged_points(vertices: Array, triangles: Array, areas: Array, rule: TriangleRule) -> WeightedPoints:
+    """Return the points of some triangles; a node that neighbours share has the weights of all of them."""
+    (on_edges, of_edges), (inside, of_inside) = rule.edge_nodes, rule.inner_nodes
+    sums = sums_at(triangles.ravel(), np.repeat(areas, 3), len(vertices)) if rule.corner_weight else areas[:0]
+    corners = np.flatnonzero(sums)
+    low, high, edge_sums = merged_edges(triangles, areas, len(vertices)) if len(of_edges) else (corners, corners, sums)
+    parts = (
+        (np.ones((1, 1)), np.array([rule.corner_weight]), (corners,), sums[corners]),
+        (on_edges, of_edges, (low, high), edge_sums),
+        (inside, of_inside, [np.ascontiguousarray(ends, like=areas) for ends in triangles.T], areas),
+    )
+    ends = np.cumsum([0, *(len(node_weights) * len(part_areas) for _, node_weights, _, part_areas in parts)]).tolist()
+    points, columns = WeightedPoints.empty(ends[-1], like=areas), np.ascontiguousarray(vertices.T, like=areas)
+    for start, end, (nodes, node_weights, indices, part_areas) in zip(ends, ends[1:], parts, strict=False):
+        if end > start:
+            places = ([column[index] for index in indices] for column in columns)
+            points.part(slice(start, end)).place(nodes, node_weights, places, part_areas)
+    return points
 
 
-def merged_midpoints(mesh: FaceArrays, members: Array) -> tuple[Array, Array]:
-    """Return the edge midpoints of some triangles (3, n), each with a third of the areas that meet there (n,)."""
-    vertices, triangles, areas = mesh
-    triangles = triangles[members]
+def merged_edges(triangles: Array, areas: Array, vertex_count: int) -> tuple[Array, Array, Array]:
+    """Return both vertices of the edges of some triangles (n,) each, and the sum of the areas that meet there (n,)."""
     triangle_bits = len(triangles).bit_length()
-    if 2 * len(vertices).bit_length() + triangle_bits > _BITS:
+    used = None
+    if 2 * vertex_count.bit_length() + triangle_bits > _BITS:
         used, triangles = np.unique(triangles, return_inverse=True)
-        vertices, triangles = vertices[used], triangles.reshape(-1, 3)
-    bits = len(vertices).bit_length()
+        vertex_count, triangles = len(used), triangles.reshape(-1, 3)
+    bits = vertex_count.bit_length()
     numbers = np.arange(len(triangles), like=triangles)
     edges = np.empty((3, len(triangles)), dtype=np.int64, like=triangles)
     for row, (i, j) in zip(edges, ((0, 1), (1, 2), (2, 0)), strict=True):
@@ -366,20 +193,17 @@ def merged_midpoints(mesh: FaceArrays, members: Array) -> tuple[Array, Array]:
         row |= numbers
     ordered = edges.ravel()
     ordered.sort()
-    thirds = (areas[members] / 3)[ordered & ((1 << triangle_bits) - 1)]
+    sums = areas[ordered & ((1 << triangle_bits) - 1)]
     ordered >>= triangle_bits
     is_first = np.empty(len(ordered), dtype=bool, like=ordered)
     is_first[:1] = True
     np.not_equal(ordered[1:], ordered[:-1], out=is_first[1:])
     starts = np.flatnonzero(is_first)
-    weights = sums_of_runs(thirds, starts)
     ends = ordered[starts]
-    coordinates = np.empty((3, len(starts)), like=thirds)
     low, high = ends >> bits, ends & ((1 << bits) - 1)
-    for axis in range(3):
-        column = np.ascontiguousarray(vertices[:, axis], like=vertices)
-        np.multiply(column[low] + column[high], 0.5, out=coordinates[axis])
-    return coordinates, weights
+    if used is not None:
+        low, high = used[low], used[high]
+    return low, high, sums_of_runs(sums, starts)
 
 
 # Fraction of the odd errors that was seen to remain between neighbouring triangles.
@@ -390,8 +214,9 @@ _LOOSEST_TOLERANCE = 0.1
 _STEPS_PER_DECADE = 4
 # The typical error of a frequency for a largest one, and the phases (radians) at which triangles may repeat.
 _TYPICAL_OF_LARGEST, _RESONANCE = 0.3, 2.0
-# Products of three coordinates, and in how many orders each comes.
-_CUBES = Counter(tuple(sorted(axes)) for axes in product(range(3), repeat=3))
+# Pairs of coordinates, and in how many orders each comes; triangles at a time that fit into the processor's cache.
+_PAIRS, _PAIR_COUNTS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)), np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
+_CACHED = 1 << 13
 
 
 def loosest_tolerance(mesh: Mesh, lattice: FrequencyLattice, orders: Sequence[float], norms: Reals) -> float:
@@ -478,7 +303,7 @@ def _error_energies(
     even, odd = np.empty_like(phases), np.empty_like(phases)
     for rule in np.unique(choice):
         members = choice == rule
-        even[:, members], odd[:, members] = _interpolated_errors(rules[rule], phases[:, members])
+        even[:, members], odd[:, members] = typical_errors(rules[rule], phases[:, members])
     coherence = np.minimum(1.0, 1 / (2 * np.pi * radii**2 * areas.sum()))
     repeats = phases > resonance
     energies = (np.where(repeats, 0, even) @ areas) ** 2 * coherence + (np.where(repeats, even + odd, 0) @ areas) ** 2
@@ -492,26 +317,19 @@ def _unpaired(mesh: Mesh) -> float:
 
     The leading odd error is that of third moments about the centroid.
     """
-    totals, amount = np.zeros(len(_CUBES)), 0.0
-    for first in range(0, len(mesh.triangles), _TRIANGLES):
-        corners = mesh.vertices[mesh.triangles[first : first + _TRIANGLES]]
-        x = np.ascontiguousarray(np.moveaxis(corners - corners.mean(axis=1, keepdims=True), 0, 2))
-        areas = mesh.areas[first : first + _TRIANGLES]
-        squares = np.zeros(len(areas))
-        for number, ((i, j, k), orders) in enumerate(_CUBES.items()):
-            moments = np.einsum("cn,cn,cn->n", x[:, i], x[:, j], x[:, k])
-            totals[number] += math.sqrt(orders) * np.sum(areas * moments)
-            squares += orders * moments * moments
-        amount += float(np.sum(areas * np.sqrt(squares)))
-    return float(np.linalg.norm(totals)) / amount if amount else 0.0
-
-
-def _interpolated_errors(rule: TriangleRule, phases: Reals) -> tuple[Reals, Reals]:
-    """Return the typical even and odd errors of a rule at some phases."""
-    sizes, even, odd = typical_errors(rule)
-    logs, grid = np.log(np.maximum(phases, sizes[0])), np.log(sizes)
-    first, second = (np.exp(np.interp(logs, grid, np.log(errors + 1e-17))) for errors in (even, odd))
-    return first, second
+    totals, amount, columns = np.zeros((len(_PAIRS), 3)), 0.0, np.ascontiguousarray(mesh.vertices.T)
+    for first in range(0, len(mesh.triangles), _CACHED):
+        areas, corners = (values[first : first + _CACHED] for values in (mesh.areas, mesh.triangles))
+        x = np.take(columns, np.ascontiguousarray(corners.T), axis=1)
+        x -= x.mean(axis=1, keepdims=True)
+        products = np.stack([x[i] * x[j] for i, j in _PAIRS])
+        totals += np.einsum("pcn,kcn->pk", products, areas * x)
+        squares = products[0] + products[1] + products[2]
+        # The corners add up to zero, so these are all products of two of them.
+        mixed = (np.roll(squares, 1, axis=0) - squares - np.roll(squares, -1, axis=0)) / 2
+        norms = np.sum(squares * squares * squares + 2 * mixed * mixed * mixed, axis=0)
+        amount += float(areas @ np.sqrt(np.maximum(norms, 0)))
+    return math.sqrt(np.sum(_PAIR_COUNTS @ totals**2)) / amount if amount else 0.0
 
 
 def _radii(lattice: FrequencyLattice) -> Reals:
@@ -529,10 +347,3 @@ def _radial_integrals(energy: Reals, radii: Reals, orders: Sequence[float]) -> R
     """Return ∫ (1+r²)^s energy(r) 4πr² dr by the midpoint rule (orders,)."""
     step = radii[1] - radii[0]
     return np.array([np.sum((1 + radii**2) ** order * energy * 4 * np.pi * radii**2) * step for order in orders])
-
-
-if __name__ == "__main__":
-    _largest = [measure_largest_errors(rule) for rule in candidate_rules()]
-    _even, _odd = zip(*(measure_typical_errors(rule) for rule in candidate_rules()), strict=True)
-    _rules = {name: tabulated()[name] for name in ("sizes", "nodes", "weights")}
-    np.savez_compressed(_TABULATED, allow_pickle=False, largest=_largest, even=_even, odd=_odd, **_rules)

@@ -36,7 +36,8 @@ from sobolev_batch.spectral.backends import (
 from sobolev_batch.spectral.kinds import SurfaceKind, kind_of
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice, Lattice
 from sobolev_batch.spectral.nufft import transform_points
-from sobolev_batch.spectral.quadrature import fixed_rule, weight_masses
+from sobolev_batch.spectral.quadrature import weight_masses
+from sobolev_batch.spectral.rules import fixed_rule
 from sobolev_batch.surfaces.shapes.subdivision import icosphere
 from sobolev_batch.surfaces.shapes.surface import Reals, Similarity, Surface
 
@@ -176,7 +177,7 @@ def _nufft_eps(
 
 # Raise it whenever the numbers for a given surface and settings change: stored fields of another version are then
 # computed again instead of being compared with new ones.
-NUMERICS_VERSION = 4
+NUMERICS_VERSION = 5
 
 # The smallest batch holds eight node sets of the largest triangle rule.
 _SMALLEST_BATCH = 1 << 12

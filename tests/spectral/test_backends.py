@@ -25,7 +25,8 @@ from sobolev_batch.spectral.backends import CPU, GPU_COSTS, Gpu, backend_named, 
 from sobolev_batch.spectral.exact import exact_transform, sampled_transform
 from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice, OctaveLattice
-from sobolev_batch.spectral.quadrature import assign_rules, corner_rule, midpoint_rule
+from sobolev_batch.spectral.quadrature import assign_rules
+from sobolev_batch.spectral.rules import sharing_rule
 from sobolev_batch.spectral.transform import ErrorTarget, Execution, Transformed, TransformSettings, transform_block
 from tests.support.fake_device import FUNCTIONS, OPTIONS, UFUNCS, Array, CUDARuntimeError, Device
 
@@ -85,7 +86,7 @@ def test_a_gpu_agrees_with_the_processor(
 
 
 def test_the_uneven_mesh_has_every_kind_of_rule() -> None:
-    kinds = {corner_rule(): "corners", midpoint_rule(): "midpoints"}
+    kinds = {sharing_rule(1): "corners", sharing_rule(2): "midpoints"}
     uses = assign_rules(uneven(), LATTICE.highest_frequency, 1e-2)
     found = {"split" if use.splits else kinds.get(use.rule, "interior") for use in uses}
     assert found == {"corners", "midpoints", "interior", "split"}

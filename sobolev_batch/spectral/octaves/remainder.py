@@ -29,7 +29,7 @@ from scipy.special import beta, betainc, stdtrit
 from sobolev_batch.errors import InputError
 from sobolev_batch.spectral.kinds import resolution_of
 from sobolev_batch.spectral.lattice import smooth_step
-from sobolev_batch.spectral.quadrature import symmetric_rule
+from sobolev_batch.spectral.rules import symmetric_rule
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.smooth import Interval, Smooth

@@ -98,7 +98,8 @@ def test_little_memory_changes_the_values_by_a_small_multiple_of_eps(memory: flo
         for allowed_bytes in (memory, ample)
     )
     assert np.array_equal(whole.values, same.values)
-    assert divided.points == whole.points
+    # Batches of triangles share no nodes with each other.
+    assert whole.points <= divided.points < 1.01 * whole.points
     assert divided.values.dtype == dtype
     assert not np.array_equal(divided.values, whole.values)
     assert np.abs(divided.values - whole.values).max() < 5 * settings.eps * mesh.area
