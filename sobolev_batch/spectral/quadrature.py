@@ -52,10 +52,10 @@ class WeightedPoints:
         """Return some of the points, which share their memory with these."""
         return WeightedPoints(self.coordinates[:, part], self.weights[part])
 
-    def place(self, nodes: Reals, node_weights: Reals, places: Iterable[Sequence[Array]], areas: Array) -> None:
-        """Write the nodes (k, p) of p places for each of n triangles, from their coordinates (n,) axis by axis."""
+    def place(self, nodes: Reals, node_weights: Reals, places: Iterable[Array], areas: Array) -> None:
+        """Write the nodes (k, p) of p places for each of n triangles, from their coordinates (p, n) axis by axis."""
         for row, coordinates in zip(self.coordinates, places, strict=True):
-            combine(nodes, np.stack(coordinates), out=row.reshape(len(nodes), -1))
+            combine(nodes, coordinates, out=row.reshape(len(nodes), -1))
         np.multiply(np.asarray(node_weights, like=areas)[:, None], areas, out=self.weights.reshape(len(nodes), -1))
 
     @staticmethod
@@ -120,7 +120,8 @@ class RuleUse:
             corners = tuple(np.concatenate(quarters) for quarters in zip(*_quarters(corners), strict=True))
             areas = np.tile(areas / 4, 4)
         points = WeightedPoints.empty(rule.size * len(areas), like=areas)
-        points.place(rule.barycentric, rule.weights, zip(*(corner.T for corner in corners), strict=True), areas)
+        places = (np.stack([corner[:, axis] for corner in corners]) for axis in range(3))
+        points.place(rule.barycentric, rule.weights, places, areas)
         return points
 
 
@@ -158,35 +159,37 @@ def _quarters(corners: _Corners) -> tuple[_Corners, _Corners, _Corners, _Corners
 def _merged_points(vertices: Array, triangles: Array, areas: Array, rule: TriangleRule) -> WeightedPoints:
     """Return the points of some triangles; a node that neighbours share has the weights of all of them."""
     (on_edges, of_edges), (inside, of_inside) = rule.edge_nodes, rule.inner_nodes
-    sums = sums_at(triangles.ravel(), np.repeat(areas, 3), len(vertices)) if rule.corner_weight else areas[:0]
+    ends = np.ascontiguousarray(triangles.T, like=areas)
+    sums = sums_at(ends.ravel(), np.tile(areas, 3), len(vertices)) if rule.corner_weight else areas[:0]
     corners = np.flatnonzero(sums)
-    low, high, edge_sums = merged_edges(triangles, areas, len(vertices)) if len(of_edges) else (corners, corners, sums)
+    edges, edge_sums = merged_edges(ends, areas, len(vertices)) if len(of_edges) else (corners, sums)
     parts = (
-        (np.ones((1, 1)), np.array([rule.corner_weight]), (corners,), sums[corners]),
-        (on_edges, of_edges, (low, high), edge_sums),
-        (inside, of_inside, [np.ascontiguousarray(ends, like=areas) for ends in triangles.T], areas),
+        (np.ones((1, 1)), np.array([rule.corner_weight]), corners[None], sums[corners]),
+        (on_edges, of_edges, edges, edge_sums),
+        (inside, of_inside, ends, areas),
     )
-    ends = np.cumsum([0, *(len(node_weights) * len(part_areas) for _, node_weights, _, part_areas in parts)]).tolist()
-    points, columns = WeightedPoints.empty(ends[-1], like=areas), np.ascontiguousarray(vertices.T, like=areas)
-    for start, end, (nodes, node_weights, indices, part_areas) in zip(ends, ends[1:], parts, strict=False):
-        if end > start:
-            places = ([column[index] for index in indices] for column in columns)
-            points.part(slice(start, end)).place(nodes, node_weights, places, part_areas)
+    sizes = [len(node_weights) * len(part_areas) for _, node_weights, _, part_areas in parts]
+    points, columns = WeightedPoints.empty(sum(sizes), like=areas), np.ascontiguousarray(vertices.T, like=areas)
+    first = 0
+    for size, (nodes, node_weights, indices, part_areas) in zip(sizes, parts, strict=True):
+        if size:
+            places = (column[indices] for column in columns)
+            points.part(slice(first, first + size)).place(nodes, node_weights, places, part_areas)
+            first += size
     return points
 
 
-def merged_edges(triangles: Array, areas: Array, vertex_count: int) -> tuple[Array, Array, Array]:
-    """Return both vertices of the edges of some triangles (n,) each, and the sum of the areas that meet there (n,)."""
-    triangle_bits = len(triangles).bit_length()
+def merged_edges(corners: Array, areas: Array, vertex_count: int) -> tuple[Array, Array]:
+    """Return both vertices of the edges (2, n) of triangles with some corners (3, m), and the sums of their areas."""
+    triangle_bits = len(areas).bit_length()
     used = None
     if 2 * vertex_count.bit_length() + triangle_bits > _BITS:
-        used, triangles = np.unique(triangles, return_inverse=True)
-        vertex_count, triangles = len(used), triangles.reshape(-1, 3)
+        used, corners = np.unique(corners, return_inverse=True)
+        vertex_count, corners = len(used), corners.reshape(3, -1)
     bits = vertex_count.bit_length()
-    numbers = np.arange(len(triangles), like=triangles)
-    edges = np.empty((3, len(triangles)), dtype=np.int64, like=triangles)
-    for row, (i, j) in zip(edges, ((0, 1), (1, 2), (2, 0)), strict=True):
-        first, second = triangles[:, i], triangles[:, j]
+    numbers = np.arange(len(areas), like=corners)
+    edges = np.empty((3, len(areas)), dtype=np.int64, like=corners)
+    for row, first, second in zip(edges, corners, (corners[1], corners[2], corners[0]), strict=True):
         np.left_shift(np.minimum(first, second), bits, out=row)
         row |= np.maximum(first, second)
         row <<= triangle_bits
@@ -199,11 +202,9 @@ def merged_edges(triangles: Array, areas: Array, vertex_count: int) -> tuple[Arr
     is_first[:1] = True
     np.not_equal(ordered[1:], ordered[:-1], out=is_first[1:])
     starts = np.flatnonzero(is_first)
-    ends = ordered[starts]
-    low, high = ends >> bits, ends & ((1 << bits) - 1)
-    if used is not None:
-        low, high = used[low], used[high]
-    return low, high, sums_of_runs(sums, starts)
+    firsts = ordered[starts]
+    ends = np.stack([firsts >> bits, firsts & ((1 << bits) - 1)])
+    return ends if used is None else used[ends], sums_of_runs(sums, starts)
 
 
 # Fraction of the odd errors that was seen to remain between neighbouring triangles.
@@ -214,9 +215,10 @@ _LOOSEST_TOLERANCE = 0.1
 _STEPS_PER_DECADE = 4
 # The typical error of a frequency for a largest one, and the phases (radians) at which triangles may repeat.
 _TYPICAL_OF_LARGEST, _RESONANCE = 0.3, 2.0
-# Pairs of coordinates, and in how many orders each comes; triangles at a time that fit into the processor's cache.
+# Pairs of coordinates, and in how many orders each comes.
 _PAIRS, _PAIR_COUNTS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)), np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
-_CACHED = 1 << 13
+# Blocks of triangles that stand for all of a fine mesh.
+_BLOCKS, _BLOCK = 32, 1 << 10
 
 
 def loosest_tolerance(mesh: Mesh, lattice: FrequencyLattice, orders: Sequence[float], norms: Reals) -> float:
@@ -315,21 +317,30 @@ def _error_energies(
 def _unpaired(mesh: Mesh) -> float:
     """Return the fraction of odd errors that adds up: 0 where each triangle has an opposite one, 1 where all are alike.
 
-    The leading odd error is that of third moments about the centroid.
+    The leading odd error is that of third moments about the centroid. Some blocks of triangles stand for all of a fine
+    mesh: neighbours are near each other in files, and cancel within a block.
     """
-    totals, amount, columns = np.zeros((len(_PAIRS), 3)), 0.0, np.ascontiguousarray(mesh.vertices.T)
-    for first in range(0, len(mesh.triangles), _CACHED):
-        areas, corners = (values[first : first + _CACHED] for values in (mesh.areas, mesh.triangles))
-        x = np.take(columns, np.ascontiguousarray(corners.T), axis=1)
+    total, own, amount, columns = np.zeros((len(_PAIRS), 3)), 0.0, 0.0, np.ascontiguousarray(mesh.vertices.T)
+    blocks = -(-len(mesh.triangles) // _BLOCK)
+    used = min(blocks, _BLOCKS)
+    for block in (blocks * number // used for number in range(used)):
+        part = slice(block * _BLOCK, (block + 1) * _BLOCK)
+        areas = mesh.areas[part]
+        x = np.take(columns, np.ascontiguousarray(mesh.triangles[part].T), axis=1)
         x -= x.mean(axis=1, keepdims=True)
         products = np.stack([x[i] * x[j] for i, j in _PAIRS])
-        totals += np.einsum("pcn,kcn->pk", products, areas * x)
+        total += np.einsum("pcn,kcn->pk", products, areas * x)
         squares = products[0] + products[1] + products[2]
         # The corners add up to zero, so these are all products of two of them.
         mixed = (np.roll(squares, 1, axis=0) - squares - np.roll(squares, -1, axis=0)) / 2
-        norms = np.sum(squares * squares * squares + 2 * mixed * mixed * mixed, axis=0)
-        amount += float(areas @ np.sqrt(np.maximum(norms, 0)))
-    return math.sqrt(np.sum(_PAIR_COUNTS @ totals**2)) / amount if amount else 0.0
+        norms = areas**2 * np.sum(squares * squares * squares + 2 * mixed * mixed * mixed, axis=0)
+        own += float(norms.sum())
+        amount += float(np.sqrt(np.maximum(norms, 0)).sum())
+    if not amount:
+        return 0.0
+    # Of triangles in random directions the squares of each are left, which are no part of what adds up.
+    chance = own if used < blocks else 0.0
+    return math.sqrt(max(float(np.sum(_PAIR_COUNTS @ total**2)) - chance, 0.0)) / amount
 
 
 def _radii(lattice: FrequencyLattice) -> Reals:
