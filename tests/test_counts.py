@@ -54,7 +54,7 @@ WORK: dict[str, tuple[Callable[[], object], int, int, int, str]] = {
     ),
     "distance to an accuracy": (
         lambda: sb.distance(COARSE, FINE, -4.0, rtol=0.05),
-        *(2, 5_900, 25_600),
+        *(2, 4_202, 25_600),
         "the lattice is chosen from exact values, before one coarse field of each mesh",
     ),
     "distance to a high accuracy": (
@@ -79,7 +79,7 @@ WORK: dict[str, tuple[Callable[[], object], int, int, int, str]] = {
     ),
     "verdict near its tolerance": (
         lambda: sb.testing.same_surface(COARSE, FINE, tolerance=0.1, order=-4.0),
-        *(5, 25_820, 51_200),
+        *(5, 22_144, 51_200),
         "a rough norm of the reference, and the two fields on two lattices",
     ),
     "study of one mesh": (

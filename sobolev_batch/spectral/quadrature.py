@@ -21,7 +21,7 @@ from sobolev_batch.spectral.rules import (
     typical_errors,
 )
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.surface import Reals
+from sobolev_batch.surfaces.shapes.surface import Indices, Reals
 
 _Corners = tuple[Array, Array, Array]
 # Vertices (n, 3), triangles (m, 3) and areas (m,) of a mesh, as arrays of a backend.
@@ -141,12 +141,23 @@ def assign_rules(
     keys = np.empty(len(sizes), dtype=np.uint16)
     for first in range(0, len(sizes), _TRIANGLES):
         batch = slice(first, first + _TRIANGLES)
-        splits, choice = choose_rules(2 * np.pi * highest_frequency * sizes[batch], ranges)
-        keys[batch] = splits * len(rules) + choice
+        keys[batch] = _rule_numbers(2 * np.pi * highest_frequency * sizes[batch], ranges)
     return tuple(
         RuleUse(rules[key % len(rules)], key // len(rules), np.flatnonzero(keys == key).astype(np.uint32))
         for key in np.flatnonzero(np.bincount(keys)).tolist()
     )
+
+
+def _rule_numbers(sizes: Reals, ranges: Reals) -> Indices:
+    """Return splits times the number of rules plus that of the rule, for sizes (n,), or (1,) where all are alike."""
+
+    def numbers(some: Reals) -> Indices:
+        splits, choice = choose_rules(some, ranges)
+        return splits * len(ranges) + choice
+
+    # Larger triangles have as many splits or more, and with as many the same rule or a later one.
+    extremes = numbers(np.array([sizes.min(), sizes.max()]))
+    return extremes[:1] if extremes[0] == extremes[1] else numbers(sizes)
 
 
 def _quarters(corners: _Corners) -> tuple[_Corners, _Corners, _Corners, _Corners]:
@@ -269,6 +280,8 @@ def size_classes(mesh: Mesh) -> Reals:
     smallest = max(float(radii.min()), 1e-6 * largest)
     count = max(1, min(_BINS, math.ceil(8 * math.log(largest / smallest))))
     edges = np.geomspace(smallest, largest, count + 1)
+    if count == 1:
+        return np.array([[edges[0]], [edges[1]], [areas.sum()], [np.square(areas).sum()]])
     classes = np.clip(np.searchsorted(edges, radii) - 1, 0, count - 1)
     return np.stack(
         [edges[:-1], edges[1:], *(np.bincount(classes, values, count) for values in (areas, areas * areas))]
