@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,20 +43,9 @@ class WeightedPoints:
     coordinates: Array
     weights: Array
 
-    @staticmethod
-    def empty(count: int, like: Array) -> WeightedPoints:
-        """Return points to be placed, on the backend of an array."""
-        return WeightedPoints(np.empty((3, count), like=like), np.empty(count, like=like))
-
     def part(self, part: slice) -> WeightedPoints:
         """Return some of the points, which share their memory with these."""
         return WeightedPoints(self.coordinates[:, part], self.weights[part])
-
-    def place(self, nodes: Reals, node_weights: Reals, places: Iterable[Array], areas: Array) -> None:
-        """Write the nodes (k, p) of p places for each of n triangles, from their coordinates (p, n) axis by axis."""
-        for row, coordinates in zip(self.coordinates, places, strict=True):
-            combine(nodes, coordinates, out=row.reshape(len(nodes), -1))
-        np.multiply(np.asarray(node_weights, like=areas)[:, None], areas, out=self.weights.reshape(len(nodes), -1))
 
     @staticmethod
     def concatenated(batches: Sequence[WeightedPoints]) -> WeightedPoints:
@@ -119,10 +108,11 @@ class RuleUse:
         for _ in range(self.splits):
             corners = tuple(np.concatenate(quarters) for quarters in zip(*_quarters(corners), strict=True))
             areas = np.tile(areas / 4, 4)
-        points = WeightedPoints.empty(rule.size * len(areas), like=areas)
-        places = (np.stack([corner[:, axis] for corner in corners]) for axis in range(3))
-        points.place(rule.barycentric, rule.weights, places, areas)
-        return points
+        coordinates = np.empty((3, rule.size * len(areas)), like=areas)
+        for axis, row in enumerate(coordinates):
+            places = np.stack([corner[:, axis] for corner in corners])
+            combine(rule.barycentric, places, out=row.reshape(rule.size, -1))
+        return WeightedPoints(coordinates, _products(rule.weights, areas))
 
 
 def assign_rules(
@@ -174,20 +164,25 @@ def _merged_points(vertices: Array, triangles: Array, areas: Array, rule: Triang
     sums = sums_at(ends.ravel(), np.tile(areas, 3), len(vertices)) if rule.corner_weight else areas[:0]
     corners = np.flatnonzero(sums)
     edges, edge_sums = merged_edges(ends, areas, len(vertices)) if len(of_edges) else (corners, sums)
-    parts = (
+    parts = [
         (np.ones((1, 1)), np.array([rule.corner_weight]), corners[None], sums[corners]),
         (on_edges, of_edges, edges, edge_sums),
         (inside, of_inside, ends, areas),
-    )
-    sizes = [len(node_weights) * len(part_areas) for _, node_weights, _, part_areas in parts]
-    points, columns = WeightedPoints.empty(sum(sizes), like=areas), np.ascontiguousarray(vertices.T, like=areas)
-    first = 0
-    for size, (nodes, node_weights, indices, part_areas) in zip(sizes, parts, strict=True):
-        if size:
-            places = (column[indices] for column in columns)
-            points.part(slice(first, first + size)).place(nodes, node_weights, places, part_areas)
-            first += size
-    return points
+    ]
+    weights = [_products(node_weights, part_areas) for _, node_weights, _, part_areas in parts]
+    limits = np.cumsum([0, *map(len, weights)]).tolist()
+    coordinates = np.empty((3, limits[-1]), like=areas)
+    for axis, row in enumerate(coordinates):
+        column = np.ascontiguousarray(vertices[:, axis], like=areas)
+        for first, last, (nodes, _, indices, _) in zip(limits, limits[1:], parts, strict=False):
+            if last > first:
+                combine(nodes, column[indices], out=row[first:last].reshape(len(nodes), -1))
+    return WeightedPoints(coordinates, np.concatenate(weights))
+
+
+def _products(weights: Reals, areas: Array) -> Array:
+    """Return the products of all weights (k,) of a rule with the areas (n,), weight by weight (k · n,)."""
+    return (np.asarray(weights, like=areas)[:, None] * areas).ravel()
 
 
 def merged_edges(corners: Array, areas: Array, vertex_count: int) -> tuple[Array, Array]:
