@@ -18,6 +18,7 @@ from scipy.special import roots_jacobi, roots_legendre
 import sobolev_batch as sb
 from sobolev_batch.fitting.transform import MeshTransform
 from sobolev_batch.spectral import backends
+from sobolev_batch.spectral.quadrature import assign_rules
 from sobolev_batch.spectral.transform import TransformSettings
 from tests.support.fake_device import Device
 from tests.support.shapes import CENTRED_BOX, tetrahedron
@@ -128,6 +129,27 @@ def test_it_is_exact_for_the_value_whatever_the_quadrature(tolerance: float) -> 
     _, found = squared(vertices)
     change = (squared.value(vertices + step * direction) - squared.value(vertices - step * direction)) / (2 * step)
     assert np.sum(found * direction) == pytest.approx(change, rel=1e-6)
+
+
+def test_its_points_are_those_of_a_field_whatever_the_rules() -> None:
+    mesh, waves, degrees = (
+        sb.Mesh(BALL.vertices, BALL.triangles[:-7]),
+        np.random.default_rng(3).normal(size=(3, 20)),
+        set(),
+    )
+    for tolerance in 10.0 ** -np.arange(0, 7):
+        settings = TransformSettings(tolerance=float(tolerance))
+        plan = settings.plan(mesh, SMALL)
+        degrees |= {
+            use.rule.degree
+            for use in assign_rules(mesh, SMALL.highest_frequency, settings.eps, tolerance=settings.tolerance)
+            if use.rule.shares
+        }
+        found, (points,) = MeshTransform.from_mesh(mesh, SMALL, settings).nodes(mesh.vertices), plan.batches(1 << 20)
+        expected = points.weights @ np.exp(1j * points.coordinates.T @ waves)
+        assert found.weights @ np.exp(1j * found.coordinates.T @ waves) == pytest.approx(expected, rel=1e-12)
+        assert len(found.weights) == len(points.weights)
+    assert degrees == {1, 2, 4, 5, 6}
 
 
 def test_the_value_is_the_squared_distance_whether_vertices_are_flat_or_not() -> None:
