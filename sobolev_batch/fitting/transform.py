@@ -193,13 +193,17 @@ def _node_matrices(mesh: Mesh, use: RuleUse) -> Iterator[tuple[csr_array, csr_ar
             inner_weights = np.tile(inner_weights / 4, 4)
     elif rule.shares:
         edges = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1), axis=2)
-        shared = [(triangles[:, :, None], np.ones(1), rule.corner_weight)] if rule.corner_weight else []
-        shared += [(edges, *node) for node in zip(*rule.edge_nodes, strict=True)]
-        for ends, coefficients, weight in shared:
+        corner = [(np.ones(1), rule.corner_weight)] if rule.corner_weight else []
+        on_edge = list(zip(*rule.edge_nodes, strict=True))
+        for ends, shared in ((triangles[:, :, None], corner), (edges, on_edge)):
+            if not shared:
+                continue
             used, nodes = np.unique(ends.reshape(-1, ends.shape[2]), axis=0, return_inverse=True)
-            of_vertices = np.repeat(np.arange(len(used)), used.shape[1]), used.ravel(), np.tile(coefficients, len(used))
-            of_areas = nodes.ravel(), np.repeat(members, 3), np.full(nodes.size, weight)
-            yield _matrix(*of_vertices, len(mesh.vertices)), _matrix(*of_areas, len(mesh.triangles))
+            rows = np.repeat(np.arange(len(used)), used.shape[1])
+            for coefficients, weight in shared:
+                of_vertices = rows, used.ravel(), np.tile(coefficients, len(used))
+                of_areas = nodes.ravel(), np.repeat(members, 3), np.full(nodes.size, weight)
+                yield _matrix(*of_vertices, len(mesh.vertices)), _matrix(*of_areas, len(mesh.triangles))
     if len(inner):
         nodes = np.arange(len(inner) * len(triangles), dtype=np.int64)
         of_vertices = (

@@ -125,7 +125,8 @@ def assign_rules(
     fixed = fixed_rule(quadrature)
     if fixed is not None:
         return (RuleUse(fixed, 0, np.arange(len(mesh.triangles), dtype=np.uint32)),)
-    rules, ranges = rule_ranges(_tolerance_for(mesh, highest_frequency, eps) if tolerance is None else tolerance)
+    tolerance = _tolerance_for(mesh, highest_frequency, eps) if tolerance is None else tolerance
+    rules, ranges = rule_ranges(tolerance, _shares_vertices(mesh))
     sizes = mesh.centroid_radii
     # Meshes have tens of millions of triangles: temporaries are small, and four bytes for each are kept.
     keys = np.empty(len(sizes), dtype=np.uint16)
@@ -136,6 +137,11 @@ def assign_rules(
         RuleUse(rules[key % len(rules)], key // len(rules), np.flatnonzero(keys == key).astype(np.uint32))
         for key in np.flatnonzero(np.bincount(keys)).tolist()
     )
+
+
+def _shares_vertices(mesh: Mesh) -> bool:
+    """Tell whether triangles share vertices, as those of a surface do, and not each have their own as in a soup."""
+    return len(mesh.used_vertices) <= len(mesh.triangles)
 
 
 def _rule_numbers(sizes: Reals, ranges: Reals) -> Indices:
@@ -232,10 +238,10 @@ def loosest_tolerance(mesh: Mesh, lattice: FrequencyLattice, orders: Sequence[fl
 
     On fine meshes the prediction was measured to be one to ten times the true error, on coarse ones down to a fifth.
     """
-    classes = size_classes(mesh)
+    classes, shared = size_classes(mesh), _shares_vertices(mesh)
     return _loosest(
         FINEST_TOLERANCE,
-        lambda tolerance: bool(np.all(quadrature_error(classes, lattice, orders, tolerance) <= norms)),
+        lambda tolerance: bool(np.all(quadrature_error(classes, lattice, orders, tolerance, shared) <= norms)),
     )
 
 
@@ -246,12 +252,12 @@ def _tolerance_for(mesh: Mesh, highest_frequency: float, eps: float) -> float:
     plates and random triangles the largest one was measured to be at most 1.1 eps, of a hundred equal ones 1.9, and of
     small pieces of a plate in rows, whose distance is a wavelength, 3.7.
     """
-    classes = size_classes(mesh)
+    classes, shared = size_classes(mesh), _shares_vertices(mesh)
     radii, unpaired = highest_frequency * (np.arange(_RADII) + 1) / _RADII, _unpaired(mesh)
     allowed = _TYPICAL_OF_LARGEST * eps * float(classes[2].sum())
 
     def suffices(tolerance: float) -> bool:
-        energies = _error_energies(classes, highest_frequency, radii, tolerance, _RESONANCE, unpaired)
+        energies = _error_energies(classes, highest_frequency, radii, tolerance, shared, _RESONANCE, unpaired)
         return bool(np.sqrt(energies.max()) <= allowed)
 
     return _loosest(eps, suffices)
@@ -283,10 +289,12 @@ def size_classes(mesh: Mesh) -> Reals:
     )
 
 
-def quadrature_error(classes: Reals, lattice: FrequencyLattice, orders: Sequence[float], tolerance: float) -> Reals:
+def quadrature_error(
+    classes: Reals, lattice: FrequencyLattice, orders: Sequence[float], tolerance: float, shared: bool
+) -> Reals:
     """Predict the norm of the quadrature's part of a field's error (orders,), from the `size_classes` of a mesh."""
     radii = _radii(lattice)
-    energies = _error_energies(classes, lattice.highest_frequency, radii, tolerance)
+    energies = _error_energies(classes, lattice.highest_frequency, radii, tolerance, shared)
     return np.asarray(np.sqrt(_radial_integrals(energies, radii, orders)))
 
 
@@ -295,6 +303,7 @@ def _error_energies(
     highest_frequency: float,
     radii: Reals,
     tolerance: float,
+    shared: bool,
     resonance: float = math.inf,
     unpaired: float = 0.0,
 ) -> Reals:
@@ -306,7 +315,7 @@ def _error_energies(
     parts add up.
     """
     smallest, largest, areas, squares = classes
-    rules, ranges = rule_ranges(tolerance)
+    rules, ranges = rule_ranges(tolerance, shared)
     # The rule for the smallest of a class, applied to the largest of it: never less than the truth.
     splits, choice = choose_rules(2 * np.pi * highest_frequency * smallest, ranges)
     phases = 2 * np.pi * radii[:, None] * (largest / 2.0**splits)
@@ -346,7 +355,7 @@ def _unpaired(mesh: Mesh) -> float:
         amount += float(np.sqrt(np.maximum(norms, 0)).sum())
     if not amount:
         return 0.0
-    # Of triangles in random directions the squares of each are left, which are no part of what adds up.
+    # Triangles in random directions leave the squares of each, which are no part of what adds up.
     chance = own if used < blocks else 0.0
     return math.sqrt(max(float(np.sum(_PAIR_COUNTS @ total**2)) - chance, 0.0)) / amount
 

@@ -66,12 +66,12 @@ class TriangleRule:
 
     @property
     def shares(self) -> bool:
-        """Whether neighbouring triangles share nodes."""
+        """True if neighbouring triangles share nodes."""
         return self.cost < self.size
 
 
-# Of rules whose nodes neighbouring triangles share: two coordinates of a node and the weight of all that symmetry makes
-# of it. They solve the equations for the means of the symmetric polynomials, to all digits.
+# Two coordinates of a node, and the weight of all nodes that symmetry makes from it, for rules whose nodes neighbouring
+# triangles share. They solve the equations for the means of the symmetric polynomials, to all digits.
 _SHARING = {
     1: ((1.0, 0.0, 1.0),),
     2: ((0.5, 0.5, 1.0),),
@@ -156,17 +156,20 @@ def fixed_rule(quadrature: str | int) -> TriangleRule | None:
 
 
 @lru_cache(maxsize=64)
-def rule_ranges(tolerance: float) -> tuple[tuple[TriangleRule, ...], Reals]:
+def rule_ranges(tolerance: float, shared: bool = True) -> tuple[tuple[TriangleRule, ...], Reals]:
     """Return the rules of increasing cost that are worth using at a tolerance, and the range of each.
 
     The tolerance is the largest error on one triangle, relative to its area, at every frequency. The range is the
     largest 2π|ξ|ρ (radians; ρ is the distance from a triangle's centroid to its farthest corner) up to which a rule
-    keeps it for every shape of triangle and direction of ξ. Rules with a smaller range than a cheaper one are left out.
+    keeps it for every shape of triangle and direction of ξ. Rules with a smaller range than a cheaper one are left out,
+    and those with shared nodes where triangles share none.
     """
     tolerance = max(tolerance, FINEST_TOLERANCE)
     rules: list[TriangleRule] = []
     ranges: list[float] = []
     for rule, row in zip(candidate_rules(), tabulated()["largest"], strict=True):
+        if rule.shares and not shared:
+            continue
         beyond = np.flatnonzero(row > tolerance)
         last = beyond[0] - 1 if beyond.size else len(_SIZES) - 1
         limit = float(_SIZES[last]) if last >= 0 else 0.0

@@ -187,6 +187,21 @@ def test_a_whole_mesh_keeps_eps_with_fewer_points_than_each_of_its_triangles(
     assert np.abs(found - exact_transform(mesh, frequencies)).max() <= 1.2 * eps * mesh.area
 
 
+def soup(mesh: Mesh) -> Mesh:
+    """The same triangles, each with vertices of its own."""
+    return Mesh(mesh.vertices[mesh.triangles].reshape(-1, 3), np.arange(3 * len(mesh.triangles)).reshape(-1, 3))
+
+
+@pytest.mark.parametrize("eps", [1e-9, 1e-6, 1e-4])
+def test_triangles_that_share_no_vertices_take_no_more_points_than_are_planned(eps: float) -> None:
+    mesh = soup(icosphere(4))
+    plan, merged = (kind_of(surface).plan(2.0, eps) for surface in (mesh, icosphere(4)))
+    count = sum(len(batch.weights) for batch in plan.batches(1 << 20))
+    assert count == plan.expected_points == plan.largest_points
+    # A rule with shared nodes would take up to twice as many of them here.
+    assert merged.expected_points <= count <= 2 * merged.expected_points
+
+
 @pytest.mark.parametrize("surface", [BOX, icosphere(3), Torus(1.0, 0.4)], ids=["box", "icosphere", "torus"])
 @pytest.mark.parametrize("method", ["auto", 7])
 def test_the_size_is_known_before_the_points_are_made(surface: Surface, method: str | int) -> None:
