@@ -174,7 +174,8 @@ class Reference:
     Attributes:
         difference: Values whose signed sum is a - b; triangles that both have may be left out.
         signs: Signs of these.
-        pair: The surfaces a and b, moved together to the centre of the lattice's period.
+        pair: The surfaces a and b, moved together to the centre of the lattice's period; of surfaces far apart b alone.
+        known: Estimate for surfaces far apart, which follows from the norm of b; None for others.
     """
 
     frequencies: Frequencies
@@ -182,6 +183,7 @@ class Reference:
     difference: Sequence[SurfaceValues]
     signs: Sequence[int]
     pair: Sequence[Surface]
+    known: ReferenceEstimate | None = None
 
     @classmethod
     def for_problem(cls, problem: Problem, solution: Solution, seed: int) -> Self:
@@ -190,6 +192,14 @@ class Reference:
         Its values are among those that the distance was computed from. But where the surfaces share triangles, which
         cancel, the reference has more than those, and gets frequencies of its own.
         """
+        if problem.is_whole and problem.apart is not None:
+            own, of_own = problem.alone[1], solution.alone[1]
+            norms = of_own.estimate
+            known = ReferenceEstimate(
+                norms, -(norms.values**2), (2 * norms.values + norms.errors) * norms.errors + problem.apart
+            )
+            frequencies = Frequencies.from_solution(own, of_own)
+            return cls(frequencies, of_own.values[0], of_own.values, own.signs, own.surfaces, known)
         if problem.is_whole:
             frequencies = Frequencies.from_solution(problem, solution)
             return cls(frequencies, solution.values[1], solution.values, problem.signs, problem.pair)
@@ -197,7 +207,8 @@ class Reference:
         pair = [move.apply(surface) for surface in problem.pair]
         support = replace(support_of(pair), areas=np.array(pair[1].area))
         accuracy = replace(problem.accuracy, best_effort=True)
-        own = replace(problem, surfaces=pair[1:], signs=(1,), support=support, accuracy=accuracy, label="the reference")
+        alone = replace(problem, signs=(1,), label="the reference", apart=None)
+        own = replace(alone, surfaces=pair[1:], support=support, accuracy=accuracy)
         of_reference = solve(own, seed)
         frequencies = Frequencies.from_solution(own, of_reference)
         target = error_target(solution.estimate.values, problem.orders, problem.accuracy, problem.area)
@@ -208,6 +219,8 @@ class Reference:
 
     def estimate(self) -> ReferenceEstimate:
         """Return the norm of b, and the product <a - b, b>."""
+        if self.known is not None:
+            return self.known
         at, values = self.frequencies, self.values
         difference, own = Measure.from_values(self.difference, self.signs), Measure.from_values([values], [1])
         other = Measure.from_values([*self.difference, values], [*self.signs, 1])

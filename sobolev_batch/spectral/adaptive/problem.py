@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import numpy as np
 
 from sobolev_batch.errors import AccuracyError
+from sobolev_batch.spectral.adaptive.apart import APART_FRACTION, product_apart
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy, unreachable
 from sobolev_batch.spectral.backends import ComplexDtype, Complexes
-from sobolev_batch.spectral.budget import NormEstimate, Sums, Support, sums_of_shells
+from sobolev_batch.spectral.budget import NormEstimate, Sums, Support, change_of_root, sums_of_shells
 from sobolev_batch.spectral.fields import USUAL_DEGREE, Field, field_for
 from sobolev_batch.spectral.lattice import Lattice, SobolevWeights, shell_sums
 from sobolev_batch.spectral.octaves.sampling import OctaveSampling
@@ -20,7 +21,7 @@ from sobolev_batch.spectral.octaves.values import OctaveValues
 from sobolev_batch.spectral.probe import Sample, draws_for, estimate, needs_probe
 from sobolev_batch.spectral.transform import ErrorTarget, Execution, TransformSettings, permits_single
 from sobolev_batch.surfaces.shapes.mesh import Mesh, shared_triangles
-from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent, Reals, Surface, centering
+from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent, Reals, Similarity, Surface, centering
 
 Samples = tuple[Sample, ...]
 
@@ -34,6 +35,8 @@ _STORED_ROUNDING, _STORED_FRACTION = 6e-8, 0.1
 # Surfaces whose common centre is no further from the origin, relative to their extent, stay where they are.
 OFF_CENTER = 1e-3
 _PAIR = 2
+# Settings that each field has.
+_OF_FIELDS = ("eps", "quadrature_eps", "points")
 # An accuracy called reachable must hold when it is requested.
 _REACHABLE_MARGIN = 1.3
 
@@ -48,6 +51,7 @@ class Problem:
         label: Name of the norm or distance in messages.
         pair: Surfaces that a distance is between, with the triangles that they share; empty for a norm.
         signs: Signs of the surfaces in the difference.
+        apart: What the product of two surfaces that are far apart does not exceed (orders,); None for others.
     """
 
     surfaces: Sequence[Surface]
@@ -58,21 +62,34 @@ class Problem:
     threads: int = 1
     pair: Sequence[Surface] = ()
     signs: Sequence[int] = (1, -1)
+    apart: Reals | None = None
 
     @classmethod
     def from_surfaces(
         cls, surfaces: Sequence[Surface], orders: tuple[float, ...], accuracy: Accuracy, label: str, threads: int
     ) -> Self:
-        """Return the problem for surfaces, moved to the centre, without triangles that both have; none may remain."""
+        """Return the problem for surfaces, moved to the centre, without triangles that both have; none may remain.
+
+        Those that are far apart stay where they are, since a common move would cost digits.
+        """
         pair = tuple(surfaces) if len(surfaces) == _PAIR else ()
         different = _without_common_parts(surfaces)
         if not different:
             return cls((), orders, accuracy, Support(np.zeros(()), np.zeros(len(DIRECTIONS))), label, threads)
-        move = centering(list(different.values()), OFF_CENTER)
+        apart = product_apart(tuple(different.values()), orders, accuracy.rtol)
+        move = centering(list(different.values()), OFF_CENTER) if apart is None else Similarity()
         is_whole = all(one is other for one, other in zip(different.values(), pair, strict=False))
         surfaces = tuple(move.apply(surface) for surface in different.values())
         pair = surfaces if is_whole else tuple(move.apply(surface) for surface in pair)
-        return cls(surfaces, orders, accuracy, support_of(surfaces), label, threads, pair, tuple(different))
+        return cls(surfaces, orders, accuracy, support_of(surfaces), label, threads, pair, tuple(different), apart)
+
+    @property
+    def alone(self) -> tuple[Self, ...]:
+        """Norms of the surfaces, each at the centre, for those that are far apart."""
+        accuracy = replace(self.accuracy, rtol=(1 - APART_FRACTION) * self.accuracy.rtol)
+        return tuple(
+            self.from_surfaces((surface,), self.orders, accuracy, self.label, self.threads) for surface in self.surfaces
+        )
 
     @property
     def area(self) -> float:
@@ -228,6 +245,7 @@ class Solution:
         values: Values of each surface on the lattice and in octaves beyond it.
         shortfall: Why the numbers miss the accuracy; None if they do not.
         has_tail: True where all that lies beyond the lattice was measured, and the lattice ends in a step.
+        alone: Norms that a distance of surfaces far apart consists of, each with a lattice of its own.
     """
 
     estimate: NormEstimate
@@ -235,11 +253,29 @@ class Solution:
     values: tuple[SurfaceValues, ...] = ()
     shortfall: AccuracyError | None = None
     has_tail: bool = False
+    alone: tuple[Solution, ...] = ()
 
     @classmethod
     def zero(cls, orders: Sequence[float]) -> Self:
         """Return the distance of equal surfaces, for which nothing is computed."""
         return cls(NormEstimate(*np.zeros((5, len(orders)))))
+
+    @classmethod
+    def of_apart(cls, problem: Problem, alone: Sequence[Solution]) -> Self:
+        """Return the distance of surfaces far apart from their norms: its square is the sum of both squares.
+
+        What the product of both surfaces may change is an error by images.
+        """
+        norms = np.stack([one.estimate.values for one in alone])
+        errors = np.stack([one.estimate.errors for one in alone])
+        values, highest = np.hypot(*norms), np.hypot(*(norms + errors))
+        # Each error is weighted such that all of them together lead from the values to the highest ones.
+        weights = (2 * norms + errors) / (highest + values)
+        parts = np.sum([w * np.stack([*one.estimate][1:]) for w, one in zip(weights, alone, strict=True)], axis=0)
+        found = NormEstimate(values, *parts)
+        product = change_of_root(values**2, 2 * cast(Reals, problem.apart))
+        shortfall = next((one.shortfall for one in alone if one.shortfall is not None), None)
+        return cls(replace(found, aliasing=found.aliasing + product), shortfall=shortfall, alone=tuple(alone))
 
     @property
     def octaves(self) -> tuple[OctaveSampling, ...]:
@@ -249,6 +285,11 @@ class Solution:
     @property
     def settings(self) -> dict[str, Any]:
         """Settings that the numbers were computed with, as attributes."""
+        if self.alone:
+            # Those of the larger lattice, and of the fields of both.
+            both = [one.settings for one in self.alone]
+            lists = {name: [value for one in both for value in one[name]] for name in _OF_FIELDS}
+            return {**max(both, key=lambda one: one["M"]), **lists}
         if self.lattice is None:
             return {}
         fields = [one.field for one in self.values]

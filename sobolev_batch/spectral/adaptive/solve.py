@@ -98,9 +98,12 @@ def solve(problem: Problem, seed: int = 0) -> Solution:
     Where a small lattice reaches far enough, or the accuracy is high, it is computed on one lattice. Else what lies
     beyond a small lattice is measured in octaves, at random frequencies that follow from the seed. Return the first
     solution that meets the accuracy; for a best effort else the nearest one, which otherwise is an AccuracyError.
+    Surfaces that are far apart are solved one by one.
     """
     if not problem.surfaces:
         return Solution.zero(problem.orders)
+    if problem.apart is not None:
+        return Solution.of_apart(problem, [solve(norm, seed) for norm in problem.alone])
     strict = replace(problem, accuracy=replace(problem.accuracy, best_effort=False))
     first = first_lattice(problem.support, problem.orders, problem.accuracy)
     on_lattices, in_octaves = partial(_solve_on_lattices, strict, *first), partial(solve_in_octaves, strict, seed)

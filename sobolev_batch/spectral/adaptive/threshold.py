@@ -18,7 +18,7 @@ from sobolev_batch.spectral.fields import USUAL_DEGREE, Field, compute_field
 from sobolev_batch.spectral.lattice import Lattice, SobolevWeights, shell_sums, shell_volumes
 from sobolev_batch.spectral.probe import Sample, draws_for, needs_probe
 from sobolev_batch.spectral.transform import ErrorTarget, Execution, TransformSettings, choose_settings, transform_block
-from sobolev_batch.surfaces.shapes.surface import Similarity, Surface
+from sobolev_batch.surfaces.shapes.surface import Surface
 
 Method = Literal["identical", "lattice", "octaves"]
 
@@ -34,8 +34,8 @@ _NARROWEST, _OF_MARGIN, _LEAST_RTOL_OF_OCTAVES = 3e-3, 0.4, 0.01
 # Errors of octaves are partly estimates: the law of energies, and random frequencies. Of a hundred verdicts that took
 # the side which they permit, two had errors that were too small, by a factor below 2.
 _OCTAVES_CAUTION = 3.0
-# Surfaces farther apart than this hardly feel each other: the kernel falls like exp(-2π gap).
-_FAR = 3.0
+# Of the distance between surfaces that are far apart, which is beyond every threshold.
+_APART_RTOL = 0.01
 # The prediction of a field's error may be too small by this factor.
 _PREDICTION_CAUTION = 4.0
 # M, eps and tolerance for the norm of the reference, the relative error that it may have, and that of a second attempt.
@@ -71,10 +71,11 @@ def relative_distance(
     if surface == reference:
         return Interval(0.0, 0.0), "identical"
     accuracy = replace(accuracy, rtol=_FIRST_RTOL, best_effort=True)
-    pair = _brought_near(surface, reference), reference
-    problem = Problem.from_surfaces(pair, (order,), accuracy, "the relative distance", threads)
+    problem = Problem.from_surfaces((surface, reference), (order,), accuracy, "the relative distance", threads)
     if not problem.surfaces:
         return Interval(0.0, 0.0), "identical"
+    if problem.apart is not None:
+        return _of_apart(problem, seed)
     of_norm = Problem.from_surfaces([reference], (order,), accuracy, "the norm of the reference", threads)
     for norm_of in (_rough_norm, _exact_norm):
         norm = norm_of(of_norm)
@@ -175,12 +176,15 @@ def _fields(problem: Problem, lattice: Lattice, target: ErrorTarget) -> tuple[Fi
         return tuple(pool.map(field, problem.surfaces))
 
 
-def _brought_near(surface: Surface, reference: Surface) -> Surface:
-    """Return a surface moved towards a reference too far away to feel it; their distance stays, the lattice shrinks."""
-    (low, high), (other_low, other_high) = surface.extent.box, reference.extent.box
-    above, below = np.maximum(low - other_high - _FAR, 0.0), np.maximum(other_low - high - _FAR, 0.0)
-    x, y, z = (above - below).tolist()
-    return Similarity(1.0, (x, y, z)).apply(surface)
+def _of_apart(problem: Problem, seed: int) -> tuple[Interval, Method]:
+    """Return bounds on the relative distance of surfaces far apart, which exceeds one, and what they follow from."""
+    solution = solve(replace(problem, accuracy=replace(problem.accuracy, rtol=_APART_RTOL)), seed)
+    caution = _OCTAVES_CAUTION if any(one.has_tail for one in solution.alone) else 1.0
+    bounds = []
+    for found in (solution.estimate, solution.alone[1].estimate):
+        value, error = float(found.values[0]), caution * float(found.errors[0])
+        bounds.append(Interval.around(value, error, error))
+    return bounds[0].over(bounds[1]), "lattice" if caution == 1.0 else "octaves"
 
 
 def _rough_norm(problem: Problem) -> Interval:

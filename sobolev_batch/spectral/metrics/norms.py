@@ -324,7 +324,7 @@ def yardsticks(
         values_errors = np.maximum(_VALUES_ACCURACY * np.maximum(distances, errors), _ROUNDING * b.area)
         target = ErrorTarget(orders, tuple(values_errors.tolist()))
         if solved is not None:
-            b, frequencies, values = cast(Mesh, solved.pair[1]), solved.frequencies, solved.values
+            b, frequencies, values = cast(Mesh, solved.pair[-1]), solved.frequencies, solved.values
         else:
             # Without an accuracy there is one.
             frequencies = Frequencies(cast(Lattice, lattice), (), orders, support_of([a, b]).widths)
