@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import itertools
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,14 +13,17 @@ from sobolev_batch import Lattice, Mesh
 from sobolev_batch.surfaces.shapes.surface import Extent
 from tests.coverage.kinds import MAKERS
 from tests.coverage.parts import PARTS
+from tests.coverage.solids import SOLIDS
 from tests.coverage.truth import Pair
 
-KINDS = MAKERS | PARTS
+KINDS = MAKERS | PARTS | SOLIDS
 ORDERS = (-0.6, -0.75, -1.0, -1.5, -2.0, -3.0, -4.0, -5.0, -10.0)
 # Of these kinds, something is known above order -1 too.
-_AT_EVERY_ORDER = {"near spheres", "far spheres", "distant spheres", "distant tetrahedra", "remeshed", *PARTS}
+_AT_EVERY_ORDER = {"near spheres", "far spheres", "distant spheres", "distant tetrahedra", "remeshed", *PARTS, *SOLIDS}
 # Errors on a given lattice are documented to miss surfaces of short periods, and small ones far apart.
-_WITHOUT_LATTICE = {"distant spheres", "distant tetrahedra", *PARTS}
+_WITHOUT_LATTICE = {"distant spheres", "distant tetrahedra", *PARTS, *SOLIDS}
+# Of these kinds, one call asks for all orders of a pair.
+_TOGETHER = {"close and thin"}
 # Orders of each pair.
 _ORDERS_EACH = 3
 # Least rtol for each order, by what takes seconds, and the largest.
@@ -31,7 +35,7 @@ _SLOW_ORDER, _SLOW_TRIANGLES, _SLOW_RTOL = -2.0, 500, 8e-2
 
 @dataclass(frozen=True)
 class Case:
-    """One distance of a pair, which its other cases share.
+    """One distance of a pair, which its other cases share, perhaps in one call that asks for all their orders.
 
     `settings` are the accuracy `rtol`, for which the package chooses everything else; or settings of transforms on a
     lattice, as a user might choose them, well or badly.
@@ -42,6 +46,7 @@ class Case:
     pair: Pair
     order: float
     settings: Mapping[str, Any]
+    together: bool = False
 
     def __str__(self) -> str:
         return f"{self.kind}, pair {self.index}, order {self.order:g}, {self.settings}"
@@ -56,12 +61,17 @@ def cases_of(seed: int, index: int) -> list[Case]:
     pair = pair if rng.random() < 0.5 else pair.swapped()
     choices = ORDERS if kind in _AT_EVERY_ORDER else ORDERS[2:]
     orders = np.sort(rng.choice(choices, size=_ORDERS_EACH, replace=False))[::-1].tolist()
+    if kind in _TOGETHER:
+        settings = _settings(rng, kind, pair, orders[0])
+        return [Case(kind, index, pair, order, settings, together=True) for order in orders]
     return [Case(kind, index, pair, order, _settings(rng, kind, pair, order)) for order in orders]
 
 
-def all_cases(seed: int, count: int) -> Iterator[list[Case]]:
-    """Yield at least ``count`` cases, pair by pair."""
-    for index in range(-(-count // _ORDERS_EACH)):
+def all_cases(seed: int, count: int, kinds: Collection[str] = tuple(KINDS), first: int = 0) -> Iterator[list[Case]]:
+    """Yield at least ``count`` cases of some kinds, pair by pair, from the pair ``first`` on."""
+    names = tuple(KINDS)
+    chosen = (index for index in itertools.count(first) if names[index % len(names)] in kinds)
+    for index in itertools.islice(chosen, -(-count // _ORDERS_EACH)):
         yield cases_of(seed, index)
 
 
