@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
 from itertools import pairwise
@@ -37,10 +37,11 @@ from sobolev_batch.spectral.backends import (
     row_dots,
     sums_at,
 )
+from sobolev_batch.spectral.compiled import pays
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.mesh import Corners, Mesh, cross_lengths
-from sobolev_batch.surfaces.shapes.surface import Reals
+from sobolev_batch.surfaces.shapes.surface import Indices, Reals
 
 Complexes = NDArray[np.complex128]
 # A number as a rounded value and what it lacks.
@@ -59,6 +60,10 @@ _BATCH = {"cpu": 1 << 13, "gpu": 1 << 18}
 _PAIRS = {"cpu": 1 << 11, "gpu": 1 << 21}
 # With fewer pairs a GPU takes longer than the processor.
 _FEWEST_FOR_GPU = 1 << 15
+# Of compiled loops: their exponentials at the vertices stay in a processor's cache.
+_COMPILED_BATCH = 1 << 12
+# Processor time of a pair of a triangle and a frequency on arrays, at least.
+_PAIR_SECONDS = 4e-8
 # Splits a double into halves of 26 bits each.
 _SPLITTER = 2.0**27 + 1
 
@@ -68,12 +73,14 @@ def exact_transform(mesh: Mesh, frequencies: Reals, backend: Backend = CPU) -> C
 
     For ξ, float64 (P, 3), in cycles per unit length, it is complex128 (P,). The error of each triangle is about 1e-15
     of its contribution, or of its area if that is smaller; the area itself is exact to rounding even on slivers. A GPU
-    changes the last digits.
+    and compiled loops change the last digits.
     """
     frequencies = np.asarray(frequencies, dtype=np.float64)
     columns = [np.ascontiguousarray(column) for column in mesh.vertices.T]
 
     def sums(backend: Backend) -> Complexes:
+        if backend is CPU and pays(_PAIR_SECONDS * len(mesh.triangles) * len(frequencies)):
+            return _compiled_exact_transform(mesh, [frequencies])
         batch = _BATCH[backend.name]
         parts = []
         for start in range(0, len(mesh.triangles), batch):
@@ -83,6 +90,29 @@ def exact_transform(mesh: Mesh, frequencies: Reals, backend: Backend = CPU) -> C
         return np.asarray(np.sum(parts, axis=0, dtype=np.complex128))
 
     return compute_on(_faster(backend, mesh, frequencies), sums)
+
+
+def _compiled_exact_transform(mesh: Mesh, parts: Sequence[Reals]) -> Complexes:
+    from sobolev_batch.spectral.compiled.divided_differences import exact_sums
+
+    batches = (
+        mesh.triangles[start : start + _COMPILED_BATCH] for start in range(0, len(mesh.triangles), _COMPILED_BATCH)
+    )
+    return _compiled_sums(exact_sums, ((mesh.vertices, triangles) for triangles in batches), parts)
+
+
+def _compiled_sums(
+    loop: Callable[..., Complexes], batches: Iterable[tuple[Reals, Indices]], parts: Sequence[Reals]
+) -> Complexes:
+    """Return what a compiled loop sums over batches of vertices and triangles, with a thread for each part of the ξ."""
+    rows = [np.ascontiguousarray(frequencies.T) for frequencies in parts]
+    total = np.zeros(sum(map(len, parts)), dtype=np.complex128)
+    with ThreadPoolExecutor(len(rows)) as pool:
+        for vertices, triangles in batches:
+            a, b, c = np.moveaxis(vertices.T[:, triangles.T], 1, 0)
+            sums = partial(loop, vertices, triangles, doubled_areas((a, b, c)))
+            total += np.concatenate(list(pool.map(sums, rows)))
+    return total
 
 
 def _faster(backend: Backend, mesh: Mesh, frequencies: Reals) -> Backend:
@@ -323,9 +353,17 @@ def sampled_transform(mesh: Mesh, frequencies: Reals, threads: int = 1, backend:
     frequencies was measured to be at most 1e-13 of the area.
     """
     frequencies = np.asarray(frequencies, dtype=np.float64)
-    lengths = np.linalg.norm(frequencies, axis=1)
-    fine = 2 * np.pi * lengths * mesh.edge_length_range[1] < _FINE_MESH
+    gaps = 2 * np.pi * np.linalg.norm(frequencies, axis=1) * mesh.edge_length_range[1]
     values = np.empty(len(frequencies), dtype=np.complex128)
+    if backend is CPU and pays(_PAIR_SECONDS * len(mesh.triangles) * len(frequencies)):
+        from sobolev_batch.spectral.compiled.divided_differences import SERIES_GAP, sampled_sums
+
+        fine = gaps < SERIES_GAP
+        values[fine] = _compiled_exact_transform(mesh, np.array_split(frequencies[fine], threads))
+        batches = ((batch.vertices, batch.triangles) for _, batch in mesh.batches(_COMPILED_BATCH))
+        values[~fine] = _compiled_sums(sampled_sums, batches, np.array_split(frequencies[~fine], threads))
+        return values
+    fine = gaps < _FINE_MESH
     values[fine] = exact_transform(mesh, frequencies[fine], backend)
     others = frequencies[~fine]
 

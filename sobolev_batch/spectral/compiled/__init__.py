@@ -41,6 +41,11 @@ def pays(seconds: float) -> bool:
     return _spent.add(seconds) > _WORTH_SECONDS
 
 
+def would_pay(seconds: float) -> bool:
+    """Tell the same of work that is only considered."""
+    return _spent.seconds + seconds > _WORTH_SECONDS
+
+
 def loop(function: Loop) -> Loop:
     """Compile a loop when it is first called, for all threads at once, and keep it for later processes if possible."""
     import numba
@@ -49,3 +54,14 @@ def loop(function: Loop) -> Loop:
         return numba.njit(cache=True, nogil=True, error_model="numpy")(function)  # type: ignore[no-any-return]
     except RuntimeError:  # no folder for what is compiled: a package that cannot be written, and a user without a home
         return numba.njit(nogil=True, error_model="numpy")(function)  # type: ignore[no-any-return]
+
+
+def part(function: Loop) -> Loop:
+    """Compile a function into each loop that calls it: a call within a loop would keep LLVM from making vectors.
+
+    A product and a sum may be rounded once instead of twice.
+    """
+    import numba
+
+    parts = numba.njit(forceinline=True, fastmath={"contract"}, error_model="numpy")
+    return parts(function)  # type: ignore[no-any-return]

@@ -1,0 +1,240 @@
+"""Transforms of triangles as compiled loops: the formulas of `sobolev_batch.spectral.exact`, frequency by frequency.
+
+The inner loop of each sum runs over some frequencies, so that a processor takes several of them at a time and loads
+corners and edges once for all. Phases are counted in cycles, of which whole ones are subtracted exactly.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.spectral.compiled import loop, part
+
+Reals = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+Indices = NDArray[np.integer]
+
+_TURN = 2 * math.pi
+# Taylor coefficients of sin(2πx)/x and cos(2πx) in x²: up to a quarter of a cycle the rest is below 2e-17.
+_SINE = tuple((-1) ** n * _TURN ** (2 * n + 1) / math.factorial(2 * n + 1) for n in range(11))
+_COSINE = tuple((-1) ** n * _TURN ** (2 * n) / math.factorial(2 * n) for n in range(12))
+# The series in gaps below `SERIES_GAP` takes 19 terms (-1)^(n // 2) h_n / (n+2)!.
+SERIES_GAP = 2.0
+_FACTORS = np.array([(-1) ** (n // 2) / math.factorial(n + 2) for n in range(20)])
+# A product of gaps below this (radians cubed) goes through the stable form: the plain one would lose as many digits.
+LEAST_PRODUCT = 2e-3
+# Frequencies at a time: the exponentials at some thousand vertices stay in a processor's cache.
+_LANES = 32
+# Splits a double into halves of 26 bits each.
+_SPLITTER = 2.0**27 + 1
+
+
+@part
+def _cosine_and_sine(cycles: float) -> tuple[float, float]:
+    halves = np.floor(2 * cycles + 0.5)
+    rest = cycles - 0.5 * halves
+    square = rest * rest
+    sine, cosine = _SINE[10], _COSINE[11]
+    for n in range(10):
+        sine = sine * square + _SINE[9 - n]
+    for n in range(11):
+        cosine = cosine * square + _COSINE[10 - n]
+    sign = 1 - 2 * (halves - 2 * np.floor(0.5 * halves))
+    return sign * cosine, sign * rest * sine
+
+
+@loop
+def _rest_of_product(a: float, b: float) -> tuple[float, float]:
+    """Return a b without whole cycles, and the rounding error of the product."""
+    shifted, other = _SPLITTER * a, _SPLITTER * b
+    a_high, b_high = shifted - (shifted - a), other - (other - b)
+    a_low, b_low = a - a_high, b - b_high
+    high = a * b
+    low = a_low * b_low - (((high - a_high * b_high) - a_low * b_high) - a_high * b_low)
+    return high - np.floor(high + 0.5), low
+
+
+@part
+def _exponential(x: float, y: float, z: float, u: float, v: float, w: float) -> tuple[float, float]:
+    """Return real and imaginary part of exp(-2πi ξ·p), whatever the number of cycles."""
+    first, low_first = _rest_of_product(x, u)
+    second, low_second = _rest_of_product(y, v)
+    third, low_third = _rest_of_product(z, w)
+    return _cosine_and_sine(-(first + second + third + (low_first + low_second + low_third)))
+
+
+@part
+def _series(ab: float, ac: float) -> tuple[float, float]:
+    """Return the sum of i^n h_n / (n+2)!, for h_n = p h_(n-2) + q h_(n-3): the nodes' mean is zero."""
+    lowest = (ab + ac) / -3
+    p = (ab * (ab - ac) + ac * ac) / 3
+    q = lowest * (ab + lowest) * (ac + lowest)
+    before, last, this = 1.0, 0.0, p
+    real, imaginary = _FACTORS[0] + _FACTORS[2] * p, 0.0
+    for n in range(8):
+        before = p * last + q * before
+        imaginary += _FACTORS[2 * n + 3] * before
+        last = p * this + q * last
+        real += _FACTORS[2 * n + 4] * last
+        before, last, this = this, before, last
+    return real, imaginary + _FACTORS[19] * (p * last + q * before)
+
+
+@part
+def _first_difference(a: complex, b: complex, gap: float) -> complex:
+    if abs(gap) > 1:
+        return (b - a) / (1j * gap)
+    cosine, sine = _cosine_and_sine(gap / (2 * _TURN))
+    return a * complex(cosine, sine) * (sine / (gap / 2) if gap else 1.0)
+
+
+@part
+def _quotient(a: complex, b: complex, c: complex, ab: float, ac: float) -> complex:
+    """Return the difference quotient of the two first differences that meet across the widest gap."""
+    bc = ac - ab
+    of_ab, of_ac, of_bc = _first_difference(a, b, ab), _first_difference(a, c, ac), _first_difference(b, c, bc)
+    if abs(ab) >= max(abs(ac), abs(bc)):
+        return (of_bc - of_ac) / (1j * ab)
+    if abs(ac) >= abs(bc):
+        return (of_bc - of_ab) / (1j * ac)
+    return (of_ac - of_ab) / (1j * bc)
+
+
+@part
+def _are_close(ab: float, bc: float, ac: float) -> bool:
+    return (abs(ab) < SERIES_GAP) & (abs(bc) < SERIES_GAP) & (abs(ac) < SERIES_GAP)
+
+
+@part
+def _stable(a: complex, b: complex, c: complex, ab: float, bc: float, ac: float) -> complex:
+    """Return the divided difference from the exponentials at the corners, whatever the gaps."""
+    if not _are_close(ab, bc, ac):
+        return _quotient(a, b, c, ab, ac)
+    # The exponential at the mean of the nodes, from that at the middle one.
+    return b * complex(*_cosine_and_sine((bc - ab) / (3 * _TURN))) * complex(*_series(ab, ac))
+
+
+@part
+def _edges(vertices: Reals, triangle: Indices) -> tuple[float, float, float, float, float, float]:
+    """Return the edge from the first corner to the second, and from there to the third."""
+    a, b, c = vertices[triangle[0]], vertices[triangle[1]], vertices[triangle[2]]
+    return b[0] - a[0], b[1] - a[1], b[2] - a[2], c[0] - b[0], c[1] - b[1], c[2] - b[2]
+
+
+@part
+def _centroid(b: Reals, edges: tuple[float, float, float, float, float, float]) -> tuple[float, float, float]:
+    """Return the centroid, from the second corner."""
+    px, py, pz, qx, qy, qz = edges
+    return b[0] + (qx - px) / 3, b[1] + (qy - py) / 3, b[2] + (qz - pz) / 3
+
+
+@part
+def _gaps(
+    edges: tuple[float, float, float, float, float, float], u: float, v: float, w: float
+) -> tuple[float, float, float]:
+    """Return the gaps along both edges, and along both together, in radians."""
+    ab = -_TURN * (u * edges[0] + v * edges[1] + w * edges[2])
+    bc = -_TURN * (u * edges[3] + v * edges[4] + w * edges[5])
+    return ab, bc, ab + bc
+
+
+@loop
+def exact_sums(vertices: Reals, triangles: Indices, doubled: Reals, frequencies: Reals) -> Complexes:
+    """Return the sums (P,) of the transforms of triangles, each to about a rounding error of its area.
+
+    The vertices are (n, 3), the triangles (k, 3), twice their areas (k,), and the frequencies (3, P).
+    """
+    sums = np.empty(frequencies.shape[1], dtype=np.complex128)
+    for first in range(0, len(sums), _LANES):
+        last = min(first + _LANES, len(sums))
+        u, v, w = frequencies[0, first:last], frequencies[1, first:last], frequencies[2, first:last]
+        _exact_group(vertices, triangles, doubled, u, v, w, sums[first:last])
+    return sums
+
+
+@loop
+def _exact_group(
+    vertices: Reals, triangles: Indices, doubled: Reals, u: Reals, v: Reals, w: Reals, sums: Complexes
+) -> None:
+    # Of two rows of one array LLVM would make no vectors.
+    reals, imaginaries = np.zeros(len(u)), np.zeros(len(u))
+    for i in range(len(triangles)):
+        edges, area, apart = _edges(vertices, triangles[i]), doubled[i], 0
+        a, b, c = vertices[triangles[i, 0]], vertices[triangles[i, 1]], vertices[triangles[i, 2]]
+        x, y, z = _centroid(b, edges)
+        for f in range(len(u)):
+            ab, bc, ac = _gaps(edges, u[f], v[f], w[f])
+            is_close = _are_close(ab, bc, ac)
+            apart += not is_close
+            cosine, sine = _exponential(x, y, z, u[f], v[f], w[f])
+            real, imaginary = _series(ab, ac)
+            reals[f] += area * (cosine * real - sine * imaginary) if is_close else 0.0
+            imaginaries[f] += area * (cosine * imaginary + sine * real) if is_close else 0.0
+        if apart:
+            for f in range(len(u)):
+                ab, bc, ac = _gaps(edges, u[f], v[f], w[f])
+                if not _are_close(ab, bc, ac):
+                    at_a = complex(*_exponential(a[0], a[1], a[2], u[f], v[f], w[f]))
+                    at_b = complex(*_exponential(b[0], b[1], b[2], u[f], v[f], w[f]))
+                    at_c = complex(*_exponential(c[0], c[1], c[2], u[f], v[f], w[f]))
+                    value = area * _quotient(at_a, at_b, at_c, ab, ac)
+                    reals[f] += value.real
+                    imaginaries[f] += value.imag
+    for f in range(len(u)):
+        sums[f] = complex(reals[f], imaginaries[f])
+
+
+@loop
+def sampled_sums(vertices: Reals, triangles: Indices, doubled: Reals, frequencies: Reals) -> Complexes:
+    """Return the same to fewer digits: the exponentials at the vertices serve all triangles around them."""
+    sums = np.empty(frequencies.shape[1], dtype=np.complex128)
+    cosines, sines = np.empty((len(vertices), _LANES)), np.empty((len(vertices), _LANES))
+    for first in range(0, len(sums), _LANES):
+        last = min(first + _LANES, len(sums))
+        u, v, w = frequencies[0, first:last], frequencies[1, first:last], frequencies[2, first:last]
+        for i in range(len(vertices)):
+            x, y, z = vertices[i]
+            for f in range(len(u)):
+                cosines[i, f], sines[i, f] = _cosine_and_sine(-(u[f] * x + v[f] * y + w[f] * z))
+        _sampled_group(vertices, triangles, doubled, u, v, w, cosines, sines, sums[first:last])
+    return sums
+
+
+@loop
+def _sampled_group(
+    vertices: Reals,
+    triangles: Indices,
+    doubled: Reals,
+    u: Reals,
+    v: Reals,
+    w: Reals,
+    cosines: Reals,
+    sines: Reals,
+    sums: Complexes,
+) -> None:
+    reals, imaginaries = np.zeros(len(u)), np.zeros(len(u))
+    for i in range(len(triangles)):
+        a, b, c = triangles[i]
+        edges, area, close = _edges(vertices, triangles[i]), doubled[i], 0
+        for f in range(len(u)):
+            ab, bc, ac = _gaps(edges, u[f], v[f], w[f])
+            product = ab * bc * ac
+            is_apart = abs(product) >= LEAST_PRODUCT
+            close += not is_apart
+            factor = area / product if is_apart else 0.0
+            middle, imaginary = cosines[b, f], sines[b, f]
+            reals[f] -= ((cosines[a, f] - middle) * bc + (cosines[c, f] - middle) * ab) * factor
+            imaginaries[f] -= ((sines[a, f] - imaginary) * bc + (sines[c, f] - imaginary) * ab) * factor
+        if close:
+            for f in range(len(u)):
+                ab, bc, ac = _gaps(edges, u[f], v[f], w[f])
+                if not abs(ab * bc * ac) >= LEAST_PRODUCT:
+                    at_a, at_b = complex(cosines[a, f], sines[a, f]), complex(cosines[b, f], sines[b, f])
+                    value = area * _stable(at_a, at_b, complex(cosines[c, f], sines[c, f]), ab, bc, ac)
+                    reals[f] += value.real
+                    imaginaries[f] += value.imag
+    for f in range(len(u)):
+        sums[f] = complex(reals[f], imaginaries[f])
