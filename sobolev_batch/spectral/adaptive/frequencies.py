@@ -172,7 +172,8 @@ class Reference:
     """The reference b of a distance ||a - b||, and what is known of it.
 
     Attributes:
-        difference: Values whose signed sum is a - b; triangles that both have may be left out.
+        difference: Values of surfaces whose signed sum is a - b.
+        surfaces: These surfaces, moved like the pair; what a and b both have may be left out.
         signs: Signs of these.
         pair: The surfaces a and b, moved together to the centre of the lattice's period; of surfaces far apart b alone.
         known: Estimate for surfaces far apart, which follows from the norm of b; None for others.
@@ -181,6 +182,7 @@ class Reference:
     frequencies: Frequencies
     values: SurfaceValues
     difference: Sequence[SurfaceValues]
+    surfaces: Sequence[Surface]
     signs: Sequence[int]
     pair: Sequence[Surface]
     known: ReferenceEstimate | None = None
@@ -189,8 +191,8 @@ class Reference:
     def for_problem(cls, problem: Problem, solution: Solution, seed: int) -> Self:
         """Return the reference of a distance between surfaces that are not equal.
 
-        Its values are among those that the distance was computed from. But where the surfaces share triangles, which
-        cancel, the reference has more than those, and gets frequencies of its own.
+        Its values are among those that the distance was computed from. But where the surfaces have parts in common,
+        which cancel, the reference has more than those, and gets frequencies of its own.
         """
         if problem.is_whole and problem.apart is not None:
             own, of_own = problem.alone[1], solution.alone[1]
@@ -199,10 +201,10 @@ class Reference:
                 norms, -(norms.values**2), (2 * norms.values + norms.errors) * norms.errors + problem.apart
             )
             frequencies = Frequencies.from_solution(own, of_own)
-            return cls(frequencies, of_own.values[0], of_own.values, own.signs, own.surfaces, known)
+            return cls(frequencies, of_own.values[0], of_own.values, own.surfaces, own.signs, own.surfaces, known)
         if problem.is_whole:
             frequencies = Frequencies.from_solution(problem, solution)
-            return cls(frequencies, solution.values[1], solution.values, problem.signs, problem.pair)
+            return cls(frequencies, solution.values[1], solution.values, problem.surfaces, problem.signs, problem.pair)
         move = centering(problem.pair, OFF_CENTER)
         pair = [move.apply(surface) for surface in problem.pair]
         support = replace(support_of(pair), areas=np.array(pair[1].area))
@@ -212,10 +214,9 @@ class Reference:
         of_reference = solve(own, seed)
         frequencies = Frequencies.from_solution(own, of_reference)
         target = error_target(solution.estimate.values, problem.orders, problem.accuracy, problem.area)
-        difference = [
-            frequencies.values(move.apply(surface), target, problem.execution) for surface in problem.surfaces
-        ]
-        return cls(frequencies, of_reference.values[0], difference, problem.signs, pair)
+        surfaces = [move.apply(surface) for surface in problem.surfaces]
+        difference = [frequencies.values(surface, target, problem.execution) for surface in surfaces]
+        return cls(frequencies, of_reference.values[0], difference, surfaces, problem.signs, pair)
 
     def estimate(self) -> ReferenceEstimate:
         """Return the norm of b, and the product <a - b, b>."""
@@ -225,7 +226,7 @@ class Reference:
         difference, own = Measure.from_values(self.difference, self.signs), Measure.from_values([values], [1])
         other = Measure.from_values([*self.difference, values], [*self.signs, 1])
         # Of a, b and their difference.
-        parts = (other, self.pair[:1], [1]), (own, self.pair[1:], [1]), (difference, self.pair, [1, -1])
+        parts = (other, self.pair[:1], [1]), (own, self.pair[1:], [1]), (difference, self.surfaces, self.signs)
         norms = at.norms_of(*parts[1], at.errors([values]))
         distances = at.norms_of(*parts[2], at.errors(self.difference))
         products = at.lattice_sums(difference, own)

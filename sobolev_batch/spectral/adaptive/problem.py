@@ -21,6 +21,7 @@ from sobolev_batch.spectral.octaves.values import OctaveValues
 from sobolev_batch.spectral.probe import Sample, draws_for, estimate, needs_probe
 from sobolev_batch.spectral.transform import ErrorTarget, Execution, TransformSettings, permits_single
 from sobolev_batch.surfaces.shapes.mesh import Mesh, shared_triangles
+from sobolev_batch.surfaces.shapes.overlap import rests_of
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent, Reals, Similarity, Surface, centering
 
 Samples = tuple[Sample, ...]
@@ -49,7 +50,7 @@ class Problem:
         surfaces: One surface, or two; none where two surfaces cancel.
         support: Area of the surfaces together, and sizes of all surfaces that share the lattice.
         label: Name of the norm or distance in messages.
-        pair: Surfaces that a distance is between, with the triangles that they share; empty for a norm.
+        pair: Surfaces that a distance is between, with what they share; empty for a norm.
         signs: Signs of the surfaces in the difference.
         apart: What the product of two surfaces that are far apart does not exceed (orders,); None for others.
     """
@@ -68,12 +69,12 @@ class Problem:
     def from_surfaces(
         cls, surfaces: Sequence[Surface], orders: tuple[float, ...], accuracy: Accuracy, label: str, threads: int
     ) -> Self:
-        """Return the problem for surfaces, moved to the centre, without triangles that both have; none may remain.
+        """Return the problem for surfaces, moved to the centre, without what both have; none may remain.
 
         Those that are far apart stay where they are, since a common move would cost digits.
         """
         pair = tuple(surfaces) if len(surfaces) == _PAIR else ()
-        different = _without_common_parts(surfaces)
+        different = without_common_parts(surfaces)
         if not different:
             return cls((), orders, accuracy, Support(np.zeros(()), np.zeros(len(DIRECTIONS))), label, threads)
         apart = product_apart(tuple(different.values()), orders, accuracy.rtol)
@@ -200,26 +201,27 @@ def support_of(surfaces: Sequence[Surface]) -> Support:
 
 
 def are_equal(a: Surface, b: Surface) -> bool:
-    """Return whether two meshes have the same triangles, in whatever order."""
-    if isinstance(a, Mesh) and isinstance(b, Mesh) and len(a.triangles) != len(b.triangles):
+    """Return whether two meshes are equal as area measures, to rounding."""
+    if isinstance(a, Mesh) and isinstance(b, Mesh) and abs(a.area - b.area) > _ROUNDING * (a.area + b.area):
         return False
-    return not _without_common_parts((a, b))
+    return not without_common_parts((a, b))
 
 
-def _without_common_parts(surfaces: Sequence[Surface]) -> Mapping[int, Surface]:
+def without_common_parts(surfaces: Sequence[Surface]) -> Mapping[int, Surface]:
     """Return one surface, or what two do not have in common, by their signs in the difference."""
     meshes = [surface for surface in surfaces if isinstance(surface, Mesh)]
-    if len(meshes) == _PAIR:
-        shared = shared_triangles(*(mesh.vertices[mesh.triangles] for mesh in meshes))
-        if shared[0].any():
-            rests = [
-                Mesh.from_checked(mesh.vertices, np.ascontiguousarray(mesh.triangles[~in_both]))
-                for mesh, in_both in zip(meshes, shared, strict=True)
-            ]
-            return {
-                sign: mesh for sign, mesh in zip((1, -1), rests, strict=True) if len(mesh.triangles) and mesh.area > 0
-            }
-    return dict(zip((1, -1), surfaces, strict=False))
+    if len(meshes) < _PAIR:
+        return dict(zip((1, -1), surfaces, strict=False))
+    shared = shared_triangles(*(mesh.vertices[mesh.triangles] for mesh in meshes))
+    if shared[0].any():
+        meshes = [
+            Mesh.from_checked(mesh.vertices, np.ascontiguousarray(mesh.triangles[~in_both]))
+            for mesh, in_both in zip(meshes, shared, strict=True)
+        ]
+    rests = [mesh if len(mesh.triangles) and mesh.area > 0 else None for mesh in meshes]
+    if rests[0] is not None and rests[1] is not None:
+        rests = list(rests_of(rests[0], rests[1]).meshes)
+    return {sign: rest for sign, rest in zip((1, -1), rests, strict=True) if rest is not None}
 
 
 @dataclass(frozen=True, eq=False)
