@@ -27,7 +27,8 @@ from sobolev_batch.spectral.adaptive.tolerance import FINER_LATTICE, core_lattic
 from sobolev_batch.spectral.budget import aliased, change_of_root
 from sobolev_batch.spectral.fields import Field
 from sobolev_batch.spectral.lattice import Lattice, OctaveLattice, SobolevWeights
-from sobolev_batch.spectral.octaves.remainder import Remainder, remainder, tail_integral
+from sobolev_batch.spectral.octaves.potentials import tail_integral
+from sobolev_batch.spectral.octaves.remainder import Remainder, remainder
 from sobolev_batch.spectral.octaves.sampling import FaceNormals, Octave, OctaveSampling
 from sobolev_batch.spectral.octaves.values import (
     POINTS_PER_SQUARE,
@@ -70,7 +71,7 @@ _GROWTH = 4.0
 # Predicted seconds that the first samples of an octave may take if drawn, and all of the samples together.
 _OCTAVE_SECONDS, _MOST_SECONDS = 20.0, 200.0
 # Random points of a remainder at most, how many more than needed are taken, and how many more to check it again.
-_MOST_POINTS, _MORE_POINTS, _MORE_TO_CHECK = 60_000, 1.3, 4
+_MOST_POINTS, _MORE_POINTS, _MORE_TO_CHECK = 400_000, 1.3, 4
 # Nodes that a parametrised surface may have; beyond the frequency that they resolve it has no octaves.
 _MOST_SMOOTH_NODES = 2e6
 
@@ -154,7 +155,7 @@ class State:
         """Return what a small lattice shows, and what lies beyond it."""
         lattice = core_lattice(problem.support, problem.orders, problem.accuracy)
         core = Core.on_lattice(problem, lattice, lattice.xi_max)
-        beyond = remainder(problem.surfaces, problem.signs, lattice.xi_max, problem.orders, seed=seed)
+        beyond = _beyond(problem, lattice.xi_max, seed)
         return cls(problem, seed, core, (), (beyond,), for_others, beyond.seconds(beyond.points))
 
     @property
@@ -171,13 +172,31 @@ class State:
 
     @cached_property
     def disagreements(self) -> Reals:
-        """Gap of each remainder to what was measured beyond it, outside of both errors (remainders, orders)."""
+        """Gap of each remainder to what was measured there otherwise, outside of both errors (remainders, orders)."""
         orders, disagreements = self.problem.orders, []
         for number, beyond in enumerate(self.remainders):
             sums = [octave.sums for octave in self.octaves[number:]]
             outer, (value, error) = Tail.from_sums(sums, *self.remainders[-1].at(orders)), beyond.at(orders)
             disagreements.append(np.abs(outer.squares - value) - outer.statistical - outer.uncertainty - error)
+        disagreements[-1] = self._missing
         return np.maximum(disagreements, 0.0)
+
+    @property
+    def _missing(self) -> Reals:
+        """Energy that the last octave has and the last remainder lacks, outside of both errors, beyond it (orders,).
+
+        From octave to octave the energy grows until it is twice the area of all that differs. Only what repeats with a
+        period has less of it farther out, and points that nothing is hidden from see that.
+        """
+        orders, beyond = self.problem.orders, self.remainders[-1]
+        if beyond.points >= beyond.covering:
+            return np.zeros(len(orders))
+        least = self.core.energy
+        if self.octaves:
+            least = self.octaves[-1].sums.energy - _QUANTILE * self.octaves[-1].sums.energy_deviation
+        return np.asarray(least * np.array([tail_integral(beyond.cutoff, order) for order in orders])) - sum(
+            beyond.at(orders)
+        )
 
     @cached_property
     def squares(self) -> Reals:
@@ -238,7 +257,7 @@ class State:
         """Return the state after a step that estimates one remainder from new points."""
         problem, known = self.problem, list(self.remainders)
         cutoff, seconds, seed = known[number].cutoff, known[number].seconds(points), self.seed + self.steps + 1
-        known[number] = remainder(problem.surfaces, problem.signs, cutoff, problem.orders, points, seed)
+        known[number] = _beyond(problem, cutoff, seed, points)
         return self.advanced(seconds, remainders=tuple(known))
 
     def advanced(self, seconds: float, **changes: object) -> State:
@@ -289,6 +308,9 @@ def farther_out(state: State) -> State | None:
     octave = Octave(state.cutoff, len(state.octaves) + 1)
     can_go_on = len(state.octaves) < _MOST_OCTAVES and octave.highest <= _resolvable_frequency(problem)
     points = int(_MORE_POINTS * beyond.points * state.excess**2)
+    if beyond.points < beyond.covering:
+        # What may be hidden is most of the error, until nothing is.
+        points = min(points, beyond.covering)
     sampling = _first_sampling(state, octave) if can_go_on else None
     seconds = np.inf if sampling is None else state.sampling_seconds(sampling) + beyond.seconds(beyond.points) / 4
     if not state.for_others and points <= _MOST_POINTS and beyond.seconds(points) < min(seconds, _MOST_SECONDS):
@@ -296,7 +318,7 @@ def farther_out(state: State) -> State | None:
     if sampling is None:
         return None
     measured = _measured(state, sampling)
-    outer = remainder(problem.surfaces, problem.signs, octave.highest, problem.orders, seed=state.seed)
+    outer = _beyond(problem, octave.highest, state.seed)
     return state.advanced(seconds, octaves=(*state.octaves, measured), remainders=(*state.remainders, outer))
 
 
@@ -423,6 +445,13 @@ def _finer_sampling(state: State, octave: MeasuredOctave, order: int, permitted:
         return replace(sampling, draws=count, seed=_seed(rng))
     intervals = 2 * round(sampling.lattices[-1].M * np.clip(excess**0.5, 1.25, 2.0) / 2)
     return replace(sampling, lattices=(*sampling.lattices, _lattice(state, sampling.octave, intervals, rng)))
+
+
+def _beyond(problem: Problem, cutoff: float, seed: int, points: int | None = None) -> Remainder:
+    """Return what lies beyond a cutoff, from new points."""
+    return remainder(
+        problem.surfaces, problem.signs, cutoff, problem.orders, points, seed=seed, threads=problem.threads
+    )
 
 
 def _lattice(state: State, octave: Octave, intervals: int, rng: np.random.Generator) -> OctaveLattice:

@@ -37,13 +37,16 @@ Settings = Callable[[Surface, OctaveLattice], TransformSettings]
 # Samples at which values on a lattice are checked: for small meshes, for huge ones, and in between as many as make this
 # number of pairs of a triangle (or point) and a frequency.
 _MOST_CHECKS, _FEWEST_CHECKS, _PAIRS = 16, 4, 100_000
-# Seconds for a quadrature point, for a sample of a lattice's block, and for a pair of a triangle and a frequency:
-# measured on one machine, and rough on others.
-_POINT_SECONDS, _SAMPLE_SECONDS, _PAIR_SECONDS = 2.5e-7, 3e-7, 6e-8
+# Seconds for a quadrature point and for a sample of a lattice's block; for a pair of a triangle and a frequency in
+# compiled loops and on arrays; and to load the loops, shared by some octaves: measured on one machine, rough on others.
+_POINT_SECONDS, _SAMPLE_SECONDS = 1.3e-7, 1e-7
+_LOOP_SECONDS, _ARRAY_SECONDS, _START_SECONDS = 3.5e-9, 4.5e-8, 0.3
 # Quadrature points for each square of half a wavelength, and for each triangle at least.
 POINTS_PER_SQUARE, _POINTS_PER_TRIANGLE = 4.0, 1.5
 # What a frequency costs beside its triangles, in triangles.
 _OVERHEAD_TRIANGLES = 50
+# Draws of an octave, for the time that one of them takes.
+_USUAL_DRAWS = 20_000
 # The true value lies within the statistical error with this probability, if sums over groups are normal.
 _CONFIDENCE = 0.99
 
@@ -160,8 +163,8 @@ class SurfaceSize:
 
     @property
     def draw_seconds(self) -> float:
-        """Time of the exact transform at one frequency."""
-        return _PAIR_SECONDS * (self.triangles + _OVERHEAD_TRIANGLES)
+        """Time of the exact transform at one of many drawn frequencies."""
+        return self._seconds_at(_USUAL_DRAWS) / _USUAL_DRAWS
 
     def lattice_seconds(self, lattice: OctaveLattice) -> float:
         """Return the time of a transform on a lattice, in the cheaper of both ways."""
@@ -190,7 +193,12 @@ class SurfaceSize:
         return seconds + _POINT_SECONDS * max(_POINTS_PER_TRIANGLE * self.triangles, of_area)
 
     def _exact_seconds(self, lattice: OctaveLattice) -> float:
-        return math.pi / 12 * lattice.M**3 * self.draw_seconds if self.triangles else math.inf
+        return self._seconds_at(math.pi / 12 * lattice.M**3) if self.triangles else math.inf
+
+    def _seconds_at(self, frequencies: float) -> float:
+        """Return the time of the exact transform, the same whatever the process has done before."""
+        pairs = frequencies * (self.triangles + _OVERHEAD_TRIANGLES)
+        return min(_ARRAY_SECONDS * pairs, _START_SECONDS + _LOOP_SECONDS * pairs)
 
 
 @dataclass(frozen=True, eq=False)

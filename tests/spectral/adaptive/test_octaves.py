@@ -73,7 +73,7 @@ def test_flat_faces_that_repeat_against_their_heat_trace(name: str, order: float
 @pytest.mark.slow
 def test_a_seed_makes_results_reproducible_and_another_one_changes_them() -> None:
     pair = icosphere(1), icosphere(2)
-    first, again, other = (distance(*pair, -1.0, rtol=0.01, seed=seed) for seed in (1, 1, 2))
+    first, again, other = (distance(*pair, -1.0, rtol=0.003, seed=seed) for seed in (1, 1, 2))
     # Sums of several threads round differently, here in single precision.
     assert first["distance"].item() == pytest.approx(again["distance"].item(), rel=1e-5)
     assert first["distance"].item() != other["distance"].item()

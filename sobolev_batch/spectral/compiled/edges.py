@@ -1,0 +1,130 @@
+"""The compiled loop over pairs of a point and a triangle: see `potentials`, whose array code says the same."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from sobolev_batch.spectral.compiled import loop
+from sobolev_batch.surfaces.shapes.surface import Indices, Reals
+
+
+@loop
+def add_potentials(
+    out: Reals,
+    points: Reals,
+    corners: Reals,
+    rows: Indices,
+    columns: Indices,
+    sign: float,
+    tables: Any,
+    panels: Any,
+    limits: Reals,
+    nodes: Reals,
+    ends: Indices,
+) -> None:
+    """Add the potential of each triangle, times a sign, at the point that it is paired with, to (n, orders).
+
+    The limits are those of `potentials`, farness and size for each rule, and the nodes those of all rules: barycentric
+    coordinates and weight, from one of the ends to the next.
+    """
+    cutoff, values = tables[0], tables[6]
+    for pair in range(len(rows)):
+        row, triangle = rows[pair], corners[columns[pair]]
+        x, y, z = points[row, 0], points[row, 1], points[row, 2]
+        ax, ay, az = triangle[0, 0] - x, triangle[0, 1] - y, triangle[0, 2] - z
+        bx, by, bz = triangle[1, 0] - x, triangle[1, 1] - y, triangle[1, 2] - z
+        cx, cy, cz = triangle[2, 0] - x, triangle[2, 1] - y, triangle[2, 2] - z
+        ux, uy, uz, vx, vy, vz = bx - ax, by - ay, bz - az, cx - ax, cy - ay, cz - az
+        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        doubled = math.sqrt(nx * nx + ny * ny + nz * nz)
+        mx, my, mz = (ax + bx + cx) / 3, (ay + by + cy) / 3, (az + bz + cz) / 3
+        distance = math.sqrt(mx * mx + my * my + mz * mz)
+        square = (ax - mx) ** 2 + (ay - my) ** 2 + (az - mz) ** 2
+        square = max(square, (bx - mx) ** 2 + (by - my) ** 2 + (bz - mz) ** 2)
+        radius = math.sqrt(max(square, (cx - mx) ** 2 + (cy - my) ** 2 + (cz - mz) ** 2))
+        rule = -1
+        for number in range(len(limits)):
+            if radius < limits[number, 0] * distance and radius * cutoff < limits[number, 1]:
+                rule = number
+        if rule >= 0:
+            for node in range(ends[rule], ends[rule + 1]):
+                p, q, r = nodes[node, 0], nodes[node, 1], nodes[node, 2]
+                dx, dy, dz = p * ax + q * bx + r * cx, p * ay + q * by + r * cy, p * az + q * bz + r * cz
+                entry, fraction = _place(dx * dx + dy * dy + dz * dz, tables)
+                weight = sign * doubled / 2 * nodes[node, 3]
+                for order in range(out.shape[1]):
+                    low = values[entry, order]
+                    out[row, order] += weight * (low + fraction * (values[entry + 1, order] - low))
+            continue
+        nx, ny, nz = nx / doubled, ny / doubled, nz / doubled
+        height = nx * ax + ny * ay + nz * az
+        _add_edge(out, row, sign, ax, ay, az, bx, by, bz, nx, ny, nz, height, tables, panels)
+        _add_edge(out, row, sign, bx, by, bz, cx, cy, cz, nx, ny, nz, height, tables, panels)
+        _add_edge(out, row, sign, cx, cy, cz, ax, ay, az, nx, ny, nz, height, tables, panels)
+
+
+@loop
+def _place(square: float, tables: Any) -> Any:
+    """Return the entry of a table before d², and how far behind it that lies."""
+    cutoff, reach, start, step, values = tables[0], tables[1], tables[2], tables[3], tables[6]
+    distance = math.sqrt(min(max(square, (tables[7] / cutoff) ** 2), reach * reach))
+    place = (math.log(distance) + cutoff / tables[8] * distance - start) / step
+    place = min(place, len(values) - 1.0001)
+    if place < 0:
+        place = 0.0
+    # NaN has no entry, and stays what it is.
+    entry = int(place) if place == place else 0
+    return entry, place - entry
+
+
+@loop
+def _add_edge(
+    out: Reals, row: int, sign: float,
+    px: float, py: float, pz: float, qx: float, qy: float, qz: float,
+    nx: float, ny: float, nz: float, height: float, tables: Any, panels: Any,
+) -> None:  # fmt: skip
+    """Add what one edge from p to q contributes to a potential at the origin."""
+    ux, uy, uz = qx - px, qy - py, qz - pz
+    length = math.sqrt(ux * ux + uy * uy + uz * uz)
+    ux, uy, uz = ux / length, uy / length, uz / length
+    offset = nx * (py * uz - pz * uy) + ny * (pz * ux - px * uz) + nz * (px * uy - py * ux)
+    _add_to_end(out, row, sign, offset, height, qx * ux + qy * uy + qz * uz, tables, panels)
+    _add_to_end(out, row, -sign, offset, height, px * ux + py * uy + pz * uz, tables, panels)
+
+
+@loop
+def _add_to_end(
+    out: Reals, row: int, sign: float, offset: float, height: float, end: float, tables: Any, panels: Any
+) -> None:
+    """Add the integral from the foot on an edge's line to one end."""
+    reach, totals, drops = tables[1], tables[4], tables[5]
+    longest_t, longest, last_t, nodes = panels
+    sign *= math.copysign(1.0, offset) * math.copysign(1.0, end) if offset != 0 and end != 0 else 0.0
+    if sign == 0:
+        return
+    q, square = max(abs(offset), tables[7] * reach), height * height
+    far = abs(end)
+    length = min(far, math.sqrt(max(reach * reach - square - q * q, 0.0)))
+    level, level_fraction = _place(square, tables)
+    outside = math.atan2(far, q) - math.atan2(length, q)
+    last, low = min(math.asinh(length / q), last_t), 0.0
+    for order in range(out.shape[1]):
+        base = drops[level, order]
+        base += level_fraction * (drops[level + 1, order] - base)
+        out[row, order] += sign * outside * (totals[order] - base)
+    angle = 0.0
+    while low < last:
+        high = min(last, low + min(longest_t, longest / (q * math.cosh(low))))
+        for node in range(nodes.shape[1]):
+            widening = math.cosh((low + high) / 2 + (high - low) / 2 * nodes[0, node])
+            weight = sign * nodes[1, node] / 2 * (high - low) / widening
+            entry, fraction = _place(square + (q * widening) ** 2, tables)
+            angle += weight
+            for order in range(out.shape[1]):
+                found = drops[entry, order]
+                out[row, order] += weight * (found + fraction * (drops[entry + 1, order] - found))
+        low = high
+    for order in range(out.shape[1]):
+        base = drops[level, order]
+        out[row, order] -= angle * (base + level_fraction * (drops[level + 1, order] - base))
