@@ -22,11 +22,12 @@ from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import Plan, Row
 from sobolev_batch.batch.study.schema import Backends
 from sobolev_batch.errors import InputError, LatticeError, MeshError, StoreError, one_line
+from sobolev_batch.spectral.adaptive.problem import without_common_parts
 from sobolev_batch.spectral.adaptive.solve import DistanceTarget
 from sobolev_batch.spectral.fields import Quality, TailQuality, compute_field, field_for
 from sobolev_batch.spectral.kinds import kind_of
 from sobolev_batch.spectral.lattice import Block, Lattice
-from sobolev_batch.spectral.octaves.remainder import remainder
+from sobolev_batch.spectral.octaves.remainder import Remainder, remainder
 from sobolev_batch.spectral.octaves.sampling import TailSampling
 from sobolev_batch.spectral.octaves.values import Settings, octave_values, settings_for
 from sobolev_batch.spectral.probe import Probe, draws_for, join, probe_block
@@ -209,11 +210,17 @@ def _store_octaves(job: Job, surface: Surface) -> StoredBlocks:
         tuple(float(radius) for octave in values for radius in octave.radii),
         tuple(float(square) for octave in values for square in octave.squares),
         remainder([surface], [1], cutoff, points=_POINTS_OF_NORM),
-        None if reference is None else remainder([surface, reference], [1, -1], cutoff),
+        None if reference is None else _remainder_between(surface, reference, cutoff),
     )
     samples = np.concatenate([octave.values for octave in values])
     checksum = job.store.write_field(job.index, (slice(0, len(samples)),), samples)
     return StoredBlocks(quality=replace(Quality.from_surface(surface, Probe()), tail=quality), checksums=(checksum,))
+
+
+def _remainder_between(surface: Surface, reference: Surface, cutoff: float) -> Remainder:
+    """Return what lies beyond a cutoff between two surfaces: only what they do not have in common counts."""
+    rests = without_common_parts((surface, reference))
+    return remainder(list(rests.values()), list(rests), cutoff) if rests else Remainder.between(0.0, 0.0, cutoff)
 
 
 def _store_whole(job: Job, surface: Surface) -> StoredBlocks:

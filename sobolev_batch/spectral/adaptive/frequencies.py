@@ -177,6 +177,7 @@ class Reference:
         signs: Signs of these.
         pair: The surfaces a and b, moved together to the centre of the lattice's period; of surfaces far apart b alone.
         known: Estimate for surfaces far apart, which follows from the norm of b; None for others.
+        moved: What the difference lacks, see `Problem`.
     """
 
     frequencies: Frequencies
@@ -186,6 +187,7 @@ class Reference:
     signs: Sequence[int]
     pair: Sequence[Surface]
     known: ReferenceEstimate | None = None
+    moved: Reals | float = 0.0
 
     @classmethod
     def for_problem(cls, problem: Problem, solution: Solution, seed: int) -> Self:
@@ -209,14 +211,14 @@ class Reference:
         pair = [move.apply(surface) for surface in problem.pair]
         support = replace(support_of(pair), areas=np.array(pair[1].area))
         accuracy = replace(problem.accuracy, best_effort=True)
-        alone = replace(problem, signs=(1,), label="the reference", apart=None)
+        alone = replace(problem, signs=(1,), label="the reference", apart=None, moved=0.0)
         own = replace(alone, surfaces=pair[1:], support=support, accuracy=accuracy)
         of_reference = solve(own, seed)
         frequencies = Frequencies.from_solution(own, of_reference)
         target = error_target(solution.estimate.values, problem.orders, problem.accuracy, problem.area)
         surfaces = [move.apply(surface) for surface in problem.surfaces]
         difference = [frequencies.values(surface, target, problem.execution) for surface in surfaces]
-        return cls(frequencies, of_reference.values[0], difference, surfaces, problem.signs, pair)
+        return cls(frequencies, of_reference.values[0], difference, surfaces, problem.signs, pair, moved=problem.moved)
 
     def estimate(self) -> ReferenceEstimate:
         """Return the norm of b, and the product <a - b, b>."""
@@ -228,7 +230,7 @@ class Reference:
         # Of a, b and their difference.
         parts = (other, self.pair[:1], [1]), (own, self.pair[1:], [1]), (difference, self.surfaces, self.signs)
         norms = at.norms_of(*parts[1], at.errors([values]))
-        distances = at.norms_of(*parts[2], at.errors(self.difference))
+        distances = at.norms_of(*parts[2], at.errors(self.difference) + self.moved)
         products = at.lattice_sums(difference, own)
         if not at.has_tail:
             return ReferenceEstimate.on_lattice(products, distances, norms, at.weights, at.widths)

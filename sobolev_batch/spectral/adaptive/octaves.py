@@ -106,7 +106,7 @@ class Core:
         )
         fields = problem.fields(lattice, samples, target, problem.dtype(lattice, target))
         weights = SobolevWeights(lattice, problem.orders, cutoff)
-        sums, errors = sums_on(fields, weights)
+        sums, errors = sums_on(problem, fields, weights)
         images = aliased(sums, weights, problem.support.widths)
         return cls(lattice, fields, np.maximum(sums.totals, 0.0), images, errors, float(sums.outer[1]))
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from sobolev_batch.errors import AccuracyError
 from sobolev_batch.spectral.adaptive.apart import APART_FRACTION, product_apart
-from sobolev_batch.spectral.adaptive.tolerance import Accuracy, unreachable
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy, first_lattice, unreachable
 from sobolev_batch.spectral.backends import ComplexDtype, Complexes
-from sobolev_batch.spectral.budget import NormEstimate, Sums, Support, change_of_root, sums_of_shells
+from sobolev_batch.spectral.budget import NormEstimate, Sums, Support, change_of_root, norm_of_moves, sums_of_shells
 from sobolev_batch.spectral.fields import USUAL_DEGREE, Field, field_for
 from sobolev_batch.spectral.lattice import Lattice, SobolevWeights, shell_sums
 from sobolev_batch.spectral.octaves.sampling import OctaveSampling
@@ -21,7 +21,7 @@ from sobolev_batch.spectral.octaves.values import OctaveValues
 from sobolev_batch.spectral.probe import Sample, draws_for, estimate, needs_probe
 from sobolev_batch.spectral.transform import ErrorTarget, Execution, TransformSettings, permits_single
 from sobolev_batch.surfaces.shapes.mesh import Mesh, shared_triangles
-from sobolev_batch.surfaces.shapes.overlap import rests_of
+from sobolev_batch.surfaces.shapes.overlap import SINGLE_ROUNDING, rests_of
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Extent, Reals, Similarity, Surface, centering
 
 Samples = tuple[Sample, ...]
@@ -36,6 +36,8 @@ _STORED_ROUNDING, _STORED_FRACTION = 6e-8, 0.1
 # Surfaces whose common centre is no further from the origin, relative to their extent, stay where they are.
 OFF_CENTER = 1e-3
 _PAIR = 2
+# Fraction of an error that faces may take that are apart by a rounding of files.
+_MOVED_FRACTION = 0.1
 # Settings that each field has.
 _OF_FIELDS = ("eps", "quadrature_eps", "points")
 # An accuracy called reachable must hold when it is requested.
@@ -53,6 +55,7 @@ class Problem:
         pair: Surfaces that a distance is between, with what they share; empty for a norm.
         signs: Signs of the surfaces in the difference.
         apart: What the product of two surfaces that are far apart does not exceed (orders,); None for others.
+        moved: Norm (orders,) that faces which were taken out do not exceed, as they are apart by a rounding of files.
     """
 
     surfaces: Sequence[Surface]
@@ -64,6 +67,7 @@ class Problem:
     pair: Sequence[Surface] = ()
     signs: Sequence[int] = (1, -1)
     apart: Reals | None = None
+    moved: Reals | float = 0.0
 
     @classmethod
     def from_surfaces(
@@ -73,13 +77,30 @@ class Problem:
 
         Those that are far apart stay where they are, since a common move would cost digits.
         """
-        pair = tuple(surfaces) if len(surfaces) == _PAIR else ()
-        different = without_common_parts(surfaces)
+        different, pair = without_common_parts(surfaces), tuple(surfaces) if len(surfaces) == _PAIR else ()
+        settings = orders, accuracy, label, threads
+        problem = cls._between(different, pair, *settings)
+        meshes = [surface for surface in different.values() if isinstance(surface, Mesh)]
+        if len(meshes) < _PAIR or not any(_is_single(surface) for surface in pair):
+            return problem
+        rests = rests_of(meshes[0], meshes[1], SINGLE_ROUNDING)
+        closer = cls._between(_signed(rests.meshes), pair, *settings)
+        moved = norm_of_moves(rests.areas, rests.distances, orders)
+        if closer.surfaces and np.all(moved <= _MOVED_FRACTION * accuracy.rtol * closer.rough_values):
+            return replace(closer, moved=moved)
+        return problem
+
+    @classmethod
+    def _between(
+        cls, different: Mapping[int, Surface], pair: Sequence[Surface], orders: tuple[float, ...], *settings: Any
+    ) -> Self:
+        """Return the problem for what two surfaces do not have in common, by sign, or for one surface."""
+        accuracy, label, threads = settings
         if not different:
             return cls((), orders, accuracy, Support(np.zeros(()), np.zeros(len(DIRECTIONS))), label, threads)
-        apart = product_apart(tuple(different.values()), orders, accuracy.rtol)
-        move = centering(list(different.values()), OFF_CENTER) if apart is None else Similarity()
         is_whole = all(one is other for one, other in zip(different.values(), pair, strict=False))
+        apart = product_apart(tuple(different.values()), orders, accuracy.rtol) if is_whole else None
+        move = centering(list(different.values()), OFF_CENTER) if apart is None else Similarity()
         surfaces = tuple(move.apply(surface) for surface in different.values())
         pair = surfaces if is_whole else tuple(move.apply(surface) for surface in pair)
         return cls(surfaces, orders, accuracy, support_of(surfaces), label, threads, pair, tuple(different), apart)
@@ -132,6 +153,12 @@ class Problem:
         """Return the cheapest dtype that meets a target."""
         single = all(permits_single(surface, lattice, target) for surface in self.surfaces)
         return "complex64" if single else "complex128"
+
+    @property
+    def rough_values(self) -> Reals:
+        """Norms (orders,) on a small lattice, from a few frequencies."""
+        lattice, _ = first_lattice(self.support, self.orders, self.accuracy)
+        return np.asarray(ESTIMATE_CAUTION * estimate(self.samples(lattice), self.orders))
 
     def permits_single_storage(self, lattice: Lattice, target: ErrorTarget) -> bool:
         """Tell whether fields meet a target once each value is rounded to single precision."""
@@ -187,11 +214,11 @@ def only_or_difference(values: Sequence[Complexes]) -> Complexes:
     return values[0] if len(values) == 1 else values[0] - values[1]
 
 
-def sums_on(fields: Sequence[Field], weights: SobolevWeights) -> tuple[Sums, Reals]:
-    """Return the sums of the only field, or of the difference of two, and the norms of their own errors (orders,)."""
+def sums_on(problem: Problem, fields: Sequence[Field], weights: SobolevWeights) -> tuple[Sums, Reals]:
+    """Return the sums of the only field, or of the difference of two, and the norms of its error (orders,)."""
     lattice, difference = weights.lattice, only_or_difference([field.values for field in fields])
     sums = sums_of_shells(shell_sums(difference, None, lattice, lattice.half), weights)
-    return sums, np.sum([field.quality.probe.norms(weights) for field in fields], axis=0)
+    return sums, np.sum([field.quality.probe.norms(weights) for field in fields], axis=0) + problem.moved
 
 
 def support_of(surfaces: Sequence[Surface]) -> Support:
@@ -221,7 +248,16 @@ def without_common_parts(surfaces: Sequence[Surface]) -> Mapping[int, Surface]:
     rests = [mesh if len(mesh.triangles) and mesh.area > 0 else None for mesh in meshes]
     if rests[0] is not None and rests[1] is not None:
         rests = list(rests_of(rests[0], rests[1]).meshes)
+    return _signed(rests)
+
+
+def _signed(rests: Sequence[Mesh | None]) -> Mapping[int, Surface]:
     return {sign: rest for sign, rest in zip((1, -1), rests, strict=True) if rest is not None}
+
+
+def _is_single(surface: Surface) -> bool:
+    """Tell whether single precision holds the coordinates of a mesh, as where STL was read."""
+    return isinstance(surface, Mesh) and bool(np.all(surface.vertices.astype(np.float32) == surface.vertices))
 
 
 @dataclass(frozen=True, eq=False)

@@ -388,7 +388,7 @@ def _compute(
 def difference_on(problem: Problem, lattice: Lattice, fields: Sequence[Field]) -> tuple[NormEstimate, Sums]:
     """Return the norm of the only field, or of the difference of two, and the sums that it follows from."""
     weights = SobolevWeights(lattice, problem.orders)
-    sums, errors = sums_on(fields, weights)
+    sums, errors = sums_on(problem, fields, weights)
     return estimate_norms(sums, weights, problem.support, errors), sums
 
 
