@@ -39,8 +39,8 @@ Settings = Callable[[Surface, OctaveLattice], TransformSettings]
 _MOST_CHECKS, _FEWEST_CHECKS, _PAIRS = 16, 4, 100_000
 # Seconds for a quadrature point and for a sample of a lattice's block; for a pair of a triangle and a frequency in
 # compiled loops and on arrays; and to load the loops, shared by some octaves: measured on one machine, rough on others.
-_POINT_SECONDS, _SAMPLE_SECONDS = 1.3e-7, 1e-7
-_LOOP_SECONDS, _ARRAY_SECONDS, _START_SECONDS = 3.5e-9, 4.5e-8, 0.3
+_POINT_SECONDS, _SAMPLE_SECONDS = 2e-7, 1e-7
+_LOOP_SECONDS, _ARRAY_SECONDS, _START_SECONDS = 3e-9, 4.5e-8, 0.15
 # Quadrature points for each square of half a wavelength, and for each triangle at least.
 POINTS_PER_SQUARE, _POINTS_PER_TRIANGLE = 4.0, 1.5
 # What a frequency costs beside its triangles, in triangles.
