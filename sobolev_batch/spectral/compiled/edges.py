@@ -59,6 +59,8 @@ def add_potentials(
             continue
         nx, ny, nz = nx / doubled, ny / doubled, nz / doubled
         height = nx * ax + ny * ay + nz * az
+        if abs(height) >= tables[1]:
+            continue
         _add_edge(out, row, sign, ax, ay, az, bx, by, bz, nx, ny, nz, height, tables, panels)
         _add_edge(out, row, sign, bx, by, bz, cx, cy, cz, nx, ny, nz, height, tables, panels)
         _add_edge(out, row, sign, cx, cy, cz, ax, ay, az, nx, ny, nz, height, tables, panels)
@@ -68,8 +70,8 @@ def add_potentials(
 def _place(square: float, tables: Any) -> Any:
     """Return the entry of a table before d², and how far behind it that lies."""
     cutoff, reach, start, step, values = tables[0], tables[1], tables[2], tables[3], tables[6]
-    distance = math.sqrt(min(max(square, (tables[7] / cutoff) ** 2), reach * reach))
-    place = (math.log(distance) + cutoff / tables[8] * distance - start) / step
+    relative = math.sqrt(min(max(square, (tables[7] / cutoff) ** 2), reach * reach)) * cutoff / tables[8]
+    place = ((math.log(relative) if relative < 1 else relative - 1) - start) / step
     place = min(place, len(values) - 1.0001)
     if place < 0:
         place = 0.0
@@ -89,41 +91,53 @@ def _add_edge(
     length = math.sqrt(ux * ux + uy * uy + uz * uz)
     ux, uy, uz = ux / length, uy / length, uz / length
     offset = nx * (py * uz - pz * uy) + ny * (pz * ux - px * uz) + nz * (px * uy - py * ux)
-    _add_to_end(out, row, sign, offset, height, qx * ux + qy * uy + qz * uz, tables, panels)
-    _add_to_end(out, row, -sign, offset, height, px * ux + py * uy + pz * uz, tables, panels)
+    first, last = px * ux + py * uy + pz * uz, qx * ux + qy * uy + qz * uz
+    if offset == 0:
+        return
+    sign = math.copysign(sign, sign * offset)
+    if first * last > 0:
+        near, far = min(abs(first), abs(last)), max(abs(first), abs(last))
+        _add_span(out, row, sign, offset, height, near, far, tables, panels)
+    else:
+        _add_span(out, row, sign, offset, height, 0.0, abs(last), tables, panels)
+        _add_span(out, row, sign, offset, height, 0.0, abs(first), tables, panels)
 
 
 @loop
-def _add_to_end(
-    out: Reals, row: int, sign: float, offset: float, height: float, end: float, tables: Any, panels: Any
+def _add_span(
+    out: Reals, row: int, sign: float, offset: float, height: float, near: float, far: float, tables: Any, panels: Any
 ) -> None:
-    """Add the integral from the foot on an edge's line to one end."""
+    """Add the integral between two distances from the foot on an edge's line."""
     reach, totals, drops = tables[1], tables[4], tables[5]
     longest_t, longest, last_t, nodes = panels
-    sign *= math.copysign(1.0, offset) * math.copysign(1.0, end) if offset != 0 and end != 0 else 0.0
-    if sign == 0:
-        return
     q, square = max(abs(offset), tables[7] * reach), height * height
-    far = abs(end)
-    length = min(far, math.sqrt(max(reach * reach - square - q * q, 0.0)))
+    farthest = math.sqrt(max(reach * reach - square - q * q, 0.0))
+    begin, end = min(near, farthest), min(far, farthest)
     level, level_fraction = _place(square, tables)
-    outside = math.atan2(far, q) - math.atan2(length, q)
-    last, low = min(math.asinh(length / q), last_t), 0.0
+    outside = math.atan2(far, q) - math.atan2(end, q) if far > end else 0.0
+    if near > begin:
+        outside -= math.atan2(near, q) - math.atan2(begin, q)
+    low, last = min(math.asinh(begin / q), last_t), min(math.asinh(end / q), last_t)
     for order in range(out.shape[1]):
         base = drops[level, order]
         base += level_fraction * (drops[level + 1, order] - base)
         out[row, order] += sign * outside * (totals[order] - base)
-    angle = 0.0
+    angle, half = 0.0, nodes.shape[1] // 2
     while low < last:
-        high = min(last, low + min(longest_t, longest / (q * math.cosh(low))))
-        for node in range(nodes.shape[1]):
-            widening = math.cosh((low + high) / 2 + (high - low) / 2 * nodes[0, node])
-            weight = sign * nodes[1, node] / 2 * (high - low) / widening
-            entry, fraction = _place(square + (q * widening) ** 2, tables)
-            angle += weight
-            for order in range(out.shape[1]):
-                found = drops[entry, order]
-                out[row, order] += weight * (found + fraction * (drops[entry + 1, order] - found))
+        widest = math.exp(low)
+        high = min(last, low + min(longest_t, 2 * longest / (q * (widest + 1 / widest))))
+        middle = math.exp((low + high) / 2)
+        for node in range(half):
+            # The nodes of a panel lie in pairs about its middle.
+            factor = math.exp((high - low) / 2 * nodes[0, half + node])
+            for growth in (middle * factor, middle / factor):
+                widening = (growth + 1 / growth) / 2
+                weight = sign * nodes[1, half + node] / 2 * (high - low) / widening
+                entry, fraction = _place(square + (q * widening) ** 2, tables)
+                angle += weight
+                for order in range(out.shape[1]):
+                    found = drops[entry, order]
+                    out[row, order] += weight * (found + fraction * (drops[entry + 1, order] - found))
         low = high
     for order in range(out.shape[1]):
         base = drops[level, order]

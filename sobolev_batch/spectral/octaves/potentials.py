@@ -122,7 +122,8 @@ class Kernels:
 
 def _scale(distances: Reals, cutoff: float) -> Reals:
     """Return where distances lie in the tables: in equal steps of log d at first, of d where kernels oscillate."""
-    return np.asarray(np.log(distances) + cutoff / _LINEAR_FROM * distances)
+    relative = distances * cutoff / _LINEAR_FROM
+    return np.where(relative < 1, np.log(relative), relative - 1)
 
 
 def _grid(cutoff: float, fineness: int) -> tuple[float, float]:
@@ -161,7 +162,7 @@ def _tables(cutoff: float, order: float, fineness: int) -> tuple[float, Reals, R
     faded = np.clip((distances / reach - _FADE) / (1 - _FADE), 0.0, 1.0)
     dense = total + (dense - total) * np.cos(np.pi / 2 * faded) ** 2
     dense[0] = 0.0
-    values = np.gradient(dense, fine) * (1 / distances + cutoff / _LINEAR_FROM) / distances
+    values = np.gradient(dense, fine) / np.minimum(distances, _LINEAR_FROM / cutoff) / distances
     values[-2:] = 0.0
     return total, dense, values
 
@@ -266,33 +267,38 @@ def _over_edges(corners: Reals, normals: Reals, kernels: Kernels) -> Reals:
     first, last = np.einsum("ijk,ijk->ij", corners, along), np.einsum("ijk,ijk->ij", ends, along)
     offsets = np.einsum("ik,ijk->ij", normals, np.cross(corners, along))
     heights = np.repeat(np.einsum("ij,ij->i", normals, corners[:, 0])[:, None], 3, axis=1)
-    parts = [_to_end(offsets.ravel(), heights.ravel(), to.ravel(), kernels) for to in (last, first)]
-    return np.asarray((parts[0] - parts[1]).reshape(len(corners), 3, len(kernels.totals)).sum(axis=1))
+    # From the foot on the line of an edge to both ends, or between the two where they are on one side of it.
+    one_side, lengths = first * last > 0, np.abs([first, last])
+    near = np.where(one_side, lengths.min(axis=0), 0.0)
+    spans = ((near, np.where(one_side, lengths.max(axis=0), lengths[1])), (0 * near, np.where(one_side, 0, lengths[0])))
+    parts = [_of_span(*(rows.ravel() for rows in (offsets, heights, *span)), kernels=kernels) for span in spans]
+    return np.asarray((parts[0] + parts[1]).reshape(len(corners), 3, len(kernels.totals)).sum(axis=1))
 
 
-def _to_end(offsets: Reals, heights: Reals, ends: Reals, kernels: Kernels) -> Reals:
-    """Return ∫ [M(h) - M(√(h² + q²/cos²θ))] dθ from the foot on an edge's line to one end, (n, orders)."""
+def _of_span(offsets: Reals, heights: Reals, near: Reals, far: Reals, *, kernels: Kernels) -> Reals:
+    """Return ∫ [M(h) - M(√(h² + q²/cos²θ))] dθ between two distances from the foot on an edge's line, (n, orders)."""
     reach, squares = kernels.reach, heights**2
     q = np.maximum(np.abs(offsets), _LEAST * reach)
     # Beyond the reach the integrand is constant.
-    lengths = np.minimum(np.abs(ends), np.sqrt(np.maximum(reach**2 - squares - q**2, 0.0)))
+    farthest = np.sqrt(np.maximum(reach**2 - squares - q**2, 0.0))
+    begin, end = np.minimum(near, farthest), np.minimum(far, farthest)
     level, result = kernels.looked_up(kernels.drops, squares), np.zeros((len(q), len(kernels.totals)))
-    outside = np.arctan2(np.abs(ends), q) - np.arctan2(lengths, q)
+    outside = np.arctan2(far, q) - np.arctan2(end, q) - np.arctan2(near, q) + np.arctan2(begin, q)
     result += outside[:, None] * (kernels.totals - level)
     longest = _PANEL_WAVES / kernels.fineness / kernels.cutoff
-    last = np.minimum(np.arcsinh(lengths / q), _LAST)
-    begun, active = np.zeros_like(q), np.flatnonzero(last > 0)
+    begun, last = (np.minimum(np.arcsinh(length / q), _LAST) for length in (begin, end))
+    active = np.flatnonzero(last > begun)
     while len(active):
-        low, near = begun[active], q[active]
-        high = np.minimum(last[active], low + np.minimum(_PANEL / kernels.fineness, longest / (near * np.cosh(low))))
+        low, here = begun[active], q[active]
+        high = np.minimum(last[active], low + np.minimum(_PANEL / kernels.fineness, longest / (here * np.cosh(low))))
         for node, weight in zip(*_PANEL_NODES, strict=True):
             widening = np.cosh((low + high) / 2 + (high - low) / 2 * node)
-            distances = squares[active] + (near * widening) ** 2
+            distances = squares[active] + (here * widening) ** 2
             terms = kernels.looked_up(kernels.drops, distances) - level[active]
             result[active] += (weight / 2 * (high - low) / widening)[:, None] * terms
         begun[active] = high
         active = active[high < last[active]]
-    return np.asarray((np.sign(offsets) * np.sign(ends))[:, None] * result)
+    return np.asarray(np.sign(offsets)[:, None] * result)
 
 
 def doubled_normals(corners: Reals) -> tuple[Reals, Reals]:
