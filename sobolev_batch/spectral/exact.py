@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
 from itertools import pairwise
@@ -41,7 +41,7 @@ from sobolev_batch.spectral.compiled import pays
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.mesh import Corners, Mesh, cross_lengths
-from sobolev_batch.surfaces.shapes.surface import Indices, Reals
+from sobolev_batch.surfaces.shapes.surface import Reals
 
 Complexes = NDArray[np.complex128]
 # A number as a rounded value and what it lacks.
@@ -80,7 +80,7 @@ def exact_transform(mesh: Mesh, frequencies: Reals, backend: Backend = CPU) -> C
 
     def sums(backend: Backend) -> Complexes:
         if backend is CPU and pays(_PAIR_SECONDS * len(mesh.triangles) * len(frequencies)):
-            return _compiled_exact_transform(mesh, [frequencies])
+            return _compiled_exact_transform(mesh, frequencies)
         batch = _BATCH[backend.name]
         parts = []
         for start in range(0, len(mesh.triangles), batch):
@@ -92,27 +92,47 @@ def exact_transform(mesh: Mesh, frequencies: Reals, backend: Backend = CPU) -> C
     return compute_on(_faster(backend, mesh, frequencies), sums)
 
 
-def _compiled_exact_transform(mesh: Mesh, parts: Sequence[Reals]) -> Complexes:
+def _compiled_exact_transform(mesh: Mesh, frequencies: Reals, threads: int = 1) -> Complexes:
     from sobolev_batch.spectral.compiled.divided_differences import exact_sums
 
-    batches = (
-        mesh.triangles[start : start + _COMPILED_BATCH] for start in range(0, len(mesh.triangles), _COMPILED_BATCH)
-    )
-    return _compiled_sums(exact_sums, ((mesh.vertices, triangles) for triangles in batches), parts)
+    doubled = _compiled_doubled_areas(mesh)
+    # Sums of sums round less often.
+    batches = [slice(start, start + _COMPILED_BATCH) for start in range(0, len(doubled), _COMPILED_BATCH)]
+
+    def sums(rows: Reals) -> Complexes:
+        parts = (exact_sums(mesh.vertices, mesh.triangles[batch], doubled[batch], rows) for batch in batches)
+        return sum(parts, np.zeros(rows.shape[1], dtype=np.complex128))
+
+    return _by_threads(sums, frequencies, threads)
 
 
-def _compiled_sums(
-    loop: Callable[..., Complexes], batches: Iterable[tuple[Reals, Indices]], parts: Sequence[Reals]
-) -> Complexes:
-    """Return what a compiled loop sums over batches of vertices and triangles, with a thread for each part of the ξ."""
-    rows = [np.ascontiguousarray(frequencies.T) for frequencies in parts]
-    total = np.zeros(sum(map(len, parts)), dtype=np.complex128)
-    with ThreadPoolExecutor(len(rows)) as pool:
-        for vertices, triangles in batches:
-            a, b, c = np.moveaxis(vertices.T[:, triangles.T], 1, 0)
-            sums = partial(loop, vertices, triangles, doubled_areas((a, b, c)))
-            total += np.concatenate(list(pool.map(sums, rows)))
+def _compiled_sampled_transform(mesh: Mesh, frequencies: Reals, threads: int) -> Complexes:
+    from sobolev_batch.spectral.compiled.divided_differences import sampled_sums
+
+    total = np.zeros(len(frequencies), dtype=np.complex128)
+    for _, batch in mesh.batches(_COMPILED_BATCH):
+        doubled = _compiled_doubled_areas(batch)
+        total += _by_threads(partial(sampled_sums, batch.vertices, batch.triangles, doubled), frequencies, threads)
     return total
+
+
+def _compiled_doubled_areas(mesh: Mesh) -> Reals:
+    from sobolev_batch.spectral.compiled.divided_differences import plain_doubled_areas
+
+    doubled, is_flat = plain_doubled_areas(mesh.vertices, mesh.triangles, _FLATNESS)
+    if np.any(is_flat):
+        a, b, c = (np.ascontiguousarray(corner.T) for corner in mesh.corners(np.flatnonzero(is_flat)))
+        doubled[is_flat] = _doubled_areas_of_flat((a, b, c))
+    return np.asarray(doubled)
+
+
+def _by_threads(sums: Callable[[Reals], Complexes], frequencies: Reals, threads: int) -> Complexes:
+    """Return sums at frequencies (P, 3), of which each thread takes a part, as rows (3, k)."""
+    parts = [np.ascontiguousarray(part.T) for part in np.array_split(frequencies, threads)]
+    if threads == 1:
+        return sums(parts[0])
+    with ThreadPoolExecutor(threads) as pool:
+        return np.concatenate(list(pool.map(sums, parts)))
 
 
 def _faster(backend: Backend, mesh: Mesh, frequencies: Reals) -> Backend:
@@ -356,12 +376,9 @@ def sampled_transform(mesh: Mesh, frequencies: Reals, threads: int = 1, backend:
     gaps = 2 * np.pi * np.linalg.norm(frequencies, axis=1) * mesh.edge_length_range[1]
     values = np.empty(len(frequencies), dtype=np.complex128)
     if backend is CPU and pays(_PAIR_SECONDS * len(mesh.triangles) * len(frequencies)):
-        from sobolev_batch.spectral.compiled.divided_differences import SERIES_GAP, sampled_sums
-
-        fine = gaps < SERIES_GAP
-        values[fine] = _compiled_exact_transform(mesh, np.array_split(frequencies[fine], threads))
-        batches = ((batch.vertices, batch.triangles) for _, batch in mesh.batches(_COMPILED_BATCH))
-        values[~fine] = _compiled_sums(sampled_sums, batches, np.array_split(frequencies[~fine], threads))
+        fine = gaps < _SERIES_GAP
+        values[fine] = _compiled_exact_transform(mesh, frequencies[fine], threads)
+        values[~fine] = _compiled_sampled_transform(mesh, frequencies[~fine], threads)
         return values
     fine = gaps < _FINE_MESH
     values[fine] = exact_transform(mesh, frequencies[fine], backend)

@@ -21,11 +21,11 @@ _TURN = 2 * math.pi
 # Taylor coefficients of sin(2πx)/x and cos(2πx) in x²: up to a quarter of a cycle the rest is below 2e-17.
 _SINE = tuple((-1) ** n * _TURN ** (2 * n + 1) / math.factorial(2 * n + 1) for n in range(11))
 _COSINE = tuple((-1) ** n * _TURN ** (2 * n) / math.factorial(2 * n) for n in range(12))
-# The series in gaps below `SERIES_GAP` takes 19 terms (-1)^(n // 2) h_n / (n+2)!.
-SERIES_GAP = 2.0
+# The series in gaps below `_SERIES_GAP` takes 19 terms (-1)^(n // 2) h_n / (n+2)!.
+_SERIES_GAP = 2.0
 _FACTORS = np.array([(-1) ** (n // 2) / math.factorial(n + 2) for n in range(20)])
 # A product of gaps below this (radians cubed) goes through the stable form: the plain one would lose as many digits.
-LEAST_PRODUCT = 2e-3
+_LEAST_PRODUCT = 2e-3
 # Frequencies at a time: the exponentials at some thousand vertices stay in a processor's cache.
 _LANES = 32
 # Splits a double into halves of 26 bits each.
@@ -105,7 +105,7 @@ def _quotient(a: complex, b: complex, c: complex, ab: float, ac: float) -> compl
 
 @part
 def _are_close(ab: float, bc: float, ac: float) -> bool:
-    return (abs(ab) < SERIES_GAP) & (abs(bc) < SERIES_GAP) & (abs(ac) < SERIES_GAP)
+    return (abs(ab) < _SERIES_GAP) & (abs(bc) < _SERIES_GAP) & (abs(ac) < _SERIES_GAP)
 
 
 @part
@@ -139,6 +139,18 @@ def _gaps(
     ab = -_TURN * (u * edges[0] + v * edges[1] + w * edges[2])
     bc = -_TURN * (u * edges[3] + v * edges[4] + w * edges[5])
     return ab, bc, ab + bc
+
+
+@loop
+def plain_doubled_areas(vertices: Reals, triangles: Indices, flatness: float) -> tuple[Reals, NDArray[np.bool_]]:
+    """Return twice the area of each triangle (k,), and whether that is a smaller fraction of its squared edges."""
+    doubled, is_flat = np.empty(len(triangles)), np.empty(len(triangles), dtype=np.bool_)
+    for i in range(len(triangles)):
+        px, py, pz, qx, qy, qz = _edges(vertices, triangles[i])
+        x, y, z = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
+        doubled[i] = np.sqrt(x * x + y * y + z * z)
+        is_flat[i] = doubled[i] < flatness * (px * px + py * py + pz * pz + qx * qx + qy * qy + qz * qz)
+    return doubled, is_flat
 
 
 @loop
@@ -222,7 +234,7 @@ def _sampled_group(
         for f in range(len(u)):
             ab, bc, ac = _gaps(edges, u[f], v[f], w[f])
             product = ab * bc * ac
-            is_apart = abs(product) >= LEAST_PRODUCT
+            is_apart = abs(product) >= _LEAST_PRODUCT
             close += not is_apart
             factor = area / product if is_apart else 0.0
             middle, imaginary = cosines[b, f], sines[b, f]
@@ -231,7 +243,7 @@ def _sampled_group(
         if close:
             for f in range(len(u)):
                 ab, bc, ac = _gaps(edges, u[f], v[f], w[f])
-                if not abs(ab * bc * ac) >= LEAST_PRODUCT:
+                if not abs(ab * bc * ac) >= _LEAST_PRODUCT:
                     at_a, at_b = complex(cosines[a, f], sines[a, f]), complex(cosines[b, f], sines[b, f])
                     value = area * _stable(at_a, at_b, complex(cosines[c, f], sines[c, f]), ab, bc, ac)
                     reals[f] += value.real
