@@ -128,7 +128,7 @@ class Job:
         transform = self.transform
         if self.distance_target is None:
             return lambda surface, lattice: transform
-        return settings_for(self.distance_target.error_target(surface).tightened(_OCTAVES_SHARE), transform.dtype)
+        return settings_for(self.distance_target.error_target(surface).tightened(_OCTAVES_SHARE))
 
     def stored_record(self) -> Record | None:
         """Return the completion record of the field if it exists: Dask repeats tasks whose worker was lost."""

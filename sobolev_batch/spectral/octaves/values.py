@@ -72,14 +72,14 @@ class OctaveValues:
         return norms_of_checks(self.radii, self.squares, orders)
 
 
-def settings_for(target: ErrorTarget, dtype: ComplexDtype | None = None) -> Settings:
-    """Return a function that gives the cheapest settings for a target; the dtype may be given."""
+def settings_for(target: ErrorTarget) -> Settings:
+    """Return a function that gives the cheapest settings for a target."""
 
     def settings(surface: Surface, lattice: OctaveLattice) -> TransformSettings:
         if kind_of(surface).is_closed_form:
-            return TransformSettings(dtype=dtype or "complex128")
+            return TransformSettings()
         cheapest: ComplexDtype = "complex64" if permits_single(surface, lattice, target) else "complex128"
-        return choose_settings(surface, lattice, target, TransformSettings(dtype=dtype or cheapest))
+        return choose_settings(surface, lattice, target, TransformSettings(dtype=cheapest))
 
     return settings
 

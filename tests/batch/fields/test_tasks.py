@@ -25,8 +25,11 @@ from sobolev_batch.batch.store.create import prepare_store
 from sobolev_batch.batch.study.plan import Plan, make_plan
 from sobolev_batch.errors import ClusterError
 from sobolev_batch.shapes import Similarity, icosphere
-from sobolev_batch.spectral.backends import CPU_COSTS, NufftSpec, Workload
-from sobolev_batch.spectral.lattice import Block
+from sobolev_batch.spectral.adaptive.solve import DistanceTarget
+from sobolev_batch.spectral.adaptive.tolerance import Accuracy
+from sobolev_batch.spectral.backends import CPU_COSTS, ComplexDtype, NufftSpec, Workload
+from sobolev_batch.spectral.lattice import Block, OctaveLattice
+from sobolev_batch.spectral.octaves.sampling import Octave
 from sobolev_batch.spectral.rules import gauss_rule
 from sobolev_batch.spectral.transform import TransformSettings, fastest_spec, projected_bytes
 from sobolev_batch.surfaces.sources.registry import ExpectedSize
@@ -55,6 +58,18 @@ def test_a_mesh_is_one_task_whatever_the_memory_allows(store_path: Path) -> None
     assert replace(record.facts, points=whole.facts.points) == whole.facts
     expected, values = job.store.read_fields([0, 1], plan.lattice.place(plan.lattice.half))
     assert np.abs(values - expected).max() < 2e-9 * whole.facts.area
+
+
+def test_octaves_have_the_precision_that_their_own_accuracy_needs(store_path: Path) -> None:
+    job, octave = job_of(make_plan(Study.from_table(FINE)), store_path), Octave(2.0, 1)
+    lattice = OctaveLattice.random(octave.lowest, octave.highest, 16, np.random.default_rng(0))
+    precisions: tuple[ComplexDtype, ...] = ("complex64", "complex128")
+    for precision in precisions:
+        for distance, expected in ((1.0, "complex64"), (1e-6, "complex128")):
+            target = DistanceTarget((-2.0,), Accuracy(0.1), None, (distance,))
+            both = replace(job, transform=TransformSettings(dtype=precision), distance_target=target)
+            mesh = job.load()
+            assert both.octave_settings(mesh)(mesh, lattice).dtype == expected
 
 
 def test_a_task_whose_record_is_there_writes_nothing(store_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
