@@ -39,8 +39,6 @@ _log = logging.getLogger(__name__)
 
 # Fraction of a field's error that each octave may have, inverted: the squares of some octaves' errors add up.
 _OCTAVES_SHARE = 5.0
-# Random points that show what lies beyond the octaves in a norm; a distance from the reference takes more.
-_POINTS_OF_NORM = 64
 
 
 @dataclass(frozen=True)
@@ -209,7 +207,7 @@ def _store_octaves(job: Job, surface: Surface) -> StoredBlocks:
     quality = TailQuality(
         tuple(float(radius) for octave in values for radius in octave.radii),
         tuple(float(square) for octave in values for square in octave.squares),
-        remainder([surface], [1], cutoff, points=_POINTS_OF_NORM),
+        remainder([surface], [1], cutoff, is_scale=True),
         None if reference is None else _remainder_between(surface, reference, cutoff),
     )
     samples = np.concatenate([octave.values for octave in values])
@@ -220,7 +218,9 @@ def _store_octaves(job: Job, surface: Surface) -> StoredBlocks:
 def _remainder_between(surface: Surface, reference: Surface, cutoff: float) -> Remainder:
     """Return what lies beyond a cutoff between two surfaces: only what they do not have in common counts."""
     rests = without_common_parts((surface, reference))
-    return remainder(list(rests.values()), list(rests), cutoff) if rests else Remainder.between(0.0, 0.0, cutoff)
+    if not rests:
+        return Remainder.between(0.0, 0.0, cutoff)
+    return remainder(list(rests.values()), list(rests), cutoff)
 
 
 def _store_whole(job: Job, surface: Surface) -> StoredBlocks:

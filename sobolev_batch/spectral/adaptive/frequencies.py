@@ -47,9 +47,6 @@ from sobolev_batch.surfaces.shapes.surface import Reals, Surface, centering
 
 Complexes = NDArray[np.complexfloating]
 
-# Random points that show what lies beyond all frequencies in a norm that is a scale.
-_POINTS_OF_SCALES = 64
-
 
 @dataclass(frozen=True, eq=False)
 class Measure:
@@ -138,15 +135,20 @@ class Frequencies:
         return np.asarray(np.sum([one.error_norms(self.weights) for one in values], axis=0))
 
     def norms_of(
-        self, measure: Measure, surfaces: Sequence[Surface], signs: Sequence[int], errors: Reals
+        self,
+        measure: Measure,
+        surfaces: Sequence[Surface],
+        signs: Sequence[int],
+        errors: Reals,
+        tail: Tail | None = None,
     ) -> NormEstimate:
-        """Return the norms of a measure from the norms of its values' own errors (orders,)."""
+        """Return the norms of a measure from the norms of its values' own errors (orders,); the tail may be known."""
         sums = self.lattice_sums(measure, measure)
         if not self.has_tail:
             support = Support(support_of(surfaces).areas, self.widths)
             return estimate_norms(sums, self.weights, support, errors)
         images = aliased(sums, self.weights, self.widths)
-        return self.tail(measure, surfaces, signs).estimate(sums.totals, images, errors)
+        return (tail or self.tail(measure, surfaces, signs)).estimate(sums.totals, images, errors)
 
     def lattice_sums(self, measure: Measure, other: Measure) -> Sums:
         """Return the sums of Re(a conj b) over the lattice."""
@@ -162,8 +164,7 @@ class Frequencies:
     def tail(self, measure: Measure, surfaces: Sequence[Surface], signs: Sequence[int]) -> Tail:
         """Return the tail from the octaves, and what is known to lie beyond them."""
         # Norms of single surfaces serve as scales.
-        points = _POINTS_OF_SCALES if len(surfaces) == 1 else None
-        beyond = remainder(surfaces, signs, self._cutoff, self.orders, points)
+        beyond = remainder(surfaces, signs, self._cutoff, self.orders, is_scale=len(surfaces) == 1)
         return Tail.from_sums(self.octave_sums(measure, measure), *beyond.at(self.orders))
 
 
@@ -229,15 +230,16 @@ class Reference:
         other = Measure.from_values([*self.difference, values], [*self.signs, 1])
         # Of a, b and their difference.
         parts = (other, self.pair[:1], [1]), (own, self.pair[1:], [1]), (difference, self.surfaces, self.signs)
-        norms = at.norms_of(*parts[1], at.errors([values]))
-        distances = at.norms_of(*parts[2], at.errors(self.difference) + self.moved)
+        tails = [at.tail(*part) for part in parts] if at.has_tail else [None] * len(parts)
+        norms = at.norms_of(*parts[1], at.errors([values]), tails[1])
+        distances = at.norms_of(*parts[2], at.errors(self.difference) + self.moved, tails[2])
         products = at.lattice_sums(difference, own)
         if not at.has_tail:
             return ReferenceEstimate.on_lattice(products, distances, norms, at.weights, at.widths)
+        of_a, of_b, of_difference = (cast(Tail, tail) for tail in tails)
         in_octaves = at.octave_sums(difference, own)
         statistical = statistical_errors(in_octaves) if in_octaves else 0.0
         # Beyond the octaves ||a||² - ||b||² - ||a - b||² is twice the product <a - b, b>.
-        of_a, of_b, of_difference = (at.tail(*part) for part in parts)
         beyond = (of_a.beyond - of_b.beyond - of_difference.beyond) / 2
         uncertainty = np.sum([tail.uncertainty for tail in (of_a, of_b, of_difference)], axis=0) / 2 + statistical
         images = aliased(products, at.weights, at.widths)

@@ -72,6 +72,8 @@ _GROWTH = 4.0
 _OCTAVE_SECONDS, _MOST_SECONDS = 20.0, 200.0
 # Random points of a remainder at most, how many more than needed are taken, and how many more to check it again.
 _MOST_POINTS, _MORE_POINTS, _MORE_TO_CHECK = 400_000, 1.3, 4
+# Share of squared errors that is most of them.
+_MOSTLY = 0.5
 # Nodes that a parametrised surface may have; beyond the frequency that they resolve it has no octaves.
 _MOST_SMOOTH_NODES = 2e6
 
@@ -308,8 +310,8 @@ def farther_out(state: State) -> State | None:
     octave = Octave(state.cutoff, len(state.octaves) + 1)
     can_go_on = len(state.octaves) < _MOST_OCTAVES and octave.highest <= _resolvable_frequency(problem)
     points = int(_MORE_POINTS * beyond.points * state.excess**2)
-    if beyond.points < beyond.covering:
-        # What may be hidden is most of the error, until nothing is.
+    if beyond.hidden > _MOSTLY:
+        # Nothing is hidden from so many.
         points = min(points, beyond.covering)
     sampling = _first_sampling(state, octave) if can_go_on else None
     seconds = np.inf if sampling is None else state.sampling_seconds(sampling) + beyond.seconds(beyond.points) / 4

@@ -37,15 +37,16 @@ from sobolev_batch.spectral.octaves.potentials import (
 )
 from sobolev_batch.surfaces.shapes.surface import Reals, Surface
 
-# Random points of the first estimate; pairs of a point and a triangle that it may take, and the fewest points.
-USUAL_POINTS, _FEWEST_POINTS, _USUAL_PAIRS = 256, 40, 300_000
+# Random points of the first estimate, the fewest, and those of a scale; pairs of a point and a triangle that they may
+# take.
+USUAL_POINTS, _FEWEST_POINTS, _POINTS_OF_SCALES, _USUAL_PAIRS = 256, 40, 64, 300_000
 # Points for each square of the reach, so that none is farther than it from the next; and those of them that are
 # computed again with twice the reach and twice the nodes.
 _PER_REACH, _CONTROLS = 2.0, 24
 # What the cut at the reach and the nodes change a potential by, as a part of what a surface alone has: at most 4e-4 in
 # the mean over points on scans, a cow, spheres and a square, at all orders. Controls are drawn where that is a larger
-# fraction of the other errors.
-_CUT, _CUT_FRACTION = 1e-3, 0.3
+# fraction of the other errors. What they leave was at most 4e-5 for single pairs of a point and a triangle.
+_CUT, _CUT_FRACTION, _CUT_LEFT = 1e-3, 0.3, 2e-5
 # Points saw unevenly where the mean square of what they saw exceeds the square of the mean by this factor, and nothing
 # where it is this fraction of what a surface alone has.
 _UNEVEN, _NOTHING = 2.0, 1e-11
@@ -70,6 +71,7 @@ class Remainder:
         points: Number of points.
         pairs: Number of pairs of a point and a triangle.
         covering: Number of points from which no part of a surface is hidden.
+        hidden: Largest share of the squared errors that allows for what too few points may have missed.
     """
 
     cutoff: float
@@ -79,6 +81,7 @@ class Remainder:
     points: int = 0
     pairs: int = 0
     covering: int = 0
+    hidden: float = 0.0
 
     @classmethod
     def between(cls, lowest: float, highest: float, cutoff: float) -> Self:
@@ -112,11 +115,14 @@ def remainder(
     points: int | None = None,
     seed: int = 0,
     threads: int = 1,
+    *,
+    is_scale: bool = False,
 ) -> Remainder:
     """Estimate what lies beyond a cutoff in the norm of a signed sum of surfaces, in units of length.
 
     The cutoff is the |ξ| at which the `smooth_step` ends, in cycles per unit length. By default there are enough orders
     to interpolate between, and as many random points as nothing is hidden from, if they take at most about a second.
+    For a norm that only serves as a scale, few points will do.
     """
     known = tuple(sorted({max(order, LOWEST_ORDER) for order in orders or _USUAL_ORDERS}, reverse=True))
     spacing, rng = reach_of(known[0]) / cutoff, np.random.default_rng(seed)
@@ -124,7 +130,8 @@ def remainder(
     seen_by = _Seen(sheets, Kernels.of_orders(cutoff, known), threads)
     # Nothing can cancel in a sum without differences.
     covering = int(_PER_REACH * sheets.area / spacing**2) if len(set(signs)) > 1 else 0
-    count = points or min(max(covering, USUAL_POINTS), seen_by.affordable(rng))
+    usual = _POINTS_OF_SCALES if is_scale else min(max(covering, USUAL_POINTS), seen_by.affordable(rng))
+    count = points or usual
     draw = sheets.even(min(count, max(covering, USUAL_POINTS)), rng)
     potentials, pairs = seen_by.potentials(draw.points)
     total, seen = len(draw.points), seen_by.shares(potentials)
@@ -148,17 +155,19 @@ def remainder(
     means = terms.mean(axis=0)
     # A single point may stand for others like it that were not met.
     variances = terms.var(axis=0, ddof=1) / n + (np.abs(terms - means).max(axis=0) / n) ** 2
-    if total < covering:
-        variances += (draw.weights.max() * seen_by.alone) ** 2
+    missed = (draw.weights.max() * seen_by.alone) ** 2 if total < covering else np.zeros(len(known))
+    variances += missed
+    hidden = float((missed / np.maximum(variances, np.finfo(np.float64).tiny)).max())
     errors = np.sqrt(variances) * _quantile(n)
-    cut = _CUT * sheets.area * seen_by.alone
-    if np.any(cut > _CUT_FRACTION * errors):
+    cut, left = (part * sheets.area * seen_by.alone for part in (_CUT, _CUT_LEFT))
+    if not is_scale and np.any(cut > _CUT_FRACTION * errors):
         corrections, cut = seen_by.corrections(draw, potentials, rng)
         means += corrections
-    errors = errors + cut
+    errors = errors + cut + left
     scales = np.array([tail_integral(cutoff, order) for order in known])
     energies = means / scales
-    return Remainder(cutoff, known, tuple(energies.tolist()), tuple((errors / scales).tolist()), total, pairs, covering)
+    errors /= scales
+    return Remainder(cutoff, known, tuple(energies.tolist()), tuple(errors.tolist()), total, pairs, covering, hidden)
 
 
 def _quantile(count: int) -> float:
