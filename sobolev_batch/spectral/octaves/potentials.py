@@ -30,7 +30,7 @@ from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.surface import Indices, Reals
 
 # Processor time of a pair of a point and a triangle, and of each of its orders, in seconds: on arrays, and compiled.
-_ON_ARRAYS, _COMPILED = (7e-7, 3e-7), (2e-7, 4e-8)
+_ON_ARRAYS, _COMPILED = (1e-6, 4e-7), (5e-7, 5e-8)
 # Distances in wavelengths 1/X between which kernels are tabulated. The smaller one is rounding. Beyond the larger one,
 # which depends on the order, they are below 1 % of what they are at zero, and from this fraction of it on they fade.
 _LEAST, _FADE = 1e-12, 0.75

@@ -71,6 +71,18 @@ def test_flat_faces_that_repeat_against_their_heat_trace(name: str, order: float
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_thin_surfaces_that_nearly_cancel(seed: int) -> None:
+    orders, turn = (-1.0, -2.0, -4.0), np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+    rods = [Rectangles.box((-0.5, y, 0.0), (0.5, y + 1e-3, 1e-3)) for y in (0.0, 2e-3)]
+    truth = rods[0].distance(rods[1], orders)
+    one, other = (Mesh(rod.mesh().vertices @ turn.T, rod.mesh().triangles) for rod in rods)
+    found = distance(one, other, orders, rtol=0.1, seed=seed)
+    assert found["within"].all()
+    assert (np.abs(found["distance"].values - truth) <= found["error"].values).all()
+
+
+@pytest.mark.slow
 def test_a_seed_makes_results_reproducible_and_another_one_changes_them() -> None:
     pair = icosphere(1), icosphere(2)
     first, again, other = (distance(*pair, -1.0, rtol=0.003, seed=seed) for seed in (1, 1, 2))
