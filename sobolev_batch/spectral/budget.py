@@ -13,7 +13,7 @@ from itertools import product
 from typing import Self
 
 import numpy as np
-from scipy.special import beta, exprel, gammaln, kve, zeta
+from scipy.special import beta, exprel, gamma, gammaln, kve, zeta
 
 from sobolev_batch.spectral.lattice import SobolevWeights
 from sobolev_batch.surfaces.shapes.surface import DIRECTIONS, Reals
@@ -233,15 +233,17 @@ def modulus_bound(area: float, orders: Reals, highest: float) -> Reals:
 def norm_of_moves(areas: Reals, distances: Reals, orders: Sequence[float]) -> Reals:
     """Return what no norm changes by (orders,) if flat faces of some areas move by distances out of their planes.
 
-    Along a plane Parseval's identity leaves area ∫ (1 + z²)^s 4 sin²(πzd) dz of the square at most, where sin² x is at
-    most x^2p for all p from 0 to 1. The norms of different planes add.
+    By Parseval's identity along a plane, the square is at most area ∫ (1 + z²)^s 4 sin²(πzd) dz. There sin² x is at
+    most x^2p for all p from 0 to 1, and at high orders (1 + z²)^s at most |z|^2s. Norms of different planes add.
     """
-    exponents = np.linspace(0, 1, 41)
-    norms = []
-    for order in orders:
-        p = exponents[exponents < -order - 0.5]
-        squares = 4 * areas[:, None] * (np.pi * distances[:, None]) ** (2 * p) * beta(p + 0.5, -order - 0.5 - p)
-        norms.append(np.sqrt(np.where(distances > 0, squares.min(axis=1), 0.0)).sum())
+    exponents, norms = np.linspace(0, 1, 41), []
+    for a in -np.array(orders):
+        p = exponents[exponents < a - 0.5]
+        squares = (4 * (np.pi * distances[:, None]) ** (2 * p) * beta(p + 0.5, a - 0.5 - p)).min(axis=1)
+        if a < 1.5:
+            powers = 2 * np.pi * (2 * np.pi * distances) ** (2 * a - 1) / (gamma(2 * a) * -np.cos(np.pi * a))
+            squares = np.minimum(squares, powers)
+        norms.append(np.sqrt(np.where(distances > 0, areas * squares, 0.0)).sum())
     return np.array(norms)
 
 

@@ -25,8 +25,8 @@ _GRID, _LEAST_HEIGHT = 0.25, 2.0
 # How far off areas may be, relative to them, and the least fraction of them that is worth taking out.
 _BALANCE, _LEAST_FRACTION = 1e-12, 0.05
 _MOST_LAYERS = 16
-# Triangles that are measured at a time.
-_BATCH = 1 << 14
+# Triangles that are measured at a time, and the most pairs of a small one and a plane, which may be tilted so far.
+_BATCH, _MOST_PAIRS, _LEAST_COSINE = 1 << 14, 1 << 23, 1 - 2e-8
 # A direction without pattern, to whose side normals are turned, and a projection of normals and offsets.
 _SIDE, _PROJECTION = np.array([0.4127, 0.7391, 0.5323]), np.array([0.4862, -0.3817, 0.6254, 0.4775])
 # Dimensions of polygons.
@@ -146,8 +146,15 @@ def _shared_planes(sides: Sequence[_Side], tolerance: float) -> tuple[Reals, lis
     ]
     corners = [side.corners(which) for side, which in zip(sides, members, strict=True)]
     planes = _planes_through(np.concatenate(corners), np.concatenate([cluster[half] for half in halves]))
-    for which, own, half, plane in zip(members, corners, halves, of, strict=True):
+    step = max(1, _MOST_PAIRS // (8 * len(planes)))
+    for side, which, own, half, plane in zip(sides, members, corners, halves, of, strict=True):
         plane[which] = np.where(_heights_above(own, planes[cluster[half]]) <= tolerance, cluster[half], -1)
+        small = np.flatnonzero((side.heights < 8 * width) & (side.areas > 0))
+        for start in range(0, len(small) if len(small) * len(planes) <= _MOST_PAIRS else 0, step):
+            some = small[start : start + step]
+            is_in = _heights_above(side.corners(some)[:, None], planes) <= tolerance
+            is_in &= np.abs(side.planes[some, :3] @ planes[:, :3].T) >= _LEAST_COSINE
+            plane[some] = np.where(is_in.any(axis=1), is_in.argmax(axis=1), -1)
     shared = np.intersect1d(of[0], of[1])
     shared = shared[shared >= 0]
     numbers = np.full(len(planes) + 1, -1)
@@ -188,7 +195,7 @@ class _Cut:
 
 
 def _cut(sides: Sequence[_Side], of: Sequence[Indices], planes: Reals, rounding: float) -> list[_Cut]:
-    """Cut planes, of which each triangle has a number, or -1 (m,); those that GEOS refuses are left out."""
+    """Cut planes, whose numbers triangles have, or -1 (m,); those that GEOS refuses are left out."""
     if not len(planes):
         return []
     from shapely.errors import GEOSException
@@ -219,7 +226,11 @@ def _cut_together(
     sheets = [_Sheet.of(side, plane, planes, frames, grid) for side, plane in zip(sides, of, strict=True)]
     depth = max(sheet.layers.shape[1] for sheet in sheets)
     mine, others = (sheet.padded(depth) for sheet in sheets)
-    rests = [shapely.difference(*pair, grid_size=grid) for pair in ((mine, others), (others, mine))]
+    # Without corners on straight sides there are fewer triangles.
+    rests = [
+        shapely.simplify(shapely.difference(*pair, grid_size=grid), rounding)
+        for pair in ((mine, others), (others, mine))
+    ]
     covered, left = ([shapely.area(one).sum(axis=1) for one in both] for both in ((mine, others), rests))
     before, after = sheets[0].areas + sheets[1].areas, left[0] + left[1]
     off = np.abs(covered[0] - covered[1] - left[0] + left[1])
@@ -272,8 +283,8 @@ class _Sheet:
         which = which[np.argsort(of[which], kind="stable")]
         plane, corners, count = of[which], side.corners(which), len(planes)
         polygons = shapely.polygons(corners @ frames[plane].transpose(0, 2, 1))
-        flat: Reals = shapely.area(polygons)
-        areas, gaps = np.bincount(plane, flat, count), np.zeros(count)
+        areas = np.asarray(np.bincount(plane, shapely.area(polygons), count), dtype=np.float64)
+        gaps = np.zeros(count)
         np.maximum.at(gaps, plane, _heights_above(corners, planes[plane]))
         unions = shapely.union_all(shapely.multipolygons(polygons, indices=plane)[:, None], axis=1)
         ends = np.cumsum(np.bincount(plane, minlength=count))
