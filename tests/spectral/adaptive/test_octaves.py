@@ -138,6 +138,18 @@ def test_a_remainder_that_inner_ones_contradict_is_no_accuracy(monkeypatch: pyte
         distance(a.mesh(), b.mesh(), -1.0, rtol=0.01)
 
 
+@pytest.mark.slow
+def test_points_that_see_less_than_is_there_already_are_no_accuracy(monkeypatch: pytest.MonkeyPatch) -> None:
+    def blind(*given: Any, **options: Any) -> Remainder:
+        """Return nothing, from many points that still leave much out."""
+        beyond = remainder(*given, **options)
+        return replace(beyond, energies=(0.0,), errors=(0.0,), points=10**8, covering=10**9, hidden=0.0)
+
+    monkeypatch.setattr(octaves, "remainder", blind)
+    with pytest.raises(AccuracyError, match="out of reach"):
+        distance(MOVED_BOX[0].mesh(), MOVED_BOX[1].mesh(), -1.0, rtol=0.1)
+
+
 @pytest.mark.parametrize("is_chance", [True, False])
 def test_other_points_confirm_a_disagreement_or_show_that_it_was_chance(
     monkeypatch: pytest.MonkeyPatch, is_chance: bool
