@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sobolev_batch import Mesh
 from sobolev_batch.spectral.octaves import potentials
 from sobolev_batch.spectral.octaves.potentials import Kernels, add_compiled, of_triangles
-from sobolev_batch.spectral.octaves.remainder import remainder
+from sobolev_batch.spectral.octaves.remainder import remainderfrom tests.support.rectangles import Rectangles
 
 Reals = NDArray[np.float64]
 ORDERS = (-0.75, -1.0, -3.0)
@@ -94,12 +94,10 @@ def test_no_edit_of_a_face_that_is_cut_anew_escapes(width: float, relative: floa
 
 
 @pytest.mark.slow
-def test_a_kernel_that_is_cut_too_early_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
-    corners = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    pair = [Mesh(corners, [[0, 1, 2], [0, 2, 3]]), Mesh(corners + np.array([0.003, 0.0, 0.01]), [[0, 1, 3], [1, 2, 3]])]
-    truth, of_truth = remainder(pair, [1, -1], 20.0, [-3.0], points=4000).at([-3.0])
-    monkeypatch.setattr(potentials, "_REACHES", ((-4.0, -1.0), (4.0, 3.0)))
-    potentials._tables.cache_clear()
-    value, error = remainder(pair, [1, -1], 20.0, [-3.0], points=4000).at([-3.0])
-    potentials._tables.cache_clear()
-    assert abs(value - truth) < error + of_truth
+def test_nodes_that_are_too_few_along_edges_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    rods = [Rectangles.box((-0.5, y, 0.0), (0.5, y + 1e-3, 1e-3)).mesh() for y in (0.0, 2e-3)]
+    truth, of_truth = remainder(rods, [1, -1], 12.0, [-2.0], points=4000).at([-2.0])
+    monkeypatch.setattr(potentials, "_PANEL", 2.4)
+    monkeypatch.setattr(potentials, "_PANEL_WAVES", 3.0)
+    value, error = remainder(rods, [1, -1], 12.0, [-2.0], points=4000).at([-2.0])
+    assert abs(value - truth) < error + of_truth < truth
