@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from sobolev_batch import Mesh
 from sobolev_batch.spectral.octaves import potentials
 from sobolev_batch.spectral.octaves.potentials import Kernels, add_compiled, of_triangles
-from sobolev_batch.spectral.octaves.remainder import remainderfrom tests.support.rectangles import Rectangles
+from sobolev_batch.spectral.octaves.remainder import remainder
+from tests.support.rectangles import Rectangles
 
 Reals = NDArray[np.float64]
 ORDERS = (-0.75, -1.0, -3.0)
