@@ -16,7 +16,7 @@ from sobolev_batch.spectral.backends import ComplexDtype, Complexes, backend_nam
 from sobolev_batch.spectral.kinds import kind_of
 from sobolev_batch.spectral.lattice import AXES, Block, Lattice, Orders, SobolevWeights, check_orders, shell_sums
 from sobolev_batch.spectral.octaves.remainder import Remainder
-from sobolev_batch.spectral.probe import Probe, Sample, draws_for, measure, needs_probe, norms_of_checks, probe_block
+from sobolev_batch.spectral.probe import COMMON, Probe, Sample, draws_for, needs_probe, norms_of_checks, probe_block
 from sobolev_batch.spectral.transform import (
     ON_CPU,
     ErrorTarget,
@@ -200,9 +200,9 @@ def compute_field(
     if not needs_probe(surface, settings):
         probe = Probe()
     elif sample is not None and plan.lowest_degree <= USUAL_DEGREE:
-        probe = measure(sample.draws, values[sample.draws.places(block)], sample.exact)
+        probe = probe_block(surface, lattice, settings, block, values, sample.draws, execution.backend, sample)
     else:
-        draws = draws_for([surface], lattice, orders, plan.lowest_degree)
+        draws = draws_for([surface], lattice, orders, plan.lowest_degree, COMMON)
         probe = probe_block(surface, lattice, settings, block, values, draws, execution.backend)
     quality = Quality.from_surface(surface, probe)
     return Field(values, transformed.points, transformed.backend, quality, settings)

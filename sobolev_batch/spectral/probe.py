@@ -9,7 +9,7 @@ field is checked end to end. Those of a parametrised surface are a direct sum ov
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -31,22 +31,38 @@ _CAUTION = 8.0
 _CANDIDATES = 1 << 20
 # Ranges of |ξ| that represent an error of the same size at every frequency.
 _BANDS = 8
+_TINY = np.finfo(np.float64).tiny
+# The fraction of draws that are made before a field is known, and how many follow its values for each of them; fewer
+# where the exact values at the former are known already, and only the latter take time.
+COMMON, _OWN, _OWN_BESIDE_SAMPLE = 2 / 3, 0.5, 0.25
+# Values among which those are drawn: to look at more takes longer than the rest of the probe.
+_LOOKED_AT = 1 << 18
 
 
 @dataclass(frozen=True)
 class Draws:
     """Random frequencies ξ = h k of the half lattice, float64 (P, 3), and the lattice indices k, int64 (P, 3).
 
-    The scales (P,) are trapezoidal weight / (P p), the factor of a squared error.
+    The scales (P,) are trapezoidal weight / (P p), the factor of a squared error. They follow from the orders, the
+    degree and the number of all draws; these may be some of them.
     """
 
     indices: Indices
     frequencies: Reals
     scales: Reals
+    orders: tuple[float, ...]
+    degree: int
+    count: int
+    seed: int
 
     def places(self, block: Block) -> tuple[Indices, ...]:
         """Return the array indices of the draws in a block that holds them all."""
         return tuple((self.indices - block.start).T)
+
+    def inside(self, block: Block) -> NDArray[np.bool_]:
+        """Return which draws fall into a block (P,)."""
+        offsets = self.indices - block.start
+        return np.asarray(np.all((offsets >= 0) & (offsets < block.shape), axis=1))
 
 
 @dataclass(frozen=True)
@@ -69,7 +85,7 @@ def norms_of_draws(parts: Reals) -> Reals:
     The fewer draws carry the sum, the less it tells, and the more it is raised.
     """
     squares = parts.sum(axis=1)
-    shares = parts / np.maximum(squares, np.finfo(np.float64).tiny)[:, None]
+    shares = parts / np.maximum(squares, _TINY)[:, None]
     return np.asarray(np.sqrt(squares * (1 + _CAUTION * np.sqrt(np.sum(shares**2, axis=1)))))
 
 
@@ -86,12 +102,13 @@ def draw(lattice: Lattice, orders: Sequence[float], degree: int, count: int, see
     alone, as the error of the NUFFT does. The weights of all orders are mixed evenly.
     """
     rng = np.random.default_rng(seed)
-    chances = _shell_chances(lattice, tuple(orders), degree)
+    chances = _shell_chances(lattice, orders, degree, shell_volumes(lattice))
     # One draw in each of P equal intervals of the distribution: fewer gaps than independent draws leave.
     levels = (np.arange(count) + rng.random(count)) / count
     shells = np.searchsorted(np.cumsum(chances * shell_volumes(lattice)), levels * (1 - 1e-12))
     indices = _draw_points(lattice, shells, rng)
-    return Draws(indices, lattice.spacing * indices.astype(np.float64), 1 / (count * chances[shells]))
+    frequencies, scales = lattice.spacing * indices.astype(np.float64), 1 / (count * chances[shells])
+    return Draws(indices, frequencies, scales, tuple(orders), degree, count, seed)
 
 
 def measure(draws: Draws, computed: NDArray[np.complexfloating[Any, Any]], exact: NDArray[np.complex128]) -> Probe:
@@ -99,6 +116,35 @@ def measure(draws: Draws, computed: NDArray[np.complexfloating[Any, Any]], exact
     sums = draws.scales * np.abs(computed - exact) ** 2
     shells = np.sum(draws.indices**2, axis=1)
     return Probe(tuple(shells.tolist()), tuple(sums.tolist()))
+
+
+def with_own(draws: Draws, count: float, lattice: Lattice, block: Block, values: Complexes) -> Draws:
+    """Add draws in proportion to |value|² and to the densities of `draw` to those that fall into a block of a field.
+
+    The error of quadrature peaks where the field does, as in arrays, and few draws meet peaks by chance. Both kinds are
+    pooled by the balance heuristic, without bias (E. Veach, L. J. Guibas 1995, doi:10.1145/218380.218498). The count is
+    that of the whole field; a block gets its share.
+    """
+    rng = np.random.default_rng([draws.seed, *np.add(block.start, lattice.M)])
+    candidates = block.split(_LOOKED_AT)
+    part = candidates[rng.integers(len(candidates))]
+    seen = values[tuple(slice(i - j, i - j + n) for i, j, n in zip(part.start, block.start, part.shape, strict=True))]
+    energies, (shells, weights) = (seen.real**2 + seen.imag**2).ravel(), _shells_and_weights(lattice, part)
+    masses = energies * weights
+    per_shell = np.bincount(shells, masses, lattice.shell_count).astype(np.float64)
+    own_density = _shell_chances(lattice, draws.orders, draws.degree, per_shell)
+    cumulative = np.cumsum(masses * own_density[shells])
+    expected = count * block.size / lattice.half.size
+    added = int(expected + rng.random())
+    drawn = np.searchsorted(cumulative, (np.arange(added) + rng.random(added)) / max(added, 1) * cumulative[-1])
+    own = np.stack(np.unravel_index(np.minimum(drawn, len(shells) - 1), part.shape), axis=1) + np.array(part.start)
+    indices = np.concatenate([draws.indices[draws.inside(block)], own])
+    pooled = replace(draws, indices=indices, frequencies=lattice.spacing * indices.astype(np.float64))
+    numbers, inside = np.sum(indices**2, axis=1), pooled.inside(part)
+    density = draws.count * _shell_chances(lattice, draws.orders, draws.degree, shell_volumes(lattice))[numbers]
+    places = np.ravel_multi_index(tuple((indices[inside] - part.start).T), part.shape)
+    density[inside] += expected * energies[places] * own_density[numbers[inside]]
+    return replace(pooled, scales=1 / density)
 
 
 def uniform_probe(lattice: Lattice, error: float) -> Probe:
@@ -116,17 +162,27 @@ def join(probes: Sequence[Probe]) -> Probe:
     )
 
 
+@lru_cache(maxsize=2)
+def _shells_and_weights(lattice: Lattice, part: Block) -> tuple[Indices, Reals]:
+    """Return the shell and the trapezoidal weight of each sample of a part of the lattice (part.size,)."""
+    return lattice.shells(part).ravel().astype(np.intp), lattice.trapezoid_weights(part).ravel()
+
+
+def _shell_chances(lattice: Lattice, orders: Sequence[float], degree: int, masses: Reals) -> Reals:
+    """Return the probability of a point over its mass for each shell, from the masses of the shells (shell_count,)."""
+    chances = np.zeros(lattice.shell_count)
+    for density in _shell_densities(lattice, tuple(orders), degree):
+        chances += density / max(float(masses @ density), _TINY)
+    return chances / (2 * len(orders))
+
+
 @lru_cache(maxsize=64)
-def _shell_chances(lattice: Lattice, orders: tuple[float, ...], degree: int) -> Reals:
-    """Return the probability of a point over its trapezoidal weight, for each shell (shell_count,)."""
-    volumes = shell_volumes(lattice)
+def _shell_densities(lattice: Lattice, orders: tuple[float, ...], degree: int) -> Reals:
+    """Return the weights of some orders by shell, and these as the error of the triangle rule (2 · orders, shells)."""
     # Relative to the highest frequency, so that high powers neither over- nor underflow.
     growth = (np.arange(lattice.shell_count) / lattice.shell_count) ** (degree + 1)
-    chances = np.zeros(lattice.shell_count)
-    for weight in SobolevWeights(lattice, orders).per_shell:
-        for density in (weight, weight * growth):
-            chances += density / (volumes @ density)
-    return chances / (2 * len(orders))
+    weights = SobolevWeights(lattice, orders).per_shell
+    return np.concatenate([weights, weights * growth])
 
 
 def _draw_points(lattice: Lattice, shells: Indices, rng: np.random.Generator) -> Indices:
@@ -168,10 +224,15 @@ class Sample:
         return cls(draws, kind.exact_values(draws.frequencies, backend))
 
 
-def draws_for(surfaces: Sequence[Surface], lattice: Lattice, orders: Sequence[float], degree: int) -> Draws:
-    """Draw the frequencies to probe fields of surfaces at, by their lowest degree: fewer where each costs more."""
+def draws_for(
+    surfaces: Sequence[Surface], lattice: Lattice, orders: Sequence[float], degree: int, fraction: float = 1.0
+) -> Draws:
+    """Draw the frequencies to probe fields of surfaces at, by their lowest degree: fewer where each costs more.
+
+    The fraction is `COMMON` where the draws serve one field alone, which adds some of its own.
+    """
     terms = max(max(kind_of(surface).triangles, 1) for surface in surfaces)
-    count = int(np.clip(_PAIRS // terms, _FEWEST_DRAWS, _MOST_DRAWS))
+    count = int(fraction * np.clip(_PAIRS // terms, _FEWEST_DRAWS, _MOST_DRAWS))
     seed = int(np.float64(sum(surface.area for surface in surfaces)).view(np.uint64))
     return draw(lattice, orders, degree, count, seed)
 
@@ -184,20 +245,26 @@ def probe_block(
     values: Complexes,
     draws: Draws,
     backend: Backend = CPU,
+    sample: Sample | None = None,
 ) -> Probe:
-    """Compare one block of a field with the exact transform, at the draws that fall into the block.
+    """Compare one block of a field with the exact transform, at the draws that fall into the block and some of its own.
+
+    A sample at these draws saves time.
 
     The exact values of a parametrised surface come from twice its nodes. Its probe therefore also holds the change
     that the last doubling made, once for the whole field.
     """
     if not needs_probe(surface, settings):
         return Probe()
-    offsets = draws.indices - block.start
-    inside = np.all((offsets >= 0) & (offsets < block.shape), axis=1)
-    draws = Draws(draws.indices[inside], draws.frequencies[inside], draws.scales[inside])
-    # What a fast sample is off by can only make the field look worse.
-    exact = Sample.from_surface(surface, draws, backend, fast=True).exact
-    probe = measure(draws, values[draws.places(block)], exact)
+    count = (_OWN if sample is None else _OWN_BESIDE_SAMPLE) * draws.count
+    pooled, common = with_own(draws, count, lattice, block, values), draws.inside(block)
+    if sample is None:
+        # What a fast sample is off by can only make the field look worse.
+        exact = Sample.from_surface(surface, pooled, backend, fast=True).exact
+    else:
+        own = kind_of(surface).sampled_values(pooled.frequencies[np.count_nonzero(common) :], 1, backend)
+        exact = np.concatenate([sample.exact[common], own])
+    probe = measure(pooled, values[pooled.places(block)], exact)
     change = settings.plan(surface, lattice).change
     # Once for the whole field.
     if change and block.start == lattice.half.start:

@@ -8,8 +8,9 @@ import pytest
 from sobolev_batch import Lattice, Mesh, distance, fourier_transform, norm
 from sobolev_batch.shapes import Ellipsoid, Sphere, Torus, icosphere
 from sobolev_batch.spectral.fields import PROBED_ORDERS, Quality
-from sobolev_batch.spectral.lattice import SobolevWeights
-from sobolev_batch.spectral.probe import Sample, draw, estimate, measure
+from sobolev_batch.spectral.lattice import SobolevWeights, shell_sums
+from sobolev_batch.spectral.probe import Sample, draw, estimate, join, measure, with_own
+from sobolev_batch.spectral.transform import TransformSettings, transform_block
 from sobolev_batch.surfaces.shapes.surface import Surface
 
 LATTICE = Lattice(3.0, 24)
@@ -42,6 +43,33 @@ def test_whichever_frequencies_are_drawn_their_probe_covers_the_error(surface: S
         ratios.append(reported / true_errors)
     assert np.mean(covered) >= 0.98
     assert np.median(ratios) < 3
+
+
+@pytest.mark.slow
+def test_draws_among_a_fields_own_values_meet_its_peaks_without_bias() -> None:
+    # Pieces whose pitch is that of the lattice: of 18,000 frequencies some fifty are peaks.
+    lattice, orders, piece = Lattice(2.5, 32), (-2.0,), icosphere(0)
+    places = 0.4 * np.stack(np.meshgrid(*[np.arange(6)] * 3), axis=-1).reshape(-1, 1, 3) - 1
+    triangles = piece.triangles + len(piece.vertices) * np.arange(len(places))[:, None, None]
+    mesh = Mesh((0.1 * piece.vertices + places).reshape(-1, 3), triangles.reshape(-1, 3))
+    values, exact = (
+        transform_block(mesh, lattice, lattice.half, settings).values
+        for settings in (TransformSettings(1e-9, tolerance=1e-2), TransformSettings(1e-13))
+    )
+    weights = SobolevWeights(lattice, orders)
+    true = weights.per_shell @ shell_sums(values - exact, None, lattice, lattice.half)
+    covered, squares = [], []
+    for seed in range(200):
+        draws, probes = draw(lattice, orders, 2, 8, seed), []
+        for block in lattice.split(6_000) if seed % 2 else (lattice.half,):
+            pooled = with_own(draws, draws.count, lattice, block, values[lattice.place(block)])
+            places_of_all = pooled.places(lattice.half)
+            probes.append(measure(pooled, values[places_of_all], exact[places_of_all].astype(np.complex128)))
+        probe = join(probes)
+        covered.append(probe.norms(weights)[0] ** 2 >= true[0])
+        squares.append((weights.per_shell[:, list(probe.shells)] @ np.array(probe.sums))[0])
+    assert np.mean(squares) == pytest.approx(true[0], rel=0.15)
+    assert np.mean(covered) > 0.9
 
 
 def test_field_coordinates_and_attributes() -> None:

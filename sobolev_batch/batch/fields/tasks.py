@@ -30,7 +30,7 @@ from sobolev_batch.spectral.lattice import Block, Lattice
 from sobolev_batch.spectral.octaves.remainder import Remainder, remainder
 from sobolev_batch.spectral.octaves.sampling import TailSampling
 from sobolev_batch.spectral.octaves.values import Settings, octave_values, settings_for
-from sobolev_batch.spectral.probe import Probe, draws_for, join, probe_block
+from sobolev_batch.spectral.probe import COMMON, Probe, draws_for, join, probe_block
 from sobolev_batch.spectral.transform import Execution, TransformSettings, choose_settings, transform_block
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.surface import Similarity, Surface
@@ -241,7 +241,7 @@ def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block]) -> Stored
     lattice, execution = job.lattice, job.execution
     transform = job.transform_settings(surface)
     plan = transform.plan(surface, lattice)
-    draws = draws_for([surface], lattice, job.orders, plan.lowest_degree)
+    draws = draws_for([surface], lattice, job.orders, plan.lowest_degree, COMMON)
     probes, backends, checksums, points = [], [], [], 0
     for block in blocks:
         result = transform_block(surface, lattice, block, transform, execution, plan)
