@@ -7,17 +7,19 @@ import os
 import re
 import shlex
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
 
 from sobolev_batch.batch.study.plan import members_of
 from sobolev_batch.batch.study.schema import RESERVED
-from sobolev_batch.batch.study.study import METHOD, OBJECT, REFERENCE_LABEL, Study, StudyCollection, is_collection
+from sobolev_batch.batch.study.study import METHOD, OBJECT, REFERENCE_LABEL, Study, StudyCollection
 from sobolev_batch.errors import MeshError, StudyError, written
 from sobolev_batch.surfaces.formats.readers import expected_size, is_mesh_name, mesh_stem, read_mesh
-from sobolev_batch.surfaces.sources.files import MOST_MESHES, matching_files
+from sobolev_batch.surfaces.sources.files import MOST_MESHES
 from sobolev_batch.surfaces.sources.names import caseless_key, label_problem, name_problem, natural_key, quoted
 from sobolev_batch.visible import reasons, table_html, visible
 
@@ -28,17 +30,15 @@ _REFERENCE = re.compile(r"(?<![^\W\d_])(original|reference|ref|target|ground[\W_
 # Only in the names of folders that hold the files themselves: objects/cow/ is the folder of one object.
 _REFERENCES = re.compile(r"(originals|references|targets|objects)", re.IGNORECASE)
 # The size of a mesh at the end of its name: cow_500, cow-1k7, cow 20.5.
-_SIZE = re.compile(r"(?P<separator>[\W_]*)\d+(?:[.,]\d+)?(?:[kKmM]\d*)?$")
+_SIZE = re.compile(r"\d+(?:[.,]\d+)?(?:[kKmM]\d*)?$")
 _LONGEST_NAME = 100
 # More families, or objects on a line, would hide what comes next.
 _MOST_LINES, _MOST_OBJECTS = 10, 6
-# Lists of paths are broken into lines where they are longer.
-_LINE = 110
 # What the optional decimated family has, as fractions of the triangles of the reference.
 _FRACTIONS = (16, 8, 4, 2)
 _FEWEST_TRIANGLES = 4
 
-_HEAD = """\
+_STUDY = """\
 # `sobolev-batch plan` says what this study would do, and how long that takes; `sobolev-batch run` computes it.
 
 [study]
@@ -50,9 +50,7 @@ best_effort = true         # where that is out of reach, compute the nearest att
 
 [norm]
 orders = [-2.0]            # add -4.0 for the overall form, or -1.5 for finer details, which takes longer
-
-"""
-_TAIL = """
+{sections}
 # More to ask for: remove the # in front of the lines.
 
 # [compare]
@@ -61,16 +59,17 @@ _TAIL = """
 # [proximity]              # the usual distances beside ours, also "mean", "rms", "percentiles", "fscore", "normals"
 # metrics = ["hausdorff", "chamfer"]
 """
-_REFERENCE_SECTION = """\
+_REFERENCE_SECTION = """
 [reference]                # {remark}
 source = "files"
-{paths}
+paths = [{path}]
 """
 _FAMILY_SECTION = """
 [[family]]
 name = {name}
 source = "files"
-{paths}
+paths = [  # {size}
+{paths}]
 """
 _DECIMATED_SECTION = """
 [[family]]
@@ -79,6 +78,13 @@ source = "decimate"
 mesh = {{ source = "files", paths = [{path}] }}
 triangles = {sizes}
 """
+_OBJECTS_SECTION = """
+[objects]
+meshes = [
+{rows}]
+"""
+# The files of each object and method.
+_Methods = Mapping[tuple[str, str], Sequence[PurePosixPath]]
 
 
 @dataclass(frozen=True)
@@ -153,27 +159,23 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
         raise StudyError(f"{folder}: there is no such folder; name one with mesh files")
     # Links are followed, as the system follows them from the study file on.
     base = output.parent.resolve()
-    relative = Path(os.path.relpath(folder.resolve(), base)).as_posix()
-    problem = _path_problem(relative)
+    below = PurePosixPath(Path(os.path.relpath(folder.resolve(), base)).as_posix())
+    problem = _path_problem(str(below))
     if problem is not None:
         raise StudyError(f"{folder}: its path cannot be in a study file: {problem}; rename it")
-    prefix = "" if relative == "." else f"{relative}/"
     sizes, left_out = _look_at(folder)
     several = _several_objects(list(sizes))
     if several is None:
-        reference = _reference(folder, sizes, left_out)
-        sections, summary = _sections_of_one(reference, sizes, base, prefix)
+        sections, summary = _sections_of_one(_reference(folder, sizes, left_out), sizes, below)
     else:
-        references, methods = several
-        sections, summary = _sections_of_several(references, methods, prefix)
-        used = {*references.values(), *(path for paths in methods.values() for path in paths)}
+        sections, summary = _sections_of_several(*several, below)
+        used = {*several[0].values(), *(path for paths in several[1].values() for path in paths)}
         left_out |= {str(path): "its name is that of no object" for path in sizes if path not in used}
-    text = f"{_HEAD.format(name=_toml(_free_name(folder.resolve().name, fallback='study')))}{sections}{_TAIL}"
-    table = tomllib.loads(text)
-    if is_collection(table):
-        StudyCollection.from_table(table, folder=base)
+    text = _STUDY.format(name=_toml(_free_name(folder.resolve().name, fallback="study")), sections=sections)
+    if several is None:
+        members_of(Study.from_table(tomllib.loads(text), folder=base))
     else:
-        members_of(Study.from_table(table, folder=base))
+        StudyCollection.from_table(tomllib.loads(text), folder=base)
     with written(output, "the study", StudyError), output.open("x", encoding="utf-8", newline="\n") as file:
         file.write(text)
     return StudyDraft(output, summary, left_out)
@@ -185,11 +187,18 @@ def _look_at(folder: Path) -> tuple[dict[PurePosixPath, int], dict[str, str]]:
     Paths below the folder are in their natural order. Hidden files, stores, and links to folders are left out. Small
     files are read as a whole, up to some bytes together.
     """
+    found: list[str] = []
+    for parent, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".") and not name.endswith(".zarr")]
+        meshes = (Path(parent, name) for name in files if not name.startswith("."))
+        found += [path.relative_to(folder).as_posix() for path in meshes if is_mesh_name(path)]
+        if len(found) > MOST_MESHES:
+            raise StudyError(f"{folder} has more than {MOST_MESHES} mesh files; name a folder with fewer")
     sizes: dict[PurePosixPath, int] = {}
     left_out: dict[str, str] = {}
-    left = _MOST_BYTES
     names: dict[str, str] = {}
-    for below in sorted(_mesh_names(folder), key=natural_key):
+    left = _MOST_BYTES
+    for below in sorted(found, key=natural_key):
         other = names.setdefault(caseless_key(below), below)
         try:
             if other != below:
@@ -206,19 +215,6 @@ def _look_at(folder: Path) -> tuple[dict[PurePosixPath, int], dict[str, str]]:
         except (MeshError, OSError) as error:
             left_out[below] = str(error).removeprefix(f"{folder / below}: ")
     return sizes, left_out
-
-
-def _mesh_names(folder: Path) -> Iterator[str]:
-    count = 0
-    for parent, folders, names in os.walk(folder):
-        folders[:] = [name for name in folders if not name.startswith(".") and not name.endswith(".zarr")]
-        for name in names:
-            if name.startswith(".") or not is_mesh_name(Path(name)):
-                continue
-            count += 1
-            if count > MOST_MESHES:
-                raise StudyError(f"{folder} has more than {MOST_MESHES} mesh files; name a folder with fewer")
-            yield Path(parent, name).relative_to(folder).as_posix()
 
 
 def _path_problem(path: str) -> str | None:
@@ -238,11 +234,9 @@ def _reference(folder: Path, sizes: Mapping[PurePosixPath, int], left_out: Mappi
     """Return the finest file that is called a reference, or else the finest of all."""
     # Of equals the one with the shortest path: original.ply before original_2.ply.
     for path in sorted(sizes, key=lambda path: (not _is_called_reference(path), -sizes[path], len(str(path)))):
-        try:
+        with suppress(MeshError):
             read_mesh(folder / path)
-        except MeshError:
-            continue
-        return path
+            return path
     examples = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:3])
     raise StudyError(
         f"{folder} holds no mesh file that can be read{': ' * bool(examples)}{examples}; name a folder with meshes"
@@ -259,31 +253,23 @@ def _free_name(wanted: str, taken: Iterable[str] = (), fallback: str = "meshes")
 
 
 def _without_size(stem: str) -> str:
-    return _SIZE.sub("", stem).rstrip(" _-.")
+    return _SIZE.sub("", stem).strip(" _-.")
 
 
 def _families(paths: Sequence[PurePosixPath]) -> dict[str, list[PurePosixPath]]:
     """Return the files of one object by family: one for each folder, or by what names in one folder have in common."""
     has_folders = len({path.parent for path in paths}) > 1
-    groups: dict[str, list[PurePosixPath]] = {}
-    for path in paths:
-        # With slashes, or those of a/b and "a b" would be one.
-        groups.setdefault("/".join(path.parent.parts) if has_folders else _without_size(mesh_stem(path)), []).append(
-            path
-        )
+    # With slashes, or those of a/b and "a b" would be one.
+    wanted = ["/".join(path.parent.parts) if has_folders else _without_size(mesh_stem(path)) for path in paths]
     if not has_folders:
-        alone = [path for members in groups.values() for path in members if len(members) == 1]
-        groups = {name: members for name, members in groups.items() if len(members) > 1}
-        groups.setdefault("", []).extend(alone)
+        # Meshes that are alone are a family together.
+        counts = Counter(wanted)
+        wanted = [name if counts[name] > 1 else "" for name in wanted]
+    names: dict[str, str] = {}
     families: dict[str, list[PurePosixPath]] = {}
-    for wanted, members in groups.items():
-        if members:
-            families[_free_name(wanted, families)] = members
+    for path, name in zip(paths, wanted, strict=True):
+        families.setdefault(names.setdefault(name, _free_name(name, names.values())), []).append(path)
     return families
-
-
-# The files of each object and method.
-_Methods = Mapping[tuple[str, str], Sequence[PurePosixPath]]
 
 
 def _several_objects(paths: Sequence[PurePosixPath]) -> tuple[dict[str, PurePosixPath], _Methods] | None:
@@ -311,7 +297,7 @@ def _several_objects(paths: Sequence[PurePosixPath]) -> tuple[dict[str, PurePosi
     for (path, name), parts in zip(owned, folders, strict=True):
         # What the name of the file says beside object and size; cowboy in the folder of cow is a method.
         rest = mesh_stem(path).removeprefix(name)
-        rest = _without_size(mesh_stem(path) if rest[:1].isalnum() else rest).strip(" _-.")
+        rest = _without_size(mesh_stem(path) if rest[:1].isalnum() else rest)
         # With slashes, or the methods of a/b and "a b" would be one.
         method = "/".join(parts[shared:]) or rest or "".join(parts[-1:])
         family = families.setdefault(method, _free_name(method, families.values()))
@@ -335,10 +321,10 @@ def _owner(path: PurePosixPath, references: Mapping[str, PurePosixPath]) -> str 
 
 
 def _sections_of_one(
-    reference: PurePosixPath, sizes: Mapping[PurePosixPath, int], base: Path, prefix: str
+    reference: PurePosixPath, sizes: Mapping[PurePosixPath, int], folder: PurePosixPath
 ) -> tuple[str, tuple[str, ...]]:
     """Return the sections of a study of one object, and what they hold."""
-    path, triangles = f"{prefix}{reference}", sizes[reference]
+    path, triangles = str(folder / reference), sizes[reference]
     families = _families([other for other in sizes if other != reference])
     counts = [count for part in _FRACTIONS if (count := triangles // part) >= _FEWEST_TRIANGLES]
     if not families and not counts:
@@ -347,14 +333,13 @@ def _sections_of_one(
             "meshes to compare with it"
         )
     remark = "its name says so" if _is_called_reference(reference) else "the mesh with the most triangles"
-    sections = _REFERENCE_SECTION.format(remark=remark, paths=_paths([path]))
+    sections = _REFERENCE_SECTION.format(remark=remark, path=_toml(path))
     summary = [f"reference {path}, {triangles:,} triangles"]
     for family, members in families.items():
-        ranked = sorted(sizes[member] for member in members)
-        range_of_sizes = f"{ranked[0]:,}" if ranked[0] == ranked[-1] else f"{ranked[0]:,} to {ranked[-1]:,}"
-        size = f"{_count(len(members))}, {range_of_sizes} triangles"
-        entries = _entries([f"{prefix}{member}" for member in members], base)
-        sections += _FAMILY_SECTION.format(name=_toml(family), paths=_paths(entries, size))
+        ends = dict.fromkeys(f"{end(sizes[member] for member in members):,}" for end in (min, max))
+        size = f"{_count(len(members))}, {' to '.join(ends)} triangles"
+        texts = "".join(f"    {_toml(str(folder / member))},\n" for member in members)
+        sections += _FAMILY_SECTION.format(name=_toml(family), paths=texts, size=size)
         summary.append(f"family {family}: {size}")
     if counts:
         decimated = _DECIMATED_SECTION.format(path=_toml(path), sizes=counts)
@@ -366,56 +351,24 @@ def _sections_of_one(
 
 
 def _sections_of_several(
-    references: Mapping[str, PurePosixPath], methods: _Methods, prefix: str
+    references: Mapping[str, PurePosixPath], methods: _Methods, folder: PurePosixPath
 ) -> tuple[str, tuple[str, ...]]:
     """Return the section of a study of several objects, which lists their meshes, and what it holds."""
     listed = [(name, REFERENCE_LABEL, path) for name, path in references.items()]
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     for (name, method), paths in methods.items():
         listed += [(name, method, path) for path in paths]
-        counts[method] = counts.get(method, 0) + len(paths)
+        counts[method] += len(paths)
     rows = (
-        f"    {{ object = {_toml(name)}, method = {_toml(method)}, path = {_toml(f'{prefix}{path}')} }},\n"
+        f"    {{ object = {_toml(name)}, method = {_toml(method)}, path = {_toml(str(folder / path))} }},\n"
         for name, method, path in listed
     )
     names = list(references)
     more = f" and {len(names) - _MOST_OBJECTS} more" if len(names) > _MOST_OBJECTS else ""
-    return f"[objects]\nmeshes = [\n{''.join(rows)}]\n", (
+    return _OBJECTS_SECTION.format(rows="".join(rows)), (
         f"{len(names)} objects: {', '.join(names[:_MOST_OBJECTS])}{more}",
         *(f"method {method}: {_count(count)}" for method, count in counts.items()),
     )
-
-
-def _entries(paths: Sequence[str], base: Path) -> list[str]:
-    """Return a glob for the files of each folder and ending if it matches these and no others, or else their paths."""
-    kinds: dict[tuple[PurePosixPath, str], list[str]] = {}
-    for path in map(PurePosixPath, paths):
-        kinds.setdefault((path.parent, path.name.removeprefix(mesh_stem(path))), []).append(str(path))
-    entries: list[str] = []
-    for (folder, ending), alike in kinds.items():
-        stems = (
-            {"*", _SIZE.sub(lambda size: f"{size['separator']}*", mesh_stem(PurePosixPath(alike[0])))}
-            if len(alike) > 1
-            else set()
-        )
-        globs = [str(folder / f"{stem}{ending}") for stem in sorted(stems) if "*" in stem]
-        for glob in globs:
-            if {Path(os.path.relpath(path, base)).as_posix() for path in matching_files(base, glob)} == set(alike):
-                entries.append(glob)
-                break
-        else:
-            entries += alike
-    return entries
-
-
-def _paths(entries: Iterable[str], remark: str = "") -> str:
-    """Return the key `paths`, on several lines if it is long."""
-    texts = [*map(_toml, entries)]
-    comment = f"  # {remark}" * bool(remark)
-    one_line = f"paths = [{', '.join(texts)}]{comment}"
-    if len(one_line) <= _LINE:
-        return one_line
-    return "\n".join([f"paths = [{comment}", *(f"    {text}," for text in texts), "]"])
 
 
 def _toml(text: str) -> str:

@@ -157,7 +157,7 @@ def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
     assert "differs from that of 'Scan_1.ply' only in case" in draft.left_out["scan_1.ply"]
     assert r"left out: \x1b[31mred.ply: its name" in str(draft)
     text = draft.path.read_text(encoding="utf-8")
-    assert 'paths = ["in/Scan_1.ply", "in/scan_2.ply"]' in text
+    assert '    "in/Scan_1.ply",\n    "in/scan_2.ply",\n' in text
     # What the file offers is valid too.
     offers = [line.removeprefix("# ") for line in text.splitlines() if not line.startswith("# More")]
     (tmp_path / "more.toml").write_text("\n".join(line for line in offers if not line.startswith(("`", "Compare"))))
