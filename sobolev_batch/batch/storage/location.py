@@ -11,11 +11,10 @@ from __future__ import annotations
 
 import asyncio
 import errno
-import inspect
 import os
 import re
 import stat
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -285,21 +284,22 @@ def path_in(root: str | Path, key: str) -> Path:
     return Path(root) / key
 
 
+class _Root(type(Path())):  # type: ignore[misc]  # that of this system; before Python 3.12 a plain Path has no subclass
+    """The folder of a store, below which no link is followed."""
+
+    def __truediv__(self, key: str) -> Path:
+        return path_in(os.fspath(self), key)
+
+
 class FolderStore(LocalStore):
-    """zarr's store in a folder, which follows no link in it."""
+    """zarr's store in a folder, which follows no link in it: all its paths are made from the root and a key."""
+
+    def __init__(self, root: Path | str, *, read_only: bool = False) -> None:
+        super().__init__(_Root(root), read_only=read_only)
 
     async def _open(self, *, mode: AccessModeLiteral | None = None) -> None:
         # zarr's makes the folder, also of a store that is only read.
         self._is_open = True
-
-    async def get_partial_values(
-        self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
-    ) -> list[Buffer | None]:
-        """Return the bytes of ranges of keys."""
-        ranges = list(key_ranges)
-        for key, _ in ranges:
-            path_in(self.root, key)
-        return await super().get_partial_values(prototype, ranges)
 
     async def delete_keys(self, keys: Sequence[str]) -> None:
         """Remove the files of keys that exist."""
@@ -332,20 +332,6 @@ def _files_below(folder: str | Path) -> Iterator[os.DirEntry[str]]:
                     folders.append(entry.path)
                 else:
                     yield entry
-
-
-def _checked(method: Callable[..., Any]) -> Callable[..., Any]:
-    def call(self: FolderStore, *arguments: Any, **options: Any) -> Any:
-        path_in(self.root, arguments[0] if arguments else options.get("key", options.get("prefix", "")))
-        return method(self, *arguments, **options)
-
-    return call
-
-
-# By their arguments, since newer versions of zarr add some.
-for _name, _method in inspect.getmembers(LocalStore, inspect.isfunction):
-    if not _name.startswith("_") and list(inspect.signature(_method).parameters)[1:2] in (["key"], ["prefix"]):
-        setattr(FolderStore, _name, _checked(_method))
 
 
 def _in_time(size_bytes: int = 0) -> asyncio.Timeout:
