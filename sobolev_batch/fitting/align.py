@@ -23,6 +23,8 @@ from sobolev_batch.surfaces.shapes.surface import Reals
 _STAGES = ((0.6, 1000, 6, 12), (1.4, 4000, 2, 12), (4.0, 10**9, 1, 25))
 # In cycles per radius: surfaces may be this far from the center, over twice the radius.
 _SPACING, _EPS = 0.2, 1e-6
+# A mesh whose center is farther from the other one, in radii, begins there: a period away nothing would draw it in.
+_IN_PLACE = 1.0
 # Steps shorter than this, in radii, end a stage; a step is damped by at most this much.
 _SHORTEST, _MOST_DAMPED = 1e-7, 1e6
 
@@ -30,9 +32,9 @@ _SHORTEST, _MOST_DAMPED = 1e-7, 1e6
 def align(a: MeshLike, b: MeshLike, *, order: float = -2.0) -> Reals:
     """Return the rigid motion of a mesh that makes its Sobolev distance from another one as small as it was found.
 
-    The search starts from the mesh as it is, from 24 rotations by right angles, and from those that match principal
-    axes. It compares long wavelengths first. A mesh with symmetries has several best motions. Reflections and changes
-    of size are no rigid motions.
+    The search starts from the mesh as it is, unless that is elsewhere, and around the center of b from 24 rotations by
+    right angles, and from those that match principal axes. It compares long wavelengths first. A mesh with symmetries
+    has several best motions. Reflections and changes of size are no rigid motions.
 
     Args:
         a: Mesh to move, or what `as_mesh` makes one of.
@@ -60,7 +62,8 @@ def align(a: MeshLike, b: MeshLike, *, order: float = -2.0) -> Reals:
     own, target = (
         Mesh((mesh.vertices - center) / radius, mesh.triangles) for mesh, center in zip(meshes, centers, strict=True)
     )
-    starts = [(np.eye(3), (centers[0] - centers[1]) / radius)]
+    as_is = (centers[0] - centers[1]) / radius
+    starts = [(np.eye(3), as_is)] if np.linalg.norm(as_is) <= _IN_PLACE else []
     starts += [(turn, np.zeros(3)) for turn in (*Rotation.create_group("O").as_matrix(), *_of_axes(own, target))]
     scored = [(0.0, *start) for start in starts]
     for xi_max, points, kept, steps in _STAGES:

@@ -51,3 +51,18 @@ def test_a_mirror_image_stays_one() -> None:
     similarity = sb.shapes.Similarity.to_unit_ball(target)
     pair = similarity.apply(moved_by(mirrored, back)), similarity.apply(target)
     assert sb.distance(*pair, order=-2, rtol=0.1)["relative"] > 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("angle", "shift"),
+    [(0.34, (5.0, 0.0, 0.0)), (0.38, (5.0, 0.0, 0.0)), (0.54, (5.0, 0.0, 0.0)), (2.0, (2e5, 1e5, 7.0))],
+)
+def test_a_mesh_in_another_place_is_brought_back(angle: float, shift: tuple[float, float, float]) -> None:
+    # A lattice of five radii does not tell the first three from meshes in place.
+    mesh = shape(2)
+    radius, middle = mesh.bounding_sphere[1], mesh.vertices.mean(axis=0)
+    turn = Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix()
+    there = sb.Mesh((mesh.vertices - middle) @ turn.T + middle + radius * np.array(shift), mesh.triangles)
+    found = moved_by(there, sb.fitting.align(there, mesh)).vertices
+    assert np.abs(found - mesh.vertices).max() < (1e-9 if max(shift) > 10 else 1e-12) * radius
