@@ -375,8 +375,10 @@ def smooth_step(radii: Reals, cutoff: float) -> Reals:
     """
     middle, width = (1 + STEP_START) / 2, (1 - STEP_START) / 2
     fractions = np.asarray(radii, dtype=np.float64) / cutoff
-    steps = 0.5 * erfc(_STEEPNESS * (fractions - middle) / width)
-    return np.where(fractions <= STEP_START, 1.0, np.where(fractions >= 1, 0.0, steps))
+    steps = np.asarray(np.where(fractions <= STEP_START, 1.0, 0.0))
+    on_step = (fractions > STEP_START) & (fractions < 1)
+    steps[on_step] = 0.5 * erfc(_STEEPNESS * (fractions[on_step] - middle) / width)
+    return steps
 
 
 def check_orders(order: Orders) -> tuple[float, ...]:

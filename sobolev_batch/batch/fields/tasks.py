@@ -22,6 +22,7 @@ from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import Plan, Row
 from sobolev_batch.batch.study.schema import Backends
 from sobolev_batch.errors import InputError, LatticeError, MeshError, StoreError, one_line
+from sobolev_batch.spectral import compiled
 from sobolev_batch.spectral.adaptive.problem import without_common_parts
 from sobolev_batch.spectral.adaptive.solve import DistanceTarget
 from sobolev_batch.spectral.fields import Quality, TailQuality, compute_field, field_for
@@ -201,6 +202,8 @@ def _store_octaves(job: Job, surface: Surface) -> StoredBlocks:
     tail = job.tail
     if tail is None:
         raise ValueError("the study has no octaves")
+    # Another worker that computes them again must write the same bytes.
+    compiled.use()
     settings = job.octave_settings(surface)
     values = [octave_values(surface, octave, job.orders, settings, job.execution) for octave in tail.octaves]
     cutoff, reference = tail.highest_frequency, job.load_reference()

@@ -28,7 +28,7 @@ from sobolev_batch.spectral.budget import aliased, change_of_root
 from sobolev_batch.spectral.fields import Field
 from sobolev_batch.spectral.lattice import Lattice, OctaveLattice, SobolevWeights
 from sobolev_batch.spectral.octaves.potentials import tail_integral
-from sobolev_batch.spectral.octaves.remainder import Remainder, remainder
+from sobolev_batch.spectral.octaves.remainder import MOSTLY, Remainder, remainder
 from sobolev_batch.spectral.octaves.sampling import FaceNormals, Octave, OctaveSampling
 from sobolev_batch.spectral.octaves.values import (
     POINTS_PER_SQUARE,
@@ -72,8 +72,6 @@ _GROWTH = 4.0
 _OCTAVE_SECONDS, _MOST_SECONDS = 20.0, 200.0
 # Random points of a remainder at most, how many more than needed are taken, and how many more to check it again.
 _MOST_POINTS, _MORE_POINTS, _MORE_TO_CHECK = 400_000, 1.3, 4
-# Share of squared errors that is most of them.
-_MOSTLY = 0.5
 # Nodes that a parametrised surface may have; beyond the frequency that they resolve it has no octaves.
 _MOST_SMOOTH_NODES = 2e6
 
@@ -310,7 +308,7 @@ def farther_out(state: State) -> State | None:
     octave = Octave(state.cutoff, len(state.octaves) + 1)
     can_go_on = len(state.octaves) < _MOST_OCTAVES and octave.highest <= _resolvable_frequency(problem)
     points = int(_MORE_POINTS * beyond.points * state.excess**2)
-    if beyond.hidden > _MOSTLY:
+    if beyond.hidden > MOSTLY:
         # Nothing is hidden from so many.
         points = min(points, beyond.covering)
     sampling = _first_sampling(state, octave) if can_go_on else None

@@ -8,6 +8,7 @@ and turns to loops as soon as its work on arrays has taken, or is predicted to t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from threading import Lock
 from typing import Any, TypeVar
@@ -41,9 +42,9 @@ def pays(seconds: float) -> bool:
     return _spent.add(seconds) > _WORTH_SECONDS
 
 
-def would_pay(seconds: float) -> bool:
-    """Tell the same of work that is only considered."""
-    return _spent.seconds + seconds > _WORTH_SECONDS
+def use() -> None:
+    """Let loops pay from now on, whatever the process has done before: what it stores then depends on nothing else."""
+    _spent.add(math.inf)
 
 
 def loop(function: Loop) -> Loop:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
@@ -63,10 +63,10 @@ class Sheets:
 
     meshes: Sequence[tuple[Mesh, int]]
     spheres: Sequence[tuple[Sphere, int]]
-    spacing: float
+    spacing: float = np.inf
 
     @classmethod
-    def from_surfaces(cls, surfaces: Sequence[Surface], signs: Sequence[int], cutoff: float, spacing: float) -> Self:
+    def from_surfaces(cls, surfaces: Sequence[Surface], signs: Sequence[int], cutoff: float) -> Self:
         """Return the sheets of surfaces; smooth ones become meshes that are fine beside the wavelength at a cutoff."""
         meshes: list[tuple[Mesh, int]] = []
         spheres: list[tuple[Sphere, int]] = []
@@ -77,7 +77,16 @@ class Sheets:
                 meshes.append((_triangulated(surface, cutoff), sign))
             elif isinstance(surface, Mesh):
                 meshes.append((surface, sign))
-        return cls(meshes, spheres, spacing)
+        return cls(meshes, spheres)
+
+    def spaced(self, spacing: float) -> Self:
+        """Return the sheets with another spacing."""
+        return replace(self, spacing=spacing)
+
+    @property
+    def cancel(self) -> bool:
+        """True where the sum has differences."""
+        return len({sign for _, sign in (*self.meshes, *self.spheres)}) > 1
 
     @property
     def area(self) -> float:
@@ -156,6 +165,8 @@ def _ordered(mesh: Mesh, spacing: float) -> Mesh:
     if len(long):
         triangles = np.concatenate([triangles[whole], len(vertices) + np.arange(3 * len(long)).reshape(-1, 3)])
         vertices = np.concatenate([vertices, long.reshape(-1, 3)])
+    if spacing == np.inf:
+        return mesh
     low, high = mesh.extent.box
     width = max(spacing, float(np.max(high - low)) / ((1 << _AXIS_BITS) - 1))
     keys = np.empty(len(triangles), dtype=np.int64)

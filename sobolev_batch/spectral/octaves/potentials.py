@@ -29,13 +29,14 @@ from sobolev_batch.spectral.rules import symmetric_rule
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.surface import Indices, Reals
 
-# Processor time of a pair of a point and a triangle, and of each of its orders, in seconds: on arrays, and compiled.
-_ON_ARRAYS, _COMPILED = (1e-6, 4e-7), (5e-7, 5e-8)
+# Processor time of a pair of a point and a triangle, and of each of its orders, in seconds: on arrays, and compiled,
+# with a share of the time that loops take to load.
+_ON_ARRAYS, _COMPILED, _START = (1e-6, 4e-7), (5e-7, 5e-8), 0.15
 # Distances in wavelengths 1/X between which kernels are tabulated. The smaller one is rounding. Beyond the larger one,
 # which depends on the order, they are below 1 % of what they are at zero, and from this fraction of it on they fade.
 _LEAST, _FADE = 1e-12, 0.75
 _REACHES = (-4.0, -3.0, -2.0, -1.0), (12.0, 10.0, 8.0, 6.0)
-# Entries of a table for each wavelength, how many times as many are interpolated, and where equal steps begin.
+# Entries of a table up to the reach, how many times as many are interpolated, and where equal steps begin.
 _ENTRIES, _DENSER, _LINEAR_FROM = 1500, 8, 0.3
 # Cycles after which a cosine counts as averaged out, and nodes for each octave of frequencies.
 _CYCLES, _NODES = 32.0, leggauss(48)
@@ -126,6 +127,11 @@ def _scale(distances: Reals, cutoff: float) -> Reals:
     return np.where(relative < 1, np.log(relative), relative - 1)
 
 
+def _distances(scale: Reals, cutoff: float) -> Reals:
+    """Return the distances of places in the tables: the inverse of `_scale`."""
+    return np.asarray(np.where(scale < 0, np.exp(np.minimum(scale, 0)), scale + 1) * _LINEAR_FROM / cutoff)
+
+
 def _grid(cutoff: float, fineness: int) -> tuple[float, float]:
     """Return where tables begin and end, the same for all orders."""
     ends = _scale(np.array([_LEAST, fineness * max(_REACHES[1])]) / cutoff, cutoff).tolist()
@@ -136,9 +142,8 @@ def _grid(cutoff: float, fineness: int) -> tuple[float, float]:
 def _tables(cutoff: float, order: float, fineness: int) -> tuple[float, Reals, Reals]:
     """Return M(0), the table of M(0) - M(d) and that of K(d) for an order."""
     (start, end), count = _grid(cutoff, fineness), fineness * _ENTRIES
-    reach, farthest = fineness * reach_of(order) / cutoff, fineness * max(_REACHES[1]) / cutoff
-    scale, many = np.linspace(start, end, count), np.geomspace(_LEAST / cutoff, farthest, 20 * count)
-    distances, total = np.interp(scale, _scale(many, cutoff), many), tail_integral(cutoff, order)
+    reach, total = fineness * reach_of(order) / cutoff, tail_integral(cutoff, order)
+    distances = _distances(np.linspace(start, end, count), cutoff)
     drops, low = np.zeros(count), cutoff / 2
     while np.any(near := _CYCLES / distances > low):
         radii, weights = low * (1.5 + 0.5 * _NODES[0]), 0.5 * low * _NODES[1]
@@ -151,13 +156,14 @@ def _tables(cutoff: float, order: float, fineness: int) -> tuple[float, Reals, R
     drops, total = (drops + _power_integral(low, order)) / np.pi, total / np.pi
     # Denser tables by cubic Hermite interpolation, so that straight lines between their entries will do.
     slopes, fractions = np.gradient(drops), np.arange(_DENSER) / _DENSER
+    slopes[2:-2] = (8 * (drops[3:-1] - drops[1:-3]) - drops[4:] + drops[:-4]) / 12
     from_start = fractions**2 * (3 - 2 * fractions)
     dense = drops[:-1, None] + np.diff(drops)[:, None] * from_start
     dense += slopes[:-1, None] * fractions * (1 - fractions) ** 2
     dense -= slopes[1:, None] * fractions**2 * (1 - fractions)
     dense = np.append(dense.ravel(), total)
     fine = np.linspace(start, end, len(dense))
-    distances = np.interp(fine, scale, distances)
+    distances = _distances(fine, cutoff)
     # What is left at the reach is cut without a jump, and distances of rounding are none.
     faded = np.clip((distances / reach - _FADE) / (1 - _FADE), 0.0, 1.0)
     dense = total + (dense - total) * np.cos(np.pi / 2 * faded) ** 2
@@ -178,8 +184,9 @@ def of_sphere(points: Reals, sphere: Sphere, kernels: Kernels) -> Reals:
 
 def seconds_of(pairs: float, orders: int) -> float:
     """Predict the processor time of the potentials of pairs of a point and a triangle, for some orders."""
+    # It depends on nothing that the process has done, or choices would.
     on_arrays, loops = (pairs * (cost[0] + cost[1] * orders) for cost in (_ON_ARRAYS, _COMPILED))
-    return loops if compiled.would_pay(on_arrays) else on_arrays
+    return min(on_arrays, _START + loops)
 
 
 def add_of_triangles(

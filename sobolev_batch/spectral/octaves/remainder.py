@@ -38,8 +38,10 @@ from sobolev_batch.spectral.octaves.potentials import (
 from sobolev_batch.surfaces.shapes.surface import Reals, Surface
 
 # Random points of the first estimate, the fewest, and those of a scale; pairs of a point and a triangle that they may
-# take.
-USUAL_POINTS, _FEWEST_POINTS, _POINTS_OF_SCALES, _USUAL_PAIRS = 256, 40, 64, 300_000
+# take, and those of points from which nothing is hidden.
+USUAL_POINTS, _FEWEST_POINTS, _POINTS_OF_SCALES, _USUAL_PAIRS, _MOST_PAIRS = 256, 40, 64, 150_000, 500_000
+# Share of the squared errors that is most of them.
+MOSTLY = 0.5
 # Points for each square of the reach, so that none is farther than it from the next; and those of them that are
 # computed again with twice the reach and twice the nodes.
 _PER_REACH, _CONTROLS = 2.0, 24
@@ -121,17 +123,26 @@ def remainder(
     """Estimate what lies beyond a cutoff in the norm of a signed sum of surfaces, in units of length.
 
     The cutoff is the |ξ| at which the `smooth_step` ends, in cycles per unit length. By default there are enough orders
-    to interpolate between, and as many random points as nothing is hidden from, if they take at most about a second.
-    For a norm that only serves as a scale, few points will do.
+    to interpolate between, and so many random points that what they may miss is not most of the error, if that takes at
+    most about a second. For a norm that only serves as a scale, few points will do.
     """
     known = tuple(sorted({max(order, LOWEST_ORDER) for order in orders or _USUAL_ORDERS}, reverse=True))
-    spacing, rng = reach_of(known[0]) / cutoff, np.random.default_rng(seed)
-    sheets = Sheets.from_surfaces(surfaces, signs, cutoff, spacing)
-    seen_by = _Seen(sheets, Kernels.of_orders(cutoff, known), threads)
-    # Nothing can cancel in a sum without differences.
-    covering = int(_PER_REACH * sheets.area / spacing**2) if len(set(signs)) > 1 else 0
-    usual = _POINTS_OF_SCALES if is_scale else min(max(covering, USUAL_POINTS), seen_by.affordable(rng))
-    count = points or usual
+    sheets = Sheets.from_surfaces(surfaces, signs, cutoff)
+    seen_by, rng = _Seen(sheets, Kernels.of_orders(cutoff, known), threads), np.random.default_rng(seed)
+    if points is not None or is_scale:
+        return _estimate(seen_by, points or _POINTS_OF_SCALES, rng, is_exact=not is_scale)
+    found = _estimate(seen_by, seen_by.affordable(rng), rng)
+    if found.hidden > MOSTLY:
+        # Nothing is hidden from more of them.
+        count = min(found.covering, _MOST_PAIRS * found.points // max(found.pairs, 1))
+        found = _estimate(seen_by, count, rng) if count > found.points else found
+    return found
+
+
+def _estimate(seen_by: _Seen, count: int, rng: np.random.Generator, *, is_exact: bool = True) -> Remainder:
+    """Return an estimate from some points; where these saw unevenly, from more of them."""
+    covering, share = seen_by.covering, seen_by.sheets.area / count
+    sheets = seen_by.sheets.spaced(max(seen_by.squared_reach, share) ** 0.5)
     draw = sheets.even(min(count, max(covering, USUAL_POINTS)), rng)
     potentials, pairs = seen_by.potentials(draw.points)
     total, seen = len(draw.points), seen_by.shares(potentials)
@@ -155,19 +166,18 @@ def remainder(
     means = terms.mean(axis=0)
     # A single point may stand for others like it that were not met.
     variances = terms.var(axis=0, ddof=1) / n + (np.abs(terms - means).max(axis=0) / n) ** 2
-    missed = (draw.weights.max() * seen_by.alone) ** 2 if total < covering else np.zeros(len(known))
+    missed = (draw.weights.max() * seen_by.alone) ** 2 * float(total < covering)
     variances += missed
     hidden = float((missed / np.maximum(variances, np.finfo(np.float64).tiny)).max())
     errors = np.sqrt(variances) * _quantile(n)
     cut, left = (part * sheets.area * seen_by.alone for part in (_CUT, _CUT_LEFT))
-    if not is_scale and np.any(cut > _CUT_FRACTION * errors):
+    if is_exact and np.any(cut > _CUT_FRACTION * errors):
         corrections, cut = seen_by.corrections(draw, potentials, rng)
         means += corrections
-    errors = errors + cut + left
-    scales = np.array([tail_integral(cutoff, order) for order in known])
-    energies = means / scales
-    errors /= scales
-    return Remainder(cutoff, known, tuple(energies.tolist()), tuple(errors.tolist()), total, pairs, covering, hidden)
+    kernels = seen_by.kernels
+    scales = np.array([tail_integral(kernels.cutoff, order) for order in kernels.orders])
+    energies, errors = (tuple(values.tolist()) for values in (means / scales, (errors + cut + left) / scales))
+    return Remainder(kernels.cutoff, kernels.orders, energies, errors, total, pairs, covering, hidden)
 
 
 def _quantile(count: int) -> float:
@@ -182,6 +192,16 @@ class _Seen:
     sheets: Sheets
     kernels: Kernels
     threads: int
+
+    @property
+    def squared_reach(self) -> float:
+        """Squared reach of the kernel that reaches least."""
+        return float((reach_of(self.kernels.orders[0]) / self.kernels.cutoff) ** 2)
+
+    @property
+    def covering(self) -> int:
+        """Number of points from which nothing is hidden; nothing can cancel in a sum without differences."""
+        return int(_PER_REACH * self.sheets.area / self.squared_reach) if self.sheets.cancel else 0
 
     @property
     def alone(self) -> Reals:
@@ -218,7 +238,7 @@ class _Seen:
         return changes.mean(axis=0), changes.std(axis=0, ddof=1) / np.sqrt(count) * _quantile(count)
 
     def affordable(self, rng: np.random.Generator) -> int:
-        """Return the number of points whose pairs take about a second."""
+        """Return the number of points that do not take long, at most the usual one."""
         if not self.sheets.meshes:
             return USUAL_POINTS
         places, pairs = self.sheets.even(_FEWEST_POINTS, rng).points, 0
@@ -229,7 +249,7 @@ class _Seen:
             centers, radii = centers_and_radii(corners)
             offsets = np.linalg.norm(places[:, None] - centers, axis=2)
             pairs += step * int(np.count_nonzero(offsets < self.kernels.reach + radii))
-        return max(_USUAL_PAIRS * _FEWEST_POINTS // max(pairs, 1), _FEWEST_POINTS)
+        return int(np.clip(_USUAL_PAIRS * _FEWEST_POINTS // max(pairs, 1), _FEWEST_POINTS, USUAL_POINTS))
 
 
 def mean_sinc(cutoff: float, order: float, length: float) -> float:
