@@ -108,12 +108,10 @@ _MOST_ROUNDING = 1e-6
 @click.pass_context
 def compare_command(
     context: click.Context,
+    /,
     a: Path,
     b: Path,
     orders: tuple[float, ...],
-    rtol: float | None,
-    memory: int | None,
-    best_effort: bool,
     xi_max: float | None,
     intervals: int | None,
     with_yardsticks: bool,
@@ -125,6 +123,7 @@ def compare_command(
     no_scaling: bool,
     below: float | None,
     style: str,
+    **accuracy: Any,
 ) -> None:
     """Print how much two meshes differ.
 
@@ -144,18 +143,16 @@ def compare_command(
 
     if below is not None:
         context.exit(_judge_files(context, a, b, below))
-    if rtol is not None and (xi_max is not None or intervals is not None):
-        raise click.UsageError("--rtol chooses the lattice; leave out --xi-max and --M")
-    lattice = None
     if xi_max is not None or intervals is not None:
-        lattice = Lattice(5.0 if xi_max is None else xi_max, 64 if intervals is None else intervals)
-    elif rtol is None:
-        rtol, best_effort = _DEFAULT_RTOL, True
+        if accuracy["rtol"] is not None:
+            raise click.UsageError("--rtol chooses the lattice; leave out --xi-max and --M")
+        accuracy["lattice"] = Lattice(5.0 if xi_max is None else xi_max, 64 if intervals is None else intervals)
+    elif accuracy["rtol"] is None:
+        accuracy |= {"rtol": _DEFAULT_RTOL, "best_effort": True}
     first, second = read_mesh(a), read_mesh(b)
     if witness_path is not None:
         require_place(witness_path)
     orders = orders or (DEFAULT_ORDER,)
-    accuracy: dict[str, Any] = {"lattice": lattice, "rtol": rtol, "memory": memory, "best_effort": best_effort}
     similarity = Similarity() if no_scaling else Similarity.to_unit_ball(second)
     motion = before = None
     if with_motion:
@@ -189,7 +186,7 @@ def compare_command(
     if motion is not None and before is not None:
         echo(f"where it is in the file: {percent(before['relative'].item(), before['relative_error'].item())}")
         echo(_motion_text(motion))
-    _print_answers(a.name, b.name, results, area_change, rtol)
+    _print_answers(a.name, b.name, results, area_change, accuracy["rtol"])
     echo(
         f"distances of orders are in {length}; the radius of {visible(b.name)} is {radius:.6g}"
         if no_scaling
@@ -348,12 +345,9 @@ def fit_command(
     start: Path,
     target: Path,
     output: Path,
-    order: float,
-    steps: int,
-    smoothing: float,
     triangles: int | None,
-    keep_boundary: bool,
     no_scaling: bool,
+    **settings: Any,
 ) -> None:
     """Move the vertices of START to bring it nearer to TARGET, and write the mesh.
 
@@ -387,15 +381,7 @@ def fit_command(
             bar.update(progress.step - bar.pos)
 
     with bar or nullcontext(), Deadline.with_results(has_begun.is_set):
-        fitted = method(
-            similarity.apply(own),
-            similarity.apply(goal),
-            order,
-            steps=steps,
-            smoothing=smoothing,
-            keep_boundary=keep_boundary,
-            notify=show,
-        )
+        fitted = method(similarity.apply(own), similarity.apply(goal), **settings, notify=show)
     vertices = np.asarray(fitted.mesh.vertices) / similarity.scale + np.asarray(similarity.origin)
     result = Mesh(vertices, fitted.mesh.triangles)
     write_mesh(result, output)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable
 from contextlib import nullcontext
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -91,14 +90,12 @@ def init_command(folder: Path, output: Path) -> None:
 @click.pass_context
 def run_command(
     context: click.Context,
+    /,
     study: Path,
     store: Location | None,
     scheduler: str | None,
     trust_network: bool,
-    workers: int | None,
-    memory: int | None,
-    allow_commands: bool,
-    only: tuple[str, ...],
+    **settings: Any,
 ) -> None:
     """Compute what is missing of STUDY and print its tables.
 
@@ -114,15 +111,14 @@ def run_command(
     from sobolev_batch.results.tables.convergence import format_table
     from sobolev_batch.results.tables.verdict import format_verdict
 
-    if scheduler and (workers or memory):
+    if scheduler and (settings["workers"] or settings["memory"]):
         raise click.UsageError(
             "--workers and --worker-memory are for a cluster on this machine; the workers of a scheduler have their own"
         )
     parsed = as_study(study)
     connected = remote_client(scheduler, trust_network) if scheduler else nullcontext()
-    compute = partial(run, parsed, store, workers=workers, memory=memory, allow_commands=allow_commands, only=only)
     with progress_reports() as show, connected as client:
-        summary = compute(client=client, on_progress=show)
+        summary = run(parsed, store, client, on_progress=show, **settings)
     if isinstance(parsed, Study):
         tree = open_store(summary.store)
         echo_lines(format_table(tree))
@@ -157,12 +153,12 @@ def run_command(
 @click.pass_context
 def submit_command(
     context: click.Context,
+    /,
     study: Path,
     scheduler: str,
     trust_network: bool,
     store: Location | None,
-    allow_commands: bool,
-    only: tuple[str, ...],
+    **settings: Any,
 ) -> None:
     """Hand STUDY over to a cluster and return.
 
@@ -172,7 +168,7 @@ def submit_command(
     from sobolev_batch.batch.submit import submit
 
     with remote_client(scheduler, trust_network) as client:
-        submission = submit(study, store, client, allow_commands=allow_commands, only=only)
+        submission = submit(study, store, client, **settings)
 
     for name, one in (submission.objects or {"": submission}).items():
         where = f"{name}: " if name else ""
