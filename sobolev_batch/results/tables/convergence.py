@@ -257,15 +257,17 @@ def _tables(tree: xr.DataTree, frame: pd.DataFrame, style: Format, x: str) -> It
 
 
 def nearest(frame: pd.DataFrame) -> tuple[pd.Series, tuple[str, ...]] | None:
-    """Return the nearest mesh of one order, and labels that may be nearer; None if all are below their errors."""
+    """Return the nearest mesh of one order, and labels that may be nearer; None if all are below their errors.
+
+    None may be nearer if the distance with its error is below those of all others less their errors, resolved or not.
+    """
     rows = frame[frame["distance"].notna()].sort_values("distance", kind="stable")
-    resolved = rows[rows["resolved"].astype(bool)]
-    if not len(resolved):
+    if not rows["resolved"].any():
         return None
-    best = resolved.iloc[0]
-    others = rows[rows["mesh"] != best["mesh"]]
-    rivals = others[others["distance"] - others["error"] < best["distance"] + best["error"]]
-    return best, tuple(rivals["mesh"])
+    best, others = rows.iloc[0], rows.iloc[1:]
+    # An unknown error leaves everything open.
+    is_farther = (others["distance"] - others["error"]).clip(lower=0) > best["distance"] + best["error"]
+    return best, tuple(others["mesh"][~is_farther])
 
 
 def _metrics_of(tree: xr.DataTree) -> list[str]:

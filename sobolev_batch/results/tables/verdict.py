@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import xarray as xr
 
@@ -83,7 +84,8 @@ def _sentence(order: float, rows: pd.DataFrame, reference: str) -> str:
     best, rivals = closest
     # On one line, in a sentence.
     amount = percent(best["relative"], best["relative_error"]).replace(" ", "\N{NO-BREAK SPACE}")
-    doubt = f", and the errors leave open whether {rivals[0]} is nearer" if rivals else ""
+    who = rivals[0] if len(rivals) == 1 else f"one of {_names(rivals)}"
+    doubt = f", and the errors leave open whether {who} is nearer" if rivals else ""
     if compared == 1:
         return f"{best['mesh']} differs from {name} by {amount} {at_order}."
     return f"Of {compared:,} meshes, {best['mesh']} is nearest to {name} {at_order}: it differs by {amount}{doubt}."
@@ -119,13 +121,23 @@ def _nearest_row(label: str, members: pd.DataFrame) -> Row:
 
 
 def _lead(best: pd.Series, members: pd.DataFrame) -> str:
-    """Return by how much the nearest mesh is nearer than the next one of another family."""
+    """Return by how much the nearest mesh is nearer than the next one of another family, of its size if there is one.
+
+    Where there is none, the remark has the number of triangles of the other one.
+    """
     others = members[(members["family"] != best["family"]) & members["distance"].notna()]
+    counts = np.maximum(others["triangles"].astype(float), 1.0) / max(best["triangles"], 1)
+    of_size = others[counts.between(1 / _SAME_SIZE, _SAME_SIZE)]
     if not len(others):
         return ""
-    second = others.loc[others["distance"].idxmin()]
+    rivals = of_size if len(of_size) else others
+    second = rivals.loc[rivals["distance"].idxmin()]
+    size = "" if len(of_size) or not second["triangles"] else f" of {second['triangles']:,} triangles"
+    nearer = f"nearer than {second['mesh']}{size}"
+    if not best["resolved"]:
+        return f"below its error, {nearer}"
     ratio = second["distance"] / best["distance"]
-    return f"{ratio:.3g} times nearer than {second['mesh']}" if ratio < 100 else f"far nearer than {second['mesh']}"
+    return f"{ratio:.3g} times {nearer}" if ratio < 100 else f"far {nearer}"
 
 
 def _smallest_rows(rows: pd.DataFrame, families: Sequence[str]) -> Iterator[Row]:

@@ -100,6 +100,33 @@ def test_errors_that_leave_a_place_open_are_said() -> None:
     assert rows["above rtol"] == ["a/100, b/100"]
 
 
+def test_a_mesh_that_equals_the_reference_is_nearest() -> None:
+    made = frame([("a", 100, 0.0), ("b", 100, 1.03), ("b", 400, 0.7)], error=0.03)
+    made.loc[0, ["error", "relative_error", "resolved"]] = 8e-10, 2e-10, False
+    sentence, rows, _ = verdict_on(made)
+    assert sentence.startswith("Of 3 meshes, a/100 is nearest to the reference")
+    assert "open" not in sentence
+    assert rows["100 triangles"] == ["a/100", "0 % ± 2 × 10⁻⁸ %", "100", "below its error, nearer than b/100"]
+    # Another one may be as near.
+    made.loc[2, ["distance", "error", "resolved"]] = 0.4, 0.5, False
+    sentence, rows, _ = verdict_on(made)
+    assert sentence.endswith("and the errors leave open whether b/400 is nearer.")
+    assert rows["nearest of all"][-1] == "errors leave open b/400"
+    made.loc[1, "error"] = np.nan
+    sentence, _, _ = verdict_on(made)
+    assert sentence.endswith("whether one of b/400, b/100 is nearer.")
+
+
+def test_the_nearest_of_all_is_compared_with_its_like() -> None:
+    meshes = [("a", 10240, 0.01), ("b", 5120, 0.03)]
+    _, rows, _ = verdict_on(frame(meshes))
+    assert rows["nearest of all"][-1] == "3 times nearer than b/5120 of 5,120 triangles"
+    _, rows, _ = verdict_on(frame([*meshes, ("b", 10000, 0.05)]))
+    assert rows["nearest of all"][-1] == "5 times nearer than b/10000"
+    _, rows, _ = verdict_on(frame([*meshes, ("c", 0, 0.02)]))
+    assert rows["nearest of all"][-1] == "2 times nearer than c/0"
+
+
 def test_failures_only() -> None:
     nothing = dict.fromkeys(("distance", "error", "relative", "relative_error"), np.nan)
     made = frame([("a", 0, 0.1)] * 5, resolved=False, within=False, **nothing)
