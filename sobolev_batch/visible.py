@@ -19,7 +19,7 @@ from typing import Any, TextIO
 HAZARDOUS = re.compile("[\0-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u206f\ud800-\udfff]")
 # The unit of length of files where it has no name.
 FILE_UNITS = "file units"
-# More rows of one kind would hide the others.
+# More rows of one kind, or at either end of a text in a notebook, would hide the others.
 _MOST_ALIKE = 20
 # Notebooks align the cells of tables to the right and keep them short.
 _CELL_STYLE = 'style="text-align: left; vertical-align: top; white-space: pre-wrap"'
@@ -78,6 +78,16 @@ def table_html(caption: str, rows: Iterable[tuple[str, str]]) -> str:
         for name, text in rows
     )
     return f"<div><strong>{_escaped(caption)}</strong><table>{cells}</table></div>"
+
+
+class Shown:
+    """A value that notebooks show as ``print`` does, its first line above the others."""
+
+    def _repr_html_(self) -> str:
+        caption, *lines = str(self).splitlines()
+        if len(lines) > 2 * _MOST_ALIKE + 1:
+            lines[_MOST_ALIKE:-_MOST_ALIKE] = [f"and {len(lines) - 2 * _MOST_ALIKE:,} more"]
+        return table_html(caption, [("", line) for line in lines])
 
 
 def reasons(name: str, by_label: Mapping[str, str]) -> Iterable[tuple[str, str]]:

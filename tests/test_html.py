@@ -38,7 +38,7 @@ def summary() -> sb.result_types.Summary:
         (sb.result_types.StudyDraft(Path(HOSTILE), [HOSTILE], {HOSTILE: "damaged"}), [f"{HOSTILE}: damaged"]),
         (
             sb.result_types.Verification(HOSTILE, 3, 4, {HOSTILE: "gone"}, {"norm": HOSTILE}, withdrawn=True),
-            ["damaged", "3 of 4", f"{HOSTILE}: gone", "computes what is damaged again"],
+            ["damaged", "3 of 4", f"{HOSTILE}: gone", "run the study again to repair it"],
         ),
         (
             sb.result_types.Status(HOSTILE, 3, 5, {HOSTILE: HOSTILE}, {}, None, False, 0.0),

@@ -34,7 +34,7 @@ from sobolev_batch.errors import DamageError, InputError
 from sobolev_batch.parameters import available_cores, require_machine_memory
 from sobolev_batch.spectral.adaptive.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.spectral.budget import NormEstimate
-from sobolev_batch.visible import reasons, table_html
+from sobolev_batch.visible import Shown, reasons, visible
 
 _log = logging.getLogger(__name__)
 
@@ -46,7 +46,7 @@ _MOST_REPAIRS = 3
 
 
 @dataclass(frozen=True)
-class Summary:
+class Summary(Shown):
     """The outcome of a run.
 
     Attributes:
@@ -72,18 +72,12 @@ class Summary:
     not_compared: Mapping[str, str] = field(default_factory=dict)
     imprecise: Mapping[str, float] = field(default_factory=dict)
 
-    def _repr_html_(self) -> str:
+    def __str__(self) -> str:
         counts = f"{len(self.computed)} computed, {len(self.reused)} reused, {len(self.failed)} failed"
         errors = {label: f"error of {100 * error:.2g} %" for label, error in self.imprecise.items()}
-        return table_html(
-            f"Run: {counts}",
-            [
-                ("store", self.store),
-                *reasons("failed", self.failed),
-                *reasons("not compared", self.not_compared),
-                *reasons("imprecise", errors),
-            ],
-        )
+        kinds = {"failed": self.failed, "not compared": self.not_compared, "imprecise": errors}
+        lines = [f"{name}: {text}" for name, by_label in kinds.items() for name, text in reasons(name, by_label)]
+        return "\n".join(map(visible, [f"{counts}; store: {self.store}", *lines]))
 
 
 def run(

@@ -26,7 +26,7 @@ from sobolev_batch.batch.store.tables import (
 from sobolev_batch.batch.workspace import Workspace, complete_records
 from sobolev_batch.errors import DamageError, LockError, StoreError
 from sobolev_batch.parameters import available_cores
-from sobolev_batch.visible import reasons, table_html
+from sobolev_batch.visible import Shown, visible
 
 _log = logging.getLogger(__name__)
 
@@ -35,7 +35,7 @@ _THREADS_PER_CORE = 2
 
 
 @dataclass(frozen=True)
-class Verification:
+class Verification(Shown):
     """The result of a verification.
 
     Attributes:
@@ -62,12 +62,21 @@ class Verification:
     withdrawn: bool
     objects: Mapping[str, Verification] = field(default_factory=dict)
 
-    def _repr_html_(self) -> str:
-        damage = [*reasons("field", self.fields), *reasons("table", self.tables)]
-        remark = [("withdrawn", "the next run computes what is damaged again")] if self.withdrawn else []
-        verdict = f"Verification: {'sound' if self.is_sound else 'damaged'}"
-        counts = f"{self.complete} of {self.total} complete"
-        return table_html(verdict, [("store", self.store), ("surfaces", counts), *damage, *remark])
+    def __str__(self) -> str:
+        lines = []
+        for name, one in (self.objects or {self.store: self}).items():
+            counts = f"{one.complete} of {one.total} surfaces complete, their fields read back"
+            nothing = "its store cannot be read" if one.tables else "it has no results yet"
+            lines.append(f"{name}: {counts if one.total else nothing}")
+        damage = {**self.fields, **{f"table {name}": what for name, what in self.tables.items()}}
+        lines += [f"{name}: {what}" for name, what in damage.items()]
+        remedy = (
+            "run the study again to repair it"
+            if self.withdrawn
+            else "the store cannot be written from here, so nothing was withdrawn"
+        )
+        found = f"{len(self.fields)} surfaces and {len(self.tables)} arrays of tables are damaged; {remedy}"
+        return "\n".join(map(visible, [*lines, "nothing is damaged" if self.is_sound else found]))
 
     @property
     def is_sound(self) -> bool:

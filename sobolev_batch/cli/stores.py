@@ -105,25 +105,9 @@ def verify_command(context: click.Context, store: Location, style: str) -> None:
         result = verify(store, show)
     if style == "json":
         echo_json(result, is_sound=result.is_sound)
-        context.exit(0 if result.is_sound else EXIT_OTHER)
-    for name, one in (result.objects or {str(store): result}).items():
-        counts = f"{one.complete} of {one.total} surfaces complete, their fields read back"
-        nothing = "its store cannot be read" if one.tables else "it has no results yet"
-        echo(f"{name}: {counts if one.total else nothing}")
-    tables = {f"table {name}": damage for name, damage in result.tables.items()}
-    for name, damage in (*result.fields.items(), *tables.items()):
-        echo(f"{name}: {damage}")
-    if result.is_sound:
-        echo("nothing is damaged")
-        return
-    remedy = (
-        "run the study again to repair it"
-        if result.withdrawn
-        else "the store cannot be written from here, so nothing was withdrawn"
-    )
-    surfaces = len(result.fields)
-    echo(f"{surfaces} surfaces and {len(result.tables)} arrays of tables are damaged; {remedy}")
-    context.exit(EXIT_OTHER)
+    else:
+        echo_lines(result)
+    context.exit(0 if result.is_sound else EXIT_OTHER)
 
 
 @cli.command("unlock")

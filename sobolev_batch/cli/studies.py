@@ -127,10 +127,7 @@ def run_command(
     else:
         _print_league(summary.store)
     echo()
-    echo(
-        f"{len(summary.computed)} computed, {len(summary.reused)} reused, {len(summary.failed)} failed; "
-        f"store: {summary.store}"
-    )
+    echo(str(summary).partition("\n")[0])
     for label, reason in summary.not_compared.items():
         echo(f"{label}: {reason}", err=True)
     for label, error in list(summary.imprecise.items())[:_MOST_IMPRECISE]:

@@ -29,7 +29,7 @@ from sobolev_batch.spectral.lattice import Lattice
 from sobolev_batch.spectral.octaves.values import SurfaceSize
 from sobolev_batch.spectral.transform import field_seconds, slowness
 from sobolev_batch.surfaces.shapes.surface import Similarity, placement_doubt
-from sobolev_batch.visible import reasons, table_html, visible
+from sobolev_batch.visible import Shown, reasons, visible
 
 # Time to describe and record a surface, and that of each of its triangles.
 _ROW_SECONDS, _TRIANGLE_SECONDS = 0.1, 5e-6
@@ -84,7 +84,7 @@ def _row_seconds(plan: Plan, row: Row) -> float:
 
 
 @dataclass(frozen=True)
-class StudyPlan:
+class StudyPlan(Shown):
     """Forecast of a run of a study; ``print(plan)`` shows what ``sobolev-batch plan`` shows.
 
     Attributes:
@@ -143,14 +143,8 @@ class StudyPlan:
         return {**numbers, "study": self.study.name, "total_bytes": self.total_bytes}
 
     def __str__(self) -> str:
-        return "\n".join(beside(f"{name + ':' * bool(name):<14} ", text) for name, text in self._shown)
-
-    @property
-    def _shown(self) -> tuple[tuple[str, str], ...]:
-        return (*self.lines, *(("warning", text) for text in self.warnings))
-
-    def _repr_html_(self) -> str:
-        return table_html("Plan", self._shown)
+        lines = (*self.lines, *(("warning", text) for text in self.warnings))
+        return "\n".join(beside(f"{name + ':' * bool(name):<14} ", text) for name, text in lines)
 
 
 def _study_lines(plan: Plan) -> Iterator[tuple[str, str]]:
@@ -213,7 +207,7 @@ def _task_lines(
 
 
 @dataclass(frozen=True)
-class CollectionPlan:
+class CollectionPlan(Shown):
     """Forecast of a run of a collection; ``print(plan)`` shows the plan of each object.
 
     Attributes:

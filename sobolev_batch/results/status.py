@@ -17,7 +17,7 @@ from sobolev_batch.batch.workspace import complete_records, failed_proximities
 from sobolev_batch.errors import DamageError
 from sobolev_batch.results.open import AnyStore, location_of
 from sobolev_batch.results.tables.text import duration
-from sobolev_batch.visible import reasons, table_html, visible
+from sobolev_batch.visible import Shown, visible
 
 # A run that waits for a busy cluster, or plans on another machine, has no heartbeat. It counts as lost after this time.
 _PATIENCE_SECONDS = 600.0
@@ -27,7 +27,7 @@ _FEWEST_FOR_RATE = 3
 
 
 @dataclass(frozen=True)
-class Status:
+class Status(Shown):
     """Progress of a study; ``print(status)`` shows what ``sobolev-batch status`` shows.
 
     Attributes:
@@ -184,19 +184,6 @@ class Status:
 
     def __str__(self) -> str:
         return "\n".join(map(visible, self.lines()))
-
-    def _repr_html_(self) -> str:
-        run = [] if self.run is None else [("run", line) for line in self._run_lines(self.run)]
-        return table_html(
-            f"Status: {self.complete} of {self.total} complete, {len(self.failed)} failed, {self.waiting} to go",
-            [
-                ("store", self.store),
-                *reasons("failed", self.failed),
-                *reasons("not compared", self.not_compared),
-                *run,
-                *([] if self.reduced else [("tables", "not yet")]),
-            ],
-        )
 
     def lines(self) -> Iterator[str]:
         """Yield the lines that ``sobolev-batch status`` prints."""

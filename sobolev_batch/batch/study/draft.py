@@ -21,7 +21,7 @@ from sobolev_batch.errors import MeshError, StudyError, written
 from sobolev_batch.surfaces.formats.readers import expected_size, is_mesh_name, mesh_stem, read_mesh
 from sobolev_batch.surfaces.sources.files import MOST_MESHES
 from sobolev_batch.surfaces.sources.names import caseless_key, label_problem, name_problem, natural_key, quoted
-from sobolev_batch.visible import reasons, table_html, visible
+from sobolev_batch.visible import Shown, reasons, visible
 
 # Bytes of files that are read as a whole; the header or the length of others gives their size.
 _MOST_BYTES = 32 << 20
@@ -88,7 +88,7 @@ _Methods = Mapping[tuple[str, str], Sequence[PurePosixPath]]
 
 
 @dataclass(frozen=True)
-class StudyDraft:
+class StudyDraft(Shown):
     """A study file that was written for a folder of meshes; ``print(draft)`` tells what it holds and what to do next.
 
     Attributes:
@@ -115,10 +115,6 @@ class StudyDraft:
         left_out = [f"{name}: {text}" for name, text in reasons("left out", self.left_out)]
         following = [f"next: sobolev-batch plan {file}", f"      sobolev-batch run {file}"]
         return "\n".join(map(visible, [f"{self.path}: {families[0]}", *families[1:], *left_out, *following]))
-
-    def _repr_html_(self) -> str:
-        rows = [("", line) for line in self.summary[:_MOST_LINES]]
-        return table_html(f"Study file {self.path}", [*rows, *reasons("left out", self.left_out)])
 
 
 def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> StudyDraft:
