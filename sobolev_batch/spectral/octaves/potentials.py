@@ -23,7 +23,7 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss
 from scipy.special import beta, betainc
 
-from sobolev_batch.spectral import compiled
+from sobolev_batch import compiled
 from sobolev_batch.spectral.lattice import smooth_step
 from sobolev_batch.spectral.rules import symmetric_rule
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
@@ -219,7 +219,7 @@ def add_compiled(
     threads: int,
 ) -> None:
     """Do the same for pairs of rows and columns, by the compiled loop."""
-    from sobolev_batch.spectral.compiled.edges import add_potentials
+    from sobolev_batch.compiled.edges import add_potentials
 
     rules = [symmetric_rule(degree) for degree, _, _ in _RULES]
     limits = np.array([[farthest, largest] for _, farthest, largest in _RULES]) / kernels.fineness

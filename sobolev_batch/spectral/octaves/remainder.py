@@ -40,8 +40,8 @@ from sobolev_batch.surfaces.shapes.surface import Reals, Surface
 # Random points of the first estimate, the fewest, and those of a scale; pairs of a point and a triangle that they may
 # take, and those of points from which nothing is hidden.
 USUAL_POINTS, _FEWEST_POINTS, _POINTS_OF_SCALES, _USUAL_PAIRS, _MOST_PAIRS = 256, 40, 64, 150_000, 500_000
-# Share of the squared errors that is most of them.
-MOSTLY = 0.5
+# Share of the squared errors that is most of them, and a relative error that may be smaller for some more points.
+MOSTLY, _ROUGH = 0.5, 0.15
 # Points for each square of the reach, so that none is farther than it from the next; and those of them that are
 # computed again with twice the reach and twice the nodes.
 _PER_REACH, _CONTROLS = 2.0, 24
@@ -132,7 +132,7 @@ def remainder(
     if points is not None or is_scale:
         return _estimate(seen_by, points or _POINTS_OF_SCALES, rng, is_exact=not is_scale)
     found = _estimate(seen_by, seen_by.affordable(rng), rng)
-    if found.hidden > MOSTLY:
+    if found.hidden > MOSTLY and np.any(np.array(found.errors) > _ROUGH * np.abs(found.energies)):
         # Nothing is hidden from more of them.
         count = min(found.covering, _MOST_PAIRS * found.points // max(found.pairs, 1))
         found = _estimate(seen_by, count, rng) if count > found.points else found
