@@ -11,7 +11,7 @@ from tests.support.repository import MODULES, PACKAGE, imported, public_names
 
 # Each may import those before it.
 LAYERS = (
-    *("visible", "errors", "parameters", "surfaces", "spectral", "fitting", "batch", "results", "testing"),
+    *("visible", "errors", "parameters", "compiled", "surfaces", "spectral", "fitting", "batch", "results", "testing"),
     *("shapes", "sources", "plot", "result_types", "cli"),
 )
 MOST_NAMES_OF_A_FOLDER = 20

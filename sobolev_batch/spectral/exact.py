@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gamma, kv
 
+from sobolev_batch.compiled import pays
 from sobolev_batch.errors import OrderError
 from sobolev_batch.spectral.backends import (
     CPU,
@@ -37,7 +38,6 @@ from sobolev_batch.spectral.backends import (
     row_dots,
     sums_at,
 )
-from sobolev_batch.spectral.compiled import pays
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice
 from sobolev_batch.surfaces.shapes.closed_forms import Sphere
 from sobolev_batch.surfaces.shapes.mesh import Corners, Mesh, cross_lengths
@@ -93,7 +93,7 @@ def exact_transform(mesh: Mesh, frequencies: Reals, backend: Backend = CPU) -> C
 
 
 def _compiled_exact_transform(mesh: Mesh, frequencies: Reals, threads: int = 1) -> Complexes:
-    from sobolev_batch.spectral.compiled.divided_differences import exact_sums
+    from sobolev_batch.compiled.divided_differences import exact_sums
 
     doubled = _compiled_doubled_areas(mesh)
     # Sums of sums round less often.
@@ -107,7 +107,7 @@ def _compiled_exact_transform(mesh: Mesh, frequencies: Reals, threads: int = 1) 
 
 
 def _compiled_sampled_transform(mesh: Mesh, frequencies: Reals, threads: int) -> Complexes:
-    from sobolev_batch.spectral.compiled.divided_differences import sampled_sums
+    from sobolev_batch.compiled.divided_differences import sampled_sums
 
     total = np.zeros(len(frequencies), dtype=np.complex128)
     for _, batch in mesh.batches(_COMPILED_BATCH):
@@ -117,7 +117,7 @@ def _compiled_sampled_transform(mesh: Mesh, frequencies: Reals, threads: int) ->
 
 
 def _compiled_doubled_areas(mesh: Mesh) -> Reals:
-    from sobolev_batch.spectral.compiled.divided_differences import plain_doubled_areas
+    from sobolev_batch.compiled.divided_differences import plain_doubled_areas
 
     doubled, is_flat = plain_doubled_areas(mesh.vertices, mesh.triangles, _FLATNESS)
     if np.any(is_flat):

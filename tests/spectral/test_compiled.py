@@ -135,7 +135,7 @@ def test_loops_work_where_nothing_can_be_kept(tmp_path: Path, monkeypatch: pytes
     for name in ("HOME", "XDG_CACHE_HOME", "IPYTHONDIR"):
         monkeypatch.setenv(name, str(tmp_path / "__pycache__"))
     module = tmp_path / "doubling.py"
-    module.write_text("from sobolev_batch.spectral.compiled import loop\n@loop\ndef doubled(x):\n    return 2 * x\n")
+    module.write_text("from sobolev_batch.compiled import loop\n@loop\ndef doubled(x):\n    return 2 * x\n")
     spec = importlib.util.spec_from_file_location("doubling", module)
     assert spec is not None
     assert spec.loader is not None

@@ -15,6 +15,7 @@ from typing import Self
 import numpy as np
 from distributed import get_worker
 
+from sobolev_batch import compiled
 from sobolev_batch.batch.cluster.workers import worker_backend
 from sobolev_batch.batch.storage.lock import utc_now
 from sobolev_batch.batch.store.records import Facts, Record
@@ -22,7 +23,6 @@ from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.plan import Plan, Row
 from sobolev_batch.batch.study.schema import Backends
 from sobolev_batch.errors import InputError, LatticeError, MeshError, StoreError, one_line
-from sobolev_batch.spectral import compiled
 from sobolev_batch.spectral.adaptive.problem import without_common_parts
 from sobolev_batch.spectral.adaptive.solve import DistanceTarget
 from sobolev_batch.spectral.fields import Quality, TailQuality, compute_field, field_for

@@ -13,6 +13,11 @@ from collections.abc import Callable
 from threading import Lock
 from typing import Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
+Reals = NDArray[np.float64]
+Indices = NDArray[np.integer]
 Loop = TypeVar("Loop", bound=Callable[..., Any])
 
 # Processor seconds on arrays from which on numba is worth its import.

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from sobolev_batch.spectral.compiled import loop
-from sobolev_batch.surfaces.shapes.surface import Indices, Reals
+from sobolev_batch.compiled import Indices, Reals, loop
 
 
 @loop

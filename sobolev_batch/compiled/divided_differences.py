@@ -11,11 +11,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.spectral.compiled import loop, part
+from sobolev_batch.compiled import Indices, Reals, loop, part
 
-Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
-Indices = NDArray[np.integer]
 
 _TURN = 2 * math.pi
 # Taylor coefficients of sin(2πx)/x and cos(2πx) in x²: up to a quarter of a cycle the rest is below 2e-17.
