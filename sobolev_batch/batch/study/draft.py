@@ -252,20 +252,26 @@ def _without_size(stem: str) -> str:
     return _SIZE.sub("", stem).strip(" _-.")
 
 
-def _families(paths: Sequence[PurePosixPath]) -> dict[str, list[PurePosixPath]]:
-    """Return the files of one object by family: one for each folder, or by what names in one folder have in common."""
-    has_folders = len({path.parent for path in paths}) > 1
-    # With slashes, or those of a/b and "a b" would be one.
-    wanted = ["/".join(path.parent.parts) if has_folders else _without_size(mesh_stem(path)) for path in paths]
-    if not has_folders:
-        # Meshes that are alone are a family together.
-        counts = Counter(wanted)
-        wanted = [name if counts[name] > 1 else "" for name in wanted]
-    names: dict[str, str] = {}
-    families: dict[str, list[PurePosixPath]] = {}
-    for path, name in zip(paths, wanted, strict=True):
-        families.setdefault(names.setdefault(name, _free_name(name, names.values())), []).append(path)
-    return families
+def _families(owned: Sequence[tuple[PurePosixPath, str]], own_folders: Mapping[str, Sequence[str]]) -> list[str]:
+    """Return the family of each file, which comes with its object, by its folder or by its name.
+
+    Objects have folders of their own, which say nothing of families; a single object is called "".
+    """
+    folders = [[part for part in path.parent.parts if part not in own_folders[name]] for path, name in owned]
+    shared = sum(1 for _ in takewhile(lambda parts: len(set(parts)) == 1, zip(*folders, strict=False)))
+    wanted = []
+    for (path, name), parts in zip(owned, folders, strict=True):
+        # What the name of the file says beside object and size; cowboy in the folder of cow is a family.
+        rest = mesh_stem(path).removeprefix(name)
+        rest = _without_size(mesh_stem(path) if rest[:1].isalnum() else rest)
+        # With slashes, or the families of a/b and "a b" would be one.
+        wanted.append("/".join(parts[shared:]) or rest or "".join(parts[-1:]))
+    # Meshes of one object that are alone, in no folder of their own, are a family together.
+    counts, names = Counter(wanted), dict[str, str]()
+    for place, ((_, name), parts) in enumerate(zip(owned, folders, strict=True)):
+        if not name and not parts[shared:] and counts[wanted[place]] == 1:
+            wanted[place] = ""
+    return [names.setdefault(one, _free_name(one, names.values())) for one in wanted]
 
 
 def _several_objects(paths: Sequence[PurePosixPath]) -> tuple[dict[str, PurePosixPath], _Methods] | None:
@@ -282,21 +288,9 @@ def _several_objects(paths: Sequence[PurePosixPath]) -> tuple[dict[str, PurePosi
     are_all_owners = references.keys() == {owner for _, owner in owned}
     if not are_names or not are_all_owners or not 2 <= len({*map(caseless_key, references)}) == len(called):
         return None
-    # Folders that are neither the object's nor those of its reference.
-    folders = [
-        [part for part in path.parent.parts if part not in (name, *references[name].parent.parts)]
-        for path, name in owned
-    ]
-    shared = sum(1 for _ in takewhile(lambda parts: len(set(parts)) == 1, zip(*folders, strict=False)))
-    families: dict[str, str] = {}
     methods: dict[tuple[str, str], list[PurePosixPath]] = {}
-    for (path, name), parts in zip(owned, folders, strict=True):
-        # What the name of the file says beside object and size; cowboy in the folder of cow is a method.
-        rest = mesh_stem(path).removeprefix(name)
-        rest = _without_size(mesh_stem(path) if rest[:1].isalnum() else rest)
-        # With slashes, or the methods of a/b and "a b" would be one.
-        method = "/".join(parts[shared:]) or rest or "".join(parts[-1:])
-        family = families.setdefault(method, _free_name(method, families.values()))
+    own_folders = {name: (name, *path.parent.parts) for name, path in references.items()}
+    for (path, name), family in zip(owned, _families(owned, own_folders), strict=True):
         methods.setdefault((name, family), []).append(path)
     return references, methods
 
@@ -321,7 +315,10 @@ def _sections_of_one(
 ) -> tuple[str, tuple[str, ...]]:
     """Return the sections of a study of one object, and what they hold."""
     path, triangles = str(folder / reference), sizes[reference]
-    families = _families([other for other in sizes if other != reference])
+    others = [(other, "") for other in sizes if other != reference]
+    families: dict[str, list[PurePosixPath]] = {}
+    for (other, _), family in zip(others, _families(others, {"": ()}), strict=True):
+        families.setdefault(family, []).append(other)
     counts = [count for part in _FRACTIONS if (count := triangles // part) >= _FEWEST_TRIANGLES]
     if not families and not counts:
         raise StudyError(
