@@ -72,21 +72,23 @@ def evolution(
     orders = list(dict.fromkeys(convergence["order"].values.tolist() if order is None else check_orders(order)))
     labels, true_labels = _labels_by_time(tree, truth)
     complete = set(complete_meshes(tree))
-    times = sorted({time for family in labels.values() for time in family})
-    places, shape = {time: k for k, time in enumerate(times)}, (len(labels), len(times), len(orders))
-    numbers = {name: np.full(shape, np.nan) for name in _NUMBERS}
-    for i, family in enumerate(labels.values()):
-        for time, label in family.items():
+    frames = []
+    for family, by_time in labels.items():
+        for time, label in by_time.items():
+            known = None
             if truth is None:
-                found = convergence.sel(mesh=label, order=orders)
+                known = convergence.sel(mesh=label, order=orders)
             elif {label, true_label := _at(true_labels, time)} <= complete:
-                found = StoreAccessor(tree).distance(orders, label, str(true_label))
-            else:
-                continue
-            place = i, places[time]
-            for name, values in numbers.items():
-                values[place] = found[name].values
-    return _dataset(list(labels), times, orders, numbers, factor)
+                known = StoreAccessor(tree).distance(orders, label, str(true_label))
+            numbers = {name: np.nan if known is None else known[name].values for name in _NUMBERS}
+            frames.append(pd.DataFrame({"family": family, "time": time, "order": orders, **numbers}))
+    times = sorted({time for by_time in labels.values() for time in by_time})
+    table = pd.concat(frames, ignore_index=True).set_index(["family", "time", "order"]).to_xarray()
+    found = table.reindex(family=list(labels), time=times, order=orders)
+    for name in (*_NUMBERS, "time", "order"):
+        found[name].attrs = VARIABLES[name]
+    found["family"].attrs = described("family of meshes")
+    return _with_growth(found, factor)
 
 
 def format_evolution(
@@ -146,22 +148,8 @@ def _at(labels: Mapping[float, str], time: float) -> str | None:
     return next((label for other, label in labels.items() if math.isclose(other, time, rel_tol=1e-9)), None)
 
 
-def _dataset(
-    families: list[str],
-    times: list[float],
-    orders: list[float],
-    numbers: Mapping[str, np.ndarray],
-    factor: float,
-) -> xr.Dataset:
-    dims = ("family", "time", "order")
-    found = xr.Dataset(
-        {name: (dims, values, VARIABLES[name]) for name, values in numbers.items()},
-        coords={
-            "family": ("family", families, described("family of meshes")),
-            "time": ("time", times, VARIABLES["time"]),
-            "order": ("order", orders, VARIABLES["order"]),
-        },
-    )
+def _with_growth(found: xr.Dataset, factor: float) -> xr.Dataset:
+    """Return distances over `family`, `time` and `order` with their growth, and when a new mesh pays."""
     first = found.isel(time=found["distance"].notnull().argmax("time")).drop_vars("time")
     # Nothing is known of the growth of a distance that may be zero.
     growth = found["distance"] / first["distance"].where(first["distance"] > first["error"])
