@@ -19,7 +19,7 @@ from sobolev_batch.errors import DamageError, InputError
 from sobolev_batch.results.open import finished_group, reference_of, require_unchanged, source_of, store_of
 from sobolev_batch.spectral import DEFAULT_ORDER
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.budget import NormEstimate
+from sobolev_batch.spectral.budget import AREA_AND_SHAPE, NormEstimate
 from sobolev_batch.spectral.fields import Quality
 from sobolev_batch.spectral.lattice import Orders, check_orders, shell_sums, single_order, smooth_step
 from sobolev_batch.spectral.metrics.causes import band_coordinates
@@ -29,7 +29,7 @@ from sobolev_batch.surfaces.sources.names import quoted
 
 # Labels of meshes: one, several, or all.
 Meshes = str | Sequence[str] | None
-_OF_DISTANCES = ("distance", "error", "error_part", "relative", "relative_error", "area_part", "shape_part")
+_OF_DISTANCES = ("distance", "error", "error_part", "relative", "relative_error", *AREA_AND_SHAPE)
 # Meshes whose distances from another are computed at a time, until others are certainly farther.
 _CANDIDATES = 32
 # The innermost octave has this many spacings of the lattice within it.
@@ -94,8 +94,8 @@ class StoreAccessor:
 
         Returns:
             `distance`, its `error` and as `error_part` the parts of that (`part`), `relative` and `relative_error` as
-            `sobolev_batch.distance`, with `area_part` and `shape_part`, float64, in the square root of a unit length;
-            for several meshes over `mesh` besides, see `norm`.
+            `sobolev_batch.distance`, with `area_part` and `shape_part`, their `area_part_error` and `shape_part_error`,
+            float64, in the square root of a unit length; for several meshes over `mesh` besides, see `norm`.
 
         >>> import sobolev_batch as sb
         >>> tree = sb.open_store("storage/icosphere.zarr")
@@ -107,14 +107,14 @@ class StoreAccessor:
         """
         if other is None or other == reference_of(self._tree):
             table = convergence_at(self._tree, order, mesh)
-            return self._chosen(table[[*_OF_DISTANCES]], order, mesh)
+            return self._chosen(table[[name for name in _OF_DISTANCES if name in table]], order, mesh)
         meshes = finished_group(self._tree, "meshes")
         complete = meshes["mesh"].values[meshes["status"].values == "complete"].tolist()
         labels = [mesh] if isinstance(mesh, str) else complete if mesh is None else list(mesh)
         reducer, rows = stored_reducer(self._tree, order, *labels, other)
-        _, distances, (area, shape, *_) = reducer.norms(rows[:-1])
+        _, distances, parts = reducer.norms(rows[:-1])
         of_other, _, _ = reducer.norms(rows[-1:])
-        columns = {**distances.named("distance"), "area_part": area, "shape_part": shape}
+        columns = {**distances.named("distance"), **dict(zip(AREA_AND_SHAPE, parts, strict=False))}
         columns["relative"], columns["relative_error"] = distances.relative_to(of_other)
         table = table_of(columns, meshes.sel(mesh=labels), reducer.orders)
         return self._chosen(table, order, mesh if isinstance(mesh, str) else labels)

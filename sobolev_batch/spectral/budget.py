@@ -80,6 +80,8 @@ class Support:
 
 # Of an error, in the order of `NormEstimate`.
 PARTS = ("truncation", "aliasing", "discretisation", "statistical")
+# Of a distance, each with its error, in the order of `ReferenceEstimate.parts`.
+AREA_AND_SHAPE = ("area_part", "area_part_error", "shape_part", "shape_part_error")
 
 
 @dataclass(frozen=True)
@@ -318,8 +320,8 @@ class ReferenceEstimate:
 
         Beyond the lattice a product is at most the product of the norms of both factors there.
         """
-        beyond = np.prod([(one.values + one.truncation) ** 2 - one.values**2 for one in (distances, norms)], axis=0)
-        errors = np.sqrt(beyond) + aliased(products, weights, widths)
+        ours, own = ((one.values + one.truncation) ** 2 - one.values**2 for one in (distances, norms))
+        errors = np.sqrt(ours * own) + aliased(products, weights, widths)
         return cls(norms, products.totals, errors + product_rounding(distances, norms))
 
     def area_shares(self, distances: NormEstimate) -> tuple[Reals, Reals]:
@@ -328,35 +330,46 @@ class ReferenceEstimate:
         The best multiple c b of the reference explains <a - b, b>² / ||b||² of ||a - b||².
         """
         products, norms = np.abs(self.products), self.norms
+        lowest, highest = self._area_bounds
         with np.errstate(divide="ignore", invalid="ignore"):
             shares = np.minimum((products / (distances.values * norms.values)) ** 2, 1.0)
-            fewest = np.maximum(products - self.product_errors, 0.0) / (
-                (distances.values + distances.errors) * (norms.values + norms.errors)
-            )
-            most = (products + self.product_errors) / (
-                np.maximum(distances.values - distances.errors, 0.0) * np.maximum(norms.values - norms.errors, 0.0)
-            )
+            fewest = lowest / (distances.values + distances.errors)
+            most = highest / np.maximum(distances.values - distances.errors, 0.0)
         return shares, np.maximum(shares - fewest**2, np.minimum(most**2, 1.0) - shares)
+
+    @property
+    def _area_bounds(self) -> tuple[Reals, Reals]:
+        """Bounds on |<a - b, b>| / ||b||."""
+        products, norms, error = np.abs(self.products), self.norms, self.product_errors
+        with np.errstate(divide="ignore", invalid="ignore"):
+            lowest = np.maximum(products - error, 0.0) / (norms.values + norms.errors)
+            return lowest, (products + error) / np.maximum(norms.values - norms.errors, 0.0)
+
+    def parts(self, distances: NormEstimate) -> dict[str, Reals]:
+        """Return two orthogonal parts of distances, that of area and the rest, by name, and bounds on their errors.
+
+        For the difference e = a - b they follow from ||e||, <e, b> and ||b||. The multiple of b nearest to a is c b
+        with c = 1 + <e, b>/<b, b>, in which nothing cancels for near-duplicates. Then e = (c - 1) b + (a - c b). The
+        squares of the norms of both parts are good to 1e-15 of the squared distance.
+        """
+        (lowest, highest), values = self._area_bounds, distances.values
+        least, most = np.maximum(values - distances.errors, 0.0), values + distances.errors
+        with np.errstate(divide="ignore", invalid="ignore"):
+            # Rounding may make the projection longer than what it projects.
+            area = np.minimum(np.abs(self.products) / self.norms.values, values)
+            highest = np.minimum(highest, most)
+        shape, shortest, longest = (
+            np.sqrt(np.maximum(distance**2 - part**2, 0.0))
+            for distance, part in ((values, area), (least, highest), (most, lowest))
+        )
+        errors = (np.maximum(area - lowest, highest - area), np.maximum(shape - shortest, longest - shape))
+        return dict(zip(AREA_AND_SHAPE, (area, errors[0], shape, errors[1]), strict=True))
 
     @property
     def excesses(self) -> Reals:
         """Difference from one of the multiple of the reference that is nearest to the other surface (orders,)."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(self.products / self.norms.values**2)
-
-
-def area_and_shape(squares: Reals, products: Reals, reference: Reals) -> Reals:
-    """Return two orthogonal parts of distances to a reference b: that of area, and the rest, (2, orders, ...).
-
-    For the difference e = a - b they follow from ||e||² and <e, b> (orders, ...) and ||b||² (orders,). The multiple of
-    b nearest to a is c b with c = 1 + <e, b>/<b, b>, in which nothing cancels for near-duplicates. Then e = (c - 1) b +
-    (a - c b). The squares of the norms of both parts are good to 1e-15 of the squared distance.
-    """
-    norm = np.sqrt(reference).reshape(-1, *[1] * (squares.ndim - 1))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        # Rounding may make the projection longer than what it projects.
-        area = np.minimum(np.abs(products) / norm, np.sqrt(squares))
-    return np.stack([area, np.sqrt(np.maximum(squares - area**2, 0.0))])
 
 
 def product_rounding(distances: NormEstimate, norms: NormEstimate) -> Reals:

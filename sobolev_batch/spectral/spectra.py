@@ -70,6 +70,14 @@ class ComparedSpectra:
         """Return the spectra of some fields."""
         return ComparedSpectra(self.norm[chosen], self.distance[chosen], self.product[chosen])
 
+    def bounded_product(self, reference: Spectra) -> Spectra:
+        """Return the spectra of products with moments and peaks that theirs do not exceed, by Schwarz's inequality."""
+        moments, peaks = (
+            np.sqrt(np.maximum(getattr(self.distance, name), 0.0) * np.maximum(getattr(reference, name), 0.0))
+            for name in ("moments", "peaks")
+        )
+        return Spectra(self.product.sums, moments, peaks)
+
     def to_arrays(self) -> dict[str, Reals]:
         """Return the arrays by the names that `RadialAxis.arrays` describes."""
         arrays = {

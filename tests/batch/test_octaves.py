@@ -77,6 +77,11 @@ def test_norms_pairs_and_parts_agree_with_closed_forms(octave_store: Path) -> No
     products = np.array([sphere_inner_product(BALL, sb.shapes.Sphere(), order) for order in ORDERS])
     parts = tree["convergence"].to_dataset().sel(mesh="ball/sphere")
     assert parts["area_part"].values == pytest.approx(np.abs(products - exact_norm**2) / exact_norm, rel=0.05)
+    areas = np.abs(products - exact_norm**2) / exact_norm
+    shapes = np.sqrt(sb.distance(BALL, sb.shapes.Sphere(), ORDERS)["distance"].values ** 2 - areas**2)
+    for name, truth in (("area_part", areas), ("shape_part", shapes)):
+        assert (np.abs(parts[name].values - truth) <= parts[f"{name}_error"].values).all()
+    assert (parts["area_part_error"].values < 0.1 * areas).all()
     assert (parts["area_part"] ** 2 + parts["shape_part"] ** 2).values == pytest.approx(parts["distance"].values ** 2)
 
 

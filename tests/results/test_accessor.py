@@ -23,6 +23,7 @@ from sobolev_batch.batch.store.store import Store
 from sobolev_batch.errors import StoreError
 from sobolev_batch.results import store_accessor
 from sobolev_batch.results.accessor import SobolevAccessor
+from sobolev_batch.spectral.exact import sphere_inner_product, sphere_norm
 from sobolev_batch.spectral.fields import Quality
 from tests.support.studies import small_table, variable
 
@@ -207,6 +208,26 @@ def test_distances_of_all_meshes_from_another_than_the_reference(balls: str) -> 
     pd.testing.assert_series_equal(
         found["distance"].to_series()[expected.index], expected, rtol=1e-9, check_names=False
     )
+
+
+def test_errors_of_area_and_shape_cover_the_closed_form(balls: str) -> None:
+    reference = 0.3 + 0.05 * 2
+    found = sb.open_store(balls).sobolev.distance([-3.0, -5.0], [f"b{k}/sphere" for k in range(12)], "b2/sphere")
+    own = sb.open_store(balls).sobolev.distance([-3.0, -5.0], [f"b{k}/sphere" for k in range(12)])
+    for numbers, radius in ((found, reference), (own, 1.0)):
+        b = sb.shapes.Sphere(radius)
+        for k, order in itertools.product(range(12), (-3.0, -5.0)):
+            row, a = numbers.sel(mesh=f"b{k}/sphere", order=order), sb.shapes.Sphere(0.3 + 0.05 * k)
+            square, norm = sphere_norm(a, order) ** 2, sphere_norm(b, order)
+            area = abs(sphere_inner_product(a, b, order) - norm**2) / norm
+            shape = (square + norm**2 - 2 * sphere_inner_product(a, b, order) - area**2) ** 0.5 if a != b else 0.0
+            assert abs(row["area_part"] - area) <= row["area_part_error"] + 1e-15 * norm
+            assert abs(row["shape_part"] - shape) <= row["shape_part_error"] + 1e-7 * norm
+            # Whatever the lattice, no part exceeds the distance.
+            assert row["area_part_error"] <= row["distance"] + row["error"]
+    equal = found.sel(mesh="b2/sphere")
+    assert (equal["area_part_error"] == 0).all()
+    assert (equal["shape_part_error"] == 0).all()
 
 
 @pytest.mark.parametrize(("mesh", "order"), [("b5/sphere", -3.0), ("b5/sphere", -1.2), ("reference", -3.0)])

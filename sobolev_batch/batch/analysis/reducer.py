@@ -15,12 +15,13 @@ from sobolev_batch.batch.store.store import Store
 from sobolev_batch.batch.study.lattice_choice import LatticeChoice
 from sobolev_batch.spectral.budget import (
     NormEstimate,
+    ReferenceEstimate,
     Sums,
     Support,
     add_sums,
     aliased,
-    area_and_shape,
     estimate_norms,
+    product_rounding,
     sums_of_shells,
 )
 from sobolev_batch.spectral.fields import Quality, TailQuality
@@ -175,9 +176,9 @@ class Reducer:
     ) -> tuple[NormEstimate, NormEstimate, Reals]:
         """Return norms of rows, distances to the reference, and parts of both, each over (orders, rows).
 
-        The four parts are the distance's area part and shape part, see `area_and_shape`, and what lies beyond the last
-        octave in the squared norm and in the squared distance. Without the field of the reference, its spectrum
-        (1, radii) is None, and distances are NaN.
+        The six parts are the distance's area part and shape part, each with its error, see `ReferenceEstimate.parts`,
+        and what lies beyond the last octave in the squared norm and in the squared distance. Without the field of the
+        reference, its spectrum (1, radii) is None, and distances are NaN.
         """
         rows, has_octaves = list(rows), self.sampling is not None
         own_tail = self._tail(spectra.norm, [self.qualities[row].own for row in rows]) if has_octaves else None
@@ -185,12 +186,13 @@ class Reducer:
         beyond = np.zeros_like(own.values) if own_tail is None else own_tail.beyond
         if self.reference is None or reference is None:
             unknown = np.full_like(own.values, np.nan)
-            return own, NormEstimate(*[unknown] * 5), np.stack([unknown, unknown, beyond, unknown])
+            return own, NormEstimate(*[unknown] * 5), np.stack([*[unknown] * 4, beyond, unknown])
         # The reference's distance to itself is zero, and nothing is uncertain about that.
         apart = np.array([row != self.reference for row in rows], dtype=np.float64)
         areas, errors = self.areas[rows] + self.areas[self.reference], self.errors[:, rows]
         errors = errors + self.errors[:, [self.reference]]
-        tail, product, square = None, self._sums(spectra.product).totals, self._sums(reference).totals
+        tail = of_reference = None
+        products = self._sums(spectra.product)
         beyond_difference = np.zeros_like(beyond)
         if has_octaves:
             energies = self.axis.energies(spectra.distance)
@@ -198,13 +200,20 @@ class Reducer:
             tail = self._tail(spectra.distance, remainders)
             of_reference = self._tail(reference, [self.qualities[self.reference].own])
             beyond_difference = tail.beyond * apart
-            # Beyond the octaves ||a||² - ||b||² - ||a - b||² is twice the product <a - b, b>.
-            product = product + self.axis.octave_integrals(spectra.product, self.orders)
-            product = product + (beyond - of_reference.beyond - beyond_difference) / 2 * apart
-            square = square + of_reference.squares
         distances = self._estimate(self._sums(spectra.distance), tail, areas, errors, apart)
-        area, shape = area_and_shape(distances.values**2, product, square[:, 0])
-        return own, distances, np.stack([area, shape, beyond, beyond_difference])
+        place = [self.reference]
+        norms = self._estimate(self._sums(reference), of_reference, self.areas[place], self.errors[:, place])
+        if own_tail is None or tail is None or of_reference is None:
+            found = ReferenceEstimate.on_lattice(products, distances, norms, self.weights, self.widths)
+        else:
+            # Beyond the octaves ||a||² - ||b||² - ||a - b||² is twice the product <a - b, b>.
+            product = products.totals + self.axis.octave_integrals(spectra.product, self.orders)
+            product = product + (beyond - of_reference.beyond - beyond_difference) / 2 * apart
+            uncertainty = (own_tail.uncertainty + of_reference.uncertainty + tail.uncertainty) / 2
+            uncertainty = uncertainty + self.axis.statistical_errors(spectra.bounded_product(reference), self.orders)
+            uncertainty = uncertainty + aliased(products, self.weights, self.widths)
+            found = ReferenceEstimate(norms, product, (uncertainty + product_rounding(distances, norms)) * apart)
+        return own, distances, np.stack([*found.parts(distances).values(), beyond, beyond_difference])
 
     def _sums(self, spectra: Spectra) -> Sums:
         return sums_of_shells(spectra.sums[:, : self.lattice.shell_count], self.weights)

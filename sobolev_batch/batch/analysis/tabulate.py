@@ -34,14 +34,14 @@ from sobolev_batch.batch.study.study import Study
 from sobolev_batch.batch.workspace import Workspace
 from sobolev_batch.errors import DamageError
 from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.budget import NormEstimate
+from sobolev_batch.spectral.budget import AREA_AND_SHAPE, NormEstimate
 from sobolev_batch.spectral.fields import Quality
 from sobolev_batch.spectral.metrics.datasets import dataset_of, describe, observed_rates
 from sobolev_batch.surfaces.sources.mesh_cache import Cost
 from sobolev_batch.surfaces.sources.names import natural_key
 
 # Raise it whenever tables hold something that those of older versions lack: they are then made again.
-TABLES_VERSION = 10
+TABLES_VERSION = 11
 
 # Columns of the table of meshes that all tables have as coordinates, besides times and other metadata.
 _COORDINATES = ("family", "name", "level", "status", "vertices", "triangles", "edge_length_mean", "seconds")
@@ -130,7 +130,7 @@ class Results:
     Attributes:
         norms: (5, orders, meshes), norms and their errors; see `NormEstimate`.
         to_reference: (5, orders, meshes), distances to the reference.
-        parts: (4, orders, meshes), see `Reducer.norms`.
+        parts: (6, orders, meshes), see `Reducer.norms`.
     """
 
     meshes: xr.Dataset
@@ -144,7 +144,7 @@ class Results:
     def from_spectra(cls, reducer: Reducer, meshes: xr.Dataset, reference: str) -> Self:
         """Return norms, and distances to the reference, from the spectra that the reducer's store holds."""
         count, orders = meshes.sizes["mesh"], len(reducer.orders)
-        arrays = [np.full((parts, orders, count), np.nan) for parts in (5, 5, 4)]
+        arrays = [np.full((parts, orders, count), np.nan) for parts in (5, 5, 6)]
         places = {row: place for place, row in enumerate(meshes["row"].values.tolist())}
         complete = {row for row in reducer.complete if row in places}
         of_reference = None if reducer.reference is None else read_spectra(reducer.store, [reducer.reference]).norm
@@ -159,7 +159,7 @@ class Results:
 
     def norms_table(self) -> xr.Dataset:
         """Return `norm` (mesh, order) with its error."""
-        columns = {**NormEstimate(*self.norms).named("norm"), "beyond": self.parts[2]}
+        columns = {**NormEstimate(*self.norms).named("norm"), "beyond": self.parts[4]}
         return table_of(columns, self.meshes, self.orders)
 
     def distances_table(self) -> xr.Dataset:
@@ -186,9 +186,8 @@ class Results:
             **to_reference.named("distance"),
             "relative": relative,
             "relative_error": relative_errors,
-            "area_part": self.parts[0],
-            "shape_part": self.parts[1],
-            "beyond": self.parts[3],
+            **dict(zip(AREA_AND_SHAPE, self.parts, strict=False)),
+            "beyond": self.parts[5],
             "rate": rates,
             "rate_error": rate_errors,
             "resolved": errors < distances,

@@ -40,7 +40,7 @@ from sobolev_batch.results.tables.text import (
     with_error,
     wrapped,
 )
-from sobolev_batch.spectral.budget import PARTS
+from sobolev_batch.spectral.budget import AREA_AND_SHAPE, PARTS
 from sobolev_batch.spectral.lattice import Orders
 from sobolev_batch.spectral.metrics.datasets import observed_rates, parts_as_variables
 from sobolev_batch.surfaces.proximity import METRICS, OF_ONE_MESH
@@ -54,8 +54,7 @@ _NUMBERS = (
     *PARTS,
     "relative",
     "relative_error",
-    "area_part",
-    "shape_part",
+    *AREA_AND_SHAPE,
     "rate",
     "rate_error",
     "resolved",
@@ -147,7 +146,7 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
         - distance (to the reference), error and its parts truncation, aliasing, discretisation and statistical;
           relative and relative_error (over the norm of the reference);
         - area_part and shape_part: what a change of total area alone explains of the distance, and the rest. Their
-          squares add up to its square;
+          squares add up to its square. area_part_error and shape_part_error are their errors;
         - rate, the observed order of convergence, and rate_error: distance ~ edge_length^rate, or distance ~ x^-rate
           for another x, since the others grow;
         - resolved (the distance exceeds its error) and within (the error is as small as the study requests);
@@ -191,7 +190,8 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
     frames = []
     for s in dict.fromkeys(convergence["order"].values.tolist()):
         row = parts_as_variables(convergence.sel(order=s))
-        numbers = {key: row[key].values[others] for key in _NUMBERS}
+        # Tables of older versions lack some.
+        numbers = {key: row[key].values[others] for key in _NUMBERS if key in row}
         frames.append(pd.DataFrame({"order": s, **columns, **numbers, **nearness}))
     frame = pd.concat(frames, ignore_index=True).astype(dict.fromkeys(_COUNTS, "Int64"))
     kept = ("reference", "rtol", "computed")
