@@ -127,7 +127,7 @@ def _compiled_doubled_areas(mesh: Mesh) -> Reals:
 
 
 def _by_threads(sums: Callable[[Reals], Complexes], frequencies: Reals, threads: int) -> Complexes:
-    """Return sums at frequencies (P, 3), of which each thread takes a part, as rows (3, k)."""
+    """Return sums at frequencies (P, 3). Each thread takes a part of them, as rows (3, k)."""
     parts = [np.ascontiguousarray(part.T) for part in np.array_split(frequencies, threads)]
     if threads == 1:
         return sums(parts[0])

@@ -47,7 +47,7 @@ def _cubes(extent: Extent) -> float:
 def kernel(order: float, distance: float) -> float:
     """Return the Matérn kernel of an order at a distance > 0: the inverse transform of (1 + |ξ|²)^order.
 
-    >>> abs(kernel(-2.0, 0.5) / (np.pi**2 * np.exp(-np.pi)) - 1) < 1e-12
+    >>> bool(abs(kernel(-2.0, 0.5) / (np.pi**2 * np.exp(-np.pi)) - 1) < 1e-12)
     True
     """
     power = -order - 1.5

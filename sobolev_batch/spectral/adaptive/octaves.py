@@ -309,7 +309,7 @@ def farther_out(state: State) -> State | None:
     can_go_on = len(state.octaves) < _MOST_OCTAVES and octave.highest <= _resolvable_frequency(problem)
     points = int(_MORE_POINTS * beyond.points * state.excess**2)
     if beyond.hidden > MOSTLY:
-        # Nothing is hidden from so many.
+        # Nothing is hidden from this many.
         points = min(points, beyond.covering)
     sampling = _first_sampling(state, octave) if can_go_on else None
     seconds = np.inf if sampling is None else state.sampling_seconds(sampling) + beyond.seconds(beyond.points) / 4

@@ -9,7 +9,7 @@ and parts that coincide count for what they are. The points x are random, and th
 computed triangle by triangle (see `potentials`).
 
 Where surfaces coincide the potential is zero, and points there have no variance to tell what they miss. But the
-potential of a part that differs reaches as far as the kernel, so points no farther apart than that see every part.
+potential of a part that differs reaches where the kernel does, so points no farther apart than that see every part.
 Where few of them saw much, further points are drawn in proportion to what they saw. Fewer points than that may miss a
 part, and their error allows for one point on a surface of its own.
 """
@@ -123,8 +123,8 @@ def remainder(
     """Estimate what lies beyond a cutoff in the norm of a signed sum of surfaces, in units of length.
 
     The cutoff is the |ξ| at which the `smooth_step` ends, in cycles per unit length. By default there are enough orders
-    to interpolate between, and so many random points that what they may miss is not most of the error, if that takes at
-    most about a second. For a norm that only serves as a scale, few points will do.
+    to interpolate between. What too few random points may miss is not most of a large error, if more of them take at most
+    about a second. For a norm that only serves as a scale, few points will do.
     """
     known = tuple(sorted({max(order, LOWEST_ORDER) for order in orders or _USUAL_ORDERS}, reverse=True))
     sheets = Sheets.from_surfaces(surfaces, signs, cutoff)
