@@ -60,7 +60,7 @@ WORK: dict[str, tuple[Callable[[], object], int, int, int, str]] = {
     "distance to a high accuracy": (
         lambda: sb.distance(sb.shapes.icosphere(4), SPHERE, -10.0, rtol=7e-4),
         *(2, 23_040, 409_600),
-        "one field, and a coarse one of the frequencies beyond, each probed at 32 of them, and at 8 that follow its own values",
+        "one field, and a coarse one of the frequencies beyond, each probed at 32 of them, and at 8 that its values chose",
     ),
     "gradient": (
         lambda: sb.fitting.gradient(COARSE, SPHERE, -4.0, lattice=SMALL_LATTICE),
