@@ -270,20 +270,20 @@ def _compute_repairing(
     cluster: Cluster, workspace: Workspace, rows: Sequence[int]
 ) -> tuple[set[int], NormEstimate | None]:
     """Compute fields and tables, and damaged fields again; return their rows, and distances if they are new."""
-    repaired: set[int] = set()
-    for attempts_left in reversed(range(_MOST_REPAIRS + 1)):
+    repairs, repaired = 0, set[int]()
+    while True:
         try:
             compute_fields(cluster, workspace, rows)
             return repaired, tabulate_fields(cluster, workspace)
         except DamageError as error:
-            if not attempts_left:
+            if repairs == _MOST_REPAIRS:
                 raise
+            repairs += 1
             _log.warning("%s", error)
             # Where one is damaged, others may be.
             rows = damaged_rows(cluster, workspace)
             workspace.withdraw(rows, "its values are not what was stored")
             repaired.update(rows)
-    raise AssertionError("unreachable: the last attempt returns or raises")
 
 
 def _summary(workspace: Workspace, computed: set[int]) -> Summary:
