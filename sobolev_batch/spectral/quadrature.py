@@ -11,6 +11,7 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
+from sobolev_batch.compiled import pays
 from sobolev_batch.spectral.backends import Array, Backend, combine, sums_at, sums_of_runs
 from sobolev_batch.spectral.coherence import RANGES, coherence, unpaired
 from sobolev_batch.spectral.lattice import FrequencyLattice
@@ -33,6 +34,8 @@ FaceArrays = tuple[Array, Array, Array]
 _TRIANGLES = 1 << 17
 # An edge and its triangle are sorted as one integer, which takes twice the bits of a vertex and those of a triangle.
 _BITS = 63
+# Processor time on arrays of what loops can do for each triangle: to merge its edges, and to find its class.
+_EDGES_SECONDS, _CLASS_SECONDS = 2e-7, 1.5e-8
 
 
 @dataclass(frozen=True)
@@ -195,6 +198,12 @@ def _products(weights: Reals, areas: Array) -> Array:
 
 def merged_edges(corners: Array, areas: Array, vertex_count: int) -> tuple[Array, Array]:
     """Return both vertices of the edges (2, n) of triangles with some corners (3, m), and the sums of their areas."""
+    is_compact = isinstance(areas, np.ndarray) and vertex_count <= corners.size
+    if is_compact and pays(_EDGES_SECONDS * len(areas)):
+        from sobolev_batch.compiled.triangles import merge_edges
+
+        low, high, sums = merge_edges(corners, areas, vertex_count)
+        return np.stack([low, high]).astype(np.int64), sums
     triangle_bits = len(areas).bit_length()
     used = None
     if 2 * vertex_count.bit_length() + triangle_bits > _BITS:
@@ -289,10 +298,15 @@ def size_classes(mesh: Mesh) -> Reals:
     edges = np.geomspace(smallest, largest, count + 1)
     if count == 1:
         return np.array([[edges[0]], [edges[1]], [areas.sum()], [np.square(areas).sum()]])
-    classes = np.clip(np.searchsorted(edges, radii) - 1, 0, count - 1)
-    return np.stack(
-        [edges[:-1], edges[1:], *(np.bincount(classes, values, count) for values in (areas, areas * areas))]
-    )
+    sums = np.zeros((2, count))
+    if pays(_CLASS_SECONDS * len(radii)):
+        from sobolev_batch.compiled.triangles import add_to_classes
+
+        add_to_classes(radii, areas, edges, sums)
+    else:
+        classes = np.clip(np.searchsorted(edges, radii) - 1, 0, count - 1)
+        sums[:] = [np.bincount(classes, values, count) for values in (areas, areas * areas)]
+    return np.stack([edges[:-1], edges[1:], *sums])
 
 
 def quadrature_error(

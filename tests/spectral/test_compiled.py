@@ -8,21 +8,25 @@ import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sobolev_batch import Mesh
+from sobolev_batch import Lattice, Mesh
 from sobolev_batch.shapes import icosphere
-from sobolev_batch.spectral import exact
+from sobolev_batch.spectral import coherence, exact, quadrature
 from sobolev_batch.spectral.exact import exact_transform, sampled_transform
+from sobolev_batch.spectral.transform import TransformSettings, transform_block
+from sobolev_batch.surfaces.shapes import mesh as meshes
 from tests.spectral.test_exact import SHAPES, oracle
 from tests.support.shapes import box
 
 Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 Transform = Callable[[Mesh, Reals], Complexes]
+Result = TypeVar("Result")
 
 
 def _soup(corners: Reals) -> Mesh:
@@ -103,6 +107,53 @@ def test_threads_change_nothing() -> None:
     alone = values(sampled_transform, mesh, frequencies, compiled=True)
     shared = values(partial(sampled_transform, threads=3), mesh, frequencies, compiled=True)
     assert np.array_equal(alone, shared)
+
+
+def both_ways(work: Callable[[], Result]) -> tuple[Result, Result]:
+    """Return what work on meshes gives on arrays, and by compiled loops."""
+    found = []
+    for compiled in (False, True):
+        with pytest.MonkeyPatch.context() as patch:
+            for module in (meshes, coherence, quadrature):
+                patch.setattr(module, "pays", lambda seconds, compiled=compiled: compiled)
+            found.append(work())
+    return found[0], found[1]
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_loops_measure_meshes_to_the_last_digit(name: str) -> None:
+    mesh = MESHES[name]()
+
+    def measured() -> list[Reals]:
+        fresh = Mesh.from_checked(mesh.vertices, mesh.triangles)
+        return [fresh.areas, fresh.centroid_radii, np.array(fresh.edge_length_range), quadrature.size_classes(fresh)]
+
+    arrays, loops = both_ways(measured)
+    assert all(map(np.array_equal, arrays, loops))
+    unpaired, by_loop = both_ways(lambda: coherence.unpaired(mesh))
+    assert by_loop == pytest.approx(unpaired, rel=1e-10, abs=1e-13)
+
+
+def test_loops_merge_the_same_edges() -> None:
+    rng = np.random.default_rng(5)
+    # Edges of one, two and many triangles, of some that repeat a vertex, and of a vertex with very many.
+    corners = rng.integers(0, 40, size=(3, 2000))
+    corners[0, 1000:] = 7
+    areas = rng.uniform(size=2000)
+    (ends, sums), (others, by_loop) = both_ways(lambda: quadrature.merged_edges(corners, areas, 41))
+    assert np.array_equal(ends, others)
+    assert by_loop == pytest.approx(sums, rel=1e-14)
+
+
+@pytest.mark.parametrize("eps", [1e-3, 1e-9])
+def test_fields_do_not_depend_on_loops(eps: float) -> None:
+    lattice, sphere = Lattice(5.0, 16), icosphere(3)
+    stretched = sphere.vertices * np.exp(sphere.vertices[:, :1]) / 4
+
+    def field() -> NDArray[np.complexfloating]:
+        return transform_block(Mesh(stretched, sphere.triangles), lattice, lattice.half, TransformSettings(eps)).values
+
+    assert np.array_equal(*both_ways(field))
 
 
 SMALL_WORK = """

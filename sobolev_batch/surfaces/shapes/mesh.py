@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sobolev_batch.compiled import pays
 from sobolev_batch.errors import MeshError, from_extra
 from sobolev_batch.surfaces.shapes.surface import LARGEST_LENGTH, Extent, Indices, Point, Reals
 
@@ -23,6 +24,8 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 _ALL = slice(None)
 # Triangles that are measured or sorted at a time: their edges and temporaries stay in cache.
 _BATCH = 1 << 14
+# Processor time on arrays of measuring a triangle.
+_SECONDS = 6e-8
 # Odd numbers without pattern, which spread the bits of coordinates.
 _MIXERS = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 # Twice the rounding error of a cross product, relative to the squared longest edge: a smaller area is not
@@ -85,11 +88,10 @@ class Mesh:
         selected = self.triangles[selection]
         return self.vertices[selected[:, 0]], self.vertices[selected[:, 1]], self.vertices[selected[:, 2]]
 
-    @cached_property
+    @property
     def areas(self) -> Reals:
         """Area of each triangle (m,), in squared units of length."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            return self._per_triangle(lambda edges: 0.5 * cross_lengths(*edges))
+        return self._sizes[0]
 
     @cached_property
     def area(self) -> float:
@@ -102,20 +104,15 @@ class Mesh:
         """Lengths of the three sides of each triangle (m, 3); an inner edge appears twice."""
         return self._per_triangle(_side_lengths)
 
-    @cached_property
+    @property
     def edge_length_range(self) -> tuple[float, float]:
-        """Mean and maximum of the `edge_lengths`, computed without holding all of them."""
-        total, longest = 0.0, 0.0
-        for edges in self._edges():
-            lengths = _side_lengths(edges)
-            total += float(lengths.sum())
-            longest = max(longest, float(lengths.max()))
-        return total / (3 * len(self.triangles)), longest
+        """Mean and maximum of the `edge_lengths`."""
+        return self._sizes[2]
 
-    @cached_property
+    @property
     def centroid_radii(self) -> Reals:
         """Distance from the centroid of each triangle to its farthest corner (m,)."""
-        return self._per_triangle(_centroid_radii)
+        return self._sizes[1]
 
     @cached_property
     def extent(self) -> Extent:
@@ -271,6 +268,30 @@ class Mesh:
             # Outside: whoever reads on may be another thread, to which a setting of NumPy does not belong.
             yield slice(number * _BATCH, (number + 1) * _BATCH), areas
 
+    @cached_property
+    def _sizes(self) -> tuple[Reals, Reals, tuple[float, float]]:
+        """Areas, centroid radii, and mean and maximum of the edge lengths: one pass reads the corners for all."""
+        areas, radii, total, longest = np.empty(len(self.triangles)), np.empty(len(self.triangles)), 0.0, 0.0
+        with np.errstate(over="ignore", invalid="ignore"):
+            for number, squares in enumerate(self._squared_sizes()):
+                batch = slice(number * _BATCH, (number + 1) * _BATCH)
+                roots = np.sqrt(squares, out=squares)
+                areas[batch], radii[batch] = roots[0] / 2, roots[1] / 3
+                total, longest = total + float(roots[2:].sum()), max(longest, float(roots[2:].max()))
+        return _frozen(areas), _frozen(radii), (total / (3 * len(areas)), longest)
+
+    def _squared_sizes(self) -> Iterator[Reals]:
+        """Yield the `_squared_sizes` of each batch of triangles."""
+        if not pays(_SECONDS * len(self.triangles)):
+            yield from map(_squared_sizes, self._edges())
+            return
+        from sobolev_batch.compiled.triangles import measure
+
+        for start in range(0, len(self.triangles), _BATCH):
+            triangles = self.triangles[start : start + _BATCH]
+            measure(self.vertices, triangles, squares := np.empty((5, len(triangles))))
+            yield squares
+
     def _per_triangle(self, measure: Callable[[_Edges], Reals]) -> Reals:
         """Return a measure of all triangles, taken batch by batch: edges of millions at once take gigabytes."""
         batches = self._edges()
@@ -302,20 +323,31 @@ class Mesh:
 
 def cross_lengths(first: Reals, second: Reals) -> Reals:
     """Return |u × v| of vectors (3, ...)."""
+    return np.asarray(np.sqrt(_squares(_cross(first, second))))
+
+
+def _cross(first: Reals, second: Reals) -> tuple[Reals, Reals, Reals]:
     (ux, uy, uz), (vx, vy, vz) = first, second
-    return np.asarray(np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2))
+    return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+
+
+def _squares(vectors: Reals | tuple[Reals, Reals, Reals]) -> Reals:
+    x, y, z = vectors
+    # Products that are added one by one have the same digits in a compiled loop.
+    return np.asarray(x * x + y * y + z * z)
 
 
 def _side_lengths(edges: _Edges) -> Reals:
     first, second = edges
-    return np.stack([np.sqrt(np.einsum("ij,ij->j", side, side)) for side in (first, second - first, second)], axis=1)
+    return np.stack([np.sqrt(_squares(side)) for side in (first, second - first, second)], axis=1)
 
 
-def _centroid_radii(edges: _Edges) -> Reals:
+def _squared_sizes(edges: _Edges) -> Reals:
+    """Return the squares of twice the area, of three times the centroid radius, and of the three sides (5, k)."""
     first, second = edges
-    centroid = (first + second) / 3
-    squares = [np.einsum("ij,ij->j", arm, arm) for arm in (centroid, first - centroid, second - centroid)]
-    return np.asarray(np.sqrt(np.maximum.reduce(squares)))
+    arms = [_squares(arm) for arm in (first + second, first + first - second, second + second - first)]
+    sides = [_squares(side) for side in (first, second - first, second)]
+    return np.stack([_squares(_cross(first, second)), np.maximum.reduce(arms), *sides])
 
 
 def _smallest_angles(edges: _Edges) -> Reals:
