@@ -102,12 +102,14 @@ class RuleUse:
     def points(self, mesh: FaceArrays, backend: Backend) -> WeightedPoints:
         """Return the points, on the backend of the mesh's arrays."""
         vertices, all_triangles, all_areas = mesh
-        members, rule = backend.upload(self.members.astype(np.int64)), self.rule
-        triangles, areas = all_triangles[members], all_areas[members]
+        triangles, areas, rule = all_triangles, all_areas, self.rule
+        if len(self.members) < len(areas):
+            members = backend.upload(self.members.astype(np.int64))
+            triangles, areas = triangles[members], areas[members]
         if not (self.splits or self.path):
             return _merged_points(vertices, triangles, areas, rule)
         corners = tuple(vertices[triangles[:, corner]] for corner in range(3))
-        areas /= 4 ** len(self.path)
+        areas = areas / 4 ** len(self.path)
         for quarter in self.path:
             corners = _quarters(corners)[quarter]
         for _ in range(self.splits):
