@@ -48,6 +48,9 @@ _ROUNDS = 6
 _OCTAVES_FIRST, _OCTAVES_AT_ALL = 1e-3, 1e-4
 # What a best effort aims at where more is out of reach.
 _COARSER = (1e-1, 1e-2, 1e-3, _OCTAVES_AT_ALL)
+# Coordinates in double precision may be off by this, in radii, if the origin is some 10⁷ of these away. Of distances as
+# small, relative to the norms, the digits are not worth minutes of a best effort.
+_OF_COORDINATES = 1e-8
 # Below this order what lies beyond a lattice is next to nothing.
 _LOW_ORDER = -3.5
 # The error of a pair is divided evenly between its two fields.
@@ -131,9 +134,16 @@ def solve(problem: Problem, seed: int = 0) -> Solution:
     if not problem.accuracy.best_effort:
         raise min(refusals, key=attrgetter("reachable"))
     nearest = nearest or [_solve_on_lattices(problem, *first)]
-    if min(map(_largest_share, nearest)) > _OCTAVES_AT_ALL:
+    if min(map(_largest_share, nearest)) > _OCTAVES_AT_ALL and not any(_is_rounding(strict, one) for one in nearest):
         nearest += _in_coarser_octaves(strict, seed)
     return min(nearest, key=_largest_share)
+
+
+def _is_rounding(problem: Problem, solution: Solution) -> bool:
+    """Tell whether a distance is known to be so small that coordinates of double precision alone may be its cause."""
+    samples = problem.samples(cast(Lattice, solution.lattice))
+    norms = np.max([estimate([sample], problem.orders) for sample in samples], axis=0)
+    return bool(np.all(solution.estimate.values + solution.estimate.errors <= _OF_COORDINATES * norms))
 
 
 def _largest_share(solution: Solution) -> float:
@@ -329,9 +339,9 @@ def _beyond_lattice(problem: Problem, solution: Solution) -> tuple[Reals, Reals]
     # What the lattice shows of the range in which the step falls.
     shown = SobolevWeights(lattice, known).per_shell - SobolevWeights(lattice, known, lattice.xi_max).per_shell
     shells = shell_sums(difference, None, lattice, lattice.half)
-    values, errors = remainder(
-        problem.surfaces, problem.signs, lattice.xi_max, known, threads=problem.threads
-    ).at(known)
+    values, errors = remainder(problem.surfaces, problem.signs, lattice.xi_max, known, threads=problem.threads).at(
+        known
+    )
     # No frequency beyond the lattice weighs more than this at lower orders.
     factors = (1 + lattice.xi_max**2) ** (np.array(problem.orders) - known)
     return factors * (values - shown @ shells), factors * errors

@@ -213,3 +213,16 @@ def test_first_lattices_hold_the_surfaces_with_room_for_their_images() -> None:
         assert far.half_period > 40.0
     assert first_lattice(support, [-1.0], Accuracy(1e-2))[1]  # the tail has no closed form: a pilot
     assert not first_lattice(support, [-10.0], Accuracy(1e-4))[1]
+
+
+@pytest.mark.slow
+def test_a_best_effort_does_not_resolve_the_rounding_of_coordinates() -> None:
+    # As after a motion from far away: to resolve this takes octaves, and a minute.
+    ball = sb.shapes.icosphere(1)
+    noise = np.random.default_rng(0).uniform(-1e-10, 1e-10, ball.vertices.shape)
+    moved = sb.Mesh(ball.vertices + noise, ball.triangles)
+    found = sb.distance(moved, ball, -2.0, rtol=1e-2, best_effort=True, memory=4e8)
+    assert found.attrs["octaves"] == 0
+    assert not found["within"]
+    # As octaves found it.
+    assert abs(found["distance"] - 1.139e-9) <= found["error"] + 0.018e-9
