@@ -16,9 +16,10 @@ from scipy.sparse.linalg import splu
 
 from sobolev_batch.errors import LatticeError
 from sobolev_batch.fitting.derivatives import SquaredDistance
-from sobolev_batch.fitting.transform import area_derivatives, normals
+from sobolev_batch.fitting.transform import area_derivatives
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.surface import Indices, Reals
+from sobolev_batch.surfaces.shapes.subdivision import Edges
+from sobolev_batch.surfaces.shapes.surface import Indices, Reals, normals
 
 Notify = Callable[[Reals, float], None]
 
@@ -155,12 +156,9 @@ class Smoothing:
     @classmethod
     def from_mesh(cls, mesh: Mesh, free: Indices, amount: float) -> Self:
         """Return the smoothing for a mesh."""
-        count = len(mesh.vertices)
-        ends = np.asarray(mesh.triangles)[:, [0, 1, 2, 1, 2, 0]].reshape(-1, 2, 3)
-        one, other = ends[:, 0].ravel(), ends[:, 1].ravel()
+        count, (one, other) = len(mesh.vertices), Edges.from_mesh(mesh).ends.T
         both = np.concatenate([one, other]), np.concatenate([other, one])
         neighbours = coo_array((np.ones(len(both[0])), both), shape=(count, count)).tocsr()
-        neighbours.data[:] = 1.0
         graph: Any = laplacian(neighbours)
         return cls(csc_array(graph), free, amount)
 

@@ -18,7 +18,7 @@ from sobolev_batch.spectral.nufft import transform_points
 from sobolev_batch.spectral.quadrature import RuleUse, WeightedPoints, assign_rules
 from sobolev_batch.spectral.transform import ON_CPU, Execution, TransformSettings, require_points_inside
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.surface import Indices, Reals
+from sobolev_batch.surfaces.shapes.surface import Indices, Reals, normals
 
 # Fraction of eps that the coefficients which are left out may carry together.
 _NEGLIGIBLE = 0.1
@@ -141,12 +141,6 @@ class MeshTransform:
             for axis in range(3):
                 gradient[:, axis] += np.bincount(ends, slopes * derivatives[:, axis], self.count)
         return gradient
-
-
-def normals(vertices: Reals, triangles: Indices) -> Reals:
-    """Return the normals of triangles (m, 3), each as long as twice its area."""
-    a, b, c = (vertices[corner] for corner in triangles.T)
-    return np.asarray(np.cross(b - a, c - a))
 
 
 def area_derivatives(vertices: Reals, triangles: Indices) -> list[Reals]:

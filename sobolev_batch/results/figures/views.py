@@ -19,7 +19,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LinearLocator, MaxNLocator
 from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial import cKDTree
+from shapely import MultiPoint
 
 from sobolev_batch.errors import InputError, SobolevBatchError
 from sobolev_batch.results.figures.meshes import StudyMeshes, fields_of, matching_labels, witness_at_vertices
@@ -45,7 +46,7 @@ from sobolev_batch.spectral.metrics.causes import witness
 from sobolev_batch.surfaces.proximity import vertex_distances
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.subdivision import subdivided
-from sobolev_batch.surfaces.shapes.surface import Reals
+from sobolev_batch.surfaces.shapes.surface import Reals, normals
 from sobolev_batch.surfaces.sources.names import file_stem
 
 Triangles = NDArray[np.int32]
@@ -123,7 +124,7 @@ class MeshView:
         For distances, the largest one.
         """
         # A third of each triangle belongs to each of its corners.
-        areas = np.repeat(np.linalg.norm(self._normals, axis=1), 3)
+        areas = np.repeat(np.linalg.norm(normals(self.vertices, self.triangles), axis=1), 3)
         areas = np.bincount(self.triangles.ravel(), areas, minlength=len(self.vertices))
         limits = []
         for moduli in np.abs(self.values):
@@ -139,9 +140,10 @@ class MeshView:
         )
         # The orientation of triangles is not to be trusted: away from the middle of the mesh.
         middle = (self.vertices.min(axis=0) + self.vertices.max(axis=0)) / 2
-        outwards = np.einsum("ij,ij->i", self._normals, self.vertices[self.triangles].mean(axis=1) - middle)
-        facing = strength @ (self._normals * np.where(outwards < 0, -1, 1)[:, None])
-        total = strength @ np.linalg.norm(self._normals, axis=1)
+        own_normals = normals(self.vertices, self.triangles)
+        outwards = np.einsum("ij,ij->i", own_normals, self.vertices[self.triangles].mean(axis=1) - middle)
+        facing = strength @ (own_normals * np.where(outwards < 0, -1, 1)[:, None])
+        total = strength @ np.linalg.norm(own_normals, axis=1)
         length = float(np.linalg.norm(facing))
         if length <= _ONE_WAY * total or facing @ FRONT >= _SHOWN * length:
             return self
@@ -149,12 +151,6 @@ class MeshView:
         if abs(eye[2]) > _STEEPEST:
             eye = eye + FRONT / 2
         return replace(self, eye=eye / np.linalg.norm(eye))
-
-    @property
-    def _normals(self) -> Reals:
-        """Normals (m, 3) of the triangles, whose lengths are twice the areas."""
-        first, second, third = (self.vertices[self.triangles[:, k]] for k in range(3))
-        return np.asarray(np.cross(second - first, third - first))
 
 
 def make_views(
@@ -209,18 +205,9 @@ def up_axis(points: Reals) -> Axis:
     low, extent = points.min(axis=0), np.ptp(points, axis=0)
     if not extent.all():
         return "z"
-    y, z = (_support((points - low) / extent, axis) for axis in (1, 2))
+    points = (points - low) / extent
+    y, z = (MultiPoint(np.delete(points[points[:, axis] <= _BASE], axis, axis=1)).convex_hull.area for axis in (1, 2))
     return "y" if y > max(_BROAD, _BROADER * z) else "z"
-
-
-def _support(points: Reals, axis: int) -> float:
-    """Return the area of the convex hull of the lowest points along an axis, of points in the unit cube."""
-    lowest = np.delete(points[points[:, axis] <= _BASE], axis, axis=1)
-    try:
-        return float(ConvexHull(lowest).volume)
-    except (QhullError, ValueError):
-        # Points on a line, or fewer than three, have no area.
-        return 0.0
 
 
 def _extremes(tree: xr.DataTree, order: float, families: Sequence[str]) -> Iterator[str]:
@@ -281,11 +268,11 @@ def draw_mesh(axes: Axes, view: MeshView, index: int = 0, limit: float | None = 
     """
     right = np.cross(_UP, view.eye)
     right /= np.linalg.norm(right)
-    corners = (view.vertices @ np.stack([right, np.cross(view.eye, right), view.eye], axis=1))[view.triangles]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    vertices = view.vertices @ np.stack([right, np.cross(view.eye, right), view.eye], axis=1)
+    corners, across = vertices[view.triangles], normals(vertices, view.triangles)
     # The orientation of triangles is not to be trusted: all of them face the viewer.
-    normals *= np.where(normals[:, 2:] < 0, -1, 1) / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    light = _AMBIENT + (1 - _AMBIENT) * np.clip(normals @ _LIGHT, 0, 1)
+    across *= np.where(across[:, 2:] < 0, -1, 1) / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
+    light = _AMBIENT + (1 - _AMBIENT) * np.clip(across @ _LIGHT, 0, 1)
     values = view.values[index][view.triangles].mean(axis=1)
     mapping = _mapping(view, view.color_limits[index] if limit is None else limit)
     colors = mapping.to_rgba(values)[:, :3] * light[:, None]

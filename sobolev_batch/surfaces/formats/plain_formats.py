@@ -22,7 +22,7 @@ from plyfile import PlyData, PlyElement, PlyElementParseError
 from sobolev_batch.errors import MeshError
 from sobolev_batch.surfaces.formats.parsing import Raw, merge_coincident, triangle_fans, triangle_fans_of_lists
 from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.surface import Indices, Reals
+from sobolev_batch.surfaces.shapes.surface import Indices, Reals, normals
 
 # Numbers per vertex line: x y z, with a weight, a colour, or both.
 _OBJ_VERTEX_SIZES = (3, 4, 6, 7)
@@ -177,14 +177,13 @@ def write_off(mesh: Mesh) -> bytes:
 
 def write_stl(mesh: Mesh) -> bytes:
     """Return a binary STL file, which has single precision and no shared vertices."""
-    corners = mesh.vertices[mesh.triangles]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    records = np.zeros(len(corners), _STL_RECORD)
-    records["corners"] = corners
+    across = normals(mesh.vertices, mesh.triangles)
+    lengths = np.linalg.norm(across, axis=1, keepdims=True)
+    records = np.zeros(len(across), _STL_RECORD)
+    records["corners"] = mesh.vertices[mesh.triangles]
     # That of a triangle without an area is zero.
-    records["normal"] = np.divide(normals, lengths, where=lengths > 0, out=np.zeros_like(normals))
-    header = bytes(_STL_HEADER_BYTES - 4) + len(corners).to_bytes(4, "little")
+    records["normal"] = np.divide(across, lengths, where=lengths > 0, out=np.zeros_like(across))
+    header = bytes(_STL_HEADER_BYTES - 4) + len(across).to_bytes(4, "little")
     return header + records.tobytes()
 
 

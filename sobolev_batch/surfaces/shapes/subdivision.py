@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -94,14 +95,9 @@ class Edges:
         doi:10.1002/nme.1620200412.
         """
         order = np.argsort(-scores, kind="stable")
-        fewest, most = 0, len(order)
-        while fewest < most:
-            middle = (fewest + most + 1) // 2
-            if self._count(self._completed(order[:middle])) <= triangles:
-                fewest = middle
-            else:
-                most = middle - 1
-        return self._completed(order[:fewest])
+        numbers = range(1, len(order) + 1)
+        most = bisect_right(numbers, triangles, key=lambda number: self._count(self._completed(order[:number])))
+        return self._completed(order[:most])
 
     def split(self, marks: Marks) -> Mesh:
         """Return the mesh with new vertices, after its own, at the middles of marked edges; of two cuts the shorter."""

@@ -227,3 +227,9 @@ def moved_point(point: Point, scale: float, origin: Point) -> Point:
     """Return scale * (point - origin)."""
     x, y, z = (scale * (coordinate - shift) for coordinate, shift in zip(point, origin, strict=True))
     return x, y, z
+
+
+def normals(vertices: Reals, triangles: NDArray[np.integer]) -> Reals:
+    """Return the normals of triangles (m, 3), each as long as twice its area."""
+    a, b, c = (vertices[corner] for corner in triangles.T)
+    return np.asarray(np.cross(b - a, c - a))

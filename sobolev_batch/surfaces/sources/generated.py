@@ -20,7 +20,7 @@ from sobolev_batch.errors import MeshError, from_extra, refused_by_pydantic
 from sobolev_batch.surfaces.shapes.closed_forms import MOST_TRIANGLES, Ellipsoid, Sphere, Torus
 from sobolev_batch.surfaces.shapes.mesh import Mesh
 from sobolev_batch.surfaces.shapes.subdivision import FINEST_LEVEL, icosphere
-from sobolev_batch.surfaces.shapes.surface import Indices, Point, Reals
+from sobolev_batch.surfaces.shapes.surface import Indices, Point, Reals, normals
 from sobolev_batch.surfaces.sources.registry import (
     Fingerprint,
     MadeMember,
@@ -424,15 +424,14 @@ def with_noise(mesh: Mesh, amplitude: float, seed: int) -> Mesh:
     """
     places, place_of_vertex = np.unique(mesh.vertices, axis=0, return_inverse=True)
     place_of_vertex = place_of_vertex.reshape(-1)
-    normals = _normals(places, place_of_vertex[mesh.triangles])
+    directions = _vertex_normals(places, place_of_vertex[mesh.triangles])
     sizes = amplitude * np.random.default_rng(seed).standard_normal(len(places))
-    return Mesh((places + sizes[:, None] * normals)[place_of_vertex], mesh.triangles)
+    return Mesh((places + sizes[:, None] * directions)[place_of_vertex], mesh.triangles)
 
 
-def _normals(vertices: Reals, triangles: Indices) -> Reals:
+def _vertex_normals(vertices: Reals, triangles: Indices) -> Reals:
     """Return the mean normal of the triangles at each vertex, weighted by area, (m, 3); zero where they cancel."""
-    a, b, c = np.moveaxis(vertices[triangles], 1, 0)
-    crosses = np.cross(b - a, c - a)
+    crosses = normals(vertices, triangles)
     sums = np.stack(
         [np.bincount(triangles.ravel(), np.repeat(crosses[:, axis], 3), len(vertices)) for axis in range(3)], axis=1
     )
