@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Self
 from uuid import uuid4
@@ -78,7 +78,7 @@ class Lock:
 
     def to_json(self) -> bytes:
         """Return the lock as JSON."""
-        return _adapter().dump_json(self)
+        return _adapter.dump_json(self)
 
     @classmethod
     def read(cls, location: Location) -> Lock | None:
@@ -87,7 +87,7 @@ class Lock:
         if text is None:
             return None
         try:
-            return _adapter().validate_json(text)
+            return _adapter.validate_json(text)
         except ValidationError:
             # Its holder was killed while it wrote this, or is still writing.
             return cls("", "", "a process that has not written its name", "an unknown time")
@@ -124,9 +124,7 @@ class Lock:
             raise LockError(f"{location}: the store was unlocked, or removed, and is no longer that of this process")
 
 
-@cache
-def _adapter() -> TypeAdapter[Lock]:
-    return TypeAdapter(Lock)
+_adapter = TypeAdapter(Lock)
 
 
 def _require_run(run: str, location: Location) -> None:

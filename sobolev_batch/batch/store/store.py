@@ -99,7 +99,7 @@ class Store:
     def exists(self) -> bool:
         """Return whether a zarr hierarchy exists; DamageError where only its root is gone, which is written first."""
         if "" not in self.documents:
-            root = self._read_document("")
+            root = self.stored_document("")
             if root is None:
                 if self.stored_document(RECORDS) is not None:
                     problem = f"{ROOT}, the metadata at the root, is gone"
@@ -162,10 +162,6 @@ class Store:
                 f"{self.path}: the store is incomplete: it has no {name}; remove it and run the study again"
             )
         return self.documents[name]
-
-    def stored_document(self, name: str) -> Document | None:
-        """Return the metadata document of a node that readers may not find yet; None if there is none."""
-        return self._read_document(name)
 
     def is_array(self, name: str) -> bool:
         """Return whether the root lists an array of this name."""
@@ -298,7 +294,8 @@ class Store:
         stored = {index: sizes.get(key, 0) for key, index in self.chunk_keys(name).items()}
         return [index for index, size in stored.items() if not size or (expected and size != expected)]
 
-    def _read_document(self, name: str) -> Document | None:
+    def stored_document(self, name: str) -> Document | None:
+        """Return the metadata document of a node that readers may not find yet; None if there is none."""
         key = f"{name}/{ROOT}".lstrip("/")
         text = self.location.read(key, MOST_BYTES)
         if text is None:
@@ -400,7 +397,7 @@ class Store:
 
     def read_run(self) -> RunRecord | None:
         """Return the record of the latest run, or None before the first one."""
-        document = self._read_document(RECORDS)
+        document = self.stored_document(RECORDS)
         if document is None:
             raise DamageError(f"{self.path}: {RECORDS}/{ROOT} is missing; run the study again", "it is not there")
         table = document.get("attributes", {}).get(_RUN)
