@@ -142,7 +142,9 @@ class Mesh:
     @property
     def used_coordinates(self) -> Reals:
         """Coordinates of the `used_vertices`, one contiguous row an axis (3, n), in units of length."""
-        return np.ascontiguousarray(self.vertices[self.used_vertices].T)
+        used = self.used_vertices
+        rows = self.vertices if len(used) == len(self.vertices) else self.vertices[used]
+        return np.ascontiguousarray(rows.T)
 
     @cached_property
     def counts(self) -> dict[str, int]:
