@@ -40,12 +40,12 @@ def measure(vertices: Reals, triangles: Indices, squares: Reals) -> None:
 
 @loop
 def third_moments(vertices: Reals, triangles: Indices, areas: Reals) -> tuple[float, float]:
-    """Return the norm of the sum of the third moments of triangles, times their areas, and the sum of their norms."""
+    """Return the norm of the sum of third moments, times areas, and the sum of their norms, in one unit of moments."""
     total = s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = s9 = 0.0
     for i in range(len(triangles)):
         ux, uy, uz, vx, vy, vz = _edges(vertices, triangles[i])
-        x, y, z = (ux + vx) / 3, (uy + vy) / 3, (uz + vz) / 3
-        bx, by, bz, cx, cy, cz = ux - x, uy - y, uz - z, vx - x, vy - y, vz - z
+        x, y, z = ux + vx, uy + vy, uz + vz
+        bx, by, bz, cx, cy, cz = 3 * ux - x, 3 * uy - y, 3 * uz - z, 3 * vx - x, 3 * vy - y, 3 * vz - z
         xx, yy, zz = bx * cx, by * cy, bz * cz
         xy, yz, zx = bx * cy + by * cx, by * cz + bz * cy, bz * cx + bx * cz
         m0, m1, m2 = 3 * x * xx, 3 * y * yy, 3 * z * zz
