@@ -1,15 +1,10 @@
-"""Loops over the triangles of a mesh: their sizes, what their errors have in common, and the edges that they share."""
+"""Loops over the triangles of a mesh: their sizes, and what their errors have in common."""
 
 from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
 from sobolev_batch.compiled import Indices, Reals, loop, part
-
-Vertices = NDArray[np.uint32]
 
 
 @part
@@ -59,57 +54,3 @@ def third_moments(vertices: Reals, triangles: Indices, areas: Reals) -> tuple[fl
         s5, s6, s7, s8, s9 = s5 + weight * m5, s6 + weight * m6, s7 + weight * m7, s8 + weight * m8, s9 + weight * m9
     square = s3 * s3 + s4 * s4 + s5 * s5 + s6 * s6 + s7 * s7 + s8 * s8
     return math.sqrt(s0 * s0 + s1 * s1 + s2 * s2 + 3 * square + 1.5 * s9 * s9), total
-
-
-@loop
-def add_to_classes(radii: Reals, areas: Reals, edges: Reals, sums: Reals) -> None:
-    """Add areas and squared areas to the sums (2, n) of the class between whose edges (n + 1,) each radius lies."""
-    for i in range(len(radii)):
-        number = 0
-        while number < sums.shape[1] - 1 and radii[i] > edges[number + 1]:
-            number += 1
-        sums[0, number] += areas[i]
-        sums[1, number] += areas[i] * areas[i]
-
-
-@loop
-def merge_edges(corners: Indices, areas: Reals, vertex_count: int) -> tuple[Vertices, Vertices, Reals]:
-    """Return the lesser and the greater vertex of the edges (n,) of triangles (3, m), and the sums of their areas (n,).
-
-    Edges are sorted by the greater vertex, and then by the lesser one: both times by counting, for they are integers.
-    """
-    count = 3 * corners.shape[1]
-    low_places, high_places = np.zeros(vertex_count + 1, dtype=np.int64), np.zeros(vertex_count + 1, dtype=np.int64)
-    for i in range(corners.shape[1]):
-        for side in range(3):
-            p, q = corners[side, i], corners[(side + 1) % 3, i]
-            low_places[min(p, q) + 1] += 1
-            high_places[max(p, q) + 1] += 1
-    for vertex in range(vertex_count):
-        low_places[vertex + 1] += low_places[vertex]
-        high_places[vertex + 1] += high_places[vertex]
-    lows, weights = np.empty(count, dtype=np.uint32), np.empty(count)
-    for i in range(corners.shape[1]):
-        for side in range(3):
-            p, q = corners[side, i], corners[(side + 1) % 3, i]
-            place = high_places[max(p, q)]
-            high_places[max(p, q)] += 1
-            lows[place], weights[place] = min(p, q), areas[i]
-    highs, sums, first = np.empty(count, dtype=np.uint32), np.empty(count), 0
-    # Each place has moved on to the end of its vertex.
-    for high in range(vertex_count):
-        for n in range(first, high_places[high]):
-            place = low_places[lows[n]]
-            low_places[lows[n]] += 1
-            highs[place], sums[place] = high, weights[n]
-        first = high_places[high]
-    first, last = 0, -1
-    for low in range(vertex_count):
-        for n in range(first, low_places[low]):
-            if n > first and highs[n] == highs[last]:
-                sums[last] += sums[n]
-            else:
-                last += 1
-                lows[last], highs[last], sums[last] = low, highs[n], sums[n]
-        first = low_places[low]
-    return lows[: last + 1], highs[: last + 1], sums[: last + 1]

@@ -78,10 +78,10 @@ def coherence(mesh: Mesh, highest: float) -> Reals:
     count = math.ceil(2 * _PADDING * (float(np.abs(centers).max()) + length) * limit)
     points = np.concatenate([centers, *(centers + corners)], axis=1)
     values = _transform(points * (2 * np.pi * limit / count), np.concatenate([-areas, np.tile(areas / 3, 3)]), count)
-    places, numbers, starts, radii = _ranges(count)
+    places, numbers, radii = _ranges(count)
     squares = np.square(np.abs(values.ravel()[places]) / (np.square(_PHASE * radii) / 4 * areas.sum())) / _MEAN_SQUARE
     largest = np.zeros(RANGES)
-    largest[numbers] = np.maximum.reduceat(squares, starts)
+    np.maximum.at(largest, numbers, squares)
     return np.where(largest > noise * (math.log(len(places)) + _EXCESS), np.minimum(largest, 1), 0)
 
 
@@ -133,15 +133,10 @@ def _transform(angles: Reals, weights: Reals, count: int) -> Complexes:
 
 
 @lru_cache(maxsize=4)
-def _ranges(count: int) -> tuple[Indices, Indices, Indices, Reals]:
-    """Return the modes that count, range by range: their flat indices, which ranges, where each starts, and |ξ|.
-
-    |ξ| is relative to the highest one.
-    """
+def _ranges(count: int) -> tuple[Indices, Indices, Reals]:
+    """Return the flat indices of those modes that count, in which range each is, and its |ξ| over the highest one."""
     axis = np.arange(-count, count + 1)
     squares = axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis[count:] ** 2
     radii = np.sqrt(squares.ravel() / 3) / count
-    order = np.argsort(radii, kind="stable")
-    places = order[radii[order] * RANGES > _FIRST]
-    numbers, starts = np.unique(np.ceil(radii[places] * RANGES - 1e-9).astype(np.int64) - 1, return_index=True)
-    return places, numbers, starts, radii[places]
+    places = np.flatnonzero(radii * RANGES > _FIRST)
+    return places, np.ceil(radii[places] * RANGES - 1e-9).astype(np.int64) - 1, radii[places]

@@ -11,7 +11,6 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.compiled import pays
 from sobolev_batch.spectral.backends import Array, Backend, combine, sums_at, sums_of_runs
 from sobolev_batch.spectral.coherence import RANGES, coherence, unpaired
 from sobolev_batch.spectral.lattice import FrequencyLattice
@@ -34,8 +33,6 @@ FaceArrays = tuple[Array, Array, Array]
 _TRIANGLES = 1 << 17
 # An edge and its triangle are sorted as one integer, which takes twice the bits of a vertex and those of a triangle.
 _BITS = 63
-# Processor time on arrays of what loops can do for each triangle: to merge its edges, and to find its class.
-_EDGES_SECONDS, _CLASS_SECONDS = 2e-7, 1.5e-8
 
 
 @dataclass(frozen=True)
@@ -200,12 +197,14 @@ def _products(weights: Reals, areas: Array) -> Array:
 
 def merged_edges(corners: Array, areas: Array, vertex_count: int) -> tuple[Array, Array]:
     """Return both vertices of the edges (2, n) of triangles with some corners (3, m), and the sums of their areas."""
-    is_compact = isinstance(areas, np.ndarray) and vertex_count <= corners.size
-    if is_compact and pays(_EDGES_SECONDS * len(areas)):
-        from sobolev_batch.compiled.triangles import merge_edges
+    nexts = (corners[1], corners[2], corners[0])
+    if isinstance(areas, np.ndarray):
+        from scipy.sparse import coo_array
 
-        low, high, sums = merge_edges(corners, areas, vertex_count)
-        return np.stack([low, high]).astype(np.int64), sums
+        # SciPy sorts by counting; a GPU sorts faster than it counts.
+        places = np.minimum(corners, nexts).ravel(), np.maximum(corners, nexts).ravel()
+        merged = coo_array((np.tile(areas, 3), places), shape=(vertex_count, vertex_count)).tocsr()
+        return np.stack(merged.tocoo().coords).astype(np.int64), merged.data
     triangle_bits = len(areas).bit_length()
     used = None
     if 2 * vertex_count.bit_length() + triangle_bits > _BITS:
@@ -214,7 +213,7 @@ def merged_edges(corners: Array, areas: Array, vertex_count: int) -> tuple[Array
     bits = vertex_count.bit_length()
     numbers = np.arange(len(areas), like=corners)
     edges = np.empty((3, len(areas)), dtype=np.int64, like=corners)
-    for row, first, second in zip(edges, corners, (corners[1], corners[2], corners[0]), strict=True):
+    for row, first, second in zip(edges, corners, nexts, strict=True):
         np.left_shift(np.minimum(first, second), bits, out=row)
         row |= np.maximum(first, second)
         row <<= triangle_bits
@@ -300,15 +299,10 @@ def size_classes(mesh: Mesh) -> Reals:
     edges = np.geomspace(smallest, largest, count + 1)
     if count == 1:
         return np.array([[edges[0]], [edges[1]], [areas.sum()], [np.square(areas).sum()]])
-    sums = np.zeros((2, count))
-    if pays(_CLASS_SECONDS * len(radii)):
-        from sobolev_batch.compiled.triangles import add_to_classes
-
-        add_to_classes(radii, areas, edges, sums)
-    else:
-        classes = np.clip(np.searchsorted(edges, radii) - 1, 0, count - 1)
-        sums[:] = [np.bincount(classes, values, count) for values in (areas, areas * areas)]
-    return np.stack([edges[:-1], edges[1:], *sums])
+    classes = np.searchsorted(edges[1:-1], radii)
+    return np.stack(
+        [edges[:-1], edges[1:], *(np.bincount(classes, values, count) for values in (areas, areas * areas))]
+    )
 
 
 def quadrature_error(

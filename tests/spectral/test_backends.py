@@ -25,7 +25,7 @@ from sobolev_batch.spectral.backends import CPU, GPU_COSTS, Gpu, backend_named, 
 from sobolev_batch.spectral.exact import exact_transform, sampled_transform
 from sobolev_batch.spectral.fields import compute_field, field_for
 from sobolev_batch.spectral.lattice import Block, FrequencyLattice, OctaveLattice
-from sobolev_batch.spectral.quadrature import assign_rules
+from sobolev_batch.spectral.quadrature import assign_rules, merged_edges
 from sobolev_batch.spectral.rules import sharing_rule
 from sobolev_batch.spectral.transform import ErrorTarget, Execution, Transformed, TransformSettings, transform_block
 from tests.support.fake_device import FUNCTIONS, OPTIONS, UFUNCS, Array, CUDARuntimeError, Device
@@ -216,6 +216,19 @@ def test_exact_transforms_agree(
         assert np.abs(found - expected).max() < 1e-13 * mesh.area
     # Else the processor may have been compared with itself.
     assert not caplog.records
+
+
+@pytest.mark.parametrize("vertex_count", [41, 1 << 40])
+def test_edges_are_merged_alike(vertex_count: int) -> None:
+    rng = np.random.default_rng(5)
+    # Edges of one, two and many triangles, of some that repeat a vertex, and of a vertex with very many.
+    corners, areas = rng.integers(0, 40, size=(3, 2000)), rng.uniform(size=2000)
+    corners[0, 1000:] = 7
+    ends, sums = merged_edges(corners, areas, 41)
+    device = Device()
+    others, other_sums = merged_edges(device.upload(corners), device.upload(areas), vertex_count)
+    assert np.array_equal(ends, others.host)
+    assert other_sums.host == pytest.approx(sums, rel=1e-14)
 
 
 def test_the_processor_computes_exact_transforms_where_a_gpu_fails(caplog: pytest.LogCaptureFixture) -> None:

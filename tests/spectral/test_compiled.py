@@ -114,7 +114,7 @@ def both_ways(work: Callable[[], Result]) -> tuple[Result, Result]:
     found = []
     for compiled in (False, True):
         with pytest.MonkeyPatch.context() as patch:
-            for module in (meshes, coherence, quadrature):
+            for module in (meshes, coherence):
                 patch.setattr(module, "pays", lambda seconds, compiled=compiled: compiled)
             found.append(work())
     return found[0], found[1]
@@ -132,17 +132,6 @@ def test_loops_measure_meshes_to_the_last_digit(name: str) -> None:
     assert all(map(np.array_equal, arrays, loops))
     unpaired, by_loop = both_ways(lambda: coherence.unpaired(mesh))
     assert by_loop == pytest.approx(unpaired, rel=1e-10, abs=1e-13)
-
-
-def test_loops_merge_the_same_edges() -> None:
-    rng = np.random.default_rng(5)
-    # Edges of one, two and many triangles, of some that repeat a vertex, and of a vertex with very many.
-    corners = rng.integers(0, 40, size=(3, 2000))
-    corners[0, 1000:] = 7
-    areas = rng.uniform(size=2000)
-    (ends, sums), (others, by_loop) = both_ways(lambda: quadrature.merged_edges(corners, areas, 41))
-    assert np.array_equal(ends, others)
-    assert by_loop == pytest.approx(sums, rel=1e-14)
 
 
 @pytest.mark.parametrize("eps", [1e-3, 1e-9])
