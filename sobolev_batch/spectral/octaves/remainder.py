@@ -37,9 +37,10 @@ from sobolev_batch.spectral.octaves.potentials import (
 )
 from sobolev_batch.surfaces.shapes.surface import Reals, Surface
 
-# Random points of the first estimate, the fewest, and those of a scale; pairs of a point and a triangle that they may
-# take, and those of points from which nothing is hidden.
-USUAL_POINTS, _FEWEST_POINTS, _POINTS_OF_SCALES, _USUAL_PAIRS, _MOST_PAIRS = 256, 40, 64, 150_000, 500_000
+# Random points of the first estimate: usually, at least, at most, and of a scale. Pairs of a point and a triangle that
+# they may take, and those of points from which nothing is hidden.
+USUAL_POINTS, _FEWEST_POINTS, _MOST_POINTS, _POINTS_OF_SCALES = 256, 40, 1024, 64
+_USUAL_PAIRS, _MOST_PAIRS = 150_000, 500_000
 # Share of the squared errors that is most of them, and a relative error that may be smaller for some more points.
 MOSTLY, _ROUGH = 0.5, 0.15
 # Points for each square of the reach, so that none is farther than it from the next; and those of them that are
@@ -123,8 +124,8 @@ def remainder(
     """Estimate what lies beyond a cutoff in the norm of a signed sum of surfaces, in units of length.
 
     The cutoff is the |ξ| at which the `smooth_step` ends, in cycles per unit length. By default there are enough orders
-    to interpolate between. What too few random points may miss is not most of a large error, if more of them take at most
-    about a second. For a norm that only serves as a scale, few points will do.
+    to interpolate between. What too few random points may miss is not most of a large error, if more of them take at
+    most about a second. For a norm that only serves as a scale, few points will do.
     """
     known = tuple(sorted({max(order, LOWEST_ORDER) for order in orders or _USUAL_ORDERS}, reverse=True))
     sheets = Sheets.from_surfaces(surfaces, signs, cutoff)
@@ -238,7 +239,7 @@ class _Seen:
         return changes.mean(axis=0), changes.std(axis=0, ddof=1) / np.sqrt(count) * _quantile(count)
 
     def affordable(self, rng: np.random.Generator) -> int:
-        """Return the number of points that do not take long, at most the usual one."""
+        """Return the number of points that do not take long."""
         if not self.sheets.meshes:
             return USUAL_POINTS
         places, pairs = self.sheets.even(_FEWEST_POINTS, rng).points, 0
@@ -249,7 +250,7 @@ class _Seen:
             centers, radii = centers_and_radii(corners)
             offsets = np.linalg.norm(places[:, None] - centers, axis=2)
             pairs += step * int(np.count_nonzero(offsets < self.kernels.reach + radii))
-        return int(np.clip(_USUAL_PAIRS * _FEWEST_POINTS // max(pairs, 1), _FEWEST_POINTS, USUAL_POINTS))
+        return int(np.clip(_USUAL_PAIRS * _FEWEST_POINTS // max(pairs, 1), _FEWEST_POINTS, _MOST_POINTS))
 
 
 def mean_sinc(cutoff: float, order: float, length: float) -> float:
