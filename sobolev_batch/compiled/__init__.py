@@ -9,7 +9,9 @@ and turns to loops as soon as its work on arrays has taken, or is predicted to t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from threading import Lock
 from typing import Any, TypeVar
 
@@ -36,7 +38,17 @@ class _Spent:
             return self.seconds
 
 
-_spent = _Spent()
+_spent: ContextVar[_Spent] = ContextVar("spent", default=_Spent())  # noqa: B039
+
+
+@contextmanager
+def by_itself() -> Iterator[None]:
+    """Count only the work within, so that its digits do not depend on what the process did before, or does beside."""
+    token = _spent.set(_Spent())
+    try:
+        yield
+    finally:
+        _spent.reset(token)
 
 
 def pays(seconds: float) -> bool:
@@ -44,12 +56,12 @@ def pays(seconds: float) -> bool:
 
     The seconds of all calls in a process add up, so that many small pieces of work turn to loops as one large one does.
     """
-    return _spent.add(seconds) > _WORTH_SECONDS
+    return _spent.get().add(seconds) > _WORTH_SECONDS
 
 
 def use() -> None:
     """Let loops pay from now on, whatever the process has done before: what it stores then depends on nothing else."""
-    _spent.add(math.inf)
+    _spent.get().add(math.inf)
 
 
 def loop(function: Loop) -> Loop:

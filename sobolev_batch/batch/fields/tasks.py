@@ -178,12 +178,14 @@ def compute_parts(job: Job, blocks: Sequence[Block] = (), octaves: bool = False)
         return record
     started = time.perf_counter()
     try:
-        surface, stored = job.load(), []
-        if blocks:
-            is_whole = tuple(blocks) == (job.lattice.half,)
-            stored.append(_store_whole(job, surface) if is_whole else _store_blocks(job, surface, blocks))
-        if octaves:
-            stored.append(_store_octaves(job, surface))
+        # Another worker that computes them again must write the same bytes.
+        with compiled.by_itself():
+            surface, stored = job.load(), []
+            if blocks:
+                is_whole = tuple(blocks) == (job.lattice.half,)
+                stored.append(_store_whole(job, surface) if is_whole else _store_blocks(job, surface, blocks))
+            if octaves:
+                stored.append(_store_octaves(job, surface))
     except StoreError:
         raise
     except Exception as error:
@@ -202,7 +204,7 @@ def _store_octaves(job: Job, surface: Surface) -> StoredBlocks:
     tail = job.tail
     if tail is None:
         raise ValueError("the study has no octaves")
-    # Another worker that computes them again must write the same bytes.
+    # Workers compute many of them.
     compiled.use()
     settings = job.octave_settings(surface)
     values = [octave_values(surface, octave, job.orders, settings, job.execution) for octave in tail.octaves]

@@ -133,7 +133,7 @@ def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def test_the_examples_in_python_run(capsys: pytest.CaptureFixture[str]) -> None:
     exec("".join(blocks(PAGE, "python")[:2]), {})
     first, second = capsys.readouterr().out.splitlines()
-    assert re.fullmatch(r"\[[\d.e-]+ +[\d.e-]+\] ± \[[\d.e-]+ +[\d.e-]+\]", first)
+    assert re.fullmatch(r"\[[\d.e-]+ +[\d.e-]+ *\] ± \[[\d.e-]+ +[\d.e-]+ *\]", first)
     assert float(second.split()[0]) > 1.6**2
 
 
