@@ -47,8 +47,8 @@ def test_stored_fields_and_tables_are_those_of_the_library(client: Client, finis
         )
         with np.errstate(divide="ignore"):
             most = (area + off) / np.maximum(found - whole, 0.0)
-        share = own["area_share"].values
-        farthest = np.maximum(np.minimum(most**2, 1.0) - share, share)
+        of_area = own["area_share"].values
+        farthest = np.maximum(np.minimum(most**2, 1.0) - of_area, of_area)
         assert (own["area_share_error"].values <= farthest + 1e-6).all()
         # A field straight from the store serves as an argument too.
         assert sb.distance(field, sphere, -3.0)["distance"].item() == pytest.approx(found[1], rel=1e-12)
