@@ -37,7 +37,7 @@ _Objects = NDArray[np.object_]
 
 @dataclass(frozen=True, eq=False)
 class Rests:
-    """What each of two meshes has that the other lacks, as area measures.
+    """Parts of each of two meshes that the other lacks, as area measures.
 
     Attributes:
         meshes: The rests; None where nothing is left, the meshes themselves where nothing is taken out.
