@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
@@ -78,10 +78,6 @@ class Sheets:
             elif isinstance(surface, Mesh):
                 meshes.append((surface, sign))
         return cls(meshes, spheres)
-
-    def spaced(self, spacing: float) -> Self:
-        """Return the sheets with another spacing."""
-        return replace(self, spacing=spacing)
 
     @property
     def cancel(self) -> bool:

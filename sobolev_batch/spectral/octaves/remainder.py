@@ -17,7 +17,7 @@ part, and their error allows for one point on a surface of its own.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -39,7 +39,7 @@ from sobolev_batch.surfaces.shapes.surface import Reals, Surface
 
 # Random points of the first estimate: usually, at least, at most, and of a scale. Pairs of a point and a triangle that
 # they may take, and those of points from which nothing is hidden.
-USUAL_POINTS, _FEWEST_POINTS, _MOST_POINTS, _POINTS_OF_SCALES = 256, 40, 1024, 64
+_USUAL_POINTS, _FEWEST_POINTS, _MOST_POINTS, _POINTS_OF_SCALES = 256, 40, 1024, 64
 _USUAL_PAIRS, _MOST_PAIRS = 150_000, 500_000
 # Share of the squared errors that is most of them, and a relative error that may be smaller for some more points.
 MOSTLY, _ROUGH = 0.5, 0.15
@@ -143,8 +143,8 @@ def remainder(
 def _estimate(seen_by: _Seen, count: int, rng: np.random.Generator, *, is_exact: bool = True) -> Remainder:
     """Return an estimate from some points; where these saw unevenly, from more of them."""
     covering, share = seen_by.covering, seen_by.sheets.area / count
-    sheets = seen_by.sheets.spaced(max(seen_by.squared_reach, share) ** 0.5)
-    draw = sheets.even(min(count, max(covering, USUAL_POINTS)), rng)
+    sheets = replace(seen_by.sheets, spacing=max(seen_by.squared_reach, share) ** 0.5)
+    draw = sheets.even(min(count, max(covering, _USUAL_POINTS)), rng)
     potentials, pairs = seen_by.potentials(draw.points)
     total, seen = len(draw.points), seen_by.shares(potentials)
     if (seen**2).mean() > _UNEVEN * seen.mean() ** 2 and seen.max() > _NOTHING:
@@ -154,7 +154,7 @@ def _estimate(seen_by: _Seen, count: int, rng: np.random.Generator, *, is_exact:
         found, more = seen_by.potentials(sheets.centers[looked_at])
         densities[looked_at] = np.maximum(densities[looked_at], seen_by.shares(found))
         total, pairs = total + len(looked_at), pairs + more
-        draw = sheets.in_proportion(densities, max(count - total, total // 2, USUAL_POINTS), rng)
+        draw = sheets.in_proportion(densities, max(count - total, total // 2, _USUAL_POINTS), rng)
         potentials, more = seen_by.potentials(draw.points)
         total, pairs = total + len(draw.points), pairs + more
     elif count > total:
@@ -241,7 +241,7 @@ class _Seen:
     def affordable(self, rng: np.random.Generator) -> int:
         """Return the number of points that do not take long."""
         if not self.sheets.meshes:
-            return USUAL_POINTS
+            return _USUAL_POINTS
         places, pairs = self.sheets.even(_FEWEST_POINTS, rng).points, 0
         for mesh, _ in self.sheets.meshes:
             # A few triangles stand for all of them.
