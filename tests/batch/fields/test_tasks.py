@@ -72,6 +72,30 @@ def test_octaves_have_the_precision_that_their_own_accuracy_needs(store_path: Pa
             assert both.octave_settings(mesh)(mesh, lattice).dtype == expected
 
 
+def test_what_a_mesh_and_its_reference_cover_is_nothing_beyond_the_octaves(tmp_path: Path) -> None:
+    corners = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0.3 0.6 0\n"
+    cuts = {"reference": "f 1 2 3\nf 1 3 4\n", "anew": "f 1 2 5\nf 2 3 5\nf 3 4 5\nf 4 1 5\n"}
+    for name, faces in cuts.items():
+        (tmp_path / f"{name}.obj").write_text(corners + faces)
+    files: dict[str, Any] = {name: {"source": "files", "paths": [f"{name}.obj"]} for name in cuts}
+    table = {
+        "lattice": {"xi_max": 3.0, "M": 16, "octaves": 1},
+        "reference": files["reference"],
+        "family": [{"name": "plates", **files["anew"]}],
+    }
+    plan = make_plan(Study.from_table(small_table(**table), folder=tmp_path))
+    reference, row = (next(row for row in plan.rows if row.label == label) for label in ("reference", "plates/anew"))
+    stored = compute_parts(
+        Job.for_row(plan, row, prepare_store(tmp_path / "store.zarr", plan), 0, None, reference), octaves=True
+    )
+    assert isinstance(stored, list)
+    quality = stored[0].quality
+    assert quality is not None
+    assert quality.tail is not None
+    assert quality.tail.difference is not None
+    assert not any(quality.tail.difference.errors)
+
+
 def test_a_task_whose_record_is_there_writes_nothing(store_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lattice = {"xi_max": 3.0, "M": 16, "octaves": 1}
     study = Study.from_table(small_table(lattice=lattice, norm={"orders": [-2.0]}))
