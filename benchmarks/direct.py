@@ -3,7 +3,7 @@
 The transform of a triangle of area A is 2A times the second divided difference of exp at its three
 imaginary nodes. Quotients serve separated nodes, and a short series takes over where nodes meet,
 which keeps some eleven digits: enough for a contestant in speed, and the oracle is
-`sobolev_batch.spectral.exact`.
+`sobolev_batch.transform.exact`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Mesh
-from sobolev_batch.spectral.lattice import Block
+from sobolev_batch.transform.lattice import Block
 
 Reals = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

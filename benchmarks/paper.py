@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from benchmarks.timing import take_turns
 from sobolev_batch import Lattice, Mesh
 from sobolev_batch.shapes import Sphere
-from sobolev_batch.spectral.backends import ComplexDtype
-from sobolev_batch.spectral.rules import gauss_rule
+from sobolev_batch.transform.backends import ComplexDtype
+from sobolev_batch.transform.rules import gauss_rule
 
 Complexes = NDArray[np.complexfloating[Any, Any]]
 Reals = NDArray[np.float64]

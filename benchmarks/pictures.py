@@ -27,8 +27,8 @@ FOLDER = ROOT / "docs" / "pictures"
 DIGESTS = FOLDER / "digests.json"
 LARGEST_BYTES = 100_000
 # Code is followed through imports from these; what they take from elsewhere computes numbers, and draws nothing.
-_DRAWING = "sobolev_batch.results.figures", "benchmarks.reconstruction", "benchmarks.pictures"
-_PAGE = [f"sobolev_batch/results/report/page/{name}" for name in ("report.css", "charts.js", "study.html.jinja")]
+_DRAWING = "sobolev_batch.extras.figures", "benchmarks.reconstruction", "benchmarks.pictures"
+_PAGE = [f"sobolev_batch/extras/report/page/{name}" for name in ("report.css", "charts.js", "study.html.jinja")]
 
 
 @dataclass(frozen=True)
@@ -135,17 +135,17 @@ def _draw_quickstart(_: Path, path: Path) -> None:
 
 
 def _draw_plot(kind: str, study: str, orders: tuple[float, ...] | None, _: Path, path: Path) -> None:
-    from sobolev_batch.results.figures.drawing import PLOTS
-    from sobolev_batch.results.figures.selection import Selection
-    from sobolev_batch.results.open import open_store
+    from sobolev_batch.extras.figures.drawing import PLOTS
+    from sobolev_batch.extras.figures.selection import Selection
+    from sobolev_batch.tables.open import open_store
 
     selection = Selection.from_store(open_store(str(_store(study))), orders)
     _save(PLOTS[kind].figure(selection), path)
 
 
 def _draw_witnesses(store: Path, folder: Path, meshes: list[str], order: float, colors: Any, path: Path) -> None:
-    from sobolev_batch.results.figures.selection import Selection
-    from sobolev_batch.results.figures.views import write_witness_plots
+    from sobolev_batch.extras.figures.selection import Selection
+    from sobolev_batch.extras.figures.views import write_witness_plots
 
     with tempfile.TemporaryDirectory() as made:
         selection = Selection.from_store(str(store), order)
@@ -198,9 +198,9 @@ def _draw_one_per_cent(meshes: Path, path: Path) -> None:
 def _draw_usual_distances(_: Path, path: Path) -> None:
     from matplotlib.figure import Figure
 
-    from sobolev_batch.results.figures.style import draw_curve, set_log_scale, style_of
-    from sobolev_batch.results.open import open_store
-    from sobolev_batch.results.tables.convergence import table
+    from sobolev_batch.extras.figures.style import draw_curve, set_log_scale, style_of
+    from sobolev_batch.tables.convergence import table
+    from sobolev_batch.tables.open import open_store
 
     study = tomllib.loads((ROOT / "workflows/cortex.toml").read_text(encoding="utf-8"))
     study |= {"study": {"name": "cortex-usual"}, "norm": {"orders": [-2.0]}, "proximity": {}}
@@ -254,7 +254,7 @@ def _draw_report(_: Path, path: Path) -> None:
         subprocess.run([browser, *flags, *options, page.as_uri()], check=True, timeout=120)
 
 
-_FIGURES = "sobolev_batch.results.figures."
+_FIGURES = "sobolev_batch.extras.figures."
 _PLOT = ("benchmarks.pictures:_draw_plot", f"{_FIGURES}style:Plot", f"{_FIGURES}style:draw_curve")
 _WITNESS = ("benchmarks.pictures:_draw_witnesses", f"{_FIGURES}views:write_witness_plots")
 _FITTED, _CORTEX, _FLOW = "workflows/cortex-fitted.toml", "workflows/cortex.toml", "workflows/flow.toml"

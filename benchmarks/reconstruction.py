@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 import sobolev_batch as sb
 from benchmarks.table import Row, as_seconds, format_table
 from benchmarks.timing import Effort, elapsed_seconds
-from sobolev_batch.results.figures.views import MeshView, draw_mesh
+from sobolev_batch.extras.figures.views import MeshView, draw_mesh
 
 _MEASURED_AT = (-2.0, -4.0)
 # Steps of the fits that are drawn.

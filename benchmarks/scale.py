@@ -16,8 +16,8 @@ from benchmarks.table import Row
 from benchmarks.timing import Effort, elapsed_seconds
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.execution import Progress
-from sobolev_batch.batch.store.store import Store
-from sobolev_batch.results.status import Status
+from sobolev_batch.batch.status import Status
+from sobolev_batch.store.store import Store
 
 _WORKERS = 2
 # Meshes that are added to those that are there.

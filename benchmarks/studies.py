@@ -22,8 +22,8 @@ from benchmarks.table import Row, Target, as_bytes, as_seconds, at_most
 from benchmarks.timing import Effort, elapsed_seconds, take_turns
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.execution import Progress
-from sobolev_batch.spectral.lattice import SobolevWeights
-from sobolev_batch.spectral.transform import TransformSettings, transform_block
+from sobolev_batch.transform.fourier import TransformSettings, transform_block
+from sobolev_batch.transform.lattice import SobolevWeights
 
 _WORKERS = 2
 _OVERHEAD = at_most(1.1)

@@ -13,9 +13,9 @@ from benchmarks.direct import direct_transform, frequencies_of
 from benchmarks.paper import Complexes, faster_upsampling, relative_distance, whole_transform
 from benchmarks.table import Row, as_seconds, at_least, at_most
 from benchmarks.timing import Effort, take_turns
-from sobolev_batch.spectral.backends import ComplexDtype
-from sobolev_batch.spectral.exact import exact_transform
-from sobolev_batch.spectral.transform import ErrorTarget, Execution, TransformSettings, choose_settings, transform_block
+from sobolev_batch.transform.backends import ComplexDtype
+from sobolev_batch.transform.exact import exact_transform
+from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, choose_settings, transform_block
 
 ORDER = -10.0
 XI_MAX = 5.0

@@ -23,7 +23,7 @@ from pdoc.render_helpers import to_html
 ROOT = Path(__file__).resolve().parents[1]
 API = "sobolev_batch"
 # Modules of public names, in the order of the pages.
-MODULES = ("plot", "shapes", "fitting", "sources", "testing", "result_types", "errors")
+MODULES = ("extras.plot", "shapes", "extras.fitting", "sources", "testing", "result_types", "errors")
 APIS = (API, *(f"{API}.{name}" for name in MODULES))
 
 # Pages by group, as in the README; the API follows the pages of the reference.
@@ -67,8 +67,10 @@ def build(output: Path) -> None:
         inspect.getmembers(package)  # pdoc sees only names that were asked for once
     modules = {name: Module(package) for name, package in packages.items()}
     addresses = {name: f"{name.replace('.', '/')}.html" for name in modules}
-    groups["Reference"] |= {address: name.replace(API, "API").replace(".", ": ") for name, address in addresses.items()}
-    (output / API).mkdir(exist_ok=True)
+    groups["Reference"] |= {
+        address: name.replace(API, "API").replace(".extras", "").replace(".", ": ")
+        for name, address in addresses.items()
+    }
     for name, module in modules.items():
         up = "../" * name.count(".")
         env.globals["groups"] = {
@@ -104,6 +106,7 @@ def relocated(source: str, output: Path, link: re.Match[str]) -> str:
 
 def write(path: Path, text: str) -> None:
     """Write one page."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text, encoding="utf-8")
 
 

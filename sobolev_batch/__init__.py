@@ -3,14 +3,18 @@
 A study file names families of meshes, a reference, and an accuracy or a frequency lattice. Each mesh becomes a Dask
 task; a reduction over the stored fields makes the tables. Data flows one way through the folders:
 
-    surfaces   study file -> sources -> Mesh or closed-form surface -> one similarity transform
-    spectral   -> weighted points, in batches -> NUFFT -> a block of the Fourier field
-    fitting    -> derivatives of distances, meshes that come nearer to a target
-    batch      -> zarr store -> norms, distances, convergence (a study as tasks on a cluster)
-    results    -> tables, plots, a report, a lazy DataTree
-    testing    -> verdicts on two surfaces, for test suites
+    geometry   meshes and surfaces by formula, and their files
+    sources    the tables of a study file become families of surfaces
+    transform  surface -> weighted points, in batches -> NUFFT -> a block of the Fourier field
+    norms      fields -> norms and distances with their errors
+    study      study file -> Study -> Plan
+    store      the zarr hierarchy of a study
+    tables     stored fields -> norms, distances, convergence; a lazy DataTree
+    batch      a study as tasks on a cluster
+    extras     plots, reports, leagues, fitting: the rest works without them
+    testing    verdicts on two surfaces, for test suites
 
-`surfaces` imports none of the others; `spectral` and `fitting` import neither dask nor zarr. See docs/design.md.
+No folder imports one below it; the first four import neither dask nor zarr. See docs/design.md.
 
 The public names by subject:
 
@@ -43,7 +47,7 @@ _RETURN_FIELDS = ("fourier_transform", "open_store")
 
 def __getattr__(name: str) -> Any:
     if name in _RETURN_FIELDS:
-        import_module(f"{__name__}.results.accessor")
+        import_module(f"{__name__}.tables.accessor")
     if name == "open_store":
-        import_module(f"{__name__}.results.store_accessor")
+        import_module(f"{__name__}.tables.store_accessor")
     return _load(name)

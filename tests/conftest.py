@@ -24,6 +24,7 @@ from distributed.utils import get_mp_context
 from sobolev_batch import Mesh, Study, read_mesh, run
 from sobolev_batch.batch.cluster.clients import local_client, thread_client
 from tests.support import durations
+from tests.support.made_tree import near, tree  # noqa: F401
 from tests.support.mesh_files import Read
 from tests.support.repository import ROOT
 from tests.support.spheres import make_study

@@ -24,8 +24,8 @@ from distributed import Client
 from plyfile import PlyData
 
 import sobolev_batch as sb
-from sobolev_batch.results.tables import FORMATS
 from sobolev_batch.shapes import icosphere
+from sobolev_batch.tables import FORMATS
 from tests.support.commands import COMMAND, STUDY, call, command, finished
 
 pytestmark = pytest.mark.process

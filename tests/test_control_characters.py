@@ -22,9 +22,9 @@ from distributed import Client
 
 import sobolev_batch as sb
 from sobolev_batch.cli.common import overwrite, progress_bar
-from sobolev_batch.results.tables import FORMATS
-from sobolev_batch.results.tables.text import machine_table, printed_table, prose
-from sobolev_batch.surfaces.sources import files
+from sobolev_batch.sources import files
+from sobolev_batch.tables import FORMATS
+from sobolev_batch.tables.text import machine_table, printed_table, prose
 from sobolev_batch.visible import VisibleRecord, table_html, visible, visible_lines
 from tests.support.commands import COMMAND, call
 

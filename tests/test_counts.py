@@ -13,7 +13,7 @@ import finufft
 import pytest
 
 import sobolev_batch as sb
-from sobolev_batch.spectral import kinds
+from sobolev_batch.transform import kinds
 from tests.support.studies import SMALL_LATTICE, small_table
 
 COARSE, FINE, SPHERE = sb.shapes.icosphere(1), sb.shapes.icosphere(2), sb.shapes.Sphere()

@@ -14,7 +14,20 @@ from tests.support.repository import PACKAGE, run_icospheres
 FLAGS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
 FILES = [file for file in sorted(PACKAGE.rglob("*.py")) if ">>>" in file.read_text(encoding="utf-8")]
 NAMES = [".".join([PACKAGE.name, *file.relative_to(PACKAGE).with_suffix("").parts]) for file in FILES]
-BESIDE_A_STORE = tuple(f"{PACKAGE.name}.{layer}" for layer in ("results.", "cli.", "plot", "batch.verify"))
+BESIDE_A_STORE = tuple(
+    f"{PACKAGE.name}.{layer}"
+    for layer in (
+        "tables.",
+        "extras.figures",
+        "extras.leagues",
+        "extras.report",
+        "cli.",
+        "extras.plot",
+        "batch.verify",
+        "batch.status",
+        "batch.dry_run",
+    )
+)
 # It runs a study on a cluster of its own.
 WITH_CLUSTER = f"{PACKAGE.name}.batch.run"
 

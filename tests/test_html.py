@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import pytest
 
 import sobolev_batch as sb
-from sobolev_batch.results.tables.league import leagues_of
+from sobolev_batch.extras.leagues.league import leagues_of
 from tests.support.studies import method_rows, small_table
 
 HOSTILE = "<script>alert('&')</script>"

@@ -11,8 +11,8 @@ from tests.support.repository import MODULES, PACKAGE, imported, public_names
 
 # Each may import those before it.
 LAYERS = (
-    *("visible", "errors", "parameters", "compiled", "surfaces", "spectral", "fitting", "batch", "results", "testing"),
-    *("shapes", "sources", "plot", "result_types", "cli"),
+    *("visible", "errors", "parameters", "compiled", "geometry", "sources", "transform", "norms", "study", "store"),
+    *("tables", "batch", "extras", "testing", "shapes", "result_types", "cli"),
 )
 MOST_NAMES_OF_A_FOLDER = 20
 
@@ -69,7 +69,7 @@ def test_every_folder_can_be_taken_in_at_a_glance() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("layer", ["surfaces", "spectral", "fitting"])
+@pytest.mark.parametrize("layer", ["geometry", "sources", "transform", "norms"])
 def test_numbers_know_neither_dask_nor_zarr(layer: str) -> None:
     files = list((PACKAGE / layer).rglob("*.py"))
     assert len(files) > 5

@@ -9,16 +9,16 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from sobolev_batch.batch.analysis.pairs import PAIR_BYTES
-from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.study.plan import members_of
-from sobolev_batch.batch.study.schema import known_names
-from sobolev_batch.batch.study.study import REFERENCE_LABEL, AnyStudy, Study, StudyCollection, StudyLike, as_study
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.parameters import format_bytes
-from sobolev_batch.surfaces.sources.mesh_cache import MeshCache
-from sobolev_batch.surfaces.sources.names import quoted
-from sobolev_batch.surfaces.sources.registry import ExpectedSize, Member
+from sobolev_batch.sources.mesh_cache import MeshCache
+from sobolev_batch.sources.names import quoted
+from sobolev_batch.sources.registry import ExpectedSize, Member
+from sobolev_batch.store.location import Location
+from sobolev_batch.study.plan import members_of
+from sobolev_batch.study.schema import known_names
+from sobolev_batch.study.study import REFERENCE_LABEL, AnyStudy, Study, StudyCollection, StudyLike, as_study
+from sobolev_batch.tables.pairs import PAIR_BYTES
 
 _log = logging.getLogger(__name__)
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from contextlib import nullcontext
 
-from sobolev_batch.batch.storage.location import PARTIAL_FILE, Location
-from sobolev_batch.batch.storage.lock import LOCK_KEYS, Lock, locked
-from sobolev_batch.batch.store.store import FIELD, OCTAVES, ROOT, Store
-from sobolev_batch.batch.workspace import complete_records
 from sobolev_batch.errors import StoreError
+from sobolev_batch.store.location import PARTIAL_FILE, Location
+from sobolev_batch.store.lock import LOCK_KEYS, Lock, locked
+from sobolev_batch.store.store import FIELD, OCTAVES, ROOT, Store
+from sobolev_batch.store.workspace import complete_records
 
 _LOST, _KILLED, _UNLISTED = (
     "fields of meshes that are no longer in the study",

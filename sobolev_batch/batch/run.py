@@ -12,28 +12,28 @@ from typing import Any
 import numpy as np
 from distributed import Client
 
-from sobolev_batch.batch.analysis.proximity import have_proximities, measure_proximities
-from sobolev_batch.batch.analysis.tabulate import are_tabulated, tabulate_fields
 from sobolev_batch.batch.checks import StoreLike, ready_to_run
 from sobolev_batch.batch.cluster.clients import local_client, memory_limit, require_blocking, thread_client
 from sobolev_batch.batch.cluster.execution import Cluster, Notify, Progress
 from sobolev_batch.batch.cluster.watch import Watch
 from sobolev_batch.batch.cluster.workers import require_store_access
-from sobolev_batch.batch.collection_store import CollectionStore, for_each_object, labelled
-from sobolev_batch.batch.fields.compute import compute_fields
-from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.storage.lock import Lock, locked
-from sobolev_batch.batch.store.create import require_usable
-from sobolev_batch.batch.store.heartbeat import Heartbeat
-from sobolev_batch.batch.store.store import stored_choice
-from sobolev_batch.batch.study.plan import make_plan
-from sobolev_batch.batch.study.study import AnyStudy, Study, StudyCollection, StudyLike
+from sobolev_batch.batch.field_stage import compute_fields
+from sobolev_batch.batch.proximity_stage import have_proximities, measure_proximities
+from sobolev_batch.batch.table_stage import are_tabulated, tabulate_fields
 from sobolev_batch.batch.verify import damaged_rows
-from sobolev_batch.batch.workspace import Workspace, failed_proximities
 from sobolev_batch.errors import DamageError, InputError
+from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
+from sobolev_batch.norms.budget import NormEstimate
 from sobolev_batch.parameters import available_cores, require_machine_memory
-from sobolev_batch.spectral.adaptive.tolerance import NEXT_TO_EQUAL
-from sobolev_batch.spectral.budget import NormEstimate
+from sobolev_batch.store.collection_store import CollectionStore, for_each_object, labelled
+from sobolev_batch.store.create import require_usable
+from sobolev_batch.store.heartbeat import Heartbeat
+from sobolev_batch.store.location import Location
+from sobolev_batch.store.lock import Lock, locked
+from sobolev_batch.store.store import stored_choice
+from sobolev_batch.store.workspace import Workspace, failed_proximities
+from sobolev_batch.study.plan import make_plan
+from sobolev_batch.study.study import AnyStudy, Study, StudyCollection, StudyLike
 from sobolev_batch.visible import Shown, reasons, visible
 
 _log = logging.getLogger(__name__)

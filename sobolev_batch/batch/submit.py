@@ -15,17 +15,17 @@ from sobolev_batch.batch.cluster.clients import require_blocking
 from sobolev_batch.batch.cluster.execution import task_key
 from sobolev_batch.batch.cluster.watch import Watch
 from sobolev_batch.batch.cluster.workers import prepare_workers, require_store_access
-from sobolev_batch.batch.collection_store import CollectionStore, for_each_object
 from sobolev_batch.batch.run import carry_out
-from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.storage.lock import Lock, acquire, release
-from sobolev_batch.batch.store.create import require_usable
-from sobolev_batch.batch.store.heartbeat import Heartbeat
-from sobolev_batch.batch.store.store import Store, stored_choice
-from sobolev_batch.batch.study.plan import make_plan
-from sobolev_batch.batch.study.study import Study, StudyLike
-from sobolev_batch.batch.workspace import Workspace
 from sobolev_batch.errors import ClusterError, StoreError
+from sobolev_batch.store.collection_store import CollectionStore, for_each_object
+from sobolev_batch.store.create import require_usable
+from sobolev_batch.store.heartbeat import Heartbeat
+from sobolev_batch.store.location import Location
+from sobolev_batch.store.lock import Lock, acquire, release
+from sobolev_batch.store.store import Store, stored_choice
+from sobolev_batch.store.workspace import Workspace
+from sobolev_batch.study.plan import make_plan
+from sobolev_batch.study.study import Study, StudyLike
 
 _log = logging.getLogger(__name__)
 

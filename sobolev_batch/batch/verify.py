@@ -8,24 +8,24 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from sobolev_batch.batch.analysis.pairs import Pairs
-from sobolev_batch.batch.analysis.spectra import spectrum_keys, stale_chunks
 from sobolev_batch.batch.cluster.execution import Cluster, Task
-from sobolev_batch.batch.collection_store import CollectionStore, labelled
-from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.storage.lock import Lock, acquire, release
-from sobolev_batch.batch.store.records import Record
-from sobolev_batch.batch.store.store import LABELS, PAIRS_KEYS, QUALITY, RECORDS, ROOT, SPECTRA_KEYS, Store
-from sobolev_batch.batch.store.tables import (
+from sobolev_batch.errors import DamageError, LockError, StoreError
+from sobolev_batch.parameters import available_cores
+from sobolev_batch.store.collection_store import CollectionStore, labelled
+from sobolev_batch.store.location import Location
+from sobolev_batch.store.lock import Lock, acquire, release
+from sobolev_batch.store.records import Record
+from sobolev_batch.store.store import LABELS, PAIRS_KEYS, QUALITY, RECORDS, ROOT, SPECTRA_KEYS, Store
+from sobolev_batch.store.stored_tables import (
     damaged_chunks,
     damaged_tables,
     rows_unlike_tables,
     table_attributes,
     withdraw_chunk,
 )
-from sobolev_batch.batch.workspace import Workspace, complete_records
-from sobolev_batch.errors import DamageError, LockError, StoreError
-from sobolev_batch.parameters import available_cores
+from sobolev_batch.store.workspace import Workspace, complete_records
+from sobolev_batch.tables.pairs import Pairs
+from sobolev_batch.tables.shells import spectrum_keys, stale_chunks
 from sobolev_batch.visible import Shown, visible
 
 _log = logging.getLogger(__name__)

@@ -11,7 +11,7 @@ from typing import NoReturn
 import click
 
 # Importing these modules adds their commands to the group.
-from sobolev_batch.cli import meshes, stores, studies, tables  # noqa: F401
+from sobolev_batch.cli import mesh_commands, store_commands, study_commands, table_commands  # noqa: F401
 from sobolev_batch.cli.common import EXIT_INPUT, EXIT_OTHER, cli, echo, echo_lines, patience, show_usage_error
 from sobolev_batch.cli.interruption import SECONDS_TO_END, Deadline, end_process, ignore_requests
 from sobolev_batch.errors import InputError, SobolevBatchError, one_line

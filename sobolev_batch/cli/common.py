@@ -21,12 +21,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from sobolev_batch.results.tables import FORMATS
+from sobolev_batch.tables import FORMATS
 from sobolev_batch.visible import visible, visible_lines
 
 if TYPE_CHECKING:
     from sobolev_batch.batch.cluster.execution import Progress
-    from sobolev_batch.batch.storage.location import Location
+    from sobolev_batch.store.location import Location
 
 # Exit statuses; `end_process` has those after SIGINT and SIGTERM.
 EXIT_OTHER, EXIT_INPUT, EXIT_SOME_FAILED = 1, 2, 3
@@ -124,7 +124,7 @@ def meshes_option(text: str, default: str) -> Callable[[Command], Command]:
 
 def location(value: Any) -> Location:
     """Return the location of a store that an option names."""
-    from sobolev_batch.batch.storage.location import Location
+    from sobolev_batch.store.location import Location
 
     return Location.parse(value)
 
@@ -243,7 +243,7 @@ def echo_lines(text: object, *, err: bool = False) -> None:
 
 def echo_json(result: Any, **more: Any) -> None:
     """Print a result and what follows from it as one JSON document; docs/commands.md lists the keys."""
-    from sobolev_batch.results.tables.text import json_text
+    from sobolev_batch.tables.text import json_text
 
     echo_lines(json_text((result if isinstance(result, dict) else vars(result)) | more))
 

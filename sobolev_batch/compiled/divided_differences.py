@@ -1,4 +1,4 @@
-"""Transforms of triangles as compiled loops: the formulas of `sobolev_batch.spectral.exact`, frequency by frequency.
+"""Transforms of triangles as compiled loops: the formulas of `sobolev_batch.transform.exact`, frequency by frequency.
 
 The inner loop of each sum runs over some frequencies, so that a processor takes several of them at a time and loads
 corners and edges once for all. Phases are counted in cycles, and whole cycles are subtracted exactly.

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
-    from sobolev_batch.surfaces.formats.readers import SurfaceLike
+    from sobolev_batch.geometry.formats.readers import SurfaceLike
     from sobolev_batch.testing.verdict import Verdict
 
 _OPTION = "--sobolev-witness-folder"
@@ -47,7 +47,7 @@ def assert_same_surface(request: pytest.FixtureRequest) -> Callable[..., Verdict
 
 def _path(request: pytest.FixtureRequest, number: int) -> Path:
     """Return the beginning of the paths of the files of a comparison of this test."""
-    from sobolev_batch.surfaces.sources.names import file_stem
+    from sobolev_batch.sources.names import file_stem
 
     # Parameters may be long, or differ in characters that names of files cannot have.
     digest = sha256(request.node.nodeid.encode()).hexdigest()[:8]

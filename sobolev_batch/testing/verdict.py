@@ -10,18 +10,10 @@ from typing import Literal
 import numpy as np
 
 from sobolev_batch.errors import InputError, SobolevBatchError, from_extra, one_line
-from sobolev_batch.parameters import available, available_cores, check_seed
-from sobolev_batch.results.tables.text import rounded_outwards, with_error
-from sobolev_batch.spectral import DEFAULT_ORDER
-from sobolev_batch.spectral.adaptive.threshold import Method, relative_distance
-from sobolev_batch.spectral.adaptive.tolerance import Accuracy, core_lattice
-from sobolev_batch.spectral.budget import Support
-from sobolev_batch.spectral.fields import fourier_transform
-from sobolev_batch.spectral.lattice import single_order
-from sobolev_batch.surfaces.formats.readers import SurfaceLike, as_surface
-from sobolev_batch.surfaces.proximity import vertex_distances
-from sobolev_batch.surfaces.shapes.mesh import Mesh
-from sobolev_batch.surfaces.shapes.surface import (
+from sobolev_batch.geometry.formats.readers import SurfaceLike, as_surface
+from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.geometry.proximity import vertex_distances
+from sobolev_batch.geometry.surface import (
     Extent,
     Similarity,
     Surface,
@@ -29,6 +21,14 @@ from sobolev_batch.surfaces.shapes.surface import (
     is_finite_number,
     placement_doubt,
 )
+from sobolev_batch.norms import DEFAULT_ORDER
+from sobolev_batch.norms.accuracy.threshold import Method, relative_distance
+from sobolev_batch.norms.accuracy.tolerance import Accuracy, core_lattice
+from sobolev_batch.norms.budget import Support
+from sobolev_batch.norms.fields import fourier_transform
+from sobolev_batch.parameters import available, available_cores, check_seed
+from sobolev_batch.tables.text import rounded_outwards, with_error
+from sobolev_batch.transform.lattice import single_order
 from sobolev_batch.visible import table_html
 
 Outcome = Literal["same", "different", "undecided"]
@@ -233,7 +233,7 @@ def require_place(path: Path) -> None:
     """Create the folder of the files that `write_difference` writes; InputError where that cannot be done."""
     if path.suffix in _PICTURES:
         with from_extra("plot", "a picture needs"):
-            from sobolev_batch.results.figures.views import write_difference_picture  # noqa: F401 -- at once
+            from sobolev_batch.extras.figures.views import write_difference_picture  # noqa: F401 -- at once
     if not path.name:
         raise InputError(f"{str(path)!r} names no file; files get {str(Path('failures', 'part'))!r} and an ending")
     try:
@@ -260,7 +260,7 @@ def write_difference(
     file cannot be written; see also `require_place`.
     """
     # Files load what reads stores, which a verdict does without.
-    from sobolev_batch.results.figures.meshes import witness_at_vertices, write_vertex_values
+    from sobolev_batch.extras.figures.remade import witness_at_vertices, write_vertex_values
 
     similarity = Similarity.to_unit_ball(b) if scaling else Similarity()
     pair = [similarity.apply(surface) for surface in (a, b)]
@@ -289,7 +289,7 @@ def write_difference(
         )
         written.append(file)
     if drawn:
-        from sobolev_batch.results.figures.views import write_difference_picture
+        from sobolev_batch.extras.figures.views import write_difference_picture
 
         written += write_difference_picture(path, drawn, (of_a, of_b), order, distances, similarity.scale)
     if not written:

@@ -15,11 +15,11 @@ import xarray as xr
 from distributed import Client
 
 import sobolev_batch as sb
-from sobolev_batch.batch.collection_store import CollectionStore
-from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.storage.lock import Lock, locked
-from sobolev_batch.batch.store.store import Store
-from sobolev_batch.batch.study.plan import Plan, make_plan
+from sobolev_batch.store.collection_store import CollectionStore
+from sobolev_batch.store.location import Location
+from sobolev_batch.store.lock import Lock, locked
+from sobolev_batch.store.store import Store
+from sobolev_batch.study.plan import Plan, make_plan
 from tests.support.commands import call
 from tests.support.stores import flip
 from tests.support.studies import GONE, balls, methods_of, small_table

@@ -13,8 +13,8 @@ import pytest
 from distributed import Client
 
 import sobolev_batch as sb
-from sobolev_batch.batch.store.store import Store
-from sobolev_batch.spectral.exact import sphere_inner_product
+from sobolev_batch.store.store import Store
+from sobolev_batch.transform.exact import sphere_inner_product
 from tests.support.stores import delete, flip, put_back, truncate
 from tests.support.studies import small_table, variable
 

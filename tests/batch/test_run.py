@@ -13,13 +13,13 @@ import trimesh
 from distributed import Client
 
 import sobolev_batch as sb
-from sobolev_batch.batch import workspace
-from sobolev_batch.batch.analysis import tabulate
+from sobolev_batch.batch import table_stage
 from sobolev_batch.batch.cluster.clients import remote_client
 from sobolev_batch.batch.cluster.execution import Progress
-from sobolev_batch.batch.store.records import Record
-from sobolev_batch.batch.store.store import Store
-from sobolev_batch.results.status import Status
+from sobolev_batch.batch.status import Status
+from sobolev_batch.store import workspace
+from sobolev_batch.store.records import Record
+from sobolev_batch.store.store import Store
 from tests.support.commands import call, command, finished
 from tests.support.processes import tcp_cluster, wait_until
 from tests.support.recipes import write_study
@@ -129,7 +129,7 @@ def test_tables_of_an_older_version_are_made_anew(
     client: Client, study: sb.Study, store_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(tabulate, "TABLES_VERSION", tabulate.TABLES_VERSION - 1)
+        patch.setattr(table_stage, "TABLES_VERSION", table_stage.TABLES_VERSION - 1)
         sb.run(study, store_path, client)
     for reduced in (True, False):
         steps: list[Progress] = []

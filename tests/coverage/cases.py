@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sobolev_batch import Lattice, Mesh
-from sobolev_batch.surfaces.shapes.surface import Extent
+from sobolev_batch.geometry.surface import Extent
 from tests.coverage.kinds import MAKERS
 from tests.coverage.parts import PARTS
 from tests.coverage.solids import SOLIDS

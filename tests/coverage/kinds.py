@@ -11,11 +11,11 @@ import trimesh
 from numpy.typing import NDArray
 
 from sobolev_batch import Mesh
+from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.shapes import Similarity, Sphere, icosphere
-from sobolev_batch.surfaces.shapes.surface import Surface
-from sobolev_batch.surfaces.sources.files import FileSource
-from sobolev_batch.surfaces.sources.generated import decimated
-from sobolev_batch.surfaces.sources.registry import load_mesh
+from sobolev_batch.sources.files import FileSource
+from sobolev_batch.sources.generated import decimated
+from sobolev_batch.sources.registry import load_mesh
 from tests.coverage.truth import Pair
 from tests.support.shapes import CENTRED_BOX as BOX
 

@@ -11,9 +11,9 @@ from scipy.integrate import quad
 from scipy.special import gamma, kv
 
 from sobolev_batch import Mesh, distance
+from sobolev_batch.geometry.surface import Surface
+from sobolev_batch.norms.budget import PARTS
 from sobolev_batch.shapes import Sphere, icosphere
-from sobolev_batch.spectral.budget import PARTS
-from sobolev_batch.surfaces.shapes.surface import Surface
 from tests.coverage.__main__ import described, judge, judged, show
 from tests.coverage.cases import KINDS, cases_of
 from tests.coverage.matern import kernel, radial_integral

@@ -12,8 +12,8 @@ import xarray as xr
 from click.testing import CliRunner
 
 from sobolev_batch import Mesh
-from sobolev_batch.spectral.budget import PARTS
-from sobolev_batch.spectral.exact import exact_transform
+from sobolev_batch.norms.budget import PARTS
+from sobolev_batch.transform.exact import exact_transform
 from tests.coverage import __main__ as program
 from tests.coverage.cases import KINDS, all_cases, cases_of
 from tests.coverage.solids import SOLIDS, Block, Turn, boundary, cut_at_random, difference

@@ -21,8 +21,8 @@ from scipy.special import erf
 
 from sobolev_batch import Lattice, Mesh, distance, fourier_transform
 from sobolev_batch.errors import AccuracyError
+from sobolev_batch.geometry.surface import Extent, Surface
 from sobolev_batch.shapes import Sphere
-from sobolev_batch.surfaces.shapes.surface import Extent, Surface
 from tests.coverage.matern import Sides, divided_points, double_sum, graded_points, mesh_potentials, sphere_potential
 from tests.support.rectangles import TIMES, Rectangles, integrals_of_traces
 

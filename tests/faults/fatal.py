@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sobolev_batch.batch.store.store import Store
+from sobolev_batch.store.store import Store
 
 VARIABLE = "FATAL_MOMENT"
 _FUNCTIONS: dict[str, tuple[type, str]] = {

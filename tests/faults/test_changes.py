@@ -20,11 +20,11 @@ from distributed import Client
 from sobolev_batch import Study, open_store, run, verify
 from sobolev_batch.batch.cluster.clients import local_client, thread_client
 from sobolev_batch.batch.cluster.execution import Progress
-from sobolev_batch.batch.store.metadata import SCHEMA_VERSION
-from sobolev_batch.batch.store.store import Store
-from sobolev_batch.batch.study import plan as plan_module
+from sobolev_batch.batch.status import Status
 from sobolev_batch.errors import StoreError
-from sobolev_batch.results.status import Status
+from sobolev_batch.store.metadata import SCHEMA_VERSION
+from sobolev_batch.store.store import Store
+from sobolev_batch.study import plan as plan_module
 from tests.support.stores import assert_same_results, contents
 from tests.support.studies import small_table, variable
 
@@ -167,10 +167,10 @@ def test_workers_and_threads(
 TWICE = """
 import os, sys
 from sobolev_batch import Study
-from sobolev_batch.batch.study.plan import make_plan
-from sobolev_batch.batch.workspace import Workspace
-from sobolev_batch.batch.store.store import Store
-from sobolev_batch.batch.fields.tasks import Job, compute_mesh
+from sobolev_batch.study.plan import make_plan
+from sobolev_batch.store.workspace import Workspace
+from sobolev_batch.store.store import Store
+from sobolev_batch.batch.field_tasks import Job, compute_mesh
 from tests.support.studies import small_table
 
 plan = make_plan(Study.from_table(small_table()))

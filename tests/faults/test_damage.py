@@ -17,11 +17,11 @@ from distributed import Client
 
 from sobolev_batch import Study, matrix, norm, open_store, run, status, verify
 from sobolev_batch.batch.cluster.execution import Progress
-from sobolev_batch.batch.storage.lock import utc_now
-from sobolev_batch.batch.store.records import RunRecord
-from sobolev_batch.batch.store.store import Store
 from sobolev_batch.errors import DamageError, StoreError
-from sobolev_batch.results.store_accessor import StoreAccessor
+from sobolev_batch.store.lock import utc_now
+from sobolev_batch.store.records import RunRecord
+from sobolev_batch.store.store import Store
+from sobolev_batch.tables.store_accessor import StoreAccessor
 from tests.faults.conftest import LABELS
 from tests.support.commands import call, write_toml
 from tests.support.stores import assert_same_results, contents, delete, empty, flip, put_back, truncate

@@ -11,7 +11,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from sobolev_batch.batch.storage.lock import LOCK_KEY
+from sobolev_batch.store.lock import LOCK_KEY
 from tests.support.commands import call, finished, read_until, started, write_toml
 from tests.support.processes import PATIENCE_SECONDS, wait_until
 

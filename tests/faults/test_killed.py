@@ -23,12 +23,12 @@ from sobolev_batch import Mesh, Study, open_store, run, verify, write_mesh
 from sobolev_batch.batch.cluster import watch
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.watch import Watch
-from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.storage.lock import Lock, locked
-from sobolev_batch.batch.store.create import prepare_store
-from sobolev_batch.batch.store.store import Store
-from sobolev_batch.batch.study.plan import make_plan
 from sobolev_batch.errors import ClusterError, LockError, StoreError
+from sobolev_batch.store.create import prepare_store
+from sobolev_batch.store.location import Location
+from sobolev_batch.store.lock import Lock, locked
+from sobolev_batch.store.store import Store
+from sobolev_batch.study.plan import make_plan
 from tests.faults.conftest import LABELS
 from tests.faults.fatal import Moment
 from tests.support.commands import TOML, call, command, finished, read_until, started, write_toml
@@ -106,9 +106,9 @@ import json, os, signal, sys
 from pathlib import Path
 import numpy as np
 from sobolev_batch import Study
-from sobolev_batch.batch.study.plan import make_plan
-from sobolev_batch.batch.store.create import prepare_store
-from sobolev_batch.batch.store.records import Record
+from sobolev_batch.study.plan import make_plan
+from sobolev_batch.store.create import prepare_store
+from sobolev_batch.store.records import Record
 from tests.support.studies import small_table
 
 path = Path(sys.argv[1])

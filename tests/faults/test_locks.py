@@ -21,13 +21,13 @@ from distributed import Client
 from sobolev_batch import Study, run, status, unlock
 from sobolev_batch.batch import run as run_module
 from sobolev_batch.batch.cluster.execution import Progress
-from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.storage.lock import LOCK_KEY, Lock, acquire, locked, utc_now
-from sobolev_batch.batch.store import heartbeat
-from sobolev_batch.batch.store.store import Store
-from sobolev_batch.batch.study.plan import Plan, make_plan
 from sobolev_batch.errors import LockError, StoreError
 from sobolev_batch.result_types import Summary
+from sobolev_batch.store import heartbeat
+from sobolev_batch.store.location import Location
+from sobolev_batch.store.lock import LOCK_KEY, Lock, acquire, locked, utc_now
+from sobolev_batch.store.store import Store
+from sobolev_batch.study.plan import Plan, make_plan
 from tests.support.commands import call, write_toml
 from tests.support.processes import PATIENCE_SECONDS
 from tests.support.stores import full_disk, winners
@@ -156,8 +156,8 @@ def test_the_lock_of_another_machine_is_unlocked_by_hand_unless_its_run_gave_a_s
 
 LOCKING = """
 import sys
-from sobolev_batch.batch.storage.lock import Lock, acquire
-from sobolev_batch.batch.storage.location import Location
+from sobolev_batch.store.lock import Lock, acquire
+from sobolev_batch.store.location import Location
 acquire(Location.parse(sys.argv[1]), Lock.of_this_process())
 print("taken", flush=True)
 sys.stdin.read()

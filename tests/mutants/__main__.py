@@ -20,7 +20,7 @@ import click
 
 from tests.support.repository import ROOT
 
-PATHS = ("sobolev_batch/batch", "sobolev_batch/surfaces/formats", "sobolev_batch/surfaces/sources")
+PATHS = ("sobolev_batch/batch", "sobolev_batch/store", "sobolev_batch/geometry/formats", "sobolev_batch/sources")
 _IS_CHECK = re.compile("_?(require|check)(_|$)")
 # A mutant that hangs is noticed too.
 _TEST_SECONDS = 300

@@ -22,7 +22,7 @@ import psutil
 
 from sobolev_batch import Study, open_store, run
 from sobolev_batch.batch.cluster.clients import local_client
-from sobolev_batch.batch.storage.location import Location
+from sobolev_batch.store.location import Location
 from tests.soak.studies import write_study
 from tests.support.commands import COMMAND
 from tests.support.object_storage import BUCKET, HEALTHY, Rule, Server, serving, taken_for_s3

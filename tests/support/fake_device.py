@@ -19,7 +19,7 @@ import finufft
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from sobolev_batch.spectral.backends import Gpu
+from sobolev_batch.transform.backends import Gpu
 
 # What CuPy answers when NumPy's function of that name is called. `ones` and `full` are not among them:
 # with like= NumPy passes on a keyword that CuPy's do not know.

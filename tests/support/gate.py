@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sobolev_batch.batch.fields.tasks import Job
-from sobolev_batch.surfaces.shapes.surface import Surface
-from sobolev_batch.surfaces.sources.files import FileMember
+from sobolev_batch.batch.field_tasks import Job
+from sobolev_batch.geometry.surface import Surface
+from sobolev_batch.sources.files import FileMember
 
 # Dask may load this twice.
 if not hasattr(Job, "load_without_gate"):

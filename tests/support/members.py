@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from sobolev_batch import Mesh
-from sobolev_batch.surfaces.sources.registry import Member, parse_source
+from sobolev_batch.sources.registry import Member, parse_source
 
 BALL: dict[str, Any] = {"source": "icosphere", "levels": [3]}
 

@@ -19,7 +19,7 @@ from typing import Any, Literal, NamedTuple, NoReturn
 import fsspec
 import pytest
 
-from sobolev_batch.batch.storage.location import _remote_store
+from sobolev_batch.store.location import _remote_store
 
 SECRET, TOKEN = "a-secret-that-nobody-may-see", "a-token-that-nobody-may-see"
 BUCKET = "studies"

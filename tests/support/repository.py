@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = Path(sb.__file__).parent
 # Those of public names, beside the package itself.
 MODULES = {
-    module.__name__.removeprefix("sobolev_batch."): module
+    module.__name__.rpartition(".")[2]: module
     for module in (sb.errors, sb.fitting, sb.plot, sb.result_types, sb.shapes, sb.sources, sb.testing)
 }
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch import Mesh
+from sobolev_batch.geometry.smooth import Smooth
+from sobolev_batch.geometry.surface import Point
 from sobolev_batch.shapes import Interval, ParametrisedSurface, Torus
-from sobolev_batch.surfaces.shapes.smooth import Smooth
-from sobolev_batch.surfaces.shapes.surface import Point
 
 Reals = NDArray[np.float64]
 

@@ -12,9 +12,9 @@ from threading import Barrier
 import numpy as np
 import xarray as xr
 
-from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.storage.lock import Lock, acquire
 from sobolev_batch.errors import DamageError, LockError
+from sobolev_batch.store.location import Location
+from sobolev_batch.store.lock import Lock, acquire
 from tests.support.studies import variable
 
 # What depends on who did it, and when.

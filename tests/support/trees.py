@@ -9,7 +9,7 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.spatial.distance import cdist
 
-from sobolev_batch.spectral.metrics.datasets import dataset_of
+from sobolev_batch.norms.columns import dataset_of
 
 
 def distances_of(points: npt.ArrayLike, labels: Sequence[str], factors: Mapping[float, float]) -> xr.Dataset:

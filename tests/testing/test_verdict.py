@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData
 
 import sobolev_batch as sb
-from sobolev_batch.results.figures import views
+from sobolev_batch.extras.figures import views
 from sobolev_batch.testing.verdict import require_place, write_difference
 
 Reals = NDArray[np.float64]
@@ -261,7 +261,7 @@ def test_a_picture_has_distances_in_the_unit_of_the_files(
 
 
 def test_a_picture_needs_matplotlib(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "sobolev_batch.results.figures.views", None)
+    monkeypatch.setitem(sys.modules, "sobolev_batch.extras.figures.views", None)
     with pytest.raises(sb.errors.InputError, match=r"a picture needs a library.*\[plot\]"):
         require_place(tmp_path / "new" / "w.png")
     assert not list(tmp_path.iterdir())

@@ -28,7 +28,7 @@ from distributed.core import Status
 from sobolev_batch import Study, open_store, run
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.errors import SobolevBatchError
-from sobolev_batch.results.tables.convergence import format_table
+from sobolev_batch.tables.convergence import format_table
 
 # dask_jobqueue ends the process on Ctrl-C with the exit status of success.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -16,9 +16,9 @@ from distributed.comm import CommClosedError
 from distributed.scheduler import KilledWorker
 
 from sobolev_batch.batch.cluster.workers import GPU, MEMORY, Workers, prepare_workers
-from sobolev_batch.batch.store.records import Record
-from sobolev_batch.batch.study.study import Study
 from sobolev_batch.errors import ClusterError, StoreError, one_line
+from sobolev_batch.store.records import Record
+from sobolev_batch.study.study import Study
 
 Stage = Literal["cluster", "fields", "reduction", "proximity"]
 

@@ -23,15 +23,15 @@ from typing import Any
 from distributed import Client, Worker, WorkerPlugin, get_worker
 from distributed.core import Status
 
-from sobolev_batch.batch.storage.location import Location
-from sobolev_batch.batch.storage.lock import Lock
-from sobolev_batch.batch.store.metadata import SCHEMA_VERSION
-from sobolev_batch.batch.study.schema import Backends
 from sobolev_batch.errors import BackendError, ClusterError, InputError, StoreError
+from sobolev_batch.norms.accuracy.tolerance import Accuracy
 from sobolev_batch.parameters import format_bytes, machine_memory
-from sobolev_batch.spectral.adaptive.tolerance import Accuracy
-from sobolev_batch.spectral.backends import CPU, INSTALL, Backend, gpu_backend
-from sobolev_batch.spectral.transform import NUMERICS_VERSION, slowness
+from sobolev_batch.store.location import Location
+from sobolev_batch.store.lock import Lock
+from sobolev_batch.store.metadata import SCHEMA_VERSION
+from sobolev_batch.study.schema import Backends
+from sobolev_batch.transform.backends import CPU, INSTALL, Backend, gpu_backend
+from sobolev_batch.transform.fourier import NUMERICS_VERSION, slowness
 from sobolev_batch.visible import make_messages_visible
 
 _log = logging.getLogger(__name__)

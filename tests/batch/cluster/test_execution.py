@@ -17,9 +17,9 @@ from sobolev_batch import Study, StudyCollection, plan, run, submit
 from sobolev_batch.batch.cluster.execution import Cluster, Progress, Task, describe_failure
 from sobolev_batch.batch.cluster.watch import Watch
 from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers, prepare_workers
-from sobolev_batch.batch.store.store import Store
+from sobolev_batch.batch.status import Status
 from sobolev_batch.errors import ClusterError, DamageError, InputError, StoreError
-from sobolev_batch.results.status import Status
+from sobolev_batch.store.store import Store
 from tests.support.processes import tcp_cluster
 from tests.support.studies import balls, methods_of, small_table
 

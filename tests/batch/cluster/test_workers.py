@@ -16,10 +16,10 @@ from sobolev_batch.batch.cluster import clients, workers
 from sobolev_batch.batch.cluster.clients import local_client, remote_client
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.cluster.workers import MEMORY, prepare_workers, require_same_versions
-from sobolev_batch.batch.store.store import Store
 from sobolev_batch.errors import ClusterError, InputError
 from sobolev_batch.parameters import machine_memory
 from sobolev_batch.shapes import icosphere
+from sobolev_batch.store.store import Store
 from tests.support import gate
 from tests.support.processes import PATIENCE_SECONDS, WORKER, dask, tcp_cluster
 from tests.support.repository import install

@@ -1,4 +1,0 @@
-"""Analysis: what is computed from stored fields, as tasks of its own.
-
-In: complete fields. Out: norms, distances, convergence, Hausdorff and Chamfer distances, as tables.
-"""

@@ -1,0 +1,311 @@
+"""The tasks of a field: they run on a worker, and turn a mesh's source into stored values and a completion record.
+
+Each task is a pure function of its arguments that writes whole chunks, so running it again, or
+twice at once, leaves the same store.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Self
+
+import numpy as np
+from distributed import get_worker
+
+from sobolev_batch import compiled
+from sobolev_batch.batch.cluster.workers import worker_backend
+from sobolev_batch.errors import InputError, LatticeError, MeshError, StoreError, one_line
+from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.geometry.surface import Similarity, Surface
+from sobolev_batch.norms.accuracy.problem import without_common_parts
+from sobolev_batch.norms.accuracy.solve import DistanceTarget
+from sobolev_batch.norms.fields import Quality, TailQuality, compute_field, field_for
+from sobolev_batch.norms.tail.remainder import Remainder, remainder
+from sobolev_batch.norms.tail.sampling import TailSampling
+from sobolev_batch.norms.tail.values import Settings, octave_values, settings_for
+from sobolev_batch.store.lock import utc_now
+from sobolev_batch.store.records import Facts, Record
+from sobolev_batch.store.store import Store
+from sobolev_batch.study.plan import Plan, Row
+from sobolev_batch.study.schema import Backends
+from sobolev_batch.transform.fourier import Execution, TransformSettings, choose_settings, transform_block
+from sobolev_batch.transform.kinds import kind_of
+from sobolev_batch.transform.lattice import Block, Lattice
+from sobolev_batch.transform.probe import COMMON, Probe, draws_for, join, probe_block
+
+_log = logging.getLogger(__name__)
+
+# Fraction of a field's error that each octave may have, inverted: the squares of some octaves' errors add up.
+_OCTAVES_SHARE = 5.0
+
+
+@dataclass(frozen=True)
+class Job:
+    """The field of one row, and where it is stored.
+
+    Attributes:
+        lattice, transform, orders, similarity, backend, tail: What all rows share; see `Plan`.
+        distance_target: Accuracy that the field is computed for, if the study has one.
+        allowed_bytes: Memory that one transform may take besides its mesh and its block.
+        reference: Row of the reference, which a surface in octaves is compared with; None where it is too large.
+    """
+
+    store: Store
+    index: int
+    row: Row
+    lattice: Lattice
+    transform: TransformSettings
+    orders: tuple[float, ...]
+    similarity: Similarity
+    backend: Backends = "auto"
+    tail: TailSampling | None = None
+    distance_target: DistanceTarget | None = None
+    allowed_bytes: float | None = None
+    reference: Row | None = None
+
+    @classmethod
+    def for_row(
+        cls,
+        plan: Plan,
+        row: Row,
+        store: Store,
+        index: int,
+        allowed_bytes: float | None = None,
+        reference: Row | None = None,
+    ) -> Self:
+        """Return the job of a row of a plan."""
+        return cls(
+            store,
+            index,
+            row,
+            plan.lattice,
+            plan.transform,
+            plan.study.orders,
+            plan.similarity,
+            plan.study.backend,
+            plan.tail,
+            plan.distance_target(row),
+            allowed_bytes,
+            reference,
+        )
+
+    @property
+    def execution(self) -> Execution:
+        """Execution of the transforms on this worker."""
+        return Execution(worker_backend(self.backend), allowed_bytes=self.allowed_bytes)
+
+    def load(self) -> Surface:
+        """Load the surface, in the study's unit; MeshError where it is not the one that the study was planned with."""
+        return self._loaded(self.row)
+
+    def load_reference(self) -> Surface | None:
+        """Load the reference, in the study's unit; None where it is too large. See `load` for errors."""
+        if self.reference is None:
+            return None
+        try:
+            return self._loaded(self.reference)
+        except MeshError as error:
+            raise MeshError(f"the reference: {error}") from error
+
+    def _loaded(self, row: Row) -> Surface:
+        surface = self.similarity.apply(row.member.load())
+        if row.fingerprint and row.member.fingerprint_digest() != row.fingerprint:
+            raise MeshError("a file of it was changed while the study was going on; run the study again")
+        return surface
+
+    def transform_settings(self, surface: Surface) -> TransformSettings:
+        """Return the settings of a field that is computed block by block, from its a priori error."""
+        if self.distance_target is None:
+            return self.transform
+        return choose_settings(surface, self.lattice, self.distance_target.error_target(surface), self.transform)
+
+    def octave_settings(self, surface: Surface) -> Settings:
+        """Return a function that gives the settings of a surface's transforms in octaves."""
+        transform = self.transform
+        if self.distance_target is None:
+            return lambda surface, lattice: transform
+        return settings_for(self.distance_target.error_target(surface).tightened(_OCTAVES_SHARE))
+
+    def stored_record(self) -> Record | None:
+        """Return the completion record of the field if it exists: Dask repeats tasks whose worker was lost."""
+        record = self.store.read_record(self.index)
+        return record if record is not None and record.completes(self.row.key) else None
+
+    def failure_reason(self, error: Exception) -> str:
+        """Return why the mesh failed, in one line, and log the traceback where its input is not to blame."""
+        reason = one_line(error)
+        if isinstance(error, LatticeError) and self.distance_target is not None:
+            reason = (
+                f"{reason}; it was chosen for surfaces that reach less far. Is this one in the same unit of length? "
+                "If it is, name another store, for which the lattice is chosen anew"
+            )
+        if not isinstance(error, InputError):
+            _log.error("%s failed for a reason that is not its mesh's", self.row.label, exc_info=error)
+        return reason
+
+
+@dataclass(frozen=True)
+class StoredBlocks:
+    """The outcome of a task that stored blocks of a field; ``error`` is empty unless it failed."""
+
+    facts: Facts = field(default_factory=Facts)
+    seconds: float = 0.0
+    error: str = ""
+    quality: Quality | None = None
+    checksums: tuple[int, ...] = ()
+    backends: tuple[str, ...] = ()
+
+
+def compute_mesh(job: Job, blocks: Sequence[Block]) -> Record:
+    """Compute and store the whole field of a mesh, then its completion record, unless that exists.
+
+    The reason of a failure goes into the record, so that one bad mesh stops nothing else. A StoreError is not its
+    fault.
+    """
+    stored = compute_parts(job, blocks, octaves=job.tail is not None)
+    return stored if isinstance(stored, Record) else _finished(job, stored)
+
+
+def compute_parts(job: Job, blocks: Sequence[Block] = (), octaves: bool = False) -> list[StoredBlocks] | Record:
+    """Compute and store some blocks of a mesh's field, and its values in octaves; see `compute_mesh`.
+
+    Return what was stored, the first with the time or the reason of a failure; or the record of the mesh, if it exists.
+    """
+    if record := job.stored_record():
+        return record
+    started = time.perf_counter()
+    try:
+        # Another worker that computes them again must write the same bytes.
+        with compiled.by_itself():
+            surface, stored = job.load(), []
+            if blocks:
+                is_whole = tuple(blocks) == (job.lattice.half,)
+                stored.append(_store_whole(job, surface) if is_whole else _store_blocks(job, surface, blocks))
+            if octaves:
+                stored.append(_store_octaves(job, surface))
+    except StoreError:
+        raise
+    except Exception as error:
+        return [StoredBlocks(seconds=time.perf_counter() - started, error=job.failure_reason(error))]
+    return [replace(stored[0], seconds=time.perf_counter() - started), *stored[1:]]
+
+
+def finish_mesh(job: Job, parts: Sequence[list[StoredBlocks] | Record]) -> Record:
+    """Write the completion record of a mesh whose blocks are all stored, or that failed, unless it exists."""
+    record = next((part for part in parts if isinstance(part, Record)), None) or job.stored_record()
+    return record or _finished(job, [stored for part in parts if isinstance(part, list) for stored in part])
+
+
+def _store_octaves(job: Job, surface: Surface) -> StoredBlocks:
+    """Compute and store a surface's values at all samples of octaves."""
+    tail = job.tail
+    if tail is None:
+        raise ValueError("the study has no octaves")
+    # Workers compute many of them.
+    compiled.use()
+    settings = job.octave_settings(surface)
+    values = [octave_values(surface, octave, job.orders, settings, job.execution) for octave in tail.octaves]
+    cutoff, reference = tail.highest_frequency, job.load_reference()
+    quality = TailQuality(
+        tuple(float(radius) for octave in values for radius in octave.radii),
+        tuple(float(square) for octave in values for square in octave.squares),
+        remainder([surface], [1], cutoff, is_scale=True),
+        None if reference is None else _remainder_between(surface, reference, cutoff),
+    )
+    samples = np.concatenate([octave.values for octave in values])
+    checksum = job.store.write_field(job.index, (slice(0, len(samples)),), samples)
+    return StoredBlocks(quality=replace(Quality.from_surface(surface, Probe()), tail=quality), checksums=(checksum,))
+
+
+def _remainder_between(surface: Surface, reference: Surface, cutoff: float) -> Remainder:
+    """Return what lies beyond a cutoff between two surfaces: only what they do not have in common counts."""
+    rests = without_common_parts((surface, reference))
+    if not rests:
+        return Remainder.between(0.0, 0.0, cutoff)
+    return remainder(list(rests.values()), list(rests), cutoff)
+
+
+def _store_whole(job: Job, surface: Surface) -> StoredBlocks:
+    """Compute and store a field of one block."""
+    lattice, transform, execution = job.lattice, job.transform, job.execution
+    if job.distance_target is not None and not kind_of(surface).is_closed_form:
+        error_target = job.distance_target.error_target(surface)
+        field = field_for(surface, lattice, error_target, transform, execution)
+    else:
+        field = compute_field(surface, lattice, transform, job.orders, execution)
+    checksum = job.store.write_field(job.index, lattice.place(lattice.half), field.values)
+    facts = _facts_of(surface, field.points)
+    return StoredBlocks(facts, quality=field.quality, checksums=(checksum,), backends=(field.backend,))
+
+
+def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block]) -> StoredBlocks:
+    """Compute and store some of several blocks."""
+    lattice, execution = job.lattice, job.execution
+    transform = job.transform_settings(surface)
+    plan = transform.plan(surface, lattice)
+    draws = draws_for([surface], lattice, job.orders, plan.lowest_degree, COMMON)
+    probes, backends, checksums, points = [], [], [], 0
+    for block in blocks:
+        result = transform_block(surface, lattice, block, transform, execution, plan)
+        checksums.append(job.store.write_field(job.index, lattice.place(block), result.values))
+        probes.append(probe_block(surface, lattice, transform, block, result.values, draws, execution.backend))
+        backends.append(result.backend)
+        points = result.points
+    quality = Quality.from_surface(surface, join(probes))
+    return StoredBlocks(
+        _facts_of(surface, points), quality=quality, checksums=tuple(checksums), backends=tuple(backends)
+    )
+
+
+def _finished(job: Job, stored: Sequence[StoredBlocks]) -> Record:
+    backends = dict.fromkeys(backend for blocks in stored for backend in blocks.backends)
+    record = Record(
+        key=job.row.key,
+        status="complete",
+        seconds=sum(blocks.seconds for blocks in stored),
+        worker=_worker_address(),
+        backend=", ".join(backends),
+        finished=utc_now(),
+        cost=job.row.member.cost(),
+    )
+    if errors := [blocks.error for blocks in stored if blocks.error]:
+        record = replace(record, status="failed", reason=errors[0])
+    else:
+        qualities = [blocks.quality for blocks in stored if blocks.quality is not None]
+        tail = next((quality.tail for quality in qualities if quality.tail is not None), None)
+        quality = replace(qualities[0], probe=join([quality.probe for quality in qualities]), tail=tail)
+        checksums = tuple(checksum for blocks in stored for checksum in blocks.checksums)
+        record = replace(record, facts=stored[0].facts, quality=quality.to_json(), checksums=checksums)
+    job.store.write_record(job.index, record)
+    _log.info("%s: %s in %.2f s by %s", job.row.label, record.status, record.seconds, record.backend)
+    return record
+
+
+def _facts_of(surface: Surface, points: int) -> Facts:
+    """Return what is recorded of a surface and its quadrature points."""
+    if not isinstance(surface, Mesh):
+        return Facts(area=surface.area, points=points)
+    mean_length, longest = surface.edge_length_range
+    return Facts(
+        vertices=len(surface.vertices),
+        triangles=len(surface.triangles),
+        area=surface.area,
+        edge_length_mean=mean_length,
+        edge_length_max=longest,
+        volume=surface.volume,
+        smallest_angle=float(surface.smallest_angles.min()),
+        aspect_ratio=float(surface.aspect_ratios.max()),
+        digest=surface.digest,
+        points=points,
+        **surface.counts,
+    )
+
+
+def _worker_address() -> str:
+    try:
+        return str(get_worker().address)
+    except ValueError:  # called outside a cluster
+        return "local"

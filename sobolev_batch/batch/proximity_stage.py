@@ -1,0 +1,201 @@
+"""Hausdorff and other usual distances of meshes from the reference, where a study requests them.
+
+One task measures those of a mesh, from both meshes and no field, and adds them to the mesh's completion record. A
+table is made from the records.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from sobolev_batch.batch.cluster.execution import Cluster, Task, describe_failure
+from sobolev_batch.batch.field_stage import MESH_BYTES
+from sobolev_batch.batch.table_stage import table_order
+from sobolev_batch.errors import InputError, MeshError, StoreError, one_line
+from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.geometry.proximity import (
+    LENGTHS,
+    NUMBERS,
+    POINT_BYTES,
+    TRIANGLE_BYTES,
+    WORKING_BYTES,
+    proximity,
+)
+from sobolev_batch.geometry.surface import Similarity
+from sobolev_batch.norms.columns import describe
+from sobolev_batch.store.records import ProximityRecord, Record
+from sobolev_batch.store.store import Store
+from sobolev_batch.store.stored_tables import table_attributes, write_table
+from sobolev_batch.store.workspace import Workspace
+from sobolev_batch.study.plan import Row
+
+_log = logging.getLogger(__name__)
+
+# Raise it whenever the distances come out differently: they are then measured again.
+_VERSION = 3
+_GROUP = "proximity"
+
+
+def have_proximities(workspace: Workspace) -> bool:
+    """Return True where the store has all distances that the study requests, and readers find them."""
+    attributes = table_attributes(workspace.store, _GROUP)
+    if workspace.plan.study.proximity is None:
+        return attributes is None
+    is_listed = attributes is not None and attributes.get("digest") == _digest(workspace)
+    return is_listed and not _pending(workspace)
+
+
+def measure_proximities(cluster: Cluster, workspace: Workspace) -> None:
+    """Measure the distances that the records lack, and write their table, or remove one that nobody requests."""
+    pending = _pending(workspace)
+    if pending:
+        _measure(cluster, workspace, pending)
+    if have_proximities(workspace):
+        return
+    workspace.store.remove(_GROUP)
+    if workspace.plan.study.proximity is not None:
+        write_table(workspace.store, _GROUP, _dataset(workspace))
+        workspace.store.consolidate()
+
+
+def _measure(cluster: Cluster, workspace: Workspace, keys: Mapping[int, str]) -> None:
+    plan, complete, reference = workspace.plan, workspace.complete, workspace.reference
+    requested = plan.study.proximity
+    if requested is None:
+        return
+    loading_bytes = {
+        i: max(workspace.rows[i].member.expected_size().projected_bytes, MESH_BYTES * complete[i].facts.triangles)
+        for i in (reference, *keys)
+    }
+    tasks = []
+    for i, key in keys.items():
+        triangles = complete[i].facts.triangles + complete[reference].facts.triangles
+        search_bytes = TRIANGLE_BYTES * triangles + 2 * POINT_BYTES * requested.points + WORKING_BYTES
+        pair = tuple((workspace.rows[row], complete[row].facts.digest) for row in (i, reference))
+        arguments = workspace.store, i, complete[i], key, pair, plan.similarity, requested.points, requested.threshold
+        projected_bytes = loading_bytes[i] + loading_bytes[reference] + search_bytes
+        tasks.append(
+            Task(measure_proximity, arguments, projected_bytes, row=i, label=workspace.labels[i], stage="proximity")
+        )
+    advance = cluster.count_steps("proximity", len(tasks))
+    for task, outcome in cluster.run(tasks, max(task.projected_bytes for task in tasks)):
+        record = outcome
+        if not isinstance(outcome, Record):
+            reason = describe_failure(outcome)
+            _log.error("%s: no proximity: %s", task.label, reason)
+            record = replace(complete[task.row], proximity=ProximityRecord(keys[task.row], reason))
+            workspace.store.write_record(task.row, record)
+        workspace.records[task.row] = record
+        advance(task.label, None)
+
+
+def measure_proximity(
+    store: Store,
+    index: int,
+    record: Record,
+    key: str,
+    pair: Sequence[tuple[Row, str]],
+    similarity: Similarity,
+    points: int,
+    threshold: float | None = None,
+) -> Record:
+    """Measure the distances of a mesh from the reference, and write its record with them, unless it has them.
+
+    A mesh that cannot be measured does not raise: the reason is part of the record. The pair is the row of the mesh and
+    that of the reference, each with the digest of the mesh whose field is stored. A StoreError is not the mesh's fault.
+    """
+    # Dask has a task done again whose worker was lost with the result.
+    stored = store.read_record(index)
+    if stored is not None and stored.proximity is not None and stored.proximity.completes(key):
+        return stored
+    started = time.perf_counter()
+    try:
+        limit = None if threshold is None else threshold * similarity.scale
+        found = proximity(*(_load(*mesh, similarity) for mesh in pair), points=points, threshold=limit)
+        lengths = {name: found[name] / similarity.scale for name in LENGTHS}
+        measured = ProximityRecord(key, "", {**found, **lengths})
+    except StoreError:
+        raise
+    except Exception as error:
+        if not isinstance(error, InputError):
+            _log.error("%s: proximity failed for a reason that is not its mesh's", pair[0][0].label, exc_info=error)
+        measured = ProximityRecord(key, one_line(error))
+    record = replace(record, proximity=replace(measured, seconds=time.perf_counter() - started))
+    store.write_record(index, record)
+    return record
+
+
+def _load(row: Row, digest: str, similarity: Similarity) -> Mesh:
+    """Load the mesh of a row in the study's unit, where it is still the one whose field is stored."""
+    surface = similarity.apply(row.member.load())
+    if not isinstance(surface, Mesh) or surface.digest != digest:
+        raise MeshError(
+            f"what is made of {row.label} now is not the mesh whose field is stored; a file may have changed: run the "
+            "study again"
+        )
+    return surface
+
+
+def _keys(workspace: Workspace) -> dict[int, str]:
+    """Return the key of the distances of each mesh that the study requests: a digest of all they depend on."""
+    requested, complete, reference = workspace.plan.study.proximity, workspace.complete, workspace.reference
+    if requested is None or reference not in complete:
+        return {}
+    settings = requested.points, requested.threshold, workspace.plan.similarity.scale
+    inputs = {
+        i: [_VERSION, record.facts.digest, complete[reference].facts.digest, *settings]
+        for i, record in complete.items()
+        # Closed forms have no triangles.
+        if i != reference and record.facts.triangles
+    }
+    return {i: hashlib.sha256(json.dumps(parts).encode()).hexdigest() for i, parts in inputs.items()}
+
+
+def _pending(workspace: Workspace) -> dict[int, str]:
+    """Return the keys of the distances that are to be measured, by the rows of their meshes."""
+    measured = {i: record.proximity for i, record in workspace.complete.items()}
+    return {
+        i: key for i, key in _keys(workspace).items() if (record := measured[i]) is None or not record.completes(key)
+    }
+
+
+def _dataset(workspace: Workspace) -> xr.Dataset:
+    """Return the numbers of `proximity` (mesh), and `reason` where they are NaN, in the order of tables."""
+    labels, records = _current(workspace)
+    columns: dict[str, Any] = {
+        name: [np.nan if record is None else record.numbers.get(name, np.nan) for record in records] for name in NUMBERS
+    }
+    columns["reason"] = np.array([record.reason if record else "" for record in records], dtype=object)
+    requested = workspace.plan.study.proximity
+    attributes = {
+        "reference": workspace.plan.reference,
+        **({} if requested is None else {"points": requested.points, "metrics": list(requested.metrics)}),
+        "digest": _digest(workspace),
+    }
+    variables = {name: ("mesh", values) for name, values in columns.items()}
+    table = xr.Dataset(variables, coords={"mesh": np.array(labels, dtype=object)}, attrs=attributes)
+    return describe(table.set_coords("reason"))
+
+
+def _current(workspace: Workspace) -> tuple[list[str], list[ProximityRecord | None]]:
+    """Return the labels of the meshes in the order of tables, and the distances that belong to what they are now."""
+    keys, rows = _keys(workspace), [i for i, _, _ in table_order(workspace)]
+    measured = {i: record.proximity for i, record in workspace.complete.items() if i in keys}
+    records = [record if (record := measured.get(i)) and record.key == keys[i] else None for i in rows]
+    return [workspace.labels[i] for i in rows], records
+
+
+def _digest(workspace: Workspace) -> str:
+    lines = [[label, record and asdict(record)] for label, record in zip(*_current(workspace), strict=True)]
+    requested = workspace.plan.study.proximity
+    shown = [] if requested is None else requested.metrics
+    return hashlib.sha256(json.dumps([shown, lines]).encode()).hexdigest()

@@ -1,0 +1,268 @@
+"""Progress of the study of a store, read from the store alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from sobolev_batch.errors import DamageError
+from sobolev_batch.store.collection_store import CollectionStore, labelled
+from sobolev_batch.store.heartbeat import LOST_AFTER_SECONDS
+from sobolev_batch.store.location import Location
+from sobolev_batch.store.lock import Lock, age_seconds, utc_now
+from sobolev_batch.store.records import Record, RunRecord
+from sobolev_batch.store.store import Store
+from sobolev_batch.store.stored_tables import rows_unlike_tables, table_attributes
+from sobolev_batch.store.workspace import complete_records, failed_proximities
+from sobolev_batch.tables.open import AnyStore, location_of
+from sobolev_batch.tables.text import duration
+from sobolev_batch.visible import Shown, visible
+
+# A run that waits for a busy cluster, or plans on another machine, has no heartbeat. It counts as lost after this time.
+_PATIENCE_SECONDS = 600.0
+_PLANNING = "planning"
+# Finished surfaces from which a rate can be told.
+_FEWEST_FOR_RATE = 3
+
+
+@dataclass(frozen=True)
+class Status(Shown):
+    """Progress of a study; ``print(status)`` shows what ``sobolev-batch status`` shows.
+
+    Attributes:
+        store: Path or URL of the store.
+        complete: Number of surfaces that are computed.
+        total: Number of surfaces of the study.
+        failed: Reason for each surface that could not be computed, by label.
+        not_compared: Reason for each surface that is computed but lacks the Hausdorff and Chamfer distances that the
+            study requests.
+        run: Record of the latest run, or None.
+        reduced: True once the store has tables.
+        silence_seconds: Seconds since the latest sign of life of a run that goes on, else 0.
+        rate: Surfaces that the latest run finishes in a second, as at the last of them; NaN before there are a few.
+        run_store: Path or URL of the store of the run in a collection: that of one object. Otherwise empty.
+        lost_records: Labels of surfaces that the tables list, and whose completion records are gone, or others. A run
+            that goes on computes them again.
+
+    >>> import sobolev_batch as sb
+    >>> status = sb.status("storage/icosphere.zarr")
+    >>> status.complete, status.total, status.failed
+    (5, 5, {})
+    """
+
+    store: str
+    complete: int
+    total: int
+    failed: dict[str, str]
+    not_compared: dict[str, str]
+    run: RunRecord | None
+    reduced: bool
+    silence_seconds: float
+    rate: float = math.nan
+    run_store: str = ""
+    lost_records: tuple[str, ...] = ()
+
+    @classmethod
+    def from_store(cls, store: AnyStore) -> Status:
+        """Return the status of a store; see `sobolev_batch.status`."""
+        place = location_of(store)
+        opened = Store.open(place)
+        run, removed, records = opened.read_run(), opened.removed, opened.records()
+        labels = {row: label for row, label in enumerate(opened.labels()) if label not in removed}
+        asks_for_proximity = opened.attributes()["study"]["table"].get("proximity") is not None
+        complete = {row: record for row, record in complete_records(records).items() if row in labels}
+        return cls(
+            str(place),
+            len(complete),
+            len(labels),
+            {
+                label: record.reason
+                for row, label in labels.items()
+                if (record := records[row]) is not None and record.status == "failed"
+            },
+            failed_proximities(labels, complete) if asks_for_proximity else {},
+            run,
+            table_attributes(opened, "convergence") is not None,
+            age_seconds(run.seen) if run is not None and run.state in ("submitted", "running") else 0.0,
+            math.nan if run is None else _rate(records, run),
+            lost_records=tuple(labels[row] for row in rows_unlike_tables(opened, records) if row in labels),
+        )
+
+    @classmethod
+    def of_collection(cls, collection: CollectionStore) -> Status:
+        """Return the status of the objects of a collection together; labels begin with the name of the object.
+
+        The run is one that goes on, or else one that failed or was lost, or else the latest.
+        """
+        parts: dict[str, Status] = {}
+        damaged: dict[str, str] = {}
+        for name in collection.objects:
+            try:
+                if part := cls._of_object(collection, name):
+                    parts[name] = part
+            except DamageError as error:
+                damaged[name] = str(error)
+        latest = max(parts.values(), key=_urgency, default=None)
+        current = latest if latest and latest.going_on else None
+        waiting = [name for name in collection.objects if name not in parts | damaged]
+        failed = labelled({name: one.failed for name, one in parts.items()}) | damaged
+        if current is None:
+            # Otherwise its turn may come.
+            failed |= dict.fromkeys(waiting, "it has no results; run the study again to see why")
+        return cls(
+            str(collection.location),
+            sum(one.complete for one in parts.values()),
+            sum(one.total for one in parts.values()) + len(waiting) + len(damaged),
+            failed,
+            labelled({name: one.not_compared for name, one in parts.items()}),
+            latest.run if latest else None,
+            not waiting and not damaged and all(one.reduced for one in parts.values()),
+            latest.silence_seconds if latest else 0.0,
+            current.rate if current else math.nan,
+            latest.store if latest else "",
+            tuple(f"{name}/{label}" for name, one in parts.items() for label in one.lost_records),
+        )
+
+    @classmethod
+    def _of_object(cls, collection: CollectionStore, name: str) -> Status | None:
+        """Return the status of an object of a collection; None before a run takes it up."""
+        place = collection.location.below(name)
+        if collection.existing_store(name) is not None:
+            return cls.from_store(place)
+        # Only a run locks a place without a store: it plans, and has no heartbeat yet.
+        lock = Lock.read(place)
+        if lock is None or not lock.run or lock.holder_is_gone:
+            return None
+        seen = utc_now() if lock.holder_is_alive else lock.since
+        run = RunRecord("running", lock.driver, lock.since, seen, _PLANNING)
+        return cls(str(place), 0, 1, {}, {}, run, reduced=False, silence_seconds=age_seconds(seen))
+
+    @property
+    def waiting(self) -> int:
+        """Number of surfaces that are neither computed nor failed."""
+        return self.total - self.complete - len(self.failed)
+
+    @property
+    def seconds_left(self) -> float:
+        """Seconds until all surfaces are finished, if they take as long as the last ones; NaN if that is unknown."""
+        return self.waiting / self.rate if self.going_on else math.nan
+
+    @property
+    def progress(self) -> str:
+        """Progress in one line, as ``sobolev-batch status --follow`` shows it."""
+        parts = [f"{self.total - self.waiting} of {self.total} done", f"{len(self.failed)} failed"]
+        if self.run is not None and self.run.state == "submitted":
+            parts.append("no worker has taken it up yet")
+        elif self.waiting == 0:
+            parts.append(self.run.stage if self.run is not None else "")
+        elif math.isnan(self.seconds_left):
+            parts.append("time left not known yet" if self.going_on else "")
+        else:
+            parts += [f"{60 * self.rate:.3g} a minute", f"about {duration(round(self.seconds_left))} left at this rate"]
+        if self.run is not None and self.run.error:
+            parts.append(self.run.error)
+        return ", ".join(filter(None, parts))
+
+    @property
+    def going_on(self) -> bool:
+        """True while a run was submitted or is running, and shows signs of life."""
+        return self.run is not None and self.run.state in ("submitted", "running") and not self.lost
+
+    @property
+    def is_incomplete(self) -> bool:
+        """True if no run goes on, and surfaces lack a record, or have another one than the tables were made from."""
+        return not self.going_on and (self.waiting > 0 or bool(self.lost_records))
+
+    @property
+    def lost(self) -> bool:
+        """True if a run began and shows no signs of life any more."""
+        if self.run is None or self.run.state not in ("submitted", "running"):
+            return False
+        has_heartbeat = self.run.state == "running" and self.run.stage != _PLANNING
+        return self.silence_seconds > (LOST_AFTER_SECONDS if has_heartbeat else _PATIENCE_SECONDS)
+
+    def __str__(self) -> str:
+        return "\n".join(map(visible, self.lines()))
+
+    def lines(self) -> Iterator[str]:
+        """Yield the lines that ``sobolev-batch status`` prints."""
+        yield (
+            f"{self.store}: {self.complete} of {self.total} complete, {len(self.failed)} failed, {self.waiting} to go"
+        )
+        lost = dict.fromkeys(self.lost_records, "its completion record is gone or another one; run the study again")
+        for label, reason in (*self.failed.items(), *self.not_compared.items(), *lost.items()):
+            yield f"{label}: {reason}"
+        if self.run is not None:
+            yield from self._run_lines(self.run)
+        if not self.reduced:
+            yield "no tables yet" if self.going_on else "no tables yet: run the study to its end"
+
+    def _run_lines(self, run: RunRecord) -> Iterator[str]:
+        start = f"by {run.driver}, begun {run.started}"
+        is_ahead = self.silence_seconds < -LOST_AFTER_SECONDS
+        direction = "ahead of the clock here" if is_ahead else "ago"
+        age = f"{duration(round(abs(self.silence_seconds)))} {direction}"
+        store = self.run_store or self.store
+        if run.state == "submitted":
+            yield f"submitted {age}, no worker has taken it up yet; {start}"
+            if self.lost:
+                yield f"if that cluster is gone, submit the study again after: sobolev-batch unlock {store}"
+        elif run.state == "running":
+            yield f"running: {run.stage or _PLANNING}; {start}, last sign of life {age}"
+            if run.error:
+                yield run.error
+            if is_ahead:
+                yield f"whether it goes on is unknown; if it is gone: sobolev-batch unlock {store} --force"
+            if self.lost:
+                yield "its process is probably gone, or its clock is behind the one here"
+                yield "run or submit the study again, and it continues from the store"
+                yield f"if the store turns out to be locked: sobolev-batch unlock {store}"
+        elif run.state == "failed":
+            object_text = f" of {self.run_store}" if self.run_store else ""
+            yield f"the latest run{object_text} failed: {run.error}; {start}, ended {run.seen}"
+        elif self.is_incomplete:
+            yield f"ended {run.seen}, incomplete: run the study again; {start}"
+        else:
+            yield f"done; {start}, ended {run.seen}"
+
+
+def _urgency(status: Status) -> tuple[bool, bool, str]:
+    """Return what orders the objects of a collection: the last one has the run to be shown."""
+    run = status.run
+    if run is None:
+        return False, False, ""
+    return status.going_on, status.lost or run.state == "failed", run.seen
+
+
+def _rate(records: Sequence[Record | None], run: RunRecord) -> float:
+    """Return how many surfaces a run finishes in a second, from the later half of those that it has finished."""
+    age = age_seconds(run.started)
+    ages = sorted(age_seconds(record.finished) for record in records if record is not None and record.finished)
+    latest = [one for one in ages if one <= age]
+    latest = latest[: max(_FEWEST_FOR_RATE, len(latest) // 2)]
+    if len(latest) < _FEWEST_FOR_RATE or latest[-1] <= latest[0]:
+        return math.nan
+    return (len(latest) - 1) / (latest[-1] - latest[0])
+
+
+def status(store: AnyStore) -> Status:
+    """Return how far the study of a store is, and what failed and why.
+
+    Args:
+        store: Path, URL or opened DataTree of the store, or that of a collection. Its study may be running.
+
+    Raises:
+        StoreError: The location has no store of a study, or cannot be reached.
+
+    >>> import sobolev_batch as sb
+    >>> found = sb.status("storage/icosphere.zarr")
+    >>> found.complete, found.total, found.failed, found.going_on
+    (5, 5, {}, False)
+    >>> print(found)  # doctest: +ELLIPSIS
+    storage/icosphere.zarr: 5 of 5 complete, 0 failed, 0 to go
+    done; by process ...
+    """
+    place = location_of(store)
+    collection = CollectionStore.read(Location.parse(place))
+    return Status.from_store(place) if collection is None else Status.of_collection(collection)

@@ -1,0 +1,223 @@
+"""Commands that make or take a study: init, run, submit, plan."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from sobolev_batch.cli.common import (
+    EXIT_SOME_FAILED,
+    PATH,
+    Command,
+    allow_commands_option,
+    cli,
+    echo,
+    echo_json,
+    echo_lines,
+    json_option,
+    memory_size,
+    progress_reports,
+    store_option,
+    study_argument,
+    trust_option,
+)
+
+if TYPE_CHECKING:
+    from sobolev_batch.store.location import Location
+
+# Lines about distances that are less accurate than requested.
+_MOST_IMPRECISE = 10
+
+
+def _scheduler_option(*, required: bool = False) -> Callable[[Command], Command]:
+    text = "Take the workers of this Dask scheduler, such as tls://host:8786."
+    return click.option("--scheduler", metavar="ADDRESS", required=required, help=text)
+
+
+_only_option = click.option(
+    "--only",
+    multiple=True,
+    metavar="FAMILY[/MEMBER]",
+    help="Compute this part with the reference; patterns such as 'mmg/0.0*' work. The option may be repeated.",
+)
+
+
+@cli.command("init", short_help="Write a study file for a folder of meshes.")
+@click.argument("folder", type=PATH, default=".")
+@click.option(
+    *("-o", "--output"),
+    type=PATH,
+    default="study.toml",
+    show_default=True,
+    help="Write the study to this file, which must not exist.",
+)
+def init_command(folder: Path, output: Path) -> None:
+    """Write a study file for the meshes in FOLDER.
+
+    It runs as it is, and says what to change. The reference is the mesh that is called original, reference, target or
+    ground truth, or else the one with the most triangles. Folders are families, and so are meshes whose names differ
+    in the number at the end. Several references are several objects. [default: current folder]
+    """
+    from sobolev_batch.extras.draft import init_study
+
+    echo_lines(init_study(folder, output))
+
+
+@cli.command("run")
+@study_argument
+@store_option
+@_scheduler_option()
+@trust_option
+@click.option(
+    "--workers",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Start N processes on this machine. [default: one per core]",
+)
+@click.option(
+    *("--worker-memory", "memory"),
+    type=memory_size,
+    metavar="SIZE",
+    help="Limit the memory of each process, such as 4GB. [default: equal parts]",
+)
+@allow_commands_option
+@_only_option
+@click.pass_context
+def run_command(
+    context: click.Context,
+    /,
+    study: Path,
+    store: Location | None,
+    scheduler: str | None,
+    trust_network: bool,
+    **settings: Any,
+) -> None:
+    """Compute what is missing of STUDY and print its tables.
+
+    Ctrl-C and SIGTERM end it. The same command continues from the store. A study with several objects gets a store for
+    each of them, and its league is printed.
+
+    The exit status is 3 if a mesh failed, or if a distance is less accurate than the study requires.
+    """
+    from sobolev_batch.batch.cluster.clients import remote_client
+    from sobolev_batch.batch.run import run
+    from sobolev_batch.study.study import Study, as_study
+    from sobolev_batch.tables.conclusion import format_verdict
+    from sobolev_batch.tables.convergence import format_table
+    from sobolev_batch.tables.open import open_store
+
+    if scheduler and (settings["workers"] or settings["memory"]):
+        raise click.UsageError(
+            "--workers and --worker-memory are for a cluster on this machine; the workers of a scheduler have their own"
+        )
+    parsed = as_study(study)
+    connected = remote_client(scheduler, trust_network) if scheduler else nullcontext()
+    with progress_reports() as show, connected as client:
+        summary = run(parsed, store, client, on_progress=show, **settings)
+    if isinstance(parsed, Study):
+        tree = open_store(summary.store)
+        echo_lines(format_table(tree))
+        echo()
+        echo_lines(format_verdict(tree))
+    else:
+        _print_league(summary.store)
+    echo()
+    echo(str(summary).partition("\n")[0])
+    for label, reason in summary.not_compared.items():
+        echo(f"{label}: {reason}", err=True)
+    for label, error in list(summary.imprecise.items())[:_MOST_IMPRECISE]:
+        echo(f"{label}: its distance has an error of {100 * error:.2g} %, more than the rtol of the study", err=True)
+    if len(summary.imprecise) > _MOST_IMPRECISE:
+        echo(f"and {len(summary.imprecise) - _MOST_IMPRECISE} more distances", err=True)
+    accuracies = [one.accuracy for one in ([parsed] if isinstance(parsed, Study) else parsed.studies.values())]
+    is_short = bool(summary.imprecise) and not any(one is not None and one.best_effort for one in accuracies)
+    if summary.failed or summary.not_compared or is_short:
+        context.exit(EXIT_SOME_FAILED)
+
+
+@cli.command("submit")
+@study_argument
+@_scheduler_option(required=True)
+@trust_option
+@store_option
+@allow_commands_option
+@_only_option
+@click.pass_context
+def submit_command(
+    context: click.Context,
+    /,
+    study: Path,
+    scheduler: str,
+    trust_network: bool,
+    store: Location | None,
+    **settings: Any,
+) -> None:
+    """Hand STUDY over to a cluster and return.
+
+    The cluster computes it without this process. The objects of a study are handed over one after another.
+    """
+    from sobolev_batch.batch.cluster.clients import remote_client
+    from sobolev_batch.batch.submit import submit
+
+    with remote_client(scheduler, trust_network) as client:
+        submission = submit(study, store, client, **settings)
+
+    for name, one in (submission.objects or {"": submission}).items():
+        where = f"{name}: " if name else ""
+        echo(f"{where}{one.missing} of {one.surfaces} surfaces to be computed by the cluster at {scheduler}")
+    for name, reason in submission.refused.items():
+        echo(f"{name}: not submitted: {reason}", err=True)
+    echo(f"follow it by: sobolev-batch status --follow {shlex.quote(submission.store)}")
+    if submission.refused:
+        context.exit(EXIT_SOME_FAILED)
+
+
+@cli.command("plan")
+@study_argument
+@store_option
+@_scheduler_option()
+@trust_option
+@allow_commands_option
+@json_option
+@click.pass_context
+def plan_command(
+    context: click.Context,
+    study: Path,
+    store: Location | None,
+    scheduler: str | None,
+    trust_network: bool,
+    allow_commands: bool,
+    style: str,
+) -> None:
+    """Show what running STUDY would do.
+
+    Nothing is computed. The plan has the lattice and the reasons for it, the tasks and their memory, the bytes to be
+    stored, and the number of surfaces that the store has already.
+    """
+    from sobolev_batch.batch.cluster.clients import remote_client
+    from sobolev_batch.batch.dry_run import CollectionPlan, plan
+
+    with remote_client(scheduler, trust_network) if scheduler else nullcontext() as client:
+        made = plan(study, store, client, allow_commands=allow_commands)
+    if style == "json":
+        echo_json(made.to_table())
+    else:
+        echo_lines(made)
+    if isinstance(made, CollectionPlan) and made.refused:
+        context.exit(EXIT_SOME_FAILED)
+
+
+def _print_league(place: str) -> None:
+    """Print the league of a collection, or why there is none."""
+    from sobolev_batch.errors import InputError
+    from sobolev_batch.extras.leagues.league import format_league, league
+
+    try:
+        echo_lines(format_league(league(place)))
+    except InputError as error:
+        echo(f"no league: {error}")

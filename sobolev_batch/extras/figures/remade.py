@@ -1,0 +1,295 @@
+"""Meshes of a store, made again by its study, with witness functions at their vertices; and as files."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from functools import cached_property
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+import xarray as xr
+
+from sobolev_batch.errors import InputError, SobolevBatchError, from_extra, written
+from sobolev_batch.geometry.formats.plain_formats import write_ply
+from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.geometry.proximity import vertex_distances
+from sobolev_batch.geometry.surface import Reals, Similarity
+from sobolev_batch.norms.causes import witness
+from sobolev_batch.sources.mesh_cache import MeshCache
+from sobolev_batch.sources.names import file_stem
+from sobolev_batch.sources.registry import Member
+from sobolev_batch.store.location import Location
+from sobolev_batch.study.plan import members_of
+from sobolev_batch.study.study import Study
+from sobolev_batch.tables.open import AnyStore, as_tree, fields_read, finished_group, reference_of
+from sobolev_batch.transform.backends import ComplexDtype
+from sobolev_batch.transform.lattice import Orders, check_orders
+
+SUFFIXES = (".ply", ".vtp")
+# Labels that a message lists as examples, and characters of a comment in a file.
+_MOST_LISTED, _LONGEST_COMMENT = 3, 600
+
+
+@dataclass(frozen=True)
+class StudyMeshes:
+    """The meshes of an open store, made again by its study.
+
+    Attributes:
+        members: Family and member of each surface that the study lists on this machine, by label.
+        similarity: Similarity from the meshes' own unit of length to the study's.
+    """
+
+    tree: xr.DataTree
+    members: Mapping[str, tuple[str, Member]]
+    table: xr.Dataset
+    similarity: Similarity
+
+    @classmethod
+    def from_tree(cls, tree: xr.DataTree, folder: str | Path) -> Self:
+        """List the meshes of an open store, with relative paths in a folder; InputError where that fails."""
+        table = finished_group(tree, "meshes")
+        try:
+            study = Study.from_table(tree.attrs["study"]["table"], folder=folder)
+            if tree.attrs["study"].get("mesh_cache"):
+                study = study.with_cache(MeshCache(Location.parse(tree.attrs["study"]["mesh_cache"])))
+            members = members_of(study)
+        except SobolevBatchError as error:
+            raise InputError(f"the study's meshes cannot be listed here: {error}") from error
+        similarity = tree.attrs["similarity"]
+        return cls(tree, members, table, Similarity(similarity["scale"], tuple(similarity["origin"])))
+
+    def make(self, label: str, most_triangles: float = math.inf) -> tuple[Mesh, Mesh]:
+        """Return the mesh of a label in its own unit of length, and in the study's, or SobolevBatchError.
+
+        Files may have changed, and a store may name files that its study never read: only a mesh with the stored digest
+        passes.
+        """
+        row = self.table.sel(mesh=label)
+        triangles = row["triangles"].item()
+        if row["status"].item() != "complete":
+            raise InputError(f"its status is {row['status'].item()!r}")
+        if label not in self.members:
+            raise InputError("the study makes no such mesh here")
+        if not triangles:
+            raise InputError("a surface that is no mesh has no triangles")
+        if triangles > most_triangles:
+            raise InputError(f"it has {triangles:,.0f} triangles; up to {most_triangles:,} are made again")
+        own = self.members[label][1].load()
+        scaled = self.similarity.apply(own)
+        if not isinstance(own, Mesh) or not isinstance(scaled, Mesh) or scaled.digest != row["digest"].item():
+            raise InputError("the study makes another mesh here than the one that was computed; its files have changed")
+        return own, scaled
+
+    def with_witness(self, label: str, orders: Sequence[float]) -> tuple[Mesh, Reals]:
+        """Return the mesh of a label in its own unit, and its witness function (orders, vertices) in the study's."""
+        own, scaled = self.make(label)
+        with fields_read(self.tree):
+            return own, witness_at_vertices(*fields_of(self.tree, label), orders, scaled)
+
+    @cached_property
+    def reference(self) -> Mesh:
+        """The reference in its own unit; InputError where it is no mesh, or see `make`."""
+        label = reference_of(self.tree)
+        try:
+            return self.make(label)[0]
+        except SobolevBatchError as error:
+            raise InputError(f"distances from the reference {label!r} cannot be written: {error}") from error
+
+    def write(
+        self, path: Path, label: str, mesh: Mesh, values: Reals, orders: Sequence[float], *, distances: bool = False
+    ) -> None:
+        """Write what `with_witness` returns, and distances from the reference; see `write_vertex_values`."""
+        lengths = vertex_distances(mesh, self.reference) if distances else None
+        title = f"{label} against {reference_of(self.tree)}, study {self.tree.attrs['study']['name']}"
+        write_vertex_values(path, mesh, values, orders, title, 1 / self.similarity.scale, distances=lengths)
+
+    def stem(self, label: str) -> str:
+        """Return the file name of a mesh without suffix: its number in the store and the plain letters of its label."""
+        return file_stem(int(self.table.indexes["mesh"].get_loc(label)), label)
+
+
+def matching_labels(tree: xr.DataTree, names: Sequence[str]) -> tuple[str, ...]:
+    """Return the labels of an open store that are meant by labels or patterns such as ``scans/*``, each once.
+
+    A pattern stands for computed meshes with triangles but the reference. InputError, with a suggestion, without a
+    match.
+    """
+    meshes = finished_group(tree, "meshes")
+    known: list[str] = meshes["mesh"].values.tolist()
+    usable = (meshes["status"] == "complete") & (meshes["triangles"] > 0) & (meshes["mesh"] != reference_of(tree))
+    candidates: list[str] = meshes["mesh"].values[usable.values].tolist()
+    chosen, labels = list[str](), set(known)
+    for name in names:
+        if name in labels:
+            chosen.append(name)
+            continue
+        is_pattern = any(character in name for character in "*?[")
+        matches = [label for label in candidates if fnmatchcase(label, name)] if is_pattern else []
+        if not matches:
+            similar = difflib.get_close_matches(name, known, n=1)
+            remedy = f"did you mean {similar[0]!r}?" if similar else f"its labels are such as {_listed(known)}"
+            raise InputError(
+                f"the store has no computed mesh with triangles that matches {name!r}; "
+                f"its labels are such as {_listed(candidates or known)}"
+                if is_pattern
+                else f"the store has no mesh {name!r}, {remedy}"
+            )
+        chosen += matches
+    return tuple(dict.fromkeys(chosen))
+
+
+def _listed(labels: Sequence[str]) -> str:
+    return ", ".join(repr(label) for label in labels[:_MOST_LISTED])
+
+
+def fields_of(tree: xr.DataTree, label: str) -> tuple[xr.DataArray, xr.DataArray]:
+    """Return the stored fields of a mesh and of the reference."""
+    fields = tree["fourier"].to_dataset()["fourier"]
+    return fields.sel(mesh=label), fields.sel(mesh=reference_of(tree))
+
+
+def witness_at_vertices(
+    a: xr.DataArray, b: xr.DataArray, orders: Sequence[float], mesh: Mesh, dtype: ComplexDtype = "complex128"
+) -> Reals:
+    """Return the witness function of two fields, (orders, n), at a mesh's vertices; NaN where no triangle uses them."""
+    used = mesh.used_vertices
+    values = np.full((len(orders), len(mesh.vertices)), np.nan)
+    values[:, used] = witness(a, b, list(orders), mesh.vertices[used], dtype=dtype)
+    return values
+
+
+def exported(
+    store: AnyStore, meshes: Sequence[str] = (), order: Orders | None = None, folder: str | Path = "."
+) -> tuple[StudyMeshes, tuple[str, ...], tuple[float, ...]]:
+    """Return the meshes of a store, with the labels and the orders whose witness functions are to be written.
+
+    By default these are all computed meshes with triangles but the reference, and the orders of the study.
+    """
+    tree = as_tree(store)
+    of_study = finished_group(tree, "convergence")["order"].values.tolist()
+    orders = tuple(dict.fromkeys(check_orders(of_study if order is None else order)))
+    made, reference = StudyMeshes.from_tree(tree, folder), reference_of(tree)
+    status = made.table["status"].sel(mesh=reference).item()
+    if status != "complete":
+        raise InputError(f"the reference {reference!r} is not computed: no mesh can be compared with it")
+    labels = matching_labels(tree, meshes or ["*"])
+    if reference in labels:
+        raise InputError(f"{reference!r} is the reference: its witness is zero everywhere")
+    return made, labels, orders
+
+
+def write_witness(
+    store: AnyStore,
+    mesh: str,
+    path: str | Path,
+    order: Orders | None = None,
+    folder: str | Path = ".",
+    *,
+    distances: bool = False,
+) -> Path:
+    """Write a mesh of a store with its witness function against the reference at its vertices.
+
+    The study makes the mesh again, and it is written only if it is, to the bit, the one that was computed. A
+    PLY file holds the vertices in the mesh's own unit in double precision, a property such as
+    ``witness_minus_2`` for each order, and the first order as ``quality``, which MeshLab shows; a .vtp file
+    (XML PolyData, for ParaView) holds arrays such as ``witness, order -2``. Both explain their numbers in comments.
+
+    Args:
+        store: Path, URL or opened DataTree of the store.
+        mesh: Label of the mesh, such as "family/name".
+        path: File to write; its suffix is .ply or .vtp. The latter needs the extra "vtk".
+        order: One order below -1/2, or several; by default those of the study.
+        folder: Folder where relative paths in the study start.
+        distances: Also write the distance of each vertex from the closest point of the reference, as ``distance``, in
+            the mesh's own unit.
+
+    Returns:
+        The path of the file. Its values are in 1 / unit length of the study, positive where the mesh has area
+        that the reference lacks; see `witness`.
+
+    Raises:
+        InputError: The label or suffix is unknown; a library is not installed; the mesh cannot be
+            made again, or is not the one that was computed.
+        StoreError: The location has no store, or the file cannot be written.
+
+    >>> import sobolev_batch as sb
+    >>> path = sb.write_witness("storage/icosphere.zarr", "icosphere/2", "icosphere-2.ply", order=-4)
+    >>> sb.read_mesh(path).vertices.shape
+    (162, 3)
+    """
+    path = Path(path)
+    if path.suffix not in SUFFIXES:
+        raise InputError(f"{path}: a witness is written as {' or '.join(SUFFIXES)}, found {path.suffix!r}")
+    made, labels, orders = exported(store, [mesh], order, folder)
+    if len(labels) > 1:
+        raise InputError(f"{mesh!r} stands for several meshes, and one is written; give its label")
+    made.write(path, labels[0], *made.with_witness(labels[0], orders), orders, distances=distances)
+    return path
+
+
+def write_vertex_values(
+    path: Path,
+    mesh: Mesh,
+    values: Reals,
+    orders: Sequence[float],
+    title: str,
+    unit: float,
+    context: str = "study",
+    distances: Reals | None = None,
+) -> None:
+    """Write a mesh with its witness function, in the format of the path's suffix, one of `SUFFIXES`.
+
+    The values (orders, vertices) are in 1 / unit length of the context, a "study" or a "comparison", whose unit is
+    given in that of the mesh, as are distances (vertices,) from the reference. The title says what was compared with
+    what.
+    """
+    escaped = title.encode("unicode_escape").decode("ascii")
+    notes = [
+        f"witness function of the mesh {escaped[:_LONGEST_COMMENT]}",
+        "positive where the mesh has area that the reference lacks, negative where it lacks area",
+        f"in 1 / unit length of the {context}, orders " + ", ".join(map(_number, orders)),
+        f"coordinates are in the unit of the mesh; one unit of the {context} is {unit!r} of them",
+    ]
+    if distances is not None:
+        notes.append("distance to the closest point of the reference, in the unit of the mesh")
+    others = {} if distances is None else {"distance": distances}
+    data = (_ply if path.suffix == ".ply" else _vtp)(mesh, dict(zip(orders, values, strict=True)), others, notes)
+    with written(path, "the witness"):
+        path.write_bytes(data)
+
+
+def _number(order: float) -> str:
+    return repr(float(order)).removesuffix(".0")
+
+
+def _ply(mesh: Mesh, values: Mapping[float, Reals], others: Mapping[str, Reals], notes: Sequence[str]) -> bytes:
+    # Letters, digits and underscores, which readers of PLY accept.
+    rows = {f"witness_minus_{_number(-order)}".replace(".", "_").replace("+", ""): row for order, row in values.items()}
+    first = next(iter(rows))
+    # The quality is the scalar that MeshLab and similar programs show.
+    quality = {"quality": rows[first].astype(np.float32)}
+    return write_ply(mesh, {**quality, **rows, **others}, [*notes, f"quality repeats {first}"])
+
+
+def _vtp(mesh: Mesh, values: Mapping[float, Reals], others: Mapping[str, Reals], notes: Sequence[str]) -> bytes:
+    with from_extra("vtk", "a .vtp file needs"):
+        from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
+    surface = mesh.to_pyvista()
+    for order, row in values.items():
+        surface.point_data[f"witness, order {_number(order)}"] = row
+    for name, row in others.items():
+        surface.point_data[name] = row
+    surface.point_data.active_scalars_name = f"witness, order {_number(next(iter(values)))}"
+    surface.field_data["notes"] = list(notes)
+    # In memory: VTK does not report a full disk.
+    writer = vtkXMLPolyDataWriter()
+    writer.SetInputData(surface)
+    writer.SetDataModeToBinary()
+    writer.WriteToOutputStringOn()
+    writer.Write()
+    return str(writer.GetOutputString()).encode("ascii")

@@ -1,0 +1,213 @@
+"""The transform of a mesh as a function of its vertices, and the derivatives of sums over it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array, vstack
+
+from sobolev_batch.errors import InputError
+from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.geometry.surface import Indices, Reals, normals
+from sobolev_batch.transform.backends import Complexes, NufftSpec
+from sobolev_batch.transform.fourier import ON_CPU, Execution, TransformSettings, require_points_inside
+from sobolev_batch.transform.lattice import Lattice
+from sobolev_batch.transform.nufft import transform_points
+from sobolev_batch.transform.quadrature import RuleUse, WeightedPoints, assign_rules
+
+# Fraction of eps that the coefficients which are left out may carry together.
+_NEGLIGIBLE = 0.1
+# The corners of the four similar triangles of a triangle, in its barycentric coordinates.
+_QUARTERS: Reals = np.array(
+    [
+        [[1, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.5]],
+        [[0.5, 0.5, 0], [0, 1, 0], [0, 0.5, 0.5]],
+        [[0.5, 0, 0.5], [0, 0.5, 0.5], [0, 0, 1]],
+        [[0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5]],
+    ]
+)
+
+
+@dataclass(frozen=True, eq=False)
+class MeshTransform:
+    """The transform of a mesh with given triangles on a half lattice, for any positions of the vertices.
+
+    Attributes:
+        triangles: Indices of the corners of each triangle, int64 (m, 3).
+        of_vertices: Matrix (nodes, vertices): its product with the vertices (n, 3) is the quadrature nodes.
+        of_areas: Matrix (nodes, triangles): its product with the areas is their weights.
+    """
+
+    triangles: Indices
+    of_vertices: csr_array
+    of_areas: csr_array
+    lattice: Lattice
+    eps: float
+    execution: Execution = ON_CPU
+
+    @classmethod
+    def from_mesh(
+        cls, mesh: Mesh, lattice: Lattice, settings: TransformSettings, execution: Execution = ON_CPU
+    ) -> Self:
+        """Return the transform of a mesh, with the triangle rules that its present shape needs."""
+        uses = assign_rules(mesh, lattice.highest_frequency, settings.eps, settings.quadrature, settings.tolerance)
+        of_vertices, of_areas = zip(*(pair for use in uses for pair in _node_matrices(mesh, use)), strict=True)
+        triangles = np.asarray(mesh.triangles, dtype=np.int64)
+        return cls(
+            triangles,
+            vstack(of_vertices, format="csr"),
+            vstack(of_areas, format="csr"),
+            lattice,
+            settings.eps,
+            execution,
+        )
+
+    @property
+    def count(self) -> int:
+        """Number n of vertices."""
+        return int(self.of_vertices.shape[1])
+
+    def nodes(self, vertices: Reals) -> WeightedPoints:
+        """Return the quadrature nodes with the vertices at positions (n, 3), in units of length.
+
+        InputError where these are not finite or not (n, 3), LatticeError where nodes lie beyond the lattice's half
+        period.
+        """
+        if vertices.shape != (self.count, 3):
+            raise InputError(
+                f"the mesh has {self.count} vertices: pass positions ({self.count}, 3), or "
+                f"{3 * self.count} numbers; found the shape {vertices.shape}"
+            )
+        coordinates = np.ascontiguousarray((self.of_vertices @ vertices).T)
+        if not np.isfinite(coordinates).all():
+            raise InputError("positions of vertices must be finite: found NaN or infinity")
+        require_points_inside(coordinates, self.lattice)
+        areas = np.linalg.norm(normals(vertices, self.triangles), axis=1) / 2
+        return WeightedPoints(coordinates, self.of_areas @ areas)
+
+    def transform(self, vertices: Reals) -> Complexes:
+        """Return the transform on the half lattice, complex128; see `nodes` for the positions."""
+        nodes, backend = self.nodes(vertices), self.execution.backend
+        spec = NufftSpec(self.lattice.shape, self.eps, threads=self.execution.threads)
+        with backend.work():
+            points = WeightedPoints(backend.upload(nodes.coordinates), backend.upload(nodes.weights))
+            values, _ = transform_points([points], self.lattice, self.lattice.half, spec, backend)
+            return np.asarray(backend.download(values))
+
+    def derivative(self, vertices: Reals, coefficients: Complexes) -> Reals:
+        """Return the derivative of Re Σ conj(c(ξ)) μ^(ξ) over the half lattice with respect to the vertices, (n, 3).
+
+        It is that of the sum over quadrature nodes x_j with weights a_j, at any number of nodes. The function
+        w(x) = Re Σ c(ξ) exp(+2πi ξ·x) and its gradient at the nodes give Σ_j (w(x_j) da_j + a_j ∇w(x_j) · dx_j). The
+        coefficients c are complex128 on the half lattice.
+        """
+        nodes = self.nodes(vertices)
+        values, slopes = self._evaluated(nodes, coefficients)
+        gradient = self.of_vertices.T @ (nodes.weights[:, None] * slopes)
+        return np.asarray(gradient + self._from_areas(vertices, self.of_areas.T @ values))
+
+    def _evaluated(self, nodes: WeightedPoints, coefficients: Complexes) -> tuple[Reals, Reals]:
+        """Return the function of the coefficients (k,) and its gradient (k, 3) at the nodes.
+
+        Each NUFFT gives two real functions, as real and imaginary part: the coefficients of f + i g on the whole
+        lattice are F + i G with those of f and g.
+        """
+        lattice, backend = self.lattice, self.execution.backend
+        most = _highest_that_counts(coefficients, lattice, _NEGLIGIBLE * self.eps)
+        middle, axis = lattice.M // 2, 2 * np.pi * lattice.spacing * np.arange(-most, most + 1)
+        inner = slice(middle - most, middle + most + 1)
+        whole = _whole(coefficients[inner, inner, : most + 1])
+        x, y, z = np.ix_(axis, axis, axis)
+        spec = NufftSpec(whole.shape, self.eps, threads=self.execution.threads)
+        points = nodes.coordinates
+        pairs = (whole * (1 - x), whole * (1j * y - z))
+        with backend.work():
+            plan = backend.plan(backend.costs.with_oversampling(spec, points.shape[1]), adjoint=True)
+            # setpts keeps references, not copies: the angles live until both functions are evaluated.
+            angles = [backend.upload(row) for row in 2 * np.pi * lattice.spacing * points]
+            plan.setpts(*angles)
+            first, second = (backend.download(plan.execute(backend.upload(pair))) for pair in pairs)
+        return first.real, np.stack([first.imag, second.real, second.imag], axis=1)
+
+    def _from_areas(self, vertices: Reals, slopes: Reals) -> Reals:
+        """Return Σ slope · ∂area/∂vertex over the triangles for each vertex (n, 3)."""
+        gradient = np.zeros((self.count, 3))
+        for ends, derivatives in zip(self.triangles.T, area_derivatives(vertices, self.triangles), strict=True):
+            for axis in range(3):
+                gradient[:, axis] += np.bincount(ends, slopes * derivatives[:, axis], self.count)
+        return gradient
+
+
+def area_derivatives(vertices: Reals, triangles: Indices) -> list[Reals]:
+    """Return derivatives of the areas of triangles by each corner, (m, 3) each; zero for those without an area."""
+    units, corners = normals(vertices, triangles), [vertices[corner] for corner in triangles.T]
+    units /= np.maximum(np.linalg.norm(units, axis=1), np.finfo(np.float64).tiny)[:, None]
+    return [np.cross(units, corners[corner - 1] - corners[corner - 2]) / 2 for corner in range(3)]
+
+
+def _highest_that_counts(coefficients: Complexes, lattice: Lattice, fraction: float) -> int:
+    """Return the largest |k| along an axis beyond which coefficients carry a negligible fraction of a gradient.
+
+    The weight (1 + |ξ|²)^s of a very negative order leaves few of them, and a small NUFFT.
+    """
+    cubes = _cubes(lattice)
+    amounts = np.bincount(cubes.ravel(), np.abs(coefficients).ravel()) * (
+        1 + 2 * np.pi * lattice.spacing * np.arange(cubes.max() + 1)
+    )
+    beyond = amounts.sum() - np.cumsum(amounts)
+    return max(int(np.argmax(beyond <= fraction * amounts.sum())), 1)
+
+
+@lru_cache(maxsize=4)
+def _cubes(lattice: Lattice) -> NDArray[np.intp]:
+    """Return the largest |k| along an axis of each sample of a half lattice."""
+    x, y, z = (np.abs(lattice.half.indices(axis)) for axis in range(3))
+    return np.maximum(np.maximum(x[:, None, None], y[:, None]), z)
+
+
+def _whole(half: Complexes) -> Complexes:
+    """Return the coefficients of a real function on the whole lattice, from those on its half that count twice."""
+    inner = half[:, :, 1:] / 2
+    return np.concatenate([inner[::-1, ::-1, ::-1].conj(), half[:, :, :1], inner], axis=2)
+
+
+def _node_matrices(mesh: Mesh, use: RuleUse) -> Iterator[tuple[csr_array, csr_array]]:
+    """Yield the rows of both matrices for the nodes of some triangles; nodes that triangles share are merged."""
+    triangles, rule = np.asarray(mesh.triangles[use.members], dtype=np.int64), use.rule
+    members, inner, inner_weights = use.members.astype(np.int64), *rule.inner_nodes
+    if use.splits:
+        inner, inner_weights = rule.barycentric, rule.weights
+        for _ in range(use.splits):
+            inner = np.concatenate([inner @ quarter for quarter in _QUARTERS])
+            inner_weights = np.tile(inner_weights / 4, 4)
+    elif rule.shares:
+        edges = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1), axis=2)
+        corner = [(np.ones(1), rule.corner_weight)] if rule.corner_weight else []
+        on_edge = list(zip(*rule.edge_nodes, strict=True))
+        for ends, shared in ((triangles[:, :, None], corner), (edges, on_edge)):
+            if not shared:
+                continue
+            used, nodes = np.unique(ends.reshape(-1, ends.shape[2]), axis=0, return_inverse=True)
+            rows = np.repeat(np.arange(len(used)), used.shape[1])
+            for coefficients, weight in shared:
+                of_vertices = rows, used.ravel(), np.tile(coefficients, len(used))
+                of_areas = nodes.ravel(), np.repeat(members, 3), np.full(nodes.size, weight)
+                yield _matrix(*of_vertices, len(mesh.vertices)), _matrix(*of_areas, len(mesh.triangles))
+    if len(inner):
+        nodes = np.arange(len(inner) * len(triangles), dtype=np.int64)
+        of_vertices = (
+            np.repeat(nodes, 3),
+            np.repeat(triangles, len(inner), axis=0).ravel(),
+            np.tile(inner, (len(triangles), 1)).ravel(),
+        )
+        of_areas = nodes, np.repeat(members, len(inner)), np.tile(inner_weights, len(triangles))
+        yield _matrix(*of_vertices, len(mesh.vertices)), _matrix(*of_areas, len(mesh.triangles))
+
+
+def _matrix(rows: Indices, columns: Indices, values: Reals, width: int) -> csr_array:
+    return coo_array((values, (rows, columns)), shape=(int(rows.max()) + 1, width)).tocsr()

@@ -1,0 +1,4 @@
+"""Formats that are read rarely, and only read.
+
+In: glTF, GIFTI, FreeSurfer and VTK files. Out: vertices and triangles.
+"""

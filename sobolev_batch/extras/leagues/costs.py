@@ -1,0 +1,238 @@
+"""A league by cost: which meshes no other one beats in both the distance and the cost of making it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from sobolev_batch.errors import InputError
+from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
+from sobolev_batch.tables import Format
+from sobolev_batch.tables.open import EDGE_LENGTH, sizes_of
+from sobolev_batch.tables.text import Column, column_table, machine_table, percent, prose, section, wrapped
+
+DEFAULT_COST = "make_seconds"
+# Members that a row of a table names, and objects whose fronts a text has.
+_MOST_MEMBERS, _MOST_OBJECTS = 4, 10
+# Costs from it on, such as bytes, are shown as integers.
+_LARGE = 1000.0
+COST_NOTE = """\
+A mesh is on the front of its object unless another one, at no more cost, is nearer to the
+reference or as near at less cost. It is undecided where the errors of the distances leave that
+open. Costs are taken as measured. Means over objects are geometric, and those of members that all
+objects have."""
+
+METHOD_COLUMNS = (
+    Column("method", "method", kind="label"),
+    Column("front", "on the front", "{} of {}".format, "objects"),
+    Column("undecided", "undecided"),
+    Column("best", "members on most fronts", kind="text"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class CostLeague:
+    """The meshes of a study or collection by distance and cost, at one order. Make it by `league` with ``by="cost"``.
+
+    Attributes:
+        order: Sobolev order s.
+        x: What is the cost: a column of `table`, such as "make_seconds".
+        objects: Names of the objects.
+        methods: Names of the methods, also of those without meshes.
+        left_out: Why other objects, and methods, are not there, by name.
+        meshes: The meshes of all objects, a row each. Columns: object; method; member, the name of the mesh within its
+            method, with {object} for the name of the object where only this makes names alike; mesh, its label; the
+            cost, by its name; relative and relative_error; front, True unless another mesh of the object beats it in
+            both; undecided, True where the errors of the distances leave that open.
+
+    >>> import sobolev_batch as sb
+    >>> (at_order,) = sb.league("storage/icosphere.zarr", -10, by="cost", x="triangles")
+    >>> at_order.table[["method", "front", "objects", "best"]].to_dict("records")
+    [{'method': 'icosphere', 'front': 1, 'objects': 1, 'best': '0, 1, 2, 3'}]
+    """
+
+    order: float
+    x: str
+    objects: tuple[str, ...]
+    methods: tuple[str, ...]
+    left_out: Mapping[str, str]
+    meshes: pd.DataFrame
+
+    @property
+    def caption(self) -> str:
+        """Caption of its table."""
+        count = len(self.objects)
+        return f"League by {self.x} at order {self.order:g}, over {count} object{'s' if count > 1 else ''}"
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """Methods from the one on the most fronts to the one on the fewest, one row each.
+
+        Columns: method; front, the number of objects on whose front it has a mesh; objects, the number of those for
+        which it has any; undecided, the number of objects for which the errors leave open whether it has one; best, its
+        members that are on fronts, those on the most first, with their numbers of fronts where there are several
+        objects.
+        """
+        rows = []
+        for method, meshes in self.meshes.groupby("method", sort=False):
+            by_object = meshes.assign(sure=meshes["front"] & ~meshes["undecided"]).groupby("object", sort=False)
+            found = by_object[["front", "undecided", "sure"]].any()
+            fronts = (
+                meshes[meshes["front"]].groupby("member", sort=False).size().sort_values(ascending=False, kind="stable")
+            )
+            shown = [f"{name} ({n})" if len(self.objects) > 1 else str(name) for name, n in fronts.items()]
+            rest = [f"{len(shown) - _MOST_MEMBERS} more"] if len(shown) > _MOST_MEMBERS else []
+            rows.append(
+                {
+                    "method": method,
+                    "front": int(found["front"].sum()),
+                    "objects": len(found),
+                    "undecided": int((found["undecided"] & ~found["sure"]).sum()),
+                    "best": ", ".join([*shown[:_MOST_MEMBERS], *rest]),
+                }
+            )
+        return pd.DataFrame(rows).sort_values("front", ascending=False, kind="stable", ignore_index=True)
+
+    @cached_property
+    def means(self) -> pd.DataFrame:
+        """Members that all objects have, from the cheapest to the most expensive, one row each.
+
+        Columns: method; member; the cost by its name, relative and relative_error, geometric means over the objects;
+        fronts, the number of objects on whose front it is; front, True unless another member beats both of its means.
+        """
+        logarithms = self.meshes.assign(
+            share=self.meshes["relative_error"] / self.meshes["relative"],
+            **{name: np.log(self.meshes[name]) for name in (self.x, "relative")},
+        )
+        # A member may be there twice for an object whose names do not tell its meshes apart.
+        members = logarithms.groupby(["method", "member"], sort=False)
+        found = members[[self.x, "relative", "share"]].mean()
+        found[[self.x, "relative"]] = np.exp(found[[self.x, "relative"]])
+        found["relative_error"] = found["relative"] * found.pop("share")
+        found["fronts"] = members["front"].sum()
+        found = found[members["object"].nunique() == len(self.objects)].sort_values([self.x, "relative"], kind="stable")
+        return found.assign(front=_is_unbeaten(found[self.x], found["relative"], found["relative"])).reset_index()
+
+    @property
+    def front(self) -> pd.DataFrame:
+        """Rows of `means` on the front, where member begins with its method; and objects, the number of all."""
+        means = self.means[self.means["front"]]
+        return means.assign(member=means["method"] + "/" + means["member"], objects=len(self.objects))
+
+    def _repr_html_(self) -> str:
+        # pandas escapes the names.
+        tables = "".join(frame.to_html(index=False, float_format="{:.3g}".format) for frame in (self.table, self.means))
+        return f"<div><strong>{self.caption}</strong>{tables}</div>"
+
+
+def cost_leagues_of(
+    tables: Mapping[str, pd.DataFrame], objects: Iterable[str], x: str, methods: Sequence[str]
+) -> tuple[CostLeague, ...]:
+    """Return the league by cost of each order, from the rows of `table` of each object that has some; see `league`."""
+    if x == EDGE_LENGTH:
+        raise InputError("edge_length falls where meshes get finer, so it is no cost; take triangles")
+    known = {name: frame.assign(cost=_costs(frame, x)) for name, frame in tables.items()}
+    frame = pd.concat(known, names=["object", "row"]).reset_index(level="object").reset_index(drop=True)
+    frame = frame[frame["family"].isin(methods) & (frame["cost"] > 0) & frame["relative"].notna()]
+    if frame.empty:
+        # Names what could be taken instead.
+        for table in tables.values():
+            sizes_of(table, x)
+        raise InputError(f"no mesh has both a distance and {x}; name another cost, such as triangles")
+    left_out = {name: "it has no tables yet" for name in objects if name not in tables}
+    left_out |= {name: f"no mesh has a distance and {x}" for name in tables if name not in set(frame["object"])}
+    left_out |= {name: f"no mesh has a distance and {x}" for name in methods if name not in set(frame["family"])}
+    orders = dict.fromkeys(s for table in tables.values() for s in table["order"])
+    return tuple(_cost_league(frame[frame["order"] == s], s, x, methods, left_out) for s in orders)
+
+
+def _costs(frame: pd.DataFrame, x: str) -> pd.Series | float:
+    """Return the costs of the meshes of an object, NaN where it has none."""
+    try:
+        return pd.Series(sizes_of(frame, x), frame.index)
+    except InputError:
+        return np.nan
+
+
+def _cost_league(
+    frame: pd.DataFrame, order: float, x: str, methods: Sequence[str], left_out: Mapping[str, str]
+) -> CostLeague:
+    # A name that objects do not share may hold that of its object.
+    is_own = (frame.groupby("mesh")["object"].transform("nunique") == 1) & (frame["object"].nunique() > 1)
+    names = [mesh.removeprefix(f"{family}/") for mesh, family in zip(frame["mesh"], frame["family"], strict=True)]
+    members = [
+        name.replace(owner, "{object}") if own else name
+        for name, owner, own in zip(names, frame["object"], is_own, strict=True)
+    ]
+    # What is next to equal tells of rounding.
+    relative = frame["relative"].clip(lower=NEXT_TO_EQUAL)
+    meshes = frame.assign(method=frame["family"], member=members, relative=relative, **{x: frame["cost"]})
+    parts = []
+    for _, own in meshes.groupby("object", sort=False):
+        costs, error = own[x], own["relative_error"].fillna(np.inf)
+        low, high = own["relative"] - error, own["relative"] + error
+        front = _is_unbeaten(costs, own["relative"], own["relative"])
+        # At worst it has the largest distance that its error allows, and others the smallest; at best the reverse.
+        at_worst, at_best = _is_unbeaten(costs, high, low), _is_unbeaten(costs, low, high)
+        parts.append(own.assign(front=front, undecided=at_worst != at_best))
+    columns = ["object", "method", "member", "mesh", x, "relative", "relative_error", "front", "undecided"]
+    made = pd.concat(parts, ignore_index=True)[columns]
+    return CostLeague(order, x, tuple(dict.fromkeys(made["object"])), tuple(methods), left_out, made)
+
+
+def _is_unbeaten(costs: pd.Series, own: pd.Series, others: pd.Series) -> NDArray[np.bool_]:
+    """Return which of some meshes no other one beats: at no more cost and nearer, or as near at less cost.
+
+    Distances and costs are (meshes,); a mesh may have another distance where others are compared with it.
+    """
+    order = np.lexsort([others, costs])
+    cost, rival, place = costs.to_numpy()[order], others.to_numpy()[order], np.arange(len(order))
+    first, end = (np.searchsorted(cost, cost, side) for side in ("left", "right"))
+    padded = np.append(rival, np.inf)
+    cheaper = np.append(np.inf, np.minimum.accumulate(rival))[first]
+    # Among those of the same cost, the first is the nearest.
+    alike = np.where(place > first, padded[first], np.where(first + 1 < end, padded[first + 1], np.inf))
+    distance, result = own.to_numpy()[order], np.empty(len(order), dtype=bool)
+    result[order] = (np.minimum(cheaper, alike) >= distance) & (cheaper > distance)
+    return result
+
+
+def format_cost_leagues(leagues: Sequence[CostLeague], style: Format = "text") -> str:
+    """Return leagues by cost as text, or their meshes for programs; see `league`."""
+    if style in ("csv", "json"):
+        frame = pd.concat([one.meshes.assign(order=one.order) for one in leagues], ignore_index=True)
+        return machine_table(frame[["order", *frame.columns.drop("order")]], style)
+    sections = []
+    for one in leagues:
+        methods = column_table(METHOD_COLUMNS, one.table.to_dict(orient="records"), style)
+        rows = one.front.to_dict(orient="records")
+        tables = [methods, *([column_table(front_columns(one.x), rows, style)] if rows else [])]
+        sections.append(section(one.caption, tables, _front_lines(one), style))
+    notes = [*wrapped(COST_NOTE), *(f"{name} is left out: {why}." for name, why in leagues[0].left_out.items())]
+    return "\n\n".join([*sections, prose(notes, style)])
+
+
+def front_columns(x: str) -> tuple[Column, ...]:
+    """Return the columns of `CostLeague.front`, with a cost of this name."""
+    return (
+        Column("member", "front of the means", kind="label"),
+        Column(x, x, lambda cost: f"{cost:,.0f}" if cost >= _LARGE else f"{cost:.3g}"),
+        Column("relative", "relative", percent, "relative_error"),
+        Column("fronts", "on the front", "{} of {}".format, "objects"),
+    )
+
+
+def _front_lines(league: CostLeague) -> list[str]:
+    """Return a line for the front of each object, from the cheapest mesh to the nearest one."""
+    fronts = (
+        league.meshes[league.meshes["front"]].sort_values(league.x, kind="stable").groupby("object", sort=False)["mesh"]
+    )
+    shown = {name: fronts.get_group(name) for name in league.objects[:_MOST_OBJECTS]}
+    lines = [f"{name}: {', '.join(meshes)}" for name, meshes in shown.items()]
+    more = len(league.objects) - len(lines)
+    return lines + [f"and {more} more objects: --format csv has all"] * (more > 0)

@@ -1,0 +1,184 @@
+"""Distances over time, for families of meshes that move."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from sobolev_batch.errors import InputError
+from sobolev_batch.norms.columns import NUMBER, VARIABLES, described
+from sobolev_batch.sources.names import quoted
+from sobolev_batch.tables import Format
+from sobolev_batch.tables.open import AnyStore, as_tree, complete_meshes, finished_group, has_times, reference_of
+from sobolev_batch.tables.store_accessor import StoreAccessor, convergence_at
+from sobolev_batch.tables.text import machine_table, printed_table, prose, section, with_error, wrapped
+from sobolev_batch.transform.lattice import Orders, check_orders
+
+# A mesh whose distance has grown by this factor since its first time is worth a new one.
+REMESHING_FACTOR = 2.0
+_NUMBERS = ("distance", "error", "relative", "relative_error")
+_NOTE = """\
+If a new mesh of as many triangles would be as near as the first one, it pays once the
+distance has certainly grown to {factor:g} times that of the first time."""
+
+
+def evolution(
+    store: AnyStore, order: Orders | None = None, *, truth: str | None = None, factor: float = REMESHING_FACTOR
+) -> xr.Dataset:
+    """Return the distances of moving meshes from the true surface over time, and when a new mesh pays.
+
+    Args:
+        store: Path, URL or opened DataTree of a store whose meshes have times.
+        order: One order s < -1/2, or several; default all of the store.
+        truth: Family of the true surface at the same times, if it moves; default the study's reference.
+        factor: Growth of the distance at which a new mesh pays, larger than 1.
+
+    Returns:
+        Dataset over `family`, `time` and `order`, float64: `distance` and its `error`, in the square root of a unit
+        length, `relative` and `relative_error` (over the norm of the true surface), and `growth`, the distance over
+        that of the family's first time with a distance, NaN if that is not larger than its error. Over `family` and
+        `order` it has `remesh_time`, the first time at which the distance has certainly grown by the factor; later it
+        may fall again. NaN where a family has no mesh of a time, where no time is late enough, and without a growth.
+
+    Raises:
+        InputError: The store has no tables yet, no mesh with a time or no such family, or the factor is not larger
+            than 1.
+        OrderError: An order is not below -1/2.
+        StoreError: The location has no store of a study.
+
+    >>> import sobolev_batch as sb
+    >>> ball = {"source": "icosphere", "levels": [2]}
+    >>> study = sb.Study.from_table({
+    ...     "study": {"name": "wound-up"},
+    ...     "lattice": {"xi_max": 2.0, "M": 20},
+    ...     "norm": {"orders": [-4.0]},
+    ...     "reference": {"source": "sphere"},
+    ...     "family": [{"name": "carried", "source": "flow", "times": [0, 1, 2], "mesh": ball}],
+    ... })
+    >>> _ = sb.run(study, "memory://wound-up.zarr")
+    >>> found = sb.evolution("memory://wound-up.zarr", -4.0)
+    >>> bool((found["growth"].sel(family="carried").diff("time") > 0).all())
+    True
+    """
+    if not factor > 1:
+        raise InputError(f"the factor must be larger than 1, found {factor!r}")
+    tree = as_tree(store)
+    # Distances to a surface that moves are computed for each time.
+    convergence = convergence_at(tree, order) if truth is None else finished_group(tree, "convergence")
+    orders = list(dict.fromkeys(convergence["order"].values.tolist() if order is None else check_orders(order)))
+    labels, true_labels = _labels_by_time(tree, truth)
+    complete = set(complete_meshes(tree))
+    frames = []
+    for family, by_time in labels.items():
+        for time, label in by_time.items():
+            known = None
+            if truth is None:
+                known = convergence.sel(mesh=label, order=orders)
+            elif {label, true_label := _at(true_labels, time)} <= complete:
+                known = StoreAccessor(tree).distance(orders, label, str(true_label))
+            numbers = {name: np.nan if known is None else known[name].values for name in _NUMBERS}
+            frames.append(pd.DataFrame({"family": family, "time": time, "order": orders, **numbers}))
+    times = sorted({time for by_time in labels.values() for time in by_time})
+    table = pd.concat(frames, ignore_index=True).set_index(["family", "time", "order"]).to_xarray()
+    found = table.reindex(family=list(labels), time=times, order=orders)
+    for name in (*_NUMBERS, "time", "order"):
+        found[name].attrs = VARIABLES[name]
+    found["family"].attrs = described("family of meshes")
+    return _with_growth(found, factor)
+
+
+def format_evolution(
+    tree: xr.DataTree,
+    style: Format = "text",
+    orders: Sequence[float] | None = None,
+    *,
+    truth: str | None = None,
+    factor: float = REMESHING_FACTOR,
+) -> str:
+    """Return the distances of moving meshes as text; see `evolution`."""
+    found = evolution(tree, orders, truth=truth, factor=factor)
+    if style in ("csv", "json"):
+        columns = [*_NUMBERS, "growth"]
+        frame: pd.DataFrame = found[columns].to_dataframe().dropna(how="all").reset_index()
+        return machine_table(frame[["order", "family", "time", *columns]], style)
+    families = found["family"].values.tolist()
+    sections = []
+    for order in found["order"].values.tolist():
+        rows = found.sel(order=order)
+        cells = [
+            [_time(time), *(_cell(rows.sel(family=family, time=time)) for family in families)]
+            for time in rows["time"].values.tolist()
+        ]
+        caption = f"Sobolev distance of order {order:g} to {truth or reference_of(tree)} over time, in % of its norm"
+        moments = [f"{family}: {_moment(rows.sel(family=family), factor)}" for family in families]
+        sections.append(section(caption, [printed_table(cells, ["time", *families], style)], moments, style))
+    return "\n\n".join([*sections, prose(wrapped(_NOTE.format(factor=factor)), style)])
+
+
+def _labels_by_time(tree: xr.DataTree, truth: str | None) -> tuple[dict[str, dict[float, str]], dict[float, str]]:
+    """Return the label of each family's mesh at each time, and those of the true surface, if that moves."""
+    labels: dict[str, dict[float, str]] = {}
+    if has_times(tree):
+        meshes = finished_group(tree, "meshes")
+        columns = (meshes[name].values.tolist() for name in ("mesh", "family", "time"))
+        for label, family, time in zip(*columns, strict=True):
+            if not np.isnan(time):
+                labels.setdefault(family, {})[time] = label
+    if not labels:
+        raise InputError("no mesh of the store has a time: the sources flow and files can give them times")
+    if truth is not None and truth not in labels:
+        raise InputError(f"no family {quoted(truth)} has times, only {', '.join(labels)}")
+    true_labels = labels.pop(reference_of(tree) if truth is None else truth, {})
+    if not labels:
+        raise InputError("no mesh has a time, except those that the others are compared with")
+    if truth is None:
+        return labels, {}
+    for name, by_time in labels.items():
+        if not any(_at(true_labels, time) for time in by_time):
+            raise InputError(f"the families {quoted(name)} and {quoted(truth)} have no time in common")
+    return labels, true_labels
+
+
+def _at(labels: Mapping[float, str], time: float) -> str | None:
+    """Return the label at a time, which may have been computed in another way: 0.3 is 0.1 + 0.2."""
+    return next((label for other, label in labels.items() if math.isclose(other, time, rel_tol=1e-9)), None)
+
+
+def _with_growth(found: xr.Dataset, factor: float) -> xr.Dataset:
+    """Return distances over `family`, `time` and `order` with their growth, and when a new mesh pays."""
+    first = found.isel(time=found["distance"].notnull().argmax("time")).drop_vars("time")
+    # Nothing is known of the growth of a distance that may be zero.
+    growth = found["distance"] / first["distance"].where(first["distance"] > first["error"])
+    late = found["distance"] - found["error"] > factor * (first["distance"] + first["error"])
+    remesh_time = found["time"].where(late & growth.notnull()).min("time")
+    return found.assign(
+        growth=growth.assign_attrs(described("distance over that of the first time", NUMBER)),
+        remesh_time=remesh_time.transpose("family", "order").assign_attrs(
+            described("first time at which a new mesh pays", factor=f"{factor:g}")
+        ),
+    )
+
+
+def _cell(found: xr.Dataset) -> str:
+    text = with_error(100 * found["relative"].item(), 100 * found["relative_error"].item())
+    growth = found["growth"].item()
+    return f"{text}  {growth:5.2f} ×" if np.isfinite(growth) else text
+
+
+def _moment(found: xr.Dataset, factor: float) -> str:
+    if not found["distance"].notnull().any():
+        return "no distance is known"
+    if not found["growth"].notnull().any():
+        return "its first distance is not larger than its error, so nothing is known of its growth"
+    moment = found["remesh_time"].item()
+    if np.isfinite(moment):
+        return f"a new mesh first pays at time {_time(moment)}"
+    return f"the distance has at no time certainly grown to {factor:g} times the first"
+
+
+def _time(time: float) -> str:
+    return f"{time:.12g}"

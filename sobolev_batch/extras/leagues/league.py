@@ -1,0 +1,505 @@
+"""A league: the methods of a collection, ranked over all objects; a study against an earlier one; both as text."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+from pathlib import Path
+from typing import Literal, overload
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from sobolev_batch.batch.checks import SIGNIFICANCE, gap_of, least_objects
+from sobolev_batch.errors import InputError, StoreError
+from sobolev_batch.extras.leagues.costs import DEFAULT_COST, CostLeague, cost_leagues_of
+from sobolev_batch.extras.leagues.statistics import (
+    Curve,
+    Reals,
+    adjusted,
+    common_sizes,
+    interval,
+    sign_flip_test,
+    within_objects,
+)
+from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
+from sobolev_batch.sources.names import quoted
+from sobolev_batch.store.collection_store import CollectionStore
+from sobolev_batch.store.location import Location
+from sobolev_batch.tables import Format
+from sobolev_batch.tables.convergence import table, tables_of
+from sobolev_batch.tables.open import EDGE_LENGTH, AnyStore, as_tree, finished_group, reference_of, stores_of
+from sobolev_batch.tables.text import Column, column_table, machine_table, prose, section, wrapped
+from sobolev_batch.transform.lattice import Orders
+
+LEAGUE_NOTE = """\
+Relative distances are geometric means over the objects, at equal {x}. Their 95 % intervals
+leave out what the objects themselves differ by, and hold the errors of the distances. A rank
+such as 1-3 says which places the intervals allow. Rates are orders of convergence in the edge
+length. Two methods differ where the permutation test of pairs says so, at the level of 5 %
+for all pairs together."""
+_CHANGES_NOTE = """\
+A ratio below 1 says that the new study is nearer to the references. It is the geometric mean
+over the {units}, with its 95 % interval. The verdict is that of the permutation test of pairs, at
+the level of 5 % for all methods together."""
+
+
+# The store of a collection, or stores of single objects by their names.
+AnyCollection = str | Path | Location | Mapping[str, AnyStore]
+# Columns of the ends of an interval.
+_ENDS = ("low", "high")
+# Of the rows that two studies have in common.
+_KEYS = ["order", "mesh"]
+
+
+def number_text(value: float, unit: str = "") -> str:
+    """Return a number with three digits, with ? for one that nothing bounds."""
+    return "" if math.isnan(value) else "?" if math.isinf(value) else f"{value:.3g}{unit}"
+
+
+def percent_text(value: float) -> str:
+    """Return the same of a fraction in per cent."""
+    return number_text(100 * value, " %")
+
+
+def _interval(shown: Callable[[float], str]) -> Callable[[float, float], str]:
+    """Return the format of intervals, with ? for an end that nothing bounds."""
+    return lambda low, high: f"{shown(low)} to {shown(high)}"
+
+
+LEAGUE_COLUMNS = (
+    Column("method", "method", kind="label"),
+    Column("rank", "rank", lambda first, last: f"{first}" if first == last else f"{first}-{last}", "last_rank"),
+    Column("relative", "relative", percent_text),
+    Column("low", "95 % interval", _interval(percent_text), "high"),
+    Column("rate", "rate", number_text),
+    Column("rate_low", "95 % interval", _interval(number_text), "rate_high"),
+    Column("objects", "objects"),
+)
+PAIR_COLUMNS = (
+    Column("method", "method", kind="label"),
+    Column("other", "other", kind="text"),
+    Column("ratio", "ratio", number_text),
+    Column("low", "95 % interval", _interval(number_text), "high"),
+    Column("p", "p", "{:.2g}".format),
+    Column("nearer", "nearer", kind="text"),
+)
+_CHANGE_COLUMNS = (
+    Column("method", "method"),
+    Column("verdict", "verdict"),
+    Column("ratio", "new/old", number_text),
+    Column("low", "95 % interval", _interval(number_text), "high"),
+    Column("p", "p", "{:.2g}".format),
+    Column("meshes", "meshes"),
+    Column("worst_ratio", "largest new/old", lambda ratio, mesh: f"{number_text(ratio)}, {mesh}", "worst"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class League:
+    """The methods of a collection, compared over its objects at one order. Make it by `league`.
+
+    Attributes:
+        order: Sobolev order s.
+        x: Size at which methods are compared, such as "triangles".
+        objects: Names of the objects that have all methods.
+        methods: Names of the methods.
+        left_out: Why other objects are not there, by name.
+        sizes: Logarithms of the sizes (objects, sizes) at which the methods are compared.
+        values_at: Logarithms of relative distances (objects, methods, sizes).
+        errors_at: Bounds on the errors of these.
+        slopes: Observed rates in the edge length, and bounds on their errors (objects, methods, 2); NaN without one.
+
+    >>> import sobolev_batch as sb
+    >>> (at_order,) = sb.league({"sphere": "storage/icosphere.zarr"}, -10)
+    >>> at_order.x, at_order.methods, len(at_order.pairs)
+    ('triangles', ('icosphere',), 0)
+    """
+
+    order: float
+    x: str
+    objects: tuple[str, ...]
+    methods: tuple[str, ...]
+    left_out: Mapping[str, str]
+    sizes: Reals
+    values_at: Reals
+    errors_at: Reals
+    slopes: Reals
+
+    @property
+    def values(self) -> Reals:
+        """Logarithms of relative distances (objects, methods), averaged over the sizes."""
+        return np.asarray(self.values_at.mean(axis=-1))
+
+    @property
+    def errors(self) -> Reals:
+        """Bounds (objects, methods) on the errors of these."""
+        return np.asarray(self.errors_at.mean(axis=-1))
+
+    def mean_curve(self, method: str) -> Curve:
+        """Return the mean over the objects of a method's distances at each size, whose mean is that of the table."""
+        number = self.methods.index(method)
+        parts = self.sizes, self.values_at[:, number], self.errors_at[:, number]
+        return Curve(*(np.mean(part, axis=0) for part in parts))
+
+    @property
+    def caption(self) -> str:
+        """Caption of its table."""
+        return f"League at order {self.order:g}, over {_objects(len(self.objects))}"
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """Methods from the nearest to the farthest, one row each.
+
+        Columns: rank and last_rank, the best and the worst place that the interval of the method allows; method;
+        objects, their number; relative, the geometric mean of its relative distances at equal sizes, with the ends low
+        and high of its interval; rate, the mean observed order of convergence in the edge length, with rate_low and
+        rate_high.
+        """
+        count = len(self.objects)
+        spreads = within_objects(self.values) if count > 1 else np.full(len(self.methods), np.nan)
+        slopes = [of_method[np.isfinite(of_method[:, 0])] for of_method in self.slopes.swapaxes(0, 1)]
+        frame = pd.DataFrame({"method": self.methods, "objects": count})
+        frame[["relative", *_ENDS]] = np.exp(list(map(interval, self.values.T, self.errors.T, spreads)))
+        frame[["rate", "rate_low", "rate_high"]] = [interval(*known.T) for known in slopes]
+        frame = frame.sort_values("relative", kind="stable", ignore_index=True)
+        low, high = frame["low"].to_numpy(), frame["high"].to_numpy()
+        # Where there are no intervals, any place is possible.
+        frame.insert(0, "rank", [1 + int(np.sum(high < end)) for end in low])
+        frame.insert(1, "last_rank", [len(frame) - int(np.sum(low > end)) for end in high])
+        return frame
+
+    @cached_property
+    def pairs(self) -> pd.DataFrame:
+        """Each two methods, compared on the same objects.
+
+        Columns: method, other; ratio, the geometric mean over the objects of the ratio of their distances at equal
+        sizes, with the ends low and high of its interval; p, the p-value of the paired permutation test, adjusted for
+        the number of pairs (Holm); nearer, the method that is nearer by this test at the level of 5 %, or nothing.
+        """
+        rows = []
+        for i, j in combinations(range(len(self.methods)), 2):
+            differences = self.values[:, i] - self.values[:, j]
+            errors = self.errors[:, i] + self.errors[:, j]
+            ratio = np.exp(interval(differences, errors))
+            rows.append([self.methods[i], self.methods[j], *ratio, sign_flip_test(differences, errors)])
+        frame = pd.DataFrame(rows, columns=["method", "other", "ratio", *_ENDS, "p"])
+        frame["p"] = adjusted(frame["p"].to_numpy(dtype=np.float64))
+        nearer = np.where(frame["ratio"] < 1, frame["method"], frame["other"])
+        frame["nearer"] = np.where(frame["p"] < SIGNIFICANCE, nearer, "")
+        return frame
+
+    def _repr_html_(self) -> str:
+        frames = [self.table, *([self.pairs] if len(self.pairs) else [])]
+        # pandas escapes the names of methods.
+        tables = "".join(frame.to_html(index=False, float_format="{:.3g}".format) for frame in frames)
+        return f"<div><strong>{self.caption}</strong>{tables}</div>"
+
+
+def _objects(count: int) -> str:
+    return f"{count} object{'s' if count > 1 else ''}"
+
+
+@overload
+def league(
+    store: AnyCollection,
+    order: Orders | None = None,
+    *,
+    by: Literal["size"] = "size",
+    x: str | None = None,
+    methods: Sequence[str] | None = None,
+) -> tuple[League, ...]: ...
+
+
+@overload
+def league(
+    store: AnyCollection,
+    order: Orders | None = None,
+    *,
+    by: Literal["cost"],
+    x: str | None = None,
+    methods: Sequence[str] | None = None,
+) -> tuple[CostLeague, ...]: ...
+
+
+def league(
+    store: AnyCollection,
+    order: Orders | None = None,
+    *,
+    by: Literal["size", "cost"] = "size",
+    x: str | None = None,
+    methods: Sequence[str] | None = None,
+) -> tuple[League, ...] | tuple[CostLeague, ...]:
+    """Rank the methods of a collection over its objects, for each order.
+
+    Methods are the families that the objects have in common. On each object, they are compared at equal sizes: at sizes
+    evenly spaced over the range that all of them have, with straight lines on logarithmic axes between their meshes.
+    By cost, they need nothing in common: what counts are the meshes that no other one of the object beats in both its
+    distance and its cost. docs/leagues.md explains the intervals and the test.
+
+    Args:
+        store: Path or URL of the store of a collection; or stores of single objects by the name of the object. By cost,
+            also the store of one object.
+        order: One of the stores' orders, or several; default all.
+        by: What methods are compared by, "size" or "cost".
+        x: Size or cost of a mesh: "triangles" (the default by size), "vertices", "edge_length", "make_seconds" (the
+            default by cost), "make_cpu_seconds", "make_peak_bytes", or a number among the metadata of the meshes, such
+            as the seconds that a method took.
+        methods: Names of the methods to compare; default all.
+
+    Returns:
+        A league for each order: with the tables `League.table` and `League.pairs`, or by cost with `CostLeague.table`,
+        `CostLeague.means` and `CostLeague.meshes`.
+
+    Raises:
+        InputError: There are no tables yet, an order, size or method is unknown, no object has all methods, or no mesh
+            has the cost.
+        StoreError: The location has no store.
+
+    >>> import sobolev_batch as sb
+    >>> (at_order,) = sb.league({"sphere": "storage/icosphere.zarr"}, -10)
+    >>> at_order.table[["method", "objects"]].to_dict("records")
+    [{'method': 'icosphere', 'objects': 1}]
+    >>> (by_cost,) = sb.league("storage/icosphere.zarr", -10, by="cost", x="triangles")
+    >>> by_cost.means[["member", "triangles", "front"]].round(1).to_dict("list")
+    {'member': ['0', '1', '2', '3'], 'triangles': [20.0, 80.0, 320.0, 1280.0], 'front': [True, True, True, True]}
+    """
+    if by not in ("size", "cost"):
+        raise InputError(f'methods are compared by "size" or "cost", found {by!r}')
+    if isinstance(store, Mapping):
+        stores, objects = store, tuple(store)
+    elif (collection := CollectionStore.read(Location.parse(store))) is not None:
+        stores, objects = collection.existing_stores, collection.objects
+    elif by == "cost":
+        tree = as_tree(store)
+        objects = (str(tree.attrs["study"]["name"]),)
+        stores = {objects[0]: tree}
+    else:
+        raise StoreError(
+            f"{store}: it holds no store of a collection; run a study with several objects, or give the stores of "
+            "single objects by their names"
+        )
+    tables = tables_of(stores, order)
+    if by == "cost":
+        return cost_leagues_of(tables, objects, x or DEFAULT_COST, _chosen(tables, methods))
+    return leagues_of(tables, objects, x=x or "triangles", methods=methods)
+
+
+def leagues_of(
+    tables: Mapping[str, pd.DataFrame],
+    objects: Sequence[str],
+    *,
+    x: str = "triangles",
+    methods: Sequence[str] | None = None,
+) -> tuple[League, ...]:
+    """Rank methods by the rows of `table` of each object that has some, among all objects; see `league`."""
+    orders = list(dict.fromkeys(s for frame in tables.values() for s in frame["order"]))
+    chosen = _chosen(tables, methods)
+    unfinished = dict.fromkeys((name for name in objects if name not in tables), "it has no tables yet")
+    return tuple(_league(tables, s, x, chosen, unfinished) for s in orders)
+
+
+def _chosen(tables: Mapping[str, pd.DataFrame], methods: Sequence[str] | None) -> list[str]:
+    """Return the methods to compare, default all; InputError where one is unknown."""
+    families = list(dict.fromkeys(family for frame in tables.values() for family in frame["family"]))
+    chosen = families if methods is None else list(methods)
+    unknown = next((method for method in chosen if method not in families), None)
+    if unknown is not None:
+        raise InputError(f"no method is named {quoted(unknown)}; known are {', '.join(families)}")
+    return chosen
+
+
+def _league(
+    tables: Mapping[str, pd.DataFrame], order: float, x: str, methods: Sequence[str], unfinished: Mapping[str, str]
+) -> League:
+    rows: dict[str, tuple[Reals, ...]] = {}
+    left_out = dict(unfinished)
+    for name, frame in tables.items():
+        at_order = frame[frame["order"] == order]
+        curves = _curves(at_order, x, methods)
+        common = common_sizes([curves[method] for method in methods]) if len(curves) == len(methods) else None
+        exact = [method for method, curve in curves.items() if np.any(curve.values < np.log(NEXT_TO_EQUAL))]
+        if len(curves) < len(methods):
+            left_out[name] = f"no distance of {', '.join(method for method in methods if method not in curves)}"
+        elif exact:
+            left_out[name] = f"{', '.join(exact)} reproduced it, up to rounding"
+        elif common is None:
+            left_out[name] = gap_of({method: curve.range for method, curve in curves.items()})
+        else:
+            values, errors = zip(*(curve.at(common) for curve in curves.values()), strict=True)
+            slopes = [curve.slope() for curve in _curves(at_order, EDGE_LENGTH, methods).values()]
+            rows[name] = common, np.array(values), np.array(errors), np.array(slopes)
+    if not rows:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:3])
+        raise InputError(
+            f"no object can serve to compare the methods {', '.join(methods)} ({reasons}); compare fewer methods, "
+            'or compare them by cost (table league --by cost, in Python by="cost")'
+        )
+    arrays = (np.array(parts) for parts in zip(*rows.values(), strict=True))
+    return League(order, x, tuple(rows), tuple(methods), left_out, *arrays)
+
+
+def _curves(frame: pd.DataFrame, x: str, methods: Sequence[str]) -> dict[str, Curve]:
+    """Return the curve of each method that has distances from an object."""
+    curves = {method: Curve.from_rows(frame[frame["family"] == method], x) for method in methods}
+    return {method: curve for method, curve in curves.items() if curve is not None}
+
+
+def compare_studies(
+    new: AnyCollection | AnyStore, old: AnyCollection | AnyStore, order: Orders | None = None
+) -> pd.DataFrame:
+    """Compare the distances of two studies of the same objects, such as those of two releases of a remesher.
+
+    Meshes of the same label are compared, by the ratio of their distances to the same reference. Relative distances
+    below 1e-5 count as 1e-5, since they tell of rounding.
+
+    Args:
+        new: Store of the new study: of a collection, or of one object; or stores of single objects by their names.
+        old: Store of the old study, likewise.
+        order: One of the stores' orders, or several; default all that both have.
+
+    Returns:
+        A row for each order and method (family): order, method; objects and meshes, their numbers; ratio, the geometric
+        mean of the ratios of new to old distances, with the ends low and high of its interval over the objects, or over
+        the meshes of a single object; p, the p-value of the paired permutation test, adjusted for the number of methods
+        (Holm); verdict, "nearer" or "farther" by this test at the level of 5 %, else "undecided"; worst, the mesh whose
+        distance grew most, and worst_ratio, by how much.
+
+    Raises:
+        InputError: The studies have no mesh in common, or an object has another reference or unit of length.
+        StoreError: A location has no store.
+
+    >>> import sobolev_batch as sb
+    >>> same = sb.compare_studies("storage/icosphere.zarr", "storage/icosphere.zarr", -10)
+    >>> same[["method", "meshes", "ratio", "verdict"]].to_dict("records")
+    [{'method': 'icosphere', 'meshes': 4, 'ratio': 1.0, 'verdict': 'undecided'}]
+    """
+    news, olds = stores_of(new), stores_of(old)
+    common = [name for name in news if name in olds]
+    if not common:
+        raise InputError(
+            f"the studies have no object in common: the new one has {', '.join(news)}, the old one {', '.join(olds)}"
+        )
+    frames = [_joined(name, news[name], olds[name], order) for name in common]
+    joined = pd.concat(frames, ignore_index=True)
+    if joined.empty:
+        raise InputError("the studies have no mesh in common that both have computed at the same order")
+    rows = [
+        {"order": s, "method": method, **_change(meshes)}
+        for (s, method), meshes in joined.groupby(["order", "family"], sort=False)
+    ]
+    result = pd.DataFrame(rows)
+    for _, of_order in result.groupby("order", sort=False):
+        result.loc[of_order.index, "p"] = adjusted(of_order["p"].to_numpy())
+    words = np.where(result["ratio"] < 1, "nearer", "farther")
+    result.insert(8, "verdict", np.where(result["p"] < SIGNIFICANCE, words, "undecided"))
+    return result
+
+
+def _joined(name: str, new: AnyStore, old: AnyStore, order: Orders | None) -> pd.DataFrame:
+    """Return the meshes that two stores of an object have in common, with the logarithms of their ratios."""
+    trees = as_tree(new), as_tree(old)
+    if trees[0].attrs["similarity"] != trees[1].attrs["similarity"] or len({_identity(tree) for tree in trees}) > 1:
+        raise InputError(
+            f"{name or 'the studies'}: they have different references or units of length, so their distances cannot be "
+            "compared; give both the same [reference] and [scaling]"
+        )
+    first, second = (_distances(table(tree, order)) for tree in trees)
+    both = first.merge(second, on=_KEYS, suffixes=("", "_old"))
+    ratios = np.log(both["relative"] / both["relative_old"])
+    errors = both["share"] + both["share_old"]
+    return both.assign(object=name, log_ratio=ratios, log_error=errors)
+
+
+def _identity(tree: xr.DataTree) -> str:
+    """Return what tells the reference from others: the digest of its mesh, or the keys of a surface in closed form."""
+    digest = str(finished_group(tree, "meshes")["digest"].sel(mesh=reference_of(tree)).item())
+    return digest or repr(sorted(tree.attrs["study"]["table"]["reference"].items()))
+
+
+def _distances(frame: pd.DataFrame) -> pd.DataFrame:
+    known = frame[frame["relative"].notna()]
+    relative = np.maximum(known["relative"], NEXT_TO_EQUAL)
+    with np.errstate(divide="ignore"):
+        share = -np.log1p(-np.minimum(known["relative_error"] / relative, 1.0))
+    return known[[*_KEYS, "family"]].assign(relative=relative, share=share)
+
+
+def _change(meshes: pd.DataFrame) -> dict[str, object]:
+    """Return the change of one method at one order."""
+    by_object = meshes.groupby("object", sort=False)[["log_ratio", "log_error"]].mean()
+    units = by_object if len(by_object) > 1 else meshes
+    ratios, errors = units["log_ratio"].to_numpy(), units["log_error"].to_numpy()
+    worst = meshes.loc[meshes["log_ratio"].idxmax()]
+    return {
+        "objects": len(by_object),
+        "meshes": len(meshes),
+        **dict(zip(("ratio", *_ENDS), np.exp(interval(ratios, errors)), strict=True)),
+        "p": sign_flip_test(ratios, errors),
+        "worst": f"{worst['object']}/{worst['mesh']}".lstrip("/"),
+        "worst_ratio": float(np.exp(worst["log_ratio"])),
+    }
+
+
+def format_league(leagues: Sequence[League], style: Format = "text") -> str:
+    """Return leagues as text; see `league`."""
+    if style in ("csv", "json"):
+        frames = [one.table.assign(order=one.order) for one in leagues]
+        frame = pd.concat(frames, ignore_index=True)
+        return machine_table(frame[["order", *frame.columns.drop("order")]], style)
+    sections = []
+    for one in leagues:
+        rows = column_table(LEAGUE_COLUMNS[:-1], one.table.to_dict(orient="records"), style)
+        sections.append(section(one.caption, [rows], pair_lines(one), style))
+    notes = wrapped(LEAGUE_NOTE.format(x=leagues[0].x))
+    notes += [f"{name} is left out{where}: {reason}." for name, where, reason in left_out(leagues)]
+    return "\n\n".join([*sections, prose(notes, style)])
+
+
+def left_out(leagues: Sequence[League]) -> Iterator[tuple[str, str, str]]:
+    """Yield the objects that leagues leave out, at which of their orders (nothing for all of them), and why."""
+    orders: dict[tuple[str, str], list[float]] = {}
+    for one in leagues:
+        for name, reason in one.left_out.items():
+            orders.setdefault((name, reason), []).append(one.order)
+    for (name, reason), at in orders.items():
+        where = "" if len(at) == len(leagues) else f" at order {', '.join(f'{s:g}' for s in at)}"
+        yield name, where, reason
+
+
+def format_changes(changes: pd.DataFrame, style: Format = "text") -> str:
+    """Return the result of `compare_studies` as text."""
+    if style in ("csv", "json"):
+        return machine_table(changes, style)
+    sections = []
+    for order, frame in changes.groupby("order", sort=False):
+        rows = column_table(_CHANGE_COLUMNS, frame.to_dict(orient="records"), style)
+        sections.append(section(f"New study against the old one at order {order:g}", [rows], [], style))
+    units = "objects" if (changes["objects"] > 1).all() else "meshes"
+    notes = wrapped(_CHANGES_NOTE.format(units=units))
+    least = least_objects(changes["method"].nunique())
+    if (changes[units] < least).any():
+        notes.append(f"With fewer than {least} {units}, the test decides nothing; look at the intervals.")
+    return "\n\n".join([*sections, prose(notes, style)])
+
+
+def pair_lines(league: League) -> list[str]:
+    """Return a line for each pair of methods that differ."""
+    lines = []
+    for row in league.pairs.itertuples():
+        if row.nearer:
+            farther, ratio = (row.other, 1 / row.ratio) if row.nearer == row.method else (row.method, row.ratio)
+            lines.append(f"{row.nearer} is {ratio:.3g} times nearer than {farther} (p = {row.p:.2g}).")
+    count, methods = len(league.objects), len(league.table)
+    if not lines and methods > 1:
+        least = least_objects(len(league.pairs))
+        lines.append(
+            "No two methods differ beyond chance and error."
+            if count >= least
+            else f"The test cannot tell {methods} methods from chance with {_objects(count)}; take {least} or more."
+        )
+    return lines

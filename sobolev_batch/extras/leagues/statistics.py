@@ -1,0 +1,159 @@
+"""Curves of methods at equal sizes, their intervals, and tests whether two methods differ."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Self
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+from sobolev_batch.batch.checks import Range, common_range
+from sobolev_batch.tables.open import sizes_of
+
+Reals = NDArray[np.float64]
+
+# Sizes at which curves are compared, evenly spaced on a logarithmic axis.
+_SIZES = 5
+# Meshes whose sizes differ by a smaller factor tell no rate.
+_SMALLEST_RANGE = 1.1
+# Of a logarithm; the bar of a larger error would leave no room for the distances.
+_LARGEST_ERROR = 3.0
+CONFIDENCE = 0.95
+# All changes of sign are tried for as many objects, and as many random ones for more.
+_MOST_ENUMERATED, _DRAWS, _SEED = 14, 20_000, 0
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """The distances of the meshes of one method from one object.
+
+    Attributes:
+        sizes: Logarithms of the sizes (n,), ascending.
+        values: Logarithms of the relative distances (n,).
+        errors: Bounds on the errors of these logarithms (n,), infinite where a distance is not larger than its error.
+    """
+
+    sizes: Reals
+    values: Reals
+    errors: Reals
+
+    @classmethod
+    def from_rows(cls, rows: pd.DataFrame, x: str) -> Self | None:
+        """Return the curve of some rows of `table`, of one order and family; None where no mesh has a distance."""
+        sizes, relative = sizes_of(rows, x), rows["relative"].to_numpy()
+        known = np.isfinite(sizes) & np.isfinite(relative)
+        if not known.any():
+            return None
+        order = np.argsort(sizes[known], kind="stable")
+        relative = relative[known][order]
+        relative_errors = rows["relative_error"].to_numpy()[known][order]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            shares = np.fmin(relative_errors / relative, 1.0)
+            return cls(np.log(sizes[known][order]), np.log(relative), -np.log1p(-shares))
+
+    @property
+    def range(self) -> Range:
+        """Smallest and largest size, as logarithms."""
+        return float(self.sizes[0]), float(self.sizes[-1])
+
+    @property
+    def bars(self) -> Reals:
+        """Errors (n,) of the distances themselves; where nothing bounds one, it is as large as the distance."""
+        factors = np.where(np.isfinite(self.errors), np.expm1(np.minimum(self.errors, _LARGEST_ERROR)), 1.0)
+        return np.exp(self.values) * factors
+
+    def at(self, sizes: Reals) -> tuple[Reals, Reals]:
+        """Return the logarithms of the distances at some sizes, on straight lines between the meshes, with errors.
+
+        Beyond the ends the distance is that of the last mesh: a line through two of about one size could lead anywhere.
+        """
+        own, index, counts = np.unique(self.sizes, return_inverse=True, return_counts=True)
+        # Of meshes of one size, the geometric mean.
+        values, errors = (np.bincount(index, numbers) / counts for numbers in (self.values, self.errors))
+        left = np.clip(np.searchsorted(own, sizes, side="right") - 1, 0, len(own) - 1)
+        right = np.minimum(left + 1, len(own) - 1)
+        # The larger of both errors, since an infinite one has no weight that one could take.
+        return np.interp(sizes, own, values), np.maximum(errors[left], errors[right])
+
+    def slope(self) -> tuple[float, float]:
+        """Return the slope of the least-squares line and a bound on its error; NaN where sizes hardly differ."""
+        if np.ptp(self.sizes) < np.log(_SMALLEST_RANGE):
+            return np.nan, np.nan
+        centred = self.sizes - self.sizes.mean()
+        square = float(centred @ centred)
+        weights = centred / square
+        with np.errstate(invalid="ignore"):
+            error = float(np.abs(weights) @ self.errors)
+        return float(weights @ self.values), np.inf if np.isnan(error) else error
+
+
+def common_sizes(curves: Sequence[Curve]) -> Reals | None:
+    """Return sizes (5,) in the range that all curves have, all alike between their ends where these nearly meet."""
+    common = common_range([curve.range for curve in curves])
+    return None if common is None else np.linspace(*common, _SIZES)
+
+
+def interval(values: Reals, errors: Reals, spread: float | None = None) -> Reals:
+    """Return a mean and the ends of its interval by Student's t (3,), widened by the mean of errors (n,) of values.
+
+    The spread is the standard deviation of the values (n,), by default their own. One value says nothing of it: NaN.
+    """
+    count = len(values)
+    if count < 2:
+        return np.array([*values, *[math.nan] * (3 - count)])
+    deviation = float(np.std(values, ddof=1)) if spread is None else spread
+    half = float(stdtrit(count - 1, (1 + CONFIDENCE) / 2)) * deviation / math.sqrt(count) + float(np.mean(errors))
+    return np.asarray(np.mean(values) + np.array([0.0, -half, half]))
+
+
+def within_objects(values: Reals) -> Reals:
+    """Return the standard deviation of each method over values (objects, methods), without that of the objects.
+
+    Each object's mean over the methods is taken off, and the variance scaled by m / (m - 1) for m methods: Morey,
+    Confidence intervals from normalized data, Tutorials in Quantitative Methods for Psychology 4(2), 2008.
+    """
+    methods = values.shape[1]
+    if methods == 1:
+        return np.asarray(np.std(values, axis=0, ddof=1))
+    centred = values - values.mean(axis=1, keepdims=True)
+    return np.asarray(np.std(centred, axis=0, ddof=1) * math.sqrt(methods / (methods - 1)))
+
+
+def sign_flip_test(differences: Reals, errors: Reals) -> float:
+    """Return the p-value of paired differences with mean zero: the share of sign changes with as large a mean.
+
+    If two methods were alike, each difference could as well have the other sign. It is the permutation test of pairs,
+    and the p-value is the largest that the bounds on the errors of the differences allow.
+    """
+    count = len(differences)
+    if count == 0 or not np.isfinite(errors).all():
+        return 1.0
+    if count <= _MOST_ENUMERATED:
+        signs = np.array(list(product((1.0, -1.0), repeat=count)))
+    else:
+        # With the observed signs among them, the p-value is never zero.
+        drawn = np.random.default_rng(_SEED).choice((1.0, -1.0), size=(_DRAWS, count))
+        signs = np.vstack([np.ones(count), drawn])
+    observed, slack = abs(float(differences.sum())), float(errors.sum())
+    # Rounding must not decide between a sum and its mirror image.
+    tolerance = 1e-12 * float(np.abs(differences).sum())
+    return float(np.mean(np.abs(signs @ differences) + slack >= observed - slack - tolerance))
+
+
+def adjusted(p_values: Reals) -> Reals:
+    """Return p-values adjusted for how many they are, by Holm's step-down method.
+
+    >>> adjusted(np.array([0.01, 0.04, 0.03]))
+    array([0.03, 0.06, 0.06])
+    """
+    order = np.argsort(p_values, kind="stable")
+    scaled = p_values[order] * np.arange(len(p_values), 0, -1)
+    result = np.empty_like(p_values)
+    result[order] = np.minimum(np.maximum.accumulate(scaled), 1.0)
+    return result

@@ -1,0 +1,370 @@
+"""The report of a store: one HTML page that needs no other files, with the data of its charts."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import hashlib
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from sobolev_batch.batch.status import Status
+from sobolev_batch.errors import InputError, from_extra, written
+from sobolev_batch.extras.leagues.costs import CostLeague
+from sobolev_batch.extras.leagues.evolution import evolution
+from sobolev_batch.extras.leagues.league import League
+from sobolev_batch.store.collection_store import CollectionStore
+from sobolev_batch.store.location import Location
+from sobolev_batch.store.lock import utc_now
+from sobolev_batch.tables.convergence import table
+from sobolev_batch.tables.matrix import pairs_of
+from sobolev_batch.tables.open import (
+    AnyStore,
+    as_tree,
+    complete_meshes,
+    families_of,
+    fields_read,
+    finished_group,
+    has_times,
+    is_sequence,
+    label_of,
+    location_of,
+    reference_of,
+    require_unchanged,
+    study_unit,
+)
+from sobolev_batch.tables.text import minus
+from sobolev_batch.visible import visible
+
+with from_extra("report", "a report needs"):
+    import jinja2
+    import plotly.offline
+    from jinja2.utils import htmlsafe_json_dumps
+
+    from sobolev_batch.extras.figures.drawing import MOST_MESHES, clustered_order
+    from sobolev_batch.extras.figures.selection import Selection, Spectra
+    from sobolev_batch.extras.figures.views import Axis, MeshView, make_views
+    from sobolev_batch.extras.report.content import PageTable, league_content, study_content, utc_text
+
+# Points of all convergence charts together, and numbers of all matrices: 10 bytes each, on a page of up to 15 MB.
+MOST_POINTS, MOST_NUMBERS = 50_000, 400_000
+
+Json = dict[str, Any]
+# A page as HTML, and what it leaves out, for people.
+Page = tuple[str, tuple[str, ...]]
+
+
+def report(
+    store: AnyStore,
+    path: str | Path,
+    *,
+    folder: str | Path = ".",
+    witnesses: Sequence[str] = (),
+    up: Axis | None = None,
+) -> Path:
+    """Write the report of a store as one HTML page, with tables, plots and meshes, that makes no requests.
+
+    The page of a collection has the league of its methods, and the best method for each object. Needs the extra
+    "report".
+
+    Args:
+        store: Path, URL or opened DataTree of the store, or path or URL of that of a collection.
+        path: File to write.
+        folder: Folder where relative paths in the study start; the study makes some meshes again, to be shown.
+        witnesses: Labels of those meshes, in the store of one object, or patterns such as "scans/*"; by default a few
+            that are chosen by their distances.
+        up: Axis that points upwards in the meshes' own coordinates; default the one that they seem to rest on, y or z.
+
+    Returns:
+        The path of the page.
+
+    Raises:
+        InputError: A library of the extra is not installed, the store has no tables yet, a label is unknown, or meshes
+            of a collection are named.
+        StoreError: The location has no store of a study, or the page cannot be written.
+        DamageError: A field is damaged.
+
+    >>> import sobolev_batch as sb
+    >>> sb.report("storage/icosphere.zarr", "report.html").name  # doctest: +SKIP
+    'report.html'
+    """
+    write_page(Path(path), make_report(store, folder=folder, witnesses=witnesses, up=up)[0])
+    return Path(path)
+
+
+def write_page(path: Path, text: str) -> None:
+    """Write a page; StoreError where that cannot be done."""
+    with written(path, "the report"):
+        path.write_text(text, encoding="utf-8")
+
+
+def make_report(
+    store: AnyStore, *, folder: str | Path = ".", witnesses: Sequence[str] = (), up: Axis | None = None
+) -> Page:
+    """Return the report of a store, and what it leaves out; see `report`."""
+    collection = CollectionStore.read(Location.parse(location_of(store)))
+    if collection is None:
+        return _study_page(store, folder, witnesses, up)
+    if witnesses:
+        raise InputError(
+            f"{collection.location}: meshes are shown in the report of one object, such as "
+            f"{collection.location.below(collection.objects[0])}"
+        )
+    content = league_content(collection, Status.of_collection(collection))
+    charts = league_data(content["leagues"], content["name"], content["orders"])
+    families = content["costs"][0].methods if content["costs"] else charts["families"]
+    return _filled("league", content, {**charts, "families": list(families), "costs": cost_data(content["costs"])})
+
+
+def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], up: Axis | None) -> Page:
+    tree = as_tree(store)
+    content = study_content(tree, Status.from_store(store))
+    selection = Selection.from_store(tree)
+    spectra = selection.spectra if selection.has_spectra else None
+    with fields_read(store):
+        views, missing = make_views(tree, folder, witnesses, up=up)
+    charts = {**chart_data(tree, spectra, views), "costs": cost_data(content["costs"])}
+    content["omissions"] += chart_omissions(tree, charts, spectra, views, missing)
+    page = _filled("study", content, charts, spectra=spectra, views=views, missing=missing)
+    require_unchanged(tree)
+    return page
+
+
+def _filled(template: str, content: dict[str, Any], charts: Json, **values: Any) -> Page:
+    """Return a page from its template, with all that it needs to be drawn, and what it leaves out."""
+    # Two thirds of a page, if the browser were not to unpack it.
+    library = plotly.offline.get_plotlyjs()
+    scripts = [_page_file("tables.js"), _page_file("charts.js")]
+    environment = jinja2.Environment(
+        loader=jinja2.FunctionLoader(_page_file),
+        autoescape=True,
+        finalize=_shown,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    text = environment.get_template(f"{template}.html.jinja").render(
+        content=content,
+        charts=charts,
+        data=htmlsafe_json_dumps(_shown_data(charts), allow_nan=False, separators=(",", ":")),
+        style=_page_file("report.css"),
+        library=base64.b64encode(gzip.compress(library.encode("utf-8"), mtime=0)).decode("ascii"),
+        scripts=scripts,
+        # Whatever names and reasons contain, the browser runs no other script and fetches nothing.
+        policy=f"default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
+        f"script-src {' '.join(map(_digest, [library, *scripts]))}; base-uri 'none'; form-action 'none'",
+        written=utc_text(utc_now()),
+        **values,
+    )
+    tables = [table for table in content.values() if isinstance(table, PageTable) and table.omitted]
+    return text, (*(f"the table {one.name}: {one.omitted:,} more rows" for one in tables), *content["omissions"])
+
+
+def _shown(value: Any) -> Any:
+    """Return what a page shows of a value; style sheet, scripts and JSON are ours, and marked as safe."""
+    return visible(value) if isinstance(value, str) and not hasattr(value, "__html__") else value
+
+
+def _shown_data(value: Any) -> Any:
+    """Return data of charts with texts as they are shown."""
+    match value:
+        case dict():
+            return {key: _shown_data(entry) for key, entry in value.items()}
+        case list() | tuple():
+            return list(map(_shown_data, value))
+    return _shown(value)
+
+
+def _page_file(name: str) -> str:
+    return (resources.files("sobolev_batch.extras.report") / "page" / name).read_text(encoding="utf-8")
+
+
+def _digest(script: str) -> str:
+    digest = hashlib.sha256(script.encode("utf-8")).digest()
+    return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
+
+
+def chart_data(tree: xr.DataTree, spectra: Spectra | None, views: Sequence[MeshView]) -> Json:
+    """Return the data of all charts of an open store, with texts not escaped, and null for missing numbers."""
+    orders = finished_group(tree, "convergence")["order"].values.tolist()
+    return {
+        "name": tree.attrs["study"]["table"]["study"]["name"],
+        "orders": [minus(f"{order:g}") for order in orders],
+        "unit": study_unit(tree),
+        "families": list(dict.fromkeys(families_of(tree).values())),
+        "convergence": _convergence(tree, orders, MOST_POINTS // len(orders)),
+        "evolution": _evolution(tree, MOST_POINTS // len(orders)),
+        "matrix": _matrices(tree, orders),
+        "spectrum": None if spectra is None else _spectra(spectra),
+        "energy": None if spectra is None else _energy(spectra, families_of(tree)),
+        "witness": [_view(view) for view in views],
+    }
+
+
+def league_data(leagues: Sequence[League], name: str, orders: Sequence[str]) -> Json:
+    """Return the data of the charts of a collection, which may have no league; see `chart_data`."""
+    return {
+        "name": name,
+        "orders": list(orders),
+        "families": list(leagues[0].methods) if leagues else [],
+        "size": label_of(leagues[0].x) if leagues else "",
+        "league": [
+            [
+                _line(method, np.exp(curve.sizes), np.exp(curve.values), curve.bars)
+                for method in league.methods
+                for curve in [league.mean_curve(method)]
+            ]
+            for league in leagues
+        ],
+    }
+
+
+def cost_data(leagues: Sequence[CostLeague]) -> list[Json] | None:
+    """Return for each order the members that all objects have, method by method, and their front; None without any."""
+    return [
+        {
+            "lines": [
+                _line(method, rows[league.x], rows["relative"], rows["relative_error"], labels=rows["member"].tolist())
+                for method, rows in league.means.groupby("method", sort=False)
+            ],
+            "front": {"x": _numbers(league.front[league.x]), "y": _numbers(league.front["relative"])},
+        }
+        for league in leagues
+    ] or None
+
+
+def _line(family: str, places: Any, values: Any, errors: Any, **others: Any) -> Json:
+    """Return the data of a line with error bars in the colour of a family."""
+    return {"family": family, "x": _numbers(places), "y": _numbers(values), "errors": _numbers(errors, 2), **others}
+
+
+def chart_omissions(
+    tree: xr.DataTree, charts: Json, spectra: Spectra | None, views: Sequence[MeshView], missing: Mapping[str, str]
+) -> Iterator[str]:
+    """Yield what the charts of an open store leave out, and the reasons for meshes without views, for people."""
+    compared = len(set(complete_meshes(tree)) - {reference_of(tree)})
+    drawn = sum(len(family["labels"]) for order in charts["convergence"] for family in order)
+    if drawn < (total := len(_drawable(tree))):
+        yield f"the chart of convergence: only {drawn:,} of {total:,} distances are drawn"
+    if charts["matrix"] and len(charts["matrix"]["labels"]) < charts["matrix"]["total"]:
+        yield f"all pairs: only {len(charts['matrix']['labels'])} of {charts['matrix']['total']:,} meshes are shown"
+    if charts["evolution"] is None and has_times(tree):
+        yield "the chart of distances over time: they are too many"
+    if spectra is not None and spectra.omission:
+        yield f"spectra: only those of {spectra.omission} are shown"
+    if 0 < len(views) < compared:
+        yield f"witness functions: only {len(views)} of {compared:,} meshes are drawn; --mesh chooses them"
+    for label, reason in missing.items():
+        yield f"the witness function of {label}: {reason}"
+
+
+def _convergence(tree: xr.DataTree, orders: list[float], most: int) -> list[list[Json]]:
+    """Return for each order and family the points with their errors."""
+    frame = _drawable(tree)
+    return [
+        [
+            _line(
+                str(family),
+                rows["edge_length"],
+                rows["relative"],
+                rows["relative_error"],
+                joined=is_sequence(rows),
+                labels=rows["mesh"].tolist(),
+                triangles=rows["triangles"].tolist(),
+            )
+            for family, rows in frame[frame["order"] == order][:most].groupby("family", sort=False)
+        ]
+        for order in orders
+    ]
+
+
+def _drawable(tree: xr.DataTree) -> pd.DataFrame:
+    """Return the rows of `table` that have a place on logarithmic axes."""
+    frame = table(tree).sort_values("edge_length", kind="stable")
+    return frame[(frame["relative"] > 0) & frame["edge_length"].notna()]
+
+
+def _evolution(tree: xr.DataTree, most: int) -> list[list[Json]] | None:
+    """Return for each order and family that moves the distances over time; None if there is none, or too many times."""
+    if not has_times(tree):
+        return None
+    found = evolution(tree)
+    if found.sizes["family"] * found.sizes["time"] > most:
+        return None
+    return [
+        [
+            {**_line(family, [], line["distance"].values, line["error"].values), "x": line["time"].values.tolist()}
+            for family in found["family"].values.tolist()
+            for line in [found.sel(order=order, family=family).dropna("time", subset=["distance"])]
+        ]
+        for order in found["order"].values
+    ]
+
+
+def _matrices(tree: xr.DataTree, orders: list[float]) -> Json | None:
+    """Return for each order the lower triangle of distances and errors, and an order of similar meshes."""
+    most = min(MOST_MESHES, int(math.sqrt(MOST_NUMBERS / len(orders))))
+    matrices = [pairs for order in orders if (pairs := pairs_of(tree, order, most)) is not None]
+    if not matrices or not matrices[0].sizes["mesh"]:
+        return None
+    return {
+        "labels": matrices[0]["mesh"].values.tolist(),
+        "total": len(complete_meshes(tree)),
+        "orders": [_matrix(matrix) for matrix in matrices],
+    }
+
+
+def _matrix(pairs: xr.Dataset) -> Json:
+    distances = pairs["distance"].values
+    return {
+        "values": [_numbers(row[:i]) for i, row in enumerate(distances)],
+        "errors": [_numbers(row[:i], digits=2) for i, row in enumerate(pairs["error"].values)],
+        "clustered": clustered_order(distances).tolist(),
+    }
+
+
+def _spectra(spectra: Spectra) -> Json:
+    return {
+        "labels": spectra.labels,
+        "bands": spectra.bands,
+        "shares": [[_numbers(row, digits=3) for row in spectra.shares[:, k]] for k in range(len(spectra.orders))],
+    }
+
+
+def _energy(spectra: Spectra, family_of: Mapping[str, str]) -> list[Json]:
+    return [
+        _line(family_of[label], spectra.wavelengths, energies, errors, label=label)
+        for label, energies, errors in zip(spectra.labels, spectra.energies, spectra.energy_errors, strict=True)
+    ]
+
+
+def _view(view: MeshView) -> Json:
+    # Two bytes are enough for most indices.
+    index = "<u2" if len(view.vertices) <= 1 << 16 else "<i4"
+    return {
+        "label": view.label,
+        "triangles": view.original_triangles,
+        "shown": len(view.triangles),
+        "points": [_packed(axis, "<f4") for axis in view.vertices.T],
+        "corners": [_packed(corner, index) for corner in view.triangles.T],
+        "values": [_packed(values, "<f4") for values in view.values],
+        "limits": _numbers(view.color_limits),
+        "extent": _numbers(np.ptp(view.vertices, axis=0)),
+    }
+
+
+def _numbers(values: Any, digits: int = 4) -> list[float | None]:
+    return [float(f"{value:.{digits}g}") if math.isfinite(value) else None for value in values]
+
+
+def _packed(values: Any, dtype: str) -> Mapping[str, str]:
+    """Return an array as plotly.js reads it."""
+    data = np.ascontiguousarray(values, dtype=dtype)
+    return {"dtype": dtype[1:], "bdata": base64.b64encode(data.tobytes()).decode("ascii")}

@@ -1,0 +1,376 @@
+"""Texts and tables of a report: of a study, with its verdict, and of a collection, with its league."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+import tomli_w
+import xarray as xr
+
+from sobolev_batch.batch.status import Status
+from sobolev_batch.errors import InputError
+from sobolev_batch.extras.leagues.costs import (
+    COST_NOTE,
+    DEFAULT_COST,
+    METHOD_COLUMNS,
+    CostLeague,
+    cost_leagues_of,
+    front_columns,
+)
+from sobolev_batch.extras.leagues.league import (
+    LEAGUE_COLUMNS,
+    LEAGUE_NOTE,
+    PAIR_COLUMNS,
+    League,
+    leagues_of,
+    left_out,
+    number_text,
+    pair_lines,
+    percent_text,
+)
+from sobolev_batch.store.collection_store import CollectionStore
+from sobolev_batch.tables.conclusion import MOST_NAMED, VERDICT_COLUMNS, Row, study_verdict
+from sobolev_batch.tables.convergence import page_columns, table, tables_of, unit_notes, with_remarks
+from sobolev_batch.tables.open import finished_group, has_proximity, open_store, placement_doubts
+from sobolev_batch.tables.text import Column, duration, minus, percent
+from sobolev_batch.transform.lattice import Lattice
+
+# Rows of all convergence tables together, of the table of meshes, and of reasons; browsers become slow beyond.
+MOST_CONVERGENCE_ROWS, MOST_MESH_ROWS, _MOST_REASONS = 10_000, 5_000, 2_000
+
+
+@dataclass(frozen=True)
+class PageTable:
+    """A table of a page.
+
+    Attributes:
+        name: Name, for its address on the page and for the file of its CSV.
+        columns: Columns, that of the labels first.
+        rows: Rows; those of an order follow each other.
+        orders: Orders of the rows; None where they belong to all.
+        is_sortable: True where clicks on the heads sort it.
+        omitted: Number of rows that a page has no room for.
+    """
+
+    name: str
+    columns: Sequence[Column]
+    rows: Sequence[Row]
+    orders: Sequence[float] | None = None
+    is_sortable: bool = True
+    omitted: int = 0
+
+    @property
+    def bodies(self) -> list[tuple[float | None, str, list[Row]]]:
+        """Each order, its text and its rows."""
+        if self.orders is None:
+            return [(None, "", list(self.rows))]
+        return [
+            (order, minus(f"{order:g}"), [row for row in self.rows if row["order"] == order]) for order in self.orders
+        ]
+
+
+def reasons_table(name: str, label: str, reasons: Mapping[str, str]) -> PageTable | None:
+    """Return the table of reasons by mesh or object; None where there are none."""
+    columns = Column(label, label, kind="label"), Column("reason", "reason", kind="text")
+    rows = [{label: key, "reason": reason} for key, reason in list(reasons.items())[:_MOST_REASONS]]
+    omitted = len(reasons) - len(rows)
+    return PageTable(name, columns, rows, is_sortable=False, omitted=omitted) if rows else None
+
+
+def utc_text(time: str) -> str:
+    """Return a time of a record, in UTC, for people."""
+    return time.replace("T", " ").removesuffix("Z")
+
+
+def common_content(
+    title: str,
+    study: Mapping[str, Any],
+    frames: Mapping[str, pd.DataFrame],
+    status: Status,
+    failed: Mapping[str, str],
+    versions: Mapping[str, str],
+) -> dict[str, Any]:
+    """Return what the pages of a study and of a collection both show.
+
+    The study is the table of its file, the frames are the rows of `table` of each object, failures have reasons by
+    label.
+    """
+    # Of the extra, which `make_report` looks for.
+    rows = pd.concat(frames.values(), ignore_index=True)
+    meshes = rows[rows["order"] == rows["order"].iloc[0]]
+    orders = [minus(f"{order:g}") for order in rows["order"].drop_duplicates()]
+    triangles, seconds = meshes["triangles"].sum(), float(meshes["seconds"].sum())
+    return {
+        "title": title,
+        "name": study["study"]["name"],
+        "orders": orders,
+        "summary": {
+            **(
+                {"objects": f"{len(frames):,}", "methods": f"{meshes['family'].nunique():,}"}
+                if "object" in study
+                else {}
+            ),
+            "meshes compared": f"{meshes['distance'].notna().sum():,} of {len(meshes):,}",
+            "orders" if len(orders) > 1 else "order": ", ".join(orders) if len(orders) < 5 else f"{len(orders)}",
+            "triangles in all": f"{triangles:,}" if triangles < 1e6 else f"{triangles / 1e6:,.3g} million",
+            "computing time": duration(seconds),
+        },
+        "failed": reasons_table("failed", "mesh", failed),
+        "not_compared": reasons_table("lacking", "mesh", status.not_compared),
+        "run": dict(_run_facts(status)),
+        "versions": versions,
+        "study_text": tomli_w.dumps(_without_nulls(study)),
+    }
+
+
+def _without_nulls(value: Any) -> Any:
+    """TOML has no null; keys without a value are left out."""
+    if isinstance(value, Mapping):
+        return {key: _without_nulls(entry) for key, entry in value.items() if entry is not None}
+    return [_without_nulls(entry) for entry in value] if isinstance(value, list) else value
+
+
+def _run_facts(status: Status) -> Iterator[tuple[str, str]]:
+    """Yield facts about the latest run, by keyword."""
+    yield "store", status.store
+    yield "surfaces", f"{status.complete} of {status.total} complete, {len(status.failed)} failed"
+    if status.run is not None:
+        yield "state", status.run.state
+        yield "driver", status.run.driver
+        yield "begun", utc_text(status.run.started)
+        yield "ended" if status.run.state in ("done", "failed") else "last sign of life", utc_text(status.run.seen)
+        if status.run.error:
+            yield "error", status.run.error
+
+
+def study_content(tree: xr.DataTree, status: Status) -> dict[str, Any]:
+    """Return what the template of an open store takes, nothing escaped; InputError where it has no tables yet."""
+    meshes, convergence = finished_group(tree, "meshes"), finished_group(tree, "convergence")
+    attributes: Mapping[str, Any] = {str(key): value for key, value in tree.attrs.items()}
+    families = tuple(dict.fromkeys(meshes["family"].values.tolist()))
+    frame, failed, study = table(tree), _failures(meshes), attributes["study"]["table"]
+    sentences, rows, omitted = study_verdict(frame, failed)
+    orders = frame["order"].drop_duplicates().tolist()
+    return {
+        **common_content(attributes["title"], study, {"": frame}, status, failed, attributes["versions"]),
+        **cost_content({str(study["study"]["name"]): frame}, families),
+        "reference": convergence.attrs["reference"],
+        "settings": dict(_settings(attributes)),
+        "sentences": sentences,
+        "verdict": PageTable("verdict", VERDICT_COLUMNS, rows, orders, is_sortable=False),
+        "verdict_omitted": omitted,
+        "convergence": convergence_table(tree, frame, families, MOST_CONVERGENCE_ROWS // convergence.sizes["order"]),
+        "meshes": _meshes_table(meshes, families),
+        "omissions": [f"verdict: only {omitted} are shown"] if omitted else [],
+        "doubtful": reasons_table("doubtful", "mesh", placement_doubts(tree)),
+        "rtol": convergence.attrs.get("rtol"),
+        "has_proximity": has_proximity(tree),
+        "units": " ".join(unit_notes([tree])),
+    }
+
+
+def convergence_table(tree: xr.DataTree, frame: pd.DataFrame, families: Sequence[str], most: int) -> PageTable:
+    """Return the convergence table of an open store, from the rows of `table`, with a limited number of each order."""
+    orders, most = frame["order"].drop_duplicates().tolist(), max(1, most)
+    longest = int(frame.groupby("order").size().max())
+    rows = with_remarks(frame).groupby("order", sort=False).head(most)
+    rows = rows.assign(color=rows["family"].map(families.index), reasons="failed")
+    return PageTable(
+        "convergence", page_columns(tree), rows.to_dict(orient="records"), orders, omitted=max(0, longest - most)
+    )
+
+
+_COUNTS = ["vertices", "triangles", "points", "boundary_edges", "nonmanifold_edges"]
+_MESH_COLUMNS = (
+    Column("mesh", "mesh", kind="label"),
+    Column("vertices", "vertices", "{:,.0f}".format),
+    Column("triangles", "triangles", "{:,.0f}".format),
+    Column("seconds", "seconds", "{:.2f}".format),
+    Column("backend", "backend", kind="text"),
+    Column("area", "area", "{:.4g}".format),
+    Column("boundary_edges", "boundary edges", "{:,.0f}".format),
+    Column("nonmanifold_edges", "non-manifold", "{:,.0f}".format),
+    Column("points", "quadrature points", "{:,.0f}".format),
+    Column("worker", "worker", kind="text"),
+    Column("finished", "finished, UTC", kind="text"),
+)
+
+
+def _meshes_table(meshes: xr.Dataset, families: Sequence[str]) -> PageTable:
+    frame = meshes.reset_coords().to_dataframe().reset_index()
+    # Surfaces in closed form have no counts.
+    rows = frame[:MOST_MESH_ROWS].assign(
+        **{name: frame[name].astype(object).where(frame["triangles"] > 0, None) for name in _COUNTS},
+        color=frame["family"].map(families.index),
+        finished=frame["finished"].dt.strftime("%Y-%m-%d %H:%M:%S").fillna(""),
+    )
+    return PageTable("meshes", _MESH_COLUMNS, rows.to_dict(orient="records"), omitted=len(frame) - len(rows))
+
+
+def _failures(meshes: xr.Dataset) -> dict[str, str]:
+    columns = (meshes[name].values.tolist() for name in ("mesh", "status", "reason"))
+    return {
+        label: reason or "not computed" for label, status, reason in zip(*columns, strict=True) if status != "complete"
+    }
+
+
+def _settings(attributes: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    study = attributes["study"]
+    lattice = Lattice(**study["lattice"])
+    yield "reference", study["reference"]
+    for reason in (study.get("choice") or {}).get("reasons", ()):
+        yield "chosen", reason
+    yield (
+        "lattice",
+        f"frequencies up to {lattice.xi_max:.6g} cycles per unit length on each axis, {lattice.M} intervals "
+        f"(spacing {lattice.spacing:.4g}): wavelengths down to {1 / lattice.xi_max:.4g} units",
+    )
+    octaves = study.get("octaves")
+    if octaves is not None:
+        highest = octaves["cutoff"] * 2 ** len(octaves["octaves"])
+        yield (
+            "octaves",
+            f"{len(octaves['octaves'])} beyond the lattice, at random frequencies up to {highest:.4g} cycles per unit "
+            f"length: wavelengths down to {1 / highest:.4g} units",
+        )
+    computed = (study["choice"] or {"transform_dtype": study["dtype"]})["transform_dtype"]
+    dtype = {"complex128": "double", "complex64": "single"}[computed]
+    eps = "" if study["eps"] is None else f", nonuniform FFT accurate to {study['eps']:g}"
+    yield "arithmetic", f"{dtype} precision{eps}"
+    scale, origin = attributes["similarity"]["scale"], attributes["similarity"]["origin"]
+    yield "similarity", f"scale {scale:.6g}, origin {' '.join(f'{x:.6g}' for x in origin)}"
+
+
+_OBJECT_COLUMNS = (
+    Column("object", "object", kind="label"),
+    Column("best", "best method", kind="text"),
+    Column("relative", "relative", percent, "relative_error"),
+    Column("next", "next", kind="text"),
+    Column("ratio", "times as far", number_text, is_marked=True),
+    Column("meshes", "meshes", "{:,}".format),
+    Column("missing", "missing", "{:,}".format),
+    Column("above_rtol", "above rtol", "{:,}".format),
+)
+# The relative distance comes first: a narrow screen shows no more without scrolling.
+_LEAGUE_COLUMNS = tuple(sorted(LEAGUE_COLUMNS, key=lambda column: (column.kind != "label", column.name != "relative")))
+
+_NO_LEAGUE = "Methods cannot be compared over the objects."
+
+
+def league_content(collection: CollectionStore, status: Status) -> dict[str, Any]:
+    """Return what the template of a collection takes, nothing escaped; InputError where no object has tables yet."""
+    tables = tables_of(collection.existing_stores)
+    try:
+        leagues, no_league = leagues_of(tables, collection.objects), ""
+    except InputError as error:
+        leagues, no_league = (), str(error)
+    orders = list(dict.fromkeys(float(s) for frame in tables.values() for s in frame["order"]))
+    one = collection.location.below(collection.objects[0])
+    by_order = {league.order: league for league in leagues}
+    objects = [row for s in orders for row in _object_rows(tables, s, by_order.get(s))]
+    ranked, pairs = ([row for league in leagues for row in _rows(league, name)] for name in ("table", "pairs"))
+    methods = leagues[0].methods if leagues else list(dict.fromkeys(pd.concat(tables.values())["family"]))
+    versions = open_store(collection.location.below(next(iter(tables)))).attrs["versions"]
+    return {
+        **common_content(collection.title, collection.table, tables, status, status.failed, versions),
+        **cost_content(tables, methods),
+        "leagues": leagues,
+        "no_league": no_league,
+        "sentences": tuple(map(sentence_of, leagues)) or (_NO_LEAGUE,) * len(orders),
+        "differences": tuple(tuple(pair_lines(one)) for one in leagues),
+        "note": LEAGUE_NOTE.format(x=leagues[0].x).replace("\n", " ") if leagues else "",
+        "league": PageTable("league", _LEAGUE_COLUMNS, ranked, [*by_order]),
+        "pairs": PageTable("pairs", PAIR_COLUMNS, pairs, [*by_order]) if pairs else None,
+        "objects": PageTable("objects", _OBJECT_COLUMNS, objects, orders),
+        "omissions": [
+            f"single meshes: each object has a report of its own, such as that of {one}",
+            *(f"{name}, from the league{where}: {why}" for name, where, why in left_out(leagues)),
+        ],
+    }
+
+
+def cost_content(tables: Mapping[str, pd.DataFrame], methods: Sequence[str]) -> dict[str, Any]:
+    """Return the leagues by cost of objects, from the rows of `table` of each; none where no cost is known."""
+    leagues: Sequence[CostLeague] = ()
+    with suppress(InputError):
+        leagues = cost_leagues_of(tables, list(tables), DEFAULT_COST, methods)
+    found = {name: [row for one in leagues for row in _rows(one, name)] for name in ("table", "front")}
+    orders = [one.order for one in leagues]
+    return {
+        "costs": leagues,
+        "cost_methods": PageTable("cost-methods", METHOD_COLUMNS, found["table"], orders),
+        "cost_front": PageTable("cost-front", front_columns(DEFAULT_COST), found["front"], orders),
+        "cost_note": COST_NOTE.replace("\n", " "),
+    }
+
+
+def sentence_of(league: League) -> str:
+    """Return a sentence on which method is nearest at one order."""
+    table, count = league.table, len(league.objects)
+    first, amount = table["method"].iloc[0], percent_text(table["relative"].iloc[0])
+    at_order = minus(f"at order {league.order:g}")
+    over = f"over {count} objects" if count > 1 else f"on {league.objects[0]}"
+    if len(table) == 1:
+        return f"{first} differs from the references by {amount} {over} {at_order}."
+    leaders = table[table["rank"] == 1]["method"].tolist()
+    if len(leaders) == 1:
+        return f"{first} is nearest to the references {over} {at_order}: it differs by {amount}."
+    if count == 1:
+        return f"{first} is nearest {over} {at_order}: it differs by {amount}. One object ranks no methods."
+    names = f"{', '.join(leaders[:-1])} and {leaders[-1]}"
+    if len(leaders) > MOST_NAMED:
+        names = f"{len(leaders)} of {len(table)} methods"
+    return f"The intervals do not separate {names} {over} {at_order}. {first} has the smallest mean, {amount}."
+
+
+def _rows(league: League | CostLeague, name: Literal["table", "pairs", "front"]) -> list[Row]:
+    """Return the rows of a table of a league, with the colours of the methods."""
+    frame: pd.DataFrame = getattr(league, name)
+    colors = frame["method"].map(list(league.methods).index)
+    return list(frame.assign(order=league.order, color=colors).to_dict(orient="records"))
+
+
+def _object_rows(tables: Mapping[str, pd.DataFrame], order: float, league: League | None) -> Iterator[Row]:
+    """Yield the objects with their best methods at one order."""
+    for name, frame in tables.items():
+        meshes = frame[frame["order"] == order]
+        known = meshes[meshes["distance"].notna()]
+        row = {
+            "order": order,
+            "object": name,
+            "meshes": len(known),
+            "missing": len(meshes) - len(known),
+            "above_rtol": int((known["resolved"].astype(bool) & ~known["within"].astype(bool)).sum()),
+        }
+        if league is None or name not in league.objects:
+            reason = league.left_out.get(name, "no distances") if league else "methods cannot be compared"
+            yield {**row, "absent": f"left out: {reason}"}
+        else:
+            yield {**row, **_best(league, league.objects.index(name))}
+
+
+def _best(league: League, number: int) -> Row:
+    """Return the best method of an object, and the next one."""
+    values, errors = league.values[number], league.errors[number]
+    first, *others = np.argsort(values, kind="stable").tolist()
+    relative = float(np.exp(values[first]))
+    row = {
+        "best": league.methods[first],
+        "relative": relative,
+        "relative_error": relative * float(np.expm1(errors[first])),
+    }
+    if not others:
+        return {**row, "next": "", "ratio": None}
+    second = others[0]
+    is_open = values[second] - errors[second] < values[first] + errors[first]
+    return {
+        **row,
+        "next": league.methods[second],
+        "ratio": float(np.exp(values[second] - values[first])),
+        "mark": "within errors" if is_open else "",
+    }

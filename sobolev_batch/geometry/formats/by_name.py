@@ -1,0 +1,96 @@
+"""Formats of mesh files, found by the names of files: those of this package, and of others that are installed.
+
+A format comes from an entry point of the group ``sobolev_batch.formats``, which names a tuple of `Format`. What is read
+rarely comes the same way from the extras of this package.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
+from pathlib import Path, PurePath
+
+from sobolev_batch.geometry.formats.parsing import Raw, is_gzipped
+from sobolev_batch.geometry.formats.plain_formats import (
+    parse_obj,
+    parse_off,
+    parse_ply,
+    parse_stl,
+    write_obj,
+    write_off,
+    write_ply,
+    write_stl,
+)
+from sobolev_batch.geometry.mesh import Mesh
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format of mesh files.
+
+    Attributes:
+        suffixes: Suffixes of its files, in lower case; one name without a dot where `is_name` tells its files.
+        parse: Function of the contents of a file, which returns vertices and triangles.
+        file_bytes: Bytes of each triangle, in a file of nothing but positions and triangles.
+        memory_bytes: Bytes of each triangle, at the measured peak of reading it.
+        write: Function of a mesh, which returns the contents of a file; None for a format that is only read.
+        is_name: Tells whether a name in lower case, without .gz, is that of a file of the format, where no suffix does.
+    """
+
+    suffixes: tuple[str, ...]
+    parse: Callable[[bytes], Raw]
+    file_bytes: int
+    memory_bytes: int
+    write: Callable[[Mesh], bytes] | None = None
+    is_name: Callable[[str], bool] | None = None
+
+
+_PLAIN = (
+    Format((".ply",), parse_ply, 19, 90, write_ply),
+    Format((".obj",), parse_obj, 35, 240, write_obj),
+    Format((".stl",), parse_stl, 50, 270, write_stl),
+    Format((".off",), parse_off, 35, 240, write_off),
+)
+_GROUP = "sobolev_batch.formats"
+_EXTRAS = "sobolev_batch.extras"
+
+
+def _known() -> dict[str, Format]:
+    """Return the formats by suffix; the first one that has a suffix keeps it."""
+    own = [EntryPoint("extras", f"{_EXTRAS}.formats.read_only:FORMATS", _GROUP)] if find_spec(_EXTRAS) else []
+    known: dict[str, Format] = {}
+    for form in (*_PLAIN, *(form for point in (*own, *entry_points(group=_GROUP)) for form in point.load())):
+        for suffix in form.suffixes:
+            known.setdefault(suffix, form)
+    return known
+
+
+BY_SUFFIX = _known()
+# What makes the contents of a file from a mesh, by suffix.
+WRITERS = {suffix: form.write for suffix, form in BY_SUFFIX.items() if form.write is not None}
+
+
+def mesh_format(path: PurePath) -> str:
+    """Return the suffix in lower case and without .gz, or the name of a format without suffixes."""
+    name = _unpacked_name(path).lower()
+    suffix = Path(name).suffix
+    if suffix in BY_SUFFIX:
+        return suffix
+    return next((form.suffixes[0] for form in BY_SUFFIX.values() if form.is_name and form.is_name(name)), suffix)
+
+
+def is_mesh_name(path: Path) -> bool:
+    """Return whether a file has the name of a mesh in a format that is read."""
+    return mesh_format(path) in BY_SUFFIX
+
+
+def mesh_stem(path: PurePath) -> str:
+    """Return the name of a file without its format and compression; names of formats without a suffix are all stem."""
+    name, form = _unpacked_name(path), BY_SUFFIX.get(mesh_format(path))
+    return name if form and form.is_name else Path(name).stem
+
+
+def _unpacked_name(path: PurePath) -> str:
+    return path.name[: -len(".gz")] if is_gzipped(path) else path.name

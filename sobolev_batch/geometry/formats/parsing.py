@@ -1,0 +1,199 @@
+"""What parsers share: the bytes of regular files, unpacked but bounded; XML in small parts; polygons as triangles."""
+
+from __future__ import annotations
+
+import errno
+import gzip
+import io
+import os
+import stat
+import zlib
+from collections.abc import Iterator, Sequence
+from io import BufferedReader
+from pathlib import Path, PurePath
+from typing import IO, Any, cast
+from xml.parsers import expat
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sobolev_batch.errors import MeshError
+from sobolev_batch.geometry.surface import Indices
+from sobolev_batch.parameters import format_bytes, machine_memory
+
+# What a parser makes of a file: vertices (n, 3) and triangles (m, 3).
+Raw = tuple[NDArray[Any], NDArray[Any]]
+
+# No larger file is read; 8 GiB hold some 160 million binary STL triangles.
+_LARGEST_BYTES = 8 << 30
+# Mesh files shrink to a tenth at best: packed ones may grow by such a factor, or to a harmless size.
+_LARGEST_PACKING, _HARMLESS_BYTES = 100, 16 << 20
+_CHUNK_BYTES = 1 << 20
+# Part of the machine's memory that reading a file may take; others use it too.
+_MEMORY_PART = 0.75
+# XML that parsers would go through again and again, or hold in memory many times over: one tag with its attributes,
+# comment or instruction, elements within each other, and elements in all. Those of surfaces are a few hundred bytes,
+# five deep and a few hundred.
+_LONGEST_MARKUP, _DEEPEST, _MOST_ELEMENTS = 1 << 16, 100, 100_000
+_XML_BYTES = 1 << 14
+
+
+def open_regular(path: Path) -> BufferedReader:
+    """Open a regular file for reading; OSError or, for impossible names, ValueError where that fails.
+
+    Pipes could keep a reader waiting for ever, devices could never end.
+    """
+    mode = path.stat().st_mode
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+    if not stat.S_ISREG(mode):
+        raise OSError(errno.EINVAL, "it is a pipe, a socket or a device, and no regular file")
+    return path.open("rb")
+
+
+def checked_length(file: IO[bytes]) -> int:
+    """Return the length of an open file."""
+    length = os.fstat(file.fileno()).st_size
+    if length > _LARGEST_BYTES:
+        raise MeshError(f"larger than {_LARGEST_BYTES} bytes, which is the most that is read: {length}")
+    return length
+
+
+def is_gzipped(path: PurePath) -> bool:
+    """Return whether the name of a file says that it is compressed."""
+    return path.name.lower().endswith(".gz")
+
+
+def require_memory_to_read(needed_bytes: float) -> None:
+    """Refuse a file, before it is read, that takes more memory than reading may."""
+    if needed_bytes <= _HARMLESS_BYTES:
+        # To look at the limits takes longer than to read a small file.
+        return
+    most, source = machine_memory()
+    if needed_bytes > _MEMORY_PART * most:
+        raise MeshError(
+            f"takes up to {format_bytes(needed_bytes)} of memory to read, and may take {_MEMORY_PART:.0%} of "
+            f"{format_bytes(most)}, {source}; read it where there is more, or give a coarser mesh"
+        )
+
+
+def read_unpacked(path: Path, factor: float) -> bytes:
+    """Return the bytes of a regular file, unpacked if its name ends in .gz, at a factor of memory for each byte."""
+    try:
+        with open_regular(path) as file:
+            length = checked_length(file)
+            if is_gzipped(path):
+                data = _read_unpacked_bounded(file, length, factor)
+            else:
+                require_memory_to_read(factor * length)
+                data = file.read(length)
+    except (OSError, EOFError, ValueError, zlib.error) as error:
+        raise MeshError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    if not data:
+        raise MeshError("the file is empty")
+    return data
+
+
+def unpacked_limit(packed_bytes: int) -> int:
+    """Return the most bytes that packed ones may unpack to: a hundredfold, at least 16 MiB and at most 8 GiB."""
+    return min(_LARGEST_BYTES, max(_HARMLESS_BYTES, _LARGEST_PACKING * packed_bytes))
+
+
+def xml_events(data: bytes, kind: str) -> Iterator[tuple[str, str, dict[str, str]]]:
+    """Parse XML a little at a time, and refuse what would take memory out of proportion in a file of some kind.
+
+    Yield ("start", name, attributes) and ("end", name, {}) of each element, and ("text", piece, {}) between them.
+    """
+    events: list[tuple[str, str, dict[str, str]]] = []
+    heard = 0
+
+    def refuse_entity(name: str, *_: object) -> None:
+        raise MeshError(f"the XML declares the entity {name[:40]!r}; a {kind} file has none, write it without")
+
+    def hear(_: str) -> None:
+        nonlocal heard
+        heard += 1
+
+    parser = expat.ParserCreate()
+    parser.buffer_text = True
+    parser.EntityDeclHandler, parser.DefaultHandlerExpand = refuse_entity, hear
+    parser.StartElementHandler = lambda name, attributes: events.append(("start", name, attributes))
+    parser.EndElementHandler = lambda name: events.append(("end", name, {}))
+    parser.CharacterDataHandler = lambda piece: events.append(("text", piece, {}))
+    silent = depth = elements = 0
+    for place in range(0, len(data), _XML_BYTES):
+        heard = 0
+        parser.Parse(memoryview(data)[place : place + _XML_BYTES], False)
+        # The parser tells of text at once, and keeps everything else until it is complete.
+        silent = 0 if heard or events else silent + _XML_BYTES
+        if silent > _LONGEST_MARKUP:
+            raise MeshError(
+                f"the XML has an attribute, name or comment of more than {_LONGEST_MARKUP} bytes, which goes on "
+                f"at byte {place + _XML_BYTES}; a {kind} file has none, write it without"
+            )
+        for event in events:
+            elements += event[0] == "start"
+            depth += (event[0] == "start") - (event[0] == "end")
+            if depth > _DEEPEST or elements > _MOST_ELEMENTS:
+                raise MeshError(
+                    f"the XML has element {elements} at the depth {depth}; a {kind} file has at most {_MOST_ELEMENTS} "
+                    f"elements, nested up to {_DEEPEST} deep: save it with the surface alone"
+                )
+            yield event
+        events.clear()
+    parser.Parse(b"", True)
+    yield from events
+
+
+def _read_unpacked_bounded(file: IO[bytes], length: int, factor: float) -> bytes:
+    """Return what a packed file holds; it is refused as soon as that exceeds a bound."""
+    most = unpacked_limit(length)
+    data = io.BytesIO()
+    with gzip.GzipFile(fileobj=file) as unpacked:
+        # One large read would reserve the bound at once.
+        while chunk := cast(IO[bytes], unpacked).read(_CHUNK_BYTES):
+            data.write(chunk)
+            if data.tell() > most:
+                raise MeshError(
+                    f"larger than {most} bytes once it is unpacked from {length}: no mesh file shrinks that far"
+                )
+            if data.tell() > _HARMLESS_BYTES:
+                require_memory_to_read(factor * data.tell())
+    return data.getvalue()
+
+
+def triangle_fans(corners: Indices, sizes: Indices) -> Indices:
+    """Cut each polygon into the fan of triangles around its first corner, exact for convex ones, int64 (m, 3).
+
+    The corners are vertex indices of all polygons, one after the other, the sizes their numbers. Triangles of a polygon
+    lie next to each other.
+    """
+    if not len(sizes):
+        raise MeshError("the file has no faces")
+    short = np.flatnonzero(sizes < 3)
+    if short.size:
+        raise MeshError(f"face {short[0] + 1} has {sizes[short[0]]} vertices, expected three or more")
+    if (sizes == 3).all():
+        return corners.reshape(-1, 3)
+    # The place of the first corner of each triangle's polygon, and the rank of the triangle in it.
+    ends = np.cumsum(sizes - 2)
+    first = np.repeat(np.cumsum(sizes) - sizes, sizes - 2)
+    rank = np.arange(ends[-1]) - np.repeat(ends - (sizes - 2), sizes - 2)
+    return np.stack([corners[first], corners[first + rank + 1], corners[first + rank + 2]], axis=1)
+
+
+def triangle_fans_of_lists(polygons: Sequence[ArrayLike]) -> Indices:
+    """Cut polygons, each a sequence of vertex indices, as `triangle_fans` does."""
+    if not len(polygons):
+        raise MeshError("the file has no faces")
+    sizes = np.array([len(np.asarray(polygon)) for polygon in polygons], dtype=np.int64)
+    return triangle_fans(np.concatenate([np.asarray(polygon, dtype=np.int64) for polygon in polygons]), sizes)
+
+
+def merge_coincident(vertices: NDArray[np.floating], triangles: Indices) -> tuple[NDArray[np.floating], Indices]:
+    """Merge vertices with exactly the same coordinates, for formats that repeat them."""
+    if not np.isfinite(vertices).all():
+        # The mesh refuses them and names the entries.
+        return vertices, triangles
+    merged, indices = np.unique(vertices, axis=0, return_inverse=True)
+    return merged, indices.reshape(-1)[triangles]

@@ -1,0 +1,374 @@
+"""PLY, OBJ, OFF and STL files, read with every line and every announced count checked, and written.
+
+PLY files are parsed by the library plyfile. Those at hand for the others silently lose or change faces where a line is
+not what they expect.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import warnings
+from array import array
+from collections.abc import Iterator, Mapping, Sequence
+from tempfile import TemporaryFile
+from typing import IO
+
+import numpy as np
+from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement, PlyElementParseError
+
+from sobolev_batch.errors import MeshError
+from sobolev_batch.geometry.formats.parsing import Raw, merge_coincident, triangle_fans, triangle_fans_of_lists
+from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.geometry.surface import Indices, Reals, normals
+
+# Numbers per vertex line: x y z, with a weight, a colour, or both.
+_OBJ_VERTEX_SIZES = (3, 4, 6, 7)
+# Further numbers per vertex line, by the kind of file, and per face line: a colour or its index.
+_OFF_EXTRAS = {"": 0, "N": 3, "C": 4, "CN": 7}
+_OFF_FACE_EXTRAS = (0, 1, 3, 4)
+# Digits of an index or count: all that fit into 64 bits.
+_MOST_DIGITS = 18
+# Characters of a line: a polygon of a hundred thousand corners.
+_LONGEST_LINE = 1 << 20
+# Seventeen digits give every double back.
+_DIGITS = "%.17g"
+_STL_HEADER_BYTES = 84
+_STL_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+# A header of PLY ends within this many bytes: room for a thousand lines, and quick to look through.
+HEADER_BYTES = 1 << 16
+_END = b"end_header"
+_LINE = re.compile(rb"\S[^\r\n]*")
+_CORNERS = ("vertex_indices", "vertex_index")
+_SHORT, _LONG = (b"short", b"ushort", b"int16", b"uint16"), (b"int", b"uint", b"float", b"int32", b"uint32", b"float32")
+_TYPE_BYTES = dict.fromkeys(_SHORT, 2) | dict.fromkeys(_LONG, 4) | dict.fromkeys((b"double", b"float64"), 8)
+# A digit and the character that ends it.
+_TEXT_BYTES = 2
+
+
+def parse_ply(data: bytes) -> Raw:
+    """Return the vertices and triangles of a PLY file, in its own precision."""
+    counts, is_text = _checked_counts(data)
+    if is_text:
+        ply = _parsed(data)
+    else:
+        # A real file: the library reads other streams row by row.
+        with TemporaryFile() as stream:
+            stream.write(data)
+            del data
+            ply = _parsed(stream)
+            read = stream.tell()
+            unread = stream.seek(0, os.SEEK_END) - read
+        if unread:
+            raise MeshError(f"the PLY header announces {counts}, but {unread} bytes more follow")
+    vertices = np.stack([ply["vertex"][axis] for axis in "xyz"], axis=1)
+    return vertices, _triangles(ply["face"])
+
+
+def announced_sizes(header: bytes) -> tuple[int, int, bool]:
+    """Return the numbers of vertices and faces that a header announces, 0 where it does not, and whether it is text."""
+    counts, _, is_text = _announced(header.partition(_END)[0])
+    return counts.get("vertex", 0), counts.get("face", 0), is_text
+
+
+def parse_obj(data: bytes) -> Raw:
+    """Return the vertices (n, 3) and triangles (m, 3) of an OBJ file, all its objects and groups together."""
+    vertices, corners, sizes = array("d"), array("q"), array("q")
+    for line in _joined_lines(data):
+        words = line.partition("#")[0].split()
+        if not words:
+            continue
+        if words[0] == "v":
+            number = len(vertices) // 3 + 1
+            if len(words) - 1 not in _OBJ_VERTEX_SIZES:
+                raise MeshError(f"vertex {number} has {len(words) - 1} coordinates, expected three")
+            vertices.extend(_parsed_numbers(words[1:4], f"vertex {number}"))
+        elif words[0] == "f":
+            corners.extend(_obj_corner(word, len(vertices) // 3, len(sizes) + 1) for word in words[1:])
+            sizes.append(len(words) - 1)
+    return np.array(vertices).reshape(-1, 3), triangle_fans(np.array(corners), np.array(sizes))
+
+
+def parse_off(data: bytes) -> Raw:
+    """Return the vertices (n, 3) and triangles (m, 3) of an OFF file in text."""
+    lines = (words for line in _text_lines(data) if (words := line.partition("#")[0].split()))
+    first = next(lines, [""])
+    kind = re.fullmatch(r"(C?N?)OFF", first[0])
+    if kind is None:
+        raise MeshError("the file does not begin with OFF, COFF, NOFF or CNOFF")
+    counts = first[1:] or next(lines, [])
+    if len(counts) not in (2, 3) or not all(map(_is_count, counts)):
+        raise MeshError("the OFF header does not announce vertices and faces")
+    vertex_count, face_count = int(counts[0]), int(counts[1])
+    vertices, corners, sizes = array("d"), array("q"), array("q")
+    found = 0
+    for found, words in enumerate(lines, 1):
+        if found <= vertex_count:
+            if len(words) != 3 + _OFF_EXTRAS[kind[1]]:
+                raise MeshError(f"vertex {found} has {len(words)} numbers, expected {3 + _OFF_EXTRAS[kind[1]]}")
+            vertices.extend(_parsed_numbers(words, f"vertex {found}")[:3])
+            continue
+        face = f"face {found - vertex_count}"
+        size = _integer(words[0], face)
+        if size < 0 or len(words) - 1 - size not in _OFF_FACE_EXTRAS:
+            raise MeshError(f"{face} announces {size} corners, but {len(words) - 1} numbers follow")
+        corners.extend(_integer(word, face) for word in words[1 : 1 + size])
+        sizes.append(size)
+    if vertex_count + face_count != found:
+        raise MeshError(
+            f"the OFF header announces {vertex_count + face_count} lines, {vertex_count} for vertices and "
+            f"{face_count} for faces, found {found}"
+        )
+    return np.array(vertices).reshape(-1, 3), triangle_fans(np.array(corners), np.array(sizes))
+
+
+def parse_stl(data: bytes) -> Raw:
+    """Return the vertices and triangles of an STL file; corners that coincide exactly are merged."""
+    announced = int.from_bytes(data[80:_STL_HEADER_BYTES], "little")
+    if len(data) >= _STL_HEADER_BYTES and len(data) == _STL_HEADER_BYTES + _STL_RECORD.itemsize * announced:
+        corners = np.frombuffer(data, _STL_RECORD, offset=_STL_HEADER_BYTES)["corners"].reshape(-1, 3)
+    elif data.lstrip()[:5].lower() == b"solid":
+        corners = _stl_text_corners(data)
+    else:
+        count = (len(data) - _STL_HEADER_BYTES) / _STL_RECORD.itemsize
+        raise MeshError(
+            f"a binary STL file of {len(data)} bytes holds {count:.2f} triangles, but its header announces {announced}"
+        )
+    if not len(corners):
+        raise MeshError("the file has no faces")
+    return merge_coincident(corners, np.arange(len(corners), dtype=np.int64).reshape(-1, 3))
+
+
+def write_ply(
+    mesh: Mesh, values: Mapping[str, NDArray[np.floating]] | None = None, comments: Sequence[str] = ()
+) -> bytes:
+    """Return a binary PLY file, all digits kept, with further values (n,) of the vertices by their names."""
+    columns = {**dict(zip("xyz", mesh.vertices.T, strict=True)), **(values or {})}
+    kinds = [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()]
+    vertices = np.empty(len(mesh.vertices), dtype=kinds)
+    for name, column in columns.items():
+        vertices[name] = column
+    faces = np.empty(len(mesh.triangles), dtype=[("vertex_indices", "<i4", (3,))])
+    faces["vertex_indices"] = mesh.triangles
+    elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
+    file = io.BytesIO()
+    PlyData(elements, text=False, byte_order="<", comments=comments).write(file)
+    return file.getvalue()
+
+
+def write_obj(mesh: Mesh) -> bytes:
+    """Return an OBJ file, all digits kept."""
+    file = io.BytesIO()
+    np.savetxt(file, mesh.vertices, fmt=f"v {_DIGITS} {_DIGITS} {_DIGITS}")
+    np.savetxt(file, mesh.triangles + 1, fmt="f %d %d %d")
+    return file.getvalue()
+
+
+def write_off(mesh: Mesh) -> bytes:
+    """Return an OFF file, all digits kept."""
+    file = io.BytesIO()
+    file.write(f"OFF\n{len(mesh.vertices)} {len(mesh.triangles)} 0\n".encode())
+    np.savetxt(file, mesh.vertices, fmt=_DIGITS)
+    np.savetxt(file, mesh.triangles, fmt="3 %d %d %d")
+    return file.getvalue()
+
+
+def write_stl(mesh: Mesh) -> bytes:
+    """Return a binary STL file, which has single precision and no shared vertices."""
+    across = normals(mesh.vertices, mesh.triangles)
+    lengths = np.linalg.norm(across, axis=1, keepdims=True)
+    records = np.zeros(len(across), _STL_RECORD)
+    records["corners"] = mesh.vertices[mesh.triangles]
+    # That of a triangle without an area is zero.
+    records["normal"] = np.divide(across, lengths, where=lengths > 0, out=np.zeros_like(across))
+    header = bytes(_STL_HEADER_BYTES - 4) + len(across).to_bytes(4, "little")
+    return header + records.tobytes()
+
+
+def _text_lines(data: bytes) -> Iterator[str]:
+    """Yield the lines of a text one by one, each with a line feed at its end, which the last may lack."""
+    reader = io.TextIOWrapper(io.BytesIO(data), "utf-8-sig", errors="replace")
+    number = 0
+    while line := reader.readline(_LONGEST_LINE + 1):
+        number += 1
+        if len(line) > _LONGEST_LINE:
+            raise MeshError(
+                f"line {number} has more than {_LONGEST_LINE} characters; cut its polygon into smaller ones"
+            )
+        yield line
+
+
+def _joined_lines(data: bytes) -> Iterator[str]:
+    """Yield the lines of an OBJ file, where one that ends in a backslash goes on in the next."""
+    parts: list[str] = []
+    length = 0
+    for line in _text_lines(data):
+        is_continued = line.endswith("\\\n")
+        parts.append(f"{line[:-2]} " if is_continued else line)
+        length += len(line)
+        if length > _LONGEST_LINE:
+            raise MeshError(
+                f"a line goes on for more than {_LONGEST_LINE} characters; cut its polygon into smaller ones"
+            )
+        if not is_continued:
+            yield "".join(parts)
+            parts, length = [], 0
+    if parts:
+        yield "".join(parts)
+
+
+def _is_count(word: str) -> bool:
+    # Other digits than these are digits to Python too.
+    return word.isascii() and word.isdigit() and len(word) <= _MOST_DIGITS
+
+
+def _parsed_numbers(words: list[str], owner: str) -> list[float]:
+    """Return words as numbers; an error begins with their owner, such as "vertex 7"."""
+    try:
+        if any("_" in word for word in words):
+            raise ValueError("Python's spelling, not that of any mesh format")
+        return [float(word) for word in words]
+    except ValueError as error:
+        raise MeshError(f"{owner} has a coordinate that is not a number: {' '.join(words)[:80]!r}") from error
+
+
+def _integer(word: str, owner: str) -> int:
+    try:
+        if len(word) > _MOST_DIGITS or "_" in word:
+            raise ValueError("too long, or Python's spelling")
+        return int(word)
+    except ValueError as error:
+        raise MeshError(
+            f"{owner} has an index that is no integer of up to {_MOST_DIGITS} digits: {word[:80]!r}"
+        ) from error
+
+
+def _obj_corner(word: str, vertices_so_far: int, face: int) -> int:
+    """Return the index from 0 of a corner such as 7, 7/1, 7//3 or -1; negative ones count back from their line."""
+    index = _integer(word.partition("/")[0], f"face {face}")
+    if index == 0:
+        raise MeshError(f"face {face} has the vertex index 0; OBJ counts from 1")
+    if index > 0:
+        return index - 1
+    if index < -vertices_so_far:
+        raise MeshError(f"face {face} counts {-index} vertices back, but only {vertices_so_far} stand before it")
+    return vertices_so_far + index
+
+
+def _stl_text_corners(data: bytes) -> Reals:
+    corners = array("d")
+    facet, facet_corners, in_solid = 0, 0, False
+    for line in _text_lines(data):
+        words = line.split()
+        match words[0].lower() if words else "":
+            case "":
+                continue
+            case "solid" | "endsolid" as word:
+                in_solid = word == "solid"
+            case "facet":
+                facet, facet_corners = facet + 1, 0
+            case "vertex":
+                if len(words) != 4:
+                    raise MeshError(f"facet {facet} has a vertex of {len(words) - 1} coordinates, expected three")
+                corners.extend(_parsed_numbers(words[1:], f"facet {facet}"))
+                facet_corners += 1
+            case "endfacet":
+                if facet_corners != 3:
+                    raise MeshError(f"facet {facet} has {facet_corners} vertices, expected three")
+                facet_corners = 0
+            case "outer" | "endloop":
+                continue
+            case other:
+                raise MeshError(f"after facet {facet}: {other[:40]!r} is no word of an STL file")
+    if in_solid or facet_corners:
+        raise MeshError(f"the file breaks off after facet {facet}: its last solid does not end")
+    return np.array(corners).reshape(-1, 3)
+
+
+def _announced(header: bytes) -> tuple[dict[str, int], int, bool]:
+    """Return the number of entries of each element, their smallest possible length, and whether they are text."""
+    counts: dict[str, int] = {}
+    row_bytes: dict[str, int] = {}
+    element, is_text = "", False
+    for line in header.splitlines():
+        match line.split():
+            case [b"format", kind, *_]:
+                is_text = kind == b"ascii"
+            case [b"element", name, count, *_]:
+                element = name.decode("ascii", errors="replace")
+                if not count.isdigit() or len(count) > _MOST_DIGITS:
+                    raise MeshError(f"the PLY header announces {count[:40]!r} entries of {element[:40]!r}")
+                counts[element], row_bytes[element] = int(count), 0
+            case [b"property", b"list", kind, _, _] | [b"property", kind, _] if element:
+                row_bytes[element] += _TEXT_BYTES if is_text else _TYPE_BYTES.get(kind, 1)
+    # The last number of a text need not be followed by anything.
+    least_bytes = sum(count * max(row_bytes[name], 1) for name, count in counts.items()) - is_text
+    return counts, least_bytes, is_text
+
+
+def _checked_counts(data: bytes) -> tuple[dict[str, int], bool]:
+    """Return the counts that a header announces, which its contents can have, and whether they are text."""
+    start = data.find(_END, 0, HEADER_BYTES)
+    length = len(data) - start - len(_END)
+    counts, least_bytes, is_text = _announced(data[: max(start, 0)])
+    if counts.get("vertex") and not counts.get("face"):
+        raise MeshError(
+            f"the PLY file has {counts['vertex']} vertices and no faces: it holds points and no surface; make a mesh "
+            "of them first"
+        )
+    if start < 0 or not {"vertex", "face"} <= set(counts):
+        raise MeshError(f"no PLY header announces vertices and faces in the first {HEADER_BYTES} bytes")
+    # The library would reserve memory for any count.
+    if least_bytes > length:
+        raise MeshError(f"the PLY header announces {counts}, but only {length} bytes follow")
+    if is_text and data.find(b"_", start + len(_END)) >= 0:
+        raise MeshError("the PLY file has a number with an underscore, which is Python's spelling and not that of PLY")
+    entries = sum(counts.values())
+    lines = _line_count(data, start) if is_text else entries
+    if lines != entries:
+        raise MeshError(f"the PLY header announces {entries} entries, found {lines}")
+    return counts, is_text
+
+
+def _line_count(data: bytes, start: int) -> int:
+    """Return the number of lines of a text that are not empty, after the one that begins at a place."""
+    count = 0
+    # From the first visible character of each line on: no list of all lines, and no line looked through twice.
+    for line in _LINE.finditer(data, start):
+        if line.end() - line.start() > _LONGEST_LINE:
+            raise MeshError(f"a line of the PLY file has more than {_LONGEST_LINE} characters; cut its polygon")
+        count += 1
+    return count - 1
+
+
+def _parsed(source: bytes | IO[bytes]) -> PlyData:
+    try:
+        # Reads all faces at once; the library refuses where one of them is no triangle.
+        return _read(source, {"face": dict.fromkeys(_CORNERS, 3)})
+    except (PlyElementParseError, KeyError):
+        return _read(source, {})
+
+
+def _read(source: bytes | IO[bytes], lengths: dict[str, dict[str, int]]) -> PlyData:
+    # The library closes the stream of a text.
+    stream = io.BytesIO(source) if isinstance(source, bytes) else source
+    stream.seek(0)
+    with warnings.catch_warnings():
+        # NumPy warns where an element has no entries.
+        warnings.filterwarnings("ignore", "loadtxt: input contained no data")
+        return PlyData.read(stream, known_list_len=lengths)
+
+
+def _triangles(faces: PlyElement) -> Indices:
+    names = [name for name in _CORNERS if name in faces.data.dtype.names]
+    if not names:
+        raise MeshError("the PLY faces have no list vertex_indices")
+    kind = faces.ply_property(names[0]).val_dtype
+    if not kind.startswith(("i", "u")):
+        raise MeshError(f"the PLY faces have indices that are not integers, but of the type {kind}")
+    corners = faces[names[0]]
+    if corners.ndim == 2:
+        return np.asarray(corners, dtype=np.int64)
+    return triangle_fans_of_lists(corners)

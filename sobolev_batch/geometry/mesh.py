@@ -1,0 +1,495 @@
+"""Triangle meshes, checked once and then frozen; counts of what is unusual in them, and what two of them share."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sobolev_batch.compiled import pays
+from sobolev_batch.errors import MeshError, from_extra
+from sobolev_batch.geometry.surface import LARGEST_LENGTH, Extent, Indices, Point, Reals
+
+Corners = tuple[Reals, Reals, Reals]
+# Vectors from the first corner to the second and to the third, (3, k) each: one row an axis.
+_Edges = tuple[Reals, Reals]
+_Scalar = TypeVar("_Scalar", bound=np.generic)
+
+_ALL = slice(None)
+# Triangles that are measured or sorted at a time: their edges and temporaries stay in cache.
+_BATCH = 1 << 14
+# Processor time on arrays of measuring a triangle.
+_SECONDS = 6e-8
+# Odd numbers without pattern, which spread the bits of coordinates.
+_MIXERS = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+# Twice the rounding error of a cross product, relative to the squared longest edge: a smaller area is not
+# distinguishable from zero in double precision.
+_AREA_RESOLUTION = 8 * np.finfo(np.float64).eps
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A triangle mesh in three-dimensional space, as a sum of flat area measures.
+
+    Both arrays are copied, converted to float64 and int64 and made read-only. Read-only arrays of these
+    types that own their memory are shared instead. Zero-area triangles, duplicates, open boundaries and
+    non-manifold edges are kept; `counts` reports them.
+
+    Args:
+        vertices: Coordinates, real (n, 3), finite, in the user's unit of length.
+        triangles: Indices into ``vertices``, integer (m, 3), m > 0.
+
+    Raises:
+        MeshError: Coordinates are not finite; indices are negative, out of range or not integers; there are no
+            triangles, or their total area is zero. The message names the entries.
+
+    >>> import sobolev_batch as sb
+    >>> mesh = sb.Mesh([[0, 0, 0], [3, 0, 0], [0, 4, 0]], [[0, 1, 2]])
+    >>> mesh.area, mesh.edge_lengths.tolist(), mesh.counts["boundary_edges"]
+    (6.0, [[3.0, 5.0, 4.0]], 3)
+    """
+
+    vertices: Reals
+    triangles: Indices
+
+    def __init__(self, vertices: ArrayLike, triangles: ArrayLike) -> None:
+        checked_vertices = _checked_vertices(vertices)
+        checked_triangles = _checked_triangles(triangles, len(checked_vertices))
+        object.__setattr__(self, "vertices", checked_vertices)
+        object.__setattr__(self, "triangles", checked_triangles)
+        largest = float(np.abs(checked_vertices).max(initial=0.0))
+        if largest > LARGEST_LENGTH or not np.isfinite(self.area):
+            raise MeshError(
+                "the mesh has coordinates so large that areas or squared lengths overflow double precision: "
+                f"largest absolute coordinate {largest:.3g}; rescale it"
+            )
+        if not any(np.any(self.areas[batch] > zero_areas) for batch, zero_areas in self._zero_areas()):
+            raise MeshError(
+                f"the total area of the {len(checked_triangles)} triangles is zero: every one is "
+                "degenerate, so there is no surface measure to compare"
+            )
+
+    @classmethod
+    def from_checked(cls, vertices: Reals, triangles: Indices) -> Mesh:
+        """Return a mesh of arrays that were checked before, without a copy; they become read-only."""
+        mesh = object.__new__(cls)
+        object.__setattr__(mesh, "vertices", _frozen(vertices))
+        object.__setattr__(mesh, "triangles", _frozen(triangles))
+        return mesh
+
+    def corners(self, selection: slice | Indices = _ALL) -> Corners:
+        """Return the first, second and third corners (k, 3) of all or some triangles, in units of length."""
+        selected = self.triangles[selection]
+        return self.vertices[selected[:, 0]], self.vertices[selected[:, 1]], self.vertices[selected[:, 2]]
+
+    @property
+    def areas(self) -> Reals:
+        """Area of each triangle (m,), in squared units of length."""
+        return self._sizes[0]
+
+    @cached_property
+    def area(self) -> float:
+        """Total area, in squared units of length."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            return float(self.areas.sum())
+
+    @property
+    def edge_lengths(self) -> Reals:
+        """Lengths of the three sides of each triangle (m, 3); an inner edge appears twice."""
+        return self._per_triangle(_side_lengths)
+
+    @property
+    def edge_length_range(self) -> tuple[float, float]:
+        """Mean and maximum of the `edge_lengths`."""
+        return self._sizes[2]
+
+    @property
+    def centroid_radii(self) -> Reals:
+        """Distance from the centroid of each triangle to its farthest corner (m,)."""
+        return self._sizes[1]
+
+    @cached_property
+    def extent(self) -> Extent:
+        """Extent of the `used_coordinates` along `DIRECTIONS`."""
+        return Extent.of_points(self.used_coordinates)
+
+    @property
+    def bounding_sphere(self) -> tuple[Point, float]:
+        """Centre of the bounding box, and distance from it to the farthest of the `used_vertices`."""
+        lower, upper = self.extent.box
+        center = lower + (upper - lower) / 2
+        radius = float(np.linalg.norm(self.vertices[self.used_vertices] - center, axis=1).max())
+        return (float(center[0]), float(center[1]), float(center[2])), radius
+
+    def moved(self, scale: float, origin: Point) -> Mesh:
+        """Return the mesh after x -> scale * (x - origin)."""
+        vertices = self.vertices - np.asarray(origin)
+        vertices *= scale
+        # Read-only, so that the mesh takes it over: a copy of huge meshes would count.
+        return Mesh(_frozen(vertices), self.triangles)
+
+    @cached_property
+    def used_vertices(self) -> Indices:
+        """Indices of the vertices that triangles use, in ascending order."""
+        return _frozen(_used(self.triangles, len(self.vertices)))
+
+    @property
+    def used_coordinates(self) -> Reals:
+        """Coordinates of the `used_vertices`, one contiguous row an axis (3, n), in units of length."""
+        used = self.used_vertices
+        rows = self.vertices if len(used) == len(self.vertices) else self.vertices[used]
+        return np.ascontiguousarray(rows.T)
+
+    @cached_property
+    def counts(self) -> dict[str, int]:
+        """Counts of what is unusual about the mesh. All of it is legitimate in a surface measure, none is repaired.
+
+        The keys are "zero_area_triangles", to double precision; "duplicate_triangles", which repeat the three vertices
+        of an earlier one in any orientation; "boundary_edges" of exactly one triangle; "nonmanifold_edges" of more
+        than two; and "inconsistent_edges" of exactly two that face opposite sides there.
+        """
+        boundary, nonmanifold, inconsistent = _unusual_edges(self.triangles, len(self.vertices))
+        zero_area = sum(int(np.count_nonzero(self.areas[batch] <= limit)) for batch, limit in self._zero_areas())
+        return {
+            "zero_area_triangles": zero_area,
+            "duplicate_triangles": _duplicate_triangles(self.triangles),
+            "boundary_edges": boundary,
+            "nonmanifold_edges": nonmanifold,
+            "inconsistent_edges": inconsistent,
+        }
+
+    @property
+    def defects(self) -> tuple[str, ...]:
+        """Defects in words: all that keeps the mesh from being a closed surface that faces outwards; empty without any.
+
+        >>> import sobolev_batch as sb
+        >>> sphere = sb.shapes.icosphere(1)
+        >>> sb.Mesh(sphere.vertices, sphere.triangles[1:]).defects
+        ('3 open edges',)
+        >>> sb.Mesh(sphere.vertices, sphere.triangles[:, ::-1]).defects
+        ('all triangles face inwards',)
+        """
+        words = {
+            "boundary_edges": ("open edge", ""),
+            "nonmanifold_edges": ("edge", " of more than two triangles"),
+            "inconsistent_edges": ("edge", " at which normals flip"),
+            "duplicate_triangles": ("duplicate triangle", ", counted twice"),
+            "zero_area_triangles": ("triangle", " without area"),
+        }
+        found = {key: self.counts[key] for key in words if self.counts[key]}
+        texts = [f"{n:,} {words[key][0]}{'s' * (n != 1)}{words[key][1]}" for key, n in found.items()]
+        return (*texts, *(["all triangles face inwards"] if self.volume < 0 else []))
+
+    @cached_property
+    def volume(self) -> float:
+        """Enclosed volume, in cubed units of length; negative where triangles, seen from outside, run clockwise.
+
+        NaN unless each edge has two triangles that face the same side: `counts` has no boundary, non-manifold or
+        inconsistent edges.
+
+        >>> import sobolev_batch as sb
+        >>> f"{sb.icosphere(5).volume:.3f}"
+        '4.184'
+        """
+        if any(self.counts[f"{kind}_edges"] for kind in ("boundary", "nonmanifold", "inconsistent")):
+            return np.nan
+        # From a point nearby: far from the origin, the parts cancel.
+        origin = self.vertices[self.triangles[0, 0]]
+        parts = []
+        for start in range(0, len(self.triangles), _BATCH):
+            a, b, c = (corner - origin for corner in self.corners(slice(start, start + _BATCH)))
+            parts.append(float(np.einsum("ij,ij->", a, np.cross(b, c))))
+        return math.fsum(parts) / 6
+
+    @property
+    def smallest_angles(self) -> Reals:
+        """Smallest angle of each triangle (m,), in degrees; zero without an area."""
+        return self._per_triangle(_smallest_angles)
+
+    @property
+    def aspect_ratios(self) -> Reals:
+        """Longest edge of each triangle over the radius of its incircle (m,), over that of an equilateral triangle.
+
+        From 1 on, and infinite without an area. Source: C. Stimpson et al., "The Verdict geometric quality library",
+        Sandia report SAND2007-1751 (2007), section 4.3.
+        """
+        return self._per_triangle(_aspect_ratios)
+
+    def batches(self, size: int) -> Iterator[tuple[int, Mesh]]:
+        """Yield the mesh as numbered meshes of at most ``size`` triangles, each with only the vertices that it uses.
+
+        Batches without area are left out: they add nothing to a transform.
+        """
+        new_indices = np.empty(len(self.vertices), dtype=np.int64)
+        for number, start in enumerate(range(0, len(self.triangles), size)):
+            triangles = self.triangles[start : start + size]
+            if not np.any(self.areas[start : start + size] > 0):
+                continue
+            used = _used(triangles, len(self.vertices))
+            new_indices[used] = np.arange(len(used))
+            yield number, Mesh.from_checked(self.vertices[used], new_indices[triangles])
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of the vertices and triangles, in hexadecimal."""
+        digest = hashlib.sha256()
+        for array in (self.vertices, self.triangles):
+            digest.update(str(array.shape).encode())
+            digest.update(np.ascontiguousarray(array, array.dtype.newbyteorder("<")).data)
+        return digest.hexdigest()
+
+    def to_trimesh(self) -> Any:
+        """Return a new ``trimesh.Trimesh`` of the same vertices and triangles, all digits kept."""
+        import trimesh
+
+        # Without processing it merges and drops nothing.
+        return trimesh.Trimesh(np.array(self.vertices), np.array(self.triangles), process=False)
+
+    def to_pyvista(self) -> Any:
+        """Return a new ``pyvista.PolyData`` of the same vertices and triangles, all digits kept.
+
+        Raises:
+            InputError: PyVista is not installed (the extra ``vtk``).
+        """
+        with from_extra("vtk", "a mesh of PyVista needs"):
+            import pyvista
+        return pyvista.PolyData.from_regular_faces(np.array(self.vertices), np.array(self.triangles))
+
+    def _zero_areas(self) -> Iterator[tuple[slice, Reals]]:
+        """Yield, for each batch of triangles, the areas below which rounding hides whether they are zero."""
+        for number, edges in enumerate(self._edges()):
+            with np.errstate(over="ignore"):
+                longest: Reals = _side_lengths(edges).max(axis=1)
+                areas = _AREA_RESOLUTION * longest**2
+            # Outside: whoever reads on may be another thread, to which a setting of NumPy does not belong.
+            yield slice(number * _BATCH, (number + 1) * _BATCH), areas
+
+    @cached_property
+    def _sizes(self) -> tuple[Reals, Reals, tuple[float, float]]:
+        """Areas, centroid radii, and mean and maximum of the edge lengths: one pass reads the corners for all."""
+        areas, radii, total, longest = np.empty(len(self.triangles)), np.empty(len(self.triangles)), 0.0, 0.0
+        with np.errstate(over="ignore", invalid="ignore"):
+            for number, squares in enumerate(self._squared_sizes()):
+                batch = slice(number * _BATCH, (number + 1) * _BATCH)
+                roots = np.sqrt(squares, out=squares)
+                areas[batch], radii[batch] = roots[0] / 2, roots[1] / 3
+                total, longest = total + float(roots[2:].sum()), max(longest, float(roots[2:].max()))
+        return _frozen(areas), _frozen(radii), (total / (3 * len(areas)), longest)
+
+    def _squared_sizes(self) -> Iterator[Reals]:
+        """Yield the `_squared_sizes` of each batch of triangles."""
+        if not pays(_SECONDS * len(self.triangles)):
+            yield from map(_squared_sizes, self._edges())
+            return
+        from sobolev_batch.compiled.triangles import measure
+
+        for start in range(0, len(self.triangles), _BATCH):
+            triangles = self.triangles[start : start + _BATCH]
+            measure(self.vertices, triangles, squares := np.empty((5, len(triangles))))
+            yield squares
+
+    def _per_triangle(self, measure: Callable[[_Edges], Reals]) -> Reals:
+        """Return a measure of all triangles, taken batch by batch: edges of millions at once take gigabytes."""
+        batches = self._edges()
+        first = measure(next(batches))
+        values = np.empty((len(self.triangles), *first.shape[1:]))
+        values[: len(first)] = first
+        for number, edges in enumerate(batches, 1):
+            values[number * _BATCH : (number + 1) * _BATCH] = measure(edges)
+        return _frozen(values)
+
+    def _edges(self) -> Iterator[_Edges]:
+        """Yield the edges of each batch of triangles."""
+        columns = [np.ascontiguousarray(column) for column in self.vertices.T]
+        for start in range(0, len(self.triangles), _BATCH):
+            a, b, c = np.ascontiguousarray(self.triangles[start : start + _BATCH].T)
+            first, second = np.empty((3, len(a))), np.empty((3, len(a)))
+            for axis, column in enumerate(columns):
+                origins = column[a]
+                np.subtract(column[b], origins, out=first[axis])
+                np.subtract(column[c], origins, out=second[axis])
+            yield first, second
+
+    def __repr__(self) -> str:
+        return f"Mesh({len(self.vertices)} vertices, {len(self.triangles)} triangles)"
+
+    def __reduce__(self) -> tuple[type[Mesh], tuple[Reals, Indices]]:
+        return Mesh, (self.vertices, self.triangles)
+
+
+def cross_lengths(first: Reals, second: Reals) -> Reals:
+    """Return |u × v| of vectors (3, ...)."""
+    return np.asarray(np.sqrt(_squares(_cross(first, second))))
+
+
+def _cross(first: Reals, second: Reals) -> tuple[Reals, Reals, Reals]:
+    (ux, uy, uz), (vx, vy, vz) = first, second
+    return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+
+
+def _squares(vectors: Reals | tuple[Reals, Reals, Reals]) -> Reals:
+    x, y, z = vectors
+    # Products that are added one by one have the same digits in a compiled loop.
+    return np.asarray(x * x + y * y + z * z)
+
+
+def _side_lengths(edges: _Edges) -> Reals:
+    first, second = edges
+    return np.stack([np.sqrt(_squares(side)) for side in (first, second - first, second)], axis=1)
+
+
+def _squared_sizes(edges: _Edges) -> Reals:
+    """Return the squares of twice the area, of three times the centroid radius, and of the three sides (5, k)."""
+    first, second = edges
+    arms = [_squares(arm) for arm in (first + second, first + first - second, second + second - first)]
+    sides = [_squares(side) for side in (first, second - first, second)]
+    return np.stack([_squares(_cross(first, second)), np.maximum.reduce(arms), *sides])
+
+
+def _smallest_angles(edges: _Edges) -> Reals:
+    # Opposite the shortest side. Unlike the law of cosines, this keeps the digits of small angles.
+    shortest, *others = np.sort(_side_lengths(edges), axis=1).T ** 2
+    return np.asarray(np.degrees(np.arctan2(2 * cross_lengths(*edges), sum(others) - shortest)))
+
+
+def _aspect_ratios(edges: _Edges) -> Reals:
+    lengths, twice_areas = _side_lengths(edges), cross_lengths(*edges)
+    # Twice the area is the perimeter times the radius of the incircle.
+    products = lengths.max(axis=1) * lengths.sum(axis=1)
+    flat = np.full_like(products, np.inf)
+    return np.asarray(np.divide(products, 2 * np.sqrt(3) * twice_areas, out=flat, where=twice_areas > 0))
+
+
+def _used(triangles: Indices, vertex_count: int) -> Indices:
+    """Return the indices of the vertices that triangles use, in ascending order."""
+    used = np.zeros(vertex_count, dtype=bool)
+    used[triangles] = True
+    return np.flatnonzero(used).astype(np.int64, copy=False)
+
+
+def _array(values: ArrayLike, name: str) -> NDArray[Any]:
+    if np.ma.is_masked(values):
+        raise MeshError(f"{name} have masked entries")
+    try:
+        return np.asarray(values)
+    except ValueError as error:
+        raise MeshError(f"{name} must be an array of rows of three, found rows of different lengths") from error
+
+
+def _checked_vertices(vertices: ArrayLike) -> Reals:
+    array = _array(vertices, "vertices")
+    if array.dtype.kind not in "fiu":
+        raise MeshError(f"vertices must be real numbers, found dtype {array.dtype}")
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise MeshError(f"vertices must have shape (n, 3), found {array.shape}")
+    with np.errstate(over="ignore"):
+        converted = _owned(array, np.float64)
+    bad = np.flatnonzero(~np.isfinite(converted).all(axis=1))
+    if bad.size:
+        raise MeshError(f"{bad.size} of {len(array)} vertices have NaN or infinite coordinates: {_listed(bad, array)}")
+    return _frozen(converted)
+
+
+def _checked_triangles(triangles: ArrayLike, vertex_count: int) -> Indices:
+    array = _array(triangles, "triangles")
+    if array.size == 0:
+        raise MeshError("the mesh has no triangles")
+    if array.dtype.kind not in "iu":
+        raise MeshError(f"triangles must be integer indices, found dtype {array.dtype}")
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise MeshError(f"triangles must have shape (m, 3), found {array.shape}")
+    if array.min() < 0 or array.max() >= vertex_count:
+        bad = np.flatnonzero(((array < 0) | (array >= vertex_count)).any(axis=1))
+        raise MeshError(
+            f"{bad.size} of {len(array)} triangles have indices outside 0..{vertex_count - 1}: {_listed(bad, array)}"
+        )
+    return _frozen(_owned(array, np.int64))
+
+
+def _owned(array: NDArray[Any], dtype: type[_Scalar]) -> NDArray[_Scalar]:
+    """Return the array itself where nobody can change it any more, else a copy."""
+    unchangeable = array.flags.c_contiguous and array.flags.owndata and not array.flags.writeable
+    return array if unchangeable and array.dtype == dtype else np.array(array, dtype=dtype, order="C")
+
+
+def _listed(rows: NDArray[np.intp], values: NDArray[np.generic], limit: int = 3) -> str:
+    entries = ", ".join(f"#{row} = {values[row].tolist()}" for row in rows[:limit])
+    return entries + (", ..." if len(rows) > limit else "")
+
+
+def _frozen(array: NDArray[_Scalar]) -> NDArray[_Scalar]:
+    array.setflags(write=False)
+    return array
+
+
+def _unusual_edges(triangles: Indices, vertex_count: int) -> tuple[int, int, int]:
+    """Return the numbers of edges of exactly one triangle, of more than two, and of two that run along it alike."""
+    keys = np.empty(3 * len(triangles), dtype=np.int64)
+    for start in range(0, len(triangles), _BATCH):
+        ends = np.ascontiguousarray(triangles[start : start + _BATCH].T)
+        nexts = ends[[1, 2, 0]]
+        low, high = np.minimum(ends, nexts), np.maximum(ends, nexts)
+        # A triangle that repeats a vertex has one edge at most, along which it runs both ways.
+        repeats = (low == high).any(axis=0)
+        batch_keys = 3 * (low * vertex_count + high) + np.where(repeats, 2, ends < nexts)
+        batch_keys[low == high] = -1
+        for side in (1, 2):
+            batch_keys[side, repeats & (batch_keys[:side] == batch_keys[side]).any(axis=0)] = -1
+        keys[3 * start : 3 * start + batch_keys.size] = batch_keys.ravel()
+    keys.sort()
+    keys = keys[np.searchsorted(keys, 0) :]
+    if not keys.size:
+        return 0, 0, 0
+    is_alike = (keys[1:] == keys[:-1]) & (keys[1:] % 3 < 2)
+    keys //= 3
+    repeats = np.concatenate([[False], keys[1:] == keys[:-1], [False, False]])
+    first, second, third = ~repeats[:-2], repeats[1:-1], repeats[2:]
+    inconsistent = first[:-1] & (second & ~third)[:-1] & is_alike
+    boundary, nonmanifold = first & ~second, first & second & third
+    return int(np.count_nonzero(boundary)), int(np.count_nonzero(nonmanifold)), int(np.count_nonzero(inconsistent))
+
+
+def _duplicate_triangles(triangles: Indices) -> int:
+    """Return the number of triangles that repeat the three vertices of an earlier one."""
+    ordered = np.sort(triangles, axis=1)
+    ordered = ordered[np.lexsort(ordered.T)]
+    return int(np.count_nonzero((ordered[1:] == ordered[:-1]).all(axis=1)))
+
+
+def shared_triangles(first: Reals, second: Reals) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which triangles (m, 3, 3) and (n, 3, 3) occur in both, as often, by hashes of their corners of 64 bits."""
+    hashes, other_hashes = _triangle_hashes(first), _triangle_hashes(second)
+    return _matched(hashes, other_hashes), _matched(other_hashes, hashes)
+
+
+def _matched(hashes: NDArray[np.uint64], others: NDArray[np.uint64]) -> NDArray[np.bool_]:
+    """Return which hashes occur among others; of equal ones, only as many as the others have."""
+    order, others = np.argsort(hashes, kind="stable"), np.sort(others)
+    ordered = hashes[order]
+    rank = np.arange(len(ordered)) - np.searchsorted(ordered, ordered)
+    matched = np.empty(len(ordered), dtype=bool)
+    matched[order] = rank < np.searchsorted(others, ordered, "right") - np.searchsorted(others, ordered)
+    return matched
+
+
+def _triangle_hashes(corners: Reals) -> NDArray[np.uint64]:
+    """Return the sum of the hashes of the corners of each triangle (m,), which does not depend on their order."""
+    sums = np.empty(len(corners), dtype=np.uint64)
+    for start in range(0, len(corners), _BATCH):
+        # Zero has two signs.
+        hashes = np.ascontiguousarray(corners[start : start + _BATCH] + 0.0).view(np.uint64)
+        mixed = np.zeros(hashes.shape[:-1], dtype=np.uint64)
+        for axis in range(3):
+            # The steps of SplitMix64 (G. Steele, D. Lea, C. Flood 2014, doi:10.1145/2714064.2660195).
+            mixed = (mixed ^ hashes[..., axis]) * _MIXERS[0]
+            mixed = (mixed ^ (mixed >> np.uint64(30))) * _MIXERS[1]
+            mixed = (mixed ^ (mixed >> np.uint64(27))) * _MIXERS[2]
+            mixed ^= mixed >> np.uint64(31)
+        sums[start : start + _BATCH] = mixed.sum(axis=1)
+    return sums

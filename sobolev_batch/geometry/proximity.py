@@ -1,0 +1,306 @@
+"""Distances of two meshes from point to closest point: Hausdorff, mean, RMS, percentiles, Chamfer, F-score, normals."""
+
+from __future__ import annotations
+
+from typing import Self
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from sobolev_batch.errors import InputError
+from sobolev_batch.geometry.formats.readers import MeshLike, as_mesh
+from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.geometry.surface import Indices, Reals, is_finite_number
+from sobolev_batch.parameters import check_seed, is_whole_number
+
+DEFAULT_POINTS = 10_000
+MOST_POINTS = 10_000_000
+# The threshold of the F-score, in radii of the bounding sphere of the reference.
+DEFAULT_THRESHOLD = 0.01
+_PERCENTILES = (50, 95, 99)
+
+_SYMMETRIC = ("hausdorff", "mean", "rms", *(f"p{percent}" for percent in _PERCENTILES))
+_BOTH_WAYS = (*_SYMMETRIC, "normal_mean", "normal_max")
+LENGTHS = (
+    *(f"{name}{way}" for name in _SYMMETRIC for way in ("", "_forward", "_backward")),
+    *("mean_error", "rms_error", "chamfer", "chamfer_error", "threshold"),
+)
+NUMBERS = (
+    *LENGTHS,
+    *("fscore", "precision", "recall"),
+    *(f"{name}{way}" for name in ("normal_mean", "normal_max") for way in ("", "_forward", "_backward")),
+)
+# What a study may show in its tables, with the numbers of `proximity` that belong to it.
+METRICS = {
+    "hausdorff": ("hausdorff",),
+    "mean": ("mean", "mean_error"),
+    "rms": ("rms", "rms_error"),
+    "percentiles": tuple(f"p{percent}" for percent in _PERCENTILES),
+    "chamfer": ("chamfer", "chamfer_error"),
+    "fscore": ("fscore", "precision", "recall"),
+    "normals": ("normal_mean", "normal_max"),
+    "volume": ("volume",),
+    "triangles": ("smallest_angle", "aspect_ratio"),
+}
+# Those of a single mesh, which every study measures.
+OF_ONE_MESH = ("volume", "smallest_angle", "aspect_ratio")
+
+# Memory of a search: for each triangle of either mesh, for each point, and of its temporary arrays.
+TRIANGLE_BYTES, POINT_BYTES, WORKING_BYTES = 500.0, 250.0, 2e8
+# Boxes in a box; points that are searched at a time, and pairs of a point and a box, which are split if they are more.
+_FAN, _CHUNK, _MOST_PAIRS = 8, 1 << 11, 1 << 18
+
+
+def proximity(
+    a: MeshLike, b: MeshLike, *, points: int = DEFAULT_POINTS, threshold: float | None = None, seed: int = 0
+) -> dict[str, float]:
+    """Measure the usual distances of two meshes, from points to the closest points of triangles.
+
+    Args:
+        a: First mesh, or what `as_mesh` makes one of.
+        b: Second mesh, the reference, in the same unit of length, or what `as_mesh` makes one of.
+        points: Number of random points on each mesh, spread evenly by area.
+        threshold: Distance up to which a point counts as matched in the F-score; default 1 % of the radius of the
+            bounding sphere of b.
+        seed: Seed of the random points; the same seed gives the same numbers.
+
+    Returns:
+        Numbers by name. Lengths are in the unit of the meshes, and angles in degrees. Names with ``_forward`` are
+        those of points of a and their distances from b, names with ``_backward`` those of points of b; the same name
+        alone is the larger of both.
+
+        - hausdorff: largest distance of all random points and vertices: the true one may be larger, not smaller;
+        - mean and rms: mean distance, and root of the mean squared distance, by area; their standard errors, since
+          points are random, are mean_error and rms_error;
+        - p50, p95 and p99: the distance below which 50, 95 and 99 % of the area are;
+        - chamfer: the sum of both means, not squared; chamfer_error is its standard error;
+        - fscore: harmonic mean of precision, the fraction of the area of a within the threshold of b, and recall, that
+          of b within the threshold of a; and threshold;
+        - normal_mean and normal_max: angle between the normal at a point and that of the closest triangle, from 0 to
+          90: which way triangles face does not matter. The largest one is that of the random points.
+
+    Raises:
+        InputError: ``points``, ``threshold`` or ``seed`` is out of range; or see `as_mesh`.
+
+    Sources: P. Cignoni, C. Rocchini, R. Scopigno, "Metro: measuring error on simplified surfaces" (1998),
+    doi:10.1111/1467-8659.00236; N. Aspert, D. Santa-Cruz, T. Ebrahimi, "MESH: measuring errors between surfaces using
+    the Hausdorff distance" (2002), doi:10.1109/ICME.2002.1035879, for the larger of both; A. Knapitsch et al., "Tanks
+    and temples" (2017), doi:10.1145/3072959.3073599, for the F-score.
+
+    >>> import sobolev_batch as sb
+    >>> square = sb.Mesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
+    >>> raised = sb.Mesh(square.vertices + [0, 0, 0.25], square.triangles)
+    >>> distances = sb.proximity(square, raised, points=1000)
+    >>> f"{distances['hausdorff']:.6f} {distances['rms']:.6f} {distances['chamfer']:.6f}"
+    '0.250000 0.250000 0.500000'
+    """
+    if not is_whole_number(points) or not 1 < points <= MOST_POINTS:
+        raise InputError(f"points must be an integer from 2 to {MOST_POINTS}, found {points!r}")
+    if threshold is not None and not (is_finite_number(threshold) and threshold > 0):
+        raise InputError(f"threshold must be a positive number, found {threshold!r}")
+    check_seed(seed)
+    meshes = as_mesh(a), as_mesh(b)
+    limit = DEFAULT_THRESHOLD * meshes[1].bounding_sphere[1] if threshold is None else float(threshold)
+    searches = [Triangles.of_mesh(mesh) for mesh in meshes]
+    found: dict[str, float] = {}
+    means, matched = [], []
+    for way, own, seeds in zip((0, 1), meshes, np.random.SeedSequence(seed).spawn(2), strict=True):
+        drawn, triangles = _drawn(own, points, np.random.default_rng(seeds))
+        distances, closest = searches[1 - way].closest(drawn)
+        of_vertices = searches[1 - way].closest(own.vertices[own.used_vertices])[0]
+        # Powers of two lose no digit, and keep squares of lengths within the range of doubles.
+        scale = 2.0 ** np.frexp(distances.max(initial=np.finfo(float).tiny))[1]
+        squares = (distances / scale) ** 2
+        rms = float(np.sqrt(squares.mean()))
+        angles = _angles(_normals(own, triangles), _normals(meshes[1 - way], closest))
+        error = float(distances.std(ddof=1)) / np.sqrt(points)
+        numbers = {
+            "hausdorff": max(distances.max(), of_vertices.max()),
+            "mean": distances.mean(),
+            "rms": scale * rms,
+            **{f"p{percent}": np.percentile(distances, percent) for percent in _PERCENTILES},
+            "normal_mean": angles.mean(),
+            "normal_max": angles.max(),
+        }
+        found |= {f"{name}{('_forward', '_backward')[way]}": float(value) for name, value in numbers.items()}
+        means.append((float(distances.mean()), error))
+        rms_error = scale * float(squares.std(ddof=1)) / (2 * rms * np.sqrt(points)) if rms else 0.0
+        found["rms_error"] = max(found.get("rms_error", 0.0), rms_error)
+        matched.append(float(np.mean(distances <= limit)))
+    precision, recall = matched
+    return {
+        **found,
+        **{name: max(found[f"{name}_forward"], found[f"{name}_backward"]) for name in _BOTH_WAYS},
+        "mean_error": max(error for _, error in means),
+        "chamfer": means[0][0] + means[1][0],
+        "chamfer_error": float(np.hypot(means[0][1], means[1][1])),
+        "fscore": 2 * precision * recall / (precision + recall) if precision + recall else 0.0,
+        "precision": precision,
+        "recall": recall,
+        "threshold": limit,
+    }
+
+
+def vertex_distances(mesh: MeshLike, other: MeshLike) -> Reals:
+    """Measure the distance of each vertex of a mesh from the closest point of another mesh.
+
+    Args:
+        mesh: Mesh whose vertices are measured, or what `as_mesh` makes one of.
+        other: Mesh from which they are measured, in the same unit of length, or what `as_mesh` makes one of.
+
+    Returns:
+        Distances (n,) of float64, unsigned, exact to rounding, in the unit of the meshes; NaN for a vertex that no
+        triangle uses.
+
+    Raises:
+        InputError: see `as_mesh`.
+
+    >>> import sobolev_batch as sb
+    >>> ball = sb.shapes.icosphere(3)
+    >>> distances = sb.vertex_distances(sb.Mesh(2 * ball.vertices, ball.triangles), ball)
+    >>> distances.shape, distances.round(12).min().item(), distances.round(12).max().item()
+    ((642,), 1.0, 1.0)
+    """
+    mesh, other = as_mesh(mesh), as_mesh(other)
+    distances = np.full(len(mesh.vertices), np.nan)
+    distances[mesh.used_vertices] = Triangles.of_mesh(other).closest(mesh.vertices[mesh.used_vertices])[0]
+    return distances
+
+
+def _drawn(mesh: Mesh, points: int, rng: np.random.Generator) -> tuple[Reals, Indices]:
+    """Return random points on a mesh (n, 3), and the triangle of each."""
+    chances = mesh.areas / mesh.areas.max()
+    triangles = rng.choice(len(chances), points, p=chances / chances.sum())
+    root, part = np.sqrt(rng.random((points, 1))), rng.random((points, 1))
+    a, b, c = mesh.corners(triangles)
+    return (1 - root) * a + root * (1 - part) * b + root * part * c, triangles
+
+
+def _normals(mesh: Mesh, triangles: Indices) -> Reals:
+    """Return vectors (3, n) across triangles, of a length that no product overflows."""
+    a, b, c = (corner.T for corner in mesh.corners(triangles))
+    sides = b - a, c - a
+    longest = np.maximum(*(np.abs(side).max(axis=0) for side in sides))
+    longest[longest == 0] = 1.0
+    return _cross(sides[0] / longest, sides[1] / longest)
+
+
+def _angles(first: Reals, second: Reals) -> Reals:
+    """Return the angles (n,) between lines along vectors (3, n), in degrees."""
+    across = np.linalg.norm(_cross(first, second), axis=0)
+    return np.asarray(np.degrees(np.arctan2(across, np.abs(_dot(first, second)))))
+
+
+class Triangles:
+    """The triangles of a mesh with a hierarchy of boxes, in which the closest one to a point is found.
+
+    Triangles of about one size that are near to each other, in the order of a tree of their centers, share boxes.
+    """
+
+    def __init__(self, corners: Reals, scale: float) -> None:
+        """Sort corners (3, 3, m): of each triangle's corners the three coordinates, in units of the scale."""
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        sizes, self.scale = (high - low).max(axis=0), scale
+        self.centers = cKDTree(corners.mean(axis=0).T)
+        classes = np.floor(np.log2(np.maximum(sizes, np.finfo(float).tiny)) / 2)
+        self.order = self.centers.indices[np.argsort(classes[self.centers.indices], kind="stable")]
+        self.places = np.argsort(self.order)
+        self.corners = np.ascontiguousarray(corners[..., self.order])
+        low, high, sizes, largest = low[:, self.order], high[:, self.order], sizes[self.order], np.arange(len(sizes))
+        # From a box of all to the boxes of single triangles, with the largest triangle of each box.
+        self.levels = [(low, high, largest)]
+        while low.shape[1] > 1:
+            starts = np.arange(0, low.shape[1], _FAN)
+            groups = np.pad(largest, (0, -len(largest) % _FAN), mode="edge").reshape(-1, _FAN)
+            largest = np.take_along_axis(groups, sizes[groups].argmax(axis=1)[:, None], axis=1)[:, 0]
+            low, high = np.minimum.reduceat(low, starts, axis=1), np.maximum.reduceat(high, starts, axis=1)
+            self.levels.insert(0, (low, high, largest))
+
+    @classmethod
+    def of_mesh(cls, mesh: Mesh) -> Self:
+        """Return the triangles of a mesh."""
+        scale = 2.0 ** np.frexp(float(np.abs(mesh.vertices).max()))[1]
+        return cls(np.stack([corner.T / scale for corner in mesh.corners()]), scale)
+
+    def closest(self, points: Reals) -> tuple[Reals, Indices]:
+        """Return the distance of points (n, 3) from the mesh, exact to rounding, and the triangle closest to each."""
+        distances, triangles = np.empty(len(points)), np.empty(len(points), dtype=np.int64)
+        parts = [slice(start, min(start + _CHUNK, len(points))) for start in range(0, len(points), _CHUNK)]
+        while parts:
+            part = parts.pop()
+            found = self._closest(np.ascontiguousarray(points[part].T) / self.scale)
+            if found is None:
+                middle = (part.start + part.stop) // 2
+                parts += [slice(part.start, middle), slice(middle, part.stop)]
+            else:
+                distances[part], triangles[part] = self.scale * np.sqrt(found[0]), self.order[found[1]]
+        return distances, triangles
+
+    def _closest(self, points: Reals) -> tuple[Reals, Indices] | None:
+        """Return squared distances of points (3, n), and triangles; None where there are too many pairs with boxes."""
+        count = points.shape[1]
+        triangles = self.places[self.centers.query(points.T)[1]]
+        best = _squares(points, self.corners[..., triangles])
+        of, boxes = np.arange(count), np.zeros(count, dtype=np.int64)
+        for level, (low, high, largest) in enumerate(self.levels):
+            if level:
+                of = np.repeat(of, _FAN)
+                boxes = (boxes[:, None] * _FAN + np.arange(_FAN)).ravel()
+                of, boxes = of[boxes < len(largest)], boxes[boxes < len(largest)]
+            gaps = np.zeros(len(of))
+            for axis in range(3):
+                x = points[axis, of]
+                gaps += np.maximum(np.maximum(low[axis, boxes] - x, x - high[axis, boxes]), 0.0) ** 2
+            keep = gaps <= best[of]
+            of, boxes, gaps = of[keep], boxes[keep], gaps[keep]
+            is_last = level == len(self.levels) - 1
+            # A large triangle bounds the distance of points that are far from its center.
+            tried = slice(None) if is_last else _first_least(of, gaps)
+            self._improve(points, of[tried], largest[boxes[tried]], best, triangles)
+            keep = gaps <= best[of]
+            of, boxes = of[keep], boxes[keep]
+            if count > 1 and len(of) * _FAN > _MOST_PAIRS and not is_last:
+                return None
+        return best, triangles
+
+    def _improve(self, points: Reals, of: Indices, tried: Indices, best: Reals, triangles: Indices) -> None:
+        """Take triangles over that are closer to points than those that are known, in place."""
+        squares = _squares(points[:, of], self.corners[..., tried])
+        nearest = _first_least(of, squares)
+        nearest = nearest[squares[nearest] < best[of[nearest]]]
+        best[of[nearest]], triangles[of[nearest]] = squares[nearest], tried[nearest]
+
+
+def _first_least(groups: Indices, values: Reals) -> Indices:
+    """Return the place of the least value of each group; members of a group follow each other."""
+    starts = np.flatnonzero(np.diff(groups, prepend=-1))
+    least = np.minimum.reduceat(values, starts)
+    places = np.flatnonzero(values == np.repeat(least, np.diff(starts, append=len(groups))))
+    return places[np.flatnonzero(np.diff(groups[places], prepend=-1))]
+
+
+def _squares(points: Reals, corners: Reals) -> Reals:
+    """Return the squared distance of points (3, k) from triangles (3, 3, k), each from its own."""
+    a, b, c = corners
+    normal = _cross(b - a, c - a)
+    size = _dot(normal, normal)
+    is_above = size > 0
+    best = np.full(points.shape[1], np.inf)
+    for start, end in ((a, b), (b, c), (c, a)):
+        side, arm = end - start, points - start
+        length = _dot(side, side)
+        along = np.divide(_dot(arm, side), length, out=np.zeros_like(length), where=length > 0)
+        rest = arm - np.clip(along, 0.0, 1.0) * side
+        best = np.minimum(best, _dot(rest, rest))
+        is_above &= _dot(_cross(side, arm), normal) >= 0
+    heights = np.divide(_dot(points - a, normal) ** 2, size, out=np.zeros_like(size), where=size > 0)
+    return np.where(is_above, np.minimum(best, heights), best)
+
+
+def _dot(first: Reals, second: Reals) -> Reals:
+    return np.asarray(first[0] * second[0] + first[1] * second[1] + first[2] * second[2])
+
+
+def _cross(first: Reals, second: Reals) -> Reals:
+    (ux, uy, uz), (vx, vy, vz) = first, second
+    return np.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx])

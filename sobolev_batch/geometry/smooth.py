@@ -1,0 +1,379 @@
+"""Smooth surfaces given by a parametrisation x(u, v) over two intervals, whose rules integrate over them.
+
+At a pole, one end of a parameter is a single point of the surface. The area element |x_u × x_v|
+vanishes there, which does no harm.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Any, Self
+
+import numpy as np
+from scipy.special import roots_legendre
+
+from sobolev_batch.errors import InputError
+from sobolev_batch.geometry.mesh import cross_lengths
+from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Point, Reals, checked_point, is_finite_number
+
+Counts = tuple[int, int]
+
+# Nodes of any one rule: about 1,000 by 4,000.
+MOST_NODES = 1 << 22
+# Nodes along a parameter that is not periodic: a Gauss rule and its derivatives cost the square of them.
+MOST_GAUSS_NODES = 1 << 11
+# Nodes that are computed at a time, where derivatives are given.
+_BATCH = 1 << 16
+# Relative changes of the area when the nodes are doubled: one that ends the doubling, and one too large at its end.
+_SETTLED, _UNSETTLED = 1e-12, 1e-3
+_FIRST_NODES = 31
+_MOST_AREA_NODES = 1 << 20
+# Extents are sought on a grid of this many points along each parameter, then on small ones around the best.
+_GRID, _ZOOM_GRID, _ZOOMS = 65, 9, 12
+# x, y and z at each pair of parameters; numbers stand for constants.
+Vectors = Reals | Sequence[Reals | float]
+
+# Largest gap between the ends of a periodic parameter, relative to the extent of the surface.
+_CLOSED = 1e-9
+# Parameters along an interval at which it is measured.
+_CHECKS = 7
+
+
+@dataclass(frozen=True)
+class Interval:
+    """The interval of a parameter of a surface.
+
+    Args:
+        low: Beginning.
+        high: End, above ``low``.
+        periodic: True where the surface closes smoothly from the end to the beginning.
+
+    Raises:
+        InputError: The ends are not finite numbers in ascending order.
+
+    >>> import numpy as np
+    >>> import sobolev_batch as sb
+    >>> nodes, weights = sb.shapes.Interval(0.0, np.pi).rule(12)
+    >>> f"{weights @ np.sin(nodes):.12f}"
+    '2.000000000000'
+    """
+
+    low: float
+    high: float
+    periodic: bool = False
+
+    def __post_init__(self) -> None:
+        if not (is_finite_number(self.low) and is_finite_number(self.high) and self.low < self.high):
+            raise InputError(f"an interval needs two finite ends in ascending order, found {self.low} and {self.high}")
+        if not isinstance(self.periodic, bool):
+            raise InputError(f"an interval is periodic or not: expected True or False, found {self.periodic!r}")
+        object.__setattr__(self, "low", float(self.low))
+        object.__setattr__(self, "high", float(self.high))
+        if not math.isfinite(self.length):
+            raise InputError(f"an interval's length must be finite, found {self.low} to {self.high}")
+
+    @property
+    def length(self) -> float:
+        """Distance between the ends."""
+        return self.high - self.low
+
+    def rule(self, count: int) -> tuple[Reals, Reals]:
+        """Return nodes and weights (count,) of a quadrature rule that converges spectrally on smooth functions.
+
+        Periodic intervals have the trapezoidal rule (L. N. Trefethen, J. A. C. Weideman 2014,
+        doi:10.1137/130932132). Others have Gauss-Legendre, whose nodes leave out the ends.
+        """
+        if self.periodic:
+            step = self.length / count
+            return np.asarray(self.low + step * np.arange(count)), np.full(count, step, dtype=np.float64)
+        nodes, weights = _gauss_legendre(count)
+        return self.low + self.length / 2 * (1 + nodes), self.length / 2 * weights
+
+    def derivative(self, values: Reals, axis: int) -> Reals:
+        """Return the derivative, at the nodes of the `rule`, of the interpolant through values at them.
+
+        The interpolant is a trigonometric polynomial where periodic, which needs an odd number of nodes,
+        and a polynomial otherwise (H. Wang, S. Xiang 2012, doi:10.1090/S0025-5718-2011-02549-4). For
+        functions that the nodes resolve, the error is about n or n² roundings of the largest value.
+
+        Args:
+            values: Values at the nodes, float64, of any shape.
+            axis: Axis of ``values`` that runs over the nodes.
+
+        Returns:
+            Derivatives, float64, in the shape of ``values``.
+        """
+        count = values.shape[axis]
+        if self.periodic:
+            frequencies = 2j * np.pi / self.length * np.arange(count // 2 + 1)
+            spectrum = np.moveaxis(np.fft.rfft(values, axis=axis), axis, -1) * frequencies
+            return np.asarray(np.moveaxis(np.fft.irfft(spectrum, count), -1, axis))
+        matrix = 2 / self.length * _differentiation(count)
+        return np.asarray(np.moveaxis(np.moveaxis(values, axis, -1) @ matrix.T, -1, axis))
+
+
+class Smooth(ABC):
+    """A surface with a smooth parametrisation x(u, v), in units of length."""
+
+    @property
+    @abstractmethod
+    def intervals(self) -> tuple[Interval, Interval]:
+        """Intervals of u and v."""
+
+    @abstractmethod
+    def positions(self, u: Reals, v: Reals) -> Reals:
+        """Return x(u, v), float64 (3, ...), at parameters of one shape (...)."""
+
+    def tangents(self, u: Reals, v: Reals) -> tuple[Reals, Reals] | None:
+        """Return x_u and x_v, float64 (3, ...) each; None where they are computed from positions."""
+        return None
+
+    @abstractmethod
+    def moved(self, scale: float, origin: Point) -> Self:
+        """Return the surface after x -> scale * (x - origin)."""
+
+    def nodes(self, counts: Counts, most: int = _BATCH) -> Iterator[tuple[Reals, Reals]]:
+        """Yield batches of at most a number of nodes x (3, k) and weights (k,) of the product rule of both intervals.
+
+        The counts of nodes along u and v are odd where periodic. The weights include the area elements. Where
+        `tangents` is None, these are those of the interpolant through all nodes: see `Interval.derivative`.
+        """
+        (u, along_u), (v, along_v) = (
+            interval.rule(count) for interval, count in zip(self.intervals, counts, strict=True)
+        )
+        whole = self._on_grid(u, v) if self.tangents(u[:1], v[:1]) is None else None
+        rows = max(1, most // counts[1])
+        for first_row in range(0, counts[0], rows):
+            batch = slice(first_row, first_row + rows)
+            parts = self._on_grid(u[batch], v) if whole is None else tuple(values[:, batch] for values in whole)
+            positions, *tangents = parts
+            weights = cross_lengths(*tangents)
+            weights *= along_u[batch, None]
+            weights *= along_v
+            points, flat_weights = positions.reshape(3, -1), weights.ravel()
+            for start in range(0, len(flat_weights), most):
+                yield np.ascontiguousarray(points[:, start : start + most]), flat_weights[start : start + most]
+
+    def _on_grid(self, u: Reals, v: Reals) -> tuple[Reals, Reals, Reals]:
+        """Return positions and their derivatives (3, n, m) on a grid; those of an interpolant need it whole."""
+        grid = np.meshgrid(u, v, indexing="ij")
+        positions, tangents = self.positions(*grid), self.tangents(*grid)
+        if tangents is None:
+            along_u, along_v = self.intervals
+            tangents = along_u.derivative(positions, 1), along_v.derivative(positions, 2)
+        return positions, *tangents
+
+    @cached_property
+    def area(self) -> float:
+        """Area, in squared units of length: by quadrature, doubled until it settles to 1e-12, or InputError."""
+        counts = _FIRST_NODES, _FIRST_NODES
+        area = self._area(counts)
+        change = math.inf
+        while change > _SETTLED * area and math.prod(doubled(counts)) <= _MOST_AREA_NODES:
+            counts = doubled(counts)
+            area, before = self._area(counts), area
+            change = abs(area - before)
+        if not (math.isfinite(area) and area > 0):
+            raise InputError(f"a surface needs an area that is positive and finite, found {area:g}")
+        if change > _UNSETTLED * area:
+            raise InputError(
+                f"the area of the surface changes from {before:.6g} to {area:.6g} when the nodes are doubled to "
+                f"{counts[0]} x {counts[1]}: its parametrisation is not smooth, or oscillates too fast"
+            )
+        return area
+
+    def _area(self, counts: Counts) -> float:
+        return math.fsum(float(weights.sum()) for _, weights in self.nodes(counts))
+
+    def highest_along(self, directions: Reals) -> Reals:
+        """Return the greatest x · direction over the surface (k,), for unit vectors (k, 3), in units of length.
+
+        The error is about 1e-12 of the extent, unless the surface has details that a grid of 65 by 65 misses.
+        """
+
+        def heights(points: Reals) -> Reals:
+            # A sum of products instead of one of matrices: all directions may share the points, or not.
+            return np.asarray(sum(directions[:, axis, None, None] * points[axis] for axis in range(3)))
+
+        return self._greatest(heights, len(directions))
+
+    @cached_property
+    def extent(self) -> Extent:
+        """Extent along `DIRECTIONS`."""
+        lowest, highest = -self.highest_along(-DIRECTIONS), self.highest_along(DIRECTIONS)
+        return Extent(tuple(lowest.tolist()), tuple(highest.tolist()))
+
+    @property
+    def bounding_sphere(self) -> tuple[Point, float]:
+        """Centre of the bounding box, and radius of the smallest sphere around it that holds the surface."""
+        lower, upper = self.extent.box
+        center = lower + (upper - lower) / 2
+
+        def distances(points: Reals) -> Reals:
+            return np.asarray(np.sqrt(sum((points[axis] - center[axis]) ** 2 for axis in range(3))))
+
+        return (float(center[0]), float(center[1]), float(center[2])), float(self._greatest(distances, 1)[0])
+
+    def _greatest(self, heights: Callable[[Reals], Reals], count: int) -> Reals:
+        """Return the maxima over the surface (count,) of as many functions of position."""
+        grids = [np.linspace(interval.low, interval.high, _GRID) for interval in self.intervals]
+        values = heights(self.positions(*np.meshgrid(*grids, indexing="ij"))[:, None]).reshape(count, -1)
+        best = np.unravel_index(values.argmax(axis=1), (_GRID, _GRID))
+        centers = [grid[index] for grid, index in zip(grids, best, strict=True)]
+        widths = [interval.length / (_GRID - 1) for interval in self.intervals]
+        greatest: Reals = values.max(axis=1)
+        steps = np.linspace(-1, 1, _ZOOM_GRID)
+        for _ in range(_ZOOMS):
+            lines = [
+                _brought_back(interval, center[:, None] + width * steps)
+                for interval, center, width in zip(self.intervals, centers, widths, strict=True)
+            ]
+            u, v = np.broadcast_arrays(lines[0][:, :, None], lines[1][:, None, :])
+            values = heights(self.positions(u, v)).reshape(count, -1)
+            np.maximum(greatest, values.max(axis=1), out=greatest)
+            best = np.unravel_index(values.argmax(axis=1), (_ZOOM_GRID, _ZOOM_GRID))
+            centers = [line[np.arange(count), index] for line, index in zip(lines, best, strict=True)]
+            widths = [width / 3 for width in widths]
+        return greatest
+
+
+@dataclass(frozen=True, eq=False)
+class ParametrisedSurface(Smooth):
+    """A surface x(u, v), as a reference or for comparison; its transform is good to the ``eps`` requested.
+
+    The parametrisation must cover the surface once, and be smooth: at the ends of parameters too, and across
+    those of periodic ones. Poles are allowed: an end of u or v may be one point, as on a sphere in its angles.
+    The quadrature is the trapezoidal rule in periodic parameters and Gauss-Legendre in others, with as many
+    nodes as it takes. Derivatives are those of the interpolant through the nodes, which costs at most 1e-13 of the
+    area, and 120 bytes of memory for each node; see docs/numerics.md. In studies the function travels to workers,
+    so it must be picklable: a function of a module, or a value with ``__call__``.
+
+    Args:
+        position: Function of u and v, float64 arrays of one shape (...), that returns x, y and z: three
+            arrays (...) or numbers, in the user's unit of length.
+        u: Interval of the first parameter.
+        v: Interval of the second parameter.
+        scale: Scale of the similarity x -> scale * (x - origin) that is applied to positions.
+        origin: Origin of that similarity, in the unit of ``position``.
+
+    Raises:
+        InputError: The function returns something else or values that are not finite; the ends of a periodic
+            parameter are apart; or there is no area.
+
+    >>> import sobolev_batch as sb
+    >>> def saddle(u, v):
+    ...     return u, v, 0.5 * (u**2 - v**2)
+    >>> side = sb.shapes.Interval(-0.8, 0.8)
+    >>> surface = sb.shapes.ParametrisedSurface(saddle, u=side, v=side)
+    >>> f"{surface.area:.6f}"
+    '3.044304'
+    """
+
+    position: Callable[[Reals, Reals], Vectors]
+    u: Interval
+    v: Interval
+    scale: float = 1.0
+    origin: Point = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name, interval in (("u", self.u), ("v", self.v)):
+            if not isinstance(interval, Interval):
+                raise InputError(f"{name} must run over an Interval, found {interval!r}")
+        if not (is_finite_number(self.scale) and self.scale > 0):
+            raise InputError(f"the scale must be positive and finite, found {self.scale!r}")
+        checked_point(self.origin, "the origin")
+        self._check_closed()
+        _ = self.area
+
+    @property
+    def intervals(self) -> tuple[Interval, Interval]:
+        """Intervals of u and v."""
+        return self.u, self.v
+
+    def positions(self, u: Reals, v: Reals) -> Reals:
+        """Return x(u, v), float64 (3, ...)."""
+        positions = _vectors(self.position(u, v), u.shape)
+        positions -= np.reshape(self.origin, (3, *[1] * u.ndim))
+        positions *= self.scale
+        return positions
+
+    def moved(self, scale: float, origin: Point) -> Self:
+        """Return the surface after x -> scale * (x - origin)."""
+        x, y, z = (old + shift / self.scale for old, shift in zip(self.origin, origin, strict=True))
+        return replace(self, scale=scale * self.scale, origin=(x, y, z))
+
+    def _check_closed(self) -> None:
+        size = float(np.ptp(self.extent.box, axis=0).max())
+        along_u, along_v = (np.linspace(interval.low, interval.high, _CHECKS) for interval in self.intervals)
+        for name, interval, other in (("u", self.u, along_v), ("v", self.v, along_u)):
+            if not interval.periodic:
+                continue
+            ends = [np.full(_CHECKS, end) for end in (interval.low, interval.high)]
+            first, last = (self.positions(end, other) if name == "u" else self.positions(other, end) for end in ends)
+            gap = float(np.abs(first - last).max())
+            if not gap <= _CLOSED * size:
+                raise InputError(
+                    f"the surface is said to be periodic in {name}, but its positions at the ends {interval.low:g} and "
+                    f"{interval.high:g} are up to {gap / self.scale:.3g} apart"
+                )
+
+
+def doubled(counts: Counts) -> Counts:
+    """Return twice as many nodes each way plus one: coprime to before, so that both rules rarely alias alike."""
+    return 2 * counts[0] + 1, 2 * counts[1] + 1
+
+
+def _brought_back(interval: Interval, values: Reals) -> Reals:
+    """Return parameters within their interval."""
+    if interval.periodic:
+        turns = np.floor((values - interval.low) / interval.length)
+        return np.asarray(values - turns * interval.length)
+    return np.asarray(np.clip(values, interval.low, interval.high))
+
+
+@lru_cache(maxsize=64)
+def _gauss_legendre(count: int) -> tuple[Reals, Reals]:
+    """Return nodes and weights (count,) on [-1, 1]."""
+    nodes = np.asarray(roots_legendre(count)[0], dtype=np.float64)
+    # SciPy's weights lack four digits near the ends, where derivatives would show it.
+    before, current = np.ones(count), nodes.copy()
+    for degree in range(2, count + 1):
+        before, current = current, ((2 * degree - 1) * nodes * current - (degree - 1) * before) / degree
+    return nodes, 2 * (1 - nodes) * (1 + nodes) / (count * (before - nodes * current)) ** 2
+
+
+@lru_cache(maxsize=4)
+def _differentiation(count: int) -> Reals:
+    """Return the matrix (count, count) from values at the Gauss-Legendre nodes on [-1, 1] to derivatives there."""
+    nodes, weights = _gauss_legendre(count)
+    barycentric = np.sqrt((1 - nodes**2) * weights) * (-1.0) ** np.arange(count)
+    differences = nodes[:, None] - nodes
+    np.fill_diagonal(differences, 1.0)
+    matrix = barycentric / barycentric[:, None] / differences
+    np.fill_diagonal(matrix, 0.0)
+    # Constants have the derivative zero, to the last digit.
+    np.fill_diagonal(matrix, -matrix.sum(axis=1))
+    return np.asarray(matrix)
+
+
+def _vectors(returned: object, shape: tuple[int, ...]) -> Reals:
+    """Return the result of a user's function as float64 (3, *shape)."""
+    try:
+        coordinates = [np.asarray(coordinate) for coordinate in returned]  # type: ignore[attr-defined]
+        if len(coordinates) != 3 or any(coordinate.dtype.kind not in "fiu" for coordinate in coordinates):
+            raise ValueError
+        vectors = np.stack([np.broadcast_to(coordinate, shape) for coordinate in coordinates]).astype(np.float64)
+    except (TypeError, ValueError) as error:
+        parts: Sequence[Any] = returned if isinstance(returned, tuple | list) else [returned]
+        kinds = ", ".join(f"{getattr(part, 'dtype', type(part).__name__)} {np.shape(part)}" for part in parts[:4])
+        raise InputError(
+            f"position must return three arrays of real numbers in the shape of u and v, {shape}, "
+            f"found {len(parts)}: {kinds}"
+        ) from error
+    if not np.isfinite(vectors).all():
+        raise InputError("position is not finite everywhere on the surface")
+    return vectors

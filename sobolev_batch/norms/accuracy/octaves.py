@@ -1,0 +1,469 @@
+"""Norms and distances whose tail is measured: a small lattice, octaves around it, and what lies beyond them.
+
+Random points measure the part beyond the lattice, and beyond each octave (see `remainder`). It must agree with the
+octaves farther out: a difference outside both errors counts as an error, unless more and new points remove it. Until
+the accuracy is met, octaves get more samples, or more points are drawn, or an octave is added, whichever is cheapest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+
+from sobolev_batch.geometry.smooth import Smooth
+from sobolev_batch.geometry.surface import Reals
+from sobolev_batch.norms.accuracy.problem import (
+    ESTIMATE_CAUTION,
+    Problem,
+    Solution,
+    SurfaceValues,
+    error_target,
+    only_or_difference,
+    sums_on,
+)
+from sobolev_batch.norms.accuracy.tolerance import FINER_LATTICE, core_lattice, good_intervals
+from sobolev_batch.norms.budget import aliased, change_of_root
+from sobolev_batch.norms.fields import Field
+from sobolev_batch.norms.tail.potentials import tail_integral
+from sobolev_batch.norms.tail.remainder import MOSTLY, Remainder, remainder
+from sobolev_batch.norms.tail.sampling import FaceNormals, Octave, OctaveSampling
+from sobolev_batch.norms.tail.values import (
+    POINTS_PER_SQUARE,
+    OctaveSums,
+    OctaveValues,
+    OctaveWeights,
+    SurfaceSize,
+    Tail,
+    octave_values,
+    settings_for,
+    squared_moduli,
+)
+from sobolev_batch.transform.lattice import Lattice, OctaveLattice, SobolevWeights
+from sobolev_batch.transform.probe import estimate as estimate_from
+
+_ROUNDS, _MOST_OCTAVES = 6, 24
+# Fraction of the tail's share of the accuracy that is left to what lies beyond the last octave.
+_REMAINDER_FRACTION = 0.4
+# How far off, relatively, other pairs may be beyond the octaves of a pilot: chosen, not derived.
+_OF_OTHERS = 1 / 8
+# Fraction of the permitted variance that may come from octaves that are not refined.
+_LEFT_FRACTION = 0.5
+# Octaves among which the statistical error is divided before anything is known of them, and Student's quantile.
+_USUAL_OCTAVES, _QUANTILE = 6, 2.9
+# Samples along an axis of the first lattice of an octave, at least and at most, and of the largest one.
+_FEWEST_M, _FIRST_M, _LARGEST_M = 32, 64, 192
+# Samples of an octave on a lattice, as a fraction of M³.
+_FILLED = np.pi / 12 * 7 / 8
+# Draws of an octave: the fewest, the most, and the most time for draws beside a lattice, as a fraction of its own.
+_FEWEST_DRAWS, _MOST_DRAWS, _DRAWS_FRACTION = 256, 1_000_000, 0.5
+# The fewest on flat faces without a lattice: where faces repeat, few draws would miss the frequency of the period.
+_FEWEST_FLAT_DRAWS = 20_000
+# Uniform directions among the draws, beside a lattice and without one.
+_UNIFORM_BESIDE_LATTICE, _UNIFORM_ALONE = 0.1, 0.5
+# Deviation of |field|² over its mean among draws, on curved surfaces and on flat faces.
+_CURVED_DEVIATION, _FLAT_DEVIATION = 1.3, 3.0
+# Between octaves the energy grows at most like |ξ|² as long as surfaces are closer than the wavelength.
+_GROWTH = 4.0
+# Predicted seconds that the first samples of an octave may take if drawn, and all of the samples together.
+_OCTAVE_SECONDS, _MOST_SECONDS = 20.0, 200.0
+# Random points of a remainder at most, how many more than needed are taken, and how many more to check it again.
+_MOST_POINTS, _MORE_POINTS, _MORE_TO_CHECK = 400_000, 1.3, 4
+# Nodes that a parametrised surface may have; beyond the frequency that they resolve it has no octaves.
+_MOST_SMOOTH_NODES = 2e6
+
+
+@dataclass(frozen=True, eq=False)
+class Core:
+    """The innermost frequencies: fields on a small lattice, under a smooth step that ends at a cutoff.
+
+    Attributes:
+        squares: Squared norm of their difference under the step (orders,).
+        images: Bound on the change of the squares by the lattice's spacing (orders,).
+        errors: Norms of the fields' own errors (orders,).
+        energy: Energy ∫_{|ξ|=r} |field|² dS in the last octave below ξ_max.
+    """
+
+    lattice: Lattice
+    fields: tuple[Field, ...]
+    squares: Reals
+    images: Reals
+    errors: Reals
+    energy: float
+
+    @classmethod
+    def on_lattice(cls, problem: Problem, lattice: Lattice, cutoff: float) -> Self:
+        """Compute the fields of a problem on a lattice."""
+        samples = problem.samples(lattice)
+        values = problem.accuracy.scale(ESTIMATE_CAUTION * estimate_from(samples, problem.orders))
+        problem.require_above_rounding(values)
+        # The octaves' values have errors of their own.
+        target = error_target(values, problem.orders, problem.accuracy, problem.area).tightened(
+            2 * problem.inexact_count
+        )
+        fields = problem.fields(lattice, samples, target, problem.dtype(lattice, target))
+        weights = SobolevWeights(lattice, problem.orders, cutoff)
+        sums, errors = sums_on(problem, fields, weights)
+        images = aliased(sums, weights, problem.support.widths)
+        return cls(lattice, fields, np.maximum(sums.totals, 0.0), images, errors, float(sums.outer[1]))
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredOctave:
+    """An octave with the values of each surface there, and the integrals of the squared difference."""
+
+    values: tuple[OctaveValues, ...]
+    sums: OctaveSums
+
+    @property
+    def sampling(self) -> OctaveSampling:
+        """Samples of the octave, common to all surfaces."""
+        return self.values[0].sampling
+
+    def error_norms(self, orders: Sequence[float]) -> Reals:
+        """Return the norms of the values' own errors (orders,), those of all surfaces added."""
+        return np.asarray(np.sum([values.error_norms(orders) for values in self.values], axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """A norm or a distance in the course of its computation.
+
+    Attributes:
+        seed: Seed of the random frequencies and points.
+        octaves: Octaves around them, from the inside out.
+        remainders: What lies beyond the core, and beyond each octave.
+        for_others: True if other pairs are to be compared at the same frequencies.
+        seconds: Processor time that was predicted for the octaves and remainders.
+        steps: Number of steps taken: each draws other frequencies.
+    """
+
+    problem: Problem
+    seed: int
+    core: Core
+    octaves: tuple[MeasuredOctave, ...]
+    remainders: tuple[Remainder, ...]
+    for_others: bool = False
+    seconds: float = 0.0
+    steps: int = 0
+
+    @classmethod
+    def first(cls, problem: Problem, seed: int, for_others: bool) -> Self:
+        """Return what a small lattice shows, and what lies beyond it."""
+        lattice = core_lattice(problem.support, problem.orders, problem.accuracy)
+        core = Core.on_lattice(problem, lattice, lattice.xi_max)
+        beyond = _beyond(problem, lattice.xi_max, seed)
+        return cls(problem, seed, core, (), (beyond,), for_others, beyond.seconds(beyond.points))
+
+    @property
+    def cutoff(self) -> float:
+        """Radius |ξ| at which the step of the core ends, in cycles per unit length."""
+        return self.remainders[0].cutoff
+
+    @cached_property
+    def tail(self) -> Tail:
+        """All beyond the core. What two ways to it disagree about counts as uncertain."""
+        last = self.remainders[-1].at(self.problem.orders)
+        tail = Tail.from_sums([octave.sums for octave in self.octaves], *last)
+        return replace(tail, uncertainty=tail.uncertainty + self.disagreements.max(axis=0))
+
+    @cached_property
+    def disagreements(self) -> Reals:
+        """Gap of each remainder to what was measured there otherwise, outside of both errors (remainders, orders)."""
+        orders, disagreements = self.problem.orders, []
+        for number, beyond in enumerate(self.remainders):
+            sums = [octave.sums for octave in self.octaves[number:]]
+            outer, (value, error) = Tail.from_sums(sums, *self.remainders[-1].at(orders)), beyond.at(orders)
+            disagreements.append(np.abs(outer.squares - value) - outer.statistical - outer.uncertainty - error)
+        disagreements[-1] = self._missing
+        return np.maximum(disagreements, 0.0)
+
+    @property
+    def _missing(self) -> Reals:
+        """Energy that the last octave has and the last remainder lacks, outside of both errors, beyond it (orders,).
+
+        From octave to octave the energy grows until it is twice the area of all that differs. Only what repeats with a
+        period has less of it farther out, and points that nothing is hidden from see that.
+        """
+        orders, beyond = self.problem.orders, self.remainders[-1]
+        if beyond.points >= beyond.covering:
+            return np.zeros(len(orders))
+        least = self.core.energy
+        if self.octaves:
+            least = self.octaves[-1].sums.energy - _QUANTILE * self.octaves[-1].sums.energy_deviation
+        return np.asarray(least * np.array([tail_integral(beyond.cutoff, order) for order in orders])) - sum(
+            beyond.at(orders)
+        )
+
+    @cached_property
+    def squares(self) -> Reals:
+        """Squared norms (orders,): what has been measured, and what lies beyond it for certain."""
+        certain = np.maximum(self.tail.beyond - self.tail.uncertainty, 0.0)
+        return np.asarray(self.core.squares + self.tail.octaves + certain)
+
+    @cached_property
+    def permitted(self) -> Reals:
+        """Largest permitted error of the squares by the tail (orders,)."""
+        accuracy = self.problem.accuracy
+        parts = accuracy.truncation_parts(self.problem.orders)
+        return np.asarray(2 * parts * np.maximum(self.squares, accuracy.floor**2))
+
+    @property
+    def permitted_variances(self) -> Reals:
+        """Largest permitted variance of the squares (orders,)."""
+        return np.asarray(((1 - _REMAINDER_FRACTION) * self.permitted / _QUANTILE) ** 2)
+
+    @property
+    def excess(self) -> float:
+        """Error of the remainder over the permitted one, at the worst order."""
+        values, errors = self.remainders[-1].at(self.problem.orders)
+        if self.for_others:
+            errors = np.maximum(errors, _OF_OTHERS * np.abs(values))
+        return float(np.max(errors / (_REMAINDER_FRACTION * self.permitted)))
+
+    @property
+    def rng(self) -> np.random.Generator:
+        """Generator of the next step's frequencies."""
+        return np.random.default_rng([self.seed, self.steps])
+
+    @cached_property
+    def sizes(self) -> list[SurfaceSize]:
+        """Sizes of the surfaces, which times follow from."""
+        return [SurfaceSize.from_surface(surface) for surface in self.problem.surfaces]
+
+    @cached_property
+    def normals(self) -> FaceNormals:
+        """Normals of flat faces."""
+        return FaceNormals.from_surfaces(self.problem.surfaces)
+
+    @property
+    def draw_seconds(self) -> float:
+        """Time of the transforms at one frequency."""
+        return sum(size.draw_seconds for size in self.sizes)
+
+    @property
+    def can_draw(self) -> bool:
+        """True where single frequencies are cheaper than whole lattices; sums over many nodes are not."""
+        return not any(isinstance(surface, Smooth) for surface in self.problem.surfaces)
+
+    def sampling_seconds(self, sampling: OctaveSampling, known: OctaveSampling | None = None) -> float:
+        """Predict the time of the samples of an octave, without those that are known."""
+        return sum(size.sampling_seconds(sampling, known) for size in self.sizes)
+
+    def redrawn(self, number: int, points: int) -> State:
+        """Return the state after a step that estimates one remainder from new points."""
+        problem, known = self.problem, list(self.remainders)
+        cutoff, seconds, seed = known[number].cutoff, known[number].seconds(points), self.seed + self.steps + 1
+        known[number] = _beyond(problem, cutoff, seed, points)
+        return self.advanced(seconds, remainders=tuple(known))
+
+    def advanced(self, seconds: float, **changes: object) -> State:
+        """Return the state after a step of some predicted time."""
+        return replace(self, seconds=self.seconds + seconds, steps=self.steps + 1, **changes)  # type: ignore[arg-type]
+
+
+def solve_in_octaves(problem: Problem, seed: int, aim: float = 1.0, for_others: bool = False) -> Solution:
+    """Compute a norm or a distance to an accuracy, with its tail measured in octaves.
+
+    The same seed gives the same random frequencies and result. The aim is a fraction of the rtol. Octaves reach farther
+    for others: pairs whose part beyond the octaves is known less well. Return the first solution that meets the aim;
+    else the last one that can be sampled in some minutes. AccuracyError where the accuracy lies below rounding.
+    """
+    aimed = replace(problem, accuracy=replace(problem.accuracy, rtol=aim * problem.accuracy.rtol))
+    state = State.first(aimed, seed, for_others)
+    for _ in range(_ROUNDS):
+        while (farther := farther_out(state)) is not None:
+            state = farther
+        solution = solution_of(state)
+        if np.all(aimed.accuracy.met(solution.estimate)) or (finer := refined(state)) is None:
+            break
+        state = finer
+    solution = solution_of(state)
+    if np.all(problem.accuracy.met(solution.estimate)):
+        return solution
+    limits = "with as many frequencies as can be sampled in some minutes"
+    return replace(solution, shortfall=problem.out_of_reach(solution.estimate, limits))
+
+
+def solution_of(state: State) -> Solution:
+    """Return the numbers by what is known so far."""
+    core, orders = state.core, state.problem.orders
+    squares = core.errors**2 + np.sum([octave.error_norms(orders) ** 2 for octave in state.octaves], axis=0)
+    found = state.tail.estimate(core.squares, core.images, np.sqrt(squares))
+    values = tuple(
+        SurfaceValues(field, tuple(octave.values[number] for octave in state.octaves))
+        for number, field in enumerate(core.fields)
+    )
+    return Solution(found, core.lattice, values, has_tail=True)
+
+
+def farther_out(state: State) -> State | None:
+    """Return a state whose remainder is known better, by more points or one more octave; None if it is known well."""
+    problem, beyond = state.problem, state.remainders[-1]
+    if state.excess <= 1 or state.seconds >= _MOST_SECONDS:
+        return None
+    octave = Octave(state.cutoff, len(state.octaves) + 1)
+    can_go_on = len(state.octaves) < _MOST_OCTAVES and octave.highest <= _resolvable_frequency(problem)
+    points = int(_MORE_POINTS * beyond.points * state.excess**2)
+    if beyond.hidden > MOSTLY:
+        # Nothing is hidden from this many.
+        points = min(points, beyond.covering)
+    sampling = _first_sampling(state, octave) if can_go_on else None
+    seconds = np.inf if sampling is None else state.sampling_seconds(sampling) + beyond.seconds(beyond.points) / 4
+    if not state.for_others and points <= _MOST_POINTS and beyond.seconds(points) < min(seconds, _MOST_SECONDS):
+        return state.redrawn(len(state.octaves), points)
+    if sampling is None:
+        return None
+    measured = _measured(state, sampling)
+    outer = _beyond(problem, octave.highest, state.seed)
+    return state.advanced(seconds, octaves=(*state.octaves, measured), remainders=(*state.remainders, outer))
+
+
+def refined(state: State) -> State | None:
+    """Return a state with more samples where they are needed most; None where no more can be taken."""
+    problem, accuracy, core = state.problem, state.problem.accuracy, state.core
+    values = accuracy.scale(np.sqrt(state.squares))
+    if np.any(change_of_root(state.squares, core.images) > accuracy.aliasing_part * values):
+        larger = good_intervals(FINER_LATTICE * core.lattice.M)
+        if larger <= accuracy.largest_intervals:
+            core = Core.on_lattice(problem, Lattice(core.lattice.xi_max, larger), state.cutoff)
+    finer = _finer_samplings(state)
+    seconds = sum(state.sampling_seconds(sampling, state.octaves[n].sampling) for n, sampling in finer.items())
+    if state.seconds + seconds > _MOST_SECONDS:
+        finer, seconds = {}, 0.0
+    if core is state.core and not finer:
+        return _checked_again(state)
+    octaves = tuple(
+        _measured(state, finer[number], octave) if number in finer else octave
+        for number, octave in enumerate(state.octaves)
+    )
+    return state.advanced(seconds, core=core, octaves=octaves)
+
+
+def _checked_again(state: State) -> State | None:
+    """Return a state whose worst disagreement is judged by more and new points; None where it cannot be chance."""
+    # Each check is at 99 %, and a study makes many: some fail by chance. Checks at a higher level would see less. So
+    # one that fails is made again, from new points with half the error, where a real difference fails again. More than
+    # twice the error, five standard deviations, is real.
+    relative = state.disagreements / state.permitted
+    number, order = np.unravel_index(np.argmax(relative), relative.shape)
+    beyond = state.remainders[number]
+    points, (_, errors) = _MORE_TO_CHECK * beyond.points, beyond.at(state.problem.orders)
+    is_affordable = points <= _MOST_POINTS and state.seconds + beyond.seconds(points) <= _MOST_SECONDS
+    may_be_chance = 0 < state.disagreements[number, order] < errors[order]
+    return state.redrawn(int(number), points) if is_affordable and may_be_chance else None
+
+
+def _measured(state: State, sampling: OctaveSampling, known: MeasuredOctave | None = None) -> MeasuredOctave:
+    """Return an octave at some samples; values that are known are not computed again."""
+    problem = state.problem
+    values = problem.accuracy.scale(np.sqrt(state.squares))
+    target = error_target(values, problem.orders, problem.accuracy, problem.area)
+    settings = settings_for(target.tightened(2 * problem.inexact_count * np.sqrt(_USUAL_OCTAVES)))
+    of_surfaces = tuple(
+        octave_values(
+            surface,
+            sampling,
+            problem.orders,
+            settings,
+            problem.execution,
+            known=known.values[number] if known else None,
+        )
+        for number, surface in enumerate(problem.surfaces)
+    )
+    squares = squared_moduli(only_or_difference([values.values for values in of_surfaces]))
+    return MeasuredOctave(of_surfaces, OctaveWeights(sampling, problem.orders).sums(squares))
+
+
+def _first_sampling(state: State, octave: Octave) -> OctaveSampling:
+    """Return the sampling of an octave that is predicted to be the cheapest one."""
+    orders, normals, rng = state.problem.orders, state.normals, state.rng
+    energy = state.octaves[-1].sums.energy if state.octaves else state.core.energy
+    energy = max(_GROWTH * energy, *state.remainders[-1].energies)
+    inside = np.array([octave.integral(order) for order in orders])
+    outside = np.array([tail_integral(octave.highest, order) for order in orders])
+    deviation = _FLAT_DEVIATION if normals else _CURVED_DEVIATION
+    # Relative errors of the energy that the octave's own part permits, and what lies beyond it.
+    # Very negative orders have nothing there.
+    with np.errstate(divide="ignore"):
+        own = np.sqrt(state.permitted_variances / _USUAL_OCTAVES) / (energy * inside)
+        further = _REMAINDER_FRACTION * state.permitted / (_QUANTILE * energy * outside)
+    count = int(np.clip((deviation / min(own.min(), further.min())) ** 2, _FEWEST_DRAWS, _MOST_DRAWS))
+    # As many samples as draws would need.
+    intervals = int(np.clip(good_intervals((count / _FILLED) ** (1 / 3)), _FEWEST_M, _FIRST_M))
+    lattice = _lattice(state, octave, intervals, rng)
+    seconds = sum(size.lattice_seconds(lattice) for size in state.sizes)
+    alone = max(count, _FEWEST_FLAT_DRAWS) if normals else count
+    alone = min(alone, max(_FEWEST_DRAWS, int(_OCTAVE_SECONDS / state.draw_seconds)))
+    if state.can_draw and alone * state.draw_seconds < seconds:
+        return OctaveSampling(octave, (), alone, _seed(rng), normals, _UNIFORM_ALONE)
+    beside = 0
+    if normals and state.can_draw:
+        affordable = _DRAWS_FRACTION * seconds / state.draw_seconds
+        beside = int(np.clip(min(count, affordable), _FEWEST_DRAWS, _MOST_DRAWS))
+    return OctaveSampling(octave, (lattice,), beside, _seed(rng), normals, _UNIFORM_BESIDE_LATTICE)
+
+
+def _finer_samplings(state: State) -> dict[int, OctaveSampling]:
+    """Return samplings for the octaves whose variance is too large."""
+    permitted = state.permitted_variances
+    totals = sum((octave.sums.variances for octave in state.octaves), np.zeros(len(permitted)))
+    order = int(np.argmax(totals / permitted))
+    if totals[order] <= permitted[order]:
+        return {}
+    variances = np.array([octave.sums.variances[order] for octave in state.octaves])
+    # Those that matter least together stay as they are.
+    ascending = np.argsort(variances)
+    decisive = ascending[np.cumsum(variances[ascending]) > _LEFT_FRACTION * permitted[order]]
+    finer = {
+        int(number): _finer_sampling(state, state.octaves[number], order, permitted[order] / len(state.octaves))
+        for number in decisive
+    }
+    return {number: sampling for number, sampling in finer.items() if sampling is not None}
+
+
+def _finer_sampling(state: State, octave: MeasuredOctave, order: int, permitted: float) -> OctaveSampling | None:
+    """Return a sampling of an octave with a smaller variance, or None if it is small enough."""
+    sampling, sums = octave.sampling, octave.sums
+    rng = np.random.default_rng([state.seed, state.steps, sampling.octave.index])
+    excess = float(sums.variances[order]) / permitted
+    if excess <= 1:
+        return None
+    count = int(min(sampling.draws * np.clip(1.5 * excess, 1.5, 16.0), _MOST_DRAWS))
+    first = _lattice(state, sampling.octave, _FIRST_M, rng)
+    seconds = sum(size.lattice_seconds(first) for size in state.sizes)
+    if not sampling.lattices and count * state.draw_seconds > seconds:
+        beside = sampling.draws if state.normals else 0
+        return replace(
+            sampling, lattices=(first,), draws=beside, seed=_seed(rng), uniform_fraction=_UNIFORM_BESIDE_LATTICE
+        )
+    of_lattices, of_draws = sums.parts[:, order]
+    if of_draws > of_lattices:
+        return replace(sampling, draws=count, seed=_seed(rng))
+    intervals = 2 * round(sampling.lattices[-1].M * np.clip(excess**0.5, 1.25, 2.0) / 2)
+    return replace(sampling, lattices=(*sampling.lattices, _lattice(state, sampling.octave, intervals, rng)))
+
+
+def _beyond(problem: Problem, cutoff: float, seed: int, points: int | None = None) -> Remainder:
+    """Return what lies beyond a cutoff, from new points."""
+    return remainder(
+        problem.surfaces, problem.signs, cutoff, problem.orders, points, seed=seed, threads=problem.threads
+    )
+
+
+def _lattice(state: State, octave: Octave, intervals: int, rng: np.random.Generator) -> OctaveLattice:
+    largest = min(_LARGEST_M, state.problem.accuracy.largest_intervals)
+    return OctaveLattice.random(octave.lowest, octave.highest, min(intervals, largest), rng)
+
+
+def _seed(rng: np.random.Generator) -> int:
+    return int(rng.integers(2**53))
+
+
+def _resolvable_frequency(problem: Problem) -> float:
+    """Return the frequency up to which all surfaces can be transformed."""
+    areas = [surface.area for surface in problem.surfaces if isinstance(surface, Smooth)]
+    return float((_MOST_SMOOTH_NODES / (4 * POINTS_PER_SQUARE * max(areas))) ** 0.5) if areas else np.inf

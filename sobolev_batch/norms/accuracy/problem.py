@@ -1,0 +1,344 @@
+"""A norm or a distance to compute, the accuracy that it needs, and its division among fields."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Self, cast
+
+import numpy as np
+
+from sobolev_batch.errors import AccuracyError
+from sobolev_batch.geometry.mesh import Mesh, shared_triangles
+from sobolev_batch.geometry.overlap import SINGLE_ROUNDING, rests_of
+from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Reals, Similarity, Surface, centering
+from sobolev_batch.norms.accuracy.apart import APART_FRACTION, product_apart
+from sobolev_batch.norms.accuracy.tolerance import Accuracy, first_lattice, unreachable
+from sobolev_batch.norms.budget import NormEstimate, Sums, Support, change_of_root, norm_of_moves, sums_of_shells
+from sobolev_batch.norms.fields import USUAL_DEGREE, Field, field_for
+from sobolev_batch.norms.tail.sampling import OctaveSampling
+from sobolev_batch.norms.tail.values import OctaveValues
+from sobolev_batch.transform.backends import ComplexDtype, Complexes
+from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, permits_single
+from sobolev_batch.transform.lattice import Lattice, SobolevWeights, shell_sums
+from sobolev_batch.transform.probe import Sample, draws_for, estimate, needs_probe
+
+Samples = tuple[Sample, ...]
+
+# A distance is first estimated from a few frequencies; it is seldom less than this fraction of the estimate.
+ESTIMATE_CAUTION = 0.7
+# No field is exact to less than this fraction of its area. Near-duplicates are that close, and have no
+# relative accuracy.
+_ROUNDING = 1e-13
+# What rounding to single precision changes a value by, relative to it, and the fraction of an error that it may take.
+_STORED_ROUNDING, _STORED_FRACTION = 6e-8, 0.1
+# Surfaces whose common centre is no further from the origin, relative to their extent, stay where they are.
+OFF_CENTER = 1e-3
+_PAIR = 2
+# Fraction of an error that faces may take that are apart by a rounding of files.
+_MOVED_FRACTION = 0.1
+# Settings that each field has.
+_OF_FIELDS = ("eps", "quadrature_eps", "points")
+# An accuracy called reachable must hold when it is requested.
+_REACHABLE_MARGIN = 1.3
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A norm of a surface, or a distance of two, and the accuracy to compute it to.
+
+    Attributes:
+        surfaces: One surface, or two; none where two surfaces cancel.
+        support: Area of the surfaces together, and sizes of all surfaces that share the lattice.
+        label: Name of the norm or distance in messages.
+        pair: Surfaces that a distance is between, with what they share; empty for a norm.
+        signs: Signs of the surfaces in the difference.
+        apart: What the product of two surfaces that are far apart does not exceed (orders,); None for others.
+        moved: Norm (orders,) that faces which were taken out do not exceed, as they are apart by a rounding of files.
+    """
+
+    surfaces: Sequence[Surface]
+    orders: tuple[float, ...]
+    accuracy: Accuracy
+    support: Support
+    label: str
+    threads: int = 1
+    pair: Sequence[Surface] = ()
+    signs: Sequence[int] = (1, -1)
+    apart: Reals | None = None
+    moved: Reals | float = 0.0
+
+    @classmethod
+    def from_surfaces(
+        cls, surfaces: Sequence[Surface], orders: tuple[float, ...], accuracy: Accuracy, label: str, threads: int
+    ) -> Self:
+        """Return the problem for surfaces, moved to the centre, without what both have; none may remain.
+
+        Those that are far apart stay where they are, since a common move would cost digits.
+        """
+        different, pair = without_common_parts(surfaces), tuple(surfaces) if len(surfaces) == _PAIR else ()
+        settings = orders, accuracy, label, threads
+        problem = cls._between(different, pair, *settings)
+        meshes = [surface for surface in different.values() if isinstance(surface, Mesh)]
+        if len(meshes) < _PAIR or not any(_is_single(surface) for surface in pair):
+            return problem
+        rests = rests_of(meshes[0], meshes[1], SINGLE_ROUNDING)
+        closer = cls._between(_signed(rests.meshes), pair, *settings)
+        moved = norm_of_moves(rests.areas, rests.distances, orders)
+        if closer.surfaces and np.all(moved <= _MOVED_FRACTION * accuracy.rtol * closer.rough_values):
+            return replace(closer, moved=moved)
+        return problem
+
+    @classmethod
+    def _between(
+        cls, different: Mapping[int, Surface], pair: Sequence[Surface], orders: tuple[float, ...], *settings: Any
+    ) -> Self:
+        """Return the problem for what two surfaces do not have in common, by sign, or for one surface."""
+        accuracy, label, threads = settings
+        if not different:
+            return cls((), orders, accuracy, Support(np.zeros(()), np.zeros(len(DIRECTIONS))), label, threads)
+        is_whole = all(one is other for one, other in zip(different.values(), pair, strict=False))
+        apart = product_apart(tuple(different.values()), orders, accuracy.rtol) if is_whole else None
+        move = centering(list(different.values()), OFF_CENTER) if apart is None else Similarity()
+        surfaces = tuple(move.apply(surface) for surface in different.values())
+        pair = surfaces if is_whole else tuple(move.apply(surface) for surface in pair)
+        return cls(surfaces, orders, accuracy, support_of(surfaces), label, threads, pair, tuple(different), apart)
+
+    @property
+    def alone(self) -> tuple[Self, ...]:
+        """Norms of the surfaces, each at the centre, for those that are far apart."""
+        accuracy = replace(self.accuracy, rtol=(1 - APART_FRACTION) * self.accuracy.rtol)
+        return tuple(
+            self.from_surfaces((surface,), self.orders, accuracy, self.label, self.threads) for surface in self.surfaces
+        )
+
+    @property
+    def area(self) -> float:
+        """Area of the surfaces together."""
+        return float(self.support.areas)
+
+    @property
+    def execution(self) -> Execution:
+        """Threads to compute with, and memory that transforms may take."""
+        return Execution(threads=self.threads, allowed_bytes=self.accuracy.allowed_bytes)
+
+    @property
+    def is_whole(self) -> bool:
+        """True if the surfaces are those that a distance is between: they share no triangles."""
+        return self.surfaces is self.pair
+
+    @property
+    def inexact_count(self) -> int:
+        """Number of fields among which an error is divided: those without a closed form, or 1."""
+        return max(1, sum(needs_probe(surface, TransformSettings()) for surface in self.surfaces))
+
+    @property
+    def rounding(self) -> float:
+        """Smallest norm that differs from zero by more than rounding."""
+        return _ROUNDING * self.area
+
+    @cached_property
+    def _samples(self) -> dict[Lattice, Samples]:
+        return {}
+
+    def samples(self, lattice: Lattice) -> Samples:
+        """Return samples of all surfaces at the same frequencies; those of a lattice are computed once."""
+        if lattice not in self._samples:
+            draws = draws_for(self.surfaces, lattice, self.orders, USUAL_DEGREE)
+            self._samples[lattice] = tuple(Sample.from_surface(surface, draws) for surface in self.surfaces)
+        return self._samples[lattice]
+
+    def dtype(self, lattice: Lattice, target: ErrorTarget) -> ComplexDtype:
+        """Return the cheapest dtype that meets a target."""
+        single = all(permits_single(surface, lattice, target) for surface in self.surfaces)
+        return "complex64" if single else "complex128"
+
+    @property
+    def rough_values(self) -> Reals:
+        """Norms (orders,) on a small lattice, from a few frequencies."""
+        lattice, _ = first_lattice(self.support, self.orders, self.accuracy)
+        return np.asarray(ESTIMATE_CAUTION * estimate(self.samples(lattice), self.orders))
+
+    def permits_single_storage(self, lattice: Lattice, target: ErrorTarget) -> bool:
+        """Tell whether fields meet a target once each value is rounded to single precision."""
+        norms = [estimate([sample], self.orders) for sample in self.samples(lattice)]
+        return bool(np.all(_STORED_ROUNDING * np.array(norms) <= _STORED_FRACTION * np.array(target.norms)))
+
+    def fields(self, lattice: Lattice, samples: Samples, target: ErrorTarget, dtype: ComplexDtype) -> tuple[Field, ...]:
+        """Return the fields of all surfaces, each with an error within a target."""
+        settings, execution = TransformSettings(dtype=dtype), Execution(threads=self.threads)
+        return tuple(
+            field_for(surface, lattice, target, settings, execution, sample=sample)
+            for surface, sample in zip(self.surfaces, samples, strict=True)
+        )
+
+    def require_above_rounding(self, values: Reals) -> None:
+        """Refuse an accuracy of norms (orders,) below the rounding of fields, unless it is a best effort."""
+        if self.accuracy.best_effort:
+            return
+        parts, floor = self.accuracy.discretisation_parts(self.orders), self.rounding
+        # A distance of no more than rounding is that of near-duplicates, and has no relative accuracy.
+        below = (parts * values < floor) & (values > floor)
+        if below.any():
+            worst = int(np.argmax(below * floor / (parts * np.maximum(values, floor))))
+            rtol = self.accuracy.rtol
+            reachable = 2 * rtol * floor / float(parts[worst] * values[worst])
+            raise AccuracyError(
+                f"{self.label}: rtol {rtol:g} of about {values[worst]:.2g} at order {self.orders[worst]:g} is below "
+                f"the rounding of double precision; about {reachable:.1g} can be reached; ask for that, or for a best "
+                "effort",
+                rtol,
+                reachable,
+            )
+
+    def out_of_reach(self, found: NormEstimate, limits: str) -> AccuracyError:
+        """Return the error for an accuracy out of reach, from the nearest that was reached and what limits it."""
+        relative = found.errors / found.values
+        worst = int(np.argmax(relative))
+        return unreachable(
+            f"{self.label}: rtol {self.accuracy.rtol:g} is out of reach at order {self.orders[worst]:g} {limits}",
+            self.accuracy.rtol,
+            _REACHABLE_MARGIN * float(relative[worst]),
+        )
+
+
+def error_target(values: Reals, orders: tuple[float, ...], accuracy: Accuracy, area: float) -> ErrorTarget:
+    """Return the target of both fields of a pair together at these distances (orders,): never below rounding."""
+    errors = np.maximum(accuracy.discretisation_parts(orders) * values, _ROUNDING * area)
+    return ErrorTarget(orders, tuple(errors.tolist()))
+
+
+def only_or_difference(values: Sequence[Complexes]) -> Complexes:
+    """Return the only values, or the difference of two."""
+    return values[0] if len(values) == 1 else values[0] - values[1]
+
+
+def sums_on(problem: Problem, fields: Sequence[Field], weights: SobolevWeights) -> tuple[Sums, Reals]:
+    """Return the sums of the only field, or of the difference of two, and the norms of its error (orders,)."""
+    lattice, difference = weights.lattice, only_or_difference([field.values for field in fields])
+    sums = sums_of_shells(shell_sums(difference, None, lattice, lattice.half), weights)
+    return sums, np.sum([field.quality.probe.norms(weights) for field in fields], axis=0) + problem.moved
+
+
+def support_of(surfaces: Sequence[Surface]) -> Support:
+    """Return the area of some surfaces, and the sizes of all of them together."""
+    extent = Extent.union([surface.extent for surface in surfaces])
+    return Support(np.array(sum(surface.area for surface in surfaces)), extent.widths, extent.reach)
+
+
+def are_equal(a: Surface, b: Surface) -> bool:
+    """Return whether two meshes are equal as area measures, to rounding."""
+    if isinstance(a, Mesh) and isinstance(b, Mesh) and abs(a.area - b.area) > _ROUNDING * (a.area + b.area):
+        return False
+    return not without_common_parts((a, b))
+
+
+def without_common_parts(surfaces: Sequence[Surface]) -> Mapping[int, Surface]:
+    """Return one surface, or what two do not have in common, by their signs in the difference."""
+    meshes = [surface for surface in surfaces if isinstance(surface, Mesh)]
+    if len(meshes) < _PAIR:
+        return dict(zip((1, -1), surfaces, strict=False))
+    shared = shared_triangles(*(mesh.vertices[mesh.triangles] for mesh in meshes))
+    if shared[0].any():
+        meshes = [
+            Mesh.from_checked(mesh.vertices, np.ascontiguousarray(mesh.triangles[~in_both]))
+            for mesh, in_both in zip(meshes, shared, strict=True)
+        ]
+    rests = [mesh if len(mesh.triangles) and mesh.area > 0 else None for mesh in meshes]
+    if rests[0] is not None and rests[1] is not None:
+        rests = list(rests_of(rests[0], rests[1]).meshes)
+    return _signed(rests)
+
+
+def _signed(rests: Sequence[Mesh | None]) -> Mapping[int, Surface]:
+    return {sign: rest for sign, rest in zip((1, -1), rests, strict=True) if rest is not None}
+
+
+def _is_single(surface: Surface) -> bool:
+    """Tell whether single precision holds the coordinates of a mesh, as where STL was read."""
+    return isinstance(surface, Mesh) and bool(np.all(surface.vertices.astype(np.float32) == surface.vertices))
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceValues:
+    """Values of a surface at some frequencies: its field on a lattice, and in the octaves beyond it."""
+
+    field: Field
+    octaves: tuple[OctaveValues, ...] = ()
+
+    def error_norms(self, weights: SobolevWeights) -> Reals:
+        """Return the norms of the values' own errors (orders,)."""
+        on_lattice = self.field.quality.probe.norms(weights)
+        return np.asarray(np.hypot.reduce([on_lattice, *(one.error_norms(weights.orders) for one in self.octaves)]))
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Norms or distances, and how they were computed.
+
+    Attributes:
+        estimate: Numbers with their errors, each (orders,).
+        lattice: Lattice of the fields; None where nothing had to be computed.
+        values: Values of each surface on the lattice and in octaves beyond it.
+        shortfall: Why the numbers miss the accuracy; None if they do not.
+        has_tail: True where all that lies beyond the lattice was measured, and the lattice ends in a step.
+        alone: Norms that a distance of surfaces far apart consists of, each with a lattice of its own.
+    """
+
+    estimate: NormEstimate
+    lattice: Lattice | None = None
+    values: tuple[SurfaceValues, ...] = ()
+    shortfall: AccuracyError | None = None
+    has_tail: bool = False
+    alone: tuple[Solution, ...] = ()
+
+    @classmethod
+    def zero(cls, orders: Sequence[float]) -> Self:
+        """Return the distance of equal surfaces, for which nothing is computed."""
+        return cls(NormEstimate(*np.zeros((5, len(orders)))))
+
+    @classmethod
+    def of_apart(cls, problem: Problem, alone: Sequence[Solution]) -> Self:
+        """Return the distance of surfaces far apart from their norms: its square is the sum of both squares.
+
+        What the product of both surfaces may change is an error by images.
+        """
+        norms = np.stack([one.estimate.values for one in alone])
+        errors = np.stack([one.estimate.errors for one in alone])
+        values, highest = np.hypot(*norms), np.hypot(*(norms + errors))
+        # Each error is weighted such that all of them together lead from the values to the highest ones.
+        weights = (2 * norms + errors) / (highest + values)
+        parts = np.sum([w * np.stack([*one.estimate][1:]) for w, one in zip(weights, alone, strict=True)], axis=0)
+        found = NormEstimate(values, *parts)
+        product = change_of_root(values**2, 2 * cast(Reals, problem.apart))
+        shortfall = next((one.shortfall for one in alone if one.shortfall is not None), None)
+        return cls(replace(found, aliasing=found.aliasing + product), shortfall=shortfall, alone=tuple(alone))
+
+    @property
+    def octaves(self) -> tuple[OctaveSampling, ...]:
+        """Octaves that were measured beyond the lattice."""
+        return tuple(one.sampling for one in self.values[0].octaves) if self.values else ()
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Settings that the numbers were computed with, as attributes."""
+        if self.alone:
+            # Those of the larger lattice, and of the fields of both.
+            both = [one.settings for one in self.alone]
+            lists = {name: [value for one in both for value in one[name]] for name in _OF_FIELDS}
+            return {**max(both, key=lambda one: one["M"]), **lists}
+        if self.lattice is None:
+            return {}
+        fields = [one.field for one in self.values]
+        settings = [field.settings for field in fields]
+        return {
+            "xi_max": self.lattice.xi_max,
+            "M": self.lattice.M,
+            "octaves": len(self.octaves),
+            "highest_frequency": max([self.lattice.xi_max, *(one.octave.highest for one in self.octaves)]),
+            "dtype": settings[0].dtype,
+            "eps": [setting.eps for setting in settings],
+            "quadrature_eps": [setting.tolerance or setting.eps for setting in settings],
+            "points": [field.points for field in fields],
+        }

@@ -1,0 +1,221 @@
+"""Distances beside a threshold, computed as exactly as it takes to tell on which side of it they lie."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal, Self
+
+import numpy as np
+
+from sobolev_batch.geometry.surface import Surface
+from sobolev_batch.norms.accuracy.octaves import solve_in_octaves
+from sobolev_batch.norms.accuracy.problem import Problem, error_target
+from sobolev_batch.norms.accuracy.solve import difference_on, solve
+from sobolev_batch.norms.accuracy.tolerance import Accuracy, core_lattice, lattice_of
+from sobolev_batch.norms.budget import area_bound, area_bounds
+from sobolev_batch.norms.fields import USUAL_DEGREE, Field, compute_field
+from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, choose_settings, transform_block
+from sobolev_batch.transform.lattice import Lattice, SobolevWeights, shell_sums, shell_volumes
+from sobolev_batch.transform.probe import Sample, draws_for, needs_probe
+
+Method = Literal["identical", "lattice", "octaves"]
+
+# Fraction of the threshold that may lie beyond the first lattice, and the relative error of its fields there.
+_BEYOND, _FIRST_RTOL = 0.7, 0.2
+# M of the first lattice at most, which is enough for surfaces that differ clearly. Where a larger one than the last is
+# needed, octaves are cheaper.
+_FIRST_M, _LARGEST_M = 96, 320
+_ROUNDS = 4
+# A distance nearer to the threshold than this fraction of it is left undecided. What errors are brought down to, as a
+# fraction of the distance between the two, and the least rtol of octaves, which take long for a small one.
+_NARROWEST, _OF_MARGIN, _LEAST_RTOL_OF_OCTAVES = 3e-3, 0.4, 0.01
+# Errors of octaves are partly estimates: the law of energies, and random frequencies. Of a hundred verdicts that took
+# the side which they permit, two had errors that were too small, by a factor below 2.
+_OCTAVES_CAUTION = 3.0
+# Of the distance between surfaces that are far apart, which is beyond every threshold.
+_APART_RTOL = 0.01
+# The prediction of a field's error may be too small by this factor.
+_PREDICTION_CAUTION = 4.0
+# M, eps and tolerance for the norm of the reference, the relative error that it may have, and that of a second attempt.
+_NORM_M, _NORM_EPS, _NORM_RTOL, _EXACT_NORM_RTOL = 40, 1e-3, 0.01, 1e-3
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Bounds on a number that is not negative."""
+
+    lower: float
+    upper: float
+
+    @classmethod
+    def around(cls, value: float, below: float, above: float) -> Self:
+        """Return the numbers from ``value - below``, or zero, to ``value + above``."""
+        return cls(max(value - below, 0.0), value + above)
+
+    def over(self, divisor: Interval) -> Interval:
+        """Return the bounds on a quotient."""
+        return Interval(self.lower / divisor.upper, self.upper / divisor.lower)
+
+
+def relative_distance(
+    surface: Surface, reference: Surface, order: float, threshold: float, accuracy: Accuracy, threads: int, seed: int
+) -> tuple[Interval, Method]:
+    """Bound a distance over the norm of its reference closely enough to tell on which side of a threshold it is.
+
+    One lattice decides, or two, where the areas alone bound what lies beyond them; else octaves measure it, at random
+    frequencies that follow from the seed. The memory of the accuracy counts, and its rtol does not. Return the bounds,
+    and what they follow from. LatticeError where a surface is too large or too small for any lattice.
+    """
+    if surface == reference:
+        return Interval(0.0, 0.0), "identical"
+    accuracy = replace(accuracy, rtol=_FIRST_RTOL, best_effort=True)
+    problem = Problem.from_surfaces((surface, reference), (order,), accuracy, "the relative distance", threads)
+    if not problem.surfaces:
+        return Interval(0.0, 0.0), "identical"
+    if problem.apart is not None:
+        return _of_apart(problem, seed)
+    of_norm = Problem.from_surfaces([reference], (order,), accuracy, "the norm of the reference", threads)
+    for norm_of in (_rough_norm, _exact_norm):
+        norm = norm_of(of_norm)
+        search = _Search(problem, Interval(threshold * norm.lower, threshold * norm.upper))
+        bounds, method = search.bounds(seed)
+        if search.is_decided(bounds):
+            break
+    return bounds.over(norm), method
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """A distance to bound, and the range of its threshold: the norm of the reference has an error."""
+
+    problem: Problem
+    threshold: Interval
+
+    def bounds(self, seed: int) -> tuple[Interval, Method]:
+        """Return bounds on the distance, and what they follow from."""
+        beyond, rtol = _BEYOND, _FIRST_RTOL
+        largest = min(_LARGEST_M, self.problem.accuracy.largest_intervals)
+        most = min(_FIRST_M, largest)
+        for _ in range(_ROUNDS):
+            lattice = lattice_of(self._frequency(beyond), self._period, most)
+            value, bounds = self._on_lattice(lattice, rtol)
+            if self.is_decided(bounds) or self._is_hopeless(value, bounds):
+                return bounds, "lattice"
+            fraction, margin = value / self.threshold.lower, max(self._margin(value), _NARROWEST)
+            # Only what lies beyond the lattice can bring a smaller distance to the threshold.
+            beyond = min(beyond, _BEYOND * max(1 - fraction**2, margin) ** 0.5)
+            rtol, most = min(rtol, _OF_MARGIN * margin), largest
+            if 2 * self._frequency(beyond) * self._period > largest:
+                break
+        return self._in_octaves(seed), "octaves"
+
+    @cached_property
+    def _period(self) -> float:
+        """Period of lattices that hold the surfaces and their images apart."""
+        return 1 / core_lattice(self.problem.support, self.problem.orders, self.problem.accuracy).spacing
+
+    def _frequency(self, beyond: float) -> float:
+        """Return the frequency beyond which no more can lie than a fraction of the threshold."""
+        return _frequency_of(self.problem, beyond * self.threshold.lower)
+
+    def _on_lattice(self, lattice: Lattice, rtol: float) -> tuple[float, Interval]:
+        """Return the part of the distance on a lattice, and bounds on all of it."""
+        problem = self.problem
+        accuracy = replace(problem.accuracy, rtol=rtol)
+        target = error_target(np.array([self.threshold.lower]), problem.orders, accuracy, problem.area)
+        fields = _fields(problem, lattice, target.tightened(problem.inexact_count))
+        found = difference_on(problem, lattice, fields)[0]
+        value, error = float(found.values[0]), float((found.aliasing + found.discretisation)[0])
+        return value, Interval.around(value, error, _with_beyond(problem, value, lattice) - value + error)
+
+    def _in_octaves(self, seed: int) -> Interval:
+        """Return bounds on the distance from what octaves measure."""
+        rtol = _FIRST_RTOL
+        for _ in range(_ROUNDS):
+            accuracy = replace(self.problem.accuracy, rtol=rtol, floor=self.threshold.lower)
+            solution = solve_in_octaves(replace(self.problem, accuracy=accuracy), seed)
+            value, error = float(solution.estimate.values[0]), float(solution.estimate.errors[0])
+            bounds = Interval.around(value, _OCTAVES_CAUTION * error, _OCTAVES_CAUTION * error)
+            rtol = min(rtol / 2, _OF_MARGIN * self._margin(value))
+            if self.is_decided(bounds) or rtol < _LEAST_RTOL_OF_OCTAVES or solution.shortfall is not None:
+                break
+        return bounds
+
+    def is_decided(self, bounds: Interval) -> bool:
+        """Tell whether bounds lie on one side of the threshold."""
+        return bounds.upper <= self.threshold.lower or bounds.lower > self.threshold.upper
+
+    def _is_hopeless(self, value: float, bounds: Interval) -> bool:
+        """Tell whether a closer look at the distance is in vain: it may equal the threshold, within its errors."""
+        narrowest = _NARROWEST * self.threshold.lower
+        widths = bounds.upper - bounds.lower, self.threshold.upper - self.threshold.lower
+        return self._margin(value) < _NARROWEST and (widths[0] < narrowest or widths[1] > narrowest)
+
+    def _margin(self, value: float) -> float:
+        """Return how far a distance is from the threshold, relative to it."""
+        below, above = self.threshold.lower - value, value - self.threshold.upper
+        return max(below, above, 0.0) / self.threshold.lower
+
+
+def _fields(problem: Problem, lattice: Lattice, target: ErrorTarget) -> tuple[Field, ...]:
+    """Return the fields of the surfaces, at the same time, with errors that are predicted to be within a target."""
+    draws = draws_for(problem.surfaces, lattice, problem.orders, USUAL_DEGREE)
+    dtype = problem.dtype(lattice, target)
+    execution = Execution(threads=max(1, problem.threads // len(problem.surfaces)))
+
+    def field(surface: Surface) -> Field:
+        sample, settings = Sample.from_surface(surface, draws), TransformSettings(dtype=dtype)
+        if needs_probe(surface, TransformSettings()):
+            # Where the prediction fails, bounds are wider, and the next lattice gets a stricter target.
+            settings = choose_settings(surface, lattice, target.tightened(_PREDICTION_CAUTION), settings)
+        return compute_field(surface, lattice, settings, problem.orders, execution, sample=sample)
+
+    with ThreadPoolExecutor(len(problem.surfaces)) as pool:
+        return tuple(pool.map(field, problem.surfaces))
+
+
+def _of_apart(problem: Problem, seed: int) -> tuple[Interval, Method]:
+    """Return bounds on the relative distance of surfaces far apart, which exceeds one, and what they follow from."""
+    solution = solve(replace(problem, accuracy=replace(problem.accuracy, rtol=_APART_RTOL)), seed)
+    caution = _OCTAVES_CAUTION if any(one.has_tail for one in solution.alone) else 1.0
+    bounds = []
+    for found in (solution.estimate, solution.alone[1].estimate):
+        value, error = float(found.values[0]), caution * float(found.errors[0])
+        bounds.append(Interval.around(value, error, error))
+    return bounds[0].over(bounds[1]), "lattice" if caution == 1.0 else "octaves"
+
+
+def _rough_norm(problem: Problem) -> Interval:
+    """Return bounds on the norm of a reference from a small lattice, if that is enough."""
+    (surface,), (order,) = problem.surfaces, problem.orders
+    core = core_lattice(problem.support, problem.orders, problem.accuracy)
+    lattice = lattice_of(core.xi_max, 1 / core.spacing, min(core.M, _NORM_M))
+    settings = TransformSettings(_NORM_EPS, "complex64", tolerance=_NORM_EPS)
+    field = transform_block(surface, lattice, lattice.half, settings, Execution(threads=problem.threads)).values
+    weights = SobolevWeights(lattice, (order,)).per_shell[0]
+    value = float(weights @ shell_sums(field, None, lattice, lattice.half)) ** 0.5
+    # The rules keep the tolerance at every frequency, and so does the NUFFT.
+    error = 2 * _NORM_EPS * surface.area * float(weights @ shell_volumes(lattice)) ** 0.5
+    above = _with_beyond(problem, value, lattice) - value + error
+    return Interval.around(value, error, above) if above <= _NORM_RTOL * value else _exact_norm(problem)
+
+
+def _exact_norm(problem: Problem) -> Interval:
+    """Return close bounds on the norm of a reference."""
+    found = solve(replace(problem, accuracy=replace(problem.accuracy, rtol=_EXACT_NORM_RTOL))).estimate
+    value, error = float(found.values[0]), float(found.errors[0])
+    return Interval.around(value, error, error)
+
+
+def _with_beyond(problem: Problem, value: float, lattice: Lattice) -> float:
+    """Return a norm on a lattice with all that may lie beyond the lattice."""
+    (order,) = problem.orders
+    return float(np.sqrt(value**2 + area_bound(problem.area, order, lattice.xi_max)))
+
+
+def _frequency_of(problem: Problem, norm: float) -> float:
+    """Return the frequency beyond which no more than a norm can lie."""
+    (order,) = problem.orders
+    return float(min((factor / norm**2) ** (1 / power) for factor, power in area_bounds(problem.area, order)))

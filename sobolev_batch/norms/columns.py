@@ -1,0 +1,223 @@
+"""Datasets of metrics, with units, long names, and the lattice and kernel that they belong to; observed rates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from sobolev_batch.geometry.surface import Reals
+from sobolev_batch.norms.budget import PARTS, NormEstimate, ReferenceEstimate
+from sobolev_batch.transform.lattice import AXES, Lattice, Orders
+
+KERNEL = "weight (1 + |xi|^2)^s, xi in cycles per unit length"
+LENGTH, AREA, VOLUME = "unit length", "unit length squared", "unit length cubed"
+FREQUENCY, NUMBER, ANGLE = "cycles per unit length", "1", "degree"
+FILE_LENGTH = "unit length of the files"
+# ||a||_s² = ∫ (1 + |ξ|²)^s |a^|² dξ is an area squared per volume.
+NORM = "unit length^(1/2)"
+
+
+def described(long_name: str, units: str = "", **others: str) -> dict[str, str]:
+    """Return the attributes of a variable, which may have no unit."""
+    return {"long_name": long_name, **({"units": units} if units else {}), **others}
+
+
+# Attributes of variables by name, in the results of functions and in stores. The tables of a store have no others, so
+# that the metadata of meshes may have any other name.
+VARIABLES: Mapping[str, Mapping[str, str]] = {
+    "mesh": described("label of the mesh"),
+    "other": described("label of the other mesh"),
+    "order": described("Sobolev order s", NUMBER),
+    "time": described("time of the mesh", description="in the unit of the study's times"),
+    "fourier": described("Fourier transform of the area measure", convention="∫ exp(-2πi ξ·x) dμ(x)"),
+    **{name: described(f"frequency along {name[-1]}", FREQUENCY) for name in AXES},
+    "squared_distance": described("squared Sobolev distance", LENGTH),
+    "gradient": described("derivative of the squared distance with respect to the vertices", NUMBER),
+    "norm": described("Sobolev norm", NORM, kernel="(1 + |ξ|²)^s"),
+    "distance": described("Sobolev distance", NORM, kernel="(1 + |ξ|²)^s"),
+    "error": described("bound on the error", NORM, description="the sum of error_part"),
+    "error_part": described("part of the bound on the error", NORM),
+    "part": described(
+        "cause of a part of the error",
+        description="truncation: frequencies beyond the highest one, which only add on a given lattice; "
+        "aliasing: spacing of the lattice; discretisation: quadrature and NUFFT; "
+        "statistical: random frequencies, in 99 % of cases",
+    ),
+    "relative": described("distance over the norm of the reference", NUMBER),
+    "relative_error": described("bound on the error of the relative distance", NUMBER),
+    "area_part": described("distance explained by a change of total area alone", NORM),
+    "area_part_error": described("bound on the error of that part", NORM),
+    "shape_part": described("rest of the distance", NORM, description="the squares of both parts add up"),
+    "shape_part_error": described("bound on the error of the rest", NORM),
+    "beyond": described("part of the square beyond the last octave", LENGTH, description="zero without octaves"),
+    "area_share": described("share of the squared distance explained by a change of total area", NUMBER),
+    "area_share_error": described("bound on the error of that share", NUMBER),
+    "moved": described("move of the reference that is like the distance", NUMBER, description="over its radius"),
+    "moved_error": described("error of the move", NUMBER),
+    "noise": described("noise of the reference that is like the distance", NUMBER, description="over its radius"),
+    "noise_error": described("error of the noise", NUMBER),
+    "decimated": described("triangles of the reference, decimated, that is like the distance", NUMBER),
+    "decimated_error": described("error of the number of triangles", NUMBER),
+    "excess": described("relative excess of area over the reference", NUMBER),
+    "rate": described("observed order of convergence in the edge length", NUMBER),
+    "rate_error": described("bound on the error of the rate", NUMBER),
+    "resolved": described("distance exceeds its error"),
+    "within": described("error is as small as requested"),
+    "edge_length": described("mean edge length", LENGTH),
+    "edge_length_mean": described("mean edge length", LENGTH),
+    "edge_length_max": described("largest edge length", LENGTH),
+    "area": described("area", AREA),
+    "family": described("family of the mesh"),
+    "name": described("name of the mesh in its family"),
+    "study": described("study of the mesh, where several stores are open as one"),
+    "level": described("refinement level; -1 without levels", NUMBER),
+    "rank": described("place in the family, from coarse to fine where it has such an order", NUMBER),
+    "ordered_by": described("what orders the family: level, triangles, names or time"),
+    "row": described("number of the mesh in /fourier", NUMBER),
+    "status": described("complete, failed or missing"),
+    "reason": described("reason of a failure"),
+    "vertices": described("number of vertices", NUMBER),
+    "triangles": described("number of triangles", NUMBER),
+    "boundary_edges": described("number of edges of one triangle", NUMBER),
+    "nonmanifold_edges": described("number of edges of more than two triangles", NUMBER),
+    "inconsistent_edges": described("number of edges whose two triangles face opposite sides", NUMBER),
+    "volume": described("enclosed volume", VOLUME, description="negative for a mesh that is inside out"),
+    "smallest_angle": described("smallest angle of the triangles", ANGLE),
+    "aspect_ratio": described("largest aspect ratio of the triangles; 1 is equilateral", NUMBER),
+    "duplicate_triangles": described("number of triangles that repeat another", NUMBER),
+    "zero_area_triangles": described("number of triangles without area", NUMBER),
+    "digest": described("SHA-256 of vertices and triangles"),
+    "key": described("SHA-256 of all that the field depends on"),
+    "points": described("number of quadrature points", NUMBER),
+    "worker": described("address of the worker"),
+    "backend": described("backend of the NUFFT"),
+    "finished": described("time of the end, in UTC"),
+    "seconds": described("time spent in tasks", "s"),
+    "make_seconds": described("time that making the mesh took", "s"),
+    "make_cpu_seconds": described("processor time that making the mesh took", "s"),
+    "make_peak_bytes": described("largest memory of the program that made the mesh", "byte"),
+    "exit_status": described("exit status of the program that made the mesh; negative for a signal", NUMBER),
+    **{
+        f"{name}{way}": described(f"{title}, {whose}", ANGLE if name.startswith("normal") else FILE_LENGTH)
+        for name, title in (
+            ("hausdorff", "Hausdorff distance, a lower bound"),
+            ("mean", "mean distance"),
+            ("rms", "root mean square of distances"),
+            *((f"p{percent}", f"distance within which {percent} % of the area are") for percent in (50, 95, 99)),
+            ("normal_mean", "mean angle between normals"),
+            ("normal_max", "largest angle between normals that was found"),
+        )
+        for way, whose in (
+            ("", "the larger of both directions"),
+            ("_forward", "from the mesh to the reference"),
+            ("_backward", "from the reference to the mesh"),
+        )
+    },
+    "mean_error": described("standard error of the mean distance", FILE_LENGTH),
+    "rms_error": described("standard error of the root mean square", FILE_LENGTH),
+    "chamfer": described("Chamfer distance: the sum of both mean distances", FILE_LENGTH),
+    "chamfer_error": described("standard error of the Chamfer distance", FILE_LENGTH),
+    "fscore": described("F-score, the harmonic mean of precision and recall", NUMBER),
+    "precision": described("fraction of the mesh within the threshold of the reference", NUMBER),
+    "recall": described("fraction of the reference within the threshold of the mesh", NUMBER),
+    "threshold": described("threshold of the F-score", FILE_LENGTH),
+}
+
+
+# Variables of results and columns of frames have these names.
+TAKEN_NAMES = VARIABLES.keys() | set(PARTS)
+
+
+def dataset_of(
+    columns: Mapping[str, NDArray[Any]], dimensions: Sequence[str], coordinates: Mapping[Any, Any]
+) -> xr.Dataset:
+    """Return values by name over some dimensions, and `error_part` over `part` besides, as a described dataset."""
+    variables = {
+        name: ((*dimensions, *(("part",) if name == "error_part" else ())), values) for name, values in columns.items()
+    }
+    names = {"part": np.array(PARTS, dtype=object)} if "error_part" in columns else {}
+    return describe(xr.Dataset(variables, coords={**coordinates, **names}))
+
+
+def parts_as_variables(dataset: xr.Dataset) -> xr.Dataset:
+    """Return a dataset with a variable for each part of the error in place of `error_part`."""
+    return dataset.drop_dims("part").assign(dataset["error_part"].to_dataset("part"))
+
+
+def describe(dataset: xr.Dataset) -> xr.Dataset:
+    """Add to variables the attributes that they lack, in place, and return the dataset."""
+    for name, variable in dataset.variables.items():
+        variable.attrs = {**VARIABLES.get(str(name), {}), **variable.attrs}
+    return dataset
+
+
+def order_axis(order: Orders) -> tuple[tuple[str, ...], Reals, dict[str, str]]:
+    """Return the coordinate `order`: a dimension for several orders, a scalar for one."""
+    orders = np.asarray(order, dtype=np.float64)
+    return ("order",) * orders.ndim, orders, dict(VARIABLES["order"])
+
+
+def labelled(order: Orders, values: Mapping[str, Reals], attributes: Mapping[str, Any]) -> xr.Dataset:
+    """Return values (orders,) by name over the dimension `order`, or without dimensions for a single order."""
+    axis = order_axis(order)
+    columns = {
+        name: np.reshape(value, (*axis[1].shape, *([len(PARTS)] if name == "error_part" else [])))
+        for name, value in values.items()
+    }
+    return dataset_of(columns, axis[0], {"order": axis}).assign_attrs({"kernel": KERNEL, **attributes})
+
+
+def labelled_distances(
+    order: Orders, distances: NormEstimate, reference: ReferenceEstimate, attributes: Mapping[str, object]
+) -> xr.Dataset:
+    """Return distances and what they are relative to the reference, in the form of `labelled`."""
+    relative, relative_errors = distances.relative_to(reference.norms)
+    shares, share_errors = reference.area_shares(distances)
+    columns = {
+        "relative": relative,
+        "relative_error": relative_errors,
+        "area_share": shares,
+        "area_share_error": share_errors,
+        "excess": reference.excesses,
+    }
+    return labelled(order, {**distances.named("distance"), **columns}, attributes)
+
+
+def lattice_attributes(lattice: Lattice, *fields: xr.DataArray) -> dict[str, Any]:
+    """Return the attributes of a dataset that was computed from fields on a lattice."""
+    dtypes = dict.fromkeys(str(field.dtype) for field in fields)
+    return {"xi_max": lattice.xi_max, "M": lattice.M, "dtype": ", ".join(dtypes)}
+
+
+# Of the sizes of two meshes between which a rate is formed.
+_LEAST_RATIO = 1.1
+
+
+def observed_rates(distances: Reals, errors: Reals, sizes: Reals) -> tuple[Reals, Reals]:
+    """Return the observed order p in distance ~ size^p between each mesh and a coarser one, with its error.
+
+    The coarser one is the next whose size is larger by a tenth at least: between nearly equal sizes chance decides.
+    From distances, their errors and mean edge lengths (n,) follow log(d_coarse/d)/log(h_coarse/h) and its error, (n,)
+    each: NaN for the coarsest meshes, for meshes without a distance or size, and for distances below their error.
+
+    >>> sizes = np.array([0.4, 0.2, 0.1])
+    >>> observed_rates(3 * sizes**2, np.zeros(3), sizes)[0].round(6)
+    array([nan,  2.,  2.])
+    """
+    rates, uncertainties = np.full(len(distances), np.nan), np.full(len(distances), np.nan)
+    usable = np.flatnonzero(np.isfinite(sizes) & (sizes > 0) & (distances > 0) & (errors < distances))
+    by_size = usable[np.argsort(-sizes[usable], kind="stable")]
+    coarser_counts = np.searchsorted(-sizes[by_size], -_LEAST_RATIO * sizes[by_size], side="right")
+    for fine, count in zip(by_size, coarser_counts, strict=True):
+        if count:
+            coarse = by_size[count - 1]
+            span = np.log(sizes[coarse] / sizes[fine])
+            rates[fine] = np.log(distances[coarse] / distances[fine]) / span
+            # The widest that both distances allow.
+            widest = sum(-np.log1p(-errors[i] / distances[i]) for i in (coarse, fine))
+            uncertainties[fine] = widest / span
+    return rates, uncertainties

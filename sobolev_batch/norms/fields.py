@@ -1,0 +1,322 @@
+"""Fourier fields of surfaces on the half lattice, each with an estimate of its error; fields as operands of metrics."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Literal, Self
+
+import numpy as np
+import xarray as xr
+from pydantic import TypeAdapter
+
+from sobolev_batch.errors import InputError, LatticeError
+from sobolev_batch.geometry.formats.readers import SurfaceLike, as_surface
+from sobolev_batch.geometry.surface import Extent, Reals, Surface
+from sobolev_batch.norms.tail.remainder import Remainder
+from sobolev_batch.transform.backends import ComplexDtype, Complexes, backend_named
+from sobolev_batch.transform.fourier import (
+    ON_CPU,
+    ErrorTarget,
+    Execution,
+    Transformed,
+    TransformSettings,
+    choose_settings,
+    thread_count,
+    transform_block,
+)
+from sobolev_batch.transform.kinds import kind_of
+from sobolev_batch.transform.lattice import AXES, Block, Lattice, Orders, SobolevWeights, check_orders, shell_sums
+from sobolev_batch.transform.probe import COMMON, Probe, Sample, draws_for, needs_probe, norms_of_checks, probe_block
+
+Operand = Surface | xr.DataArray
+# What people pass as an operand: see `as_mesh`.
+OperandLike = SurfaceLike | xr.DataArray
+
+# Samples of a field held at a time when it is read from elsewhere: 64 MB of complex128.
+BLOCK_SAMPLES = 1 << 22
+
+# The orders that a field is probed for if none are named.
+PROBED_ORDERS = (-2.0, -5.0, -10.0)
+# The degree of the rule that most triangles get: samples drawn for it serve coarser and equal ones.
+USUAL_DEGREE = 2
+_ATTEMPTS = 3
+
+
+@dataclass(frozen=True)
+class TailQuality:
+    """Properties of a surface's values in octaves that errors follow from.
+
+    Attributes:
+        radii: |ξ| at which values were compared with exact ones.
+        squares: Contribution of each comparison to the squared norm of the error, without the weight of an order.
+        own: What lies beyond the octaves in the surface's own norm.
+        difference: The same in its distance from the study's reference; None if unknown.
+    """
+
+    radii: tuple[float, ...]
+    squares: tuple[float, ...]
+    own: Remainder
+    difference: Remainder | None = None
+
+
+_TAIL_QUALITY = TypeAdapter(TailQuality)
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Properties of a field that the errors of norms and distances follow from.
+
+    Attributes:
+        area: Area of the surface, in squared units of length.
+        probe: Measured error of the field itself; empty for a closed form.
+        tail: Quality of the values in octaves; None without octaves.
+    """
+
+    area: float
+    extent: Extent
+    probe: Probe
+    tail: TailQuality | None = None
+
+    @classmethod
+    def from_surface(cls, surface: Surface, probe: Probe) -> Self:
+        """Return the quality of the field of a surface."""
+        return cls(surface.area, surface.extent, probe)
+
+    def error_norms(self, weights: SobolevWeights) -> Reals:
+        """Return the norm of all values' own error for each order (orders,), raised for the small samples."""
+        norms = self.probe.norms(weights)
+        if self.tail is None or not self.tail.radii:
+            return norms
+        tails = norms_of_checks(np.array(self.tail.radii), np.array(self.tail.squares), weights.orders)
+        return np.asarray(np.hypot(norms, tails))
+
+    def to_json(self) -> str:
+        """Return the quality as one line of JSON."""
+        parts = [self.area, self.extent.lowest, self.extent.highest, self.probe.shells, self.probe.sums]
+        return json.dumps(parts if self.tail is None else [*parts, asdict(self.tail)])
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """Read a quality from a line of `to_json`."""
+        area, lowest, highest, shells, sums, *tail = json.loads(text)
+        extent, probe = Extent(tuple(lowest), tuple(highest)), Probe(tuple(shells), tuple(sums))
+        return cls(area, extent, probe, _TAIL_QUALITY.validate_python(*tail) if tail else None)
+
+
+@dataclass(frozen=True, eq=False)
+class Field(Transformed):
+    """The whole field of a surface, with the quality that errors follow from, and the settings it was computed with."""
+
+    quality: Quality
+    settings: TransformSettings
+
+
+def fourier_transform(
+    surface: SurfaceLike,
+    lattice: Lattice,
+    eps: float | None = None,
+    *,
+    dtype: ComplexDtype = "complex128",
+    quadrature: str | int = "auto",
+    backend: Literal["cpu", "gpu", "auto"] = "cpu",
+    threads: int | None = None,
+    order: Orders = PROBED_ORDERS,
+) -> xr.DataArray:
+    """Return the Fourier transform of a surface's area measure, ∫ exp(-2πi ξ·x) dμ(x), on a lattice.
+
+    Args:
+        surface: `Mesh`, `Sphere`, `Ellipsoid`, `Torus` or `ParametrisedSurface`, in units of length; or what `as_mesh`
+            makes a mesh of, such as the path of a file.
+        lattice: Frequencies ξ, in cycles per unit length.
+        eps: Accuracy relative to the surface's area; the error is a small multiple of it. Default 1e-9, or 1e-6 in
+            single precision.
+        dtype: "complex128" or "complex64".
+        quadrature: Rules for the triangles of a mesh: "auto", a degree from 1 to 50, or "gauss8".
+        backend: "cpu", "gpu", or "auto" for a GPU if one is usable. If a GPU fails, the processor takes over, with a
+            warning in the log.
+        threads: Threads of the NUFFT on the processor; one per core by default.
+        order: Sobolev orders for which the error of the field is probed. Errors at other orders follow too, with
+            more uncertainty.
+
+    Returns:
+        Complex array (M+1, M+1, M/2+1), in squared units of length, on the half xi_z >= 0 with the coordinates xi_x,
+        xi_y, xi_z; the other half is its complex conjugate. The attributes hold the lattice, the convention, the
+        settings, the `backend` (the library that computed it), and as `quality` what the errors of norms and
+        distances follow from.
+
+    Raises:
+        LatticeError: The surface extends beyond the lattice's half period 1/(2h).
+        InputError: Settings are out of range, or a parametrised surface is not smooth.
+        BackendError: "gpu", and no GPU is usable.
+
+    Source: K. Koga, "Computing weak distance between the 2-sphere and its nonsmooth approximations".
+
+    >>> from sobolev_batch import Lattice, fourier_transform
+    >>> from sobolev_batch.shapes import Sphere
+    >>> field = fourier_transform(Sphere(radius=1.0), Lattice(xi_max=2.0, M=16))
+    >>> field.shape, str(field.dtype)
+    ((17, 17, 9), 'complex128')
+    >>> round(field.sel(xi_x=0, xi_y=0, xi_z=0).item().real, 4)  # the area of the sphere, 4π
+    12.5664
+    """
+    settings = TransformSettings(eps, dtype, quadrature)
+    execution = Execution(backend_named(backend), thread_count(threads))
+    field = compute_field(as_surface(surface), lattice, settings, check_orders(order), execution)
+    attributes = {
+        "long_name": "Fourier transform of the area measure",
+        "units": "squared units of length",
+        "convention": "integral of exp(-2 pi i xi.x) over the surface",
+        "xi_max": lattice.xi_max,
+        "M": lattice.M,
+        "eps": settings.eps,
+        "quadrature": settings.quadrature,
+        "quality": field.quality.to_json(),
+        "backend": field.backend,
+    }
+    units = {"units": "cycles per unit length"}
+    coordinates = {name: (name, axis, units) for name, axis in zip(AXES, lattice.axes, strict=True)}
+    return xr.DataArray(field.values, coords=coordinates, dims=AXES, name="fourier", attrs=attributes)
+
+
+def compute_field(
+    surface: Surface,
+    lattice: Lattice,
+    settings: TransformSettings,
+    orders: Sequence[float],
+    execution: Execution = ON_CPU,
+    *,
+    sample: Sample | None = None,
+) -> Field:
+    """Return the field of a surface by given settings, with its probe for some orders; see `transform_block`.
+
+    A sample of the surface, drawn for these orders and `USUAL_DEGREE`, saves time.
+    """
+    block = lattice.half
+    plan = settings.plan(surface, lattice)
+    transformed = transform_block(surface, lattice, block, settings, execution, plan)
+    values = transformed.values
+    if not needs_probe(surface, settings):
+        probe = Probe()
+    elif sample is not None and plan.lowest_degree <= USUAL_DEGREE:
+        probe = probe_block(surface, lattice, settings, block, values, sample.draws, execution.backend, sample)
+    else:
+        draws = draws_for([surface], lattice, orders, plan.lowest_degree, COMMON)
+        probe = probe_block(surface, lattice, settings, block, values, draws, execution.backend)
+    quality = Quality.from_surface(surface, probe)
+    return Field(values, transformed.points, transformed.backend, quality, settings)
+
+
+def field_for(
+    surface: Surface,
+    lattice: Lattice,
+    target: ErrorTarget,
+    settings: TransformSettings,
+    execution: Execution = ON_CPU,
+    *,
+    sample: Sample | None = None,
+) -> Field:
+    """Return the field of a surface with an error within a target, by the estimate of its probe; see `compute_field`.
+
+    It is the first of a few attempts that meets the target, or the last, in the dtype and quadrature of the settings.
+    """
+    if kind_of(surface).is_closed_form:
+        return compute_field(surface, lattice, settings, target.orders, sample=sample)
+    for _ in range(_ATTEMPTS):
+        chosen = choose_settings(surface, lattice, target, settings)
+        field = compute_field(surface, lattice, chosen, target.orders, execution, sample=sample)
+        excess = float(np.max(field.quality.probe.norms(SobolevWeights(lattice, target.orders)) / target.norms))
+        if excess <= 1:
+            break
+        target = target.tightened(2 * excess)
+    return field
+
+
+def as_operand(a: OperandLike) -> Operand:
+    """Return a field as it is, and anything else as a surface; see `as_surface`."""
+    return a if isinstance(a, xr.DataArray) else as_surface(a)
+
+
+def field_of(
+    a: OperandLike, lattice: Lattice | None, orders: Sequence[float], eps: float | None = None
+) -> xr.DataArray:
+    """Return a field as it is, or transform a surface on a lattice; LatticeError or InputError where it is neither."""
+    if isinstance(a, xr.DataArray):
+        if a.dtype.kind != "c":
+            raise InputError(f"a Fourier field has complex values, found {a.dtype}")
+        if set(a.dims) != set(AXES):
+            raise LatticeError(
+                f"a field must have the dimensions {', '.join(AXES)} and no others, found {a.dims}: select one mesh"
+            )
+        return a
+    surface = as_surface(a)
+    if lattice is None:
+        raise InputError(
+            f"a surface such as this {type(surface).__name__} needs a lattice or an accuracy: "
+            "pass lattice=Lattice(xi_max=..., M=...), or rtol=... to a norm or distance"
+        )
+    return fourier_transform(surface, lattice, eps, order=orders)
+
+
+def field_values(field: xr.DataArray) -> Complexes:
+    """Return all samples of a field, complex128 on the half lattice; refuse any that is not finite."""
+    values = np.asarray(field.transpose(*AXES).to_numpy(), dtype=np.complex128)
+    if not np.isfinite(values).all():
+        raise InputError(f"the field has {np.count_nonzero(~np.isfinite(values)):,} values that are NaN or infinite")
+    return values
+
+
+def pair_of(
+    a: OperandLike, b: OperandLike, lattice: Lattice | None, orders: Sequence[float]
+) -> tuple[xr.DataArray, xr.DataArray]:
+    """Return both as fields on one lattice, that of a field if there is one; see `field_of` and `common_lattice`."""
+    common = common_lattice((a, b), lattice)
+    return field_of(a, common, orders), field_of(b, common, orders)
+
+
+def common_lattice(operands: Sequence[OperandLike], lattice: Lattice | None) -> Lattice | None:
+    """Return the lattice of the fields among operands, else the given one or None; LatticeError where they differ."""
+    lattices = [Lattice.from_field(x) for x in operands if isinstance(x, xr.DataArray)]
+    if lattice is not None:
+        lattices.append(lattice)
+    for other in lattices[1:]:
+        if other.M != lattices[0].M or not np.isclose(other.xi_max, lattices[0].xi_max, rtol=1e-12, atol=0):
+            raise LatticeError(f"fields on different lattices cannot be compared: {lattices[0]} and {other}")
+    return lattices[0] if lattices else None
+
+
+def quality_of(field: xr.DataArray) -> Quality | None:
+    """Return the quality of a field: an attribute of computed fields, a coordinate of stored ones."""
+    text = field.coords["quality"].item() if "quality" in field.coords else field.attrs.get("quality")
+    return Quality.from_json(text) if text else None
+
+
+def read_blocks(
+    lattice: Lattice, *fields: xr.DataArray, largest: int = BLOCK_SAMPLES
+) -> Iterator[tuple[Block, list[Complexes]]]:
+    """Read fields block by block of their half lattice, so that they need not fit into memory."""
+    for block in lattice.split(largest):
+        places = dict(zip(AXES, lattice.place(block), strict=True))
+        yield block, [np.asarray(field.isel(places).transpose(*AXES).values) for field in fields]
+
+
+def shells_against(a: xr.DataArray, b: xr.DataArray, lattice: Lattice) -> Reals:
+    """Return the shell sums of |a - b|², Re((a - b) conj b) and |b|², (3, lattice.shell_count)."""
+    sums = np.zeros((3, lattice.shell_count))
+    for block, (values, others) in read_blocks(lattice, a, b):
+        difference = values - others
+        sums += [
+            shell_sums(difference, None, lattice, block),
+            shell_sums(difference, others, lattice, block),
+            shell_sums(others, None, lattice, block),
+        ]
+    return sums
+
+
+def shells_of(a: xr.DataArray, b: xr.DataArray | None, lattice: Lattice) -> Reals:
+    """Return the shell sums of |a|², or of |a - b|²."""
+    sums = np.zeros(lattice.shell_count)
+    for block, (values, *others) in read_blocks(lattice, *((a,) if b is None else (a, b))):
+        sums += shell_sums(values - others[0] if others else values, None, lattice, block)
+    return sums

@@ -1,0 +1,145 @@
+"""Squared distances between many fields at once, as weighted matrix products.
+
+Fields enter as differences to one common center, so that the product |a|² + |b|² - 2<a, b> loses
+only the digits by which a pair is closer to each other than to the center. Pairs that lose too many are
+reported; their differences must be summed directly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.geometry.surface import Reals
+from sobolev_batch.norms.budget import Sums, outer_windows
+from sobolev_batch.transform.lattice import Block, SobolevWeights
+
+Complexes = NDArray[np.complex128]
+Run = tuple[slice, int, int | None]
+
+# A squared distance this much smaller than the squared distances to the center has lost six of its
+# sixteen digits.
+_CANCELLATION = 1e-6
+# Columns of one product: this many samples of a few dozen fields, weighted for a few orders, stay in cache.
+_COLUMNS = 1 << 12
+# One sample in eight represents the outer ranges well enough, or this many samples if that is more.
+_SAMPLED_ONE_IN = 8
+_FEWEST_SAMPLED = 1 << 10
+
+
+@dataclass(frozen=True, eq=False)
+class Arrangement:
+    """Samples of a block of the half lattice, sorted by the sums that they count towards.
+
+    A matrix product then runs over one contiguous run of all fields after the other, with the
+    weights of all orders at once, instead of gathering samples for each.
+
+    Attributes:
+        order: Position in the block of each sample, int64 (block.size,).
+        runs: Neighbouring samples that count towards the same sums, and cover the block: their positions, |k|² mod 4,
+            and the outer range that they represent, or None.
+        shells: |k|² of each sample, int32 (block.size,).
+        trapezoid: Weight of each sample in the sum over the lattice (block.size,).
+        by_order: Weights of the shells for each order (orders, lattice.shell_count).
+        by_window: Weights of the shells for the outer ranges (2, lattice.shell_count), raised to make up for
+            the samples left out.
+    """
+
+    order: NDArray[np.intp]
+    runs: tuple[Run, ...]
+    shells: NDArray[np.int32]
+    trapezoid: Reals
+    by_order: Reals
+    by_window: Reals
+
+    @classmethod
+    def for_block(cls, weights: SobolevWeights, block: Block) -> Arrangement:
+        """Return the arrangement of a block of the weights' lattice."""
+        lattice = weights.lattice
+        shells = lattice.shells(block).ravel()
+        windows = outer_windows(weights)
+        kinds = (shells % 4 * 3).astype(np.uint8)
+        for i, window in enumerate(windows):
+            members = np.flatnonzero(window[shells])
+            # Drawn, not strided: strides would follow the lattice's rows. The same for every tile.
+            count = min(len(members), max(-(-len(members) // _SAMPLED_ONE_IN), _FEWEST_SAMPLED))
+            kinds[np.random.default_rng(i).choice(members, count, replace=False)] += i + 1
+            window *= len(members) / max(count, 1)
+        order = np.argsort(kinds, kind="stable")
+        ends = np.cumsum(np.bincount(kinds, minlength=12)).tolist()
+        runs = tuple(
+            (slice(start, end), kind // 3, kind % 3 - 1 if kind % 3 else None)
+            for kind, (start, end) in enumerate(zip([0, *ends], ends, strict=False))
+            if end > start
+        )
+        trapezoid = lattice.trapezoid_weights(block).ravel()[order]
+        return cls(order, runs, shells[order], trapezoid, weights.per_shell, windows)
+
+    def zeros(self, *shape: int) -> Sums:
+        """Return sums of zero for squares or products of fields."""
+        return Sums.zeros(len(self.by_order), *shape)
+
+    def products(self, first: Complexes, second: Complexes) -> Sums:
+        """Return the contributions of this block to the inner products Re <a_i, b_j>_s of fields.
+
+        The fields are complex128 (m, block.size) and (n, block.size), arranged, each row contiguous; preferably the
+        second ones are fewer. The inner products are (orders, 4, m, n) and (2, m, n), as `Sums` has squares. The
+        contributions of all blocks of the half lattice add up to the whole.
+        """
+        m, n = len(first), len(second)
+        left, right = first.view(np.float64), second.view(np.float64)
+        sums = self.zeros(m, n)
+        # Allocated once: large temporaries cost as much as the arithmetic on them.
+        buffer = np.empty((len(self.by_order) + 1) * n * 2 * _COLUMNS)
+        for run, columns, weights in self._column_batches():
+            weighted = buffer[: weights.size * n].reshape(len(weights), n, -1)
+            np.multiply(right[:, columns], weights[:, None], out=weighted)
+            products = left[:, columns] @ weighted.reshape(len(weights) * n, -1).T
+            self._add(sums, run, np.moveaxis(products.reshape(m, len(weights), n), 1, 0))
+        return sums
+
+    def squares(self, fields: Complexes) -> Sums:
+        """Return the products of fields (m, block.size) with themselves: (orders, 4, m) and (2, m)."""
+        values = fields.view(np.float64)
+        sums = self.zeros(len(fields))
+        buffer = np.empty(len(fields) * 2 * _COLUMNS)
+        for run, columns, weights in self._column_batches():
+            squared = buffer[: len(fields) * weights.shape[1]].reshape(len(fields), -1)
+            np.square(values[:, columns], out=squared)
+            self._add(sums, run, weights @ squared.T)
+        return sums
+
+    def _column_batches(self) -> Iterator[tuple[Run, slice, Reals]]:
+        """Yield columns of real and imaginary parts that stay in cache, with weights (orders or one more, columns)."""
+        for run in self.runs:
+            samples, _, window = run
+            rows = self.by_order if window is None else np.vstack([self.by_order, self.by_window[window]])
+            for start in range(samples.start, samples.stop, _COLUMNS):
+                stop = min(start + _COLUMNS, samples.stop)
+                weights = rows[:, self.shells[start:stop]] * self.trapezoid[start:stop]
+                yield run, slice(2 * start, 2 * stop), np.repeat(weights, 2, axis=1)
+
+    def _add(self, sums: Sums, run: Run, products: Reals) -> None:
+        _, residue, window = run
+        orders = len(self.by_order)
+        sums.squares[:, residue] += products[:orders]
+        if window is not None:
+            sums.outer[window] += products[orders]
+
+
+def differences(products: Sums, first: Sums, second: Sums) -> tuple[Sums, NDArray[np.bool_]]:
+    """Return squared differences of pairs from their inner products, and a mask of those that cancelled.
+
+    The products are those of the differences to the center, (orders, 4, m, n) and (2, m, n). The others are squares of
+    these differences, (orders, 4, m) and (orders, 4, n). The mask (m, n) is True for pairs that lost more than about
+    six digits at any order.
+    """
+    sums = first.squares[..., :, None] + second.squares[..., None, :]
+    squares = sums - 2 * products.squares
+    total, scale = squares.sum(axis=1), sums.sum(axis=1)
+    outer = np.maximum(first.outer[:, :, None] + second.outer[:, None, :] - 2 * products.outer, 0.0)
+    cancelled: NDArray[np.bool_] = np.any(total <= _CANCELLATION * scale, axis=0)
+    return Sums(squares, outer), cancelled

@@ -1,0 +1,230 @@
+"""Points on surfaces that nothing escapes: evenly spread, no farther apart than a reach, or where much was seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+
+from sobolev_batch.errors import InputError
+from sobolev_batch.geometry.closed_forms import Sphere
+from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.geometry.smooth import Interval, Smooth
+from sobolev_batch.geometry.surface import Indices, Reals, Surface
+from sobolev_batch.norms.tail.potentials import centers_and_radii
+from sobolev_batch.transform.kinds import resolution_of
+
+# Cells along each parameter that a smooth surface is replaced by: the most, and how many for a node of its transform.
+_MOST_CELLS, _CELLS_PER_NODE, _TRIANGULATION_TOLERANCE = 320, 4, 1e-4
+# Triangles whose corners are held at a time, and the most pieces that long ones are cut into.
+_HELD, _MOST_PIECES = 1 << 18, 2_000_000
+# Triangles of a smaller fraction of a squared spacing stay whole.
+_POINTLESS = 16
+# Bits for the place of a cell along an axis.
+_AXIS_BITS = 20
+# Neighbours whose potentials tell how much there is around a point, the share of points that follow the area alone, and
+# the fraction of the largest share of a triangle below which it gets next to none.
+_NEIGHBOURS, _EVEN_SHARE, _UNSEEN = 8, 0.25, 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Draw:
+    """Random points on a signed sum of surfaces.
+
+    Attributes:
+        points: Float64 (n, 3).
+        own: Sign of the surface of each point (n,).
+        weights: Inverse density (n,): Σ weights · f is the integral of f over all surfaces, in expectation.
+    """
+
+    points: Reals
+    own: Reals
+    weights: Reals
+
+    def joined(self, other: Draw) -> Draw:
+        """Return the points of two draws of one density."""
+        share = len(self.points) / (len(self.points) + len(other.points))
+        weights = np.concatenate([share * self.weights, (1 - share) * other.weights])
+        return Draw(np.concatenate([self.points, other.points]), np.concatenate([self.own, other.own]), weights)
+
+
+@dataclass(frozen=True, eq=False)
+class Sheets:
+    """Surfaces as meshes and spheres with their signs, on which points are drawn in an order that follows space.
+
+    Attributes:
+        meshes: Meshes, and those that stand for smooth surfaces.
+        spheres: Spheres.
+        spacing: Triangles are in the order of cells of this width, and long ones are cut into pieces no longer.
+    """
+
+    meshes: Sequence[tuple[Mesh, int]]
+    spheres: Sequence[tuple[Sphere, int]]
+    spacing: float = np.inf
+
+    @classmethod
+    def from_surfaces(cls, surfaces: Sequence[Surface], signs: Sequence[int], cutoff: float) -> Self:
+        """Return the sheets of surfaces; smooth ones become meshes that are fine beside the wavelength at a cutoff."""
+        meshes: list[tuple[Mesh, int]] = []
+        spheres: list[tuple[Sphere, int]] = []
+        for surface, sign in zip(surfaces, signs, strict=True):
+            if isinstance(surface, Sphere):
+                spheres.append((surface, sign))
+            elif isinstance(surface, Smooth):
+                meshes.append((_triangulated(surface, cutoff), sign))
+            elif isinstance(surface, Mesh):
+                meshes.append((surface, sign))
+        return cls(meshes, spheres)
+
+    @property
+    def cancel(self) -> bool:
+        """True where the sum has differences."""
+        return len({sign for _, sign in (*self.meshes, *self.spheres)}) > 1
+
+    @property
+    def area(self) -> float:
+        """Area of all surfaces together."""
+        return sum(mesh.area for mesh, _ in self.meshes) + sum(sphere.area for sphere, _ in self.spheres)
+
+    @cached_property
+    def _pieces(self) -> list[Mesh]:
+        """Meshes whose triangles follow space, the long ones in pieces."""
+        return [_ordered(mesh, self.spacing) for mesh, _ in self.meshes]
+
+    @cached_property
+    def _levels(self) -> tuple[Reals, Indices]:
+        """Area up to the end of each triangle or sphere, and where those of each surface begin."""
+        areas = [np.asarray(mesh.areas) for mesh in self._pieces] + [np.array([it.area]) for it, _ in self.spheres]
+        return np.cumsum(np.concatenate(areas)), np.cumsum([0, *map(len, areas)])
+
+    def even(self, count: int, rng: np.random.Generator) -> Draw:
+        """Draw points evenly by area, one on each of equal parts."""
+        ends = self._levels[0]
+        places = (np.arange(count) + rng.random(count)) / count * ends[-1]
+        chosen = np.minimum(np.searchsorted(ends, places), len(ends) - 1)
+        return self._at(chosen, np.full(count, ends[-1] / count), rng)
+
+    @cached_property
+    def centers(self) -> Reals:
+        """Centroid of each triangle, piece or sphere (m, 3)."""
+        centers = [centers_and_radii(piece.vertices[piece.triangles])[0] for piece in self._pieces]
+        return np.concatenate([*centers, *(np.array([sphere.center]) for sphere, _ in self.spheres)])
+
+    def around(self, points: Reals, seen: Reals) -> Reals:
+        """Return the most that points (n,) nearby saw, for each triangle, piece or sphere (m,)."""
+        from scipy.spatial import KDTree
+
+        _, near = KDTree(points).query(self.centers, k=min(_NEIGHBOURS, len(seen)))
+        return np.asarray(seen[near.reshape(len(self.centers), -1)].max(axis=1))
+
+    def largest(self, densities: Reals, count: int) -> Indices:
+        """Return the triangles, pieces or spheres on which densities (m,) put the most points, at most a number."""
+        shares = np.diff(self._levels[0], prepend=0.0) * densities
+        return np.argsort(-shares)[: min(count, np.count_nonzero(shares > _UNSEEN * shares.max()))]
+
+    def in_proportion(self, densities: Reals, count: int, rng: np.random.Generator) -> Draw:
+        """Draw points in proportion to densities (m,), most of them, and evenly by area for the others."""
+        areas = np.diff(self._levels[0], prepend=0.0)
+        shares = areas * (_EVEN_SHARE / areas.sum() + (1 - _EVEN_SHARE) * densities / (areas @ densities))
+        levels = np.cumsum(shares)
+        places = (np.arange(count) + rng.random(count)) / count * levels[-1]
+        chosen = np.minimum(np.searchsorted(levels, places), len(levels) - 1)
+        return self._at(chosen, areas[chosen] / (count * shares[chosen]), rng)
+
+    def _at(self, chosen: Indices, weights: Reals, rng: np.random.Generator) -> Draw:
+        """Return random points in some triangles and on spheres."""
+        count, starts = len(chosen), self._levels[1]
+        signs = np.repeat([float(sign) for _, sign in (*self.meshes, *self.spheres)], np.diff(starts))[chosen]
+        first, second = np.sqrt(rng.random((count, 1))), rng.random((count, 1))
+        directions = rng.normal(size=(count, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        points = np.empty((count, 3))
+        surfaces: list[Mesh | Sphere] = [*self._pieces, *(sphere for sphere, _ in self.spheres)]
+        for number, surface in enumerate(surfaces):
+            here = (chosen >= starts[number]) & (chosen < starts[number + 1])
+            if isinstance(surface, Sphere):
+                points[here] = surface.center + surface.radius * directions[here]
+                continue
+            a, b, c = np.moveaxis(surface.vertices[surface.triangles[chosen[here] - starts[number]]], 1, 0)
+            r, t = first[here], second[here]
+            points[here] = (1 - r) * a + r * (1 - t) * b + r * t * c
+        return Draw(points, signs, weights)
+
+
+def _ordered(mesh: Mesh, spacing: float) -> Mesh:
+    """Return a mesh with its triangles in the order of cells of some width, and long ones cut at their longest edge."""
+    vertices, triangles = mesh.vertices, mesh.triangles
+    long, whole = _pieces_of_long(mesh, spacing)
+    if len(long):
+        triangles = np.concatenate([triangles[whole], len(vertices) + np.arange(3 * len(long)).reshape(-1, 3)])
+        vertices = np.concatenate([vertices, long.reshape(-1, 3)])
+    if spacing == np.inf:
+        return mesh
+    low, high = mesh.extent.box
+    width = max(spacing, float(np.max(high - low)) / ((1 << _AXIS_BITS) - 1))
+    keys = np.empty(len(triangles), dtype=np.int64)
+    for start in range(0, len(triangles), _HELD):
+        part = triangles[start : start + _HELD]
+        centers = (vertices[part[:, 0]] + vertices[part[:, 1]] + vertices[part[:, 2]]) / 3
+        x, y, z = ((centers - low) / width).astype(np.int64).T
+        keys[start : start + _HELD] = (((x << _AXIS_BITS) | y) << _AXIS_BITS) | z
+    return Mesh.from_checked(vertices, np.ascontiguousarray(triangles[np.argsort(keys, kind="stable")]))
+
+
+def _pieces_of_long(mesh: Mesh, spacing: float) -> tuple[Reals, Indices]:
+    """Return pieces (n, 3, 3) of triangles with edges longer than a spacing, and the triangles that have none."""
+    if mesh.edge_length_range[1] <= spacing:
+        return np.zeros((0, 3, 3)), np.arange(len(mesh.triangles))
+    rows = np.arange(len(mesh.triangles))
+    is_long = np.zeros(len(rows), dtype=bool)
+    for start in range(0, len(rows), _HELD):
+        corners = mesh.vertices[mesh.triangles[start : start + _HELD]]
+        # A triangle of less area than one in some points has would not get another point.
+        is_large = mesh.areas[start : start + _HELD] > spacing**2 / _POINTLESS
+        is_long[start : start + _HELD] = is_large & (_edges(corners).max(axis=1) > spacing)
+    done, pieces = [], mesh.vertices[mesh.triangles[is_long]]
+    while len(pieces):
+        lengths = _edges(pieces)
+        short = lengths.max(axis=1) <= spacing
+        done.append(pieces[short])
+        pieces, longest = pieces[~short], lengths[~short].argmax(axis=1)
+        if sum(map(len, done)) + 2 * len(pieces) > _MOST_PIECES:
+            done.append(pieces)
+            break
+        turn = np.arange(len(pieces))[:, None], (longest[:, None] + np.arange(3)) % 3
+        pieces = pieces[turn]
+        middle = (pieces[:, 0] + pieces[:, 1]) / 2
+        a, b, c = np.moveaxis(pieces, 1, 0)
+        pieces = np.concatenate([np.stack([a, middle, c], 1), np.stack([middle, b, c], 1)])
+    return np.concatenate([np.zeros((0, 3, 3)), *done]), rows[~is_long]
+
+
+def _edges(corners: Reals) -> Reals:
+    """Return the length of the edge behind each corner (n, 3, 3), (n, 3)."""
+    return np.asarray(np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2))
+
+
+def _triangulated(surface: Smooth, cutoff: float) -> Mesh:
+    """Return a mesh of a smooth surface that is fine beside it and beside the wavelength at a cutoff."""
+    try:
+        counts, _ = resolution_of(surface, cutoff, _TRIANGULATION_TOLERANCE)
+    except InputError:
+        counts = (_MOST_CELLS, _MOST_CELLS)
+    cells = (min(_CELLS_PER_NODE * count, _MOST_CELLS) for count in counts)
+    u, v = (_grid(interval, count) for interval, count in zip(surface.intervals, cells, strict=True))
+    vertices = surface.positions(*np.meshgrid(u, v, indexing="ij")).reshape(3, -1).T
+    first = (np.arange(len(u) - 1)[:, None] * len(v) + np.arange(len(v) - 1)).ravel()
+    across, both = first + len(v), first + len(v) + 1
+    triangles = np.concatenate([np.stack([first, across, both], 1), np.stack([first, both, first + 1], 1)])
+    return Mesh.from_checked(np.ascontiguousarray(vertices), triangles)
+
+
+def _grid(interval: Interval, cells: int) -> Reals:
+    """Return ends of cells along a parameter, denser at the ends of one that is not periodic: there may be a pole."""
+    fractions = np.linspace(0, 1, cells + 1)
+    if not interval.periodic:
+        fractions = (1 - np.cos(np.pi * fractions)) / 2
+    return np.asarray(interval.low + interval.length * fractions)

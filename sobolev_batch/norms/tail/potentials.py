@@ -1,0 +1,342 @@
+"""Potentials of triangles and spheres by the kernel that is left beyond a frequency.
+
+With K the inverse transform of (1 - step(|ξ|)) (1 + |ξ|²)^s, where step is `smooth_step`, and M(d) = ∫_d^∞ K(r) r dr =
+1/π ∫ (1 - step(r)) (1 + r²)^s cos(2πrd) dr, the divergence theorem in the plane of a triangle turns its potential into
+a sum over the three edges,
+
+    ∫ K(|x - y|) dy = Σ ∫ [M(h) - M(√(h² + q²/cos²θ))] dθ,
+
+for x at the height h above the plane, its foot at the distance q from the line of an edge, and θ the angle about the
+foot. With q sinh t for the distance along the edge, dθ is dt/cosh t. K and M fall off within a few wavelengths, where
+they are cut; twice the reach and twice the nodes tell what that changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Self
+
+import numpy as np
+from numpy.polynomial.legendre import leggauss
+from scipy.special import beta, betainc
+
+from sobolev_batch import compiled
+from sobolev_batch.geometry.closed_forms import Sphere
+from sobolev_batch.geometry.surface import Indices, Reals
+from sobolev_batch.transform.lattice import smooth_step
+from sobolev_batch.transform.rules import symmetric_rule
+
+# Processor time of a pair of a point and a triangle, and of each of its orders, in seconds: on arrays, and compiled,
+# with a share of the time that loops take to load.
+_ON_ARRAYS, _COMPILED, _START = (1e-6, 4e-7), (5e-7, 5e-8), 0.15
+# Distances in wavelengths 1/X between which kernels are tabulated. The smaller one is rounding. Beyond the larger one,
+# which depends on the order, they are below 1 % of what they are at zero, and from this fraction of it on they fade.
+_LEAST, _FADE = 1e-12, 0.75
+_REACHES = (-4.0, -3.0, -2.0, -1.0), (12.0, 10.0, 8.0, 6.0)
+# Entries of a table up to the reach, how many times as many are interpolated, and where equal steps begin.
+_ENTRIES, _DENSER, _LINEAR_FROM = 1500, 8, 0.3
+# Cycles after which a cosine counts as averaged out, and nodes for each octave of frequencies.
+_CYCLES, _NODES = 32.0, leggauss(48)
+# Degrees of the rules for triangles that are smaller than these fractions of their distance, and of 1/X.
+_RULES = (12, 0.6, 1.1), (4, 0.5, 0.5), (2, 0.2, 0.1)
+# Panels along an edge are at most as long as this, in t and in wavelengths 1/X, with nodes in each; t ends where all
+# that follows is rounding.
+_PANEL, _PANEL_WAVES, _PANEL_NODES, _LAST = 1.2, 1.5, leggauss(4), 22.0
+# Pairs that are computed at a time on arrays.
+_BATCH = 20_000
+
+
+@lru_cache(maxsize=4096)
+def tail_integral(cutoff: float, order: float) -> float:
+    """Return ∫ (1 - step(r)) (1+r²)^s dr over all r, for the smooth step that ends at a cutoff."""
+    radii = cutoff * (0.75 + 0.25 * _NODES[0])
+    on_step = float(0.25 * cutoff * _NODES[1] @ ((1 - smooth_step(radii, cutoff)) * (1 + radii**2) ** order))
+    return on_step + _power_integral(cutoff, order)
+
+
+def _power_integral(lowest: float, order: float) -> float:
+    """Return ∫ (1+r²)^s dr from a radius on."""
+    # With p = 1/(1+r²) it is half an incomplete beta integral.
+    exponent = -order - 0.5
+    return 0.5 * float(beta(exponent, 0.5) * betainc(exponent, 0.5, 1 / (1 + lowest**2)))
+
+
+def reach_of(order: float) -> float:
+    """Return the distance, in wavelengths 1/X, beyond which the kernel of an order is cut."""
+    return float(np.interp(order, *_REACHES))
+
+
+@dataclass(frozen=True, eq=False)
+class Kernels:
+    """The kernels of some orders beyond a cutoff, in tables over equal steps of `_scale`.
+
+    Attributes:
+        cutoff: |ξ| at which the step ends, in cycles per unit length.
+        orders: Orders s.
+        fineness: 1, or how many times as far the kernels reach, and as many nodes serve.
+        reach: Distance beyond which all kernels are zero.
+        start: Where the tables begin, and the step between their entries.
+        totals: M(0), (orders,).
+        drops: M(0) - M(d), (n, orders).
+        values: K(d), (n, orders).
+    """
+
+    cutoff: float
+    orders: tuple[float, ...]
+    fineness: int
+    reach: float
+    start: float
+    step: float
+    totals: Reals
+    drops: Reals
+    values: Reals
+
+    @classmethod
+    def of_orders(cls, cutoff: float, orders: Sequence[float], fineness: int = 1) -> Self:
+        """Return the kernels of some orders."""
+        start, end = _grid(cutoff, fineness)
+        totals, drops, values = (
+            np.stack(rows, axis=-1)
+            for rows in zip(*(_tables(cutoff, order, fineness) for order in orders), strict=True)
+        )
+        reach = fineness * max(map(reach_of, orders)) / cutoff
+        return cls(
+            cutoff, tuple(orders), fineness, reach, start, (end - start) / (len(drops) - 1), totals, drops, values
+        )
+
+    @property
+    def finer(self) -> Kernels:
+        """The same kernels up to twice their reach, with twice the nodes."""
+        return self.of_orders(self.cutoff, self.orders, 2 * self.fineness)
+
+    def looked_up(self, table: Reals, squares: Reals) -> Reals:
+        """Return a table's values at each d², (..., orders)."""
+        distances = np.sqrt(np.clip(squares, (_LEAST / self.cutoff) ** 2, self.reach**2))
+        places = np.minimum((_scale(distances, self.cutoff) - self.start) / self.step, len(table) - 1.0001)
+        entries = np.where(places > 0, places, 0.0).astype(np.int64)  # NaN stays what it is
+        low = table[entries]
+        return np.asarray(low + (places - entries)[..., None] * (table[entries + 1] - low))
+
+
+def _scale(distances: Reals, cutoff: float) -> Reals:
+    """Return where distances lie in the tables: in equal steps of log d at first, of d where kernels oscillate."""
+    relative = distances * cutoff / _LINEAR_FROM
+    return np.where(relative < 1, np.log(relative), relative - 1)
+
+
+def _distances(scale: Reals, cutoff: float) -> Reals:
+    """Return the distances of places in the tables: the inverse of `_scale`."""
+    return np.asarray(np.where(scale < 0, np.exp(np.minimum(scale, 0)), scale + 1) * _LINEAR_FROM / cutoff)
+
+
+def _grid(cutoff: float, fineness: int) -> tuple[float, float]:
+    """Return where tables begin and end, the same for all orders."""
+    ends = _scale(np.array([_LEAST, fineness * max(_REACHES[1])]) / cutoff, cutoff).tolist()
+    return ends[0], ends[1]
+
+
+@lru_cache(maxsize=1024)
+def _tables(cutoff: float, order: float, fineness: int) -> tuple[float, Reals, Reals]:
+    """Return M(0), the table of M(0) - M(d) and that of K(d) for an order."""
+    (start, end), count = _grid(cutoff, fineness), fineness * _ENTRIES
+    reach, total = fineness * reach_of(order) / cutoff, tail_integral(cutoff, order)
+    distances = _distances(np.linspace(start, end, count), cutoff)
+    drops, low = np.zeros(count), cutoff / 2
+    while np.any(near := _CYCLES / distances > low):
+        radii, weights = low * (1.5 + 0.5 * _NODES[0]), 0.5 * low * _NODES[1]
+        terms = weights * (1 - smooth_step(radii, cutoff)) * (1 + radii**2) ** order
+        cycles = np.outer(distances[near], radii)
+        fade = smooth_step(cycles, _CYCLES)
+        drops[near] += np.einsum("ij,j->i", 1 - fade + 2 * fade * np.sin(np.pi * cycles) ** 2, terms)
+        drops[~near] += terms.sum()
+        low *= 2
+    drops, total = (drops + _power_integral(low, order)) / np.pi, total / np.pi
+    # Denser tables by cubic Hermite interpolation, so that straight lines between their entries will do.
+    slopes, fractions = np.gradient(drops), np.arange(_DENSER) / _DENSER
+    slopes[2:-2] = (8 * (drops[3:-1] - drops[1:-3]) - drops[4:] + drops[:-4]) / 12
+    from_start = fractions**2 * (3 - 2 * fractions)
+    dense = drops[:-1, None] + np.diff(drops)[:, None] * from_start
+    dense += slopes[:-1, None] * fractions * (1 - fractions) ** 2
+    dense -= slopes[1:, None] * fractions**2 * (1 - fractions)
+    dense = np.append(dense.ravel(), total)
+    fine = np.linspace(start, end, len(dense))
+    distances = _distances(fine, cutoff)
+    # What is left at the reach is cut without a jump, and distances of rounding are none.
+    faded = np.clip((distances / reach - _FADE) / (1 - _FADE), 0.0, 1.0)
+    dense = total + (dense - total) * np.cos(np.pi / 2 * faded) ** 2
+    dense[0] = 0.0
+    values = np.gradient(dense, fine) / np.minimum(distances, _LINEAR_FROM / cutoff) / distances
+    values[-2:] = 0.0
+    return total, dense, values
+
+
+def of_sphere(points: Reals, sphere: Sphere, kernels: Kernels) -> Reals:
+    """Return ∫ K(|x - y|) dy over a sphere for points (n, 3), (n, orders)."""
+    distances = np.linalg.norm(points - sphere.center, axis=1)
+    ends = [kernels.looked_up(kernels.drops, (distances + radius) ** 2) for radius in (sphere.radius, -sphere.radius)]
+    # At the centre itself this is 0/0.
+    factors = 2 * np.pi * sphere.radius / np.maximum(distances, 1e-4 * sphere.radius)
+    return np.asarray(factors[:, None] * (ends[0] - ends[1]))
+
+
+def seconds_of(pairs: float, orders: int) -> float:
+    """Predict the processor time of the potentials of pairs of a point and a triangle, for some orders."""
+    # It depends on nothing that the process has done, or choices would.
+    on_arrays, loops = (pairs * (cost[0] + cost[1] * orders) for cost in (_ON_ARRAYS, _COMPILED))
+    return min(on_arrays, _START + loops)
+
+
+def add_of_triangles(
+    potentials: Reals, points: Reals, corners: Reals, sign: float, kernels: Kernels, threads: int = 1
+) -> int:
+    """Add ∫ K(|x - y|) dy over triangles (m, 3, 3), times a sign, to potentials (n, orders) at points (n, 3).
+
+    Return the number of pairs of a point and a triangle that are close enough to count.
+    """
+    count = 0
+    for rows, columns in _close_pairs(points, corners, kernels.reach):
+        count += len(rows)
+        if compiled.pays(len(rows) * (_ON_ARRAYS[0] + _ON_ARRAYS[1] * len(kernels.totals))):
+            add_compiled(potentials, points, corners, (rows, columns), sign, kernels, threads)
+            continue
+        for start in range(0, len(rows), _BATCH):
+            part = slice(start, start + _BATCH)
+            found = of_triangles(points[rows[part]], corners[columns[part]], kernels)
+            np.add.at(potentials, rows[part], sign * found)
+    return count
+
+
+def add_compiled(
+    potentials: Reals,
+    points: Reals,
+    corners: Reals,
+    pairs: tuple[Indices, Indices],
+    sign: float,
+    kernels: Kernels,
+    threads: int,
+) -> None:
+    """Do the same for pairs of rows and columns, by the compiled loop."""
+    from sobolev_batch.compiled.edges import add_potentials
+
+    rules = [symmetric_rule(degree) for degree, _, _ in _RULES]
+    limits = np.array([[farthest, largest] for _, farthest, largest in _RULES]) / kernels.fineness
+    nodes = np.concatenate([np.column_stack([rule.barycentric, rule.weights]) for rule in rules])
+    ends = np.cumsum([0, *(len(rule.weights) for rule in rules)])
+    tables = (
+        *(kernels.cutoff, kernels.reach, kernels.start, kernels.step),
+        *(kernels.totals, kernels.drops, kernels.values, _LEAST, _LINEAR_FROM),
+    )
+    longest = _PANEL / kernels.fineness, _PANEL_WAVES / kernels.fineness / kernels.cutoff
+    panels = *longest, _LAST, np.stack(_PANEL_NODES)
+
+    def add(part: slice) -> None:
+        own = np.zeros_like(potentials) if threads > 1 else potentials
+        rows, columns = pairs[0][part], pairs[1][part]
+        add_potentials(own, points, corners, rows, columns, sign, tables, panels, limits, nodes, ends)
+        if threads > 1:
+            sums.append(own)
+
+    sums: list[Reals] = []
+    bounds = np.linspace(0, len(pairs[0]), threads + 1).astype(int)
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(add, map(slice, bounds[:-1], bounds[1:])))
+    for own in sums:
+        potentials += own
+
+
+def of_triangles(points: Reals, corners: Reals, kernels: Kernels) -> Reals:
+    """Return ∫ K(|x - y|) dy over a triangle for each pair of a point (n, 3) and a triangle (n, 3, 3), (n, orders)."""
+    corners = corners - points[:, None]
+    normals, doubled = doubled_normals(corners)
+    centers, radii = centers_and_radii(corners)
+    distances, fineness = np.sqrt(_squares(centers)), kernels.fineness
+    degrees = np.zeros(len(points), dtype=np.int64)
+    for degree, farthest, largest in _RULES:
+        is_far = radii < farthest / fineness * distances
+        degrees[is_far & (radii * kernels.cutoff < largest / fineness)] = degree
+    values, near = np.empty((len(points), len(kernels.totals))), degrees == 0
+    for degree, _, _ in _RULES:
+        here, rule = degrees == degree, symmetric_rule(degree)
+        at_nodes = kernels.looked_up(kernels.values, _squares(rule.barycentric @ corners[here]))
+        values[here] = doubled[here, None] / 2 * np.einsum("k,ikj->ij", rule.weights, at_nodes)
+    values[near] = _over_edges(corners[near], normals[near] / doubled[near, None], kernels)
+    return values
+
+
+def _over_edges(corners: Reals, normals: Reals, kernels: Kernels) -> Reals:
+    """Return the potential at the origin of triangles (n, 3, 3) with these unit normals, by edges, (n, orders)."""
+    ends = np.roll(corners, -1, axis=1)
+    along = ends - corners
+    along /= np.linalg.norm(along, axis=2, keepdims=True)
+    first, last = np.einsum("ijk,ijk->ij", corners, along), np.einsum("ijk,ijk->ij", ends, along)
+    offsets = np.einsum("ik,ijk->ij", normals, np.cross(corners, along))
+    heights = np.repeat(np.einsum("ij,ij->i", normals, corners[:, 0])[:, None], 3, axis=1)
+    # From the foot on the line of an edge to both ends, or between the two where they are on one side of it.
+    one_side, lengths = first * last > 0, np.abs([first, last])
+    near = np.where(one_side, lengths.min(axis=0), 0.0)
+    spans = ((near, np.where(one_side, lengths.max(axis=0), lengths[1])), (0 * near, np.where(one_side, 0, lengths[0])))
+    parts = [_of_span(*(rows.ravel() for rows in (offsets, heights, *span)), kernels=kernels) for span in spans]
+    return np.asarray((parts[0] + parts[1]).reshape(len(corners), 3, len(kernels.totals)).sum(axis=1))
+
+
+def _of_span(offsets: Reals, heights: Reals, near: Reals, far: Reals, *, kernels: Kernels) -> Reals:
+    """Return ∫ [M(h) - M(√(h² + q²/cos²θ))] dθ between two distances from the foot on an edge's line, (n, orders)."""
+    reach, squares = kernels.reach, heights**2
+    q = np.maximum(np.abs(offsets), _LEAST * reach)
+    # Beyond the reach the integrand is constant.
+    farthest = np.sqrt(np.maximum(reach**2 - squares - q**2, 0.0))
+    begin, end = np.minimum(near, farthest), np.minimum(far, farthest)
+    level, result = kernels.looked_up(kernels.drops, squares), np.zeros((len(q), len(kernels.totals)))
+    outside = np.arctan2(far, q) - np.arctan2(end, q) - np.arctan2(near, q) + np.arctan2(begin, q)
+    result += outside[:, None] * (kernels.totals - level)
+    longest = _PANEL_WAVES / kernels.fineness / kernels.cutoff
+    begun, last = (np.minimum(np.arcsinh(length / q), _LAST) for length in (begin, end))
+    active = np.flatnonzero(last > begun)
+    while len(active):
+        low, here = begun[active], q[active]
+        high = np.minimum(last[active], low + np.minimum(_PANEL / kernels.fineness, longest / (here * np.cosh(low))))
+        for node, weight in zip(*_PANEL_NODES, strict=True):
+            widening = np.cosh((low + high) / 2 + (high - low) / 2 * node)
+            distances = squares[active] + (here * widening) ** 2
+            terms = kernels.looked_up(kernels.drops, distances) - level[active]
+            result[active] += (weight / 2 * (high - low) / widening)[:, None] * terms
+        begun[active] = high
+        active = active[high < last[active]]
+    return np.asarray(np.sign(offsets)[:, None] * result)
+
+
+def doubled_normals(corners: Reals) -> tuple[Reals, Reals]:
+    """Return normals (n, 3) of triangles and their lengths (n,), twice the areas."""
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return normals, np.sqrt(_squares(normals))
+
+
+def _squares(vectors: Reals) -> Reals:
+    """Return the squared lengths of vectors (..., 3)."""
+    return np.asarray(vectors[..., 0] ** 2 + vectors[..., 1] ** 2 + vectors[..., 2] ** 2)
+
+
+def centers_and_radii(corners: Reals) -> tuple[Reals, Reals]:
+    """Return the centroids (n, 3) of triangles, and the distance of the farthest corner (n,)."""
+    centers = (corners[:, 0] + corners[:, 1] + corners[:, 2]) / 3
+    return centers, np.sqrt(_squares(corners - centers[:, None]).max(axis=1))
+
+
+def _close_pairs(points: Reals, corners: Reals, reach: float) -> Iterator[tuple[Indices, Indices]]:
+    """Yield rows and columns of pairs of a point and a triangle that may be closer than a reach."""
+    from scipy.spatial import KDTree
+
+    centers, radii = centers_and_radii(corners)
+    # Triangles of like size at a time.
+    sizes = np.maximum(np.ceil(np.log2(radii / reach)), -2.0)
+    tree = KDTree(points)
+    for size in np.unique(sizes):
+        members = np.flatnonzero(sizes == size)
+        farthest = reach * (1 + 2.0**size)
+        found = tree.sparse_distance_matrix(KDTree(centers[members]), farthest, output_type="ndarray")
+        columns = members[found["j"]]
+        near = found["v"] < reach + radii[columns]
+        yield found["i"][near], columns[near]

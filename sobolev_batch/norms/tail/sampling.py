@@ -1,0 +1,447 @@
+"""Frequencies at which octaves of |ξ| are sampled: random lattices, and draws around the normals of flat faces.
+
+An innermost ball and the octaves around it are a smooth partition of frequency space. All samples of an octave are
+pooled by the balance heuristic (E. Veach, L. J. Guibas 1995, doi:10.1145/218380.218498): a sample counts for the
+inverse of the density with which all lattices and draws together put samples there. The sum of weight · f then has
+the integral of f as its expectation, and no sample weighs more than the method that serves its frequency best would
+let it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.geometry.surface import Indices, Reals, Surface
+from sobolev_batch.transform.backends import combine
+from sobolev_batch.transform.lattice import STEP_START, OctaveLattice, smooth_step
+
+# Normals whose entries agree to this many parts are one direction.
+_DIRECTION_PARTS = 500
+# Numbers that an entry can be rounded to; three of them make a key of 32 bits.
+_KEYS_PER_AXIS = 2 * _DIRECTION_PARTS + 1
+# Triangles whose normals are taken at a time.
+_BATCH = 1 << 14
+# A direction counts if the faces along it hold this fraction of the area; this many directions at most.
+_LEAST_SHARE, _MOST_DIRECTIONS = 0.01, 64
+# κ as a fraction of 2π |ξ| · size of the faces: the spots around normals are about 1/κ wide.
+_SPOT_FRACTION = 0.5
+# No direction of small whole numbers is orthogonal to this one, where rounding would decide.
+_UPWARDS = np.array([1.0, np.sqrt(2.0), np.pi])
+_NO_NORMALS = (np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+
+
+@dataclass(frozen=True, eq=False)
+class FaceNormals:
+    """Directions of the flat faces of some surfaces, and a density of directions that follows them.
+
+    The transform of a flat face is concentrated around its normal, in a spot as wide as the inverse size of the face,
+    and falls off from there like the inverse third power. So does the density around each normal n, which is
+    (1 + κ²) / (4π (1 + κ² sin²θ)^(3/2)) at an angle θ to n, with κ in proportion to |ξ| times the size.
+
+    Attributes:
+        directions: Unit normals, float64 (n, 3); the density is the same at opposite directions.
+        shares: Area of the faces along each normal over that along all of them, float64 (n,).
+        sizes: Typical width of these faces, float64 (n,), in units of length.
+    """
+
+    directions: Reals
+    shares: Reals
+    sizes: Reals
+
+    @classmethod
+    def from_surfaces(cls, surfaces: Sequence[Surface]) -> Self:
+        """Return the normals of the flat faces of surfaces; none for curved ones."""
+        found = [_main_normals(surface) for surface in surfaces if isinstance(surface, Mesh)]
+        directions, areas, sizes = (np.concatenate(rows) for rows in zip(_NO_NORMALS, *found, strict=True))
+        return cls(directions, areas / max(float(areas.sum()), np.finfo(np.float64).tiny), sizes)
+
+    def __bool__(self) -> bool:
+        return len(self.shares) > 0
+
+    def draw(self, radii: Reals, rng: np.random.Generator) -> Reals:
+        """Draw a unit direction on the side of a normal for each |ξ| (n,) by the density, float64 (n, 3)."""
+        chosen = rng.choice(len(self.shares), len(radii), p=self.shares)
+        axes = self.directions[chosen]
+        squares = self._concentrations(radii, self.sizes[chosen])
+        levels = rng.random(len(radii))
+        # The distribution of u = |cos θ| is u / √(1 + κ² - κ² u²), which inverts in closed form.
+        cosines = levels * np.sqrt((1 + squares) / (1 + squares * levels**2))
+        sines = np.sqrt(np.maximum(1 - cosines**2, 0.0))
+        turns = 2 * np.pi * rng.random(len(radii))
+        across = np.cross(axes, np.eye(3)[np.abs(axes).argmin(axis=1)])
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        sideways = np.cos(turns)[:, None] * across + np.sin(turns)[:, None] * np.cross(axes, across)
+        # Of each direction and its opposite one will do: all integrands are even.
+        return np.asarray(cosines[:, None] * axes + sines[:, None] * sideways)
+
+    def density(self, directions: Reals, radii: Reals) -> Reals:
+        """Return the density per solid angle (n,) at unit directions (n, 3), for their |ξ| (n,)."""
+        total, columns = np.zeros(len(radii)), np.ascontiguousarray(directions.T)
+        for axis, share, size in zip(self.directions, self.shares, self.sizes, strict=True):
+            squares = self._concentrations(radii, size)
+            spread = 1 + squares * np.maximum(1 - combine(axis, columns) ** 2, 0.0)
+            total += share / (4 * np.pi) * (1 + squares) / (spread * np.sqrt(spread))
+        return total
+
+    @staticmethod
+    def _concentrations(radii: Reals, sizes: Reals | float) -> Reals:
+        """Return κ² of the density."""
+        return np.asarray((_SPOT_FRACTION * 2 * np.pi * radii * sizes) ** 2)
+
+
+def without_sign(normals: Reals) -> Reals:
+    """Return of each normal (n, 3) and its opposite the same one."""
+    return np.where((combine(_UPWARDS, normals.T) < 0)[:, None], -normals, normals)
+
+
+def _main_normals(mesh: Mesh) -> tuple[Reals, Reals, Reals]:
+    """Return the normals, areas and face sizes of the directions that hold much of a mesh's area."""
+    count = len(mesh.triangles)
+    normals, areas, keys = np.empty((count, 3)), np.empty(count), np.empty(count, dtype=np.int32)
+    # The corners and temporaries of all triangles of a fine mesh would take gigabytes.
+    for start in range(0, count, _BATCH):
+        part = slice(start, start + _BATCH)
+        normals[part], areas[part] = _normals_and_areas(mesh, part)
+        # A number for each normal, the same for those that count as one direction.
+        x, y, z = np.round(normals[part] * _DIRECTION_PARTS).astype(np.int32).T
+        keys[part] = (x * _KEYS_PER_AXIS + y) * _KEYS_PER_AXIS + z
+    _, members = np.unique(keys, return_inverse=True)
+    sums = np.bincount(members, weights=areas)
+    largest = np.argsort(-sums)[:_MOST_DIRECTIONS]
+    largest = largest[sums[largest] > _LEAST_SHARE * areas.sum()]
+    directions, sizes = np.empty((len(largest), 3)), np.empty(len(largest))
+    for number, group in enumerate(largest):
+        face = members == group
+        directions[number] = areas[face] @ normals[face]
+        used = np.zeros(len(mesh.vertices), dtype=bool)
+        used[mesh.triangles[face]] = True
+        # Between the width of one triangle and that of all faces along the normal: spots of both lie there.
+        sizes[number] = np.sqrt(np.ptp(mesh.vertices[used], axis=0).max() * np.sqrt(areas[face].mean()))
+    directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    return directions, sums[largest], sizes
+
+
+def _normals_and_areas(mesh: Mesh, part: slice) -> tuple[Reals, Reals]:
+    """Return the unit normals (k, 3), without sign, and areas (k,) of some triangles; 0 for those without area."""
+    a, b, c = mesh.corners(part)
+    crosses = np.cross(b - a, c - a)
+    doubled = np.linalg.norm(crosses, axis=1)
+    return without_sign(crosses / np.where(doubled > 0, doubled, 1.0)[:, None]), doubled / 2
+
+
+# Samples along an axis of the lattice of each octave, and draws beside it where surfaces have flat faces.
+USUAL_M, _USUAL_DRAWS, _USUAL_UNIFORM = 64, 20_000, 0.1
+_SUBLATTICES = 8
+_NOWHERE: Indices = np.zeros(0, dtype=np.int64)
+
+
+@dataclass(frozen=True)
+class Octave:
+    """A smooth shell of frequencies around an innermost ball, whose `smooth_step` ends at a cutoff; counted from 1."""
+
+    cutoff: float
+    index: int
+
+    @property
+    def lowest(self) -> float:
+        """Least |ξ| of the octave, in cycles per unit length."""
+        return STEP_START * self.highest / 2
+
+    @property
+    def highest(self) -> float:
+        """Largest |ξ| of the octave."""
+        return self.cutoff * 2.0**self.index
+
+    def window(self, radii: Reals) -> Reals:
+        """Return the weight of this octave at some |ξ|; the ball and all octaves add up to one."""
+        return smooth_step(radii, self.highest) - smooth_step(radii, self.highest / 2)
+
+    def integral(self, order: float) -> float:
+        """Return ∫ window(r) (1+r²)^s dr over the octave."""
+        from scipy.integrate import quad
+
+        def integrand(radius: float) -> float:
+            return float(self.window(np.array(radius)) * (1 + radius**2) ** order)
+
+        middle = self.highest / 2
+        return float(quad(integrand, self.lowest, middle)[0] + quad(integrand, middle, self.highest)[0])
+
+
+@dataclass(frozen=True, eq=False)
+class SamplePart:
+    """Neighbouring samples of an octave: those of one lattice, or the drawn ones.
+
+    Attributes:
+        samples: Place of the samples in the octave.
+        starts: First sample of each of the eight sublattices, counted from the part's first, int64 (8,). Sums over
+            sublattices are nearly independent. None for drawn samples, which are all independent.
+        places: Indices of the samples in the lattice's block, flattened, int64 (n,); empty for drawn ones.
+    """
+
+    samples: slice
+    starts: Indices | None
+    places: Indices
+
+    @property
+    def is_drawn(self) -> bool:
+        """True for drawn samples."""
+        return self.starts is None
+
+
+@dataclass(frozen=True, eq=False)
+class OctaveSampling:
+    """All frequencies at which an octave is sampled, with their weights.
+
+    One drawn frequency lies in each of equally likely ranges of |ξ|. Their lengths follow |ξ|^-2. Their directions are
+    uniform for a fraction, and follow the normals of flat faces for the others.
+
+    Attributes:
+        lattices: Random lattices, which may be none.
+        draws: Number of drawn frequencies, which may be zero.
+        uniform_fraction: Fraction of uniform directions, which counts if there are normals.
+    """
+
+    octave: Octave
+    lattices: tuple[OctaveLattice, ...]
+    draws: int
+    seed: int
+    normals: FaceNormals
+    uniform_fraction: float = 1.0
+
+    @classmethod
+    def random(
+        cls,
+        octave: Octave,
+        sizes: Sequence[int],
+        draws: int,
+        normals: FaceNormals,
+        uniform_fraction: float,
+        rng: np.random.Generator,
+    ) -> Self:
+        """Draw lattices with some numbers M of samples along an axis, and a seed."""
+        lattices = tuple(OctaveLattice.random(octave.lowest, octave.highest, M, rng) for M in sizes)
+        return cls(octave, lattices, draws, int(rng.integers(2**53)), normals, uniform_fraction)
+
+    def __len__(self) -> int:
+        return len(self.weights)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Tasks make the samples anew: it is cheaper than sending them.
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def has_draws_of(self, other: OctaveSampling) -> bool:
+        """Tell whether the drawn frequencies are those of another sampling of the octave."""
+        return (self.draws, self.seed, self.uniform_fraction) == (other.draws, other.seed, other.uniform_fraction)
+
+    @property
+    def frequencies(self) -> Reals:
+        """ξ along the axes of the surfaces, float64 (n, 3), in cycles per unit length; drawn ones come last."""
+        return self._samples[0]
+
+    @property
+    def weights(self) -> Reals:
+        """Weight of each sample in the integral over all of frequency space (n,), the octave's window included."""
+        return self._samples[1]
+
+    @property
+    def parts(self) -> tuple[SamplePart, ...]:
+        """The samples of each lattice, and the drawn ones last."""
+        return self._samples[2]
+
+    @cached_property
+    def radii(self) -> Reals:
+        """|ξ| of each sample (n,)."""
+        return np.asarray(np.linalg.norm(self.frequencies, axis=1))
+
+    @cached_property
+    def _samples(self) -> tuple[Reals, Reals, tuple[SamplePart, ...]]:
+        found = [_lattice_samples(lattice) for lattice in self.lattices]
+        frequencies = np.concatenate([*(samples[0] for samples in found), self._drawn()])
+        multiples = np.concatenate([*(samples[1] for samples in found), np.ones(self.draws)])
+        density = sum(lattice.spacing**-3 for lattice in self.lattices) + self._density(frequencies)
+        weights = multiples * self.octave.window(np.linalg.norm(frequencies, axis=1)) / density
+        parts, first = [], 0
+        for places, starts in (samples[2:] for samples in found):
+            parts.append(SamplePart(slice(first, first + len(places)), starts, places))
+            first += len(places)
+        parts.append(SamplePart(slice(first, len(weights)), None, _NOWHERE))
+        return frequencies, weights, tuple(parts)
+
+    def _drawn(self) -> Reals:
+        """Draw frequencies, float64 (draws, 3)."""
+        rng = np.random.default_rng(self.seed)
+        low, high = self.octave.lowest, self.octave.highest
+        levels = (rng.permutation(self.draws) + rng.random(self.draws)) / max(self.draws, 1)
+        radii = 1 / (1 / low - levels * (1 / low - 1 / high))
+        directions = rng.normal(size=(self.draws, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        if self.normals:
+            along = rng.random(self.draws) >= self.uniform_fraction
+            directions[along] = self.normals.draw(radii[along], rng)
+        return np.asarray(radii[:, None] * directions)
+
+    def _density(self, frequencies: Reals) -> Reals:
+        """Return the expected number of draws per volume (n,) at frequencies (n, 3) of the octave."""
+        if not self.draws:
+            return np.zeros(len(frequencies))
+        radii = np.linalg.norm(frequencies, axis=1)
+        radial = 1 / (radii**2 * (1 / self.octave.lowest - 1 / self.octave.highest))
+        uniform = self.uniform_fraction if self.normals else 1.0
+        directional = np.full(len(radii), uniform / (4 * np.pi))
+        if self.normals:
+            directional += (1 - uniform) * self.normals.density(frequencies / radii[:, None], radii)
+        return np.asarray(self.draws * radial * directional / radii**2)
+
+    def to_table(self) -> dict[str, Any]:
+        """Return the sampling as a table, without its octave and the normals."""
+        return {
+            "lattices": [
+                {"M": one.M, "quaternion": list(one.quaternion), "offset": list(one.offset)} for one in self.lattices
+            ],
+            "draws": self.draws,
+            "seed": self.seed,
+            "uniform_fraction": self.uniform_fraction,
+        }
+
+    @classmethod
+    def from_table(cls, octave: Octave, normals: FaceNormals, table: Mapping[str, Any]) -> Self:
+        """Return the sampling of an octave that a table holds."""
+        lattices = tuple(
+            OctaveLattice(octave.lowest, octave.highest, one["M"], tuple(one["quaternion"]), tuple(one["offset"]))
+            for one in table["lattices"]
+        )
+        return cls(octave, lattices, table["draws"], table["seed"], normals, table["uniform_fraction"])
+
+
+def _lattice_samples(lattice: OctaveLattice) -> tuple[Reals, Reals, Indices, Indices]:
+    """Return the frequencies in the lattice's range by sublattice, how often each counts, places, and starts."""
+    block = lattice.half
+    x, y, z = lattice.frequencies(block)
+    squares = (x**2)[:, None, None] + (y**2)[:, None] + z**2
+    i, j, k = np.nonzero((squares > lattice.lowest**2) & (squares < lattice.highest**2))
+    sublattices = (4 * (i % 2) + 2 * (j % 2) + k % 2).astype(np.int8)
+    order = np.argsort(sublattices, kind="stable")
+    i, j, k = i[order], j[order], k[order]
+    starts = np.searchsorted(sublattices[order], np.arange(_SUBLATTICES)).astype(np.int64)
+    own = np.stack([x[i], y[j], z[k]])
+    places = np.ravel_multi_index((i, j, k), block.shape).astype(np.int64)
+    return combine(lattice.rotation.T, own).T, lattice.half_weights()[k], places, starts
+
+
+@dataclass(frozen=True, eq=False)
+class TailSampling:
+    """The octaves beyond a cutoff as all surfaces of a study sample them, from the inside out.
+
+    Attributes:
+        cutoff: Radius |ξ| at which the step of the innermost frequencies ends, in cycles per unit length.
+        octaves: Samplings of the octaves, whose samples follow each other on one axis.
+    """
+
+    cutoff: float
+    octaves: tuple[OctaveSampling, ...]
+
+    @classmethod
+    def usual(cls, cutoff: float, count: int, surfaces: Sequence[Surface], seed: int = 0) -> Self:
+        """Return a sampling of some octaves by one lattice each, and by draws where surfaces have flat faces."""
+        rng, normals = np.random.default_rng(seed), FaceNormals.from_surfaces(surfaces)
+        octaves = (Octave(cutoff, index) for index in range(1, count + 1))
+        draws = _USUAL_DRAWS if normals else 0
+        return cls(
+            cutoff, tuple(OctaveSampling.random(one, [USUAL_M], draws, normals, _USUAL_UNIFORM, rng) for one in octaves)
+        )
+
+    @classmethod
+    def joined(cls, cutoff: float, several: Sequence[Sequence[OctaveSampling]], normals: FaceNormals) -> Self:
+        """Return a sampling that serves all of several: of each octave the largest lattices, and the most draws."""
+        octaves = []
+        for index in range(max((len(samplings) for samplings in several), default=0)):
+            candidates = [samplings[index] for samplings in several if len(samplings) > index]
+            lattices = max((one.lattices for one in candidates), key=lambda found: sum(one.M**3 for one in found))
+            most = max(candidates, key=lambda one: one.draws)
+            octaves.append(OctaveSampling(most.octave, lattices, most.draws, most.seed, normals, most.uniform_fraction))
+        return cls(cutoff, tuple(octaves))
+
+    def refined(self, factor: float, more_octaves: int, largest: int, seed: int) -> TailSampling:
+        """Return a sampling with about ``factor`` times the samples, and further octaves; no M is above ``largest``."""
+        rng, samplings = np.random.default_rng(seed), []
+        for one in self.octaves:
+            sizes = [min(2 * round(it.M * factor ** (1 / 3) / 2), max(largest, it.M)) for it in one.lattices]
+            count = round(factor * one.draws)
+            samplings.append(OctaveSampling.random(one.octave, sizes, count, one.normals, one.uniform_fraction, rng))
+        sizes, normals = [lattice.M for lattice in samplings[-1].lattices], self.octaves[0].normals
+        for index in range(len(samplings) + 1, len(samplings) + 1 + more_octaves):
+            octave, last = Octave(self.cutoff, index), samplings[-1]
+            samplings.append(OctaveSampling.random(octave, sizes, last.draws, normals, last.uniform_fraction, rng))
+        return TailSampling(self.cutoff, tuple(samplings))
+
+    def to_table(self) -> dict[str, Any]:
+        """Return the sampling as a table, from which `from_table` makes it again."""
+        normals = self.octaves[0].normals
+        return {
+            "cutoff": self.cutoff,
+            "normals": {name: getattr(normals, name).tolist() for name in ("directions", "shares", "sizes")},
+            "octaves": [sampling.to_table() for sampling in self.octaves],
+        }
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any]) -> Self:
+        """Return the sampling that a table holds."""
+        arrays = {name: np.array(values, dtype=np.float64) for name, values in table["normals"].items()}
+        normals = FaceNormals(arrays["directions"].reshape(-1, 3), arrays["shares"], arrays["sizes"])
+        samplings = (
+            OctaveSampling.from_table(Octave(table["cutoff"], index), normals, octave)
+            for index, octave in enumerate(table["octaves"], 1)
+        )
+        return cls(table["cutoff"], tuple(samplings))
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of all that the samples follow from."""
+        return hashlib.sha256(json.dumps(self.to_table(), sort_keys=True).encode()).hexdigest()
+
+    @property
+    def size(self) -> int:
+        """Number of samples."""
+        return sum(map(len, self.octaves))
+
+    @property
+    def highest_frequency(self) -> float:
+        """Largest |ξ| of the last octave, in cycles per unit length."""
+        return self.octaves[-1].octave.highest
+
+    @property
+    def frequencies(self) -> Reals:
+        """ξ of all samples, float64 (n, 3), in cycles per unit length."""
+        return np.concatenate([octave.frequencies for octave in self.octaves])
+
+    @property
+    def weights(self) -> Reals:
+        """Weight of each sample in the integral over all of frequency space (n,)."""
+        return np.concatenate([octave.weights for octave in self.octaves])
+
+    def split(self, values: NDArray[Any]) -> Iterator[NDArray[Any]]:
+        """Yield the values of each octave, from those at all samples (n,)."""
+        yield from np.split(values, np.cumsum([len(octave) for octave in self.octaves])[:-1])
+
+    def labels(self) -> dict[str, Indices]:
+        """Return the octave of each sample, the number of its lattice in it and of its sublattice; -1 if drawn."""
+        octaves, lattices, sublattices = [], [], []
+        for number, octave in enumerate(self.octaves, 1):
+            octaves.append(np.full(len(octave), number))
+            for lattice, part in enumerate(octave.parts):
+                count = part.samples.stop - part.samples.start
+                lattices.append(np.full(count, -1 if part.starts is None else lattice))
+                counts = [count] if part.starts is None else np.diff([*part.starts, count])
+                names = [-1] if part.starts is None else range(_SUBLATTICES)
+                sublattices.append(np.repeat(names, counts))
+        columns = {"octave": octaves, "lattice": lattices, "sublattice": sublattices}
+        return {name: np.concatenate(values).astype(np.int64) for name, values in columns.items()}

@@ -1,0 +1,337 @@
+"""Transforms of surfaces at the samples of octaves: values with errors, integrals of their squares, processor time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+from sobolev_batch.geometry.surface import Reals, Surface
+from sobolev_batch.norms.budget import NormEstimate, change_of_root
+from sobolev_batch.norms.tail.sampling import OctaveSampling
+from sobolev_batch.transform.backends import Backend, ComplexDtype
+from sobolev_batch.transform.fourier import (
+    ON_CPU,
+    ErrorTarget,
+    Execution,
+    TransformSettings,
+    choose_settings,
+    permits_single,
+    transform_block,
+)
+from sobolev_batch.transform.kinds import kind_of
+from sobolev_batch.transform.lattice import OctaveLattice
+from sobolev_batch.transform.probe import norms_of_checks
+
+Complexes = NDArray[np.complex128]
+
+# Settings of the transform of a surface on a lattice.
+Settings = Callable[[Surface, OctaveLattice], TransformSettings]
+
+# Samples at which values on a lattice are checked: for small meshes, for huge ones, and in between as many as make this
+# number of pairs of a triangle (or point) and a frequency.
+_MOST_CHECKS, _FEWEST_CHECKS, _PAIRS = 16, 4, 100_000
+# Seconds for a quadrature point and for a sample of a lattice's block; for a pair of a triangle and a frequency in
+# compiled loops and on arrays; and to load the loops, shared by some octaves: measured on one machine, rough on others.
+_POINT_SECONDS, _SAMPLE_SECONDS = 2e-7, 1e-7
+_LOOP_SECONDS, _ARRAY_SECONDS, _START_SECONDS = 3e-9, 4.5e-8, 0.15
+# Quadrature points for each square of half a wavelength, and for each triangle at least.
+POINTS_PER_SQUARE, _POINTS_PER_TRIANGLE = 4.0, 1.5
+# What a frequency costs beside its triangles, in triangles.
+_OVERHEAD_TRIANGLES = 50
+# Draws of an octave, for the time that one of them takes.
+_USUAL_DRAWS = 20_000
+# The true value lies within the statistical error with this probability, if sums over groups are normal.
+_CONFIDENCE = 0.99
+
+
+@dataclass(frozen=True, eq=False)
+class OctaveValues:
+    """The transform of a surface at the samples of an octave, compared with exact values at a few of them.
+
+    Attributes:
+        values: Values at all samples, complex (n,).
+        radii: |ξ| of each comparison, float64 (P,).
+        squares: Contribution of each comparison to the squared norm of the error, without the weight of an order,
+            float64 (P,).
+    """
+
+    sampling: OctaveSampling
+    values: NDArray[np.complexfloating]
+    radii: Reals
+    squares: Reals
+
+    def error_norms(self, orders: Sequence[float]) -> Reals:
+        """Return the norm of the values' own error for each order (orders,), raised for the small sample."""
+        return norms_of_checks(self.radii, self.squares, orders)
+
+
+def settings_for(target: ErrorTarget) -> Settings:
+    """Return a function that gives the cheapest settings for a target."""
+
+    def settings(surface: Surface, lattice: OctaveLattice) -> TransformSettings:
+        if kind_of(surface).is_closed_form:
+            return TransformSettings()
+        cheapest: ComplexDtype = "complex64" if permits_single(surface, lattice, target) else "complex128"
+        return choose_settings(surface, lattice, target, TransformSettings(dtype=cheapest))
+
+    return settings
+
+
+def octave_values(
+    surface: Surface,
+    sampling: OctaveSampling,
+    orders: Sequence[float],
+    settings: Settings,
+    execution: Execution = ON_CPU,
+    *,
+    known: OctaveValues | None = None,
+) -> OctaveValues:
+    """Return the transform of a surface at the samples of an octave.
+
+    Values on lattices come from nonuniform FFTs by these settings, and their errors are measured for some orders. Those
+    at drawn frequencies, and on lattices where large triangles would take many points, are exact. Known values, on the
+    first lattices and maybe at the same drawn frequencies, are not computed again.
+    """
+    values: list[NDArray[np.complexfloating]] = []
+    finished = 0 if known is None else len(known.sampling.lattices)
+    for number, part in enumerate(sampling.parts):
+        if known is not None and number < finished:
+            values.append(known.values[known.sampling.parts[number].samples])
+            continue
+        if known is not None and part.is_drawn and sampling.has_draws_of(known.sampling):
+            values.append(known.values[known.sampling.parts[-1].samples])
+            continue
+        lattice = None if part.is_drawn else sampling.lattices[number]
+        if lattice is None or SurfaceSize.from_surface(surface).prefers_exact(lattice):
+            frequencies = sampling.frequencies[part.samples]
+            values.append(kind_of(surface).sampled_values(frequencies, execution.threads, execution.backend))
+        else:
+            block = transform_block(surface, lattice, lattice.half, settings(surface, lattice), execution).values
+            values.append(block.ravel()[part.places])
+    joined = np.concatenate(values)
+    return OctaveValues(sampling, joined, *_compared(surface, sampling, joined, orders, execution.backend))
+
+
+def _compared(
+    surface: Surface,
+    sampling: OctaveSampling,
+    values: NDArray[np.complexfloating],
+    orders: Sequence[float],
+    backend: Backend,
+) -> tuple[Reals, Reals]:
+    """Compare values on lattices with exact ones at a few samples, drawn by weight; fewer where each costs more."""
+    kind = kind_of(surface)
+    count = 0 if kind.is_closed_form else int(np.clip(_PAIRS // max(kind.triangles, 1), _FEWEST_CHECKS, _MOST_CHECKS))
+    chosen, scales = [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
+    for number, part in enumerate(sampling.parts):
+        if part.is_drawn or not count:
+            continue
+        weights = sampling.weights[part.samples]
+        # Relative to the lowest frequency, so that high powers do not all underflow.
+        lengths = 1 + sampling.radii[part.samples] ** 2
+        by_order = weights * [(lengths / lengths[weights > 0].min()) ** order for order in orders]
+        chances = (by_order / by_order.sum(axis=1, keepdims=True)).mean(axis=0)
+        drawn = np.random.default_rng(number).choice(len(chances), count, p=chances)
+        chosen.append(part.samples.start + drawn)
+        scales.append(weights[drawn] / (count * chances[drawn]))
+    places = np.concatenate(chosen)
+    exact = kind.sampled_values(sampling.frequencies[places], ON_CPU.threads, backend)
+    differences = values[places] - exact
+    return sampling.radii[places], np.concatenate(scales) * np.abs(differences) ** 2
+
+
+@dataclass(frozen=True)
+class SurfaceSize:
+    """Size of a surface, on which the processor time of its transforms depends: area in squared units of length."""
+
+    triangles: int
+    area: float
+    is_closed_form: bool = False
+
+    @classmethod
+    def from_surface(cls, surface: Surface) -> Self:
+        """Return the size of a surface."""
+        kind = kind_of(surface)
+        return cls(kind.triangles, surface.area, kind.is_closed_form)
+
+    @property
+    def draw_seconds(self) -> float:
+        """Time of the exact transform at one of many drawn frequencies."""
+        return self._seconds_at(_USUAL_DRAWS) / _USUAL_DRAWS
+
+    def lattice_seconds(self, lattice: OctaveLattice) -> float:
+        """Return the time of a transform on a lattice, in the cheaper of both ways."""
+        return min(self._nufft_seconds(lattice), self._exact_seconds(lattice))
+
+    def prefers_exact(self, lattice: OctaveLattice) -> bool:
+        """Tell whether the exact transform at all samples of a lattice is cheaper than a nonuniform FFT."""
+        return self._exact_seconds(lattice) < self._nufft_seconds(lattice)
+
+    def sampling_seconds(self, sampling: OctaveSampling, known: OctaveSampling | None = None) -> float:
+        """Return the time of the transforms at the samples of an octave, without those of a known sampling.
+
+        The known one has some of the same lattices, from the first on, and maybe the same drawn frequencies.
+        """
+        lattices, draws = sampling.lattices, sampling.draws
+        if known is not None:
+            lattices = lattices[len(known.lattices) :]
+            draws = 0 if sampling.has_draws_of(known) else draws
+        return sum(map(self.lattice_seconds, lattices)) + draws * self.draw_seconds
+
+    def _nufft_seconds(self, lattice: OctaveLattice) -> float:
+        seconds = _SAMPLE_SECONDS * lattice.half.size
+        if self.is_closed_form:
+            return seconds
+        of_area = POINTS_PER_SQUARE * self.area * (2 * lattice.highest) ** 2
+        return seconds + _POINT_SECONDS * max(_POINTS_PER_TRIANGLE * self.triangles, of_area)
+
+    def _exact_seconds(self, lattice: OctaveLattice) -> float:
+        return self._seconds_at(math.pi / 12 * lattice.M**3) if self.triangles else math.inf
+
+    def _seconds_at(self, frequencies: float) -> float:
+        """Return the time of the exact transform, the same whatever the process has done before."""
+        pairs = frequencies * (self.triangles + _OVERHEAD_TRIANGLES)
+        return min(_ARRAY_SECONDS * pairs, _START_SECONDS + _LOOP_SECONDS * pairs)
+
+
+@dataclass(frozen=True, eq=False)
+class OctaveSums:
+    """Integrals of |field|² over an octave.
+
+    Attributes:
+        squares: ∫ window (1+|ξ|²)^s |field|² for each order (orders,).
+        parts: Variances of their parts from lattices and from drawn frequencies (2, orders).
+        degrees: Degrees of freedom of these variances (2,).
+        energy: Mean of ∫_{|ξ|=r} |field|² dS over the octave.
+        energy_deviation: Standard error of the energy.
+    """
+
+    squares: Reals
+    parts: Reals
+    degrees: Reals
+    energy: float
+    energy_deviation: float
+
+    @property
+    def variances(self) -> Reals:
+        """Variance of the integrals (orders,)."""
+        return np.asarray(self.parts.sum(axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class OctaveWeights:
+    """Weights of the samples of an octave for some orders s."""
+
+    sampling: OctaveSampling
+    orders: tuple[float, ...]
+
+    @cached_property
+    def by_order(self) -> Reals:
+        """Weight times (1+|ξ|²)^s for each order, and the weight alone, float64 (orders + 1, n)."""
+        lengths, weights = 1 + self.sampling.radii**2, self.sampling.weights
+        return np.stack([*(weights * lengths**order for order in self.orders), weights])
+
+    @cached_property
+    def width(self) -> float:
+        """Integral of the octave's window over |ξ|."""
+        return self.sampling.octave.integral(0.0)
+
+    def integrals(self, products: Reals) -> Reals:
+        """Return ∫ window (1+|ξ|²)^s products for each order (orders,), from values at all samples (n,)."""
+        return np.asarray(self.by_order[:-1] @ products)
+
+    def sums(self, squares: Reals) -> OctaveSums:
+        """Return the integrals of |field|², or of products of two fields, with variances, from all samples (n,).
+
+        What is known of the integrals otherwise may have been subtracted from the samples.
+        """
+        sums, variances, degrees = np.zeros(len(self.by_order)), np.zeros((2, len(self.by_order))), np.zeros(2)
+        for part in self.sampling.parts:
+            if part.samples.start == part.samples.stop:
+                continue
+            kind = int(part.is_drawn)
+            for i, weights in enumerate(self.by_order):
+                terms = weights[part.samples] * squares[part.samples]
+                groups = terms if part.starts is None else np.add.reduceat(terms, part.starts)
+                sums[i] += groups.sum()
+                # A single sample may stand for others like it that were not met.
+                variances[kind, i] += len(groups) * groups.var(ddof=1) + np.abs(terms).max() ** 2
+            degrees[kind] += len(groups) - 1
+        deviation = float(np.sqrt(variances[:, -1].sum())) / self.width
+        energy = float(sums[-1]) / self.width
+        return OctaveSums(sums[:-1], variances[:, :-1], degrees, energy, deviation)
+
+
+def squared_moduli(values: NDArray[np.complexfloating]) -> Reals:
+    """Return |values|² in double precision."""
+    return np.asarray(values.real.astype(np.float64) ** 2 + values.imag.astype(np.float64) ** 2)
+
+
+def statistical_errors(octaves: Sequence[OctaveSums]) -> Reals:
+    """Return how far off the sum of integrals over several octaves may be (orders,), at 99 %."""
+    # Few sublattices stay few beside many draws.
+    variances = np.concatenate([octave.parts for octave in octaves])
+    return quantile_of_sum(variances, np.concatenate([octave.degrees for octave in octaves]))
+
+
+def quantile_of_sum(variances: Reals, degrees: NDArray[Any]) -> Reals:
+    """Return how far off a sum may be at 99 %, from the variances of its parts (parts, ...) and their degrees.
+
+    It is Student's quantile for the degrees of freedom of the sum (F. E. Satterthwaite 1946, doi:10.2307/3002019).
+    """
+    total, tiny = variances.sum(axis=0), np.finfo(np.float64).tiny
+    shares = variances**2 / np.maximum(degrees, 1).reshape(-1, *[1] * (variances.ndim - 1))
+    effective = total**2 / np.maximum(np.sum(shares, axis=0), tiny)
+    return np.asarray(np.sqrt(total) * stdtrit(np.maximum(effective, 1.0), (1 + _CONFIDENCE) / 2))
+
+
+@dataclass(frozen=True, eq=False)
+class Tail:
+    """Squared norms of fields beyond the innermost frequencies, each (orders, ...).
+
+    Attributes:
+        octaves: Part of the octaves.
+        statistical: How far off that may be, at 99 %.
+        beyond: Part beyond the last octave.
+        uncertainty: How far off that may be.
+    """
+
+    octaves: Reals
+    statistical: Reals
+    beyond: Reals
+    uncertainty: Reals
+
+    @classmethod
+    def from_sums(cls, sums: Sequence[OctaveSums], beyond: Reals, uncertainty: Reals) -> Self:
+        """Return the tail by the sums over octaves, and what lies beyond them (orders,)."""
+        none = np.zeros(len(beyond))
+        measured = np.sum([octave.squares for octave in sums], axis=0) if sums else none
+        return cls(measured, statistical_errors(sums) if sums else none, beyond, uncertainty)
+
+    def scaled(self, factors: Reals) -> Tail:
+        """Return the tails of several fields, (orders, fields), each times a factor."""
+        parts = (getattr(self, field.name) for field in fields(self))
+        return Tail(*(part * factors for part in parts))
+
+    @property
+    def squares(self) -> Reals:
+        """The whole tail."""
+        return self.octaves + self.beyond
+
+    def estimate(self, core: Reals, images: Reals, discretisation: Reals) -> NormEstimate:
+        """Return norms (orders, ...) from squares of the innermost frequencies, images, and errors of all values."""
+        squares = np.maximum(np.maximum(core, 0.0) + self.squares, 0.0)
+        return NormEstimate(
+            np.sqrt(squares),
+            change_of_root(squares, self.uncertainty),
+            change_of_root(squares, images),
+            discretisation,
+            change_of_root(squares, self.statistical),
+        )

@@ -1,0 +1,390 @@
+"""The sources `command` and `function`: meshes that a program, or a function of yours, makes of another mesh.
+
+Such a mesh may take long, so it is kept in a `MeshCache`. Nothing runs without one that permits it: a study file may
+come from somebody else.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import math
+import re
+import shlex
+import subprocess
+import time
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+import pandas as pd
+from pydantic import BeforeValidator, ConfigDict, Field, PrivateAttr, model_validator
+
+from sobolev_batch.errors import MeshError, StudyError, one_line, refused_by_pydantic
+from sobolev_batch.geometry.formats.readers import as_mesh
+from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.parameters import byte_count
+from sobolev_batch.sources.files import file_digest, number_as_text
+from sobolev_batch.sources.mesh_cache import (
+    INPUT,
+    OUTPUT,
+    PLACEHOLDER,
+    Cost,
+    Made,
+    MeshCache,
+    environment,
+    run_command,
+)
+from sobolev_batch.sources.names import label_problem, quoted
+from sobolev_batch.sources.registry import (
+    MOST_ENTRIES,
+    ExpectedSize,
+    Fingerprint,
+    Member,
+    NestedSource,
+    load_mesh,
+    single_member,
+)
+
+Parameter = str | int | float | bool
+
+# The placeholder for the folder of the study.
+_FOLDER = "folder"
+_VERSION_SECONDS = 60.0
+
+
+def _seconds(value: object) -> float:
+    """Return a time, given in seconds or as a text such as "10 min"."""
+    with suppress(ValueError):
+        seconds = value if isinstance(value, int | float) else pd.Timedelta(str(value)).total_seconds()
+        if not isinstance(value, bool) and 0 < seconds < float("inf"):
+            return float(seconds)
+    raise ValueError("must be a number of seconds, or a time such as '10 min' or '2 h'")
+
+
+def _bytes(value: object) -> int:
+    with refused_by_pydantic():
+        return byte_count(value)  # type: ignore[arg-type]
+
+
+def _file_suffix(value: object) -> str:
+    if not isinstance(value, str) or not re.fullmatch(r"\.[A-Za-z0-9]+", value):
+        raise ValueError("must be the suffix of a mesh format, such as '.ply'")
+    return value.lower()
+
+
+Seconds = Annotated[float, BeforeValidator(_seconds)]
+Bytes = Annotated[int, BeforeValidator(_bytes)]
+FileSuffix = Annotated[str, BeforeValidator(_file_suffix)]
+Words = Annotated[tuple[str, ...], Field(min_length=1, strict=False)]
+
+
+class RemesherSource(NestedSource):
+    """Meshes that something of yours makes of one other mesh.
+
+    Keys that are not listed here are its parameters: numbers, texts or truth values. A list of them is swept: each
+    value makes a mesh, and several lists make one for each combination.
+
+    Attributes:
+        mesh: Table of a source with one member, or the name of a mesh: the mesh to start from.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="allow", strict=True)
+    _cache: MeshCache | None = PrivateAttr(None)
+
+    @property
+    def keeps_meshes(self) -> bool:
+        """True: every mesh is kept."""
+        return True
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Parameters by name; a list stands for its values."""
+        return dict(self.model_extra or {})
+
+    @model_validator(mode="after")
+    def _check_parameters(self) -> Self:
+        count = 1
+        for name, value in self.parameters.items():
+            values = value if isinstance(value, list | tuple) else [value]
+            if not values or not all(isinstance(entry, Parameter) for entry in values):
+                raise ValueError(
+                    f"{name} must be a number, a text, true, false or a list of them, found {quoted(value)}"
+                )
+            count *= len(values)
+        if count > MOST_ENTRIES:
+            raise ValueError(f"at most {MOST_ENTRIES} meshes are allowed, and its lists make {count}")
+        return self
+
+    def with_cache(self, cache: MeshCache) -> Self:
+        """Return the source with the place where its meshes are kept."""
+        source = super().with_cache(cache)
+        source._cache = cache
+        return source
+
+    def members(self, folder: Path) -> tuple[Member, ...]:
+        """Return one member for each combination of parameters, in the order of the lists."""
+        original, version = single_member(self.mesh, folder), self._found_version(folder)
+        return tuple(
+            RemeshedMember(
+                name,
+                -1,
+                metadata=tuple((key, _as_number_or_text(value)) for key, value in parameters.items()),
+                make=self._maker(parameters, folder),
+                identity={"remesher": self._settings(parameters), "version": version},
+                original=original,
+                files=self._files(folder),
+                cache=self._cache,
+            )
+            for name, parameters in self._swept(original.name)
+        )
+
+    def _swept(self, alone: str) -> Iterator[tuple[str, dict[str, Parameter]]]:
+        """Yield a name and the parameters of each mesh."""
+        lists = {name: value for name, value in self.parameters.items() if isinstance(value, list | tuple)}
+        for values in product(*lists.values()):
+            texts = list(map(_as_text, values))
+            named = [f"{key}={text}" for key, text in zip(lists, texts, strict=True)]
+            name = texts[0] if len(texts) == 1 else ",".join(named) or alone
+            problem = label_problem(name)
+            if problem is not None:
+                raise StudyError(f"the parameters {quoted(name)} are no label: {problem}")
+            yield name, {**self.parameters, **dict(zip(lists, values, strict=True))}
+
+    @abstractmethod
+    def _maker(self, parameters: dict[str, Parameter], folder: Path) -> Callable[[Mesh], Made]:
+        """Return a function that makes the mesh of some parameters."""
+
+    @abstractmethod
+    def _settings(self, parameters: dict[str, Parameter]) -> dict[str, Any]:
+        """Return what a fingerprint holds of the remesher and its parameters."""
+
+    @abstractmethod
+    def _found_version(self, folder: Path) -> str | None:
+        """Return the version of the remesher."""
+
+    def _files(self, folder: Path) -> dict[str, Path]:
+        """Return files that the remesher reads besides, by their names in the command."""
+        return {}
+
+
+class CommandSource(RemesherSource):
+    """Meshes that a program makes of one other mesh.
+
+    The program gets a folder of its own, and no shell. ``{input}`` and ``{output}`` in the command stand for its files,
+    ``{folder}`` for the folder of the study, and ``{NAME}`` for a parameter.
+
+    Attributes:
+        command: Program and arguments.
+        input, output: Suffixes of the files that it reads and writes; formats that this package lacks, such as Medit's
+            .mesh, go through the library meshio.
+        timeout: Time after which the program is ended, in seconds or as a text such as "10 min".
+        largest_output: Bytes that it may write, such as "2 GB".
+        version: Command that prints the program's version. It is part of the fingerprint.
+    """
+
+    command: Words
+    input: FileSuffix = ".ply"
+    output: FileSuffix = ".ply"
+    timeout: Seconds = 3600.0
+    largest_output: Bytes = 4_000_000_000
+    version: Words | None = None
+
+    @property
+    def commands(self) -> tuple[str, ...]:
+        """The command and that of the version, as a shell would have them; and those of other sources."""
+        own = [self.command, *([self.version] if self.version else [])]
+        return (*map(shlex.join, own), *super().commands)
+
+    @model_validator(mode="after")
+    def _check_command(self) -> Self:
+        asked = {name for word in self.command for name in PLACEHOLDER.findall(word)}
+        known = {INPUT, OUTPUT, _FOLDER, *self.parameters}
+        if unknown := sorted(asked - known):
+            raise ValueError(f"the command has {{{unknown[0]}}}, and no parameter has this name")
+        if unused := sorted(known - asked - {_FOLDER, INPUT, OUTPUT}):
+            keys = ", ".join(name for name in type(self).model_fields)
+            raise ValueError(
+                f"{unused[0]} is unknown: it is no key ({keys}), and the command has no {{{unused[0]}}} for it"
+            )
+        if OUTPUT not in asked:
+            raise ValueError("the command has no {output}, the file that it has to write")
+        return self
+
+    def _maker(self, parameters: dict[str, Parameter], folder: Path) -> Callable[[Mesh], Made]:
+        return partial(
+            run_command,
+            words=[self._filled(word, parameters, folder) for word in self.command],
+            suffixes=(self.input, self.output),
+            timeout=self.timeout,
+            largest_output=self.largest_output,
+        )
+
+    def _settings(self, parameters: dict[str, Parameter]) -> dict[str, Any]:
+        return {"command": list(self.command), "parameters": parameters, "input": self.input, "output": self.output}
+
+    def _files(self, folder: Path) -> dict[str, Path]:
+        found = {word: re.search(r"\{folder\}/.+", word) for word in self.command}
+        return {word: Path(self._filled(match[0], {}, folder)) for word, match in found.items() if match}
+
+    @staticmethod
+    def _filled(word: str, parameters: Mapping[str, Parameter], folder: Path) -> str:
+        """Return a word of a command with its parameters and the folder of the study."""
+        values = {_FOLDER: str(folder.absolute()), **{key: _as_text(value) for key, value in parameters.items()}}
+        return PLACEHOLDER.sub(lambda found: values.get(found[1], found[0]), word)
+
+    def _found_version(self, folder: Path) -> str | None:
+        """Return what the version's command prints, or printed last where it may not run."""
+        if self.version is None or self._cache is None:
+            return None
+        key = f"version-{hashlib.sha256(shlex.join(self.version).encode()).hexdigest()}.txt"
+        known = (self._cache.folder.read(key) or b"").decode() or None
+        if not self._cache.may_run:
+            return known
+        words = [self._filled(word, {}, folder) for word in self.version]
+        try:
+            done = subprocess.run(  # noqa: S603 -- the user permitted it
+                words,
+                env=environment(),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                timeout=_VERSION_SECONDS,
+                check=True,
+            )
+        except (OSError, subprocess.SubprocessError) as error:
+            raise StudyError(f"version: {shlex.join(words)}: {one_line(error)}") from error
+        found = done.stdout.decode(errors="replace").strip()
+        if found != known:
+            self._cache.folder.write({key: found.encode()})
+        return found
+
+
+class FunctionSource(RemesherSource):
+    """Meshes that a function of Python makes of one other mesh.
+
+    The table of a family in Python names it as its source: ``{"source": remesh, "mesh": ..., "triangles": [500]}`` has
+    ``remesh(mesh, triangles=500)`` called, which returns a mesh or anything that `as_mesh` takes. Dask takes the
+    function to the workers.
+
+    Attributes:
+        function: The function; in a store its name alone, with which no mesh can be made.
+        version: Text that changes whenever the function makes other meshes; by default a digest of its source.
+    """
+
+    function: Callable[..., Any] | str
+    version: str | None = None
+
+    def _maker(self, parameters: dict[str, Parameter], folder: Path) -> Callable[[Mesh], Made]:
+        return partial(call_function, function=self.function, parameters=parameters)
+
+    def _settings(self, parameters: dict[str, Parameter]) -> dict[str, Any]:
+        return {"function": function_name(self.function), "parameters": parameters}
+
+    def _found_version(self, folder: Path) -> str | None:
+        return self.version or function_version(self.function)
+
+
+@dataclass(frozen=True)
+class RemeshedMember(Member):
+    """A mesh that a remesher makes, unless it is kept.
+
+    Attributes:
+        identity: The remesher, its parameters and its version.
+        files: Files that the remesher reads besides, by their names in the command.
+        cache: Where it is kept; None if nothing may run.
+    """
+
+    make: Callable[[Mesh], Made]
+    identity: Fingerprint
+    original: Member
+    files: Mapping[str, Path]
+    cache: MeshCache | None
+
+    @property
+    def names_wishes(self) -> bool:
+        """True: a remesher makes about as many triangles as it was asked for."""
+        return True
+
+    def load(self) -> Mesh:
+        """Return the mesh that is kept, or make it and keep it; MeshError where that failed, or is not permitted."""
+        if self.cache is None:
+            raise MeshError("no remesher may run here, and none of its meshes is kept; run a study with it")
+        digest = self.fingerprint_digest()
+        mesh = self.cache.read(digest)
+        if mesh is not None:
+            return mesh
+        if not self.cache.may_run:
+            raise MeshError(
+                f"the remesher may not run, and its mesh is not kept in {self.cache.folder}; run the study with "
+                "--allow-commands (in Python: allow_commands=True) if you trust it"
+            )
+        made = self.make(load_mesh(self.original))
+        if self.fingerprint_digest() != digest:
+            raise MeshError("a file of it was changed while it was made; run the study again")
+        self.cache.write(digest, made, {"made by": self.identity, "of": self.original.name})
+        if isinstance(made[1], str):
+            raise MeshError(made[1])
+        return made[1]
+
+    def cost(self) -> Cost | None:
+        """Return what making it took the last time."""
+        with suppress(MeshError):
+            return None if self.cache is None else self.cache.cost(self.fingerprint_digest())
+        return None
+
+    def fingerprint(self) -> Fingerprint:
+        """Return the identity, the digests of files and the fingerprint of the original."""
+        files = {name: file_digest(path) for name, path in self.files.items()}
+        return {**self.identity, "files": files, "of": dict(self.original.fingerprint())}
+
+    def expected_size(self) -> ExpectedSize:
+        """Return the size of the original, since nothing is known of the result."""
+        return replace(self.original.expected_size(), factor=math.inf)
+
+
+def call_function(mesh: Mesh, function: Callable[..., Any] | str, parameters: Mapping[str, Parameter]) -> Made:
+    """Call a function that makes a mesh of another one; see `FunctionSource`."""
+    if isinstance(function, str):
+        return Cost(), f"the function {function} is not at hand; run the study from Python with it"
+    started, processor = time.perf_counter(), time.thread_time()
+    made: Mesh | str
+    try:
+        made = as_mesh(function(mesh, **parameters))
+    # Libraries end the process where they fail to read, which would be that of the worker.
+    except (Exception, SystemExit) as error:
+        made = f"{function_name(function)}: {type(error).__name__}: {one_line(error)}"
+    return Cost(time.perf_counter() - started, time.thread_time() - processor), made
+
+
+def function_name(function: Callable[..., Any] | str) -> str:
+    """Return the name of a function, with that of its module."""
+    if isinstance(function, str):
+        return function
+    return f"{getattr(function, '__module__', '')}.{getattr(function, '__qualname__', type(function).__name__)}"
+
+
+def function_version(function: Callable[..., Any] | str) -> str:
+    """Return a digest of a function's source; StudyError where it has none."""
+    try:
+        return hashlib.sha256(inspect.getsource(function).encode()).hexdigest()  # type: ignore[arg-type]
+    except (OSError, TypeError) as error:
+        raise StudyError(
+            f'the source of {function_name(function)} is not at hand; give "version", a text that changes whenever it '
+            "makes other meshes"
+        ) from error
+
+
+def _as_text(value: Parameter) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return number_as_text(value) if isinstance(value, float) else str(value)
+
+
+def _as_number_or_text(value: Parameter) -> float | str:
+    return _as_text(value) if isinstance(value, bool | str) else float(value)

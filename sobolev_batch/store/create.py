@@ -1,0 +1,360 @@
+"""Preparation of a store for a run: create it, or lay it out again for what the study or its state has become."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections import deque
+from collections.abc import Sequence
+from contextlib import suppress
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from sobolev_batch.errors import DamageError, StoreError
+from sobolev_batch.geometry.surface import Similarity
+from sobolev_batch.norms.spectrum import RadialAxis
+from sobolev_batch.norms.tail.sampling import TailSampling
+from sobolev_batch.store.location import Location
+from sobolev_batch.store.lock import LOCK_KEYS
+from sobolev_batch.store.metadata import SCHEMA_VERSION
+from sobolev_batch.store.records import Record
+from sobolev_batch.store.store import (
+    FIELD,
+    OCTAVES,
+    OCTAVES_GROUP,
+    PAGE,
+    QUALITY,
+    RECORD,
+    REMOVED,
+    ROOT,
+    SPECTRA_GROUP,
+    SPECTRA_KEYS,
+    UNFINISHED,
+    Store,
+)
+from sobolev_batch.store.stored_tables import array_keys, dataset_keys, hide_tables
+from sobolev_batch.study.plan import Plan
+from sobolev_batch.transform.lattice import AXES, smooth_step
+
+_log = logging.getLogger(__name__)
+
+# Of a chunk of spectra: its rows are one task, and small ones would be many keys. Qualities have as many rows.
+_SPECTRA_BYTES, _MOST_SPECTRA = 2 << 20, 512
+# Records that lie together once a run has ended.
+ROWS_PER_PAGE = 100
+_RECORDED_VERSIONS = ("sobolev-batch", "finufft", "numpy", "scipy", "xarray", "zarr")
+
+
+def require_usable(location: Location) -> None:
+    """Check, without writing, that a store exists or may be created at a location."""
+    store = Store(location)
+    # Damaged metadata are made again.
+    with suppress(DamageError):
+        if not store.exists():
+            location.require_free(besides=LOCK_KEYS)
+        elif not store.is_unfinished:
+            store.attributes()
+
+
+def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
+    """Create the store of a plan, or open it and add rows for new meshes. Rows that the study has lost stay.
+
+    If tables, coordinates or metadata are not those that were written, all of them are made again, and the fields stay.
+    A StoreError leaves the location as it is: it cannot be written, holds something else or the store of another study;
+    or its root is damaged, and no field of the study is found (DamageError).
+    """
+    store = Store(location)
+    try:
+        exists = store.exists()
+    except DamageError as damage:
+        return _mended(store, plan, damage)
+    if not exists:
+        store.location.require_free(besides=LOCK_KEYS)
+    if not exists or store.is_unfinished:
+        _create(store, plan)
+        return store
+    attributes, lattice = store.attributes(), _lattice_entry(plan)
+    if not store.has_digest():
+        is_same = attributes["study"].items() >= {"name": plan.study.name, **lattice}.items()
+        return _mended(store, plan, None if is_same else _ALTERED)
+    _check_same_study(store, plan)
+    store.location.remove_partial_files()
+    with store.location.access("written"):
+        if not attributes["study"].items() >= lattice.items():
+            done = sum(record is not None for record in store.records())
+            _log.warning(
+                "%s: another lattice follows from the study now; all of %d fields are computed again", store.path, done
+            )
+            _create(store, plan)
+        _require_same_samples(store, plan, is_trusted=True)
+        stored = store.labels()
+        # Only a row whose mesh the study has lost may serve another one.
+        is_kept = set(stored) <= {row.label for row in plan.rows}
+        labels = _labels_for(plan, stored, [None] * len(stored) if is_kept else store.records(), is_trusted=True)
+        if labels != list(stored):
+            _lay_out(store, plan, labels, store.read_strings(QUALITY))
+        if attributes.get("similarity") != _similarity_entry(plan.similarity):
+            # Tables are in another unit of length, and the run may end before there are others.
+            hide_tables(store)
+        store.documents[""]["attributes"].update(_attributes(plan, labels))
+        # Written even if nothing changed: a location that cannot be written must fail before tasks start.
+        store.consolidate()
+    return store
+
+
+_ALTERED = DamageError("the metadata at the root are damaged", "they are not what was written")
+
+
+def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:
+    """Return a store with new metadata, coordinates and labels, and without tables, around its fields and records.
+
+    DamageError where, with this damage, it may be the store of another study: no field in it is one of this study.
+    """
+    stored: tuple[str, ...] = ()
+    with suppress(StoreError, ValueError, TypeError, KeyError):
+        stored = store.labels()
+    last, last_page = (max(store.stored_chunks(name), default=-1) for name in (RECORD, PAGE))
+    count = max(1 + last, ROWS_PER_PAGE * (1 + last_page))
+    fresh = Store(store.location)
+    fresh.documents = _documents_of(_record_keys(count))
+    records, damaged = fresh.examine_records()
+    keys = {row.key for row in plan.rows}
+    if damage is not None and not any(record is not None and record.key in keys for record in records):
+        raise DamageError(
+            f"{store.path}: {ROOT}, the metadata at the root, is damaged, and no field of this study is found in the "
+            "store to make it again from; name another store, or remove this one",
+            damage.what,
+        )
+    _log.warning("%s: tables or metadata are not what was written, and are made again", store.path)
+    store.location.remove_partial_files()
+    with store.location.access("written"):
+        if plan.tail is not None:
+            fresh.documents |= _documents_of(dataset_keys(OCTAVES_GROUP, xr.Dataset(coords=_sample_columns(plan.tail))))
+        _require_same_samples(fresh, plan, is_trusted=False)
+        labels = _labels_for(plan, (stored + ("",) * count)[:count], records, is_trusted=False)
+        _lay_out(fresh, plan, labels, ())
+        # Nothing else replaces the record of a row that has lost its label.
+        for row in damaged:
+            fresh.write_record(row, None)
+        fresh.consolidate()
+    return fresh
+
+
+def _create(store: Store, plan: Plan) -> None:
+    """Create all arrays, in place of everything that the store holds."""
+    # This process may be killed before all of them exist: until then the content is declared invalid.
+    attributes = {"title": plan.study.title, "schema_version": SCHEMA_VERSION, UNFINISHED: True}
+    store.location.write({ROOT: json.dumps(_root(attributes)).encode()})
+    store.location.remove_partial_files()
+    for name in sorted(store.location.names() - {*LOCK_KEYS, ROOT}):
+        store.location.remove(name)
+    store.documents = {}
+    _lay_out(store, plan, [row.label for row in plan.rows], ())
+    store.consolidate()
+
+
+def _lay_out(store: Store, plan: Plan, labels: Sequence[str], qualities: Sequence[str]) -> None:
+    """Write metadata and coordinates of all arrays that tasks fill, and first qualities; chunks and tables stay."""
+    rows, mesh = len(labels), np.array(labels, dtype=object)
+    padded = np.array([*qualities, *[""] * (rows - len(qualities))], dtype=object)
+    # Whoever reads the field of one mesh reads the qualities of few.
+    chunks = {"chunks": (min(rows, _MOST_SPECTRA),)}
+    units = {"units": "cycles per unit length"}
+    axes = {name: (name, axis, units) for name, axis in zip(AXES, plan.lattice.axes, strict=True)}
+    keys = {
+        **array_keys(
+            FIELD,
+            plan.choice.dtype,
+            (rows, *plan.lattice.shape),
+            (1, *plan.blocks[0].shape),
+            ("mesh", *AXES),
+            long_name="Fourier transform of the area measure, xi_z >= 0 half",
+            # xarray makes coordinates of what `coordinates` names, which then stay with a selected field.
+            coordinates="quality",
+        ),
+        **dataset_keys(
+            "fourier",
+            xr.Dataset(
+                {"quality": ("mesh", padded, {}, chunks)}, coords={**axes, "mesh": mesh, **_weight_columns(plan)}
+            ),
+        ),
+        **_record_keys(rows),
+    }
+    if plan.tail is not None:
+        keys |= array_keys(
+            OCTAVES,
+            plan.choice.dtype,
+            (rows, plan.tail.size),
+            (1, plan.tail.size),
+            ("mesh", "sample"),
+            long_name="Fourier transform of the area measure, beyond the lattice",
+            description="the sum of weight (1 + |xi|²)^s |octaves|² is the tail of a squared norm to the last octave",
+        )
+        keys |= dataset_keys(OCTAVES_GROUP, xr.Dataset(coords={**_sample_columns(plan.tail), "mesh": mesh}))
+    store.publish(keys | _spectra_keys(plan, mesh))
+    store.documents[""] = _root(_attributes(plan, labels))
+
+
+def _spectra_keys(plan: Plan, mesh: NDArray[Any]) -> dict[str, bytes]:
+    """Return the keys of the radial spectra of all rows, without their chunks."""
+    axis, rows = RadialAxis(plan.lattice, plan.tail), len(mesh)
+    step = min(max(1, _SPECTRA_BYTES // (8 * len(axis))), _MOST_SPECTRA)
+    columns = {
+        "radius": ("shell", axis.radii, {"units": "cycles per unit length"}),
+        "weight": ("shell", axis.weights, {"long_name": "factor of an entry in the squared value"}),
+        "octave": ("shell", axis.labels()["octave"], {"long_name": "number of the octave, 0 for the lattice"}),
+        "lattice": ("shell", axis.labels()["lattice"], {"long_name": "lattice in the octave, -1 for drawn samples"}),
+    }
+    keys = {
+        **dataset_keys(SPECTRA_GROUP, xr.Dataset(coords={**columns, "mesh": mesh})),
+        **array_keys(SPECTRA_KEYS, str, (rows,), (step,), ("mesh",)),
+    }
+    for name, (width, dimension, meaning) in axis.arrays().items():
+        attributes = {"long_name": meaning, "coordinates": " ".join(["key", *columns])}
+        path, dimensions = f"{SPECTRA_GROUP}/{name}", ("mesh", dimension)
+        keys |= array_keys(path, "float64", (rows, width), (step, width), dimensions, **attributes)
+    return keys
+
+
+def _record_keys(rows: int) -> dict[str, bytes]:
+    """Return the keys of the arrays of records: a chunk for each row, which tasks write, and pages of many rows."""
+    return {
+        **array_keys(RECORD, str, (rows,), (1,), ("mesh",)),
+        **array_keys(PAGE, str, (rows,), (ROWS_PER_PAGE,), ("mesh",)),
+    }
+
+
+def _weight_columns(plan: Plan) -> dict[str, tuple[str, NDArray[np.float64], dict[str, str]]]:
+    """Return the weights of samples in the integral over all frequencies: along each axis, and by the shell |k|²."""
+    lattice = plan.lattice
+    radii = lattice.spacing * np.sqrt(np.arange(lattice.shell_count))
+    step = np.ones_like(radii) if plan.tail is None else smooth_step(radii, plan.tail.cutoff)
+    columns = {
+        name.replace("xi", "weight"): (name, weights, {"long_name": f"factor of the weight of a sample, by {name}"})
+        for name, weights in zip(AXES, lattice.axis_weights(lattice.half), strict=True)
+    }
+    meaning = {"long_name": "factor of the weight of a sample, by the shell |k|² of xi = spacing k"}
+    return {**columns, "weight_shell": ("shell", step, meaning)}
+
+
+def _documents_of(keys: dict[str, bytes]) -> dict[str, Any]:
+    ending = f"/{ROOT}"
+    return {key.removesuffix(ending): json.loads(content) for key, content in keys.items() if key.endswith(ending)}
+
+
+def _sample_columns(tail: TailSampling) -> dict[str, tuple[str, NDArray[Any], dict[str, str]]]:
+    """Return the coordinates of the samples of octaves."""
+    units = {"units": "cycles per unit length"}
+    columns = {name: ("sample", column, units) for name, column in zip(AXES, tail.frequencies.T, strict=True)}
+    columns["weight"] = ("sample", tail.weights, {"long_name": "weight in the integral over all frequencies"})
+    meanings = {
+        "octave": "number of the octave, from 1",
+        "lattice": "number of the random lattice in the octave; -1 for drawn samples",
+        "sublattice": "number of the sublattice in the lattice; -1 for drawn samples",
+    }
+    labels = tail.labels()
+    return columns | {name: ("sample", labels[name], {"long_name": meaning}) for name, meaning in meanings.items()}
+
+
+def _root(attributes: dict[str, Any]) -> dict[str, Any]:
+    return {"zarr_format": 3, "node_type": "group", "attributes": attributes}
+
+
+def _require_same_samples(store: Store, plan: Plan, *, is_trusted: bool) -> None:
+    """Check that octaves have the frequencies that are drawn here; of coordinates not trusted, one axis is enough."""
+    agree = []
+    for name, expected in zip(AXES, () if plan.tail is None else plan.tail.frequencies.T, strict=False):
+        with suppress(StoreError, ValueError, TypeError, KeyError):
+            stored = np.asarray(store.read(f"{OCTAVES_GROUP}/{name}"))
+            agree.append(stored.shape == expected.shape and np.allclose(stored, expected, rtol=1e-9, atol=1e-12))
+    if agree and not (all if is_trusted else any)(agree):
+        raise StoreError(
+            f"{store.path}: its octaves were sampled at other frequencies than this version of NumPy draws; use "
+            "the versions that the attributes of the store name, or name another store"
+        )
+
+
+def _check_same_study(store: Store, plan: Plan) -> None:
+    study = store.attributes()["study"]
+    # A chosen lattice may be chosen anew; a given one is part of the study.
+    may_change = plan.study.accuracy is not None and study.get("choice")
+    comparisons = [("the study", repr(study["name"]), repr(plan.study.name))]
+    if not may_change:
+        old_lattice, new_lattice = (
+            f"xi_max {lattice['xi_max']:.6g} and M {lattice['M']}"
+            for lattice in (study["lattice"], _lattice_entry(plan)["lattice"])
+        )
+        comparisons.append(("a lattice of", old_lattice, new_lattice))
+        comparisons.append(("dtype", repr(study["dtype"]), repr(plan.choice.dtype)))
+        old, new = study.get("octaves"), plan.choice.octaves
+        if old != new:
+            first, second = (str(len(table["octaves"])) if table else "none" for table in (old, new))
+            comparisons.append(("octaves:", first, second if first != second else f"{second} others"))
+    differences = [f"{what} {old}, not {new}" for what, old, new in comparisons if old != new]
+    if differences:
+        raise StoreError(
+            f"{store.path}: it holds a store of another study, with {'; '.join(differences)}. "
+            "Name another store, or remove this one"
+        )
+
+
+def _labels_for(plan: Plan, stored: Sequence[str], records: Sequence[Record | None], *, is_trusted: bool) -> list[str]:
+    """Return a label for each stored row, followed by the labels of new meshes.
+
+    A row whose mesh the study has lost gets the label of a new mesh with the same field. Labels that are not trusted
+    count only where the key of the record is that of their mesh.
+    """
+    planned = {row.label: row.key for row in plan.rows}
+    labels = [
+        label if label in planned and (is_trusted or (record is not None and record.completes(planned[label]))) else ""
+        for label, record in zip(stored, records, strict=True)
+    ]
+    taken, by_key = set(labels), dict[str, deque[str]]()
+    for label, key in planned.items():
+        if key and label not in taken:
+            by_key.setdefault(key, deque()).append(label)
+    for row, record in enumerate(records):
+        if not labels[row] and record is not None and record.status == "complete" and by_key.get(record.key):
+            labels[row] = by_key[record.key].popleft()
+    taken = set(labels)
+    for row, label in enumerate(stored):
+        if not labels[row]:
+            labels[row] = label if label and label not in taken else f"removed/{row}"
+            taken.add(labels[row])
+    return [*labels, *(label for label in planned if label not in taken)]
+
+
+def _attributes(plan: Plan, labels: Sequence[str]) -> dict[str, Any]:
+    """Return the attributes of the root of the store of a plan with some rows."""
+    study, planned = plan.study, {row.label for row in plan.rows}
+    return {
+        "title": study.title,
+        "schema_version": SCHEMA_VERSION,
+        "study": {
+            "name": study.name,
+            **_lattice_entry(plan),
+            "eps": None if study.accuracy else study.transform.eps,
+            "choice": plan.choice.to_table() if study.accuracy else None,
+            "orders": list(study.orders),
+            "reference": plan.reference,
+            "table": dict(study.table),
+            "mesh_cache": str(study.cache.folder) if study.cache else None,
+        },
+        REMOVED: [label for label in labels if label not in planned],
+        "similarity": _similarity_entry(plan.similarity),
+        "versions": {name: version(name) for name in _RECORDED_VERSIONS},
+    }
+
+
+def _lattice_entry(plan: Plan) -> dict[str, Any]:
+    lattice = {"xi_max": plan.lattice.xi_max, "M": plan.lattice.M}
+    return {"lattice": lattice, "dtype": plan.choice.dtype, "octaves": plan.choice.octaves}
+
+
+def _similarity_entry(similarity: Similarity) -> dict[str, Any]:
+    return {"scale": similarity.scale, "origin": list(similarity.origin)}

@@ -1,0 +1,244 @@
+"""A plan: the surfaces of a study as rows of the store, with a digest of all that each field depends on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from sobolev_batch.errors import MeshError, StudyError, one_line
+from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.geometry.surface import Extent, Similarity, Surface
+from sobolev_batch.norms.accuracy.solve import DistanceTarget
+from sobolev_batch.norms.columns import TAKEN_NAMES
+from sobolev_batch.norms.fields import USUAL_DEGREE
+from sobolev_batch.norms.tail.sampling import TailSampling
+from sobolev_batch.sources.names import quoted
+from sobolev_batch.sources.registry import Member, single_member
+from sobolev_batch.study.lattice_choice import LatticeChoice, Members, choice_basis, choose_lattice
+from sobolev_batch.study.schema import FamilyReference
+from sobolev_batch.study.study import REFERENCE_LABEL, Study
+from sobolev_batch.transform.fourier import NUMERICS_VERSION, TransformSettings, require_inside
+from sobolev_batch.transform.kinds import kind_of
+from sobolev_batch.transform.lattice import Block, Lattice
+from sobolev_batch.transform.probe import Sample, draws_for
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One surface of a study.
+
+    Attributes:
+        label: Family/name, or "reference"; unique in the study.
+        fingerprint: Digest of the member, see `Member.fingerprint_digest`; empty if one of its files cannot be read.
+        key: SHA-256 of all that its field depends on; empty if the fingerprint is.
+        is_chosen: True if a run computes it; see `Study.only`.
+    """
+
+    label: str
+    family: str
+    member: Member
+    fingerprint: str
+    key: str = ""
+    is_chosen: bool = True
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Plan of a run: all surfaces in the order of the study, the label of the reference, the lattice of all fields.
+
+    Area and extent of the reference are in the study's unit of length. It has a sample if an accuracy is requested.
+    """
+
+    study: Study
+    similarity: Similarity
+    rows: tuple[Row, ...]
+    reference: str
+    choice: LatticeChoice
+    reference_area: float
+    reference_extent: Extent
+    sample: Sample | None = None
+
+    @property
+    def lattice(self) -> Lattice:
+        """Lattice of all fields."""
+        return self.choice.lattice
+
+    @property
+    def transform(self) -> TransformSettings:
+        """Settings of the transforms. If an accuracy is requested, eps and tolerance are chosen for each field."""
+        given, choice = self.study.transform, self.choice
+        if self.study.accuracy is None:
+            return given
+        return TransformSettings(None, choice.transform_dtype, given.quadrature, stored=choice.dtype)
+
+    @cached_property
+    def blocks(self) -> tuple[Block, ...]:
+        """Blocks of the lattice, one chunk of the store each."""
+        return self.lattice.split(self.study.largest_chunk_bytes // self.item_bytes)
+
+    @property
+    def item_bytes(self) -> int:
+        """Bytes of one sample of a field."""
+        return np.dtype(self.choice.dtype).itemsize
+
+    @property
+    def tail(self) -> TailSampling | None:
+        """Sampling of the octaves beyond the lattice, if there are any."""
+        return self.choice.tail
+
+    @property
+    def field_bytes(self) -> int:
+        """Bytes of one stored field, octaves included."""
+        return (self.lattice.half.size + (0 if self.tail is None else self.tail.size)) * self.item_bytes
+
+    def distance_target(self, row: Row) -> DistanceTarget | None:
+        """Return the accuracy that the field of a row is computed for, if an accuracy is requested."""
+        if self.study.accuracy is None:
+            return None
+        sample, closest = (None, self.choice.closest) if row.label == self.reference else (self.sample, ())
+        return DistanceTarget(self.study.orders, self.study.accuracy, sample, closest)
+
+    def with_choice(self, choice: LatticeChoice) -> Plan:
+        """Return the plan of the same study on another lattice."""
+        rows = tuple(replace(row, key=_key(self.study, self.similarity, choice, row.fingerprint)) for row in self.rows)
+        return replace(self, rows=rows, choice=choice)
+
+
+def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan:
+    """Plan a study: list its surfaces, choose its similarity and lattice, identify every field.
+
+    Only the reference is loaded, and a few pilots for an accuracy. MeshError where the reference cannot be read,
+    LatticeError where it does not fit into the period; see also `members_of` and `choose_lattice`.
+    """
+    members = members_of(study)
+    reference = _reference_label(study, members)
+    try:
+        own = members[reference][1].load()
+    except Exception as error:  # its source may raise anything
+        raise MeshError(f"the reference cannot be made: {one_line(error)}") from error
+    similarity = study.scaling or Similarity.to_unit_ball(own)
+    surface = similarity.apply(own)
+    choice = _lattice_choice(study, similarity, members, reference, surface, earlier_choice)
+    if not kind_of(surface).is_closed_form:
+        require_inside(surface, choice.lattice)
+    if study.proximity is not None and not isinstance(surface, Mesh):
+        raise StudyError(
+            "proximity: Hausdorff and Chamfer distances are measured between meshes, and the reference is not one "
+            f"but a {type(surface).__name__}; take a fine mesh of it for the reference, or leave [proximity] out"
+        )
+    rows = (
+        Row(
+            label,
+            family,
+            member,
+            _fingerprint(label, member),
+            is_chosen=label == reference or study.chooses(family, label),
+        )
+        for label, (family, member) in members.items()
+    )
+    sample = None
+    if study.accuracy is not None:
+        sample = Sample.from_surface(surface, draws_for([surface], choice.lattice, study.orders, USUAL_DEGREE))
+    plan = Plan(study, similarity, tuple(rows), reference, choice, surface.area, surface.extent, sample)
+    return plan.with_choice(choice)
+
+
+def _lattice_choice(
+    study: Study,
+    similarity: Similarity,
+    members: Members,
+    reference: str,
+    surface: Surface,
+    earlier: LatticeChoice | None,
+) -> LatticeChoice:
+    if study.lattice is not None:
+        tail = TailSampling.usual(study.lattice.xi_max, study.octaves, [surface]) if study.octaves else None
+        return LatticeChoice(study.lattice, study.transform.dtype, study.transform.dtype, tail=tail)
+    if study.accuracy is None:
+        raise ValueError("a study has a lattice or an accuracy")
+    basis = choice_basis(study, study.accuracy, similarity, members[reference][1].fingerprint())
+    if earlier is not None and earlier.basis == basis:
+        return earlier
+    others = {label: member for label, member in members.items() if label != reference}
+    return replace(choose_lattice(study, study.accuracy, similarity, surface, others), basis=basis)
+
+
+def members_of(study: Study) -> dict[str, tuple[str, Member]]:
+    """Return family and member of each surface of a study, by label. No surface is made."""
+    members: dict[str, tuple[str, Member]] = {}
+    for family in study.families:
+        try:
+            listed = family.source.members(study.folder)
+        except StudyError as error:
+            raise StudyError(f"family {family.name!r}: {error}") from error
+        for member in listed:
+            label = f"{family.name}/{member.name}"
+            if label in members:
+                raise StudyError(f"two surfaces of the study have the label {label!r}")
+            if member.names_wishes:
+                named = ((f"target_{name}" if name in TAKEN_NAMES else name, value) for name, value in member.metadata)
+                member = replace(member, metadata=tuple(named))
+            taken = next((name for name, _ in member.metadata if name in TAKEN_NAMES), None)
+            if taken is not None:
+                raise StudyError(
+                    f"family {family.name!r}: the metadata of {quoted(member.name)} have the name {taken!r}, which "
+                    f"tables use themselves; rename it, for example to {family.name}_{taken}"
+                )
+            members[label] = family.name, member
+    if not isinstance(study.reference, FamilyReference):
+        try:
+            members[REFERENCE_LABEL] = REFERENCE_LABEL, single_member(study.reference, study.folder)
+        except StudyError as error:
+            raise StudyError(f"reference: {error}") from error
+    return members
+
+
+def _reference_label(study: Study, members: Members) -> str:
+    if not isinstance(study.reference, FamilyReference):
+        return REFERENCE_LABEL
+    family, name = study.reference.family, study.reference.member
+    if name is None:
+        candidates = [member for family_name, member in members.values() if family_name == family]
+        finest = max(candidates, key=lambda member: member.level)
+        if sum(member.level == finest.level for member in candidates) > 1:
+            raise StudyError(
+                f"reference: the family {family!r} has no finest level; name one of its members: "
+                + ", ".join(member.name for member in candidates[:5])
+            )
+        name = finest.name
+    if f"{family}/{name}" not in members:
+        raise StudyError(f"reference: the family {family!r} has no member {quoted(name)}")
+    return f"{family}/{name}"
+
+
+def _fingerprint(label: str, member: Member) -> str:
+    try:
+        return member.fingerprint_digest()
+    except Exception as error:  # its source may raise anything, and the task reports it
+        _log.warning("%s: %s", label, one_line(error))
+        return ""
+
+
+def _key(study: Study, similarity: Similarity, choice: LatticeChoice, fingerprint: str) -> str:
+    if not fingerprint:
+        return ""
+    dependencies: dict[str, Any] = {
+        "surface": fingerprint,
+        "similarity": [similarity.scale, *similarity.origin],
+        "lattice": [choice.lattice.xi_max, choice.lattice.M],
+        "transform": [study.transform.eps, choice.transform_dtype, choice.dtype, study.transform.quadrature],
+        "numerics": NUMERICS_VERSION,
+        # The target of a field follows from its distance to the reference.
+        "accuracy": choice.basis,
+    }
+    if choice.tail is not None:
+        dependencies["octaves"] = choice.tail.digest
+    return hashlib.sha256(json.dumps(dependencies, sort_keys=True).encode()).hexdigest()

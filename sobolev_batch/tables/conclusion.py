@@ -1,0 +1,196 @@
+"""The verdict on a study: the nearest mesh at each size, and the smallest mesh of each family below a bound."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from sobolev_batch.tables import Format
+from sobolev_batch.tables.convergence import nearest, smallest_of, table
+from sobolev_batch.tables.text import (
+    Column,
+    column_table,
+    count,
+    machine_table,
+    minus,
+    percent,
+    prose,
+    section,
+    spread,
+)
+
+# A row of a table: a record of a frame. It may also have its "order"; a "mark", a short remark about its marked number;
+# the number of its "color"; and the text "absent" in place of all numbers, with the section "reasons" that explains it.
+Row = Mapping[Any, Any]
+
+_BOUNDS = (0.05, 0.01)
+# Meshes whose numbers of triangles differ by no more than this factor are of one size.
+_SAME_SIZE = 1.2
+# More rows are no verdict any more.
+_MOST_SIZES = 8
+_MOST_FAMILIES = 6
+MOST_NAMED = 3
+
+VERDICT_COLUMNS = (
+    Column("verdict", "verdict", kind="label"),
+    Column("mesh", "mesh", kind="text"),
+    Column("relative", "relative", percent, "relative_error"),
+    Column("triangles", "triangles", count),
+    Column("remark", "remark", kind="text"),
+)
+
+
+def study_verdict(frame: pd.DataFrame, failed: Mapping[str, str]) -> tuple[tuple[str, ...], list[Row], str]:
+    """Return the verdict on a study at each order, from the rows of `table` and the reasons of meshes that are missing.
+
+    It is a sentence for each order; rows of nearest meshes, smallest meshes below bounds, and meshes that are missing
+    or imprecise, with their order; and a note on the sizes and families that are left out, empty where none is.
+    """
+    groups = [(float(order), rows) for order, rows in frame.groupby("order", sort=False)]
+    sizes = _sizes(groups[0][1])
+    shown_sizes = spread(sizes, _MOST_SIZES)
+    sized = frame[frame["triangles"] > 0]["family"].unique().tolist()
+    lines: list[Row] = []
+    for order, rows in groups:
+        at_sizes = [rows[rows["mesh"].isin(labels)] for labels in shown_sizes]
+        nearest_rows, smallest_rows = _nearest_rows(rows, at_sizes), _smallest_rows(rows, sized[:_MOST_FAMILIES])
+        of_order = (*nearest_rows, *smallest_rows, *_doubtful_rows(rows, failed))
+        lines += [{**line, "order": order} for line in of_order]
+    omitted = [
+        f"{shown} of {total} {things}"
+        for shown, total, things in (
+            (len(shown_sizes), len(sizes), "sizes"),
+            (min(len(sized), _MOST_FAMILIES), len(sized), "families"),
+        )
+        if shown < total
+    ]
+    sentences = tuple(_sentence(order, rows, frame.attrs["reference"]) for order, rows in groups)
+    return sentences, lines, " and ".join(omitted)
+
+
+def _sentence(order: float, rows: pd.DataFrame, reference: str) -> str:
+    """Return a sentence on one order."""
+    name, at_order = "the reference" if reference == "reference" else reference, minus(f"at order {order:g}")
+    closest, compared = nearest(rows), int(rows["distance"].notna().sum())
+    if compared == 0:
+        return f"No mesh could be compared with {name}."
+    if closest is None:
+        return f"No distance to {name} is above its error {at_order}: the meshes may be equal to it."
+    best, rivals = closest
+    # On one line, in a sentence.
+    amount = percent(best["relative"], best["relative_error"]).replace(" ", "\N{NO-BREAK SPACE}")
+    who = rivals[0] if len(rivals) == 1 else f"one of {_names(rivals)}"
+    doubt = f", and the errors leave open whether {who} is nearer" if rivals else ""
+    if compared == 1:
+        return f"{best['mesh']} differs from {name} by {amount} {at_order}."
+    return f"Of {compared:,} meshes, {best['mesh']} is nearest to {name} {at_order}: it differs by {amount}{doubt}."
+
+
+def _sizes(rows: pd.DataFrame) -> list[list[str]]:
+    """Return the labels of meshes of about as many triangles, where these are of several families."""
+    known = rows[rows["triangles"] > 0].sort_values("triangles", kind="stable")
+    sizes: list[pd.DataFrame] = []
+    while len(known):
+        is_same = known["triangles"] <= _SAME_SIZE * known["triangles"].iloc[0]
+        sizes.append(known[is_same])
+        known = known[~is_same]
+    return [size["mesh"].tolist() for size in sizes if size["family"].nunique() > 1]
+
+
+def _nearest_rows(rows: pd.DataFrame, at_sizes: Sequence[pd.DataFrame]) -> Iterator[Row]:
+    """Yield the nearest mesh of all, and those of each size."""
+    yield _nearest_row("nearest of all", rows)
+    for members in at_sizes:
+        low, high = int(members["triangles"].min()), int(members["triangles"].max())
+        counts = f"{low:,}" if low == high else f"{low:,} to {high:,}"
+        yield _nearest_row(f"{counts} triangles", members)
+
+
+def _nearest_row(label: str, members: pd.DataFrame) -> Row:
+    closest = nearest(members)
+    if closest is None:
+        is_known = members["distance"].notna().any()
+        return _absent(label, "no distance is above its error" if is_known else "no distance is known")
+    best, rivals = closest
+    return _row(label, best, f"errors leave open {_names(rivals)}" if rivals else _lead(best, members))
+
+
+def _lead(best: pd.Series, members: pd.DataFrame) -> str:
+    """Return by how much the nearest mesh is nearer than the next one of another family, of its size if there is one.
+
+    Where there is none, the remark has the number of triangles of the other one.
+    """
+    others = members[(members["family"] != best["family"]) & members["distance"].notna()]
+    counts = np.maximum(others["triangles"].astype(float), 1.0) / max(best["triangles"], 1)
+    of_size = others[counts.between(1 / _SAME_SIZE, _SAME_SIZE)]
+    if not len(others):
+        return ""
+    rivals = of_size if len(of_size) else others
+    second = rivals.loc[rivals["distance"].idxmin()]
+    size = "" if len(of_size) or not second["triangles"] else f" of {second['triangles']:,} triangles"
+    nearer = f"nearer than {second['mesh']}{size}"
+    if not best["resolved"]:
+        return f"below its error, {nearer}"
+    ratio = second["distance"] / best["distance"]
+    return f"{ratio:.3g} times {nearer}" if ratio < 100 else f"far {nearer}"
+
+
+def _smallest_rows(rows: pd.DataFrame, families: Sequence[str]) -> Iterator[Row]:
+    """Yield the smallest mesh of each family below each bound."""
+    for bound in _BOUNDS:
+        frame = smallest_of(rows, bound)
+        for row in frame[frame["family"].isin(families)].to_dict(orient="records"):
+            label = f"below {100 * bound:g} %: {row['family']}"
+            open_ones = f"errors leave open {_names(row['undecided'])}" if row["undecided"] else ""
+            if row["mesh"]:
+                yield _row(label, row, open_ones)
+            else:
+                amount = percent(row["nearest_relative"], row["nearest_relative_error"])
+                closest = f"{row['nearest']} has {amount}" if row["nearest"] else ""
+                yield _absent(label, "; ".join(filter(None, ("none", closest, open_ones))))
+
+
+def _doubtful_rows(rows: pd.DataFrame, failed: Mapping[str, str]) -> Iterator[Row]:
+    """Yield the meshes whose distances have larger errors than the study requests, and those that failed."""
+    short = rows[rows["resolved"].astype(bool) & ~rows["within"].astype(bool) & rows["distance"].notna()]
+    if len(short):
+        yield _absent("above rtol", _names(short["mesh"].tolist()))
+    if failed:
+        yield {**_absent("missing", _names(list(failed))), "reasons": "failed"}
+
+
+def _row(label: str, mesh: Mapping[str, Any] | pd.Series, remark: str) -> Row:
+    numbers = {name: mesh[name] for name in ("mesh", "relative", "relative_error", "triangles")}
+    return {"verdict": label, **numbers, "remark": remark}
+
+
+def _absent(label: str, text: str) -> Row:
+    """Return a row with a text in place of numbers."""
+    return {"verdict": label, "absent": text}
+
+
+def _names(labels: Sequence[str]) -> str:
+    """Return a few labels, and how many more there are."""
+    more = len(labels) - MOST_NAMED
+    return ", ".join(labels[:MOST_NAMED]) + (f" and {more:,} more" if more > 0 else "")
+
+
+def format_verdict(tree: xr.DataTree, style: Format = "text", orders: Sequence[float] | None = None) -> str:
+    """Return the verdict on the study of an open store as text, or its rows for programs."""
+    frame = table(tree, orders)
+    reasons = frame[frame["status"] != "complete"].drop_duplicates("mesh").set_index("mesh")["reason"]
+    _, rows, omitted = study_verdict(frame, reasons.to_dict())
+    if style in ("csv", "json"):
+        names = ("order", "verdict", "mesh", "relative", "relative_error", "triangles", "remark", "absent")
+        return machine_table(pd.DataFrame(rows, columns=[*names]).astype({"triangles": "Int64"}), style)
+    sections = []
+    blank = {"mesh": "", "relative": math.nan, "triangles": pd.NA}
+    for order in frame["order"].drop_duplicates():
+        own = [{**blank, "remark": row.get("absent", ""), **row, "absent": ""} for row in rows if row["order"] == order]
+        sections.append(section(f"Verdict at order {order:g}", [column_table(VERDICT_COLUMNS, own, style)], [], style))
+    return "\n\n".join([*sections, *([prose([f"Only {omitted} are shown."], style)] if omitted else [])])

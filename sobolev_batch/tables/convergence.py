@@ -1,0 +1,430 @@
+"""Tables of distances to the reference, with observed rates; and the smallest mesh of each family near enough."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from sobolev_batch.errors import InputError
+from sobolev_batch.geometry.proximity import METRICS, OF_ONE_MESH
+from sobolev_batch.norms.budget import AREA_AND_SHAPE, PARTS
+from sobolev_batch.norms.columns import observed_rates, parts_as_variables
+from sobolev_batch.parameters import fraction
+from sobolev_batch.sources.mesh_cache import Cost
+from sobolev_batch.tables import Format
+from sobolev_batch.tables.open import (
+    EDGE_LENGTH,
+    AnyStore,
+    as_tree,
+    finished_group,
+    has_proximity,
+    is_sequence,
+    metadata_of,
+    placement_doubts,
+    sizes_of,
+    stores_of,
+    study_unit,
+    unit_of,
+)
+from sobolev_batch.tables.store_accessor import convergence_at, order_note
+from sobolev_batch.tables.text import (
+    Column,
+    column_table,
+    count,
+    machine_table,
+    percent,
+    prose,
+    section,
+    with_error,
+    wrapped,
+)
+from sobolev_batch.transform.lattice import Orders
+
+_ABOUT = ("family", "name", "level", "rank", "ordered_by", "status", "reason", "triangles", "vertices", "seconds")
+_NUMBERS = (
+    "edge_length",
+    "distance",
+    "error",
+    *PARTS,
+    "relative",
+    "relative_error",
+    *AREA_AND_SHAPE,
+    "rate",
+    "rate_error",
+    "resolved",
+    "within",
+)
+# Of meshes that a program or function made.
+_MADE = tuple(item.name for item in fields(Cost))
+# Integers, or missing where a mesh failed.
+_COUNTS = ("triangles", "vertices")
+_NOTE = """\
+Relative distances are fractions of the reference's norm. Errors are meant as bounds,
+the sums of truncation (frequencies beyond the highest one), aliasing (spacing of the
+lattice), discretisation (quadrature and NUFFT) and chance (random frequencies, if the
+study samples octaves). A distance marked * is not larger than its error, and gives no
+rate. The column "area" is the share of the squared distance that a change of total area
+alone explains."""
+_UNIT_NOTE = """\
+Edges and other lengths are in {}.
+Distances of orders are computed in {}."""
+_PROXIMITY_NOTE = """\
+Other distances are the same at all orders. They are those of sampled points to the other
+mesh, the larger of both directions, with standard errors. Hausdorff is a lower bound: the
+largest distance of any vertex or sampled point. Chamfer is the sum of the mean distances
+of both directions. Normals are compared as lines."""
+_ACCURACY_NOTE = """\
+The study requests an error of at most {rtol:g} of each distance; a distance
+marked ! has a larger one."""
+
+
+_RELATIVE = ["relative", "relative_error"]
+_SMALLEST = ["mesh", "triangles", *_RELATIVE, "nearest", *(f"nearest_{name}" for name in _RELATIVE), "undecided"]
+_SMALLEST_NOTE = """\
+A mesh is below the bound if its relative distance and the error of that are together.
+Meshes that are smaller, and that the errors leave open, are named as undecided."""
+
+_UNKNOWN: dict[str, Any] = {"mesh": "", "triangles": pd.NA, "relative": math.nan, "relative_error": math.nan}
+_MESH = Column("mesh", "mesh", kind="label")
+_TRIANGLES = Column("triangles", "triangles", count)
+_COLUMNS = (
+    _MESH,
+    _TRIANGLES,
+    Column("edge_length", "edge", "{:.4g}".format),
+    Column("relative", "relative", percent, "relative_error", is_marked=True),
+    Column("distance", "distance", with_error, "error"),
+    Column("rate", "rate", with_error, "rate_error"),
+    Column("area_fraction", "area", lambda fraction: f"{100 * fraction:.0f} %"),
+)
+_METRIC_COLUMNS = (
+    Column("hausdorff", "Hausdorff ≥", "{:.3g}".format),
+    Column("mean", "mean ± s.e.", with_error, "mean_error"),
+    Column("rms", "RMS ± s.e.", with_error, "rms_error"),
+    *(Column(f"p{percent}", f"{percent} % ≤", "{:.3g}".format) for percent in (50, 95, 99)),
+    Column("chamfer", "Chamfer ± s.e.", with_error, "chamfer_error"),
+    Column("fscore", "F-score", lambda score: f"{100 * score:.1f} %"),
+    Column("normal_mean", "normals", "{:.2g}°".format),
+    Column("normal_max", "largest", "{:.2g}°".format),
+    Column("volume", "volume", "{:.4g}".format),
+    Column("smallest_angle", "angles ≥", "{:.2g}°".format),
+    Column("aspect_ratio", "aspect ≤", "{:.3g}".format),
+)
+_SMALLEST_COLUMNS = (
+    Column("family", "family"),
+    _MESH,
+    _TRIANGLES,
+    Column("relative", "relative", percent, "relative_error"),
+    Column("remark", "remark", kind="text"),
+)
+
+
+def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH) -> pd.DataFrame:
+    """Return the convergence table of a store in long form: one row for each mesh and order.
+
+    Args:
+        store: Path, URL or opened DataTree of the store. From the store of a collection, the rows of all objects that
+            have tables follow each other, and the first column, object, names theirs.
+        order: One order s < -1/2, or several; default all of the store. Others than those are computed from the stored
+            fields, which takes about as long as reading them.
+        x: Size of a mesh, a column of the table, in which rates are observed: "edge_length", "triangles", "vertices"
+            or "seconds" (spent on its Fourier field), or one of the metadata that the study gives its meshes.
+
+    Returns:
+        One row for each mesh and order. Lengths of a mesh are in the study's unit. The columns:
+
+        - order, mesh, family, name, level; rank, the place in the family from coarse to fine, and ordered_by, what
+          decides on it (level, triangles, names or time);
+        - status, reason, triangles, vertices, seconds (of computing), edge_length (mean), and the metadata that the
+          study gives its meshes; make_seconds, make_cpu_seconds, make_peak_bytes and exit_status of what made them,
+          where the study does;
+        - distance (to the reference), error and its parts truncation, aliasing, discretisation and statistical;
+          relative and relative_error (over the norm of the reference);
+        - area_part and shape_part: what a change of total area alone explains of the distance, and the rest. Their
+          squares add up to its square. area_part_error and shape_part_error are their errors;
+        - rate, the observed order of convergence, and rate_error: distance ~ edge_length^rate, or distance ~ x^-rate
+          for another x, since the others grow;
+        - resolved (the distance exceeds its error) and within (the error is as small as the study requests);
+        - where the study requests [proximity]: the numbers of its metrics, by their names in `proximity`, and volume,
+          smallest_angle and aspect_ratio; their lengths are in the unit of the files.
+
+        Numbers of a mesh that failed are NaN. The frame's ``attrs`` have the
+        reference's label, and where there are any, the study's rtol, as ``metadata`` the names of the metadata, and as
+        ``computed`` the orders that were computed from the fields.
+
+    Raises:
+        InputError: The store has no tables yet, or its meshes have no such size.
+        OrderError: An order is not below -1/2.
+        DamageError: An order is to be computed, and a field is not what was stored.
+        StoreError: The location has no store of a study.
+
+    >>> import sobolev_batch as sb
+    >>> frame = sb.table("storage/icosphere.zarr", order=-10)
+    >>> frame.attrs["reference"]
+    'reference'
+    >>> frame.set_index("mesh")["rate"].round(1).to_dict()
+    {'icosphere/0': nan, 'icosphere/1': 2.0, 'icosphere/2': 2.0, 'icosphere/3': 2.0}
+    """
+    stores = stores_of(store)
+    if "" not in stores:
+        return _joined(tables_of(stores, order, x=x))
+    tree = as_tree(store)
+    convergence, meshes = convergence_at(tree, order), finished_group(tree, "meshes")
+    labels = convergence["mesh"].values
+    others = labels != convergence.attrs["reference"]
+    about = [key for key in (*_ABOUT, *_MADE, *metadata_of(tree)) if key in meshes]
+    columns = {"mesh": labels[others], **{key: meshes[key].values[others] for key in about}}
+    nearness = {}
+    if has_proximity(tree):
+        proximity = finished_group(tree, "proximity").sel(mesh=labels[others])
+        asked = [f"{name}{way}" for name in _metrics_of(tree) for way in ("", "_forward", "_backward")]
+        nearness = {name: proximity[name].values for name in asked if name in proximity}
+        nearness |= {name: meshes[name].values[others] for name in asked if name in OF_ONE_MESH}
+        if "volume" in nearness:
+            nearness["volume"] = nearness["volume"] * unit_of(tree)[1] ** 3
+    frames = []
+    for s in dict.fromkeys(convergence["order"].values.tolist()):
+        row = parts_as_variables(convergence.sel(order=s))
+        # Tables of older versions lack some.
+        numbers = {key: row[key].values[others] for key in _NUMBERS if key in row}
+        frames.append(pd.DataFrame({"order": s, **columns, **numbers, **nearness}))
+    frame = pd.concat(frames, ignore_index=True).astype(dict.fromkeys(_COUNTS, "Int64"))
+    kept = ("reference", "rtol", "computed")
+    frame.attrs = {key: convergence.attrs[key] for key in kept if key in convergence.attrs}
+    frame.attrs["unit_length"] = unit_of(tree)[1]
+    if known := metadata_of(tree):
+        frame.attrs["metadata"] = known
+    return frame if x == EDGE_LENGTH else _with_rates(frame, x)
+
+
+def _joined(frames: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+    """Return the rows of several objects after each other, named in the first column."""
+    return pd.concat(frames, names=["object", "row"]).reset_index(level="object").reset_index(drop=True)
+
+
+def tables_of(
+    stores: Mapping[str, AnyStore], order: Orders | None = None, *, x: str = EDGE_LENGTH
+) -> dict[str, pd.DataFrame]:
+    """Return the rows of `table` of each object that has any, by its name; InputError if none has."""
+    trees = {name: as_tree(place) for name, place in stores.items()}
+    finished = {name: tree for name, tree in trees.items() if "convergence" in tree.children}
+    if not finished:
+        raise InputError("there are no tables yet: run the study to its end")
+    return {name: table(tree, order, x=x) for name, tree in finished.items()}
+
+
+def format_table(
+    store: AnyStore | Mapping[str, AnyStore],
+    style: Format = "text",
+    orders: Sequence[float] | None = None,
+    *,
+    x: str = EDGE_LENGTH,
+) -> str:
+    """Return the convergence tables of a store, or of several objects by their names, as text; see `table`."""
+    trees = {name: as_tree(place) for name, place in stores_of(store).items()}
+    frames = tables_of(trees, orders, x=x)
+    if style in ("csv", "json"):
+        return machine_table(frames[""] if "" in frames else _joined(frames), style)
+    sections: list[str] = []
+    for name, frame in frames.items():
+        tree = trees[name]
+        sections += [prose([f"Object {name}"], style)] if name else []
+        sections += _tables(tree, frame, style, x)
+        computed = order_note(tree, frame.attrs["computed"]) if "computed" in frame.attrs else []
+        doubts = [f"{mesh}: {doubt}" for mesh, doubt in placement_doubts(tree).items()]
+        sections += [prose(lines, style) for lines in (computed, [*_failures(tree, frame), *doubts]) if lines]
+    return "\n\n".join([*sections, prose(_notes([trees[name] for name in frames], list(frames.values()), x), style)])
+
+
+def _tables(tree: xr.DataTree, frame: pd.DataFrame, style: Format, x: str) -> Iterator[str]:
+    """Yield the table of each order with its caption, and that of other distances where there are any."""
+    marked = with_remarks(frame)
+    columns = list(_COLUMNS)
+    if x not in {column.name for column in columns}:
+        columns.insert(2, Column(x, x, "{:.4g}".format))
+    for order, rows in marked.groupby("order", sort=False):
+        caption = f"Sobolev distance of order {order:g} to {frame.attrs['reference']}"
+        yield section(caption, [column_table(columns, rows.to_dict(orient="records"), style)], [], style)
+    if has_proximity(tree):
+        once = marked[marked["order"] == marked["order"].iloc[0]]
+        others = column_table((_MESH, *_metric_columns(tree)), once.to_dict(orient="records"), style)
+        yield section("Other distances, the same at all orders", [others], [], style)
+
+
+def nearest(frame: pd.DataFrame) -> tuple[pd.Series, tuple[str, ...]] | None:
+    """Return the nearest mesh of one order, and labels that may be nearer; None if all are below their errors.
+
+    None may be nearer if the distance with its error is below those of all others less their errors, resolved or not.
+    """
+    rows = frame[frame["distance"].notna()].sort_values("distance", kind="stable")
+    if not rows["resolved"].any():
+        return None
+    best, others = rows.iloc[0], rows.iloc[1:]
+    # An unknown error leaves everything open.
+    is_farther = (others["distance"] - others["error"]).clip(lower=0) > best["distance"] + best["error"]
+    return best, tuple(others["mesh"][~is_farther])
+
+
+def _metrics_of(tree: xr.DataTree) -> list[str]:
+    """Return the names of the numbers, besides distances of orders, that the study shows in its tables."""
+    metrics = finished_group(tree, "proximity").attrs["metrics"] if has_proximity(tree) else []
+    return [name for metric in metrics for name in METRICS.get(metric, ())]
+
+
+def _metric_columns(tree: xr.DataTree) -> list[Column]:
+    shown = _metrics_of(tree)
+    return [column for column in _METRIC_COLUMNS if column.name in shown]
+
+
+def page_columns(tree: xr.DataTree) -> tuple[Column, ...]:
+    """Return the columns whose numbers an open store has, for a page, which may be narrow."""
+    columns = [*_COLUMNS, *_metric_columns(tree)]
+    return tuple(sorted(columns, key=lambda column: (column is not _MESH, not column.is_marked)))
+
+
+def with_remarks(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return rows of `table` with edges in the unit of the files, shares of area, marks, and why they are absent."""
+    resolved, within = (frame[name].astype(bool) for name in ("resolved", "within"))
+    shares = (frame["area_part"] / frame["distance"].where(frame["distance"] > 0)) ** 2
+    return frame.assign(
+        edge_length=frame["edge_length"] * frame.attrs["unit_length"],
+        area_fraction=shares.where(resolved),
+        mark=np.where(~resolved, "below its error", np.where(within, "", "above rtol")),
+        absent=frame["status"].where(frame["status"] != "complete", ""),
+    )
+
+
+def _notes(trees: Sequence[xr.DataTree], frames: Sequence[pd.DataFrame], x: str) -> list[str]:
+    """Return what the numbers of all tables mean."""
+    notes = [*wrapped(_NOTE), *([] if x == EDGE_LENGTH else [f"Rates are those of distance ~ ({x})^-rate."])]
+    notes += wrapped(" ".join(unit_notes(trees)))
+    if any(map(has_proximity, trees)):
+        notes += wrapped(_PROXIMITY_NOTE)
+    for rtol in dict.fromkeys(frame.attrs["rtol"] for frame in frames if "rtol" in frame.attrs):
+        notes += wrapped(_ACCURACY_NOTE.format(rtol=rtol))
+    return notes
+
+
+def unit_notes(trees: Sequence[xr.DataTree]) -> list[str]:
+    """Return the units of lengths and of distances in the tables of open stores, each in a sentence."""
+    units, studies = sorted({unit_of(tree)[0] for tree in trees}), {study_unit(tree) for tree in trees}
+    own = studies.pop() if len(studies) == 1 else "units of their own for each object"
+    return _UNIT_NOTE.format(", ".join(units), own).splitlines()
+
+
+def _failures(tree: xr.DataTree, frame: pd.DataFrame) -> list[str]:
+    rows = frame.drop_duplicates("mesh")
+    failures = [f"{row.mesh} failed: {row.reason}" for row in rows.query("status == 'failed'").itertuples(index=False)]
+    if missing := int((rows["status"] == "missing").sum()):
+        failures.append(f"{missing:,} of {len(rows):,} meshes are not computed; run the whole study to add them")
+    if has_proximity(tree):
+        reasons = finished_group(tree, "proximity")["reason"].to_series()
+        failures += [f"{mesh} has no proximity: {reason}" for mesh, reason in reasons.items() if reason]
+    return failures
+
+
+def _with_rates(frame: pd.DataFrame, x: str) -> pd.DataFrame:
+    """Return rows of `table` with rates in another size, in place of those in the edge length; see `sizes_of`."""
+    sizes = 1 / sizes_of(frame, x)
+    rates, errors = np.full(len(frame), np.nan), np.full(len(frame), np.nan)
+    numbered = frame.reset_index(drop=True)
+    for _, rows in numbered.groupby(["order", "family"], sort=False):
+        if is_sequence(rows):
+            places = rows.index.to_numpy()
+            distances, bounds = rows["distance"].to_numpy(), rows["error"].to_numpy()
+            rates[places], errors[places] = observed_rates(distances, bounds, sizes[places])
+    return numbered.assign(rate=rates, rate_error=errors)
+
+
+def smallest_below(store: AnyStore, relative: float | str, order: Orders | None = None) -> pd.DataFrame:
+    """Return the mesh with the fewest triangles in each family whose relative distance is certainly below a bound.
+
+    Args:
+        store: Path, URL or opened DataTree of the store.
+        relative: Bound on the relative distance with its error, such as 0.01 or "1%".
+        order: One of the store's orders, or several; default all.
+
+    Returns:
+        One row for each order and family with meshes of triangles: order, family, mesh (empty if none is below the
+        bound), its triangles, relative and relative_error (missing likewise); nearest (the mesh of the family with the
+        smallest distance), nearest_relative and nearest_relative_error; undecided (meshes with fewer triangles of
+        which the errors leave open whether they are below the bound, separated by commas). The frame's ``attrs`` have
+        the reference's label and the bound.
+
+    Raises:
+        InputError: The store has no tables yet, lacks an order, or has no meshes of triangles, or the bound is not
+            positive.
+        StoreError: The location has no store of a study.
+
+    >>> import sobolev_batch as sb
+    >>> frame = sb.smallest_below("storage/icosphere.zarr", "5%", order=-10)
+    >>> frame[["family", "mesh", "triangles"]].values.tolist()
+    [['icosphere', 'icosphere/2', 320]]
+    """
+    most = fraction(relative)
+    frame = table(as_tree(store), order)
+    if not (frame["triangles"] > 0).any():
+        raise InputError("the smallest mesh has the fewest triangles, and no surface of the store is known to have any")
+    smallest = smallest_of(frame, most)
+    return smallest.assign(undecided=smallest["undecided"].map(", ".join))
+
+
+def smallest_of(frame: pd.DataFrame, most: float) -> pd.DataFrame:
+    """Return the smallest mesh of each family of triangles below a bound, of rows of `table`; see `smallest_below`."""
+    with_triangles = frame[frame["triangles"] > 0]
+    rows = [
+        {"order": s, "family": family, **_smallest(members, most)}
+        for (s, family), members in with_triangles.groupby(["order", "family"], sort=False)
+    ]
+    smallest = pd.DataFrame(rows, columns=["order", "family", *_SMALLEST]).astype({"triangles": "Int64"})
+    smallest.attrs = {"reference": frame.attrs["reference"], "below": most}
+    return smallest
+
+
+def format_smallest(
+    tree: xr.DataTree, style: Format = "text", orders: Sequence[float] | None = None, *, below: float | str
+) -> str:
+    """Return the smallest meshes below a bound as text; see `smallest_below`."""
+    frame = smallest_below(tree, below, orders)
+    if style in ("csv", "json"):
+        return machine_table(frame, style)
+    sections = []
+    for order, rows in frame.groupby("order", sort=False):
+        amount = f"{100 * frame.attrs['below']:g} %"
+        caption = f"Smallest mesh below {amount} of the norm of {frame.attrs['reference']}, order {order:g}"
+        cells = [
+            {**row, "mesh": row["mesh"] or "none", "remark": _remark(row)} for row in rows.to_dict(orient="records")
+        ]
+        sections.append(section(caption, [column_table(_SMALLEST_COLUMNS, cells, style)], [], style))
+    return "\n\n".join([*sections, prose(wrapped(_SMALLEST_NOTE), style)])
+
+
+def _smallest(members: pd.DataFrame, most: float) -> dict[str, Any]:
+    """Return the row of one family at one order."""
+    lowest, highest = (members["relative"] + sign * members["relative_error"] for sign in (-1, 1))
+    below = members[highest < most].sort_values(["triangles", "relative"])
+    best = _UNKNOWN if below.empty else below.iloc[0]
+    # An unknown error leaves everything open.
+    is_open = members["relative"].notna() & ~(highest < most) & ~(lowest >= most)
+    is_fewer = True if below.empty else members["triangles"] < best["triangles"]
+    nearest = members.loc[members["relative"].idxmin()] if members["relative"].notna().any() else _UNKNOWN
+    return {
+        **{name: best[name] for name in ("mesh", "triangles", *_RELATIVE)},
+        "nearest": nearest["mesh"],
+        **{f"nearest_{name}": nearest[name] for name in _RELATIVE},
+        "undecided": tuple(members.loc[is_open & is_fewer, "mesh"]),
+    }
+
+
+def _remark(row: Mapping[Any, Any]) -> str:
+    """Return the nearest mesh of a family without one below the bound, and the undecided ones."""
+    remarks = []
+    if not row["mesh"]:
+        nearest_text = f"nearest: {row['nearest']}, {percent(row['nearest_relative'], row['nearest_relative_error'])}"
+        remarks.append(nearest_text if row["nearest"] else "no distance is known")
+    return "; ".join([*remarks, *([f"undecided: {row['undecided']}"] if row["undecided"] else [])])

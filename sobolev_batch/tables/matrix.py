@@ -1,0 +1,152 @@
+"""Distances of every mesh to every other and to the reference, order by order."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from numpy.typing import NDArray
+
+from sobolev_batch.errors import InputError
+from sobolev_batch.norms.budget import PARTS, quotients
+from sobolev_batch.norms.columns import parts_as_variables
+from sobolev_batch.tables import Format
+from sobolev_batch.tables.open import AnyStore, as_tree, complete_meshes, finished_group, reference_of
+from sobolev_batch.tables.store_accessor import distances_at, norms_at, order_note
+from sobolev_batch.tables.text import (
+    machine_table,
+    middle_cut,
+    printed_table,
+    prose,
+    section,
+    with_error,
+)
+from sobolev_batch.transform.lattice import check_orders
+
+Reals = NDArray[np.float64]
+
+_COLUMNS = ("distance", "error", *PARTS)
+# A longer printed matrix cannot be read.
+_MOST_MESHES = 20
+_LONGEST_LABEL = 30
+_NOTE = "Errors are meant as bounds. The columns have the numbers of the rows; the matrix is symmetric."
+
+
+def pairs_of(
+    tree: xr.DataTree, order: float, most: int | None = None, among: Collection[str] | None = None
+) -> xr.Dataset | None:
+    """Return `distance` and `error` of one order between the computed meshes, over `mesh` and `other`, symmetric.
+
+    They may be limited to the first ones, or to some labels, and the reference. None without distances of all pairs.
+    """
+    stored = finished_group(tree, "distances", load=False)
+    if stored.sizes["other"] != stored.sizes["mesh"]:
+        return None
+    reference, complete = reference_of(tree), complete_meshes(tree)
+    others = [label for label in complete if label != reference and (among is None or label in among)]
+    kept = others[: None if most is None else max(0, most - 1)] + [reference] * (reference in complete)
+    return distances_at(tree, order)[["distance", "error"]].sel(order=order, mesh=kept, other=kept).load()
+
+
+def matrix(
+    store: AnyStore,
+    order: float,
+    values: Literal["distance", "error", "truncation", "aliasing", "discretisation", "statistical"] = "distance",
+) -> pd.DataFrame:
+    """Return the distances of every mesh to every other as a matrix.
+
+    Args:
+        store: Path, URL or opened DataTree of the store.
+        order: Order s < -1/2. One that the store lacks is computed from the stored fields of all meshes.
+        values: Content of the matrix: the distances, their errors, or a part of the errors.
+
+    Returns:
+        A symmetric frame of float64 in the study's unit of length, with the labels of meshes as index "mesh" and
+        columns "other". The columns are the reference alone where the study requests no more. NaN where a
+        mesh failed. The frame's ``attrs`` have the order and the reference's label.
+
+    Raises:
+        InputError: The store has no tables yet.
+        OrderError: The order is not below -1/2.
+        StoreError: The location has no store of a study.
+
+    >>> import sobolev_batch as sb
+    >>> distances = sb.matrix("storage/icosphere.zarr", order=-10)
+    >>> distances.shape, distances.attrs["reference"]
+    ((5, 5), 'reference')
+    >>> bool((distances == distances.T).all(axis=None))
+    True
+    >>> distances["icosphere/0"].idxmax()
+    'reference'
+    """
+    tree = as_tree(store)
+    (order,) = check_orders(order)
+    distances = distances_at(tree, order)
+    if values not in _COLUMNS:
+        raise InputError(f"values must be one of {', '.join(_COLUMNS)}, found {values!r}")
+    frame: pd.DataFrame = parts_as_variables(distances)[values].sel(order=order).transpose("mesh", "other").to_pandas()
+    frame.attrs = {"order": order, "reference": reference_of(tree), "values": values}
+    return frame
+
+
+def matrix_frame(distances: xr.Dataset, order: float) -> pd.DataFrame:
+    """Return the distances of one order in long form, with their errors: one row for each pair of meshes."""
+    columns = list(_COLUMNS)
+    chosen = parts_as_variables(distances.sel(order=order))[columns].load()
+    frame = chosen.to_dataframe(dim_order=["mesh", "other"]).reset_index()
+    return frame[["order", "mesh", "other", *columns]]
+
+
+def format_matrix(tree: xr.DataTree, style: Format = "text", orders: Sequence[float] | None = None) -> str:
+    """Return the distance matrices of an open store as text; InputError where they are too large for people."""
+    distances = distances_at(tree, orders)
+    chosen = list(dict.fromkeys(distances["order"].values.tolist()))
+    if style in ("csv", "json"):
+        return machine_table(pd.concat([matrix_frame(distances, order) for order in chosen]), style)
+    count = distances.sizes["mesh"]
+    if count > _MOST_MESHES:
+        raise InputError(
+            f"a matrix of {count} meshes is too large to be read as {style}, which goes up to {_MOST_MESHES}: "
+            "take --format csv or json"
+        )
+    sections = []
+    for order in chosen:
+        values, errors, unit = _shown_numbers(tree, distances.sel(order=order).load())
+        caption = f"Sobolev distances of order {order:g}, {unit}"
+        sections.append(section(caption, [_table(distances, values, errors, style)], [], style))
+    notes = [_NOTE]
+    if "computed" in distances.attrs:
+        notes += order_note(tree, distances.attrs["computed"])
+    return "\n\n".join([*sections, prose(notes, style)])
+
+
+def _shown_numbers(tree: xr.DataTree, distances: xr.Dataset) -> tuple[Reals, Reals, str]:
+    """Return the distances of one order, their errors, and the unit of both: the reference if it has a norm."""
+    values, errors = distances["distance"].values, distances["error"].values
+    if "norms" in tree.children:
+        norm = norms_at(tree, distances["order"].item()).sel(mesh=reference_of(tree)).squeeze("order")
+        relative, bounds = quotients((values, errors), (norm["norm"].values, norm["error"].values))
+        if norm["norm"].notnull():
+            return 100 * relative, 100 * bounds, f"in % of the norm of {reference_of(tree)}"
+    return values, errors, "in the square root of a unit length"
+
+
+def _table(distances: xr.Dataset, numbers: Reals, errors: Reals, style: Format) -> str:
+    """Return a matrix as a table; a symmetric one has only the cells below its diagonal."""
+    labels, others = (distances[name].values.tolist() for name in ("mesh", "other"))
+    is_symmetric = labels == others
+    numbers_of = {label: str(i) for i, label in enumerate(labels, 1)}
+    rows = [
+        [f"{i + 1} {middle_cut(label, _LONGEST_LABEL)}"]
+        + [
+            "" if is_symmetric and i <= j else with_error(float(numbers[i, j]), float(errors[i, j])) or "missing"
+            for j in range(len(others))
+        ]
+        for i, label in enumerate(labels)
+    ]
+    kept = [0, *(column for column in range(1, 1 + len(others)) if any(row[column] for row in rows))]
+    headers = ["", *(numbers_of[label] for label in others)]
+    return printed_table([[row[k] for k in kept] for row in rows], [headers[k] for k in kept], style)

@@ -1,0 +1,379 @@
+"""A store that is open for reading, and what it has: groups, orders, families and sizes of meshes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from fnmatch import fnmatchcase
+from itertools import accumulate, chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from numpy.typing import NDArray
+
+from sobolev_batch.errors import DamageError, InputError, StoreError, one_line
+from sobolev_batch.geometry.surface import placement_doubt
+from sobolev_batch.norms.columns import describe
+from sobolev_batch.norms.fields import Quality
+from sobolev_batch.sources.names import quoted
+from sobolev_batch.store.collection_store import CollectionStore
+from sobolev_batch.store.location import Location
+from sobolev_batch.store.store import DIGEST, OCTAVES_GROUP, RECORDS, SPECTRA_GROUP, JoinedStore, Store
+from sobolev_batch.store.stored_tables import table_attributes
+from sobolev_batch.visible import FILE_UNITS
+
+Reals = NDArray[np.float64]
+# Names of families, or globs of names; None is all of them.
+Families = str | Sequence[str] | None
+
+# Of the columns of a table. The finer a mesh is, the smaller is the first, and the larger are the others.
+EDGE_LENGTH = "edge_length"
+_GROWING = ("triangles", "vertices", "seconds", "make_seconds", "make_cpu_seconds", "make_peak_bytes")
+_FROM_COARSE_TO_FINE = ("level", "triangles")
+
+_LABELS = {
+    EDGE_LENGTH: "mean edge length in {unit}",
+    "triangles": "number of triangles",
+    "vertices": "number of vertices",
+    "seconds": "computing time of the mesh in seconds",
+    "make_seconds": "time of making the mesh in seconds",
+    "make_cpu_seconds": "processor time of making the mesh in seconds",
+    "make_peak_bytes": "memory of making the mesh in bytes",
+}
+
+# A store as functions for its readers take it.
+AnyStore = str | Path | Location | xr.DataTree
+
+# Entries of the encoding of a tree: where it was opened, and the digest of its tables then.
+_SOURCE, _STATE = "source", "state"
+# Another: the trees of several stores that are open as one, each with the labels of its meshes by their own labels.
+_PARTS = "parts"
+# Groups that may be larger than the memory: xarray computes with them chunk by chunk.
+_LARGE = {"fourier", OCTAVES_GROUP, SPECTRA_GROUP}
+# What zarr and xarray raise for metadata that nobody has written.
+_MEANINGLESS = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError)
+
+
+def open_store(store: str | Path | Location | Sequence[str | Path | Location]) -> xr.DataTree:
+    """Open a store lazily, as ``xarray.open_datatree(store, engine="zarr")`` does.
+
+    Groups: fourier (the fields), spectra, meshes, norms, distances, convergence, records; where the study requests it
+    also octaves and proximity. docs/store.md lists their variables with dimensions and units. All stay on disk until
+    you ask for values of them. Fields and spectra are Dask arrays, unless the store is in memory; fields have the
+    accessor `field.sobolev`.
+
+    Several stores open as one, without copies of their fields. They need the same lattice, similarity and reference.
+    Their meshes follow each other, with the name of their `study` as a coordinate, which begins labels and families if
+    a label comes twice. Tables have the orders that all stores have, and distances to the reference.
+
+    Args:
+        store: Path or URL of the store, or several.
+
+    Raises:
+        StoreError: The location has no store of a study, cannot be reached, or holds something else; or several stores
+            do not fit together.
+        DamageError: What is read at once is damaged. All else that is missing or damaged raises when it is read.
+
+    >>> import sobolev_batch as sb
+    >>> tree = sb.open_store("storage/icosphere.zarr")
+    >>> tree["convergence"]["distance"].dims
+    ('mesh', 'order')
+    >>> tree["convergence"].attrs["reference"]
+    'reference'
+    """
+    if not isinstance(store, str | Path | Location):
+        return _joined([open_store(place) for place in store])
+    # Else values that are read once the process has gone to another folder would be missing ones.
+    location = Location.parse(store).absolute()
+    opened = Store.open(location)
+    # Left to itself, xarray looks for older formats, which nobody has checked, and lists keys again.
+    keys: Any = opened.checked_keys(has_tables=table_attributes(opened, "convergence") is not None)
+    with opened.location.access("read"):
+        try:
+            tree = xr.open_datatree(keys, engine="zarr", consolidated=True, zarr_format=3)
+            # The processes of a Dask client do not see the memory of this one.
+            for group in () if opened.location.is_in_memory else _LARGE.intersection(tree.children):
+                lazy = xr.open_dataset(keys, group=group, engine="zarr", consolidated=True, zarr_format=3, chunks={})
+                # Coordinates are small.
+                tree[group].dataset = tree[group].to_dataset().assign(lazy.data_vars)
+        except _MEANINGLESS as error:
+            problem = f"its metadata make no sense: {one_line(error)}"
+            raise DamageError(
+                f"{opened.path}: the store is damaged ({problem}); run the study again", problem
+            ) from error
+    tree.encoding = {**tree.encoding, _SOURCE: str(location), _STATE: tree.attrs.pop(DIGEST, None)}
+    return tree
+
+
+def _joined(trees: Sequence[xr.DataTree]) -> xr.DataTree:
+    """Return open stores as one."""
+    if not trees:
+        raise InputError("no store is named")
+    for tree in trees[1:]:
+        differences = [name for name, value in _common(tree).items() if value != _common(trees[0])[name]]
+        if differences:
+            raise StoreError(
+                f"{source_of(tree)}: it cannot be opened as one with {source_of(trees[0])}: "
+                f"they differ in {', '.join(differences)}"
+            )
+    names, study = _names_in_all(trees), trees[0].attrs["study"]
+    stored = [set(tree.attrs["study"]["orders"]) for tree in trees]
+    orders = [s for s in study["orders"] if all(s in others for others in stored)]
+    firsts = [*accumulate((store_of(tree).row_count for tree in trees), initial=0)]
+    groups = {
+        group: _concatenated(
+            [_part(tree, group, own, first, orders) for tree, own, first in zip(trees, names, firsts, strict=False)]
+        )
+        for group in trees[0].children
+        if group != RECORDS and all(group in tree.children for tree in trees)
+    }
+    groups["meshes"].attrs["metadata"] = list(dict.fromkeys(chain(*map(metadata_of, trees))))
+    groups["convergence"].attrs["reference"] = reference_of(trees[0])
+    title = " + ".join(str(tree.attrs["title"]) for tree in trees)
+    joined = xr.DataTree.from_dict(groups)
+    joined.attrs = {**trees[0].attrs, "title": title, "study": {**study, "name": title, "orders": orders}}
+    joined.encoding = {_PARTS: list(zip(trees, names, strict=True))}
+    return joined
+
+
+def _common(tree: xr.DataTree) -> dict[str, Any]:
+    """Return what stores have in common that open as one."""
+    reference = finished_group(tree, "meshes", load=False)["key"].sel(mesh=reference_of(tree)).item()
+    of_study = {name: tree.attrs["study"][name] for name in ("lattice", "dtype", "octaves")}
+    return {**of_study, "similarity": tree.attrs["similarity"], "reference": reference}
+
+
+def _names_in_all(trees: Sequence[xr.DataTree]) -> list[dict[str, str]]:
+    """Return the label among all stores of each mesh by its own label; the reference is that of the first store."""
+    own = [finished_group(tree, "meshes", load=False)["mesh"].values.tolist() for tree in trees]
+    for tree, labels in zip(trees[1:], own[1:], strict=True):
+        labels.remove(reference_of(tree))
+    twice = next((label for label, count in Counter(chain(*own)).items() if count > 1), None)
+    begins = [f"{tree.attrs['study']['name']}/" if twice else "" for tree in trees]
+    if twice and len(set(begins)) < len(begins):
+        raise StoreError(f"{source_of(trees[0])}: another study of the same name has a mesh {quoted(twice)} too")
+    names = [{label: f"{begin}{label}" for label in labels} for begin, labels in zip(begins, own, strict=True)]
+    names[0][reference_of(trees[0])] = reference_of(trees[0])
+    return names
+
+
+def _part(tree: xr.DataTree, group: str, names: Mapping[str, str], first: int, orders: Sequence[float]) -> xr.Dataset:
+    """Return a group of one of several stores: of these meshes, with their labels among all, and rows after others."""
+    part, study = tree[group].to_dataset(), str(tree.attrs["study"]["name"])
+    if "order" in part.dims:
+        part = part.sel(order=list(orders))
+    if "other" in part.dims:
+        part = part.drop_dims(["tile", "other_tile"], errors="ignore").sel(other=[reference_of(tree)])
+    own = [label for label in part["mesh"].values.tolist() if label in names]
+    part = part.sel(mesh=own)
+    columns = {"mesh": [names[label] for label in own], "study": [study] * len(own)}
+    if "family" in part.coords:
+        begins = [names[label].removesuffix(label) for label in own]
+        columns["family"] = [f"{begin}{family}" for begin, family in zip(begins, part["family"].values, strict=True)]
+    if "row" in part:
+        part = part.assign(row=part["row"] + first)
+    return part.assign_coords({name: ("mesh", np.array(texts, dtype=object)) for name, texts in columns.items()})
+
+
+def _concatenated(parts: Sequence[xr.Dataset]) -> xr.Dataset:
+    """Return parts one after the other, with NaN or empty texts where only others have a coordinate."""
+    known = {name: column for part in parts for name, column in part.coords.items() if column.dims == ("mesh",)}
+    absent = {name: np.array(np.nan if column.dtype.kind in "fiu" else "", object) for name, column in known.items()}
+    filled = []
+    for part in parts:
+        lacking = {
+            name: ("mesh", np.full(part.sizes["mesh"], absent[name])) for name in known.keys() - part.coords.keys()
+        }
+        same = {"other": parts[0]["other"]} if "other" in part.dims else {}
+        filled.append(part.assign_coords({**lacking, **same}))
+    return describe(
+        xr.concat(
+            filled, "mesh", data_vars="minimal", coords="minimal", compat="override", join="exact",
+            combine_attrs="drop_conflicts",
+        )
+    )  # fmt: skip
+
+
+def store_of(tree: xr.DataTree) -> Store:
+    """Return the store of an open tree, or those of several as one."""
+    parts = tree.encoding.get(_PARTS)
+    if parts is None:
+        return Store.open(location_of(tree))
+    stores = [store_of(part) for part, _ in parts]
+    labels = [names.get(label, "") for store, (_, names) in zip(stores, parts, strict=True) for label in store.labels()]
+    return JoinedStore(stores, labels)
+
+
+def as_tree(store: AnyStore) -> xr.DataTree:
+    """Return a store as a DataTree, which it may be already."""
+    return store if isinstance(store, xr.DataTree) else open_store(store)
+
+
+def stores_of(store: AnyStore | Mapping[str, AnyStore]) -> Mapping[str, AnyStore]:
+    """Return the stores of the objects of a collection by name, which they may be already; "" names one study."""
+    if isinstance(store, Mapping) and not isinstance(store, xr.DataTree):
+        return store
+    collection = None if isinstance(store, xr.DataTree) else CollectionStore.read(Location.parse(store))
+    return {"": store} if collection is None else {**collection.existing_stores}
+
+
+def source_of(tree: xr.DataTree) -> str | None:
+    """Return the path or URL at which a tree was opened by `open_store`, or all of them; None for other trees."""
+    if _PARTS in tree.encoding:
+        return ", ".join(str(source_of(part)) for part, _ in tree.encoding[_PARTS])
+    source = tree.encoding.get(_SOURCE)
+    return None if source is None else str(source)
+
+
+def require_unchanged(tree: xr.DataTree) -> None:
+    """Check that all that was read of a store is one state of it; StoreError where a run has changed it since."""
+    for part, _ in tree.encoding.get(_PARTS, ()):
+        require_unchanged(part)
+    if _PARTS in tree.encoding:
+        return
+    source = source_of(tree)
+    # One that xarray itself has opened says so among its attributes.
+    state = tree.encoding.get(_STATE, tree.attrs.get(DIGEST))
+    if source is not None and Store.open(source).attributes().get(DIGEST) != state:
+        raise StoreError(
+            f"{source}: a run has changed the store while it was read; once that run has ended, open the store again, "
+            "or give the same command again"
+        )
+
+
+def location_of(store: AnyStore) -> str | Path | Location:
+    """Return the path or URL of a store; InputError for a DataTree of several stores, or from elsewhere."""
+    if not isinstance(store, xr.DataTree):
+        return store
+    if _PARTS in store.encoding:
+        raise InputError(f"{source_of(store)}: this is done for one store at a time")
+    source = source_of(store)
+    if source is None:
+        raise InputError(
+            "the DataTree does not say where it was opened; open it with sobolev_batch.open_store, "
+            "or give the path or URL of the store"
+        )
+    return source
+
+
+@contextmanager
+def fields_read(store: AnyStore) -> Iterator[None]:
+    """Turn a checksum error that reading a field of an open store raises into a DamageError."""
+    try:
+        yield
+    except ValueError as error:
+        # zarr's codec has no exception of its own.
+        if "checksum" not in str(error):
+            raise
+        place = (
+            (store.encoding.get(_SOURCE) or "the store") if isinstance(store, xr.DataTree) else Location.parse(store)
+        )
+        raise DamageError(
+            f"{place}: a field is damaged: its bytes are not those that were stored; "
+            "sobolev-batch verify names it, and run computes it again",
+            "its bytes are not those that were stored",
+        ) from error
+
+
+def finished_group(tree: xr.DataTree, name: str, *, load: bool = True) -> xr.Dataset:
+    """Return a table of an open store, in memory unless it may stay on disk; InputError if it has no tables yet."""
+    if name not in tree.children:
+        raise InputError("the store has no tables yet: run the study to its end")
+    dataset = tree[name].to_dataset()
+    return dataset.load() if load else dataset
+
+
+def has_proximity(tree: xr.DataTree) -> bool:
+    """Return True if the store has Hausdorff and Chamfer distances."""
+    return "proximity" in tree.children
+
+
+def reference_of(tree: xr.DataTree) -> str:
+    """Return the label of the study's reference."""
+    return str(finished_group(tree, "convergence", load=False).attrs["reference"])
+
+
+def families_of(tree: xr.DataTree) -> dict[str, str]:
+    """Return the family of each mesh by its label, in the order of the study."""
+    meshes = finished_group(tree, "meshes", load=False)
+    return dict(zip(meshes["mesh"].values.tolist(), meshes["family"].values.tolist(), strict=True))
+
+
+def chosen_families(tree: xr.DataTree, family: Families) -> list[str]:
+    """Return the families that names or globs choose, in the study's order; InputError if one fits none of it."""
+    known = list(dict.fromkeys(families_of(tree).values()))
+    if family is None:
+        return known
+    chosen: set[str] = set()
+    for pattern in [family] if isinstance(family, str) else family:
+        # A name may have characters that mean something else in a glob.
+        fitting = [pattern] if pattern in known else [name for name in known if fnmatchcase(name, pattern)]
+        if not fitting:
+            raise InputError(f"the study has no family {quoted(pattern)}, only {', '.join(known)}")
+        chosen.update(fitting)
+    return [name for name in known if name in chosen]
+
+
+def has_times(tree: xr.DataTree) -> bool:
+    """Return True if any mesh of the store has a time."""
+    return "time" in finished_group(tree, "meshes", load=False).coords
+
+
+def metadata_of(tree: xr.DataTree) -> list[str]:
+    """Return the names of the metadata that the study gives its meshes."""
+    return list(finished_group(tree, "meshes", load=False).attrs.get("metadata", ()))
+
+
+def complete_meshes(tree: xr.DataTree) -> list[str]:
+    """Return the labels of all meshes that are computed, the reference among them."""
+    meshes = finished_group(tree, "meshes", load=False)
+    labels: list[str] = meshes["mesh"].values[meshes["status"].values == "complete"].tolist()
+    return labels
+
+
+def placement_doubts(tree: xr.DataTree) -> dict[str, str]:
+    """Return why one doubts that a mesh can be compared with the reference, by the label of the mesh."""
+    complete, reference = complete_meshes(tree), reference_of(tree)
+    if reference not in complete:
+        return {}
+    texts = tree["fourier"]["quality"].sel(mesh=complete).load()
+    extents = {label: Quality.from_json(str(texts.sel(mesh=label).item())).extent for label in complete}
+    doubts = {label: placement_doubt(extent, extents[reference]) for label, extent in extents.items()}
+    return {label: doubt for label, doubt in doubts.items() if doubt is not None}
+
+
+def unit_of(tree: xr.DataTree) -> tuple[str, float]:
+    """Return the name of the unit of length of the files, and the study's unit in terms of it."""
+    header = tree.attrs.get("study", {}).get("table", {}).get("study", {})
+    return header.get("length_unit", FILE_UNITS), 1 / tree.attrs.get("similarity", {"scale": 1.0})["scale"]
+
+
+def study_unit(tree: xr.DataTree) -> str:
+    """Return the study's unit of length in words, by the unit of the files."""
+    name, size = unit_of(tree)
+    return name if size == 1 else f"units of {size:.4g} {name}"
+
+
+def label_of(x: str, unit: str = "each object's unit") -> str:
+    """Return the label of an axis of sizes; one of the metadata has its name."""
+    return _LABELS[x].format(unit=unit) if x in _LABELS else x
+
+
+def sizes_of(frame: pd.DataFrame, x: str) -> Reals:
+    """Return a column of `table`, NaN where sizes are not known; InputError where it has no such numbers."""
+    if x not in frame or not pd.api.types.is_numeric_dtype(frame[x]):
+        numbers = [name for name in (EDGE_LENGTH, *_GROWING) if name in frame]
+        given = [name for name in frame.attrs.get("metadata", ()) if pd.api.types.is_numeric_dtype(frame[name])]
+        raise InputError(f"no size of meshes is named {quoted(x)}; known are {', '.join([*numbers, *given])}")
+    sizes: Reals = frame[x].to_numpy(dtype=np.float64, na_value=np.nan)
+    # A surface in closed form has none.
+    return np.where(sizes > 0, sizes, np.nan)
+
+
+def is_sequence(rows: pd.DataFrame) -> bool:
+    """Return True where the meshes of a family go from coarse to fine, so that a line may join them."""
+    return bool(rows["ordered_by"].isin(_FROM_COARSE_TO_FINE).all())

@@ -1,0 +1,167 @@
+"""Distances of all pairs in the store: square tiles, each computed by one task and written as chunks of its own.
+
+Neither the driver nor a task holds the whole matrix. A tile has a key, which tells the fields that it was computed
+from: an interrupted run goes on with the tiles that are missing, and new meshes, which come last, cost new tiles.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+import xarray as xr
+
+from sobolev_batch.errors import DamageError
+from sobolev_batch.geometry.surface import Reals
+from sobolev_batch.norms.budget import PARTS, NormEstimate
+from sobolev_batch.norms.columns import VARIABLES, describe
+from sobolev_batch.store.store import DISTANCES, PAIRS_KEYS, Store
+from sobolev_batch.store.stored_tables import array_keys, dataset_keys, key_in, key_of, missing_chunks, seal
+from sobolev_batch.tables.reducer import Reducer
+from sobolev_batch.tables.shells import read_spectra
+
+# Meshes along a side of a tile: with fewer, small studies keep their workers busy; with more, there are fewer keys.
+_FEWEST, _MOST, _TILES_OF_A_ROW = 32, 512, 8
+# Of the distances and the parts of their errors, as `NormEstimate.named` gives them.
+_COLUMNS = ("distance", "error", "error_part")
+# Of a pair on disk, for each order.
+PAIR_BYTES = 8 * (2 + len(PARTS))
+
+
+def _side(meshes: int) -> int:
+    """Return the number of meshes along a side of a tile: a power of two, which seldom changes as meshes are added."""
+    return int(np.clip(2 ** np.ceil(np.log2(max(meshes, 1) / _TILES_OF_A_ROW)), _FEWEST, _MOST))
+
+
+def tile_count(meshes: int) -> int:
+    """Return the number of tiles that are computed for some meshes."""
+    return math.comb(math.ceil(meshes / _side(meshes)) + 1, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """The distances of all pairs of a study's meshes in a store.
+
+    Attributes:
+        rows: Row of each mesh in the order of the matrix, that in which the meshes were added.
+        keys: What each row with a field was computed from, by the row; see `Record`.
+        reference: Row of the reference.
+    """
+
+    store: Store
+    rows: Sequence[int]
+    keys: Mapping[int, str]
+    orders: tuple[float, ...]
+    reference: int
+
+    @classmethod
+    def tabulated(cls, store: Store) -> Self:
+        """Return the distances of all pairs by the tables of a store, which it may lack."""
+        rows, status, keys = (np.asarray(store.read(f"meshes/{name}")).tolist() for name in ("row", "status", "key"))
+        complete = {row: key for row, key, state in zip(rows, keys, status, strict=True) if state == "complete"}
+        study = store.attributes()["study"]
+        reference = store.labels().index(study["reference"])
+        return cls(store, tuple(sorted(rows)), complete, tuple(study["orders"]), reference)
+
+    def lay_out(self, coordinates: xr.Dataset) -> None:
+        """Lay out the arrays, with coordinates of tables, for `Store.consolidate`; tiles that exist stay."""
+        labels = self.store.labels()
+        meshes = coordinates.sel(mesh=[labels[row] for row in self.rows])
+        count, side = len(self.rows), self.side
+        shape, chunks = (count, count, len(self.orders)), (side, side, len(self.orders))
+        others = ("other", meshes["mesh"].values, dict(VARIABLES["other"]))
+        keys = dataset_keys(DISTANCES, describe(meshes.assign_coords(other=others, part=np.array(PARTS, dtype=object))))
+        # xarray makes coordinates of what `coordinates` names.
+        names = " ".join(["key", *map(str, meshes.coords.keys() - meshes.sizes.keys())])
+        for name in _COLUMNS:
+            path, dimensions = f"{DISTANCES}/{name}", ("mesh", "other", "order")
+            attributes = {**VARIABLES[name], "coordinates": names}
+            # A chunk for each part, as small as those of the distances.
+            length, step, axis = ((len(PARTS),), (1,), ("part",)) if name == "error_part" else ((), (), ())
+            keys |= array_keys(path, "float64", shape + length, chunks + step, dimensions + axis, **attributes)
+        tiles = math.ceil(count / side)
+        keys |= array_keys(PAIRS_KEYS, str, (tiles, tiles), (1, 1), ("tile", "other_tile"))
+        before = self.store.stored_document(f"{DISTANCES}/{_COLUMNS[0]}")
+        if before is not None and before["chunk_grid"]["configuration"]["chunk_shape"] != list(chunks):
+            self.store.location.remove(DISTANCES)
+        self.store.publish(keys)
+
+    @property
+    def side(self) -> int:
+        """Number of meshes along a side of a tile."""
+        return _side(len(self.rows))
+
+    def tile_rows(self, number: int) -> Sequence[int]:
+        """Return the rows along one side of a tile."""
+        return self.rows[number * self.side : (number + 1) * self.side]
+
+    def key_of_tile(self, tile: tuple[int, int]) -> str:
+        """Return the key of what a tile depends on."""
+        sides = [[self.keys.get(row, "") for row in self.tile_rows(number)] for number in tile]
+        # Products lose no digits but those of the difference to the reference, which is their center.
+        return key_of([*sides[0], "|", *sides[1], "|", self.keys.get(self.reference, ""), *map(repr, self.orders)])
+
+    def stale(self) -> list[tuple[int, int]]:
+        """Return the tiles (i, j), i <= j, that are to be computed. No distance is read."""
+        count, missing = math.ceil(len(self.rows) / self.side), missing_chunks(self.store, PAIRS_KEYS)
+        try:
+            texts = np.asarray(self.store.read(PAIRS_KEYS)).tolist()
+        except DamageError:
+            texts = [[""] * count] * count
+        stored = {(i, j): key_in(text) for i, line in enumerate(texts) for j, text in enumerate(line)}
+        return [
+            (i, j)
+            for i in range(count)
+            for j in range(i, count)
+            if {(i, j), (j, i)} & missing or not stored[i, j] == stored[j, i] == self.key_of_tile((i, j))
+        ]
+
+    def only(self, tile: tuple[int, int]) -> Self:
+        """Return what is needed for a tile alone: of many meshes, the rest is much to send."""
+        needed = {self.reference, *self.tile_rows(tile[0]), *self.tile_rows(tile[1])}
+        return replace(self, keys={row: self.keys[row] for row in sorted(needed & self.keys.keys())})
+
+
+def fill_tile(reducer: Reducer, pairs: Pairs, tile: tuple[int, int]) -> None:
+    """Compute a tile of distances, and write it with its mirror image; DamageError where a field was changed."""
+    sides = [pairs.tile_rows(number) for number in tile]
+    complete = [[row for row in side if row in pairs.keys] for side in sides]
+    places = np.ix_(*([place for place, row in enumerate(side) if row in pairs.keys] for side in sides))
+    unknown = np.full((1 + len(PARTS), len(pairs.orders), *map(len, complete)), np.nan)
+    estimate = pair_distances(reducer, *complete) if all(complete) else NormEstimate(*unknown)
+    spans = [slice(k * pairs.side, k * pairs.side + len(side)) for k, side in zip(tile, sides, strict=True)]
+    arrays: dict[str, Reals] = {}
+    for name, values in sorted(estimate.named("distance").items()):
+        moved = np.moveaxis(values, 0, 2)
+        arrays[name] = np.full((*map(len, sides), *moved.shape[2:]), np.nan)
+        arrays[name][places] = moved
+    mirrored = {name: np.swapaxes(values, 0, 1) for name, values in arrays.items()}
+    both = [(tile, spans, arrays), (tile[::-1], spans[::-1], mirrored)][: len({*tile})]
+    # Should this be interrupted, no old key may stand for new values.
+    for place, *_ in both:
+        _write_key(pairs.store, place, "")
+    for _, region, values_by_name in both:
+        for name, values in values_by_name.items():
+            pairs.store.write(f"{DISTANCES}/{name}", tuple(region), values)
+    for place, _, values_by_name in both:
+        _write_key(pairs.store, place, seal(pairs.key_of_tile(tile), values_by_name.values()))
+
+
+def _write_key(store: Store, tile: tuple[int, ...], text: str) -> None:
+    store.write(PAIRS_KEYS, tuple(slice(k, k + 1) for k in tile), np.array([[text]], dtype=object))
+
+
+def pair_distances(reducer: Reducer, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
+    """Return distances over (orders, rows, others), the same or no rows; those to the reference come from spectra."""
+    distances = np.stack(list(reducer.pairs(rows, others)))
+    reference = reducer.reference
+    if reference is not None:
+        of_reference = read_spectra(reducer.store, [reference]).norm
+        for side, opposite, axis in ((rows, others, 2), (others, rows, 3)):
+            if reference in side:
+                _, found, _ = reducer.norms_of(opposite, read_spectra(reducer.store, opposite), of_reference)
+                distances.swapaxes(2, axis)[:, :, side.index(reference)] = np.stack(list(found))
+    return NormEstimate(*distances)

@@ -1,0 +1,409 @@
+"""Norms and distances from stored fields: batches and tiles of rows, each one task over the store."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import astuple, dataclass, field, fields, replace
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.geometry.surface import DIRECTIONS, Extent
+from sobolev_batch.norms.budget import (
+    NormEstimate,
+    ReferenceEstimate,
+    Sums,
+    Support,
+    add_sums,
+    aliased,
+    estimate_norms,
+    product_rounding,
+    sums_of_shells,
+)
+from sobolev_batch.norms.fields import Quality, TailQuality
+from sobolev_batch.norms.gram import Arrangement, differences
+from sobolev_batch.norms.spectrum import ComparedSpectra, RadialAxis, Spectra
+from sobolev_batch.norms.tail.remainder import Remainder
+from sobolev_batch.norms.tail.sampling import TailSampling
+from sobolev_batch.norms.tail.values import OctaveSums, OctaveWeights, Tail, squared_moduli
+from sobolev_batch.store.store import Store
+from sobolev_batch.study.lattice_choice import LatticeChoice
+from sobolev_batch.transform.lattice import Block, Lattice, SobolevWeights, shell_sums
+
+Reals = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+
+# Others that are multiplied with the rows of a tile at a time: nearly as fast as all of them at once.
+_GROUP = 32
+_READ_AT_ONCE = 8
+# For fewer rows than this, products do not earn what arranging the samples costs: pairs are taken one by one.
+_FEWEST_ROWS = 4
+# Factor of the errors of surfaces that are not equal.
+_APART = np.ones(())
+# Of two surfaces that were not compared: the mean energy beyond the octaves is at least this fraction of the last
+# measured one. It exceeds the sum of both own ones by no more than this multiple of the last distance from it; or this
+# fraction of it, where the energy has just grown by more than a factor from octave to octave.
+_LEAST_LIMIT, _SWING, _RISE, _STEEPEST_GROWTH = 0.7, 1.25, 0.9, 2.5
+# Rows of a tile whose values in octaves are held at a time take this many bytes.
+_HELD_BYTES = 128 << 20
+# Of a sample of octaves: its frequency, weight and place, values of three fields with their squares, and what moves
+# them to the radii of spectra.
+_SAMPLE_BYTES = 400.0
+# Of a sample of a row while its spectra are computed.
+_SPECTRUM_BYTES = 100.0
+
+
+@dataclass(frozen=True, eq=False)
+class Reducer:
+    """The input that all tiles of one reduction share.
+
+    Attributes:
+        reference: Row of the reference, or None if it has no field.
+        areas: Area of every row's surface (rows,), NaN without a field.
+        errors: Norms of the fields' own errors (orders, rows), likewise.
+        widths: Widths of all surfaces together (13,), see `Extent`.
+        checksums: Checksums of the blocks of each field, by its row, and of its values in octaves.
+        sampling: Samples of the octaves; None where the fields are all there is.
+        qualities: Quality of each row's values in octaves.
+        known_reference: Row of the study's reference, which the qualities know; None if it has no field.
+        tile_bytes: Bytes of fields that a task holds at a time, in all: the rows of a tile, a group of the others,
+            and fields as they are read.
+    """
+
+    store: Store
+    lattice: Lattice
+    blocks: tuple[Block, ...]
+    orders: tuple[float, ...]
+    reference: int | None
+    areas: Reals
+    errors: Reals
+    widths: Reals
+    checksums: Mapping[int, tuple[int, ...]]
+    sampling: TailSampling | None = None
+    qualities: Mapping[int, TailQuality] = field(default_factory=dict)
+    known_reference: int | None = None
+    tile_bytes: int = 384 << 20
+
+    @classmethod
+    def for_fields(
+        cls,
+        store: Store,
+        choice: LatticeChoice,
+        orders: tuple[float, ...],
+        qualities: Mapping[int, Quality],
+        checksums: Mapping[int, tuple[int, ...]],
+        reference: int,
+        compared_with: int | None = None,
+    ) -> Self:
+        """Return the reducer of rows with known qualities; distances are to the reference, or another row."""
+        count = sum(part.row_count for _, part in store.parts)
+        areas, errors = np.full(count, np.nan), np.full((len(orders), count), np.nan)
+        weights = SobolevWeights(choice.lattice, orders, None if choice.tail is None else choice.tail.cutoff)
+        for row, quality in qualities.items():
+            areas[row], errors[:, row] = quality.area, quality.error_norms(weights)
+        known = reference if reference in qualities else None
+        extents = [quality.extent for quality in qualities.values()]
+        return cls(
+            store=store,
+            lattice=choice.lattice,
+            blocks=store.blocks_of(choice.lattice),
+            orders=orders,
+            reference=known if compared_with is None else compared_with,
+            areas=areas,
+            errors=errors,
+            widths=Extent.union(extents).widths if extents else np.zeros(len(DIRECTIONS)),
+            checksums=checksums,
+            sampling=choice.tail,
+            qualities={row: quality.tail for row, quality in qualities.items() if quality.tail is not None},
+            known_reference=known,
+        )
+
+    @property
+    def complete(self) -> list[int]:
+        """Rows with a field."""
+        return np.flatnonzero(~np.isnan(self.areas)).tolist()
+
+    @property
+    def weights(self) -> SobolevWeights:
+        """Weights of the orders on the lattice, with a step where octaves follow."""
+        return SobolevWeights(self.lattice, self.orders, None if self.sampling is None else self.sampling.cutoff)
+
+    @cached_property
+    def octave_weights(self) -> tuple[OctaveWeights, ...]:
+        """Weights of the samples of each octave."""
+        octaves = () if self.sampling is None else self.sampling.octaves
+        return tuple(OctaveWeights(octave, self.orders) for octave in octaves)
+
+    @cached_property
+    def axis(self) -> RadialAxis:
+        """Radii of the spectra of fields."""
+        return RadialAxis(self.lattice, self.sampling)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name not in ("octave_weights", "axis")}
+
+    @property
+    def task_bytes(self) -> float:
+        """Memory that a task takes at most, as measured: the fields that it holds, and temporaries."""
+        block_bytes = 16.0 * self.blocks[0].size
+        tail_bytes = 0.0
+        if self.sampling is not None:
+            tail_bytes = _HELD_BYTES + (_SAMPLE_BYTES + 8 * len(self.orders)) * self.sampling.size
+        return max(5 * block_bytes, self.tile_bytes + 4 * block_bytes) + tail_bytes
+
+    @property
+    def _capacity(self) -> int:
+        return self.tile_bytes // (self.blocks[0].size * 16)
+
+    @property
+    def _group(self) -> int:
+        return max(1, min(_GROUP, self._capacity // 4))
+
+    @property
+    def _read_at_once(self) -> int:
+        return max(1, min(_READ_AT_ONCE, self._capacity // 16))
+
+    def norms(self, rows: Sequence[int]) -> tuple[NormEstimate, NormEstimate, Reals]:
+        """Return the norms of rows, and their distances to the reference, from their fields; see `norms_of`."""
+        reference = None if self.reference is None else self.spectra([self.reference]).norm
+        return self.norms_of(rows, self.spectra(rows), reference)
+
+    def norms_of(
+        self, rows: Sequence[int], spectra: ComparedSpectra, reference: Spectra | None
+    ) -> tuple[NormEstimate, NormEstimate, Reals]:
+        """Return norms of rows, distances to the reference, and parts of both, each over (orders, rows).
+
+        The six parts are the distance's area part and shape part, each with its error, see `ReferenceEstimate.parts`,
+        and what lies beyond the last octave in the squared norm and in the squared distance. Without the field of the
+        reference, its spectrum (1, radii) is None, and distances are NaN.
+        """
+        rows, has_octaves = list(rows), self.sampling is not None
+        own_tail = self._tail(spectra.norm, [self.qualities[row].own for row in rows]) if has_octaves else None
+        own = self._estimate(self._sums(spectra.norm), own_tail, self.areas[rows], self.errors[:, rows])
+        beyond = np.zeros_like(own.values) if own_tail is None else own_tail.beyond
+        if self.reference is None or reference is None:
+            unknown = np.full_like(own.values, np.nan)
+            return own, NormEstimate(*[unknown] * 5), np.stack([*[unknown] * 4, beyond, unknown])
+        # The reference's distance to itself is zero, and nothing is uncertain about that.
+        apart = np.array([row != self.reference for row in rows], dtype=np.float64)
+        areas, errors = self.areas[rows] + self.areas[self.reference], self.errors[:, rows]
+        errors = errors + self.errors[:, [self.reference]]
+        tail = of_reference = None
+        products = self._sums(spectra.product)
+        beyond_difference = np.zeros_like(beyond)
+        if has_octaves:
+            energies = self.axis.energies(spectra.distance)
+            remainders = [self._remainder(row, self.reference, it) for row, it in zip(rows, energies, strict=True)]
+            tail = self._tail(spectra.distance, remainders)
+            of_reference = self._tail(reference, [self.qualities[self.reference].own])
+            beyond_difference = tail.beyond * apart
+        distances = self._estimate(self._sums(spectra.distance), tail, areas, errors, apart)
+        place = [self.reference]
+        norms = self._estimate(self._sums(reference), of_reference, self.areas[place], self.errors[:, place])
+        if own_tail is None or tail is None or of_reference is None:
+            found = ReferenceEstimate.on_lattice(products, distances, norms, self.weights, self.widths)
+        else:
+            # Beyond the octaves ||a||² - ||b||² - ||a - b||² is twice the product <a - b, b>.
+            product = products.totals + self.axis.octave_integrals(spectra.product, self.orders)
+            product = product + (beyond - of_reference.beyond - beyond_difference) / 2 * apart
+            uncertainty = (own_tail.uncertainty + of_reference.uncertainty + tail.uncertainty) / 2
+            uncertainty = uncertainty + self.axis.statistical_errors(spectra.bounded_product(reference), self.orders)
+            uncertainty = uncertainty + aliased(products, self.weights, self.widths)
+            found = ReferenceEstimate(norms, product, (uncertainty + product_rounding(distances, norms)) * apart)
+        return own, distances, np.stack([*found.parts(distances).values(), beyond, beyond_difference])
+
+    def _sums(self, spectra: Spectra) -> Sums:
+        return sums_of_shells(spectra.sums[:, : self.lattice.shell_count], self.weights)
+
+    def _tail(self, spectra: Spectra, remainders: Sequence[Remainder]) -> Tail:
+        """Return the tails of squared norms (orders, fields), from what lies beyond the octaves of each field."""
+        beyond = np.array([remainder.at(self.orders) for remainder in remainders])
+        octaves = self.axis.octave_integrals(spectra, self.orders)
+        return Tail(octaves, self.axis.statistical_errors(spectra, self.orders), *np.moveaxis(beyond, 0, -1))
+
+    def only(self, rows: Iterable[int]) -> Self:
+        """Return what is needed for some rows alone: of many rows, the rest is much to send."""
+        needed = {*rows} if self.reference is None else {*rows, self.reference}
+        checksums = {row: self.checksums[row] for row in sorted(needed & self.checksums.keys())}
+        qualities = {row: self.qualities[row] for row in sorted(needed & self.qualities.keys())}
+        return replace(self, checksums=checksums, qualities=qualities)
+
+    def spectra(self, rows: Sequence[int]) -> ComparedSpectra:
+        """Return the spectra of rows, from their fields. Without the reference's field, those of distances are NaN."""
+        rows = list(rows)
+        own = np.zeros((len(rows), self.lattice.shell_count))
+        differences, products = (np.zeros_like(own) if self.reference is not None else own * np.nan for _ in range(2))
+        for number, block in enumerate(self.blocks):
+            reference = None if self.reference is None else self.read([self.reference], number)
+            for batch in _slices(len(rows), self._read_at_once):
+                values = self.read(rows[batch], number)
+                own[batch] += shell_sums(values, None, self.lattice, block)
+                if reference is not None:
+                    values -= reference
+                    differences[batch] += shell_sums(values, None, self.lattice, block)
+                    products[batch] += shell_sums(values, np.broadcast_to(reference, values.shape), self.lattice, block)
+        samples = 0 if self.sampling is None else self.sampling.size
+        reference_octaves = np.full(samples, np.nan, dtype=np.complex128)
+        if self.reference is not None:
+            reference_octaves[:] = self.read_octaves(self.reference)
+        parts = []
+        for batch in _slices(len(rows), max(1, int(_HELD_BYTES // (_SPECTRUM_BYTES * max(samples, 1))))):
+            octaves = np.stack([self.read_octaves(row) for row in rows[batch]]).astype(np.complex128)
+            norms = self.axis.spectra(own[batch], squared_moduli(octaves))
+            octaves -= reference_octaves
+            distances = self.axis.spectra(differences[batch], squared_moduli(octaves))
+            inner = (octaves * reference_octaves.conj()).real
+            parts.append(ComparedSpectra(norms, distances, self.axis.spectra(products[batch], inner, is_square=False)))
+        return ComparedSpectra.joined(parts)
+
+    def pairs(self, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
+        """Return distances over (orders, rows, others), in batches that fit a task; others are rows, or none."""
+        distances, is_square = np.zeros((5, len(self.orders), len(rows), len(others))), tuple(rows) == tuple(others)
+        for batch in _slices(len(rows), max(1, self._capacity - self._group - self._read_at_once)):
+            first = batch.start if is_square else 0
+            found = np.stack(list(self.tile(rows[batch], others[first:])))
+            distances[..., batch, first:] = found
+            if is_square:
+                distances[..., first:, batch] = np.swapaxes(found, -1, -2)
+        return NormEstimate(*distances)
+
+    def tile(self, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
+        """Return distances over (orders, rows, others); the others begin with all of the rows, or have none of them."""
+        shared = len(rows) if tuple(others[: len(rows)]) == tuple(rows) else 0
+        if self._capacity < _FEWEST_ROWS:
+            sums = Sums.zeros(len(self.orders), len(rows), len(others))
+            direct_pairs = np.ones((len(rows), len(others)), dtype=bool)
+        else:
+            by_block = [self._block_sums(rows, others, number, shared) for number in range(len(self.blocks))]
+            products, left, right = (add_sums(sums) for sums in zip(*by_block, strict=True))
+            sums, direct_pairs = differences(products, left, right)
+        for i, j in np.argwhere(np.triu(direct_pairs) if shared else direct_pairs).tolist():
+            direct = self._direct(rows[i], others[j])
+            sums.squares[:, :, i, j], sums.outer[:, i, j] = direct.squares, direct.outer
+        if shared:
+            for square in (sums.squares[..., :shared], sums.outer[..., :shared]):
+                square[...] = np.triu(square) + np.swapaxes(np.triu(square, 1), -1, -2)
+        unequal = np.not_equal.outer(rows, others).astype(np.float64)
+        areas = self.areas[list(rows)][:, None] + self.areas[list(others)]
+        errors = self.errors[:, list(rows)][:, :, None] + self.errors[:, list(others)][:, None, :]
+        tail = None if self.sampling is None else self._tails_of_pairs(self.sampling, rows, others, shared)
+        return self._estimate(sums, tail, areas, errors, unequal)
+
+    def _estimate(
+        self, sums: Sums, tail: Tail | None, areas: Reals, errors: Reals, apart: Reals = _APART
+    ) -> NormEstimate:
+        """Return norms from sums over the lattice and tails beyond it, with errors: zero where surfaces are not apart.
+
+        Areas and norms of the errors of fields are those of both surfaces of a pair together.
+        """
+        if tail is None:
+            return estimate_norms(sums, self.weights, Support(areas * apart, self.widths), errors * apart)
+        images = aliased(sums, self.weights, self.widths) * apart
+        return tail.scaled(apart).estimate(sums.totals, images, errors * apart)
+
+    def _block_sums(
+        self, rows: Sequence[int], others: Sequence[int], number: int, shared: int
+    ) -> tuple[Sums, Sums, Sums]:
+        """Return one block's products of rows and others, and the squares of either.
+
+        The first ``shared`` others are the rows: of these, only the products on and above the diagonal.
+        """
+        block = self.blocks[number]
+        arrangement = Arrangement.for_block(self.weights, block)
+        reference = None if self.reference is None else self.read([self.reference], number)
+
+        def read(fields: Sequence[int], buffer: Complexes) -> Complexes:
+            for batch in _slices(len(fields), self._read_at_once):
+                values = self.read(fields[batch], number).astype(np.complex128, copy=False)
+                if reference is not None:
+                    values -= reference
+                np.take(values.reshape(len(values), -1), arrangement.order, axis=1, out=buffer[batch], mode="clip")
+            return buffer[: len(fields)]
+
+        held = read(rows, np.empty((len(rows), block.size), dtype=np.complex128))
+        left = arrangement.squares(held)
+        products, right = arrangement.zeros(len(rows), len(others)), arrangement.zeros(len(others))
+
+        def multiply(group: slice, fields: Complexes, above: int) -> None:
+            sums, squares = arrangement.products(held[:above], fields), arrangement.squares(fields)
+            products.squares[:, :, :above, group], products.outer[:, :above, group] = sums.squares, sums.outer
+            right.squares[..., group], right.outer[..., group] = squares.squares, squares.outer
+
+        for group in _slices(shared, self._group):
+            multiply(group, held[group], group.stop)
+        buffer = np.empty((min(self._group, len(others) - shared), block.size), dtype=np.complex128)
+        for group in _slices(len(others), self._group, shared):
+            multiply(group, read(others[group], buffer), len(rows))
+        return products, left, right
+
+    def read(self, rows: Sequence[int], number: int) -> Complexes:
+        """Read one block of fields, and check it against their records."""
+        expected = [self.checksums[row][number] for row in rows]
+        return self.store.read_fields(rows, self.lattice.place(self.blocks[number]), expected)
+
+    def read_octaves(self, row: int) -> NDArray[np.complexfloating]:
+        """Return the values of a row at all samples of octaves (n,), and check them against its record."""
+        if self.sampling is None:
+            return np.zeros(0, dtype=np.complex128)
+        place = (slice(0, self.sampling.size),)
+        values: NDArray[np.complexfloating] = self.store.read_fields([row], place, [self.checksums[row][-1]])[0]
+        return values
+
+    def octave_sums(self, values: NDArray[np.complexfloating]) -> list[OctaveSums]:
+        """Return the integrals of |values|² over each octave, from those at all samples (n,)."""
+        parts = () if self.sampling is None else self.sampling.split(squared_moduli(values))
+        return [weights.sums(squares) for weights, squares in zip(self.octave_weights, parts, strict=True)]
+
+    def _tails_of_pairs(self, sampling: TailSampling, rows: Sequence[int], others: Sequence[int], shared: int) -> Tail:
+        """Return the tails of squared distances (orders, rows, others); the first ``shared`` others are the rows."""
+        parts = np.zeros((len(fields(Tail)), len(self.orders), len(rows), len(others)))
+        for batch in _slices(len(rows), max(1, _HELD_BYTES // (16 * sampling.size))):
+            held = {i: self.read_octaves(rows[i]) for i in range(batch.start, batch.stop)}
+            for j in range(min(batch.start, shared), len(others)):
+                values = held[j] if j < shared and j in held else self.read_octaves(others[j])
+                for i, own in held.items():
+                    if i < j or j >= shared:
+                        sums = self.octave_sums(own - values)
+                        beyond = self._remainder(rows[i], others[j], [octave.energy for octave in sums])
+                        parts[..., i, j] = astuple(Tail.from_sums(sums, *beyond.at(self.orders)))
+        if shared:
+            parts[..., :shared] += np.swapaxes(np.triu(parts[..., :shared], 1), -1, -2)
+        return Tail(*parts)
+
+    def _remainder(self, row: int, other: int, measured: Sequence[float]) -> Remainder:
+        """Return what lies beyond the octaves in a distance: known to the reference, else between bounds.
+
+        These follow from the energies in the octaves, which are measured, and those of both surfaces beyond.
+        """
+        for first, second in ((row, other), (other, row)):
+            known = self.qualities[first].difference
+            if second == self.known_reference and known is not None:
+                return known
+        parts = [self.qualities[number].own for number in (row, other)]
+        energies, cutoff = [max(part.energies) for part in parts], parts[0].cutoff
+        before, last = ([0.0, *measured])[-2:]
+        # Equal meshes have equal values.
+        if not last:
+            return Remainder.between(0.0, 0.0, cutoff)
+        # Between parallel surfaces the energy grows like |ξ|², rises through the sum to twice it, and swings about it.
+        total = sum(energies)
+        largest = sum(math.sqrt(energy) for energy in energies) ** 2
+        swing = max(_SWING * abs(total - last), _RISE * total if last > _STEEPEST_GROWTH * before else 0.0)
+        return Remainder.between(min(_LEAST_LIMIT * last, total), max(total, min(total + swing, largest)), cutoff)
+
+    def _direct(self, row: int, other: int) -> Sums:
+        """Return the sums of one pair, from the difference of its fields."""
+        sums = np.zeros(self.lattice.shell_count)
+        if row != other:
+            for number, block in enumerate(self.blocks):
+                a, b = self.read([row, other], number)
+                sums += shell_sums(a - b, None, self.lattice, block)
+        return sums_of_shells(sums, self.weights)
+
+
+def _slices(count: int, size: int, start: int = 0) -> Iterator[slice]:
+    for first in range(start, count, size):
+        yield slice(first, min(first + size, count))

@@ -1,0 +1,128 @@
+"""The results of a reduction as datasets: norms, distances and observed rates of meshes, in the order of tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Self
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from sobolev_batch.geometry.surface import Reals
+from sobolev_batch.norms.accuracy.tolerance import Accuracy
+from sobolev_batch.norms.budget import AREA_AND_SHAPE, NormEstimate
+from sobolev_batch.norms.columns import dataset_of, describe, observed_rates
+from sobolev_batch.sources.mesh_cache import Cost
+from sobolev_batch.tables.reducer import Reducer
+from sobolev_batch.tables.shells import chunks_of_spectra, read_spectra
+
+# Columns of the table of meshes that all tables have as coordinates, besides times and other metadata.
+COORDINATES = ("family", "name", "level", "status", "vertices", "triangles", "edge_length_mean", "seconds")
+# Those that only some studies have.
+SOME_COORDINATES = {"time", *(item.name for item in fields(Cost))}
+
+# Criteria of families that go from coarse to fine.
+_FROM_COARSE_TO_FINE = ("level", "triangles")
+
+
+@dataclass(frozen=True, eq=False)
+class Results:
+    """The results of a reduction in the order of tables, NaN where there are none.
+
+    Attributes:
+        norms: (5, orders, meshes), norms and their errors; see `NormEstimate`.
+        to_reference: (5, orders, meshes), distances to the reference.
+        parts: (6, orders, meshes), see `Reducer.norms`.
+    """
+
+    meshes: xr.Dataset
+    reference: str
+    orders: tuple[float, ...]
+    norms: Reals
+    to_reference: Reals
+    parts: Reals
+
+    @classmethod
+    def from_spectra(cls, reducer: Reducer, meshes: xr.Dataset, reference: str) -> Self:
+        """Return norms, and distances to the reference, from the spectra that the reducer's store holds."""
+        count, orders = meshes.sizes["mesh"], len(reducer.orders)
+        arrays = [np.full((parts, orders, count), np.nan) for parts in (5, 5, 6)]
+        places = {row: place for place, row in enumerate(meshes["row"].values.tolist())}
+        complete = {row for row in reducer.complete if row in places}
+        of_reference = None if reducer.reference is None else read_spectra(reducer.store, [reducer.reference]).norm
+        for chunk in chunks_of_spectra(reducer.store):
+            rows = [row for row in chunk if row in complete]
+            if rows:
+                norms, distances, parts = reducer.norms_of(rows, read_spectra(reducer.store, rows), of_reference)
+                of_rows = [places[row] for row in rows]
+                for array, numbers in zip(arrays, (np.stack([*norms]), np.stack([*distances]), parts), strict=True):
+                    array[..., of_rows] = numbers
+        return cls(meshes, reference, reducer.orders, *arrays)
+
+    def norms_table(self) -> xr.Dataset:
+        """Return `norm` (mesh, order) with its error."""
+        columns = {**NormEstimate(*self.norms).named("norm"), "beyond": self.parts[4]}
+        return table_of(columns, self.meshes, self.orders)
+
+    def distances_table(self) -> xr.Dataset:
+        """Return `distance` (mesh, other, order) with its error; the only other is the reference."""
+        distances = NormEstimate(*self.to_reference[..., None]).named("distance")
+        table = table_of(distances, self.meshes, self.orders, "mesh", "other")
+        return describe(table.assign_coords(other=("other", np.array([self.reference], dtype=object))))
+
+    def convergence_table(self, accuracy: Accuracy | None) -> xr.Dataset:
+        """Return distances to the reference, relative ones and their parts, and observed orders of convergence."""
+        to_reference = NormEstimate(*self.to_reference)
+        sizes = self.meshes["edge_length_mean"].to_numpy()
+        reference = self.meshes.indexes["mesh"].get_loc(self.reference)
+        distances, errors = to_reference.values, to_reference.errors
+        rates, rate_errors = (np.full_like(distances, np.nan) for _ in range(2))
+        for family in self._sequences():
+            members = [place for place in family if place != reference]
+            for k in range(len(self.orders)):
+                rates[k, members], rate_errors[k, members] = observed_rates(
+                    distances[k, members], errors[k, members], sizes[members]
+                )
+        relative, relative_errors = to_reference.relative_to(NormEstimate(*self.norms[..., [reference]]))
+        columns = {
+            **to_reference.named("distance"),
+            "relative": relative,
+            "relative_error": relative_errors,
+            **dict(zip(AREA_AND_SHAPE, self.parts, strict=False)),
+            "beyond": self.parts[5],
+            "rate": rates,
+            "rate_error": rate_errors,
+            "resolved": errors < distances,
+            "within": np.ones_like(distances, dtype=bool) if accuracy is None else accuracy.met(to_reference),
+        }
+        attributes = {"reference": self.reference, **({} if accuracy is None else {"rtol": accuracy.rtol})}
+        return table_of(columns, self.meshes, self.orders).assign_attrs(attributes)
+
+    def _sequences(self) -> list[list[int]]:
+        """Return the places of the meshes of each family that goes from coarse to fine."""
+        families: dict[str, list[int]] = {}
+        criteria = self.meshes["ordered_by"].values.tolist()
+        for place, (family, criterion) in enumerate(zip(self.meshes["family"].values.tolist(), criteria, strict=True)):
+            if criterion in _FROM_COARSE_TO_FINE:
+                families.setdefault(family, []).append(place)
+        return list(families.values())
+
+
+def table_of(
+    columns: Mapping[str, NDArray[Any]], meshes: xr.Dataset, orders: Sequence[float], *dimensions: str
+) -> xr.Dataset:
+    """Return values (orders, ...) by name over dimensions (default "mesh") and the order, as a table of meshes."""
+    dimensions = dimensions or ("mesh",)
+    moved = {name: np.moveaxis(values, 0, len(dimensions)) for name, values in columns.items()}
+    return dataset_of(moved, (*dimensions, "order"), coordinates_of(meshes, orders).variables)
+
+
+def coordinates_of(meshes: xr.Dataset, orders: Sequence[float]) -> xr.Dataset:
+    """Return the coordinates that every table has, from the table of meshes."""
+    names = [*COORDINATES, *sorted(SOME_COORDINATES & meshes.coords.keys()), *meshes.attrs.get("metadata", ())]
+    coordinates = meshes.reset_coords()[names].rename(edge_length_mean="edge_length")
+    return describe(
+        xr.Dataset(coords={**coordinates.variables, "order": ("order", np.array(orders, dtype=np.float64))})
+    )

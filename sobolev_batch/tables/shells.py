@@ -1,0 +1,118 @@
+"""Radial spectra in the store: computed from fields by tasks, one chunk of rows each, and read for any order."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence, Set
+from contextlib import suppress
+
+import numpy as np
+
+from sobolev_batch.errors import DamageError
+from sobolev_batch.geometry.surface import Reals
+from sobolev_batch.norms.spectrum import ComparedSpectra
+from sobolev_batch.store.store import SPECTRA_GROUP, SPECTRA_KEYS, Store
+from sobolev_batch.store.stored_tables import arrays_of, key_in, key_of, missing_chunks, read_chunk, seal
+from sobolev_batch.tables.reducer import Reducer
+
+# Of a lower bound.
+_ROUNDING = 1e-9
+
+
+def spectrum_keys(keys: Mapping[int, str], reference: int) -> dict[int, str]:
+    """Return what tells which fields a row's spectra were computed from, by the keys of all rows with a field."""
+    of_reference = keys.get(reference, "")
+    return {row: key_of([key, of_reference]) for row, key in keys.items()}
+
+
+def chunks_of_spectra(store: Store) -> Iterator[range]:
+    """Yield the rows of each chunk of spectra."""
+    for before, part in store.parts:
+        document = part.document(SPECTRA_KEYS)
+        (count,), (step,) = document["shape"], document["chunk_grid"]["configuration"]["chunk_shape"]
+        for first in range(0, count, step):
+            yield range(before + first, before + min(first + step, count))
+
+
+def stale_chunks(store: Store, keys: Mapping[int, str]) -> dict[int, range]:
+    """Return the rows of the chunks that lack spectra with these keys, by the chunk's number; no spectrum is read."""
+    missing, stale = missing_chunks(store, SPECTRA_KEYS), dict[int, range]()
+    for number, rows in enumerate(chunks_of_spectra(store)):
+        expected = {row: keys[row] for row in rows if row in keys}
+        if (number,) in missing or (expected and not expected.items() <= _stored_keys(store, rows).items()):
+            stale[number] = rows
+    return stale
+
+
+def _stored_keys(store: Store, rows: range) -> dict[int, str]:
+    """Return the keys of the rows of a chunk that have spectra; none if the chunk is damaged."""
+    with suppress(DamageError):
+        stored = np.asarray(store.read(SPECTRA_KEYS, slice(rows.start, rows.stop))).tolist()
+        return {row: key_in(text) for row, text in zip(rows, stored, strict=True) if text}
+    return {}
+
+
+def fill_chunk(reducer: Reducer, number: int, keys: Mapping[int, str]) -> None:
+    """Compute the spectra of a chunk's rows, but for those that it has with these keys, and write the chunk."""
+    store, rows = reducer.store, list(chunks_of_spectra(reducer.store))[number]
+    widths = {f"{SPECTRA_GROUP}/{name}": width for name, (width, *_) in reducer.axis.arrays().items()}
+    arrays = {name: np.full((len(rows), widths[name]), np.nan) for name in arrays_of(store, SPECTRA_KEYS)}
+    kept: set[int] = set()
+    with suppress(DamageError):
+        stored_keys, stored = read_chunk(store, SPECTRA_KEYS, (number,))
+        kept = {row for row, key in zip(rows, stored_keys, strict=True) if key and keys.get(row) == key}
+        for name, values in stored.items():
+            arrays[name][_places(kept, rows)] = values[_places(kept, rows)]
+    missing = {row for row in rows if row in keys} - kept
+    for name, values in reducer.spectra(sorted(missing)).to_arrays().items() if missing else ():
+        arrays[f"{SPECTRA_GROUP}/{name}"][_places(missing, rows)] = values
+
+    def write_keys(of: set[int]) -> None:
+        texts = [
+            seal(keys[row], [values[place] for values in arrays.values()]) if row in of else ""
+            for place, row in enumerate(rows)
+        ]
+        store.write(SPECTRA_KEYS, slice(rows.start, rows.stop), np.array(texts, dtype=object))
+
+    # Should this be interrupted, no old key may stand for new values.
+    write_keys(kept)
+    for name, values in arrays.items():
+        store.write(name, slice(rows.start, rows.stop), values)
+    write_keys(kept | missing)
+
+
+def _places(of: set[int], rows: range) -> list[int]:
+    return [row - rows.start for row in sorted(of)]
+
+
+def read_spectra(store: Store, rows: Sequence[int]) -> ComparedSpectra:
+    """Return the spectra of rows, in their order; a damaged chunk raises a `DamageError`."""
+    parts, wanted = [], set(rows)
+    for before, part in store.parts:
+        for number, chunk in enumerate(chunks_of_spectra(part)):
+            of_chunk = {row - before for row in wanted.intersection(range(before + chunk.start, before + chunk.stop))}
+            if of_chunk:
+                _, arrays = read_chunk(part, SPECTRA_KEYS, (number,))
+                chosen = {name.partition("/")[2]: values[_places(of_chunk, chunk)] for name, values in arrays.items()}
+                parts.append(ComparedSpectra.from_arrays(chosen))
+    places = {row: place for place, row in enumerate(sorted(wanted))}
+    return ComparedSpectra.joined(parts)[[places[row] for row in rows]]
+
+
+def lower_bounds(reducer: Reducer, row: int, others: Set[int]) -> dict[int, float]:
+    """Return a lower bound on the distance of a row from each of some others, at the reducer's first order.
+
+    On each shell two fields differ by no less than their norms there, or those of their differences from a third field.
+    """
+
+    def shells(rows: Sequence[int]) -> Reals:
+        spectra = read_spectra(reducer.store, rows)
+        chosen = spectra.norm if reducer.reference is None else spectra.distance
+        return np.asarray(np.sqrt(np.maximum(chosen.sums[:, : reducer.lattice.shell_count], 0.0)))
+
+    own, weights, bounds = shells([row]), reducer.weights.per_shell[0], dict[int, float]()
+    for chunk in chunks_of_spectra(reducer.store):
+        rows = [one for one in chunk if one in others]
+        if rows:
+            squares = (shells(rows) - own) ** 2 @ weights
+            bounds |= zip(rows, ((1 - _ROUNDING) * np.sqrt(squares)).tolist(), strict=True)
+    return bounds

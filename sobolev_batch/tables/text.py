@@ -1,0 +1,448 @@
+"""Numbers and tables as text: for people (text, markdown, latex) or for programs (csv, json)."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import shutil
+import textwrap
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
+
+import numpy as np
+import pandas as pd
+from tabulate import tabulate
+
+from sobolev_batch.tables import Format
+from sobolev_batch.visible import visible
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+Item = TypeVar("Item")
+
+
+# More digits are hard to read, whatever the error.
+_MOST_DIGITS = 7
+_DIGITS_WITHOUT_ERROR = 4
+# Beyond these, powers of ten are easier to read.
+_SMALLEST_PLAIN, _LARGEST_PLAIN, _LAST_PLAIN = 1e-3, 1e5, -6
+_POWER = " × 10"
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+# Surfaces whose distance, relative to the reference, is certainly smaller differ by rounding.
+_ROUNDING = 1e-10
+# A share of area is told if its error is no larger, and to whole per cents.
+_LARGEST_SHARE_ERROR, _WHOLE_PERCENT = 0.1, 0.01
+# Area is called lost or gained if the surface really lost or gained at least this fraction of what fits best.
+_LEAST_CHANGE = 0.5
+_PLAIN = {ord(raised): plain for plain, raised in zip("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹", strict=True)}
+
+
+def with_error(value: float, error: float = math.nan, unit: str = "") -> str:
+    """Return a number with the digits that its error leaves it, and its error; both have one power of ten.
+
+    The error, unknown for NaN, has one digit and is rounded up, so that it stays a bound. NaN gives an empty text.
+    """
+    if not math.isfinite(value):
+        return ""
+    shown = rounded(value, error, unit)
+    if not math.isfinite(error) or error == 0:
+        return f"{shown} ± {'0' if error == 0 else '?'}"
+    above, last = _rounded_up(error, 1), _last_digit(value, error)
+    if _POWER in shown and above < value * 1e3 and _magnitude(above) >= last:
+        power = _magnitude(round(value, -last))
+        size, decimals = 10.0**power, max(0, power - last)
+        return f"({value / size:.{decimals}f} ± {above / size:.{decimals}f}){_power(power)}{unit}"
+    return f"{shown} ± {_shown(above, _magnitude(above))}{unit}"
+
+
+def rounded(value: float, error: float = math.nan, unit: str = "") -> str:
+    """Return a number with the digits that its error leaves it; see `with_error`."""
+    return f"{_shown(value, _last_digit(value, error))}{unit}" if math.isfinite(value) else ""
+
+
+def percent(fraction: float, error: float = math.nan) -> str:
+    """Return a fraction in per cent with its error."""
+    return with_error(100 * fraction, 100 * error, " %")
+
+
+def count(number: int) -> str:
+    """Return a number of things; nothing for none."""
+    return f"{number:,}" if number else ""
+
+
+def bound(fraction: float) -> str:
+    """Return an upper bound in per cent, with two digits, rounded up."""
+    rounded = _rounded_up(100 * fraction, 2)
+    return f"{_shown(rounded, _magnitude(rounded) - 1)} %"
+
+
+def rounded_outwards(lower: float, upper: float) -> tuple[str, str]:
+    """Return two bounds with two digits, the lower one rounded down and the upper one up.
+
+    >>> rounded_outwards(0.01239, 0.1231), rounded_outwards(0.012, 0.13)
+    (('0.012', '0.13'), ('0.012', '0.13'))
+    """
+    low, high = -_rounded_up(-lower, 2), _rounded_up(upper, 2)
+    return _shown(low, _magnitude(low) - 1), _shown(high, _magnitude(high) - 1)
+
+
+def count_text(number: float, error: float) -> str:
+    """Return a large number of things with the digits that its error leaves it.
+
+    >>> count_text(2312.4, 36.0)
+    '2,310'
+    """
+    return "" if math.isnan(number) else f"{round(number, -max(0, _magnitude(_rounded_up(error, 1)))):,.0f}"
+
+
+def second_digit(value: float) -> float:
+    """Return the unit of the second digit of a number.
+
+    >>> second_digit(2312.4)
+    100.0
+    """
+    return 10.0 ** (_magnitude(value) - 1) if math.isfinite(value) else math.nan
+
+
+def duration(seconds: float, digits: int = 3) -> str:
+    """Return a duration in the largest unit that it holds twice or more.
+
+    >>> duration(42), duration(5400), duration(1e6), duration(1e6, digits=2)
+    ('42 s', '90 min', '11.6 days', '12 days')
+    """
+    units = (("days", 86400), ("h", 3600), ("min", 60))
+    unit, size = next(((unit, size) for unit, size in units if seconds >= 2 * size), ("s", 1))
+    # Rounded first, since the format turns 120 into 1.2e+02.
+    rounded = float(f"{max(seconds, 0) / size:.{digits}g}")
+    return f"{rounded:g} {unit}"
+
+
+def latex_powers(text: str) -> str:
+    r"""Return a text whose powers of ten are formulas of LaTeX, which has no raised digits.
+
+    >>> latex_powers("1.2 × 10⁻⁵ %")
+    '1.2 $\\times 10^{-5}$ %'
+    """
+    return re.sub(
+        rf"{_POWER.strip()}([⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)", lambda found: rf"$\times 10^{{{found[1].translate(_PLAIN)}}}$", text
+    )
+
+
+def minus(text: str) -> str:
+    """Return numbers with minus signs as wide as a digit."""
+    return text.replace("-", "−")
+
+
+def spread(items: Sequence[Item], most: int) -> list[Item]:
+    """Return a limited number of items: the first, the last, and others evenly between."""
+    return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int))]
+
+
+def middle_cut(label: str, longest: int) -> str:
+    """Return a label that is cut in its middle: labels of one family differ at their ends."""
+    return label if len(label) <= longest else f"{label[: longest // 2]}…{label[1 - longest // 2 :]}"
+
+
+def answer(name: str, reference: str, result: xr.Dataset | Mapping[str, float], area_change: float) -> str:
+    """Return a sentence that says how much a surface differs from the reference, from `distance` at one order.
+
+    The change of area is the area of the surface over that of the reference, minus one.
+    """
+    numbers = {key: float(result[key]) for key in ("distance", "error", "relative", "relative_error")}
+    at_order = f"at order {float(result['order']):g}"
+    if numbers["distance"] == numbers["error"] == 0:
+        return f"{name} and {reference} are identical: they have the same triangles."
+    if numbers["distance"] > numbers["error"]:
+        amount = percent(numbers["relative"], numbers["relative_error"])
+        return f"{name} differs from {reference} by {amount} {at_order}{_share_text(result, area_change)}."
+    most = numbers["relative"] + numbers["relative_error"]
+    if most < _ROUNDING:
+        return f"{name} and {reference} are equal up to rounding {at_order}: they differ by less than {bound(most)}."
+    amount = "an unknown amount" if math.isnan(most) else f"less than {bound(most)}"
+    return f"{name} differs from {reference} by {amount} {at_order}: not resolved."
+
+
+def likeness(name: str, reference: str, result: xr.Dataset | Mapping[str, float]) -> str:
+    """Return a sentence about changes that bring the reference as far from itself, from `yardsticks` at one order.
+
+    >>> amounts = {"order": -2.0, "moved": 0.0081, "noise": 0.0032, "decimated": 2312.0}
+    >>> errors = {"moved_error": 1e-4, "noise_error": 1e-4, "decimated_error": 40.0}
+    >>> print(likeness("small.obj", "large.obj", {**amounts, **errors}))
+    At order -2, small.obj is as far from large.obj as
+      large.obj moved by 0.81 % of its radius,
+      large.obj with noise of 0.32 % of its radius,
+      large.obj decimated to 2,300 triangles.
+    """
+    amounts = {kind: float(result[kind]) for kind in ("moved", "noise", "decimated")}
+    errors = {kind: max(float(result[f"{kind}_error"]), second_digit(amount)) for kind, amount in amounts.items()}
+    texts = {
+        "moved": f"moved by {rounded(100 * amounts['moved'], 100 * errors['moved'], ' %')} of its radius",
+        "noise": f"with noise of {rounded(100 * amounts['noise'], 100 * errors['noise'], ' %')} of its radius",
+        "decimated": f"decimated to {count_text(amounts['decimated'], errors['decimated'])} triangles",
+    }
+    known = [f"  {reference} {text}" for kind, text in texts.items() if not math.isnan(amounts[kind])]
+    at_order = f"At order {float(result['order']):g}, "
+    if not known:
+        return f"{at_order}no move, noise or decimation of {reference} is known to be as far from it."
+    return f"{at_order}{name} is as far from {reference} as\n" + ",\n".join(known) + "."
+
+
+def _share_text(result: xr.Dataset | Mapping[str, float], area_change: float) -> str:
+    """Return which share of a squared distance is a change of area; nothing where that is not known."""
+    share, error, excess = (float(result[key]) for key in ("area_share", "area_share_error", "excess"))
+    if not error <= _LARGEST_SHARE_ERROR:
+        return ""
+    if share + error < _WHOLE_PERCENT:
+        return "; a uniform change of area explains less than 1 % of the squared distance"
+    # A moved surface has lost no area, though a smaller multiple of the reference fits it best.
+    if share <= error or not area_change / excess >= _LEAST_CHANGE:
+        return ""
+    amount = rounded(100 * share, 100 * max(error, _WHOLE_PERCENT), " %")
+    return f"; a uniform {'loss' if excess < 0 else 'gain'} of area explains {amount} of the squared distance"
+
+
+def _last_digit(value: float, error: float) -> int:
+    """Return the power of ten of the last digit that an error leaves a number."""
+    if not math.isfinite(error) or error == 0:
+        return _magnitude(value) - (_MOST_DIGITS if error == 0 else _DIGITS_WITHOUT_ERROR) + 1
+    above = _rounded_up(error, 1)
+    # A value below its error keeps a digit, to be told from zero.
+    top = _magnitude(value or above)
+    return min(top, max(_magnitude(above), top - _MOST_DIGITS + 1))
+
+
+def _magnitude(value: float) -> int:
+    """Return the power of ten of the first digit."""
+    return 0 if value == 0 else int(f"{abs(value):e}".partition("e")[2])
+
+
+def _rounded_up(value: float, digits: int) -> float:
+    unit = 10.0 ** (_magnitude(value) - digits + 1)
+    # Less a little, so that no rounding error of the division counts.
+    return float(f"{math.ceil(value / unit - 1e-9 * abs(value / unit)) * unit:.{digits}g}")
+
+
+def _shown(value: float, last: int) -> str:
+    """Return a value down to a power of ten."""
+    value = round(value, -last)
+    if value == 0:
+        return "0"
+    if abs(value) < _LARGEST_PLAIN and (abs(value) >= _SMALLEST_PLAIN or last >= _LAST_PLAIN):
+        return f"{value:.{max(0, -last)}f}"
+    power = _magnitude(value)
+    return f"{value / 10.0**power:.{max(0, power - last)}f}{_power(power)}"
+
+
+def _power(power: int) -> str:
+    return _POWER + str(power).translate(_SUPERSCRIPTS)
+
+
+# Of numbers, in texts.
+_MARKS = {"": "", "below its error": "*", "above rtol": "!"}
+_TABULATE_FORMATS = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
+
+# Length of lines without a terminal, longest line of prose, and the least that remains of a label or a text.
+_LINE_LENGTH, _LONGEST_PROSE, _SHORTEST_TEXT = 100, 100, 20
+# Spaces between columns, and beside headers, by tabulate.
+_GAP, _PADDING = 2, 2
+# Spreadsheets take texts that begin so for formulas, and run them; those of East Asia also take the wide ones.
+_FORMULA_SIGNS = tuple("=+-@＝＋－＠")
+# What divides cells of Markdown, or begins code, links, HTML, entities, formulas and headings; and emphasis, which
+# underscores within words do not begin.
+_MARKDOWN_MARKS = re.compile(r"[\\|`\[\]<>&~$#*]|(?<![^\W_])_|_(?![^\W_])")
+# After the end of a row, LaTeX takes these for options of that end.
+_LATEX_OPTIONS = re.compile(r"^( *)(?=[\[*])", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table: of a text, and of a page.
+
+    Attributes:
+        name: Column of the frame that has its values, and its name in the CSV of a page.
+        format: Function that returns the text of a value, and of the error where there is one.
+        error: Column of the frame with the errors, or with other second numbers; empty where there are none.
+        kind: "label" for the first column of a page, else what the cells hold.
+        is_marked: True where the mark of a row follows the number.
+    """
+
+    name: str
+    header: str
+    format: Callable[..., str] = str
+    error: str = ""
+    kind: Literal["number", "text", "label"] = "number"
+    is_marked: bool = False
+
+    def text(self, row: Mapping[Any, Any]) -> str:
+        """Return the cell of a row of the frame; it is empty where the value is missing."""
+        value = row[self.name]
+        if value is None or value is pd.NA or (isinstance(value, float) and math.isnan(value)):
+            return ""
+        return self.format(value, row[self.error]) if self.error else self.format(value)
+
+
+def column_table(columns: Sequence[Column], rows: Iterable[Mapping[Any, Any]], style: Format) -> str:
+    """Return rows of a frame as a table for people, with marks, and where numbers are absent; see `printed_table`."""
+    cells = [
+        [
+            "missing"
+            if row.get("absent") and column.kind != "label"
+            else column.text(row) + (_MARKS[row.get("mark", "")] if column.is_marked else "")
+            for column in columns
+        ]
+        for row in rows
+    ]
+    texts = [number for number, column in enumerate(columns) if column.kind == "text"]
+    return printed_table(cells, [column.header for column in columns], style, texts)
+
+
+def section(caption: str, tables: Iterable[str], sentences: Iterable[str], style: Format) -> str:
+    """Return a caption, tables and sentences below each other."""
+    parts = prose([caption], style), *tables, prose(sentences, style)
+    return ("\n" if style == "latex" else "\n\n").join(filter(None, parts))
+
+
+def machine_table(frame: pd.DataFrame, style: Format) -> str:
+    """Return a table as CSV or JSON, which spells control characters itself; missing numbers are blank or null."""
+    if style == "csv":
+        texts = frame.rename(columns=_csv_cell).apply(
+            lambda cells: cells if pd.api.types.is_numeric_dtype(cells) else cells.map(_csv_cell)
+        )
+        return str(texts.to_csv(index=False, lineterminator="\n")).rstrip("\n")
+    return json_text(frame.astype(object).where(frame.notna(), None).to_dict(orient="records"))
+
+
+def json_text(value: Any) -> str:
+    """Return dataclasses, paths, tables and lists as ASCII JSON; null are numbers that are unknown or unbounded."""
+    text = json.dumps(value, default=_plain)
+    return json.dumps(json.loads(text, parse_constant=lambda _: None), indent=2)
+
+
+def _plain(value: Any) -> Any:
+    return os.fspath(value) if isinstance(value, os.PathLike) else asdict(value)
+
+
+def line_length() -> int:
+    """Return the length of a line: that of the terminal where there is one."""
+    return shutil.get_terminal_size((_LINE_LENGTH, 0)).columns
+
+
+def printed_table(
+    rows: Sequence[Sequence[str]], headers: Sequence[str], style: Format, texts: Sequence[int] = ()
+) -> str:
+    """Return cells as a table whose columns are aligned to the right, but for the first and for those of texts.
+
+    In a text, labels of the first column and texts give way where lines would be too long: labels lose what they repeat
+    and then their middle, and texts are wrapped. Columns that still have no room follow in a table of their own,
+    without rows that have no cells there. Tabulate escapes LaTeX's special characters.
+    """
+    rows, headers = (
+        [[_escaped(cell, style) for cell in row] for row in rows],
+        [_escaped(text, style) for text in headers],
+    )
+    groups: list[list[int]] = [list(range(1, len(headers)))]
+    if style == "text":
+        rows = _with_short_texts(rows, headers, texts)
+        groups, room = [], 0
+        first, *widths = _widths(rows, headers)
+        for column, width in enumerate(widths, 1):
+            if not groups or width + _GAP > room:
+                groups.append([])
+                room = line_length() - first
+            groups[-1].append(column)
+            room -= width + _GAP
+    tables = [
+        str(
+            tabulate(
+                [
+                    [row[0], *(row[column] for column in group)]
+                    for row in rows
+                    if group is groups[0] or any(row[column] for column in group)
+                ],
+                headers=[headers[0], *(headers[column] for column in group)],
+                tablefmt=_TABULATE_FORMATS[style],
+                disable_numparse=True,
+                colalign=("left", *("left" if column in texts else "right" for column in group)),
+            )
+        )
+        for group in groups
+    ]
+    table = "\n\n".join(tables)
+    return _LATEX_OPTIONS.sub(r"\1{}", latex_powers(table)) if style == "latex" else table
+
+
+def _widths(rows: Sequence[Sequence[str]], headers: Sequence[str]) -> list[int]:
+    return [
+        max(len(header) + _PADDING, *(len(line) for cell in column for line in cell.split("\n")))
+        for header, *column in zip(headers, *rows, strict=True)
+    ]
+
+
+def _with_short_texts(
+    rows: Sequence[Sequence[str]], headers: Sequence[str], texts: Sequence[int]
+) -> Sequence[Sequence[str]]:
+    """Return rows whose labels and texts are shortened so that lines fit, unless two labels would then be the same."""
+
+    def missing() -> int:
+        widths = _widths(rows, headers)
+        return sum(widths) + _GAP * (len(widths) - 1) - line_length()
+
+    for column in texts:
+        if (lacking := missing()) > 0:
+            width = max(_widths(rows, headers)[column] - lacking, _SHORTEST_TEXT)
+            cells = ["\n".join(textwrap.wrap(row[column], width, break_long_words=False)) for row in rows]
+            rows = [[*row[:column], cell, *row[column + 1 :]] for row, cell in zip(rows, cells, strict=True)]
+    for shorten in (_without_repeats, lambda names, longest: [middle_cut(name, longest) for name in names]):
+        if (lacking := missing()) > 0:
+            labels = [row[0] for row in rows]
+            shorter = shorten(labels, max(_widths(rows, headers)[0] - lacking, _SHORTEST_TEXT))
+            if len(set(shorter)) == len(set(labels)):
+                rows = [[label, *row[1:]] for label, row in zip(shorter, rows, strict=True)]
+    return rows
+
+
+def _without_repeats(labels: Sequence[str], _longest: int) -> list[str]:
+    """Return labels FAMILY/NAME without the family, or the beginning of all names, at the beginning of the name."""
+    parts = [label.partition("/") for label in labels]
+    names = {name for _, slash, name in parts if slash}
+    common = os.path.commonprefix([*names]) if len(names) > 1 else ""  # noqa: RUF071 -- of characters
+    # Words and numbers stay whole.
+    common = common[: max(map(common.rfind, "_-. ")) + 1]
+    shorter = []
+    for family, slash, name in parts:
+        rest = name.removeprefix(family if name.startswith(family) else common)
+        shorter.append(f"{family}/…{rest}" if slash and rest and len(name) - len(rest) > 1 else family + slash + name)
+    return shorter
+
+
+def wrapped(text: str) -> list[str]:
+    """Return the lines of a paragraph that fits the terminal."""
+    return textwrap.wrap(" ".join(text.split()), min(line_length(), _LONGEST_PROSE))
+
+
+def beside(name: str, text: str) -> str:
+    """Return a text beside its name, on lines that fit the terminal; paths and words stay whole."""
+    indent = " " * min(len(name), _SHORTEST_TEXT)
+    wrapper = textwrap.TextWrapper(line_length(), name, indent, break_long_words=False, break_on_hyphens=False)
+    return wrapper.fill(visible(text))
+
+
+def prose(lines: Iterable[str], style: Format) -> str:
+    """Return lines printed beside tables; LaTeX takes them as comments."""
+    return "\n".join(f"{'% ' * (style == 'latex')}{_escaped(line, style)}" for line in lines)
+
+
+def _escaped(text: str, style: Format) -> str:
+    """Return a text whose characters have no meaning of their own to terminals and Markdown."""
+    return _MARKDOWN_MARKS.sub(r"\\\g<0>", visible(text)) if style == "markdown" else visible(text)
+
+
+def _csv_cell(value: Any) -> Any:
+    """Return a cell that no spreadsheet takes for a formula; an apostrophe makes it a text."""
+    if not isinstance(value, str):
+        return value
+    return f"'{visible(value)}" if value.startswith(_FORMULA_SIGNS) else visible(value)

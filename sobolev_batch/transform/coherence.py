@@ -1,0 +1,142 @@
+"""Errors of a mesh's triangles that add up at some frequency: all of them in arrays, whose pieces repeat."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from itertools import permutations
+
+import numpy as np
+
+from sobolev_batch.compiled import pays
+from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.geometry.surface import Indices, Reals
+from sobolev_batch.transform.backends import CPU, Complexes, NufftSpec, cosine_and_sine
+
+# Triangles at a time: their temporaries stay in cache.
+_BATCH = 1 << 13
+# Processor time on arrays of the third moments of a triangle.
+_SECONDS = 4e-8
+# Number of ranges of |ξ| up to the highest one, the first that counts, and triangles that stand for all.
+RANGES, _FIRST, _SAMPLE = 32, 10, 1 << 11
+# The phase (radians) of a triangle's farthest corner at the highest frequency, once all are equally large.
+_PHASE = 1.5
+# Wavelengths along the box that is looked at; of a peak between the frequencies at least 0.83 is seen along each axis.
+_MOST_WAVELENGTHS, _PADDING, _EPS = 50.0, 1.5, 1e-3
+# The mean square over all directions for an equilateral triangle, whose errors are at most x²/4.
+_MEAN_SQUARE = 8 / 15
+# The largest of many sums of random terms, over their mean square, exceeds the logarithm of their number by this much.
+_EXCESS = 4.0
+# Numbers without pattern, which tell points apart.
+_MIXERS = np.array([43758.5453, 12989.8, 7823.3])
+
+
+def unpaired(mesh: Mesh) -> float:
+    """Return the fraction of odd errors that adds up: 0 where each triangle has an opposite one, 1 where all are alike.
+
+    The leading odd error is that of third moments about the centroid: of products of the three corners.
+    """
+    if pays(_SECONDS * len(mesh.triangles)):
+        from sobolev_batch.compiled.triangles import third_moments
+
+        norm, amount = third_moments(mesh.vertices, mesh.triangles, mesh.areas)
+        return norm / amount if amount else 0.0
+    total, amount, columns = np.zeros((3, 3, 3)), 0.0, np.ascontiguousarray(mesh.vertices.T)
+    for first in range(0, len(mesh.triangles), _BATCH):
+        areas = mesh.areas[first : first + _BATCH]
+        x = np.take(columns, np.ascontiguousarray(mesh.triangles[first : first + _BATCH].T), axis=1)
+        x -= x.mean(axis=1, keepdims=True)
+        a, b, c = x[:, 0], x[:, 1], x[:, 2]
+        total += ((a[:, None] * (b * areas)).reshape(9, -1) @ c.T).reshape(3, 3, 3)
+        aa, bb, cc = (x * x).sum(axis=0)
+        # The corners add up to zero, so these are all products of two of them.
+        ab, bc, ca = (cc - aa - bb) / 2, (aa - bb - cc) / 2, (bb - cc - aa) / 2
+        squares = aa * bb * cc + 2 * ab * bc * ca + aa * bc * bc + bb * ca * ca + cc * ab * ab
+        amount += float(areas @ np.sqrt(np.maximum(squares, 0)))
+    symmetric = sum(np.transpose(total, axes) for axes in permutations(range(3)))
+    return float(np.linalg.norm(symmetric)) / math.sqrt(6) / amount if amount else 0.0
+
+
+def coherence(mesh: Mesh, highest: float) -> Reals:
+    """Return the squares of the largest sums of errors in 32 equal ranges of |ξ| up to the highest one (32,).
+
+    They are relative to the sum of triangles that are all in phase, and zero where none exceeds the sums of random
+    terms. A sample of the triangles stands for all, whatever their order in the file; of meshes that are large beside
+    the shortest wavelength, a sample of the box that holds most area. Frequencies fill the cube of a lattice.
+    """
+    triangles, areas, noise = _sample(mesh, highest)
+    corners = np.stack([mesh.vertices[triangles[:, corner]].T for corner in range(3)])
+    centers = corners.mean(axis=0)
+    corners -= centers
+    sizes = np.sqrt((corners * corners).sum(axis=1).max(axis=0))
+    # Rules adapt to sizes, so errors do not depend on them: of equally large triangles, each weighs by its area. The
+    # errors are those of the corners against the centroid, and vanish where ξ is normal to the triangle, as all do.
+    length = _PHASE / (2 * np.pi * highest)
+    corners *= length / np.maximum(sizes, np.finfo(np.float64).tiny)
+    centers -= (centers.min(axis=1, keepdims=True) + centers.max(axis=1, keepdims=True)) / 2
+    limit = highest / math.sqrt(3)
+    count = math.ceil(2 * _PADDING * (float(np.abs(centers).max()) + length) * limit)
+    points = np.concatenate([centers, *(centers + corners)], axis=1)
+    values = _transform(points * (2 * np.pi * limit / count), np.concatenate([-areas, np.tile(areas / 3, 3)]), count)
+    places, numbers, radii = _ranges(count)
+    squares = np.square(np.abs(values.ravel()[places]) / (np.square(_PHASE * radii) / 4 * areas.sum())) / _MEAN_SQUARE
+    largest = np.zeros(RANGES)
+    np.maximum.at(largest, numbers, squares)
+    return np.where(largest > noise * (math.log(len(places)) + _EXCESS), np.minimum(largest, 1), 0)
+
+
+def _sample(mesh: Mesh, highest: float) -> tuple[Indices, Reals, float]:
+    """Return some triangles (k, 3), the areas that they stand for (k,), and the mean square of random sums of these.
+
+    Triangles are drawn in proportion to their areas, by numbers that depend on their corners alone.
+    """
+    triangles, areas = mesh.triangles, mesh.areas
+    low, high = mesh.extent.box
+    if (high - low).max() * highest > _MOST_WAVELENGTHS:
+        boxes = _boxes(mesh, low, _MOST_WAVELENGTHS / highest)
+        here = boxes == np.bincount(boxes, areas).argmax()
+        triangles, areas = triangles[here], areas[here]
+    if len(areas) <= _SAMPLE:
+        return triangles, areas, 0.0
+    levels, drawn, each = np.empty(len(mesh.vertices)), [], float(areas.sum()) / _SAMPLE
+    for first in range(0, len(levels), _BATCH):
+        batch = slice(first, first + _BATCH)
+        levels[batch] = np.sin(mesh.vertices[batch] @ (highest * _MIXERS)) * _MIXERS[0]
+    for first in range(0, len(areas), _BATCH):
+        batch = slice(first, first + _BATCH)
+        a, b, c = triangles[batch].T
+        sums = levels[a] + levels[b] + levels[c]
+        drawn.append(first + np.flatnonzero((sums - np.floor(sums)) * each < areas[batch]))
+    numbers = np.concatenate(drawn)
+    sampled = np.maximum(areas[numbers], each)
+    return triangles[numbers], sampled, np.count_nonzero(sampled == each) * (each / float(sampled.sum())) ** 2
+
+
+def _boxes(mesh: Mesh, low: Reals, side: float) -> Indices:
+    """Return the number of the box that holds the centroid of each triangle (m,)."""
+    numbers = np.empty(len(mesh.triangles), dtype=np.int64)
+    for first in range(0, len(numbers), _BATCH):
+        centers = mesh.vertices[mesh.triangles[first : first + _BATCH]].mean(axis=1)
+        numbers[first : first + _BATCH] = ((centers - low) / side).astype(np.int64) @ [1, 1 << 20, 1 << 40]
+    return np.unique(numbers, return_inverse=True)[1]
+
+
+def _transform(angles: Reals, weights: Reals, count: int) -> Complexes:
+    """Return Σ w exp(-i k·x) of points x (3, n) for |k_x|, |k_y| and 0 <= k_z up to a count."""
+    shape = 2 * count + 1, 2 * count + 1, count + 1
+    plan = CPU.plan(CPU.costs.with_oversampling(NufftSpec(shape, _EPS, "complex64"), len(weights)))
+    plan.setpts(*(np.ascontiguousarray(row, dtype=np.float32) for row in angles))
+    # Modes of an axis of n samples start at -(n // 2).
+    cosines, sines = cosine_and_sine((shape[2] // 2) * angles[2])
+    values: Complexes = plan.execute((weights * (cosines - 1j * sines)).astype(np.complex64))
+    return values
+
+
+@lru_cache(maxsize=4)
+def _ranges(count: int) -> tuple[Indices, Indices, Reals]:
+    """Return the flat indices of those modes that count, in which range each is, and its |ξ| over the highest one."""
+    axis = np.arange(-count, count + 1)
+    squares = axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis[count:] ** 2
+    radii = np.sqrt(squares.ravel() / 3) / count
+    places = np.flatnonzero(radii * RANGES > _FIRST)
+    return places, np.ceil(radii[places] * RANGES - 1e-9).astype(np.int64) - 1, radii[places]

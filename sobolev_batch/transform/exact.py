@@ -1,0 +1,562 @@
+"""Exact Fourier transforms: of spheres, with their norms, and of flat triangles, evaluated without loss of digits.
+
+That of triangles costs O(triangles) for each frequency, so it does not replace the NUFFT: it is the independent formula
+that rates quadrature rules and checks computed fields.
+
+The transform of a triangle of area A is 2A times the second divided difference of exp at the nodes -2πi ξ·p_j of its
+corners p_j (Hermite-Genocchi; C. de Boor, "Divided differences", 2005, arXiv:math/0502036). The explicit quotient of
+exponentials cancels if two nodes are close, the usual case on a fine mesh. Hence two branches: a power series about
+the centroid if all three are close, else the difference quotient of first differences across the widest gap.
+
+Where digits would be lost, sums and products carry their rounding errors: T. J. Dekker, "A floating-point technique for
+extending the available precision" (1971), doi:10.1007/BF01397083; T. Ogita, S. M. Rump, S. Oishi, "Accurate sum and dot
+product" (2005), doi:10.1137/030601818. That is valid without over- and underflow.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache, partial
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gamma, kv
+
+from sobolev_batch.compiled import pays
+from sobolev_batch.errors import OrderError
+from sobolev_batch.geometry.closed_forms import Sphere
+from sobolev_batch.geometry.mesh import Corners, Mesh, cross_lengths
+from sobolev_batch.geometry.surface import Reals
+from sobolev_batch.transform.backends import (
+    CPU,
+    Array,
+    Backend,
+    combine,
+    compute_on,
+    cosine_and_sine,
+    row_dots,
+    sums_at,
+)
+from sobolev_batch.transform.lattice import Block, FrequencyLattice
+
+Complexes = NDArray[np.complex128]
+# A number as a rounded value and what it lacks.
+Pair = tuple[Array, Array]
+
+# Gaps below this (radians) go through the series, which then needs at most 19 terms and a fraction of the time of the
+# quotient.
+_SERIES_GAP = 2.0
+# Below this many cycles a plain dot product keeps the phase of exp to 5e-14 radians.
+_PLAIN_CYCLES = 16.0
+# Triangles whose area is a smaller fraction of a squared edge lose digits in a plain cross product.
+_FLATNESS = 1e-2
+# Triangles at a time: their temporaries stay in a processor's cache.
+_BATCH = {"cpu": 1 << 13, "gpu": 1 << 18}
+# Pairs of a triangle and a frequency for each pass: with fewer, calls of NumPy and CuPy take longer than their work.
+_PAIRS = {"cpu": 1 << 11, "gpu": 1 << 21}
+# With fewer pairs a GPU takes longer than the processor.
+_FEWEST_FOR_GPU = 1 << 15
+# Of compiled loops: their exponentials at the vertices stay in a processor's cache.
+_COMPILED_BATCH = 1 << 12
+# Processor time of a pair of a triangle and a frequency on arrays, at least.
+_PAIR_SECONDS = 4e-8
+# Splits a double into halves of 26 bits each.
+_SPLITTER = 2.0**27 + 1
+
+
+def exact_transform(mesh: Mesh, frequencies: Reals, backend: Backend = CPU) -> Complexes:
+    """Return the transform ∫ exp(-2πi ξ·x) dμ(x) of a mesh's area measure, free of quadrature error.
+
+    For ξ, float64 (P, 3), in cycles per unit length, it is complex128 (P,). The error of each triangle is about 1e-15
+    of its contribution, or of its area if that is smaller; the area itself is exact to rounding even on slivers. A GPU
+    and compiled loops change the last digits.
+    """
+    frequencies = np.asarray(frequencies, dtype=np.float64)
+    columns = [np.ascontiguousarray(column) for column in mesh.vertices.T]
+
+    def sums(backend: Backend) -> Complexes:
+        if backend is CPU and pays(_PAIR_SECONDS * len(mesh.triangles) * len(frequencies)):
+            return _compiled_exact_transform(mesh, frequencies)
+        batch = _BATCH[backend.name]
+        parts = []
+        for start in range(0, len(mesh.triangles), batch):
+            rows = np.ascontiguousarray(mesh.triangles[start : start + batch].T)
+            corners = np.stack([[column[index] for column in columns] for index in rows])
+            parts.append(_sums(corners, frequencies, backend))
+        return np.asarray(np.sum(parts, axis=0, dtype=np.complex128))
+
+    return compute_on(_faster(backend, mesh, frequencies), sums)
+
+
+def _compiled_exact_transform(mesh: Mesh, frequencies: Reals, threads: int = 1) -> Complexes:
+    from sobolev_batch.compiled.divided_differences import exact_sums
+
+    doubled = _compiled_doubled_areas(mesh)
+    # Sums of sums round less often.
+    batches = [slice(start, start + _COMPILED_BATCH) for start in range(0, len(doubled), _COMPILED_BATCH)]
+
+    def sums(rows: Reals) -> Complexes:
+        parts = (exact_sums(mesh.vertices, mesh.triangles[batch], doubled[batch], rows) for batch in batches)
+        return sum(parts, np.zeros(rows.shape[1], dtype=np.complex128))
+
+    return _by_threads(sums, frequencies, threads)
+
+
+def _compiled_sampled_transform(mesh: Mesh, frequencies: Reals, threads: int) -> Complexes:
+    from sobolev_batch.compiled.divided_differences import sampled_sums
+
+    total = np.zeros(len(frequencies), dtype=np.complex128)
+    for _, batch in mesh.batches(_COMPILED_BATCH):
+        doubled = _compiled_doubled_areas(batch)
+        total += _by_threads(partial(sampled_sums, batch.vertices, batch.triangles, doubled), frequencies, threads)
+    return total
+
+
+def _compiled_doubled_areas(mesh: Mesh) -> Reals:
+    from sobolev_batch.compiled.divided_differences import plain_doubled_areas
+
+    doubled, is_flat = plain_doubled_areas(mesh.vertices, mesh.triangles, _FLATNESS)
+    if np.any(is_flat):
+        a, b, c = (np.ascontiguousarray(corner.T) for corner in mesh.corners(np.flatnonzero(is_flat)))
+        doubled[is_flat] = _doubled_areas_of_flat((a, b, c))
+    return np.asarray(doubled)
+
+
+def _by_threads(sums: Callable[[Reals], Complexes], frequencies: Reals, threads: int) -> Complexes:
+    """Return sums at frequencies (P, 3). Each thread takes a part of them, as rows (3, k)."""
+    parts = [np.ascontiguousarray(part.T) for part in np.array_split(frequencies, threads)]
+    if threads == 1:
+        return sums(parts[0])
+    with ThreadPoolExecutor(threads) as pool:
+        return np.concatenate(list(pool.map(sums, parts)))
+
+
+def _faster(backend: Backend, mesh: Mesh, frequencies: Reals) -> Backend:
+    return backend if len(mesh.triangles) * len(frequencies) >= _FEWEST_FOR_GPU else CPU
+
+
+def second_difference(ab: Array, ac: Array) -> Array:
+    """Return the second divided difference of exp at imaginary nodes iα, iβ, iγ whose mean is zero, complex128 (n,).
+
+    The gaps are β - α and γ - α in radians (n,). Form them from edge vectors: differences of phases have lost the
+    digits that the phases share. If the three nodes coincide, the value is 1/2.
+    """
+    widest = np.maximum(np.maximum(np.abs(ab), np.abs(ac)), np.abs(ac - ab))
+    most = float(widest.max()) if len(widest) else 0.0
+    if most < _SERIES_GAP:
+        real, imaginary = _series(ab, ac, most)
+        return real + 1j * imaginary
+    close = widest < _SERIES_GAP
+    values = np.empty(len(ab), dtype=np.complex128, like=ab)
+    real, imaginary = _series(ab[close], ac[close], _SERIES_GAP)
+    values[close] = real + 1j * imaginary
+    apart = ~close
+    b, c = ab[apart], ac[apart]
+    lowest = (b + c) / -3
+    corners = np.exp(1j * lowest), np.exp(1j * (b + lowest)), np.exp(1j * (c + lowest))
+    values[apart] = _quotient(corners, b, c)
+    return values
+
+
+def doubled_areas(corners: Corners) -> Reals:
+    """Return twice the area of each triangle (m,), to rounding even if its corners (3, m) are nearly collinear.
+
+    On flat triangles the edge vectors and their cross product are formed in double-double arithmetic: in doubles, an
+    aspect ratio of 1e6 costs six digits.
+    """
+    a, b, c = corners
+    (ux, uy, uz), (vx, vy, vz) = edges = b - a, c - a
+    doubled = cross_lengths(*edges)
+    flat = np.flatnonzero(doubled < _FLATNESS * (ux * ux + uy * uy + uz * uz + vx * vx + vy * vy + vz * vz))
+    doubled[flat] = _doubled_areas_of_flat((a[:, flat], b[:, flat], c[:, flat]))
+    return np.asarray(doubled)
+
+
+def _doubled_areas_of_flat(corners: Corners) -> Reals:
+    a, b, c = corners
+    p = [_two_sum(b[i], -a[i]) for i in range(3)]
+    q = [_two_sum(c[i], -a[i]) for i in range(3)]
+    normal = []
+    for i, j in ((1, 2), (2, 0), (0, 1)):
+        high, low = _subtract(_multiply(p[i], q[j]), _multiply(p[j], q[i]))
+        normal.append(high + low)
+    return np.asarray(np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2))
+
+
+def _sums(corners: Reals, frequencies: Reals, backend: Backend) -> Complexes:
+    """Return the transform (P,) of a batch of triangles, from their corners (3, 3, k): corner, axis, triangle."""
+    a, b, c = corners
+    ab, ac = b - a, c - a
+    longest = np.sqrt(max(float(np.einsum("ij,ij->j", side, side).max()) for side in (ab, ac, c - b)))
+    centroids = a + (ab + ac) / 3
+    farthest = float(np.abs(centroids).max()) + longest
+    doubled = backend.upload(doubled_areas((a, b, c)))
+    points, edges = (backend.upload(np.stack(rows)) for rows in ((centroids, a, b, c), (ab, ac)))
+    parts = []
+    # For few triangles, take several frequencies at a time.
+    step = max(1, _PAIRS[backend.name] // len(doubled))
+    for first in range(0, len(frequencies), step):
+        group = frequencies[first : first + step]
+        plain = farthest * float(np.abs(group).sum(axis=1).max()) <= _PLAIN_CYCLES
+        widest = 2 * np.pi * float(np.linalg.norm(group, axis=1).max()) * longest
+        if len(group) == 1:
+            contributions = _contributions(doubled, points, edges, group[0], plain, widest)
+        else:
+            all_points, all_edges = (np.tile(rows, len(group)) for rows in (points, edges))
+            repeated = np.repeat(backend.upload(group).T, len(doubled), axis=1)
+            contributions = _contributions(np.tile(doubled, len(group)), all_points, all_edges, repeated, plain, widest)
+        real, imaginary = (values.reshape(len(group), -1).sum(axis=1) for values in contributions)
+        parts.append(backend.download(real + 1j * imaginary))
+    return np.concatenate(parts) if parts else np.empty(0, dtype=np.complex128)
+
+
+def _contributions(
+    doubled: Array, points: Array, edges: Array, frequency: Array, plain: bool, widest: float
+) -> tuple[Array, Array]:
+    """Return real and imaginary parts of the transform of each triangle, at ξ (3,) for all or (3, k) for each.
+
+    The points are centroids and the three corners, the edges those from the first corner, (3, k) each. Phases are
+    plain dot products if these are good enough; all gaps are at most the widest one, in radians.
+    """
+    ab, ac = (_dots(-2 * np.pi * frequency, edge) for edge in edges)
+    if widest < _SERIES_GAP:
+        return _near(doubled, _phases(points[0], frequency, plain), ab, ac, widest)
+    real, imaginary = np.empty_like(doubled), np.empty_like(doubled)
+    close = np.maximum(np.maximum(np.abs(ab), np.abs(ac)), np.abs(ac - ab)) < _SERIES_GAP
+    apart = ~close
+    near, far = (frequency if frequency.ndim == 1 else frequency[:, mask] for mask in (close, apart))
+    phases = _phases(points[0][:, close], near, plain)
+    real[close], imaginary[close] = _near(doubled[close], phases, ab[close], ac[close], _SERIES_GAP)
+    at_corners = (cosine_and_sine(_phases(corner[:, apart], far, plain)) for corner in points[1:])
+    quotients = doubled[apart] * _quotient(
+        [cosines + 1j * sines for cosines, sines in at_corners], ab[apart], ac[apart]
+    )
+    real[apart], imaginary[apart] = quotients.real, quotients.imag
+    return real, imaginary
+
+
+def _near(doubled: Array, phases: Array, ab: Array, ac: Array, widest: float) -> tuple[Array, Array]:
+    """Return the same for triangles with small gaps, from the phases of their centroids."""
+    cosines, sines = (doubled * values for values in cosine_and_sine(phases))
+    real, imaginary = _series(ab, ac, widest)
+    return cosines * real - sines * imaginary, cosines * imaginary + sines * real
+
+
+def _dots(direction: Array, points: Array) -> Array:
+    """Return dot products of points (3, k) with one vector (3,) or one each (3, k), without a BLAS and its threads."""
+    return direction[0] * points[0] + direction[1] * points[1] + direction[2] * points[2]
+
+
+def _phases(points: Array, frequency: Array, plain: bool) -> Array:
+    """Return -2π ξ·p at points (3, k), in radians; unless ``plain``, whole cycles are subtracted before rounding."""
+    if plain:
+        return _dots(-2 * np.pi * frequency, points)
+    cycles: Pair = (np.zeros_like(points[0]), np.zeros_like(points[0]))
+    for axis in range(3):
+        high, low = _two_product(points[axis], frequency[axis])
+        high -= np.rint(high)  # exact, and whole cycles do not change the exponential
+        total, error = _two_sum(cycles[0], high)
+        cycles = total, cycles[1] + (error + low)
+    return -2 * np.pi * (cycles[0] + cycles[1])
+
+
+def _series(ab: Array, ac: Array, widest: float) -> tuple[Array, Array]:
+    """Return real and imaginary part of Σ_n i^n h_n / (n+2)!, h_n the complete homogeneous symmetric polynomials.
+
+    As the nodes' mean is zero, h_n is the sum of C(j+k, k) p^j q^k over 2j + 3k = n, for p = Σ node²/2 and q their
+    product.
+    """
+    lowest = (ab + ac) / -3
+    p = (ab * (ab - ac) + ac * ac) / 3
+    q = lowest * (ab + lowest) * (ac + lowest)
+    n = 2
+    # |h_n| <= 2 (widest · 2/3)^n: stop where the next term is below half a rounding error of 1/2.
+    while 2 * (widest * 2 / 3) ** (n + 1) / math.factorial(n + 3) > 2e-17:
+        n += 1
+    # Powers of q with even exponents are real, the others imaginary; Horner's scheme in p, and then in q².
+    parts: list[Array] = [np.zeros_like(p), np.zeros_like(p)]
+    squares = q * q
+    for power, (last, *others) in reversed(list(enumerate(_coefficients(n)))):
+        values = np.zeros_like(p)
+        values += last
+        for coefficient in others:
+            values *= p
+            values += coefficient
+        parts[power % 2] *= squares
+        parts[power % 2] += values
+    return parts[0], parts[1] * q
+
+
+@cache
+def _coefficients(highest: int) -> list[list[float]]:
+    """Return the factors of p^j q^k in a series up to n, for each k those of the highest j first."""
+    return [
+        [
+            (-1) ** ((2 * j + 3 * k) // 2) * math.comb(j + k, k) / math.factorial(2 * j + 3 * k + 2)
+            for j in reversed(range((highest - 3 * k) // 2 + 1))
+        ]
+        for k in range(highest // 3 + 1)
+    ]
+
+
+def _quotient(exponentials: Sequence[Array], ab: Array, ac: Array) -> Array:
+    """Return the difference quotient of the two first differences that meet across the widest gap."""
+    a, b, c = exponentials
+    bc = ac - ab
+    of_ab, of_ac, of_bc = _first_difference(a, b, ab), _first_difference(a, c, ac), _first_difference(b, c, bc)
+    across_ab = np.abs(ab) >= np.maximum(np.abs(ac), np.abs(bc))
+    across_ac = np.abs(ac) >= np.abs(bc)
+    numerator = np.where(across_ab, of_bc - of_ac, np.where(across_ac, of_bc - of_ab, of_ac - of_ab))
+    return numerator / (1j * np.where(across_ab, ab, np.where(across_ac, ac, bc)))
+
+
+def _first_difference(a: Array, b: Array, gap: Array) -> Array:
+    """Return the first divided difference (exp(iβ) - exp(iα)) / (i (β - α))."""
+    wide = np.abs(gap) > 1
+    denominator = np.where(wide, gap, 1.0)
+    near = a * np.exp(0.5j * gap) * np.sinc(gap / (2 * np.pi))
+    return np.where(wide, (b - a) / (1j * denominator), near)
+
+
+def _two_sum(a: Array, b: Array) -> Pair:
+    """Return the rounded sum and its rounding error: a + b = high + low exactly."""
+    high = a + b
+    shadow = high - a
+    return high, (a - (high - shadow)) + (b - shadow)
+
+
+def _two_product(a: Array, b: Array) -> Pair:
+    """Return the rounded product and its rounding error: a * b = high + low exactly."""
+    high = a * b
+    a_high, a_low = _halves(a)
+    b_high, b_low = _halves(b)
+    return high, a_low * b_low - (((high - a_high * b_high) - a_low * b_high) - a_high * b_low)
+
+
+def _multiply(a: Pair, b: Pair) -> Pair:
+    """Return the product of two double-double numbers, to about twice double precision."""
+    high, low = _two_product(a[0], b[0])
+    return _two_sum(high, low + (a[0] * b[1] + a[1] * b[0]))
+
+
+def _subtract(a: Pair, b: Pair) -> Pair:
+    """Return the difference of two double-double numbers, to about twice double precision of the larger one."""
+    high, low = _two_sum(a[0], -b[0])
+    return _two_sum(high, low + (a[1] - b[1]))
+
+
+def _halves(a: Array) -> Pair:
+    shifted = _SPLITTER * a
+    high = shifted - (shifted - a)
+    return high, a - high
+
+
+# A product of gaps below this (radians cubed) goes through the stable form: the plain one would lose as many digits.
+_LEAST_PRODUCT = 2e-3
+# If the longest edge is below this many radians, most triangles would go through the stable form.
+_FINE_MESH = 0.5
+# Most pairs of a triangle and a frequency at a time, and most triangles: their temporaries stay in a processor's cache.
+# Those of all triangles of a fine mesh, on every thread, would take gigabytes.
+_SAMPLED_PAIRS = {"cpu": 1 << 14, "gpu": 1 << 22}
+
+
+def sampled_transform(mesh: Mesh, frequencies: Reals, threads: int = 1, backend: Backend = CPU) -> Complexes:
+    """Return the transform ∫ exp(-2πi ξ·x) dμ(x) of a mesh at single frequencies (P, 3), fast and to fewer digits.
+
+    Away from small gaps the divided difference of exp at the corners is a plain sum of their exponentials, which
+    neighbouring triangles share. It is several times as fast as `exact_transform` where triangles are not small beside
+    the wavelength. The error of a triangle is at most about 1e-9 of its area. That of whole meshes at random
+    frequencies was measured to be at most 1e-13 of the area.
+    """
+    frequencies = np.asarray(frequencies, dtype=np.float64)
+    gaps = 2 * np.pi * np.linalg.norm(frequencies, axis=1) * mesh.edge_length_range[1]
+    values = np.empty(len(frequencies), dtype=np.complex128)
+    if backend is CPU and pays(_PAIR_SECONDS * len(mesh.triangles) * len(frequencies)):
+        fine = gaps < _SERIES_GAP
+        values[fine] = _compiled_exact_transform(mesh, frequencies[fine], threads)
+        values[~fine] = _compiled_sampled_transform(mesh, frequencies[~fine], threads)
+        return values
+    fine = gaps < _FINE_MESH
+    values[fine] = exact_transform(mesh, frequencies[fine], backend)
+    others = frequencies[~fine]
+
+    def sums(backend: Backend) -> Complexes:
+        # The threads are the processor's.
+        parts = np.array_split(others, threads if backend is CPU else 1)
+        total = np.zeros(len(others), dtype=np.complex128)
+        with ThreadPoolExecutor(len(parts)) as pool:
+            for _, batch in mesh.batches(_SAMPLED_PAIRS[backend.name]):
+                total += np.concatenate(list(pool.map(partial(_plain_sums, _faces(batch, backend), backend), parts)))
+        return total
+
+    values[~fine] = compute_on(_faster(backend, mesh, others), sums) if len(others) else 0
+    return values
+
+
+# Vertices (3, n), indices of corners (3, m), twice the areas (m,), and the first two edges (2, 3, m).
+_Faces = tuple[Array, Array, Array, Array]
+
+
+def _faces(mesh: Mesh, backend: Backend) -> _Faces:
+    corners = np.ascontiguousarray(mesh.triangles.T)
+    a, b, c = np.moveaxis(mesh.vertices.T[:, corners], 1, 0)
+    arrays = np.ascontiguousarray(mesh.vertices.T), corners, doubled_areas((a, b, c)), np.stack([b - a, c - b])
+    vertices, indices, doubled, edges = map(backend.upload, arrays)
+    return vertices, indices, doubled, edges
+
+
+def _plain_sums(faces: _Faces, backend: Backend, frequencies: Reals) -> Complexes:
+    """Return the transform (P,) of some faces, a few frequencies at a time."""
+    step = max(1, _SAMPLED_PAIRS[backend.name] // len(faces[2]))
+    groups = [frequencies[first : first + step] for first in range(0, len(frequencies), step)]
+    sums = [backend.download(_group_sums(faces, group)) for group in groups]
+    return np.concatenate(sums or [np.empty(0, complex)])
+
+
+def _group_sums(faces: _Faces, frequencies: Reals) -> Array:
+    vertices, (a, b, c), doubled, edges = faces
+    directions = -2 * np.pi * frequencies
+    phases = combine(directions, vertices)
+    # Of one edge, of the next, and of both.
+    first, second = combine(directions, edges[0]), combine(directions, edges[1])
+    both = first + second
+    product = first * second
+    product *= both
+    close = np.abs(product) < _LEAST_PRODUCT
+    product[close] = np.inf
+    factors = doubled / product
+    # The divided difference is (e_a g_bc + e_b g_ca + e_c g_ab) / (g_ab g_bc g_ca); the gaps g add up to zero.
+    parts = []
+    for values in cosine_and_sine(phases):
+        middle = np.take(values, b, axis=1)
+        before, after = np.take(values, a, axis=1), np.take(values, c, axis=1)
+        before -= middle
+        before *= second
+        after -= middle
+        after *= first
+        before += after
+        parts.append(row_dots(before, factors))
+    sums = -(parts[0] + 1j * parts[1])
+    rows, columns = np.nonzero(close)
+    gaps = first[rows, columns], both[rows, columns]
+    means = phases[rows, b[columns]] + (gaps[1] - 2 * gaps[0]) / 3
+    cosines, sines = cosine_and_sine(means)
+    terms = doubled[columns] * (cosines + 1j * sines) * second_difference(*gaps)
+    real, imaginary = (sums_at(rows, values, len(sums)) for values in (terms.real, terms.imag))
+    return sums + (real + 1j * imaginary)
+
+
+# Of a series, relative to its sum.
+_LEAST_TERM = 1e-17
+# The integrand is smooth where this rule is used, over intervals shorter than their distance from its singularity.
+_NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(14)
+
+
+def sphere_transform(sphere: Sphere, frequencies: Reals) -> NDArray[np.complex128]:
+    """Return the transform ∫ exp(-2πi ξ·x) dσ(x) of the area measure of a sphere of radius R and centre c.
+
+    For ξ, float64 (..., 3), in cycles per unit length, it is 4πR² sinc(2R|ξ|) exp(-2πi ξ·c) with sinc(t) =
+    sin(πt)/(πt), complex128 (...).
+    """
+    lengths = np.sqrt(np.einsum("...i,...i->...", frequencies, frequencies))
+    phases = np.exp(-2j * np.pi * (frequencies @ np.asarray(sphere.center)))
+    return np.asarray(sphere.area * np.sinc(2 * sphere.radius * lengths) * phases)
+
+
+def sphere_block(sphere: Sphere, lattice: FrequencyLattice, block: Block) -> NDArray[np.complex128]:
+    """Return the transform of a sphere on a block of the lattice, complex128 (block.shape)."""
+    x, y, z = lattice.frequencies(block)
+    lengths = np.sqrt((x**2)[:, None, None] + (y**2)[:, None] + z**2)
+    values = (sphere.area * np.sinc(2 * sphere.radius * lengths)).astype(np.complex128)
+    center = np.array(sphere.center) if lattice.rotation is None else lattice.rotation @ sphere.center
+    for axis, frequencies in enumerate((x, y, z)):
+        shape = [1, 1, 1]
+        shape[axis] = -1
+        values *= np.exp(-2j * np.pi * center[axis] * frequencies).reshape(shape)
+    return values
+
+
+def sphere_inner_product(first: Sphere, second: Sphere, order: float) -> float:
+    """Return the inner product of two spheres' area measures in the Sobolev norm of an order s < -1/2.
+
+    It is 4πR₁R₂ times the mean over |t| <= 1 of 2 C(2π(R₁-R₂+dt)) - 2 C(2π(R₁+R₂+dt)), where d is the distance of the
+    centres and C(b) = ∫_0^∞ cos(bρ) (1+ρ²)^s dρ is a Matérn function: a closed form for concentric spheres, a
+    one-dimensional integral otherwise. The relative error is about 1e-13. OrderError where the Bessel functions
+    overflow.
+    """
+    nu = -order - 0.5
+    separation = math.dist(first.center, second.center)
+    radii = first.radius, second.radius
+    near, far = radii[0] - radii[1], radii[0] + radii[1]
+
+    def integrand(t: float) -> float:
+        with np.errstate(over="ignore", invalid="ignore"):
+            return _matern_difference(nu, abs(near + separation * t), abs(far + separation * t))
+
+    if separation == 0:
+        mean = integrand(0.0)
+    else:
+        # Integrate up to the kink of the Matérn function at zero from both sides.
+        kinks = sorted(t for t in (-near / separation, -far / separation) if -1 < t < 1)
+        edges = [-1.0, *kinks, 1.0]
+        mean = 0.5 * sum(_integral(integrand, low, high) for low, high in pairwise(edges))
+    value = 8 * math.pi * radii[0] * radii[1] * mean
+    if not math.isfinite(value):
+        raise OrderError(f"order {order:g} is too low for the closed form of spheres: its Bessel functions overflow")
+    return value
+
+
+def sphere_norm(sphere: Sphere, order: float) -> float:
+    """Return the Sobolev norm of a sphere's area measure, of an order s < -1/2."""
+    return math.sqrt(sphere_inner_product(sphere, sphere, order))
+
+
+def sphere_distance(first: Sphere, second: Sphere, order: float) -> float:
+    """Return the Sobolev distance of two spheres' area measures; its square is off by 1e-13 of the squared norms."""
+    squared = (
+        sphere_inner_product(first, first, order)
+        + sphere_inner_product(second, second, order)
+        - 2 * sphere_inner_product(first, second, order)
+    )
+    return math.sqrt(max(squared, 0.0))
+
+
+def _matern_difference(nu: float, shorter: float, longer: float) -> float:
+    """Return C(2π shorter) - C(2π longer), without cancellation if the arguments are close.
+
+    C(b) = √π (b/2)^ν K_ν(b) / Γ(ν+1/2), and d/db [b^ν K_ν(b)] = -b^ν K_{ν-1}(b).
+    """
+    low, high = 2 * math.pi * shorter, 2 * math.pi * longer
+    factor = float(math.sqrt(math.pi) / (np.exp2(nu) * gamma(nu + 0.5)))
+    if abs(high - low) < 1 <= min(low, high):
+        nodes = (low + high) / 2 + (high - low) / 2 * _NODES
+        return float(factor * (high - low) / 2 * (_NODE_WEIGHTS @ (nodes**nu * kv(nu - 1, nodes))))
+    if abs(high - low) < 1:
+        return factor * _integral(lambda b: b * _matern(nu - 1, b) if b > 0 else 0.0, low, high)
+    return float(factor * (_matern(nu, low) - _matern(nu, high)))
+
+
+def _integral(function: Callable[[float], float], low: float, high: float) -> float:
+    from scipy.integrate import IntegrationWarning, quad
+
+    with warnings.catch_warnings():
+        # The tolerance requires the last digits; quad warns if rounding prevents one of them.
+        warnings.simplefilter("ignore", IntegrationWarning)
+        return float(quad(function, low, high, epsabs=0, epsrel=1e-13, limit=200)[0])
+
+
+def _matern(nu: float, b: float) -> float:
+    """Return b^ν K_ν(b); at zero its limit 2^(ν-1) Γ(ν)."""
+    value = np.power(b, nu) * kv(nu, b) if b > 0 else math.inf
+    if math.isfinite(value):
+        return float(value)
+    # K overflows far below b = ν, where the first terms of its series are all of it (DLMF, 10.31.1).
+    series, term, k = 1.0, 1.0, 1
+    while k < nu and abs(term) > _LEAST_TERM * series:
+        term *= (b / 2) ** 2 / (k * (k - nu))
+        series, k = series + term, k + 1
+    return float(np.exp2(nu - 1) * gamma(nu) * series)

@@ -1,0 +1,421 @@
+"""The Fourier transform of a surface on a block of the lattice, by a closed form or by a NUFFT: settings, memory, time.
+
+The prediction of errors is good enough to choose settings by; the probe measures the error afterwards.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from bisect import bisect_left
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import product
+from typing import get_args
+
+import numpy as np
+
+from sobolev_batch.errors import InputError, LatticeError, one_line
+from sobolev_batch.geometry.subdivision import icosphere
+from sobolev_batch.geometry.surface import Reals, Similarity, Surface
+from sobolev_batch.parameters import available_cores, is_whole_number
+from sobolev_batch.transform.backends import (
+    CPU,
+    CPU_COSTS,
+    DEFAULT_BATCH,
+    WIDEST_KERNEL,
+    Backend,
+    ComplexDtype,
+    Complexes,
+    Costs,
+    Gpu,
+    NufftSpec,
+    Shape,
+    Workload,
+)
+from sobolev_batch.transform.kinds import SurfaceKind, kind_of
+from sobolev_batch.transform.lattice import Block, FrequencyLattice, Lattice
+from sobolev_batch.transform.nufft import transform_points
+from sobolev_batch.transform.quadrature import weight_masses
+from sobolev_batch.transform.rules import fixed_rule
+
+DEFAULT_EPS: dict[ComplexDtype, float] = {"complex128": 1e-9, "complex64": 1e-6}
+# The limits of FINUFFT: below them 2.5 warns, and 2.6 refuses.
+FINEST_EPS: dict[ComplexDtype, float] = {"complex128": 1e-14, "complex64": 2e-7}
+COARSEST_EPS = 0.1
+# OpenMP crashes with very many.
+_MOST_THREADS = 1024
+
+
+@dataclass(frozen=True, init=False)
+class TransformSettings:
+    """Accuracy, dtype and quadrature of fields; InputError where one is unknown or out of reach for the dtype.
+
+    Attributes:
+        eps: Accuracy of a field relative to the surface's area; by default 1e-9 in complex128 and 1e-6 in
+            complex64.
+        dtype: "complex128" or "complex64".
+        quadrature: Rules for triangles: see `fixed_rule`.
+        tolerance: Largest error of the rule on any one triangle, relative to its area, or of the nodes of a
+            parametrised surface, relative to the whole area; by default what eps needs.
+        stored: Dtype that values are rounded to once they are computed; by default that of the computation.
+    """
+
+    eps: float
+    dtype: ComplexDtype
+    quadrature: str | int
+    tolerance: float | None
+    stored: ComplexDtype
+
+    def __init__(
+        self,
+        eps: float | None = None,
+        dtype: ComplexDtype = "complex128",
+        quadrature: str | int = "auto",
+        tolerance: float | None = None,
+        stored: ComplexDtype | None = None,
+    ) -> None:
+        if dtype not in get_args(ComplexDtype):
+            raise InputError(f"dtype must be 'complex128' or 'complex64', found {dtype!r}")
+        eps = DEFAULT_EPS[dtype] if eps is None else float(eps)
+        if not FINEST_EPS[dtype] <= eps <= COARSEST_EPS:
+            raise InputError(f"eps must lie between {FINEST_EPS[dtype]:g} and {COARSEST_EPS:g} in {dtype}, found {eps}")
+        fixed_rule(quadrature)
+        object.__setattr__(self, "eps", eps)
+        object.__setattr__(self, "dtype", dtype)
+        object.__setattr__(self, "quadrature", quadrature)
+        object.__setattr__(self, "tolerance", tolerance)
+        object.__setattr__(self, "stored", stored or dtype)
+
+    def plan(self, surface: Surface, lattice: FrequencyLattice) -> SurfaceKind:
+        """Return a surface with quadrature points for a lattice."""
+        return kind_of(surface).plan(lattice.highest_frequency, self.eps, self.quadrature, self.tolerance)
+
+
+def thread_count(threads: int | None) -> int:
+    """Return a number of threads, by default one per core; InputError where it is not from 1 to 1,024."""
+    if threads is None:
+        return available_cores()
+    if not is_whole_number(threads) or not 1 <= threads <= _MOST_THREADS:
+        raise InputError(f"threads must be a whole number from 1 to {_MOST_THREADS:,}, found {threads!r}")
+    return int(threads)
+
+
+@dataclass(frozen=True)
+class Execution:
+    """The means to compute a transform; values depend on them by a small multiple of eps at most.
+
+    Attributes:
+        backend: Backend to compute on. The processor steps in for a GPU that fails.
+        allowed_bytes: Memory that a transform may take on the processor, without the mesh and the result; None
+            for no limit. To stay within it, a transform uses smaller batches, sub-blocks and less oversampling,
+            whichever is predicted to be the fastest. On a GPU the limit is its free memory.
+        batch: Largest number of points of one NUFFT.
+    """
+
+    backend: Backend = CPU
+    threads: int = 1
+    allowed_bytes: float | None = None
+    batch: int = DEFAULT_BATCH
+
+
+ON_CPU = Execution()
+
+
+# Fraction of a field's error that is left to the NUFFT.
+_NUFFT_FRACTION = 0.4
+# The rms error of a field of many points at one frequency over eps · area: measured 0.003 to 0.006.
+_NUFFT_ERROR = 0.005
+# The same of single precision over the area, however small its eps; measured 1e-7 at most.
+_SINGLE_ROUNDING = 3e-7
+
+
+@dataclass(frozen=True)
+class ErrorTarget:
+    """Largest permitted norms ||computed - exact||_s of a field's own error, one for each order s."""
+
+    orders: tuple[float, ...]
+    norms: tuple[float, ...]
+
+    def tightened(self, factor: float) -> ErrorTarget:
+        """Return a target that is smaller by a factor."""
+        return ErrorTarget(self.orders, tuple(norm / factor for norm in self.norms))
+
+
+def permits_single(surface: Surface, lattice: FrequencyLattice, target: ErrorTarget) -> bool:
+    """Tell whether single precision meets a target: its rounding is 1e-7 of the area at every frequency."""
+    rounding = _SINGLE_ROUNDING * surface.area * np.sqrt(weight_masses(lattice, target.orders))
+    return bool(np.all(rounding <= _NUFFT_FRACTION * np.array(target.norms)))
+
+
+def choose_settings(
+    surface: Surface, lattice: FrequencyLattice, target: ErrorTarget, settings: TransformSettings
+) -> TransformSettings:
+    """Return the cheapest settings that are predicted to meet a target, or the finest possible ones.
+
+    The dtype and quadrature are kept, and all settings for a closed form, which depends on none.
+    """
+    kind = kind_of(surface)
+    if kind.is_closed_form:
+        return settings
+    tolerance = kind.loosest_tolerance(lattice, target.orders, (1 - _NUFFT_FRACTION) * np.array(target.norms))
+    eps = _nufft_eps(surface.area, kind.fewest_points, lattice, target, settings)
+    return replace(settings, eps=eps, tolerance=tolerance)
+
+
+def _nufft_eps(
+    area: float, points: float, lattice: FrequencyLattice, target: ErrorTarget, settings: TransformSettings
+) -> float:
+    """Return the largest eps with which the NUFFT of this many points keeps to its fraction of a target."""
+    masses = weight_masses(lattice, target.orders)
+    spread = _NUFFT_ERROR + 1 / math.sqrt(points)
+    eps = float(np.min(_NUFFT_FRACTION * np.array(target.norms) / (area * spread * np.sqrt(masses))))
+    return min(max(eps, FINEST_EPS[settings.dtype]), COARSEST_EPS)
+
+
+# Raise it whenever the numbers for a given surface and settings change: stored fields of another version are then
+# computed again instead of being compared with new ones.
+NUMERICS_VERSION = 6
+
+# The smallest batch holds eight node sets of the largest triangle rule.
+_SMALLEST_BATCH = 1 << 12
+# Samples of a closed form at a time: temporaries of the whole block would take several times its size.
+_SAMPLES = 1 << 18
+# The fraction of a GPU's free memory that a transform plans with, and the number of attempts, each with half of it.
+_DEVICE_FRACTION, _ATTEMPTS = 0.9, 4
+_OUT_OF_MEMORY = "out of memory"
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Transformed:
+    """A block of a field: its values, the number of quadrature points (0 for a closed form), and the library.
+
+    The library is "closed form" if none was needed, and comes with the reason if another one failed before.
+    """
+
+    values: Complexes
+    points: int
+    backend: str
+
+
+def transform_block(
+    surface: Surface,
+    lattice: FrequencyLattice,
+    block: Block,
+    settings: TransformSettings,
+    execution: Execution = ON_CPU,
+    plan: SurfaceKind | None = None,
+) -> Transformed:
+    """Return the transform of a surface on one block of the lattice.
+
+    Pass the quadrature plan of the surface by the same settings to transform several blocks with one choice of rules.
+    LatticeError where the surface extends beyond the lattice's half period, InputError where the allowed memory is too
+    little, or the quadrature of a parametrised surface does not converge.
+    """
+    kind = kind_of(surface)
+    if isinstance(lattice, Lattice):
+        require_inside(surface, lattice)
+    if kind.is_closed_form:
+        return Transformed(_closed_form(kind, lattice, block, settings.stored), 0, "closed form")
+    plan = plan or settings.plan(surface, lattice)
+    whole = NufftSpec(block.shape, settings.eps, settings.dtype, threads=execution.threads, batch=execution.batch)
+    low, high = surface.extent.box
+    fill = min(1.0, float(np.prod((high - low) / (2 * lattice.half_period))))
+
+    # Rules are chosen while other threads have the device.
+    points = plan.expected_points if isinstance(execution.backend, Gpu) else math.inf
+
+    def fitting(costs: Costs, allowed_bytes: float) -> tuple[NufftSpec, int]:
+        workload = Workload(points, triangles=plan.triangles, fill=fill)
+        if costs.projected_bytes(whole, workload) > allowed_bytes:
+            # Only now do the points need counting.
+            workload = replace(workload, points=plan.expected_points, largest_points=plan.largest_points)
+        spec = fastest_spec(whole, workload, costs, allowed_bytes)
+        return spec, costs.projected_bytes(spec, workload)
+
+    def compute(backend: Backend, spec: NufftSpec) -> Transformed:
+        values, points = transform_points(plan.batches(spec.batch, backend), lattice, block, spec, backend)
+        return Transformed(backend.download(values.astype(settings.stored, copy=False)), points, backend.library)
+
+    # Before the GPU is tried: the memory must be enough for the processor that may have to step in.
+    spec = whole if execution.allowed_bytes is None else fitting(CPU.costs, execution.allowed_bytes)[0]
+    if not isinstance(execution.backend, Gpu):
+        return compute(CPU, spec)
+    gpu = execution.backend
+    try:
+        with gpu.work():
+            return _on_gpu(gpu, block.size * whole.item_bytes, fitting, compute)
+    except InputError:  # nothing is small enough
+        failure = _OUT_OF_MEMORY
+    except Exception as error:
+        failure = one_line(error)[:200]
+    _log.warning("%s: %s; the processor computes it instead", gpu.library, failure)
+    transformed = compute(CPU, spec)
+    return replace(transformed, backend=f"{transformed.backend} after {gpu.library}: {failure}")
+
+
+def _on_gpu(
+    gpu: Gpu,
+    result_bytes: int,
+    fitting: Callable[[Costs, float], tuple[NufftSpec, int]],
+    compute: Callable[[Backend, NufftSpec], Transformed],
+) -> Transformed:
+    """Compute on a GPU, and try again with half the memory where it is too little after all; at last InputError."""
+    allowed_bytes = _DEVICE_FRACTION * gpu.free_bytes - result_bytes
+    for _ in range(_ATTEMPTS):
+        spec, projected = fitting(gpu.costs, allowed_bytes)
+        gpu.release_memory(projected)
+        try:
+            return compute(gpu, spec)
+        except Exception as error:
+            # cuFINUFFT says of a failure only where it happened, and nothing if cuFFT ran out of memory.
+            unexplained = type(error) is RuntimeError and projected > allowed_bytes / 2
+            if not (gpu.is_out_of_memory(error) or unexplained):
+                raise
+        allowed_bytes = min(allowed_bytes, projected) / 2
+        _log.warning("%s: %s; trying again with %.3g MB", gpu.library, _OUT_OF_MEMORY, allowed_bytes / 1e6)
+        gpu.release_memory(math.inf)
+    raise InputError(_OUT_OF_MEMORY)
+
+
+def fastest_spec(whole: NufftSpec, workload: Workload, costs: Costs, allowed_bytes: float) -> NufftSpec:
+    """Return the sub-blocks, batches and oversampling that are predicted to be the fastest within the allowed memory.
+
+    That memory is without the result and the mesh. If the whole block fits, nothing is subdivided or prescribed: the
+    values are then those of unlimited memory. InputError, with the smallest memory that works, where nothing fits.
+    """
+
+    def fits(spec: NufftSpec) -> bool:
+        if costs.grid_cells(spec, workload) > costs.largest_grid:
+            return False
+        return costs.projected_bytes(spec, workload) <= allowed_bytes
+
+    if fits(whole):
+        return whole
+    candidates: list[NufftSpec] = []
+    least_bytes = math.inf
+    batches = [whole.batch]
+    while batches[-1] // 2 >= _SMALLEST_BATCH:
+        batches.append(batches[-1] // 2)
+    for batch, sigma in product(batches, costs.oversamplings(whole)):
+        smaller = [
+            replace(whole, shape=shape, oversampling=sigma, batch=batch) for shape in sub_shapes(whole.shape, sigma)
+        ]
+        # Ever smaller sub-blocks take ever less memory: the first that fits is the largest.
+        first = bisect_left(smaller, True, key=fits)
+        if first < len(smaller):
+            candidates.append(smaller[first])
+        else:
+            least_bytes = min(least_bytes, costs.projected_bytes(smaller[-1], workload))
+    if not candidates:
+        raise InputError(
+            f"{allowed_bytes / 1e6:.4g} MB of memory are too little for a block of {' x '.join(map(str, whole.shape))} "
+            f"samples: give at least {math.ceil(least_bytes / 1e5) / 10:.4g} MB besides the result and the mesh"
+        )
+    return min(candidates, key=lambda spec: costs.projected_nanoseconds(spec, whole.shape, workload))
+
+
+def sub_shapes(shape: Shape, sigma: float) -> Iterator[Shape]:
+    """Yield shapes of sub-blocks, from the whole block down to where smaller ones save nothing."""
+    counts = [1, 1, 1]
+    lengths = list(shape)
+    while True:
+        yield lengths[0], lengths[1], lengths[2]
+        axis = max(range(3), key=lengths.__getitem__)
+        if lengths[axis] * sigma <= 2 * WIDEST_KERNEL:
+            return
+        before = lengths[axis]
+        while lengths[axis] == before:
+            counts[axis] += 1
+            lengths[axis] = math.ceil(shape[axis] / counts[axis])
+
+
+def projected_bytes(block: Block, settings: TransformSettings, *, triangles: int = 0) -> int:
+    """Return an upper estimate of the peak memory of `transform_block`, with its result and without the mesh.
+
+    Each triangle of the mesh counts for some bytes while its rule is chosen.
+    """
+    whole = NufftSpec(block.shape, settings.eps, settings.dtype)
+    return block.size * whole.item_bytes + CPU.costs.projected_bytes(whole, Workload(triangles=triangles))
+
+
+def _closed_form(kind: SurfaceKind, lattice: FrequencyLattice, block: Block, dtype: ComplexDtype) -> Complexes:
+    values: Complexes = np.empty(block.shape, dtype=dtype)
+    step = max(1, _SAMPLES // math.prod(block.shape[1:]))
+    for first in range(0, block.shape[0], step):
+        count = min(step, block.shape[0] - first)
+        slab = Block((block.start[0] + first, *block.start[1:]), (count, *block.shape[1:]))
+        values[first : first + count] = kind.block_values(lattice, slab)
+    return values
+
+
+def require_inside(surface: Surface, lattice: Lattice) -> None:
+    """Check that a surface lies within the lattice's period, and would not be folded back; LatticeError otherwise."""
+    kind = "mesh" if kind_of(surface).triangles else "surface"
+    require_points_inside(np.stack(surface.extent.box), lattice, f"the {kind} reaches", "it")
+
+
+def require_points_inside(
+    coordinates: Reals, lattice: Lattice, subject: str = "the points reach", pronoun: str = "them"
+) -> None:
+    """Check that coordinates lie within the lattice's period; see `require_inside`."""
+    reach = float(np.abs(coordinates).max(initial=0.0))
+    if not reach < lattice.half_period:
+        intervals = 2 * math.floor(2 * lattice.xi_max * reach) + 2
+        raise LatticeError(
+            f"{subject} to |coordinate| = {reach:.6g}, but the lattice (xi_max {lattice.xi_max:g}, "
+            f"M {lattice.M}) holds only |coordinate| < 1/(2h) = {lattice.half_period:.6g}; "
+            f"take M >= {intervals}, a smaller xi_max, or scale {pronoun} down"
+        )
+
+
+# Triangles of a mesh differ in size, which their rules follow; those of this sphere stand for them.
+_STAND_IN_LEVEL = 2
+# A sphere, transformed in a fraction of a second, mostly spreading its points.
+_TRIAL_LEVEL, _TRIAL_LATTICE = 5, Lattice(5.0, 64)
+_NANO = 1e-9
+
+
+def field_seconds(triangles: int, area: float, lattice: Lattice, settings: TransformSettings) -> float:
+    """Return the predicted processor time of the field of a mesh; of a closed form with zero triangles."""
+    spec = NufftSpec(lattice.half.shape, settings.eps, settings.dtype)
+    workload = Workload(points=expected_points(triangles, area, lattice, settings), triangles=triangles)
+    return _NANO * CPU_COSTS.projected_nanoseconds(spec, spec.shape, workload)
+
+
+@lru_cache(maxsize=4)
+def slowness(backend: Backend = CPU) -> float:
+    """Return how many times as long as predicted a field takes on this machine, in processor time of one thread.
+
+    The time of a GPU is that of the whole computation.
+    """
+    mesh, settings = icosphere(_TRIAL_LEVEL), TransformSettings()
+    clock = time.thread_time if backend is CPU else time.perf_counter
+    predicted = field_seconds(len(mesh.triangles), mesh.area, _TRIAL_LATTICE, settings)
+    times = []
+    # The first time includes what is loaded and tabulated once.
+    for _ in range(2):
+        started = clock()
+        transform_block(mesh, _TRIAL_LATTICE, _TRIAL_LATTICE.half, settings, Execution(backend))
+        times.append(clock() - started)
+    return min(times) / predicted
+
+
+def expected_points(triangles: int, area: float, lattice: Lattice, settings: TransformSettings) -> float:
+    """Return the number of quadrature points of a mesh, as if all its triangles were alike; see `field_seconds`."""
+    if not triangles:
+        return 0.0
+    # Of many sizes a few stand for all.
+    return triangles * _points_of_triangle(float(f"{area / triangles:.1e}"), lattice, settings)
+
+
+@lru_cache(maxsize=1 << 10)
+def _points_of_triangle(area: float, lattice: Lattice, settings: TransformSettings) -> float:
+    sphere = icosphere(_STAND_IN_LEVEL)
+    count = len(sphere.triangles)
+    alike = Similarity(math.sqrt(area * count / sphere.area)).apply(sphere)
+    return settings.plan(alike, lattice).expected_points / count

@@ -1,0 +1,196 @@
+"""The time that a plan foretells: what it counts, and how it follows from stored fields."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import tomli_w
+from distributed import Client
+
+import sobolev_batch as sb
+from sobolev_batch.batch.checks import warnings_of
+from sobolev_batch.batch.cluster.workers import Workers
+from sobolev_batch.batch.dry_run import forecast
+from sobolev_batch.geometry.formats.readers import write_mesh
+from sobolev_batch.store.location import Location
+from sobolev_batch.store.records import Record
+from sobolev_batch.study.plan import Plan, make_plan
+from sobolev_batch.transform.fourier import TransformSettings, expected_points, field_seconds, transform_block
+from tests.support.commands import call
+from tests.support.studies import balls, methods_of, small_table
+
+
+@pytest.fixture
+def plan() -> Plan:
+    return make_plan(sb.Study.from_table(small_table()))
+
+
+def records(plan: Plan, *labels: str, seconds: float) -> dict[str, Record]:
+    """Return records of fields that took so long each."""
+    keys = {row.label: row.key for row in plan.rows}
+    return {label: Record(keys[label], "complete", seconds=seconds) for label in labels}
+
+
+@pytest.mark.parametrize(
+    "mesh", [sb.shapes.icosphere(1), sb.shapes.icosphere(4), sb.shapes.Torus(1.0, 0.4).mesh(96, 48)]
+)
+@pytest.mark.parametrize("xi_max", [2.0, 8.0])
+def test_points_are_predicted_without_the_mesh(mesh: sb.Mesh, xi_max: float) -> None:
+    lattice, settings = sb.Lattice(xi_max, 48), TransformSettings()
+    points = transform_block(mesh, lattice, replace(lattice.half, shape=(2, 2, 2)), settings).points
+    assert expected_points(len(mesh.triangles), mesh.area, lattice, settings) == pytest.approx(points, rel=0.5)
+
+
+def test_finer_meshes_and_larger_lattices_take_longer() -> None:
+    counts, settings = (0, 10_000, 1_000_000), TransformSettings()
+    seconds = np.array([[field_seconds(n, 12.0, sb.Lattice(4.0, M), settings) for n in counts] for M in (32, 128)])
+    assert (np.diff(seconds, axis=0) > 0).all()
+    assert (np.diff(seconds, axis=1) > 0).all()
+    # Spreading costs some hundreds of nanoseconds for each of some points of a triangle.
+    assert 0.1 < seconds[0, 2] - seconds[0, 0] < 10
+
+
+def test_stored_fields_tell_the_speed_of_the_others(plan: Plan) -> None:
+    labels = [row.label for row in plan.rows]
+    stored = records(plan, *labels[:3], seconds=10.0)
+    workers = Workers.of_this_machine(2)
+    seconds, processor_seconds, (first, second) = forecast(plan, stored, workers, None, planning_seconds=0.0)
+    twice, _, _ = forecast(plan, records(plan, *labels[:3], seconds=20.0), workers, None, planning_seconds=0.0)
+    later, _, _ = forecast(plan, stored, workers, None, planning_seconds=7.0)
+    # Two surfaces of about the same cost as those that took ten seconds, side by side.
+    assert 10 < seconds < 40
+    assert processor_seconds > seconds
+    assert 1.3 < twice / seconds <= 2
+    assert later == pytest.approx(seconds + 7.0)
+    assert first.endswith("for 2 missing fields, with 2 tasks at once")
+    assert second.endswith("of processor time; the speed is that of the 3 fields that are stored")
+
+
+def test_nothing_is_foretold_where_nothing_is_missing(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    def measured() -> float:
+        raise AssertionError("nothing needs to be measured")
+
+    monkeypatch.setattr("sobolev_batch.batch.dry_run.slowness", measured)
+    stored = records(plan, *(row.label for row in plan.rows), seconds=1.0)
+    found = forecast(plan, stored, Workers.of_this_machine(2), None, planning_seconds=3.0)
+    assert found == (0.0, 0.0, ["nothing is missing"])
+
+
+def test_meshes_that_take_long_to_make_count(plan: Plan) -> None:
+    fit = {"name": "fitted", "source": "fit", "mesh": {"source": "icosphere", "levels": [1]}}
+    fitted, *_ = make_plan(sb.Study.from_table(small_table(family=[fit]))).rows
+    fast, *_ = plan.rows
+    assert fitted.member.expected_size().seconds > 1 > fast.member.expected_size().seconds
+
+
+def test_workers_of_a_cluster_are_tried(client: Client, plan: Plan) -> None:
+    found = sb.plan(sb.Study.from_table(small_table()), "memory://forecast-cluster.zarr", client)
+    assert 0 < found.seconds <= found.processor_seconds < 60
+    *_, first, second = str(found).splitlines()
+    assert re.fullmatch(r"time: +about \d+(\.\d+)? s for 5 missing fields, with 2 tasks at once", first)
+    assert second.endswith("the speed is that of a transform on a worker")
+    assert "1 tiles, 2.4KB on disk" in str(found)
+
+
+def made_of(**families: Mapping[str, Any] | list[int]) -> list[dict[str, Any]]:
+    """Return families by name: icospheres of some levels, or sources."""
+    return [
+        {"name": name, **(source if isinstance(source, Mapping) else {"source": "icosphere", "levels": source})}
+        for name, source in families.items()
+    ]
+
+
+def files(*names: str) -> dict[str, Any]:
+    return {"source": "files", "paths": [*names]}
+
+
+COMMAND = {
+    "source": "command",
+    "mesh": {"source": "icosphere", "levels": [0]},
+    "command": ["cp", "{input}", "{output}"],
+}
+SIX, FIVE = (balls(**{f"ball{i}": 1.0 for i in range(count)}) for count in (6, 5))
+APART = "no common range of sizes: fine begins at 1,280, coarse ends at 80; methods cannot be ranked at equal triangles"
+FEW = "the test of a league cannot tell 2 methods from chance with"
+
+
+@pytest.mark.parametrize(
+    ("table", "expected"),
+    [
+        (small_table(), []),
+        (small_table(family=made_of(coarse=[0, 1], fine=[1, 2])), []),
+        # 80 and 320 triangles, and the rest.
+        (small_table(family=made_of(coarse=[0, 1], fine=[3, 4])), [APART]),
+        (
+            small_table(object=SIX, family=made_of(coarse=[1], fine=[3])),
+            [f"{APART} for 6 of 6 objects, such as ball0", FEW],
+        ),
+        # Not meant for a comparison by size, or not known.
+        (small_table(family=made_of(coarse=[1], fine=[3])), []),
+        (small_table(object=SIX, family=made_of(coarse=COMMAND, fine=[3])), []),
+        (small_table(object=SIX, family=made_of(coarse=files("80.ply"), fine=[3])), [APART, FEW]),
+        # The length of a file only suggests how many triangles it has.
+        (small_table(object=SIX, family=made_of(coarse=files("80.off"), fine=[2])), []),
+        (small_table(object=SIX, family=made_of(coarse=files("80.off"), fine=[5])), ["no common range", FEW]),
+        (small_table(object=SIX, family=methods_of()), []),
+        (small_table(object=FIVE, family=methods_of()), [f"{FEW} 5 objects; take 6 objects or more"]),
+        (small_table(object=FIVE, family=made_of(coarse=[1, 2])), []),
+    ],
+)
+def test_what_would_make_a_run_useless_is_told_before_it(
+    table: dict[str, Any], expected: list[str], tmp_path: Path
+) -> None:
+    for suffix in ("ply", "off"):
+        write_mesh(sb.shapes.icosphere(1), tmp_path / f"80.{suffix}")
+    made = (sb.StudyCollection if "object" in table else sb.Study).from_table(table, folder=tmp_path)
+    found = warnings_of(made, Location.parse(tmp_path / "s.zarr"))
+    assert len(found) == len(expected)
+    for line, beginning in zip(found, expected, strict=True):
+        assert line.startswith(beginning)
+        assert "\n" not in line
+
+
+def test_pairs_that_the_disk_has_no_place_for_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    place = Location.parse(tmp_path / "not" / "yet.zarr")
+    needed = 5**2 * 2 * 6 * 8
+
+    def found(free: int, **changes: Any) -> tuple[str, ...]:
+        monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=free, total=1))
+        return warnings_of(sb.Study.from_table(small_table(**changes)), place)
+
+    assert found(needed) == ()
+    (line,) = found(needed - 1)
+    assert f'2.4KB on disk, and 2.4KB are free at {place}; set pairs = "reference"' in line
+    assert found(0, compare=None) == ()
+    place.write({"distances/c/0": bytes(needed)})
+    assert found(0) == ()
+
+
+def test_a_plan_fits_the_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "60")
+    title = " ".join(["several words"] * 9)
+    found = sb.plan(sb.Study.from_table(small_table(study={"name": "small", "title": title})), tmp_path / ("x" * 60))
+    lines = str(found).splitlines()
+    assert {len(line) > 60 for line in lines if "x" * 60 not in line} == {False}
+    assert " ".join(str(found).split()).startswith(f"study: {title}")
+    assert lines[1].startswith(" " * 15)
+
+
+def test_warnings_come_first_in_commands_and_in_python(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "study.toml"
+    path.write_text(tomli_w.dumps(small_table(object=balls(a=1.0), family=methods_of())))
+    plan, run = (call(word, path, "--store", f"memory://warnings-{word}") for word in ("plan", "run"))
+    (warning,) = sb.plan(path, "memory://warnings-python").warnings
+    assert warning.startswith(f"{FEW} 1 object; ")
+    assert f"warning: {warning} " in f"{' '.join(plan.stdout.split())} "
+    assert run.stderr.startswith(f"warning: {warning}\n")
+    sb.run(path, "memory://warnings-python")
+    assert caplog.messages[0] == warning

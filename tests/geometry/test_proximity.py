@@ -1,0 +1,166 @@
+"""Hausdorff and Chamfer distances against geometry that is known, and against another library's search."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+import sobolev_batch as sb
+from sobolev_batch.geometry.proximity import MOST_POINTS, proximity
+
+
+def square(side: float, height: float = 0.0, *, stray: tuple[float, float, float] | None = None) -> sb.Mesh:
+    corners = [[-1, -1], [1, -1], [1, 1], [-1, 1]]
+    vertices = [[0.5 * side * x, 0.5 * side * y, height] for x, y in corners]
+    return sb.Mesh(np.array([*vertices, *([stray] if stray else [])], dtype=float), np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "hausdorff", "chamfer"),
+    [
+        (square(2.0), square(2.0, 0.25), 0.25, 0.5),
+        # A vertex that no triangle uses is not on the surface.
+        (square(2.0), square(2.0, 0.25, stray=(50.0, 0.0, 0.0)), 0.25, 0.5),
+        (sb.shapes.icosphere(3), sb.shapes.icosphere(3), 0.0, 0.0),
+    ],
+)
+def test_surfaces_that_are_parallel_or_the_same(a: sb.Mesh, b: sb.Mesh, hausdorff: float, chamfer: float) -> None:
+    found = proximity(a, b, points=500)
+    assert found["hausdorff"] == pytest.approx(hausdorff, rel=1e-12, abs=1e-15)
+    assert found["chamfer"] == pytest.approx(chamfer, rel=1e-12, abs=1e-15)
+    assert found["chamfer_error"] < 1e-12
+
+
+@pytest.mark.slow
+def test_a_square_within_a_larger_one() -> None:
+    found = proximity(square(2.0), square(4.0), points=200_000, threshold=0.5)
+    # The corner of the larger is the farthest point; from the smaller one all distances are zero.
+    assert found["hausdorff"] == found["hausdorff_backward"] == pytest.approx(np.sqrt(2), rel=1e-12)
+    assert found["hausdorff_forward"] == found["mean_forward"] == 0
+    # Mean over the square [-2, 2]²: four strips of mean 1/2 and four corner squares of mean
+    # (√2 + asinh 1)/3, over 16. Squares have the mean 1/3 in a strip and 2/3 in a corner.
+    exact = (4 * 2 * 0.5 + 4 * (np.sqrt(2) + np.arcsinh(1)) / 3) / 16
+    assert 0 < found["chamfer_error"] < 0.01
+    assert abs(found["chamfer"] - exact) < 4 * found["chamfer_error"]
+    assert abs(found["rms"] - np.sqrt(1 / 3)) < 4 * found["rms_error"] < 0.01
+    # A square with round corners is within the threshold.
+    recall = (4 + 4 * 2 * 0.5 + np.pi * 0.5**2) / 16
+    assert found["precision"] == 1
+    assert found["recall"] == pytest.approx(recall, abs=5e-3)
+    assert found["fscore"] == pytest.approx(2 * recall / (1 + recall), abs=5e-3)
+    # A quarter of the area is at a distance of 0, so half of it within the distance with (2 + 2d)² - (4 - π) d² = 8.
+    assert (4 + 8 * found["p50"] + np.pi * found["p50"] ** 2) / 16 == pytest.approx(0.5, abs=5e-3)
+    assert proximity(square(4.0), square(2.0), points=200_000)["hausdorff"] == found["hausdorff"]
+
+
+@pytest.mark.parametrize("flipped", [False, True])
+def test_planes_at_an_angle(flipped: bool) -> None:
+    flat, angle = square(2.0), np.radians(20)
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    tilted = sb.Mesh(flat.vertices @ turn, flat.triangles[:, ::-1] if flipped else flat.triangles)
+    found = proximity(tilted, flat, points=100)
+    assert (found["normal_mean"], found["normal_max"]) == pytest.approx((20, 20), rel=1e-12)
+    # The farthest point of the one is over the other, the mean height is half of it.
+    assert found["hausdorff_forward"] == pytest.approx(np.sin(angle), rel=1e-12)
+
+
+def test_concentric_spheres() -> None:
+    inner, outer = (
+        sb.Mesh(radius * sb.shapes.icosphere(5).vertices, sb.shapes.icosphere(5).triangles) for radius in (1, 1.5)
+    )
+    found = proximity(outer, inner, points=2000, threshold=0.4)
+    for name in ("hausdorff", "mean", "rms", "p50", "p99", "mean_forward", "mean_backward"):
+        assert found[name] == pytest.approx(0.5, abs=2e-3)
+    assert (found["fscore"], proximity(outer, inner, points=2000, threshold=0.6)["fscore"]) == (0, 1)
+    # Facets of 2.4 degrees or less.
+    assert found["normal_max"] < 2.5
+
+
+@pytest.mark.slow
+def test_the_error_is_that_of_the_drawing() -> None:
+    a, b = square(2.0), square(4.0)
+    exact = proximity(a, b, points=400_000)["chamfer"]
+    drawn = [proximity(a, b, points=400, seed=seed) for seed in range(60)]
+    deviations = np.array([found["chamfer"] - exact for found in drawn]) / [found["chamfer_error"] for found in drawn]
+    assert 0.7 < deviations.std() < 1.4
+    assert abs(deviations.mean()) < 0.5
+
+
+def test_distances_of_vertices_as_another_search_finds_them() -> None:
+    rng = np.random.default_rng(3)
+    a, b = (
+        sb.Mesh(rng.normal(size=(30, 3)), np.array([rng.choice(30, 3, replace=False) for _ in range(25)]))
+        for _ in range(2)
+    )
+    farthest = 0.0
+    for mesh, other in ((a, b), (b, a)):
+        surface = trimesh.Trimesh(other.vertices, other.triangles, process=False)
+        on_mesh = mesh.vertices[np.unique(mesh.triangles)]
+        _, distances, _ = trimesh.proximity.closest_point_naive(surface, on_mesh)
+        farthest = max(farthest, float(distances.max()))
+    found = proximity(a, b, points=2000)
+    assert farthest - 1e-12 <= found["hausdorff"] < 1.3 * farthest
+
+
+def test_triangles_of_all_sizes_are_searched() -> None:
+    rng = np.random.default_rng(8)
+    sizes = 10.0 ** rng.uniform(-3, 1, size=(400, 1, 1))
+    corners = rng.normal(size=(400, 1, 3)) + sizes * rng.normal(size=(400, 3, 3)) * [1, 1, 0.01]
+    many = sb.Mesh(corners.reshape(-1, 3), np.arange(1200).reshape(-1, 3))
+    points = sb.Mesh(np.vstack([3 * rng.normal(size=(300, 3)), [[9.0, 9.0, 9.0]]]), np.arange(300).reshape(-1, 3))
+    surface = trimesh.Trimesh(many.vertices, many.triangles, process=False)
+    _, expected, _ = trimesh.proximity.closest_point_naive(surface, points.vertices[:300])
+    found = sb.vertex_distances(points, many)
+    assert found[:300] == pytest.approx(expected, rel=1e-9, abs=1e-12)
+    assert np.isnan(found[300])
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 25.4])
+def test_vertices_of_spheres_and_plates_have_distances_in_closed_form(unit: float) -> None:
+    ball = sb.shapes.icosphere(3)
+    inner, outer = (sb.Mesh(unit * radius * ball.vertices + 7 * unit, ball.triangles) for radius in (1.0, 1.5))
+    # The closest point of a convex body is its vertex on the same ray.
+    assert sb.vertex_distances(outer, inner) == pytest.approx(np.full(len(ball.vertices), 0.5 * unit), rel=1e-12)
+    # From within a convex body the closest plane of a triangle decides.
+    first, second, third = ball.corners()
+    normals = np.cross(second - first, third - first)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    heights = 1.5 * (normals * first).sum(axis=1) - ball.vertices @ normals.T
+    assert sb.vertex_distances(inner, outer) == pytest.approx(unit * heights.min(axis=1), rel=1e-12)
+    plate, raised = square(2.0 * unit), square(2.0 * unit, 0.25 * unit, stray=(9.0, 9.0, 9.0))
+    assert sb.vertex_distances(plate, raised) == pytest.approx(np.full(4, 0.25 * unit), rel=1e-12)
+    assert sb.vertex_distances(raised, plate)[:4] == pytest.approx(np.full(4, 0.25 * unit), rel=1e-12)
+    # A larger plate reaches beyond a smaller one: its corners have a diagonal to go.
+    larger = square(8.0 * unit, 4.0 * unit)
+    assert sb.vertex_distances(larger, plate) == pytest.approx(np.full(4, np.sqrt(9 + 9 + 16) * unit), rel=1e-12)
+
+
+def test_distances_of_vertices_are_measured_between_meshes_alone() -> None:
+    with pytest.raises(sb.errors.InputError, match="mesh"):
+        sb.vertex_distances(sb.shapes.icosphere(1), sb.shapes.Sphere())
+
+
+@pytest.mark.parametrize("scale", [1e-60, 1e-12, 1.0, 1e12, 1e60])
+def test_lengths_scale(scale: float) -> None:
+    a, b = square(2.0), square(3.0, 0.25)
+    plain = proximity(a, b, points=300)
+    scaled = proximity(*(sb.Mesh(scale * mesh.vertices, mesh.triangles) for mesh in (a, b)), points=300)
+    assert scaled["hausdorff"] == pytest.approx(scale * plain["hausdorff"], rel=1e-9)
+    assert scaled["chamfer"] == pytest.approx(scale * plain["chamfer"], rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("key", "values", "message"),
+    [
+        ("points", [0, 1, -5, MOST_POINTS + 1, 2.5, True], "points must be an integer"),
+        ("threshold", [0, -1.0, np.nan, np.inf, "1"], "threshold must be a positive number"),
+        ("seed", [-1, 0.5, "1", True, None], "seed must be a whole number from 0 on"),
+    ],
+)
+def test_wrong_points_and_seeds_are_refused(key: str, values: list[Any], message: str) -> None:
+    for value in values:
+        with pytest.raises(sb.errors.InputError, match=message):
+            proximity(square(1.0), square(2.0), **{key: value})

@@ -1,0 +1,121 @@
+"""Distances of meshes that have much in common, in other triangles: what cancels costs nothing and hides nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.special import gamma
+from scipy.stats import special_ortho_group
+
+import sobolev_batch as sb
+from sobolev_batch.norms.accuracy.problem import Problem, are_equal
+from sobolev_batch.norms.accuracy.solve import solve
+from sobolev_batch.norms.accuracy.tolerance import Accuracy
+from sobolev_batch.norms.budget import norm_of_moves
+from tests.support.rectangles import Rectangles
+
+BOX = Rectangles.box([0.0, 0.0, 0.0], [1.0, 0.8, 0.5])
+BOSS = Rectangles.box([0.3, 0.4, 0.5], [0.34, 0.44, 0.54])
+TURN: NDArray[np.float64] = special_ortho_group.rvs(3, random_state=np.random.default_rng(4))
+
+
+def cut_anew(mesh: sb.Mesh, seed: int) -> sb.Mesh:
+    """Each triangle in three, around a random point of it."""
+    shares = np.random.default_rng(seed).dirichlet([2, 2, 2], size=len(mesh.triangles))
+    middles = np.einsum("ij,jik->ik", shares, np.array(mesh.corners()))
+    number, n = np.arange(len(mesh.triangles)), len(mesh.vertices)
+    thirds = [np.c_[mesh.triangles[:, [k, (k + 1) % 3]], n + number] for k in range(3)]
+    return sb.Mesh(np.concatenate([mesh.vertices, middles]), np.concatenate(thirds))
+
+
+def turned(mesh: sb.Mesh, *, single: bool = False) -> sb.Mesh:
+    vertices = mesh.vertices @ TURN
+    return sb.Mesh(vertices.astype(np.float32) if single else vertices, mesh.triangles)
+
+
+def part_and_edited() -> tuple[sb.Mesh, sb.Mesh]:
+    """A box, and the same with a boss whose bottom covers it once more, in other triangles."""
+    return turned(BOX.mesh()), turned(cut_anew(BOX.joined(BOSS).mesh(), 1))
+
+
+# A small edit costs as little as its own faces.
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [-0.75, -1.0, -2.0])
+def test_an_edit_of_a_part_is_measured_by_what_it_adds(order: float) -> None:
+    first, second = part_and_edited()
+    true, nothing = (
+        sb.norm(BOSS.mesh(), order, rtol=1e-2),
+        sb.distance(first, turned(cut_anew(BOX.mesh(), 2)), order, rtol=0.1),
+    )
+    found = sb.distance(second, first, order, rtol=0.05)
+    gap = abs(found["distance"] - true["norm"])
+    assert gap <= found["error"] + true["error"]
+    assert found["within"]
+    assert nothing["distance"] == 0
+    # The reference is whole.
+    own = sb.norm(BOX.mesh(), order, rtol=1e-2)
+    relative = found["distance"] / own["norm"]
+    assert abs(found["relative"] - relative) <= found["relative_error"] + relative * own["error"] / own["norm"]
+    product = sb.distance(turned(BOX.joined(BOSS).mesh()), first, order, rtol=0.01)
+    assert abs(found["area_share"] - product["area_share"]) <= found["area_share_error"] + product["area_share_error"]
+
+
+def test_only_what_differs_is_computed() -> None:
+    first, second = part_and_edited()
+    problem = Problem.from_surfaces([second, first], (-2.0,), Accuracy(0.1), "the distance", 1)
+    (boss,) = problem.surfaces
+    assert problem.signs == (1,)
+    assert boss.area == pytest.approx(BOSS.mesh().area, rel=1e-10)
+    assert [surface.area for surface in problem.pair] == pytest.approx([second.area, first.area])
+
+
+def test_edits_far_apart_on_one_part_are_no_surfaces_far_apart() -> None:
+    """The norm of the reference is not among theirs."""
+    plate = Rectangles.from_corners(([0.0, 0.0, 0.0], [12.0, 1.0, 0.0]))
+    ends = [Rectangles.box([x, 0.4, 0.0], [x + 0.1, 0.5, 0.1]) for x in (0.1, 11.8)]
+    first, second = (cut_anew(plate.joined(end).mesh(), seed) for seed, end in enumerate(ends))
+    problem = Problem.from_surfaces([first, second], (-2.0,), Accuracy(0.1), "the distance", 1)
+    assert problem.area == pytest.approx(sum(end.mesh().area for end in ends))
+    assert problem.apart is None
+
+
+def test_equal_surfaces_are_equal_in_any_triangles() -> None:
+    first, second = part_and_edited()
+    assert are_equal(first, turned(cut_anew(BOX.mesh(), 5)))
+    assert not are_equal(first, second)
+    smaller = sb.Mesh(first.vertices * (1 + 1e-9), first.triangles)
+    assert not are_equal(first, smaller)
+    lattice = sb.Lattice(3.0, 24)
+    assert sb.distance(first, turned(cut_anew(BOX.mesh(), 5)), -2.0, lattice=lattice)["distance"] == 0
+
+
+def test_faces_apart_by_single_precision_are_left_out_with_an_error() -> None:
+    first, second = (turned(mesh, single=True) for mesh in (BOX.mesh(), cut_anew(BOX.joined(BOSS).mesh(), 1)))
+    low = Problem.from_surfaces([second, first], (-3.0,), Accuracy(0.1), "the distance", 1)
+    assert low.area < 2 * BOSS.mesh().area
+    assert 0 < np.max(low.moved) < 1e-5
+    found, true = sb.distance(second, first, -3.0, rtol=0.1), sb.norm(BOSS.mesh(), -3.0, rtol=1e-3)
+    assert abs(found["distance"] - true["norm"]) <= found["error"] + true["error"]
+    with_error, without = (solve(problem).estimate.errors for problem in (low, replace(low, moved=0.0)))
+    assert with_error > without
+    # At high orders it is no small error that these faces are apart.
+    high = Problem.from_surfaces([second, first], (-0.6,), Accuracy(0.1), "the distance", 1)
+    assert high.area > BOX.mesh().area
+    assert high.moved == 0
+
+
+@pytest.mark.parametrize("order", [-0.6, -0.75, -1.0, -1.5, -2.0, -4.0])
+def test_moved_faces_change_no_norm_by_more_than_the_bound(order: float) -> None:
+    plate = Rectangles.from_corners(([0.0, 0.0, 0.0], [1.0, 1.0, 0.0]))
+    for gap in (1e-2, 1e-4):
+        squared, uncertainty = plate.squared_distance(plate.moved(0.0, 0.0, gap), [order])
+        bound = norm_of_moves(np.ones(1), np.array([gap]), [order]).item()
+        assert bound**2 >= squared.item() - uncertainty.item()
+        assert bound**2 <= 3 * (squared.item() + uncertainty.item())
+    # However far apart, no plate is more than this from another one, and bounds of planes add.
+    far = 2 * np.sqrt(np.sqrt(np.pi) * gamma(-order - 0.5) / gamma(-order))
+    found = norm_of_moves(np.ones(3), np.array([1e9, 0.0, 1e9]), [order]).item()
+    assert found == pytest.approx(2 * far)

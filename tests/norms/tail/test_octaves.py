@@ -1,0 +1,209 @@
+"""Octaves: the partition, random lattices, drawn frequencies, and the sums over them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.integrate import quad
+
+from sobolev_batch import Mesh
+from sobolev_batch.geometry.surface import Surface
+from sobolev_batch.norms.tail.sampling import FaceNormals, Octave, OctaveSampling, TailSampling
+from sobolev_batch.norms.tail.values import (
+    OctaveSums,
+    OctaveValues,
+    OctaveWeights,
+    octave_values,
+    settings_for,
+    squared_moduli,
+    statistical_errors,
+)
+from sobolev_batch.shapes import Sphere, Torus, icosphere
+from sobolev_batch.transform.exact import exact_transform, sphere_transform
+from sobolev_batch.transform.fourier import ErrorTarget
+from sobolev_batch.transform.lattice import smooth_step
+from tests.support.oracles import torus_value
+from tests.support.rectangles import Rectangles
+
+Reals = NDArray[np.float64]
+
+OCTAVE = Octave(2.0, 1)
+ORDERS = (-1.0, -2.0)
+BOX = Rectangles.box((-0.5, -0.3, -0.2), (0.5, 0.3, 0.2)).mesh()
+TARGET = ErrorTarget(ORDERS, (1e-4, 1e-4))
+
+
+def sampling_of(surface: Surface, seed: int, intervals: int = 16, draws: int = 200) -> OctaveSampling:
+    sizes, rng = [intervals] if intervals else [], np.random.default_rng(seed)
+    found = OctaveSampling.random(OCTAVE, sizes, draws, FaceNormals.from_surfaces([surface]), 0.3, rng)
+    return replace(found, seed=seed)
+
+
+def values_of(surface: Surface, sampling: OctaveSampling, known: OctaveValues | None = None) -> OctaveValues:
+    return octave_values(surface, sampling, ORDERS, settings_for(TARGET), known=known)
+
+
+def sums_of(surface: Surface, sampling: OctaveSampling) -> OctaveSums:
+    return OctaveWeights(sampling, ORDERS).sums(squared_moduli(values_of(surface, sampling).values))
+
+
+def sphere_integral(order: float) -> float:
+    """∫ window (1+r²)^s |σ^|² over an octave, for the unit sphere."""
+
+    def integrand(r: float) -> float:
+        value = 2 * np.sin(2 * np.pi * r) / r
+        return float(OCTAVE.window(np.array(r)) * (1 + r * r) ** order * value**2 * 4 * np.pi * r * r)
+
+    return float(quad(integrand, OCTAVE.lowest, OCTAVE.highest, limit=200)[0])
+
+
+def test_the_ball_and_its_octaves_are_a_partition_of_one() -> None:
+    radii = np.linspace(0, 60, 2001)
+    octaves = [Octave(5.0, index) for index in range(1, 5)]
+    total = smooth_step(radii, 5.0) + sum(octave.window(radii) for octave in octaves)
+    assert total == pytest.approx(smooth_step(radii, octaves[-1].highest), abs=1e-15)
+    assert (total[radii <= 40] == 1).all()
+    for octave in octaves:
+        assert not octave.window(radii[(radii <= octave.lowest) | (radii >= octave.highest)]).any()
+
+
+@pytest.mark.parametrize("surface", [icosphere(2), Sphere(0.8, (0.1, 0.2, -0.4)), Torus(0.8, 0.3), BOX])
+def test_values_on_a_random_lattice_are_those_at_its_frequencies(surface: Surface) -> None:
+    sampling = sampling_of(surface, 3)
+    values = values_of(surface, sampling)
+    chosen = np.random.default_rng(0).integers(sampling.parts[0].samples.stop, size=20)
+    frequencies = sampling.frequencies[chosen]
+    if isinstance(surface, Mesh):
+        expected = exact_transform(surface, frequencies)
+    elif isinstance(surface, Sphere):
+        expected = sphere_transform(surface, frequencies)
+    else:
+        expected = np.array([torus_value(0.8, 0.3, float(np.hypot(x, y)), float(z)) + 0j for x, y, z in frequencies])
+    assert np.abs(values.values[chosen] - expected).max() < 1e-4 * surface.area
+    assert (values.error_norms(ORDERS) <= 10 * np.array(TARGET.norms)).all()
+
+
+@pytest.mark.parametrize(("intervals", "draws"), [(8, 0), (12, 0), (0, 400), (8, 300)])
+def test_sums_over_an_octave_are_right_within_their_standard_errors(intervals: int, draws: int) -> None:
+    # The lattice is far too coarse for the sphere: every image overlaps the next.
+    expected = np.array([sphere_integral(order) for order in ORDERS])
+    found = [sums_of(Sphere(), sampling_of(Sphere(), seed, intervals, draws)) for seed in range(60)]
+    misses = np.array([sums.squares - expected for sums in found])
+    # Without a random shift, or with wrong weights, the mean would be off by many standard errors of a mean.
+    assert (np.abs(misses.mean(axis=0)) < 4 / np.sqrt(60) * misses.std(axis=0)).all()
+    assert np.mean(np.abs(misses) < 3 * np.sqrt([sums.variances for sums in found])) > 0.95
+
+
+def test_draws_follow_their_density() -> None:
+    assert FaceNormals.from_surfaces([icosphere(0)])
+    # Curved surfaces have none.
+    assert not FaceNormals.from_surfaces([icosphere(4), Sphere()])
+    normals = FaceNormals.from_surfaces([BOX])
+    assert len(normals.shares) == 3
+    assert normals.shares.sum() == pytest.approx(1)
+    rng = np.random.default_rng(0)
+    uniform = rng.normal(size=(200_000, 3))
+    uniform /= np.linalg.norm(uniform, axis=1, keepdims=True)
+    radii = np.full(len(uniform), 4.0)
+    density = 4 * np.pi * normals.density(uniform, radii)
+    assert density.mean() == pytest.approx(1, rel=0.02)
+    drawn = normals.draw(radii, rng)
+    assert np.linalg.norm(drawn, axis=1) == pytest.approx(1)
+    for powers in ((2, 0, 0), (0, 0, 8), (0, 2, 2)):
+        moment = np.prod(drawn**powers, axis=1).mean()
+        assert moment == pytest.approx((np.prod(uniform**powers, axis=1) * density).mean(), rel=0.03)
+
+
+def test_draws_around_normals_make_flat_faces_quick_to_sample() -> None:
+    octave = Octave(40.0, 1)
+    deviations = []
+    for normals in (FaceNormals.from_surfaces([BOX]), FaceNormals.from_surfaces([Sphere()])):
+        sums = sums_of(BOX, OctaveSampling(octave, (), 2000, 0, normals, 0.3))
+        deviations.append(sums.energy_deviation / sums.energy)
+    assert deviations[0] < 0.1
+    assert deviations[1] > 3 * deviations[0]
+
+
+def test_known_values_are_not_computed_again() -> None:
+    sampling = sampling_of(BOX, 0)
+    known = values_of(BOX, sampling)
+    more = replace(sampling, lattices=(*sampling.lattices, *sampling_of(BOX, 1).lattices))
+    # What is known is taken as it is, wrong or right.
+    marked = replace(known, values=known.values + 1)
+    found, fresh = values_of(BOX, more, marked), values_of(BOX, more)
+    (lattice, drawn), (first, second, last) = sampling.parts, more.parts
+    assert (found.values[first.samples] == marked.values[lattice.samples]).all()
+    assert (found.values[last.samples] == marked.values[drawn.samples]).all()
+    assert found.values[second.samples] == pytest.approx(fresh.values[second.samples], abs=1e-12)
+    assert len(found.radii) == 2 * len(known.radii)
+    other_draws = replace(sampling, seed=7)
+    again = values_of(BOX, other_draws, marked)
+    assert again.values[drawn.samples] == pytest.approx(values_of(BOX, other_draws).values[drawn.samples], abs=1e-12)
+
+
+def test_statistical_errors_grow_with_few_degrees_of_freedom() -> None:
+    few, many = (sums_of(BOX, sampling) for sampling in (sampling_of(BOX, 0, 16, 0), sampling_of(BOX, 0, 0, 2000)))
+    assert (statistical_errors([few]) / np.sqrt(few.variances) > 3.4).all()
+    assert (statistical_errors([many]) / np.sqrt(many.variances) < 2.7).all()
+    # Eight sublattices that carry the variance have no more degrees of freedom for many draws beside them.
+    mixed = replace(few, parts=few.parts[0] * np.array([[1.0], [1e-6]]), degrees=np.array([few.degrees[0], 2000]))
+    assert (statistical_errors([mixed]) / np.sqrt(mixed.variances) > 3.4).all()
+
+
+def test_one_sample_that_carries_the_sum_may_stand_for_others() -> None:
+    squares = np.zeros(400)
+    squares[7] = 1.0
+    weights = OctaveWeights(sampling_of(BOX, 0, 0, 400), ORDERS)
+    sums = weights.sums(squares)
+    assert (sums.variances >= 1.9 * weights.integrals(squares) ** 2).all()
+
+
+def test_wrong_values_have_large_errors() -> None:
+    values = values_of(icosphere(2), sampling_of(icosphere(2), 0))
+    off = values_of(icosphere(2), values.sampling, replace(values, values=values.values + 0.1))
+    window = OCTAVE.highest - OCTAVE.lowest
+    for order, norm in zip(ORDERS, off.error_norms(ORDERS), strict=True):
+        radii = np.linspace(OCTAVE.lowest, OCTAVE.highest, 1001)
+        square = np.mean(OCTAVE.window(radii) * (1 + radii**2) ** order * 0.01 * 4 * np.pi * radii**2) * window
+        assert 0.8 * np.sqrt(square) < norm < 4 * np.sqrt(square)
+
+
+def sizes_of(sampling: TailSampling) -> list[int]:
+    return [lattice.M for one in sampling.octaves for lattice in one.lattices]
+
+
+def test_joined_samplings_serve_the_most_demanding_pilot_in_each_octave() -> None:
+    first, second = TailSampling.usual(4.0, 2, [BOX]), TailSampling.usual(4.0, 3, [BOX], seed=1)
+    large = [replace(one, lattices=tuple(replace(lattice, M=96) for lattice in one.lattices)) for one in first.octaves]
+    fewer, fewest = ([replace(one, draws=n) for one in it.octaves] for it, n in ((first, 900), (second, 700)))
+    normals = FaceNormals.from_surfaces([BOX])
+    joined = TailSampling.joined(4.0, [large, fewest, fewer], normals)
+    assert sizes_of(joined) == [96, 96, 64]
+    assert [one.draws for one in joined.octaves] == [20_000, 20_000, 700]
+    assert [one.draws for one in TailSampling.joined(4.0, [fewer, fewest], normals).octaves] == [900, 900, 700]
+
+
+def test_refined_samplings_have_more_samples_within_the_largest_lattice() -> None:
+    usual = TailSampling.usual(4.0, 2, [BOX])
+    refined = usual.refined(8.0, 1, 1000, seed=3)
+    assert sizes_of(refined) == [128, 128, 128]
+    assert [one.draws for one in refined.octaves] == [160_000] * 3
+    assert refined.octaves[-1].octave.highest == 2 * usual.highest_frequency
+    assert sizes_of(usual.refined(8.0, 0, 70, seed=3)) == [70, 70]
+    # A lattice that is larger already stays.
+    assert sizes_of(usual.refined(8.0, 0, 38, seed=3)) == [64, 64]
+
+
+def test_samples_follow_from_the_seed_differ_in_each_octave_and_survive_storage() -> None:
+    first, again, other = (TailSampling.usual(4.0, 2, [BOX], seed=seed) for seed in (0, 0, 1))
+    stored = TailSampling.from_table(json.loads(json.dumps(first.to_table())))
+    assert stored.digest == first.digest == again.digest != other.digest
+    for same in (again, stored):
+        assert np.array_equal(same.frequencies, first.frequencies)
+        assert np.array_equal(same.weights, first.weights)
+    offsets = [one.lattices[0].offset for one in first.octaves]
+    assert offsets[0] != offsets[1]

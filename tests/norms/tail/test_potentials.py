@@ -1,0 +1,104 @@
+"""Potentials by the kernel beyond a frequency: compiled loops say what arrays say, and neither looks at too little."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sobolev_batch import Mesh
+from sobolev_batch.norms.tail import potentials
+from sobolev_batch.norms.tail.potentials import Kernels, add_compiled, of_triangles
+from sobolev_batch.norms.tail.remainder import remainder
+from tests.support.rectangles import Rectangles
+
+Reals = NDArray[np.float64]
+ORDERS = (-0.75, -1.0, -3.0)
+CUTOFF = 12.0
+
+
+@pytest.fixture(params=["random", "slivers", "points", "edges", "on a corner", "far away", "NaN"])
+def triangles(request: pytest.FixtureRequest) -> tuple[Reals, Reals]:
+    """Points (n, 3) beside triangles (m, 3, 3) that would be hard."""
+    rng = np.random.default_rng(7)
+    points = 0.3 * rng.normal(size=(60, 3))
+    corners = points[:, None] + 10.0 ** rng.uniform(-3, 0.5, (60, 1, 1)) * rng.normal(size=(60, 3, 3))
+    if request.param == "slivers":
+        corners[:, 2] = corners[:, 1] + 1e-7 * rng.normal(size=(60, 3))
+    elif request.param == "points":
+        corners = points[:, None] + 1e-9 * rng.normal(size=(60, 3, 3))
+    elif request.param == "edges":
+        points = (0.3 * corners[:, 0] + 0.7 * corners[:, 1]).copy()
+    elif request.param == "on a corner":
+        points = corners[:, 0].copy()
+    elif request.param == "far away":
+        points, corners = points + 1e6, corners + 1e6
+    elif request.param == "NaN":
+        points[::7, 1] = np.nan
+    return points, corners
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fineness", [1, 2])
+def test_loops_and_arrays_agree(triangles: tuple[Reals, Reals], fineness: int) -> None:
+    points, corners = triangles
+    kernels, rows = Kernels.of_orders(CUTOFF, ORDERS, fineness), np.arange(len(points))
+    by_arrays = of_triangles(points, corners, kernels)
+    assert np.nanmax(np.abs(by_arrays)) > 0
+    for threads in (1, 2):
+        found = np.zeros_like(by_arrays)
+        add_compiled(found, points, corners, (rows, rows), 1.0, kernels, threads)
+        assert np.allclose(found, by_arrays, rtol=0, atol=1e-11 * kernels.totals, equal_nan=True)
+
+
+def test_the_kernel_of_an_order_does_not_depend_on_other_orders() -> None:
+    rng = np.random.default_rng(3)
+    points, corners = rng.normal(size=(200, 3)), rng.normal(size=(200, 3, 3))
+    alone = of_triangles(points, corners, Kernels.of_orders(CUTOFF, [-1.0]))
+    beside = of_triangles(points, corners, Kernels.of_orders(CUTOFF, [-1.0, -4.0]))
+    assert np.allclose(alone[:, 0], beside[:, 0], rtol=0, atol=1e-4 * np.abs(alone).max())
+
+
+def rectangles(*corners: tuple[tuple[float, float, float], ...]) -> Mesh:
+    first = 4 * np.arange(len(corners))[:, None]
+    return Mesh(
+        np.array(corners).reshape(-1, 3), np.concatenate([first + np.array(cut) for cut in ([0, 1, 2], [0, 2, 3])])
+    )
+
+
+def level(a: float, b: float, c: float, d: float, z: float = 0.0) -> tuple[tuple[float, float, float], ...]:
+    return ((a, b, z), (c, b, z), (c, d, z), (a, d, z))
+
+
+def edited(width: float) -> tuple[Mesh, Mesh, Mesh, Mesh]:
+    """A plate, the same cut anew with a box on it, and what each of them has alone."""
+    x, y, u, v = 0.3, 0.4, 0.3 + width, 0.4 + width
+    around = [level(0, 0, x, 1), level(u, 0, 1, 1), level(x, 0, u, y), level(x, v, u, 1)]
+    ring = [(x, y), (u, y), (u, v), (x, v)]
+    sides = [((*p, 0.0), (*q, 0.0), (*q, width), (*p, width)) for p, q in zip(ring, ring[1:] + ring[:1], strict=True)]
+    box = [*sides, level(x, y, u, v, width)]
+    return rectangles(level(0, 0, 1, 1)), rectangles(*around, *box), rectangles(level(x, y, u, v)), rectangles(*box)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("width", "relative"), [(0.005, np.inf), (0.01, 4.0), (0.06, 0.6)])
+def test_no_edit_of_a_face_that_is_cut_anew_escapes(width: float, relative: float) -> None:
+    whole, changed, gone, added = edited(width)
+    truth, of_truth = remainder([gone, added], [1, -1], 60.0, [-0.75, -1.0], points=4000).at([-0.75, -1.0])
+    for seed in range(10):
+        value, error = remainder([whole, changed], [1, -1], 60.0, [-0.75, -1.0], seed=seed).at([-0.75, -1.0])
+        assert (np.abs(value - truth) < error + of_truth).all()
+        assert (error < relative * truth).all()
+        # Too few points may not meet the edit, and say so.
+        value, error = remainder([whole, changed], [1, -1], 60.0, [-0.75], points=64, seed=seed).at([-0.75])
+        assert abs(value[0] - truth[0]) < error[0]
+
+
+@pytest.mark.slow
+def test_nodes_that_are_too_few_along_edges_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    rods = [Rectangles.box((-0.5, y, 0.0), (0.5, y + 1e-3, 1e-3)).mesh() for y in (0.0, 2e-3)]
+    truth, of_truth = remainder(rods, [1, -1], 12.0, [-2.0], points=4000).at([-2.0])
+    monkeypatch.setattr(potentials, "_PANEL", 2.4)
+    monkeypatch.setattr(potentials, "_PANEL_WAVES", 3.0)
+    value, error = remainder(rods, [1, -1], 12.0, [-2.0], points=4000).at([-2.0])
+    assert abs(value - truth) < error + of_truth < truth

@@ -1,0 +1,93 @@
+"""What lies beyond a frequency, against closed forms and heat traces."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import sobolev_batch as sb
+from sobolev_batch import Mesh
+from sobolev_batch.geometry.surface import Surface
+from sobolev_batch.norms.fields import Quality, TailQuality
+from sobolev_batch.norms.tail.remainder import remainder
+from sobolev_batch.shapes import Sphere
+from sobolev_batch.transform.probe import Probe
+from tests.support.rectangles import Rectangles
+
+BOX = Rectangles.box((-0.5, -0.3, -0.2), (0.5, 0.3, 0.2)).mesh()
+ORDERS = (-0.55, -1.0, -2.0)
+
+
+# Half a pitch apart, plates at a pitch of 1/20 differ from |ξ| = 20 on only.
+PLATES, MOVED = (Rectangles.tapered(40, 1 / 20, 0.2, offset) for offset in (0.0, 0.5))
+
+
+def test_energies_of_one_surface_are_twice_its_area() -> None:
+    for surface in (BOX, Sphere(0.7, (0.1, 0.2, 0.3)), sb.shapes.Torus(1.0, 0.4)):
+        beyond = remainder([surface], [1], 60.0, ORDERS, points=200)
+        assert np.allclose(beyond.energies, 2 * surface.area, rtol=0.02), surface
+
+
+def test_what_two_surfaces_share_cancels() -> None:
+    same = Mesh(BOX.vertices, BOX.triangles)
+    assert np.allclose(remainder([BOX, same], [1, -1], 60.0, ORDERS).energies, 0, atol=1e-9)
+    # Moved along x by a quarter of its length: three quarters of the four long faces coincide.
+    moved = Mesh(BOX.vertices + np.array([0.25, 0, 0]), BOX.triangles)
+    beyond = remainder([BOX, moved], [1, -1], 300.0, ORDERS)
+    expected = 2 * (2 * BOX.area - 2 * 0.75 * 2 * (1.0 * 0.6 + 1.0 * 0.4))
+    assert np.all(np.abs(np.array(beyond.energies) - expected) < np.array(beyond.errors) + 0.01 * expected)
+
+
+def test_a_part_that_lies_there_twice_weighs_four_times_as_much() -> None:
+    twice = Mesh(np.concatenate([BOX.vertices] * 2), np.concatenate([BOX.triangles, BOX.triangles + len(BOX.vertices)]))
+    assert np.allclose(remainder([twice], [1], 60.0, ORDERS).energies, 8 * BOX.area, rtol=0.02)
+
+
+def test_one_rectangle_cut_along_either_diagonal_is_the_same_surface() -> None:
+    along, across = np.array([3.0, 5.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    corners = 0.7 * np.array([np.zeros(3), along, along + across, across]) + np.array([0.1, 0.2, 0.3])
+    for flipped in ([[0, 1, 3], [1, 2, 3]], [[3, 1, 0], [1, 2, 3]], [[3, 1, 0], [3, 2, 1]]):
+        beyond = remainder([Mesh(corners, [[0, 1, 2], [0, 2, 3]]), Mesh(corners, flipped)], [1, -1], 20.0, ORDERS)
+        assert np.allclose(beyond.energies, 0, atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [-0.7, -1.0, -2.0, -3.0, -4.0])
+def test_periods_beyond_the_cutoff_are_seen(order: float) -> None:
+    square, _ = PLATES.squared_distance(MOVED, [order])
+    meshes = [PLATES.mesh(), MOVED.mesh()]
+    for seed, cutoff in enumerate((8.0, 6.5)):
+        (value,), (error,) = remainder(meshes, [1, -1], cutoff, [order], seed=seed).at([order])
+        assert abs(value - square.item()) < error < 0.1 * value
+
+
+@pytest.mark.slow
+def test_lower_orders_are_bounded_by_the_lowest_one_that_is_computed() -> None:
+    pair = [PLATES.mesh(), MOVED.mesh()]
+    (value,), (error,) = remainder(pair, [1, -1], 12.0, [-6.0]).at([-6.0])
+    square, _ = PLATES.squared_distance(MOVED, [-6.0])
+    assert value - error <= square.item() <= value + error
+
+
+def test_vertices_that_no_triangle_uses_and_triangles_without_area_do_not_matter() -> None:
+    stray = Mesh(np.concatenate([BOX.vertices, [[1e8, 0, 0]]]), np.concatenate([BOX.triangles, [[0, 0, 1]]]))
+    assert remainder([stray], [1], 60.0, ORDERS).energies == pytest.approx(remainder([BOX], [1], 60.0, ORDERS).energies)
+
+
+def test_a_remainder_survives_the_quality_of_a_field() -> None:
+    beyond = remainder([BOX], [1], 60.0, ORDERS, points=100)
+    for difference in (beyond, None):
+        quality = Quality.from_surface(BOX, Probe((1, 2), (0.5, 0.25)))
+        quality = replace(quality, tail=TailQuality((1.0,), (2.0,), beyond, difference))
+        assert Quality.from_json(quality.to_json()) == quality
+
+
+def test_between_the_orders_of_a_study_energies_are_interpolated() -> None:
+    pair: list[Surface] = [sb.shapes.icosphere(3), Sphere()]
+    usual = remainder(pair, [1, -1], 60.0, points=1000)
+    for order in (-0.6, -0.85, -1.25, -1.75, -2.5):
+        (value,), (error,) = usual.at([order])
+        (other,), (other_error,) = remainder(pair, [1, -1], 60.0, [order], points=1000).at([order])
+        assert abs(value - other) < 0.03 * other + 0.1 * (error + other_error)

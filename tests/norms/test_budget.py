@@ -1,0 +1,152 @@
+"""Errors of norms and distances: they cover the truth, and are not many times larger."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sobolev_batch import Lattice, Mesh, distance, fourier_transform, norm
+from sobolev_batch.geometry.surface import Surface
+from sobolev_batch.norms.budget import NormEstimate, Sums, Support, truncated
+from sobolev_batch.norms.fields import Quality
+from sobolev_batch.shapes import Sphere, icosphere
+from sobolev_batch.transform.exact import sphere_distance, sphere_inner_product
+from sobolev_batch.transform.lattice import SobolevWeights
+from sobolev_batch.transform.probe import draw
+from tests.support.shapes import CENTRED_BOX as BOX
+
+Reals = NDArray[np.float64]
+
+ORDERS = (-2.0, -3.0, -5.0, -10.0)
+STICK = Mesh(BOX.vertices * np.array([1.0, 0.15, 0.1]), BOX.triangles)
+PAIRS: dict[str, tuple[Surface, Surface]] = {
+    "icosphere and sphere": (icosphere(2), Sphere()),
+    "icospheres": (icosphere(0), icosphere(1)),
+    "box and sphere": (BOX, Sphere()),
+    "boxes": (BOX, Mesh(0.9 * BOX.vertices, BOX.triangles)),
+    "sticks": (STICK, Mesh(0.97 * STICK.vertices, STICK.triangles)),
+    "moved spheres": (Sphere(0.8, (0.2, 0.0, 0.0)), Sphere(0.8, (-0.2, 0.0, 0.0))),
+    "near spheres": (Sphere(0.8), Sphere(0.79)),
+}
+FINE = Lattice(16.0, 128)
+COARSE = (Lattice(2.0, 12), Lattice(3.0, 20), Lattice(4.0, 24), Lattice(4.0, 36), Lattice(6.0, 54))
+
+
+@pytest.mark.slow
+def test_reported_errors_cover_the_true_ones_and_stay_near_them() -> None:
+    ratios = []
+    for name, (a, b) in PAIRS.items():
+        truth = distance(a, b, ORDERS, lattice=FINE)
+        for lattice in COARSE:
+            dataset = distance(a, b, ORDERS, lattice=lattice)
+            true_errors = np.abs(dataset["distance"].values - truth["distance"].values)
+            # Where the fine lattice cannot tell, there is nothing to compare with.
+            telling = true_errors > 20 * truth["error"].values
+            ratio = dataset["error"].values[telling] / true_errors[telling]
+            assert (ratio > 1).all(), (name, lattice, ratio)
+            ratios.append(ratio)
+    every = np.concatenate(ratios)
+    assert len(every) > 35
+    assert np.median(every) < 10
+
+
+def test_closed_forms_lie_within_the_error() -> None:
+    a, b = Sphere(), Sphere(0.9, (0.3, 0.0, 0.0))
+    exact = distance(a, b, ORDERS)
+    assert (exact["error"] <= 1e-12 * norm(a, ORDERS)["norm"] ** 2 / exact["distance"]).all()
+    for lattice in (Lattice(3.0, 20), Lattice(5.0, 64)):
+        dataset = distance(a, b, ORDERS, lattice=lattice)
+        assert (np.abs(dataset["distance"] - exact["distance"]) <= dataset["error"] + exact["error"]).all()
+        assert np.allclose(dataset["error"], dataset["error_part"].sum("part"), rtol=1e-14, atol=0)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 4])
+def test_coarse_quadrature_is_noticed(degree: int) -> None:
+    mesh, lattice = icosphere(3), Lattice(5.0, 64)
+    exact = fourier_transform(mesh, lattice, 1e-13)
+    rough = fourier_transform(mesh, lattice, 1e-10, quadrature=degree)
+    true_error = norm((rough - exact), ORDERS)["norm"].values
+    reported = norm(rough, ORDERS)["error_part"].sel(part="discretisation").values
+    assert (reported > true_error).all()
+    assert (reported < 6 * true_error).all()
+
+
+def test_probe_draws_depend_on_the_mesh_alone_and_leave_the_orders_open() -> None:
+    lattice = Lattice(4.0, 32)
+    first, again = (Quality.from_json(fourier_transform(icosphere(2), lattice).attrs["quality"]) for _ in range(2))
+    assert first.probe.shells == again.probe.shells
+    other = Quality.from_json(fourier_transform(icosphere(1), lattice).attrs["quality"])
+    assert other.probe.shells != first.probe.shells
+    assert (first.probe.norms(SobolevWeights(lattice, (-1.3, -7.7))) > 0).all()
+
+
+def test_points_are_drawn_by_the_weights_of_the_trapezoidal_rule() -> None:
+    count, lattice = 40_000, Lattice(1.0, 8)
+    draws = draw(lattice, (-2.0,), 2, count, seed=3)
+    places = tuple((draws.indices - lattice.half.start).T)
+    found = np.zeros(lattice.half.shape)
+    np.add.at(found, places, draws.scales)
+    # The mean of each point is its weight, and its variance that of rare events of this scale.
+    weights = lattice.trapezoid_weights(lattice.half)
+    assert (np.abs(found - weights)[places] <= 6 * np.sqrt(weights[places] * draws.scales)).all()
+    assert len(np.unique(draws.indices, axis=0)) == weights.size
+
+
+def test_fields_of_unknown_origin_have_numbers_without_errors() -> None:
+    lattice = Lattice(4.0, 32)
+    field = fourier_transform(BOX, lattice)
+    dataset = norm(2 * field.drop_attrs(), ORDERS)
+    assert np.isnan(dataset["error"]).all()
+    assert np.allclose(dataset["norm"], 2 * norm(field, ORDERS)["norm"], rtol=1e-13)
+
+
+@pytest.mark.parametrize("growth", [1e-4, 3e-4, 1e-3, 1e-2])
+def test_energies_that_hardly_grow_have_a_bound(growth: float) -> None:
+    lattice = Lattice(4.0, 16)
+    sums = Sums(np.ones((2, 4, 1)), np.array([[1.5 / (1 + growth)], [1.5]]))
+    weights, support = SobolevWeights(lattice, (-2.0, -0.6)), Support(np.ones(1), np.full(13, 2.0))
+    bound = truncated(sums, weights, support)
+    flat = truncated(Sums(sums.squares, np.full((2, 1), 1.5)), weights, support)
+    assert bound == pytest.approx(flat, rel=0.3)
+
+
+@pytest.mark.parametrize("settings", [{"lattice": Lattice(5.0, 64)}, {"rtol": 1e-2}])
+@pytest.mark.parametrize("radius", [0.9, 1.2])
+def test_relative_distances_and_shares_of_area(settings: dict[str, Any], radius: float) -> None:
+    orders = [-1.0, -1.5, -2.0, -4.0]
+    found = distance(Sphere(radius, (0.1, 0.0, 0.0)), Sphere(), orders, **settings)
+    for order in orders:
+        one = found.sel(order=order)
+        squared = sphere_inner_product(Sphere(), Sphere(), order)
+        product = sphere_inner_product(Sphere(radius, (0.1, 0.0, 0.0)), Sphere(), order) - squared
+        relative = sphere_distance(Sphere(radius, (0.1, 0.0, 0.0)), Sphere(), order) / squared**0.5
+        assert abs(one["relative"] - relative) <= one["relative_error"]
+        assert abs(one["area_share"] - (product / squared / relative) ** 2) <= one["area_share_error"]
+        if "rtol" in settings:
+            assert one["relative_error"] <= 1.1e-2 * relative
+            assert one["area_share_error"] <= 0.02
+            assert one["excess"].item() == pytest.approx(product / squared, rel=0.02)
+
+
+def test_equal_surfaces_differ_by_nothing() -> None:
+    # Whatever the order of vertices and triangles, and their orientation.
+    order = np.random.default_rng(0).permutation(len(BOX.vertices))
+    shuffled = Mesh(BOX.vertices[order], np.argsort(order)[BOX.triangles[::-1, [2, 0, 1]]])
+    for settings in ({"lattice": Lattice(2.0, 16)}, {"rtol": 1e-2}):
+        found = distance(shuffled, BOX, -2.0, **settings)
+        assert [found[name].item() for name in ("distance", "error", "relative", "relative_error")] == [0.0] * 4
+        assert np.isnan(found["area_share"].item())
+
+
+def test_norms_below_their_errors_give_no_relative_error() -> None:
+    values, errors = NormEstimate(*np.full((4, 1), 0.1)).relative_to(NormEstimate(*np.full((4, 1), 0.2)))
+    assert (values.item(), np.isnan(errors.item())) == (0.5, True)
+    distances, norms = (
+        NormEstimate(np.array([value]), *np.full((3, 1), error)) for value, error in ((0.5, 0.01), (2, 0.1))
+    )
+    close = distances.relative_to(norms)
+    # The largest quotient that both errors permit.
+    assert close[0].item() + close[1].item() == pytest.approx((0.5 + 0.03) / (2.0 - 0.3))

@@ -1,0 +1,85 @@
+"""Labels of the datasets of metrics: units, long names, the lattice and the kernel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from sobolev_batch import Lattice, distance, fourier_transform, norm, spectrum, witness
+from sobolev_batch.norms.columns import observed_rates
+from sobolev_batch.shapes import Sphere, icosphere
+
+LATTICE = Lattice(2.0, 16)
+A, B = fourier_transform(icosphere(1), LATTICE), fourier_transform(Sphere(), LATTICE, dtype="complex64")
+POINTS = np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
+METRICS: dict[str, Callable[[list[float]], xr.Dataset]] = {
+    "norm": lambda order: norm(A, order),
+    "distance": lambda order: distance(A, B, order),
+    "spectrum": lambda order: spectrum(A, B, order),
+    "witness": lambda order: witness(A, B, order, POINTS).to_dataset(promote_attrs=True),
+}
+
+
+@pytest.mark.parametrize("name", METRICS)
+def test_every_number_has_a_unit_and_a_name(name: str) -> None:
+    dataset = METRICS[name]([-2.0, -3.0])
+    assert dataset.attrs["kernel"] == "weight (1 + |xi|^2)^s, xi in cycles per unit length"
+    assert (dataset.attrs["xi_max"], dataset.attrs["M"]) == (2.0, 16)
+    assert dataset.attrs["dtype"] == ("complex128" if name == "norm" else "complex128, complex64")
+    for variable in dataset.variables:
+        assert dataset[variable].attrs["long_name"], variable
+        assert dataset[variable].dtype == object or dataset[variable].attrs["units"], variable
+    assert dataset["order"].values.tolist() == [-2.0, -3.0]
+
+
+def test_settings_of_an_accuracy_are_attributes_and_closed_forms_have_none() -> None:
+    assert set(distance(Sphere(), Sphere(0.5), -2.0).attrs) == {"kernel"}
+    dataset = distance(icosphere(0), Sphere(), [-5.0], rtol=0.1)
+    assert dataset["within"].attrs["long_name"]
+    chosen = {"kernel", "rtol", "xi_max", "M", "octaves", "highest_frequency", "seed"}
+    assert chosen | {"dtype", "eps", "quadrature_eps", "points"} == set(dataset.attrs)
+
+
+def test_witness_keeps_the_points() -> None:
+    values = witness(A, B, [-2.0], POINTS)
+    assert np.array_equal(np.stack([values[axis].values for axis in "xyz"], axis=1), POINTS)
+    assert values["x"].dims == ("point",)
+
+
+NAN = np.nan
+
+
+@pytest.mark.parametrize(
+    ("sizes", "distances", "errors", "rates"),
+    [
+        # They follow the sizes, not the order of the meshes.
+        ([0.1, 0.4, 0.2], [0.01, 0.16, 0.04], [0, 0, 0], [2, NAN, 2]),
+        # Missing meshes are bridged, and so are sizes that are nearly equal.
+        ([0.4, 0.2, 0.1, NAN], [0.16, NAN, 0.01, 0.001], [0, 0, 0, 0], [NAN, NAN, 2, NAN]),
+        ([0.4, 0.2, 0.19], [0.16, 0.04, 0.0361], [0, 0, 0], [NAN, 2, 2]),
+        # Distances below their error, distances of zero and equal sizes carry no rate.
+        ([0.4, 0.2, 0.1], [0.16, 0.04, 0.01], [0, 0, 0.011], [NAN, 2, NAN]),
+        ([0.2, 0.1], [1, 0], [0, 0], [NAN, NAN]),
+        ([0.1, 0.1], [1, 2], [0, 0], [NAN, NAN]),
+    ],
+)
+def test_observed_rates(sizes: list[float], distances: list[float], errors: list[float], rates: list[float]) -> None:
+    found, uncertainties = observed_rates(np.array(distances), np.array(errors), np.array(sizes))
+    np.testing.assert_allclose(found, rates, rtol=1e-12)
+    assert np.array_equal(np.isnan(uncertainties), np.isnan(rates))
+
+
+def test_errors_of_rates_cover_what_the_distances_allow() -> None:
+    sizes, distances, errors = np.array([0.2, 0.1]), np.array([0.4, 0.1]), np.array([0.02, 0.01])
+    rates, uncertainties = observed_rates(distances, errors, sizes)
+    extremes = [
+        observed_rates(distances + a * errors * [1, 0] + b * errors * [0, 1], np.zeros(2), sizes)[0][1]
+        for a in (-1, 1)
+        for b in (-1, 1)
+    ]
+    assert rates[1] - uncertainties[1] <= min(extremes)
+    assert rates[1] + uncertainties[1] >= max(extremes)
+    assert uncertainties[1] < 1.2 * (max(extremes) - min(extremes)) / 2

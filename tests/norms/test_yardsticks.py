@@ -1,0 +1,86 @@
+"""Yardsticks against changes of known size, whose distances are computed by themselves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from sobolev_batch import Lattice, Mesh, distance, yardsticks
+from sobolev_batch.errors import InputError
+from sobolev_batch.shapes import Sphere, icosphere
+from sobolev_batch.sources.generated import decimated, with_noise
+
+LATTICE = Lattice(3.0, 32)
+ORDERS = [-3.0, -5.0]
+BALL = icosphere(3)
+
+
+def moved(length: float) -> Mesh:
+    """The ball is nearly the same from all directions."""
+    return Mesh(BALL.vertices + length * np.array([0.36, 0.48, 0.8]), BALL.triangles)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("length", [0.002, 0.3])
+def test_a_move_is_found_again(length: float) -> None:
+    found = yardsticks(moved(length), BALL, ORDERS, lattice=LATTICE)
+    np.testing.assert_allclose(found["moved"], length, rtol=0.01)
+
+
+@pytest.mark.slow
+def test_noise_is_found_again() -> None:
+    found = yardsticks(with_noise(BALL, 0.01, 4), BALL, ORDERS, lattice=LATTICE, seed=4)
+    np.testing.assert_allclose(found["noise"], 0.01, rtol=0.03)
+    assert (abs(found["noise"] - 0.01) <= found["noise_error"] + 1e-4).all()
+
+
+# The distance from the noisy ball changes little between 170 and 190 triangles, and much between 150 and 160.
+@pytest.mark.slow
+@pytest.mark.parametrize(("reference", "triangles"), [(BALL, 300), (with_noise(BALL, 0.03, 1), 160)])
+def test_decimation_is_found_again(reference: Mesh, triangles: int) -> None:
+    found = yardsticks(decimated(reference, triangles), reference, -2.0, lattice=LATTICE)
+    assert found["decimated"].dims == ()
+    assert found["decimated"].item() == pytest.approx(triangles, rel=0.05)
+
+
+@pytest.mark.slow
+def test_yardsticks_come_with_the_distance() -> None:
+    a, b = moved(0.1), BALL
+    found, alone = yardsticks(a, b, ORDERS, rtol=0.05), distance(a, b, ORDERS, rtol=0.05)
+    for name, variable in alone.items():
+        np.testing.assert_array_equal(found[name], variable)
+    assert found.attrs == alone.attrs
+    np.testing.assert_allclose(found["moved"], 0.1, rtol=0.05)
+
+
+@pytest.mark.slow
+def test_shared_triangles_change_nothing() -> None:
+    """The reference is whole though most of it cancels."""
+    part = Mesh(BALL.vertices, BALL.triangles[:-40])
+    quarters = Mesh(*trimesh.remesh.subdivide(part.vertices, part.triangles))
+    together, apart = (yardsticks(mesh, BALL, -2.0, rtol=0.02) for mesh in (part, quarters))
+    for name in ("moved", "noise", "relative", "excess", "area_share"):
+        assert together[name].item() == pytest.approx(apart[name].item(), rel=0.03), name
+
+
+def test_what_is_like_nothing() -> None:
+    same = yardsticks(BALL, BALL, ORDERS, lattice=LATTICE)
+    assert (same["distance"] == 0).all()
+    assert np.isnan(same["moved"]).all()
+    # No move of a ball is as far from it as a ball of twice the radius.
+    far = yardsticks(Mesh(2 * np.asarray(BALL.vertices), BALL.triangles), BALL, -4.0, lattice=Lattice(3.0, 48))
+    assert np.isnan(far["moved"].item())
+    with pytest.raises(InputError, match="found Sphere"):
+        yardsticks(Sphere(), BALL, -2.0, lattice=LATTICE)
+    with pytest.raises(InputError, match="seed must be a whole number from 0 on, found -1"):
+        yardsticks(moved(0.1), BALL, -2.0, lattice=LATTICE, seed=-1)
+
+
+@pytest.mark.slow
+def test_a_move_is_as_far_beyond_all_frequencies_too() -> None:
+    part = Mesh(BALL.vertices, BALL.triangles[:-40])
+    found = yardsticks(part, BALL, -2.0, rtol=0.02)
+    direct = distance(moved(found["moved"].item()), BALL, -2.0, rtol=0.01)
+    share = found["moved_error"].item() / found["moved"].item()
+    assert direct["distance"].item() == pytest.approx(found["distance"].item(), rel=share + 0.01)

@@ -1,0 +1,133 @@
+"""Lists of meshes with metadata: CSV files, tables of a study, DataFrames."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import sobolev_batch as sb
+from sobolev_batch.errors import StudyError
+from sobolev_batch.sources.files import FileMember, FileSource, read_mesh_list
+from sobolev_batch.tables.convergence import format_table
+from tests.support.studies import small_table
+
+
+def members(meshes: Any, folder: Path) -> list[FileMember]:
+    found = FileSource(meshes=meshes).members(folder)
+    return [member for member in found if isinstance(member, FileMember)]
+
+
+def test_a_csv_file_gives_paths_names_times_and_metadata(tmp_path: Path) -> None:
+    (tmp_path / "lists").mkdir()
+    # As spreadsheets write it: a byte order mark, blanks, and cells that say nothing.
+    (tmp_path / "lists/meshes.csv").write_text(
+        "\ufeffpath, name, time, tool, method_seconds, note\na.ply, 007, 0.5, QEM, 3.5,\n../b.obj, , , 5, , 12\n"
+    )
+    first, second = members("lists/meshes.csv", tmp_path)
+    assert (first.name, first.time, first.path) == ("007", 0.5, tmp_path / "lists/a.ply")
+    assert first.metadata == (("tool", "QEM"), ("method_seconds", 3.5))
+    assert (second.name, second.time) == ("b", None)
+    # A column with one text is of texts.
+    assert second.metadata == (("tool", "5"), ("note", 12.0))
+    assert second.path.resolve() == (tmp_path / "b.obj").resolve()
+
+
+def test_tables_of_a_study_keep_their_order(tmp_path: Path) -> None:
+    found = members([{"path": "b.ply", "seconds_of_method": 2}, {"path": "a.ply", "name": "x"}], tmp_path)
+    assert [(member.name, member.metadata) for member in found] == [("b", (("seconds_of_method", 2.0),)), ("x", ())]
+    for second in ({"path": "b.ply", "name": "a"}, {"path": "a.ply", "tool": 2}):
+        with pytest.raises(StudyError, match="several are named 'a'"):
+            members([{"path": "a.ply", "tool": 1}, second], tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("meshes", "message"),
+    [
+        ([{"paths": "a.ply"}], "each mesh needs a path"),
+        ([{"path": "a.ply", "name": " x"}], "which is no label: it begins or ends with a blank"),
+        ([{"path": "a.ply", "time": "soon"}], "has the time 'soon'; a time is a number"),
+        ([{"path": "a.ply", "colour": [1, 2]}], "colour of 'a.ply' must be a number or a line of text"),
+        ([{"path": "a.ply", "a/b": 1}], "'a/b' cannot name metadata: it holds '/'"),
+        ([], "must be the path of a CSV file"),
+        (["a.ply"], "must be the path of a CSV file"),
+    ],
+)
+def test_refused_lists_say_what_was_found(meshes: Any, message: str) -> None:
+    table = small_table(family=[{"name": "f", "source": "files", "meshes": meshes}])
+    with pytest.raises(StudyError, match=message):
+        sb.Study.from_table(table)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("file,tool\na.ply,x\n", "needs a column path"),
+        ("path\n", "a line for each mesh; found 0 lines"),
+        ("", "cannot be read"),
+        ('path\n"a\n', "cannot be read"),
+        ("path,tool\n,x\n", "each mesh needs a path"),
+        ("tool,path\nx,a.ply,1.5\n", "cannot be read: .*Expected 2 fields in line 2, saw 3"),
+        ("path,tool,path\na.ply,x,b.ply\n", "has the column 'path' twice"),
+        ("path,time\na.ply,0\nb.ply,x\n", "'b.ply' has the time 'x'; a time is a number"),
+    ],
+)
+def test_csv_files_that_are_no_lists_are_refused_by_name(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "meshes.csv").write_text(text)
+    with pytest.raises(StudyError, match=f"'meshes.csv'.*{message}"):
+        read_mesh_list(tmp_path / "meshes.csv")
+
+
+def test_a_frame_loses_nothing() -> None:
+    times, tiny = [1.23e-11, 2e-11], [3e-13, 1 / 3]
+    day = pd.Timestamp("2026-01-31")
+    paths = [Path("a.ply"), Path("b.ply")]
+    frame = pd.DataFrame({"path": paths, "time": times, "tiny": tiny, "day": [day, pd.NaT], "name": [1234567, 8]})
+    study = sb.Study.from_table(small_table(family=[{"name": "f", "source": "files", "meshes": frame}]))
+    found = study.families[0].source.members(Path())
+    assert [member.name for member in found] == ["1234567", "8"]
+    assert [member.time for member in found] == times
+    assert [dict(member.metadata)["tiny"] for member in found] == tiny
+    assert [dict(member.metadata).get("day") for member in found] == ["2026-01-31T00:00:00", None]
+    twice = pd.DataFrame([["a.ply", "b.ply"]], columns=["path", "path"])
+    with pytest.raises(StudyError, match="has the column 'path' twice"):
+        sb.Study.from_table(small_table(family=[{"name": "f", "source": "files", "meshes": twice}]))
+
+
+@pytest.mark.slow
+def test_metadata_become_coordinates_and_sizes_of_rates(tmp_path: Path) -> None:
+    for level in (0, 1):
+        sb.write_mesh(sb.shapes.icosphere(level), tmp_path / f"{level}.ply")
+    frame = pd.DataFrame({"path": ["0.ply", "1.ply"], "effort": [1.0, 4.0], "tool": ["a", None]})
+    study = sb.Study.from_table(
+        small_table(family=[{"name": "f", "source": "files", "meshes": frame}]), folder=tmp_path
+    )
+    sb.run(study, "memory://mesh-lists.zarr", workers=1)
+    convergence = sb.open_store("memory://mesh-lists.zarr")["convergence"].to_dataset()
+    assert convergence["tool"].sel(mesh=["f/0", "f/1"]).values.tolist() == ["a", ""]
+    np.testing.assert_array_equal(convergence["effort"], [1.0, 4.0, np.nan])
+    by_effort = sb.table("memory://mesh-lists.zarr", -3, x="effort")
+    fall = np.log(by_effort["distance"][0] / by_effort["distance"][1]) / np.log(4)
+    assert by_effort["rate"][1] == pytest.approx(fall)
+    shown = format_table("memory://mesh-lists.zarr", orders=[-3.0], x="effort")
+    assert re.search(r"^mesh +triangles +effort .*\n.*\n.*\nf/1 +80 +4 ", shown, re.M)
+    with pytest.raises(sb.errors.InputError, match=r"known are edge_length, triangles, vertices, seconds, effort$"):
+        sb.table("memory://mesh-lists.zarr", x="tool")
+
+
+def test_metadata_cannot_take_the_name_of_a_variable_of_tables(finished_store: Path, tmp_path: Path) -> None:
+    tree = sb.open_store(finished_store)
+    groups = [tree[name].to_dataset() for name in ("meshes", "norms", "distances", "convergence")]
+    taken = {str(name) for group in groups for name in group.variables}
+    sb.write_mesh(sb.shapes.icosphere(0), tmp_path / "a.ply")
+    for name in taken - {"name", "time"}:
+        meshes = [{"path": "a.ply", name: 1.0}]
+        study = sb.Study.from_table(
+            small_table(family=[{"name": "f", "source": "files", "meshes": meshes}]), folder=tmp_path
+        )
+        with pytest.raises(StudyError, match=f"have the name '{name}', which tables use"):
+            sb.plan(study, "memory://nowhere.zarr")

@@ -1,0 +1,278 @@
+"""The store's layout, what it refuses, and that what others have written has zarr and xarray do nothing else."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zarr
+from distributed import Client
+
+from sobolev_batch import Study, open_store, run, verify
+from sobolev_batch.batch.prune import prune
+from sobolev_batch.batch.status import Status
+from sobolev_batch.errors import LockError, StoreError
+from sobolev_batch.store import metadata as documents
+from sobolev_batch.store.create import prepare_store
+from sobolev_batch.store.location import Location
+from sobolev_batch.store.lock import Lock, locked
+from sobolev_batch.store.records import Record
+from sobolev_batch.store.store import Store
+from sobolev_batch.study.plan import Plan, make_plan
+from tests.support.commands import COMMAND, call, finished
+from tests.support.repository import ROOT, blocks, install
+from tests.support.stores import READER, contents
+from tests.support.studies import small_table
+
+
+def small_plan(**changes: object) -> Plan:
+    return make_plan(Study.from_table(small_table(**changes)))
+
+
+def test_fields_that_were_not_computed_are_nan_zeros_are_kept_and_all_arrays_have_checksums(store_path: Path) -> None:
+    plan = small_plan()
+    store = prepare_store(store_path, plan)
+    (place,) = store.places()
+    store.write_field(3, place, np.zeros(plan.lattice.shape, dtype=complex))
+    missing, zeros = store.read_fields([0, 3], place)
+    assert np.isnan(missing).all()
+    assert (zeros == 0).all()
+    metadata = [json.loads(path.read_text()) for path in store_path.rglob("zarr.json")]
+    codecs = [entry["codecs"][-1]["name"] for entry in metadata if entry["node_type"] == "array"]
+    assert len(codecs) >= 6
+    assert set(codecs) == {"crc32c"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"study": {"name": "other"}}, "the study 'small', not 'other'"),
+        ({"lattice": {"xi_max": 3.0, "M": 18}}, "a lattice of xi_max 3 and M 16, not xi_max 3 and M 18"),
+        ({"transform": {"dtype": "complex64"}}, "dtype 'complex128', not 'complex64'"),
+        ({"lattice": {"xi_max": 3.0, "M": 16, "octaves": 2}}, "octaves: none, not 2"),
+    ],
+)
+def test_refuses_the_store_of_another_study_and_leaves_it_alone(
+    store_path: Path, changes: dict[str, object], message: str
+) -> None:
+    prepare_store(store_path, small_plan())
+    before = contents(store_path)
+    with pytest.raises(StoreError, match=message):
+        prepare_store(store_path, small_plan(**changes))
+    assert contents(store_path) == before
+
+
+def test_a_folder_of_other_files_is_refused_and_left_alone(store_path: Path) -> None:
+    store_path.mkdir()
+    (store_path / "notes.txt").write_text("mine")
+    with pytest.raises(StoreError, match="not empty and holds no store"):
+        prepare_store(store_path, small_plan())
+    assert [path.name for path in contents(store_path)] == ["notes.txt"]
+
+
+def test_new_meshes_become_new_rows(store_path: Path) -> None:
+    store = prepare_store(store_path, small_plan())
+    store.write_record(0, Record("k", "complete"))
+    more = [{"name": name, "source": "icosphere", "levels": [0, 1]} for name in ("more", "ico")]
+    grown = prepare_store(store_path, small_plan(family=more))
+    assert grown.labels() == ("ico/0", "ico/1", "ico/2", "ico/3", "reference", "more/0", "more/1")
+    assert [record is None for record in grown.records()] == [False, *[True] * 6]
+
+
+def test_opening_what_is_no_store(store_path: Path) -> None:
+    with pytest.raises(StoreError, match="it holds no store of a study"):
+        Store.open(store_path)
+    zarr.create_group(str(store_path))
+    with pytest.raises(StoreError, match="not one of a study"):
+        prepare_store(store_path, small_plan())
+
+
+def test_plain_xarray_reads_everything_without_this_package(finished_store: Path, tmp_path: Path) -> None:
+    done = finished(sys.executable, "-c", READER, finished_store, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert 0.003 < float(done.stdout) < 0.006
+
+
+@pytest.mark.parametrize("octaves", [0, 1])
+def test_zarr_and_numpy_alone_compute_norms_and_distances(octaves: int, store_path: Path, threads: Client) -> None:
+    lattice = {"xi_max": 3.0, "M": 16, "octaves": octaves}
+    run(Study.from_table(small_table(lattice=lattice)), store_path, threads)
+    tree = open_store(store_path)
+    (function,) = (block for block in blocks("docs/store.md", "python") if "def squared_norm" in block)
+    names: dict[str, Any] = {}
+    exec(function, names)
+    store = zarr.open_group(str(store_path), mode="r")
+    norms, convergence, reference = tree["norms"].to_dataset(), tree["convergence"].to_dataset(), 4
+    for row, label in enumerate(Store.open(store_path).labels()):
+        for order in (-10.0, -3.0):
+            norm, distance = (table.sel(mesh=label, order=order) for table in (norms, convergence))
+            squared = names["squared_norm"](store, row, None, order) + norm["beyond"].item()
+            assert squared == pytest.approx(norm["norm"].item() ** 2, rel=1e-13)
+            squared = names["squared_norm"](store, row, reference, order) + distance["beyond"].item()
+            assert squared == pytest.approx(distance["distance"].item() ** 2, rel=1e-13)
+    assert (norms["beyond"] > 0).all() == (convergence["beyond"].drop_sel(mesh="reference") > 0).all() == bool(octaves)
+
+
+@pytest.mark.all
+@pytest.mark.process
+@pytest.mark.parametrize("octaves", [0, 1])
+def test_a_reader_in_another_language_computes_norms_and_distances(
+    octaves: int, store_path: Path, threads: Client
+) -> None:
+    script = ROOT / "tests/store/norms.mjs"
+    node = shutil.which("node")
+    if node is None or not (ROOT / "node_modules/zarrita").is_dir():
+        pytest.skip("needs node, and zarrita as `make test-all` installs it by npm")
+    run(Study.from_table(small_table(lattice={"xi_max": 3.0, "M": 16, "octaves": octaves})), store_path, threads)
+    tree = open_store(store_path)
+    for table, number, others in (("norms", "norm", []), ("convergence", "distance", ["reference"])):
+        stored = tree[table].to_dataset().sel(mesh="ico/2", order=-3.0)
+        done = finished(node, script, store_path, -3, "ico/2", *others)
+        assert (done.returncode, done.stderr) == (0, "")
+        squared = float(done.stdout) ** 2 + stored["beyond"].item()
+        assert squared == pytest.approx(stored[number].item() ** 2, rel=1e-12)
+
+
+Document = dict[str, Any]
+
+
+def change(store: Path, node: str, how: Callable[[Document], None]) -> None:
+    """Change what the root of a store says of a node."""
+    root = json.loads((store / "zarr.json").read_text())
+    how(root["consolidated_metadata"]["metadata"][node] if node else root)
+    (store / "zarr.json").write_text(json.dumps(root))
+
+
+def refusals(store: Path) -> set[str]:
+    """What each way to read a store is told."""
+    said = set()
+    for read in (open_store, Status.from_store, Store.open):
+        with pytest.raises(StoreError) as caught:
+            read(store)
+        said.add(str(caught.value))
+    return said
+
+
+BARE = {"node_type": "array", "zarr_format": 3}
+# Of a node, what is changed, and how it is refused.
+NOT_WRITTEN_HERE: list[tuple[str, Document, str]] = [
+    ("records/record", {"codecs": [{"name": "numcodecs.pickle"}]}, "the codec of records/record is 'numcodecs"),
+    ("fourier/mesh", {"codecs": [{"name": "vlen-utf8"}, "zstd"]}, "the codec of fourier/mesh is 'zstd'"),
+    ("fourier/mesh", {"codecs": []}, "the codec of fourier/mesh is None"),
+    ("meshes/name", {"data_type": "variable_length_bytes"}, "the data type of meshes/name is 'variable"),
+    ("meshes/name", {"data_type": {"name": "object"}}, "the data type of meshes/name is {'name': 'object'}"),
+    ("fourier/xi_x", {"storage_transformers": [{"name": "x"}]}, "has the storage transformers"),
+    ("fourier/xi_x", {"chunk_grid": {"name": "x"}}, "the chunk_grid of fourier/xi_x is {'name': 'x'}"),
+    ("fourier/xi_x", {"chunk_key_encoding": {"name": "v2"}}, "the chunk_key_encoding of fourier/xi_x"),
+    ("fourier/xi_x", {"zarr_format": 2, "filters": [{"id": "pickle"}]}, "of zarr format 2"),
+    ("fourier/xi_x", {"node_type": "group"}, "fourier/xi_x is 'group' of zarr format 3"),
+    ("norms", {"must_understand": True}, "norms has metadata 'must_understand'"),
+    ("fourier/mesh", {"shape": [10**15]}, "fourier/mesh has the shape [1000000000000000]"),
+    ("convergence/relative", {"shape": [10**8, 10**7]}, "convergence/relative has the shape [100000000"),
+    ("fourier/mesh", {"shape": [-1]}, "fourier/mesh has the shape [-1]"),
+    (
+        "norms",
+        {"consolidated_metadata": {"kind": "inline", "metadata": {"b": BARE}}},
+        "the data type of norms/b is None",
+    ),
+    ("", {"consolidated_metadata": {"kind": "x"}}, "the consolidated metadata of the root are {'kind'"),
+    ("norms", {"attributes": []}, "the attributes of norms are no table"),
+]
+
+
+@pytest.mark.parametrize(("node", "changes", "message"), NOT_WRITTEN_HERE)
+def test_metadata_that_this_package_does_not_write(copy: Path, node: str, changes: Document, message: str) -> None:
+    change(copy, node, lambda document: document.update(changes))
+    (said,) = refusals(copy)
+    assert said.startswith(f"{copy}: the store is not used: ")
+    assert message in said
+    with pytest.raises(StoreError, match="is not used"):
+        run(Study.from_table(small_table()), copy)
+
+
+@pytest.mark.parametrize("name", ["..", "../other", "/etc", "a/../../b", "C:\\x", "a\x00b", "fourier//c", ""])
+def test_nodes_with_other_names(copy: Path, name: str) -> None:
+    def add(root: Document) -> None:
+        root["consolidated_metadata"]["metadata"][name] = {"node_type": "group", "zarr_format": 3, "codecs": 1}
+
+    change(copy, "", add)
+    (said,) = refusals(copy)
+    assert "a node is named" in said or "has metadata 'codecs'" in said
+
+
+def test_documents_beside_the_root_are_checked_when_they_are_read(copy: Path) -> None:
+    path = copy / "records" / "zarr.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "node_type": "array"}))
+    with pytest.raises(StoreError, match="records is 'array' of zarr format 3"):
+        Status.from_store(copy)
+
+
+def test_a_document_without_end(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with (copy / "zarr.json").open("r+b") as file:
+        file.truncate(documents.MOST_BYTES + 1)
+    (said,) = refusals(copy)
+    assert "zarr.json has more than" in said
+    (copy / "zarr.json").write_text("[" * 100_000)
+    (said,) = refusals(copy)
+    assert "is damaged" in said
+
+
+EVIL = """
+import os
+from zarr.abc.codec import ArrayBytesCodec
+open(os.environ["MARKER"], "w").close()
+class Evil(ArrayBytesCodec):
+    pass
+"""
+
+
+def test_code_that_a_codec_names_is_not_imported(copy: Path, tmp_path: Path) -> None:
+    """An installed distribution offers a codec: zarr imports it for whatever store has its name."""
+    install(tmp_path / "site", "evil", "[zarr.codecs]\nevil = evil:Evil\n", EVIL)
+    change(copy, "records/record", lambda document: document.update(codecs=[{"name": "evil"}]))
+    paths = os.pathsep.join([str(tmp_path / "site"), str(ROOT)])
+    environment = {**os.environ, "PYTHONPATH": paths, "MARKER": str(tmp_path / "imported")}
+    for command in ("status", "table"):
+        assert finished(*COMMAND, command, copy, env=environment).returncode == 2
+    assert not (tmp_path / "imported").exists()
+    finished(sys.executable, "-c", f"import zarr; zarr.open({str(copy)!r})['records/record']", env=environment)
+    assert (tmp_path / "imported").exists()
+
+
+def test_what_no_record_needs_is_counted_and_then_removed(copy: Path, threads: Client) -> None:
+    whole = Study.from_table(small_table())
+    family = small_table()["family"][0]
+    part = Study.from_table(small_table(family=[{**family, "levels": family["levels"][:-1]}]))
+    assert run(part, copy, threads).computed == ()
+    sound = contents(copy)
+    (row,) = (row for row, label in enumerate(Store.open(copy).labels()) if label in Store.open(copy).removed)
+    chunks = copy / "fourier" / "fourier" / "c"
+    lost = sum(path.stat().st_size for path in (chunks / str(row)).rglob("*") if path.is_file())
+    # A killed run leaves a field without a record, a part of a file, and tables without their metadata.
+    (chunks / "99").mkdir()
+    (chunks / "99" / "0").write_bytes(b"12345")
+    (copy / "meshes" / f"x.{'0' * 32}.partial").write_bytes(b"123")
+    (copy / "earlier").mkdir()
+    (copy / "earlier" / "zarr.json").write_bytes(b"1")
+    before = contents(copy)
+    counted = call("prune", copy)
+    assert list(prune(Location.parse(copy)).values()) == [lost, 8, 1]
+    assert contents(copy) == before
+    assert "can be removed: give --yes" in counted.stdout
+    assert "removed" in call("prune", copy, "--yes").stdout
+    left = contents(copy)
+    assert {path for path in sound if path not in left} == {path for path in sound if chunks / str(row) in path.parents}
+    assert left.keys() <= sound.keys() | {copy / f"records/record/c/{row}"}
+    assert call("prune", copy).stdout == "nothing to remove\n"
+    assert verify(copy).is_sound
+    assert run(part, copy, threads).computed == ()
+    assert len(run(whole, copy, threads).computed) == 1
+    with locked(Location.parse(copy), Lock.of_this_process()), pytest.raises(LockError):
+        prune(Location.parse(copy), is_dry=False)
