@@ -13,10 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Mesh
+from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.transform.lattice import Block
-
-Reals = NDArray[np.float64]
-Complexes = NDArray[np.complex128]
 
 # Gaps in radians below which the quotients would lose more digits than the series lack.
 _PAIR_MEETS = 1e-3

@@ -8,15 +8,14 @@ from functools import partial
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 import sobolev_batch as sb
 from benchmarks.meshes import pair_of_cortex, pair_of_parts
 from benchmarks.table import Row, as_seconds, at_most
 from benchmarks.timing import Effort
+from sobolev_batch.arrays import Reals
 
 Found = TypeVar("Found")
-Reals = NDArray[np.float64]
 Sum = Callable[[Reals, Reals], float]
 
 # Order, rtol, and most processor seconds, for a coarse organic mesh against a fine one.

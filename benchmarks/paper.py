@@ -7,20 +7,16 @@ one half of it is the conjugate of the other; norms are trapezoidal sums over th
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import finufft
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.timing import take_turns
 from sobolev_batch import Lattice, Mesh
+from sobolev_batch.arrays import Complexes
 from sobolev_batch.shapes import Sphere
 from sobolev_batch.transform.backends import ComplexDtype
 from sobolev_batch.transform.rules import gauss_rule
-
-Complexes = NDArray[np.complexfloating[Any, Any]]
-Reals = NDArray[np.float64]
 
 _RULE = gauss_rule(8)
 # Below 1.5 the kernel is so wide that the points of this rule take several times as long.

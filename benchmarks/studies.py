@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import trimesh
 from distributed import Client
-from numpy.typing import NDArray
 
 import sobolev_batch as sb
 from benchmarks.memory import highest_bytes
 from benchmarks.table import Row, Target, as_bytes, as_seconds, at_most
 from benchmarks.timing import Effort, elapsed_seconds, take_turns
+from sobolev_batch.arrays import Reals
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.transform.fourier import TransformSettings, transform_block
@@ -31,8 +31,6 @@ _ALL_PAIRS = at_most(1.7)
 _ALL_PAIRS_BYTES = 2e9
 _XI_MAX = 5.0
 _SAMPLE_PER_WORKER = 8
-
-Reals = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,6 @@ from sobolev_batch.tables.shells import (
 # Raise it whenever tables hold something that those of older versions lack: they are then made again.
 TABLES_VERSION = 11
 
-Reals = NDArray[np.float64]
 Criterion = Literal["level", "triangles", "names", "time"]
 # A row, its place in its family, and what orders that.
 Placed = tuple[int, int, Criterion]

@@ -38,9 +38,10 @@ from sobolev_batch.visible import FILE_UNITS, visible
 if TYPE_CHECKING:
     import xarray as xr
 
+    from sobolev_batch.arrays import Reals
     from sobolev_batch.extras.fitting.fit import FitProgress, FitQuality
     from sobolev_batch.geometry.mesh import Mesh
-    from sobolev_batch.geometry.surface import Reals, Similarity
+    from sobolev_batch.geometry.surface import Similarity
 
 _STATUSES = {"same": 0, "different": EXIT_DIFFERENT, "undecided": EXIT_UNDECIDED}
 # Options of compare that a verdict knows; it chooses the accuracy of the distance itself.

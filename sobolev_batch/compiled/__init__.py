@@ -15,11 +15,6 @@ from contextvars import ContextVar
 from threading import Lock
 from typing import Any, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
-Reals = NDArray[np.float64]
-Indices = NDArray[np.integer]
 Loop = TypeVar("Loop", bound=Callable[..., Any])
 
 # Processor seconds on arrays from which on numba is worth its import.

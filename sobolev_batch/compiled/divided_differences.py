@@ -11,9 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.compiled import Indices, Reals, loop, part
-
-Complexes = NDArray[np.complex128]
+from sobolev_batch.arrays import Complexes, Indices, Reals
+from sobolev_batch.compiled import loop, part
 
 _TURN = 2 * math.pi
 # Taylor coefficients of sin(2πx)/x and cos(2πx) in x²: up to a quarter of a cycle the rest is below 2e-17.

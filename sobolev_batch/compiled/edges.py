@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from sobolev_batch.compiled import Indices, Reals, loop
+from sobolev_batch.arrays import Indices, Reals
+from sobolev_batch.compiled import loop
 
 
 @loop

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from sobolev_batch.compiled import Indices, Reals, loop, part
+from sobolev_batch.arrays import Indices, Reals
+from sobolev_batch.compiled import loop, part
 
 
 @part

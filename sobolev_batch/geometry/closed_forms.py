@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import elliprg
 
+from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.smooth import Interval, Smooth
@@ -18,7 +19,6 @@ from sobolev_batch.geometry.surface import (
     LARGEST_LENGTH,
     Extent,
     Point,
-    Reals,
     checked_point,
     is_finite_number,
     moved_point,

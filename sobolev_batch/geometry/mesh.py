@@ -12,9 +12,10 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.compiled import pays
 from sobolev_batch.errors import MeshError, from_extra
-from sobolev_batch.geometry.surface import LARGEST_LENGTH, Extent, Indices, Point, Reals
+from sobolev_batch.geometry.surface import LARGEST_LENGTH, Extent, Point
 
 Corners = tuple[Reals, Reals, Reals]
 # Vectors from the first corner to the second and to the third, (3, k) each: one row an axis.

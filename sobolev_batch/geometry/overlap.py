@@ -15,8 +15,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.geometry.surface import Extent, Indices, Reals
+from sobolev_batch.geometry.surface import Extent
 
 # Tolerances, relative to the largest coordinate: its rounding, and that in single precision, as in STL.
 ROUNDING, SINGLE_ROUNDING = 2.0**-47, 2.0**-22

@@ -7,10 +7,11 @@ from typing import Self
 import numpy as np
 from scipy.spatial import cKDTree
 
+from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.formats.readers import MeshLike, as_mesh
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.geometry.surface import Indices, Reals, is_finite_number
+from sobolev_batch.geometry.surface import is_finite_number
 from sobolev_batch.parameters import check_seed, is_whole_number
 
 DEFAULT_POINTS = 10_000

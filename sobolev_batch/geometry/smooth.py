@@ -16,9 +16,10 @@ from typing import Any, Self
 import numpy as np
 from scipy.special import roots_legendre
 
+from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.mesh import cross_lengths
-from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Point, Reals, checked_point, is_finite_number
+from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Point, checked_point, is_finite_number
 
 Counts = tuple[int, int]
 

@@ -12,9 +12,9 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.geometry.surface import Indices, Reals
 from sobolev_batch.parameters import is_whole_number
 
 Marks = NDArray[np.bool_]

@@ -12,11 +12,10 @@ from typing import Protocol, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError
 
 Point = tuple[float, float, float]
-Reals = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 # Squares of larger lengths overflow, squares of the reciprocal vanish.
 LARGEST_LENGTH = 1e150

@@ -15,7 +15,8 @@ from typing import Self
 import numpy as np
 from scipy.special import beta, exprel, gamma, gammaln, kve, zeta
 
-from sobolev_batch.geometry.surface import DIRECTIONS, Reals
+from sobolev_batch.arrays import Reals
+from sobolev_batch.geometry.surface import DIRECTIONS
 from sobolev_batch.transform.lattice import SobolevWeights
 
 # Both laws were measured on spheres, boxes, sticks and icospheres, near and far: the truncation was

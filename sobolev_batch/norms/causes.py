@@ -8,8 +8,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError
-from sobolev_batch.geometry.surface import Reals, Similarity
+from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.columns import (
     AREA,

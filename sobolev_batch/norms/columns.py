@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sobolev_batch.geometry.surface import Reals
+from sobolev_batch.arrays import Reals
 from sobolev_batch.norms.budget import PARTS, NormEstimate, ReferenceEstimate
 from sobolev_batch.transform.lattice import AXES, Lattice, Orders
 

@@ -15,11 +15,12 @@ from typing import cast
 import numpy as np
 import xarray as xr
 
+from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError, LatticeError, MeshError
 from sobolev_batch.geometry.closed_forms import Sphere
 from sobolev_batch.geometry.formats.readers import MeshLike, as_mesh, as_surface
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Reals
+from sobolev_batch.geometry.surface import DIRECTIONS, Extent
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.accuracy.frequencies import Frequencies, Reference
 from sobolev_batch.norms.accuracy.problem import Problem, Solution, SurfaceValues, are_equal, support_of

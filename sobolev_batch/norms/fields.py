@@ -11,11 +11,12 @@ import numpy as np
 import xarray as xr
 from pydantic import TypeAdapter
 
+from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.geometry.formats.readers import SurfaceLike, as_surface
-from sobolev_batch.geometry.surface import Extent, Reals, Surface
+from sobolev_batch.geometry.surface import Extent, Surface
 from sobolev_batch.norms.tail.remainder import Remainder
-from sobolev_batch.transform.backends import ComplexDtype, Complexes, backend_named
+from sobolev_batch.transform.backends import ComplexDtype, backend_named
 from sobolev_batch.transform.fourier import (
     ON_CPU,
     ErrorTarget,

@@ -13,11 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.geometry.surface import Reals
+from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.norms.budget import Sums, outer_windows
 from sobolev_batch.transform.lattice import Block, SobolevWeights
 
-Complexes = NDArray[np.complex128]
 Run = tuple[slice, int, int | None]
 
 # A squared distance this much smaller than the squared distances to the center has lost six of its

@@ -15,9 +15,8 @@ from itertools import pairwise
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sobolev_batch.geometry.surface import Reals
+from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.norms.tail.sampling import OctaveSampling, SamplePart, TailSampling
 from sobolev_batch.norms.tail.values import quantile_of_sum
 from sobolev_batch.transform.lattice import Lattice, smooth_step
@@ -253,7 +252,7 @@ class RadialAxis:
             weights[shells] = smooth_step(self.radii[shells], self.sampling.cutoff)
         return weights
 
-    def labels(self) -> dict[str, NDArray[np.int64]]:
+    def labels(self) -> dict[str, Indices]:
         """Return the octave of each entry, 0 for the lattice; the number of its lattice in it, -1 for drawn samples."""
         octaves, lattices = np.zeros(len(self), dtype=np.int64), np.zeros(len(self), dtype=np.int64)
         for part in self.parts:

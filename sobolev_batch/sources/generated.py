@@ -16,11 +16,12 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
+from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import MeshError, from_extra, refused_by_pydantic
 from sobolev_batch.geometry.closed_forms import MOST_TRIANGLES, Ellipsoid, Sphere, Torus
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.subdivision import FINEST_LEVEL, icosphere
-from sobolev_batch.geometry.surface import Indices, Point, Reals, normals
+from sobolev_batch.geometry.surface import Point, normals
 from sobolev_batch.sources.registry import (
     Fingerprint,
     MadeMember,

@@ -15,6 +15,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import DamageError, StoreError
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms.spectrum import RadialAxis
@@ -229,7 +230,7 @@ def _record_keys(rows: int) -> dict[str, bytes]:
     }
 
 
-def _weight_columns(plan: Plan) -> dict[str, tuple[str, NDArray[np.float64], dict[str, str]]]:
+def _weight_columns(plan: Plan) -> dict[str, tuple[str, Reals, dict[str, str]]]:
     """Return the weights of samples in the integral over all frequencies: along each axis, and by the shell |k|²."""
     lattice = plan.lattice
     radii = lattice.spacing * np.sqrt(np.arange(lattice.shell_count))

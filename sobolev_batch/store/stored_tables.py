@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 import xarray as xr
 import zarr
-from numpy.typing import NDArray
 from zarr.abc.buffer import Buffer
 from zarr.codecs import Crc32cCodec
 from zarr.storage import MemoryStore
 
+from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import DamageError
 from sobolev_batch.store.checked import CHANGED, checksum_of
 from sobolev_batch.store.records import Record
@@ -204,7 +204,7 @@ def damaged_chunks(store: Store) -> Iterator[tuple[str, Index, str]]:
                     yield keys, index, error.what
 
 
-def read_chunk(store: Store, keys: str, index: Index) -> tuple[list[str], dict[str, NDArray[np.float64]]]:
+def read_chunk(store: Store, keys: str, index: Index) -> tuple[list[str], dict[str, Reals]]:
     """Return a chunk of keys, flattened, and of their arrays by name; DamageError where they do not match."""
     sealed = np.asarray(store.read(keys, _region(store, keys, index)))
     arrays = {name: np.asarray(store.read(name, _region(store, name, index))) for name in arrays_of(store, keys)}
@@ -218,7 +218,7 @@ def read_chunk(store: Store, keys: str, index: Index) -> tuple[list[str], dict[s
     return [key_in(text) for text in sealed.ravel().tolist()], arrays
 
 
-def seal(key: str, arrays: Iterable[NDArray[np.float64]]) -> str:
+def seal(key: str, arrays: Iterable[Reals]) -> str:
     """Return a key with the checksums of the values that it is for, in the order of `arrays_of`."""
     return " ".join([key, *(str(checksum_of(np.ascontiguousarray(values))) for values in arrays)])
 

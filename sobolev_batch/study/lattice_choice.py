@@ -16,8 +16,9 @@ from typing import Any, Self
 
 import numpy as np
 
+from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import AccuracyError, MeshError, StudyError, one_line
-from sobolev_batch.geometry.surface import Extent, Reals, Similarity, Surface
+from sobolev_batch.geometry.surface import Extent, Similarity, Surface
 from sobolev_batch.norms.accuracy.octaves import solve_in_octaves
 from sobolev_batch.norms.accuracy.problem import ESTIMATE_CAUTION, Problem, error_target
 from sobolev_batch.norms.accuracy.solve import coarser_than, permits_octaves, prefers_octaves, run_pilot

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from typing import Literal
 
-import numpy as np
 import pandas as pd
 import xarray as xr
-from numpy.typing import NDArray
 
+from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.norms.budget import PARTS, quotients
 from sobolev_batch.norms.columns import parts_as_variables
@@ -25,8 +24,6 @@ from sobolev_batch.tables.text import (
     with_error,
 )
 from sobolev_batch.transform.lattice import check_orders
-
-Reals = NDArray[np.float64]
 
 _COLUMNS = ("distance", "error", *PARTS)
 # A longer printed matrix cannot be read.

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import xarray as xr
-from numpy.typing import NDArray
 
+from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import DamageError, InputError, StoreError, one_line
 from sobolev_batch.geometry.surface import placement_doubt
 from sobolev_batch.norms.columns import describe
@@ -26,7 +26,6 @@ from sobolev_batch.store.store import DIGEST, OCTAVES_GROUP, RECORDS, SPECTRA_GR
 from sobolev_batch.store.stored_tables import table_attributes
 from sobolev_batch.visible import FILE_UNITS
 
-Reals = NDArray[np.float64]
 # Names of families, or globs of names; None is all of them.
 Families = str | Sequence[str] | None
 

@@ -14,8 +14,8 @@ from typing import Self
 import numpy as np
 import xarray as xr
 
+from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import DamageError
-from sobolev_batch.geometry.surface import Reals
 from sobolev_batch.norms.budget import PARTS, NormEstimate
 from sobolev_batch.norms.columns import VARIABLES, describe
 from sobolev_batch.store.store import DISTANCES, PAIRS_KEYS, Store

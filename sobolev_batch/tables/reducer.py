@@ -11,6 +11,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.geometry.surface import DIRECTIONS, Extent
 from sobolev_batch.norms.budget import (
     NormEstimate,
@@ -32,9 +33,6 @@ from sobolev_batch.norms.tail.values import OctaveSums, OctaveWeights, Tail, squ
 from sobolev_batch.store.store import Store
 from sobolev_batch.study.lattice_choice import LatticeChoice
 from sobolev_batch.transform.lattice import Block, Lattice, SobolevWeights, shell_sums
-
-Reals = NDArray[np.float64]
-Complexes = NDArray[np.complex128]
 
 # Others that are multiplied with the rows of a tile at a time: nearly as fast as all of them at once.
 _GROUP = 32

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sobolev_batch.geometry.surface import Reals
+from sobolev_batch.arrays import Reals
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
 from sobolev_batch.norms.budget import AREA_AND_SHAPE, NormEstimate
 from sobolev_batch.norms.columns import dataset_of, describe, observed_rates

@@ -7,8 +7,8 @@ from contextlib import suppress
 
 import numpy as np
 
+from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import DamageError
-from sobolev_batch.geometry.surface import Reals
 from sobolev_batch.norms.spectrum import ComparedSpectra
 from sobolev_batch.store.store import SPECTRA_GROUP, SPECTRA_KEYS, Store
 from sobolev_batch.store.stored_tables import arrays_of, key_in, key_of, missing_chunks, read_chunk, seal

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
+from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import DamageError, InputError
-from sobolev_batch.geometry.surface import Reals, Similarity
+from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
 from sobolev_batch.norms.budget import AREA_AND_SHAPE, NormEstimate

@@ -24,15 +24,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 
+from sobolev_batch.arrays import Array, Reals
 from sobolev_batch.errors import BackendError, InputError, one_line
-from sobolev_batch.geometry.surface import Reals
 
 ComplexDtype = Literal["complex128", "complex64"]
-Complexes = NDArray[np.complexfloating[Any, Any]]
 
 
 # NumPy's or CuPy's; CuPy has no types.
-Array = Any
 Shape = tuple[int, int, int]
 Result = TypeVar("Result")
 

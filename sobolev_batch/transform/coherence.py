@@ -8,10 +8,10 @@ from itertools import permutations
 
 import numpy as np
 
+from sobolev_batch.arrays import Complexes, Indices, Reals
 from sobolev_batch.compiled import pays
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.geometry.surface import Indices, Reals
-from sobolev_batch.transform.backends import CPU, Complexes, NufftSpec, cosine_and_sine
+from sobolev_batch.transform.backends import CPU, NufftSpec, cosine_and_sine
 
 # Triangles at a time: their temporaries stay in cache.
 _BATCH = 1 << 13

@@ -23,27 +23,16 @@ from functools import cache, partial
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gamma, kv
 
+from sobolev_batch.arrays import Array, Complexes, Reals
 from sobolev_batch.compiled import pays
 from sobolev_batch.errors import OrderError
 from sobolev_batch.geometry.closed_forms import Sphere
 from sobolev_batch.geometry.mesh import Corners, Mesh, cross_lengths
-from sobolev_batch.geometry.surface import Reals
-from sobolev_batch.transform.backends import (
-    CPU,
-    Array,
-    Backend,
-    combine,
-    compute_on,
-    cosine_and_sine,
-    row_dots,
-    sums_at,
-)
+from sobolev_batch.transform.backends import CPU, Backend, combine, compute_on, cosine_and_sine, row_dots, sums_at
 from sobolev_batch.transform.lattice import Block, FrequencyLattice
 
-Complexes = NDArray[np.complex128]
 # A number as a rounded value and what it lacks.
 Pair = tuple[Array, Array]
 
@@ -456,7 +445,7 @@ _LEAST_TERM = 1e-17
 _NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(14)
 
 
-def sphere_transform(sphere: Sphere, frequencies: Reals) -> NDArray[np.complex128]:
+def sphere_transform(sphere: Sphere, frequencies: Reals) -> Complexes:
     """Return the transform ∫ exp(-2πi ξ·x) dσ(x) of the area measure of a sphere of radius R and centre c.
 
     For ξ, float64 (..., 3), in cycles per unit length, it is 4πR² sinc(2R|ξ|) exp(-2πi ξ·c) with sinc(t) =
@@ -467,7 +456,7 @@ def sphere_transform(sphere: Sphere, frequencies: Reals) -> NDArray[np.complex12
     return np.asarray(sphere.area * np.sinc(2 * sphere.radius * lengths) * phases)
 
 
-def sphere_block(sphere: Sphere, lattice: FrequencyLattice, block: Block) -> NDArray[np.complex128]:
+def sphere_block(sphere: Sphere, lattice: FrequencyLattice, block: Block) -> Complexes:
     """Return the transform of a sphere on a block of the lattice, complex128 (block.shape)."""
     x, y, z = lattice.frequencies(block)
     lengths = np.sqrt((x**2)[:, None, None] + (y**2)[:, None] + z**2)

@@ -17,9 +17,10 @@ from typing import get_args
 
 import numpy as np
 
+from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.errors import InputError, LatticeError, one_line
 from sobolev_batch.geometry.subdivision import icosphere
-from sobolev_batch.geometry.surface import Reals, Similarity, Surface
+from sobolev_batch.geometry.surface import Similarity, Surface
 from sobolev_batch.parameters import available_cores, is_whole_number
 from sobolev_batch.transform.backends import (
     CPU,
@@ -28,7 +29,6 @@ from sobolev_batch.transform.backends import (
     WIDEST_KERNEL,
     Backend,
     ComplexDtype,
-    Complexes,
     Costs,
     Gpu,
     NufftSpec,

@@ -15,19 +15,17 @@ from operator import itemgetter
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.closed_forms import Sphere
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.smooth import MOST_GAUSS_NODES, MOST_NODES, Counts, Smooth, doubled
-from sobolev_batch.geometry.surface import DIRECTIONS, Reals
+from sobolev_batch.geometry.surface import DIRECTIONS
 from sobolev_batch.transform.backends import CPU, Backend, cosine_and_sine
 from sobolev_batch.transform.exact import exact_transform, sampled_transform, sphere_block, sphere_transform
 from sobolev_batch.transform.lattice import Block, FrequencyLattice
 from sobolev_batch.transform.quadrature import RuleUse, WeightedPoints, assign_rules, loosest_tolerance, weight_masses
-
-Complexes = NDArray[np.complex128]
 
 # Less is rounding: of the transform, and of derivatives that come from an interpolant.
 FINEST_CHANGE = 1e-13

@@ -19,8 +19,8 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import erf, erfc
 
+from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import InputError, LatticeError, OrderError
-from sobolev_batch.geometry.surface import Indices, Reals
 from sobolev_batch.parameters import is_whole_number
 
 # Beyond this a field takes more than 34 GB even in single precision.
@@ -333,7 +333,6 @@ class OctaveLattice(FrequencyLattice):
         return np.asarray(1 + erf(layers / _FADING_LAYERS))
 
 
-Complexes = NDArray[np.complexfloating[Any, Any]]
 Orders = float | Sequence[float]
 
 _LOWEST_ORDER = -100.0

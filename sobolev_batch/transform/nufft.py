@@ -7,17 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from sobolev_batch.geometry.surface import Reals
-from sobolev_batch.transform.backends import (
-    CPU,
-    Array,
-    Backend,
-    ComplexDtype,
-    Complexes,
-    NufftSpec,
-    combine,
-    cosine_and_sine,
-)
+from sobolev_batch.arrays import Array, Complexes, Reals
+from sobolev_batch.transform.backends import CPU, Backend, ComplexDtype, NufftSpec, combine, cosine_and_sine
 from sobolev_batch.transform.lattice import Block, FrequencyLattice, Lattice
 from sobolev_batch.transform.quadrature import WeightedPoints
 

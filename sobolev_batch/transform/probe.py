@@ -11,13 +11,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.geometry.surface import Indices, Reals, Surface
-from sobolev_batch.transform.backends import CPU, Backend, Complexes
+from sobolev_batch.arrays import Complexes, Indices, Reals
+from sobolev_batch.geometry.surface import Surface
+from sobolev_batch.transform.backends import CPU, Backend
 from sobolev_batch.transform.fourier import TransformSettings
 from sobolev_batch.transform.kinds import kind_of
 from sobolev_batch.transform.lattice import Block, Lattice, SobolevWeights, shell_volumes
@@ -111,7 +111,7 @@ def draw(lattice: Lattice, orders: Sequence[float], degree: int, count: int, see
     return Draws(indices, frequencies, scales, tuple(orders), degree, count, seed)
 
 
-def measure(draws: Draws, computed: NDArray[np.complexfloating[Any, Any]], exact: NDArray[np.complex128]) -> Probe:
+def measure(draws: Draws, computed: Complexes, exact: Complexes) -> Probe:
     """Return the probe from a field's values at the drawn frequencies (P,) and the exact ones."""
     sums = draws.scales * np.abs(computed - exact) ** 2
     shells = np.sum(draws.indices**2, axis=1)
@@ -213,7 +213,7 @@ class Sample:
     """Exact transform of a surface at drawn frequencies, complex128 (P,)."""
 
     draws: Draws
-    exact: NDArray[np.complex128]
+    exact: Complexes
 
     @classmethod
     def from_surface(cls, surface: Surface, draws: Draws, backend: Backend = CPU, *, fast: bool = False) -> Sample:

@@ -11,9 +11,9 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
+from sobolev_batch.arrays import Array, Indices, Reals
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.geometry.surface import Indices, Reals
-from sobolev_batch.transform.backends import Array, Backend, combine, sums_at, sums_of_runs
+from sobolev_batch.transform.backends import Backend, combine, sums_at, sums_of_runs
 from sobolev_batch.transform.coherence import RANGES, coherence, unpaired
 from sobolev_batch.transform.lattice import FrequencyLattice
 from sobolev_batch.transform.rules import (

@@ -8,10 +8,9 @@ from itertools import permutations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sobolev_batch.arrays import Complexes, Indices, Reals
 from sobolev_batch.errors import InputError
-from sobolev_batch.geometry.surface import Indices, Reals
 from sobolev_batch.transform.exact import second_difference
 
 HIGHEST_DEGREE = 50
@@ -246,7 +245,7 @@ def measure_typical_errors(rule: TriangleRule) -> tuple[Reals, Reals]:
     return np.maximum(*even), np.maximum(*odd)
 
 
-def _rule_errors(rule: TriangleRule, phases: Reals) -> NDArray[np.complex128]:
+def _rule_errors(rule: TriangleRule, phases: Reals) -> Complexes:
     """Return the error (n,) of a rule on exp(i phase), relative to the area, from the phases at the corners (3, n)."""
     exact = 2 * second_difference(phases[1] - phases[0], phases[2] - phases[0])
     return np.asarray(rule.weights @ np.exp(1j * (rule.barycentric @ phases)) - exact)

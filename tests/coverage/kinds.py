@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
 from sobolev_batch import Mesh
+from sobolev_batch.arrays import Reals
 from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.shapes import Similarity, Sphere, icosphere
 from sobolev_batch.sources.files import FileSource
@@ -19,7 +19,6 @@ from sobolev_batch.sources.registry import load_mesh
 from tests.coverage.truth import Pair
 from tests.support.shapes import CENTRED_BOX as BOX
 
-Reals = NDArray[np.float64]
 Surfaces = tuple[Surface, Surface]
 
 # The cortical surface that the extra `studies` brings.

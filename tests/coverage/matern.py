@@ -17,14 +17,12 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 from scipy.special import gamma, k0, k1, kv
 
 from sobolev_batch import Mesh
+from sobolev_batch.arrays import Reals
 from sobolev_batch.shapes import Sphere
-
-Reals = NDArray[np.float64]
 
 # Points per side of a tile of the double sum: its temporaries stay in the processor's cache.
 _TILE = 384

@@ -6,14 +6,12 @@ import itertools
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sobolev_batch import Mesh
+from sobolev_batch.arrays import Reals
 from tests.coverage.kinds import direction, rotation, small_amount
 from tests.coverage.truth import Pair
 from tests.support.rectangles import Rectangles
-
-Reals = NDArray[np.float64]
 
 
 def pair_of(rng: np.random.Generator, a: Rectangles, b: Rectangles) -> Pair:

@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
 from sobolev_batch import Mesh
+from sobolev_batch.arrays import Reals
 from tests.coverage.kinds import direction, sphere_at
 from tests.coverage.truth import Pair
 from tests.support.rectangles import Rectangles
-
-Reals = NDArray[np.float64]
 
 # Coordinates are multiples of this times the denominator of the rotation: up to 2²² they are exact, as are their sums.
 _STEP = 2.0**-30

@@ -16,17 +16,15 @@ from dataclasses import dataclass, replace
 from itertools import pairwise, product
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import erf
 
 from sobolev_batch import Lattice, Mesh, distance, fourier_transform
+from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import AccuracyError
 from sobolev_batch.geometry.surface import Extent, Surface
 from sobolev_batch.shapes import Sphere
 from tests.coverage.matern import Sides, divided_points, double_sum, graded_points, mesh_potentials, sphere_potential
 from tests.support.rectangles import TIMES, Rectangles, integrals_of_traces
-
-Reals = NDArray[np.float64]
 
 # Kernels of orders above this have a strong kink at zero, those of others hardly any.
 _SMOOTH = -4.0

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from sobolev_batch import Mesh
+from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.mesh import shared_triangles
 from tests.support.shapes import (
@@ -21,7 +22,6 @@ from tests.support.shapes import (
     TETRAHEDRON_AREA,
     TETRAHEDRON_TRIANGLES,
     TETRAHEDRON_VERTICES,
-    Reals,
     box,
     mesh_counts,
     tetrahedron,

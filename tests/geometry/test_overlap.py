@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import special_ortho_group
 
 from sobolev_batch import Mesh
+from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.geometry.overlap import SINGLE_ROUNDING, Rests, rests_of
 from sobolev_batch.shapes import icosphere
 from sobolev_batch.transform.exact import exact_transform
@@ -19,12 +20,10 @@ from tests.coverage.solids import edited
 from tests.support.rectangles import Rectangles
 from tests.support.shapes import soup
 
-Reals = NDArray[np.float64]
-
 FREQUENCIES: Reals = np.random.default_rng(3).normal(size=(40, 3)) * np.geomspace(0.1, 30, 40)[:, None]
 
 
-def values(mesh: Mesh | None) -> NDArray[np.complex128]:
+def values(mesh: Mesh | None) -> Complexes:
     return np.zeros(len(FREQUENCIES), complex) if mesh is None else exact_transform(mesh, FREQUENCIES)
 
 

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Mesh, distance, fourier_transform, norm
 from sobolev_batch.geometry.surface import Surface
@@ -17,8 +16,6 @@ from sobolev_batch.transform.exact import sphere_distance, sphere_inner_product
 from sobolev_batch.transform.lattice import SobolevWeights
 from sobolev_batch.transform.probe import draw
 from tests.support.shapes import CENTRED_BOX as BOX
-
-Reals = NDArray[np.float64]
 
 ORDERS = (-2.0, -3.0, -5.0, -10.0)
 STICK = Mesh(BOX.vertices * np.array([1.0, 0.15, 0.1]), BOX.triangles)

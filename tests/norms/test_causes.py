@@ -5,18 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
-from numpy.typing import NDArray
 
 import sobolev_batch as sb
+from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.norms import causes, fields
 from sobolev_batch.transform.backends import NufftSpec
 from sobolev_batch.transform.lattice import Block
 from sobolev_batch.transform.nufft import evaluate_at
 from tests.support.oracles import full_lattice_norm, on_whole_cube
 from tests.support.shapes import CENTRED_BOX as BOX
-
-Reals = NDArray[np.float64]
-Complexes = NDArray[np.complex128]
 
 LATTICE = sb.Lattice(4.0, 32)
 ORDERS = [-0.7, -2.0, -10.0]

@@ -17,8 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import erf, gamma
 
 from sobolev_batch import Mesh
-
-Reals = NDArray[np.float64]
+from sobolev_batch.arrays import Reals
 
 # Times of the finer of two rules. The least resolves gaps from some 1e-6 on.
 TIMES: Reals = np.geomspace(1e-12, 80.0, 481)

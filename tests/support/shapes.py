@@ -6,14 +6,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sobolev_batch import Mesh
+from sobolev_batch.arrays import Reals
 from sobolev_batch.geometry.smooth import Smooth
 from sobolev_batch.geometry.surface import Point
 from sobolev_batch.shapes import Interval, ParametrisedSurface, Torus
-
-Reals = NDArray[np.float64]
 
 # A box with sides of 1, 2 and 4, so that axes cannot be confused. Its coordinates are exact in single precision.
 BOX_VERTICES: Reals = np.array([(x, y, z) for x in (0, 1) for y in (0, 2) for z in (0, 4)], dtype=np.float64)

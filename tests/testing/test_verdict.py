@@ -14,14 +14,11 @@ import numpy as np
 import pytest
 import trimesh
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from plyfile import PlyData
 
 import sobolev_batch as sb
 from sobolev_batch.extras.figures import views
 from sobolev_batch.testing.verdict import require_place, write_difference
-
-Reals = NDArray[np.float64]
 
 # Areas alone bound what lies beyond a lattice at this order, so that verdicts are proofs and take little time.
 same_surface = partial(sb.testing.same_surface, order=-4.0)

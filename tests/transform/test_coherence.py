@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sobolev_batch import Lattice, Mesh
+from sobolev_batch.arrays import Reals
 from sobolev_batch.geometry.subdivision import subdivided
-from sobolev_batch.geometry.surface import Reals
 from sobolev_batch.shapes import icosphere
 from sobolev_batch.transform.coherence import coherence
 from sobolev_batch.transform.fourier import TransformSettings, transform_block

@@ -15,6 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Mesh
+from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.geometry import mesh as meshes
 from sobolev_batch.shapes import icosphere
 from sobolev_batch.transform import coherence, exact, quadrature
@@ -23,8 +24,6 @@ from sobolev_batch.transform.fourier import TransformSettings, transform_block
 from tests.support.shapes import box
 from tests.transform.test_exact import SHAPES, oracle
 
-Reals = NDArray[np.float64]
-Complexes = NDArray[np.complex128]
 Transform = Callable[[Mesh, Reals], Complexes]
 Result = TypeVar("Result")
 

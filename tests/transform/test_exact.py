@@ -7,9 +7,9 @@ import math
 import mpmath
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Mesh, norm
+from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import OrderError
 from sobolev_batch.shapes import Sphere, icosphere
 from sobolev_batch.transform.exact import (
@@ -20,8 +20,6 @@ from sobolev_batch.transform.exact import (
     sphere_transform,
 )
 from tests.support.shapes import box, tetrahedron
-
-Reals = NDArray[np.float64]
 
 
 def oracle(corners: Reals, frequency: Reals) -> complex:

@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 import sobolev_batch as sb
+from sobolev_batch.arrays import Reals
 from sobolev_batch.geometry.smooth import Smooth
 from sobolev_batch.transform import kinds
 from sobolev_batch.transform.backends import CPU
@@ -18,8 +19,6 @@ from sobolev_batch.transform.kinds import direct_transform, exact_values, resolu
 from tests.support.fake_device import Device
 from tests.support.oracles import spheroid_value, torus_value
 from tests.support.shapes import HALF_TURN, TURN, Roof, angular_ball, turned_torus
-
-Reals = NDArray[np.float64]
 
 LATTICE = sb.Lattice(4.0, 32)
 SMOOTH = [

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Mesh, fourier_transform, norm
 from sobolev_batch.errors import InputError, LatticeError
@@ -30,8 +29,6 @@ from sobolev_batch.transform.fourier import (
 )
 from sobolev_batch.transform.lattice import Block, SobolevWeights
 from tests.support.shapes import CENTRED_BOX as BOX
-
-Reals = NDArray[np.float64]
 
 
 def soup(rng: np.random.Generator) -> Mesh:

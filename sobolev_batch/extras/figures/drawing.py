@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.cluster.hierarchy import leaves_list, linkage
 from scipy.spatial.distance import squareform
 
+from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.extras.figures.selection import Selection
 from sobolev_batch.extras.figures.style import (
@@ -37,7 +38,6 @@ from sobolev_batch.extras.figures.style import (
 from sobolev_batch.extras.leagues.costs import CostLeague
 from sobolev_batch.extras.leagues.evolution import evolution
 from sobolev_batch.extras.leagues.league import League
-from sobolev_batch.geometry.surface import Reals
 from sobolev_batch.tables.convergence import table
 from sobolev_batch.tables.matrix import pairs_of
 from sobolev_batch.tables.open import (

@@ -14,11 +14,12 @@ from typing import Self
 import numpy as np
 import xarray as xr
 
+from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError, SobolevBatchError, from_extra, written
 from sobolev_batch.geometry.formats.plain_formats import write_ply
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.proximity import vertex_distances
-from sobolev_batch.geometry.surface import Reals, Similarity
+from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms.causes import witness
 from sobolev_batch.sources.mesh_cache import MeshCache
 from sobolev_batch.sources.names import file_stem

@@ -10,9 +10,9 @@ from typing import Self
 import numpy as np
 import xarray as xr
 
+from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.extras.figures.style import Style, style_of
-from sobolev_batch.geometry.surface import Reals
 from sobolev_batch.norms.causes import spectrum
 from sobolev_batch.tables.open import (
     EDGE_LENGTH,

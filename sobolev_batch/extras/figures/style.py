@@ -17,8 +17,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 
+from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError, written
-from sobolev_batch.geometry.surface import Reals
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.tables.text import middle_cut
 from sobolev_batch.visible import visible

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from shapely import MultiPoint
 
+from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError, SobolevBatchError
 from sobolev_batch.extras.figures.remade import StudyMeshes, fields_of, matching_labels, witness_at_vertices
 from sobolev_batch.extras.figures.selection import Selection
@@ -39,7 +40,7 @@ from sobolev_batch.extras.figures.style import (
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.proximity import vertex_distances
 from sobolev_batch.geometry.subdivision import subdivided
-from sobolev_batch.geometry.surface import Reals, normals
+from sobolev_batch.geometry.surface import normals
 from sobolev_batch.norms.causes import witness
 from sobolev_batch.sources.names import file_stem
 from sobolev_batch.tables.convergence import table

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, vstack
 
+from sobolev_batch.arrays import Complexes, Indices, Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.geometry.surface import Indices, Reals, normals
-from sobolev_batch.transform.backends import Complexes, NufftSpec
+from sobolev_batch.geometry.surface import normals
+from sobolev_batch.transform.backends import NufftSpec
 from sobolev_batch.transform.fourier import ON_CPU, Execution, TransformSettings, require_points_inside
 from sobolev_batch.transform.lattice import Lattice
 from sobolev_batch.transform.nufft import transform_points

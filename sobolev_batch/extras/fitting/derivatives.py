@@ -10,11 +10,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
+from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.errors import InputError, from_extra
 from sobolev_batch.extras.fitting.adjoint import MeshTransform
 from sobolev_batch.geometry.formats.readers import MeshLike, as_mesh
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.geometry.surface import Extent, Reals
+from sobolev_batch.geometry.surface import Extent
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.budget import ALIASING_CAUTION, PARTS, Support, decay_to_period, sums_of_shells, truncated
 from sobolev_batch.norms.columns import NUMBER, VARIABLES, labelled, lattice_attributes
@@ -28,7 +29,7 @@ from sobolev_batch.norms.fields import (
     field_values,
     quality_of,
 )
-from sobolev_batch.transform.backends import Complexes, backend_named
+from sobolev_batch.transform.backends import backend_named
 from sobolev_batch.transform.fourier import FINEST_EPS, Execution, TransformSettings, thread_count
 from sobolev_batch.transform.lattice import Lattice, Orders, SobolevWeights, check_orders, shell_sums, single_order
 

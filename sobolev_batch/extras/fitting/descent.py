@@ -14,12 +14,13 @@ from scipy.sparse import coo_array, csc_array, eye_array
 from scipy.sparse.csgraph import laplacian
 from scipy.sparse.linalg import splu
 
+from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import LatticeError
 from sobolev_batch.extras.fitting.adjoint import area_derivatives
 from sobolev_batch.extras.fitting.derivatives import SquaredDistance
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.subdivision import Edges
-from sobolev_batch.geometry.surface import Indices, Reals, normals
+from sobolev_batch.geometry.surface import normals
 
 Notify = Callable[[Reals, float], None]
 

@@ -10,6 +10,7 @@ from typing import Self
 import numpy as np
 import xarray as xr
 
+from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import AccuracyError, InputError
 from sobolev_batch.extras.fitting import DEFAULT_SMOOTHING, DEFAULT_STEPS
 from sobolev_batch.extras.fitting.descent import Descent, End, Smoothing
@@ -18,7 +19,6 @@ from sobolev_batch.geometry.formats.readers import MeshLike, as_mesh
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.proximity import proximity
 from sobolev_batch.geometry.subdivision import Edges
-from sobolev_batch.geometry.surface import Reals
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.distances import distance
 from sobolev_batch.norms.fields import Operand, OperandLike, as_operand

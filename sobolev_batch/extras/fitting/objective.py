@@ -9,21 +9,14 @@ from typing import Self
 import numpy as np
 import xarray as xr
 
+from sobolev_batch.arrays import Complexes, Indices, Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.extras.fitting import DEFAULT_SMOOTHING, DEFAULT_STEPS
 from sobolev_batch.extras.fitting.adjoint import MeshTransform
 from sobolev_batch.extras.fitting.derivatives import SquaredDistance, factors_of
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.subdivision import Edges
-from sobolev_batch.geometry.surface import (
-    Extent,
-    Indices,
-    Reals,
-    Similarity,
-    Surface,
-    centering,
-    is_finite_number,
-)
+from sobolev_batch.geometry.surface import Extent, Similarity, Surface, centering, is_finite_number
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.accuracy.tolerance import Accuracy, core_lattice, lattice_of
 from sobolev_batch.norms.budget import Support
@@ -38,7 +31,6 @@ from sobolev_batch.norms.fields import (
     quality_of,
 )
 from sobolev_batch.parameters import is_whole_number
-from sobolev_batch.transform.backends import Complexes
 from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, choose_settings
 from sobolev_batch.transform.lattice import Lattice, SobolevWeights, single_order
 from sobolev_batch.transform.probe import Sample, draws_for, estimate

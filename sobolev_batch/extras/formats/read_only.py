@@ -28,10 +28,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import MeshError, from_extra
 from sobolev_batch.geometry.formats.by_name import Format
 from sobolev_batch.geometry.formats.parsing import Raw, merge_coincident, triangle_fans, unpacked_limit, xml_events
-from sobolev_batch.geometry.surface import Indices, Reals
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3}

@@ -14,12 +14,12 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from sobolev_batch.arrays import Reals
 from sobolev_batch.batch.checks import SIGNIFICANCE, gap_of, least_objects
 from sobolev_batch.errors import InputError, StoreError
 from sobolev_batch.extras.leagues.costs import DEFAULT_COST, CostLeague, cost_leagues_of
 from sobolev_batch.extras.leagues.statistics import (
     Curve,
-    Reals,
     adjusted,
     common_sizes,
     interval,

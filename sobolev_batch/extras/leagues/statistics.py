@@ -10,13 +10,11 @@ from typing import Self
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from sobolev_batch.arrays import Reals
 from sobolev_batch.batch.checks import Range, common_range
 from sobolev_batch.tables.open import sizes_of
-
-Reals = NDArray[np.float64]
 
 # Sizes at which curves are compared, evenly spaced on a logarithmic axis.
 _SIZES = 5

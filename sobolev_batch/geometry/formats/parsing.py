@@ -17,8 +17,8 @@ from xml.parsers import expat
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sobolev_batch.arrays import Indices
 from sobolev_batch.errors import MeshError
-from sobolev_batch.geometry.surface import Indices
 from sobolev_batch.parameters import format_bytes, machine_memory
 
 # What a parser makes of a file: vertices (n, 3) and triangles (m, 3).

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.special import gammaln, kve
 
-from sobolev_batch.geometry.surface import Extent, Reals, Surface
+from sobolev_batch.arrays import Reals
+from sobolev_batch.geometry.surface import Extent, Surface
 
 # Fraction of the accuracy that the product of both surfaces may take.
 APART_FRACTION = 0.01

@@ -8,9 +8,9 @@ from functools import cached_property
 from typing import Self, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sobolev_batch.geometry.surface import Reals, Surface, centering
+from sobolev_batch.arrays import Complexes, Reals
+from sobolev_batch.geometry.surface import Surface, centering
 from sobolev_batch.norms.accuracy.problem import (
     OFF_CENTER,
     Problem,
@@ -44,8 +44,6 @@ from sobolev_batch.norms.tail.values import (
 )
 from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, permits_single
 from sobolev_batch.transform.lattice import Lattice, SobolevWeights, shell_sums
-
-Complexes = NDArray[np.complexfloating]
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,8 @@ from typing import Self
 
 import numpy as np
 
+from sobolev_batch.arrays import Reals
 from sobolev_batch.geometry.smooth import Smooth
-from sobolev_batch.geometry.surface import Reals
 from sobolev_batch.norms.accuracy.problem import (
     ESTIMATE_CAUTION,
     Problem,

@@ -9,17 +9,18 @@ from typing import Any, Self, cast
 
 import numpy as np
 
+from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.errors import AccuracyError
 from sobolev_batch.geometry.mesh import Mesh, shared_triangles
 from sobolev_batch.geometry.overlap import SINGLE_ROUNDING, rests_of
-from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Reals, Similarity, Surface, centering
+from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Similarity, Surface, centering
 from sobolev_batch.norms.accuracy.apart import APART_FRACTION, product_apart
 from sobolev_batch.norms.accuracy.tolerance import Accuracy, first_lattice, unreachable
 from sobolev_batch.norms.budget import NormEstimate, Sums, Support, change_of_root, norm_of_moves, sums_of_shells
 from sobolev_batch.norms.fields import USUAL_DEGREE, Field, field_for
 from sobolev_batch.norms.tail.sampling import OctaveSampling
 from sobolev_batch.norms.tail.values import OctaveValues
-from sobolev_batch.transform.backends import ComplexDtype, Complexes
+from sobolev_batch.transform.backends import ComplexDtype
 from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, permits_single
 from sobolev_batch.transform.lattice import Lattice, SobolevWeights, shell_sums
 from sobolev_batch.transform.probe import Sample, draws_for, estimate, needs_probe

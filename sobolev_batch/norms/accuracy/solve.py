@@ -11,9 +11,10 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import AccuracyError
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.geometry.surface import Reals, Surface
+from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms.accuracy.octaves import solve_in_octaves
 from sobolev_batch.norms.accuracy.problem import (
     ESTIMATE_CAUTION,

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 from scipy.special import betainc
 
+from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import AccuracyError, InputError
-from sobolev_batch.geometry.surface import Reals
 from sobolev_batch.norms.budget import (
     ALIASING_CAUTION,
     TRUNCATION_CAUTION,

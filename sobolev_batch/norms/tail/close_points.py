@@ -9,11 +9,12 @@ from typing import Self
 
 import numpy as np
 
+from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.closed_forms import Sphere
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.smooth import Interval, Smooth
-from sobolev_batch.geometry.surface import Indices, Reals, Surface
+from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms.tail.potentials import centers_and_radii
 from sobolev_batch.transform.kinds import resolution_of
 

@@ -24,8 +24,8 @@ from numpy.polynomial.legendre import leggauss
 from scipy.special import beta, betainc
 
 from sobolev_batch import compiled
+from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.geometry.closed_forms import Sphere
-from sobolev_batch.geometry.surface import Indices, Reals
 from sobolev_batch.transform.lattice import smooth_step
 from sobolev_batch.transform.rules import symmetric_rule
 

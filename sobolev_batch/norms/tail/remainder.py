@@ -23,7 +23,8 @@ from typing import Self
 import numpy as np
 from scipy.special import stdtrit
 
-from sobolev_batch.geometry.surface import Reals, Surface
+from sobolev_batch.arrays import Reals
+from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms.tail.close_points import Draw, Sheets
 from sobolev_batch.norms.tail.potentials import (
     Kernels,

@@ -19,8 +19,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.geometry.surface import Indices, Reals, Surface
+from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.transform.backends import combine
 from sobolev_batch.transform.lattice import STEP_START, OctaveLattice, smooth_step
 

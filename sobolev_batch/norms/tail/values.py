@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from sobolev_batch.geometry.surface import Reals, Surface
+from sobolev_batch.arrays import Reals
+from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms.budget import NormEstimate, change_of_root
 from sobolev_batch.norms.tail.sampling import OctaveSampling
 from sobolev_batch.transform.backends import Backend, ComplexDtype
@@ -28,8 +29,6 @@ from sobolev_batch.transform.fourier import (
 from sobolev_batch.transform.kinds import kind_of
 from sobolev_batch.transform.lattice import OctaveLattice
 from sobolev_batch.transform.probe import norms_of_checks
-
-Complexes = NDArray[np.complex128]
 
 # Settings of the transform of a surface on a lattice.
 Settings = Callable[[Surface, OctaveLattice], TransformSettings]

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import sobolev_batch as sb
+from sobolev_batch.arrays import Reals
 from sobolev_batch.extras.fitting.align import moved_by
-from sobolev_batch.geometry.surface import Reals
 
 
 def shape(level: int) -> sb.Mesh:

@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 from scipy.special import roots_jacobi, roots_legendre
 
 import sobolev_batch as sb
+from sobolev_batch.arrays import Reals
 from sobolev_batch.extras.fitting.adjoint import MeshTransform
 from sobolev_batch.transform import backends
 from sobolev_batch.transform.fourier import TransformSettings
 from sobolev_batch.transform.quadrature import assign_rules
 from tests.support.fake_device import Device
 from tests.support.shapes import CENTRED_BOX, tetrahedron
-
-Reals = NDArray[np.float64]
 
 BALL = sb.shapes.icosphere(1)
 SPHERE = sb.shapes.Sphere(0.7, (0.2, -0.1, 0.05))

@@ -17,6 +17,7 @@ import trimesh
 
 import sobolev_batch as sb
 from sobolev_batch import Mesh, read_mesh
+from sobolev_batch.arrays import Reals
 from sobolev_batch.geometry.formats.by_name import mesh_format, mesh_stem
 from sobolev_batch.shapes import icosphere
 from tests.support.mesh_files import BIG, BOXES, LITTLE, OFF_BOX, WRITERS, Read, obj, off, ply, stl_text
@@ -28,7 +29,6 @@ from tests.support.shapes import (
     BOX_TRIANGLES,
     BOX_VERTICES,
     CLOSED,
-    Reals,
     box,
     mesh_counts,
     soup,

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.integrate import quad
 
 from sobolev_batch import Mesh
@@ -28,8 +27,6 @@ from sobolev_batch.transform.fourier import ErrorTarget
 from sobolev_batch.transform.lattice import smooth_step
 from tests.support.oracles import torus_value
 from tests.support.rectangles import Rectangles
-
-Reals = NDArray[np.float64]
 
 OCTAVE = Octave(2.0, 1)
 ORDERS = (-1.0, -2.0)

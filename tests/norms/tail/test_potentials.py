@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from sobolev_batch import Mesh
+from sobolev_batch.arrays import Reals
 from sobolev_batch.norms.tail import potentials
 from sobolev_batch.norms.tail.potentials import Kernels, add_compiled, of_triangles
 from sobolev_batch.norms.tail.remainder import remainder
 from tests.support.rectangles import Rectangles
 
-Reals = NDArray[np.float64]
 ORDERS = (-0.75, -1.0, -3.0)
 CUTOFF = 12.0
 
