@@ -64,7 +64,11 @@ class Mesh:
         checked_triangles = _checked_triangles(triangles, len(checked_vertices))
         object.__setattr__(self, "vertices", checked_vertices)
         object.__setattr__(self, "triangles", checked_triangles)
-        largest = float(np.abs(checked_vertices).max(initial=0.0))
+        self._require_sizes()
+
+    def _require_sizes(self) -> None:
+        """Refuse coordinates that overflow, and triangles that are all degenerate."""
+        largest = float(np.abs(self.vertices).max(initial=0.0))
         if largest > LARGEST_LENGTH or not np.isfinite(self.area):
             raise MeshError(
                 "the mesh has coordinates so large that areas or squared lengths overflow double precision: "
@@ -72,7 +76,7 @@ class Mesh:
             )
         if not any(np.any(self.areas[batch] > zero_areas) for batch, zero_areas in self._zero_areas()):
             raise MeshError(
-                f"the total area of the {len(checked_triangles)} triangles is zero: every one is "
+                f"the total area of the {len(self.triangles)} triangles is zero: every one is "
                 "degenerate, so there is no surface measure to compare"
             )
 
@@ -132,8 +136,9 @@ class Mesh:
         """Return the mesh after x -> scale * (x - origin)."""
         vertices = self.vertices - np.asarray(origin)
         vertices *= scale
-        # Read-only, so that the mesh takes it over: a copy of huge meshes would count.
-        return Mesh(_frozen(vertices), self.triangles)
+        moved = Mesh.from_checked(vertices, self.triangles)
+        moved._require_sizes()
+        return moved
 
     @cached_property
     def used_vertices(self) -> Indices:

@@ -8,14 +8,14 @@ import io
 import os
 import stat
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from io import BufferedReader
 from pathlib import Path, PurePath
 from typing import IO, Any, cast
 from xml.parsers import expat
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Indices
 from sobolev_batch.errors import MeshError
@@ -23,6 +23,8 @@ from sobolev_batch.parameters import format_bytes, machine_memory
 
 # What a parser makes of a file: vertices (n, 3) and triangles (m, 3).
 Raw = tuple[NDArray[Any], NDArray[Any]]
+# How the bytes of an open file are read, of which so many are wanted.
+Read = Callable[[BufferedReader, int], bytes]
 
 # No larger file is read; 8 GiB hold some 160 million binary STL triangles.
 _LARGEST_BYTES = 8 << 30
@@ -77,16 +79,16 @@ def require_memory_to_read(needed_bytes: float) -> None:
         )
 
 
-def read_unpacked(path: Path, factor: float) -> bytes:
+def read_unpacked(path: Path, factor: float, read: Read = BufferedReader.read) -> bytes:
     """Return the bytes of a regular file, unpacked if its name ends in .gz, at a factor of memory for each byte."""
     try:
         with open_regular(path) as file:
             length = checked_length(file)
-            if is_gzipped(path):
-                data = _read_unpacked_bounded(file, length, factor)
-            else:
+            if not is_gzipped(path):
                 require_memory_to_read(factor * length)
-                data = file.read(length)
+            data = read(file, length)
+        if is_gzipped(path):
+            data = _unpacked_bounded(data, factor)
     except (OSError, EOFError, ValueError, zlib.error) as error:
         raise MeshError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
     if not data:
@@ -145,17 +147,17 @@ def xml_events(data: bytes, kind: str) -> Iterator[tuple[str, str, dict[str, str
     yield from events
 
 
-def _read_unpacked_bounded(file: IO[bytes], length: int, factor: float) -> bytes:
-    """Return what a packed file holds; it is refused as soon as that exceeds a bound."""
-    most = unpacked_limit(length)
+def _unpacked_bounded(packed: bytes, factor: float) -> bytes:
+    """Return what packed bytes hold; they are refused as soon as that exceeds a bound."""
+    most = unpacked_limit(len(packed))
     data = io.BytesIO()
-    with gzip.GzipFile(fileobj=file) as unpacked:
+    with gzip.GzipFile(fileobj=io.BytesIO(packed)) as unpacked:
         # One large read would reserve the bound at once.
         while chunk := cast(IO[bytes], unpacked).read(_CHUNK_BYTES):
             data.write(chunk)
             if data.tell() > most:
                 raise MeshError(
-                    f"larger than {most} bytes once it is unpacked from {length}: no mesh file shrinks that far"
+                    f"larger than {most} bytes once it is unpacked from {len(packed)}: no mesh file shrinks that far"
                 )
             if data.tell() > _HARMLESS_BYTES:
                 require_memory_to_read(factor * data.tell())
@@ -180,14 +182,6 @@ def triangle_fans(corners: Indices, sizes: Indices) -> Indices:
     first = np.repeat(np.cumsum(sizes) - sizes, sizes - 2)
     rank = np.arange(ends[-1]) - np.repeat(ends - (sizes - 2), sizes - 2)
     return np.stack([corners[first], corners[first + rank + 1], corners[first + rank + 2]], axis=1)
-
-
-def triangle_fans_of_lists(polygons: Sequence[ArrayLike]) -> Indices:
-    """Cut polygons, each a sequence of vertex indices, as `triangle_fans` does."""
-    if not len(polygons):
-        raise MeshError("the file has no faces")
-    sizes = np.array([len(np.asarray(polygon)) for polygon in polygons], dtype=np.int64)
-    return triangle_fans(np.concatenate([np.asarray(polygon, dtype=np.int64) for polygon in polygons]), sizes)
 
 
 def merge_coincident(vertices: NDArray[np.floating], triangles: Indices) -> tuple[NDArray[np.floating], Indices]:

@@ -10,6 +10,7 @@ import os
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
 from typing import IO, Any
 from uuid import uuid4
@@ -21,6 +22,7 @@ from sobolev_batch.errors import InputError, MeshError, written
 from sobolev_batch.geometry.closed_forms import Sphere
 from sobolev_batch.geometry.formats.by_name import BY_SUFFIX, WRITERS, mesh_format
 from sobolev_batch.geometry.formats.parsing import (
+    Read,
     checked_length,
     is_gzipped,
     open_regular,
@@ -28,7 +30,7 @@ from sobolev_batch.geometry.formats.parsing import (
     require_memory_to_read,
     unpacked_limit,
 )
-from sobolev_batch.geometry.formats.plain_formats import HEADER_BYTES, announced_sizes
+from sobolev_batch.geometry.formats.ply import HEADER_BYTES, announced_size
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.smooth import Smooth
 from sobolev_batch.geometry.surface import Surface
@@ -83,7 +85,11 @@ def read_mesh(path: str | Path) -> Mesh:
     ...     sb.read_mesh(path)
     Mesh(3 vertices, 1 triangles)
     """
-    path = Path(path)
+    return read_mesh_by(Path(path), BufferedReader.read)
+
+
+def read_mesh_by(path: Path, read: Read) -> Mesh:
+    """Read a mesh as `read_mesh` does, by a function that reads the bytes of its file."""
     suffix = mesh_format(path)
     if suffix not in BY_SUFFIX:
         known = ", ".join(name for name, form in BY_SUFFIX.items() if form.is_name is None)
@@ -95,7 +101,7 @@ def read_mesh(path: str | Path) -> Mesh:
     try:
         # The header of a PLY file tells more than its length.
         require_memory_to_read(expected_size(path)[1])
-        data = [read_unpacked(path, form.memory_bytes / form.file_bytes)]
+        data = [read_unpacked(path, form.memory_bytes / form.file_bytes, read)]
         # Numbers that overflow become infinite, which the mesh refuses.
         with np.errstate(all="ignore"):
             # Only the parser holds the bytes, so that it can free them early.
