@@ -15,7 +15,7 @@ from typing import IO, Any, cast
 from xml.parsers import expat
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.arrays import Indices
 from sobolev_batch.errors import MeshError
@@ -182,6 +182,14 @@ def triangle_fans(corners: Indices, sizes: Indices) -> Indices:
     first = np.repeat(np.cumsum(sizes) - sizes, sizes - 2)
     rank = np.arange(ends[-1]) - np.repeat(ends - (sizes - 2), sizes - 2)
     return np.stack([corners[first], corners[first + rank + 1], corners[first + rank + 2]], axis=1)
+
+
+def triangle_fans_of_lists(polygons: Sequence[ArrayLike]) -> Indices:
+    """Cut polygons, each a sequence of vertex indices, as `triangle_fans` does."""
+    if not len(polygons):
+        raise MeshError("the file has no faces")
+    sizes = np.array([len(np.asarray(polygon)) for polygon in polygons], dtype=np.int64)
+    return triangle_fans(np.concatenate([np.asarray(polygon, dtype=np.int64) for polygon in polygons]), sizes)
 
 
 def merge_coincident(vertices: NDArray[np.floating], triangles: Indices) -> tuple[NDArray[np.floating], Indices]:

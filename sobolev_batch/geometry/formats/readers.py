@@ -30,7 +30,7 @@ from sobolev_batch.geometry.formats.parsing import (
     require_memory_to_read,
     unpacked_limit,
 )
-from sobolev_batch.geometry.formats.ply import HEADER_BYTES, announced_size
+from sobolev_batch.geometry.formats.plain_formats import HEADER_BYTES, announced_sizes
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.smooth import Smooth
 from sobolev_batch.geometry.surface import Surface
