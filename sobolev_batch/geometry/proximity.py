@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Self
-
 import numpy as np
-from scipy.spatial import cKDTree
 
 from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import InputError
+from sobolev_batch.geometry.closest import Triangles, cross, dot
 from sobolev_batch.geometry.formats.readers import MeshLike, as_mesh
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import is_finite_number
@@ -48,8 +46,6 @@ OF_ONE_MESH = ("volume", "smallest_angle", "aspect_ratio")
 
 # Memory of a search: for each triangle of either mesh, for each point, and of its temporary arrays.
 TRIANGLE_BYTES, POINT_BYTES, WORKING_BYTES = 500.0, 250.0, 2e8
-# Boxes in a box; points that are searched at a time, and pairs of a point and a box, which are split if they are more.
-_FAN, _CHUNK, _MOST_PAIRS = 8, 1 << 11, 1 << 18
 
 
 def proximity(
@@ -102,7 +98,7 @@ def proximity(
     check_seed(seed)
     meshes = as_mesh(a), as_mesh(b)
     limit = DEFAULT_THRESHOLD * meshes[1].bounding_sphere[1] if threshold is None else float(threshold)
-    searches = [Triangles.of_mesh(mesh) for mesh in meshes]
+    searches = [Triangles(mesh) for mesh in meshes]
     found: dict[str, float] = {}
     means, matched = [], []
     for way, own, seeds in zip((0, 1), meshes, np.random.SeedSequence(seed).spawn(2), strict=True):
@@ -164,7 +160,7 @@ def vertex_distances(mesh: MeshLike, other: MeshLike) -> Reals:
     """
     mesh, other = as_mesh(mesh), as_mesh(other)
     distances = np.full(len(mesh.vertices), np.nan)
-    distances[mesh.used_vertices] = Triangles.of_mesh(other).closest(mesh.vertices[mesh.used_vertices])[0]
+    distances[mesh.used_vertices] = Triangles(other).closest(mesh.vertices[mesh.used_vertices])[0]
     return distances
 
 
@@ -183,125 +179,10 @@ def _normals(mesh: Mesh, triangles: Indices) -> Reals:
     sides = b - a, c - a
     longest = np.maximum(*(np.abs(side).max(axis=0) for side in sides))
     longest[longest == 0] = 1.0
-    return _cross(sides[0] / longest, sides[1] / longest)
+    return cross(sides[0] / longest, sides[1] / longest)
 
 
 def _angles(first: Reals, second: Reals) -> Reals:
     """Return the angles (n,) between lines along vectors (3, n), in degrees."""
-    across = np.linalg.norm(_cross(first, second), axis=0)
-    return np.asarray(np.degrees(np.arctan2(across, np.abs(_dot(first, second)))))
-
-
-class Triangles:
-    """The triangles of a mesh with a hierarchy of boxes, in which the closest one to a point is found.
-
-    Triangles of about one size that are near to each other, in the order of a tree of their centers, share boxes.
-    """
-
-    def __init__(self, corners: Reals, scale: float) -> None:
-        """Sort corners (3, 3, m): of each triangle's corners the three coordinates, in units of the scale."""
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        sizes, self.scale = (high - low).max(axis=0), scale
-        self.centers = cKDTree(corners.mean(axis=0).T)
-        classes = np.floor(np.log2(np.maximum(sizes, np.finfo(float).tiny)) / 2)
-        self.order = self.centers.indices[np.argsort(classes[self.centers.indices], kind="stable")]
-        self.places = np.argsort(self.order)
-        self.corners = np.ascontiguousarray(corners[..., self.order])
-        low, high, sizes, largest = low[:, self.order], high[:, self.order], sizes[self.order], np.arange(len(sizes))
-        # From a box of all to the boxes of single triangles, with the largest triangle of each box.
-        self.levels = [(low, high, largest)]
-        while low.shape[1] > 1:
-            starts = np.arange(0, low.shape[1], _FAN)
-            groups = np.pad(largest, (0, -len(largest) % _FAN), mode="edge").reshape(-1, _FAN)
-            largest = np.take_along_axis(groups, sizes[groups].argmax(axis=1)[:, None], axis=1)[:, 0]
-            low, high = np.minimum.reduceat(low, starts, axis=1), np.maximum.reduceat(high, starts, axis=1)
-            self.levels.insert(0, (low, high, largest))
-
-    @classmethod
-    def of_mesh(cls, mesh: Mesh) -> Self:
-        """Return the triangles of a mesh."""
-        scale = 2.0 ** np.frexp(float(np.abs(mesh.vertices).max()))[1]
-        return cls(np.stack([corner.T / scale for corner in mesh.corners()]), scale)
-
-    def closest(self, points: Reals) -> tuple[Reals, Indices]:
-        """Return the distance of points (n, 3) from the mesh, exact to rounding, and the triangle closest to each."""
-        distances, triangles = np.empty(len(points)), np.empty(len(points), dtype=np.int64)
-        parts = [slice(start, min(start + _CHUNK, len(points))) for start in range(0, len(points), _CHUNK)]
-        while parts:
-            part = parts.pop()
-            found = self._closest(np.ascontiguousarray(points[part].T) / self.scale)
-            if found is None:
-                middle = (part.start + part.stop) // 2
-                parts += [slice(part.start, middle), slice(middle, part.stop)]
-            else:
-                distances[part], triangles[part] = self.scale * np.sqrt(found[0]), self.order[found[1]]
-        return distances, triangles
-
-    def _closest(self, points: Reals) -> tuple[Reals, Indices] | None:
-        """Return squared distances of points (3, n), and triangles; None where there are too many pairs with boxes."""
-        count = points.shape[1]
-        triangles = self.places[self.centers.query(points.T)[1]]
-        best = _squares(points, self.corners[..., triangles])
-        of, boxes = np.arange(count), np.zeros(count, dtype=np.int64)
-        for level, (low, high, largest) in enumerate(self.levels):
-            if level:
-                of = np.repeat(of, _FAN)
-                boxes = (boxes[:, None] * _FAN + np.arange(_FAN)).ravel()
-                of, boxes = of[boxes < len(largest)], boxes[boxes < len(largest)]
-            gaps = np.zeros(len(of))
-            for axis in range(3):
-                x = points[axis, of]
-                gaps += np.maximum(np.maximum(low[axis, boxes] - x, x - high[axis, boxes]), 0.0) ** 2
-            keep = gaps <= best[of]
-            of, boxes, gaps = of[keep], boxes[keep], gaps[keep]
-            is_last = level == len(self.levels) - 1
-            # A large triangle bounds the distance of points that are far from its center.
-            tried = slice(None) if is_last else _first_least(of, gaps)
-            self._improve(points, of[tried], largest[boxes[tried]], best, triangles)
-            keep = gaps <= best[of]
-            of, boxes = of[keep], boxes[keep]
-            if count > 1 and len(of) * _FAN > _MOST_PAIRS and not is_last:
-                return None
-        return best, triangles
-
-    def _improve(self, points: Reals, of: Indices, tried: Indices, best: Reals, triangles: Indices) -> None:
-        """Take triangles over that are closer to points than those that are known, in place."""
-        squares = _squares(points[:, of], self.corners[..., tried])
-        nearest = _first_least(of, squares)
-        nearest = nearest[squares[nearest] < best[of[nearest]]]
-        best[of[nearest]], triangles[of[nearest]] = squares[nearest], tried[nearest]
-
-
-def _first_least(groups: Indices, values: Reals) -> Indices:
-    """Return the place of the least value of each group; members of a group follow each other."""
-    starts = np.flatnonzero(np.diff(groups, prepend=-1))
-    least = np.minimum.reduceat(values, starts)
-    places = np.flatnonzero(values == np.repeat(least, np.diff(starts, append=len(groups))))
-    return places[np.flatnonzero(np.diff(groups[places], prepend=-1))]
-
-
-def _squares(points: Reals, corners: Reals) -> Reals:
-    """Return the squared distance of points (3, k) from triangles (3, 3, k), each from its own."""
-    a, b, c = corners
-    normal = _cross(b - a, c - a)
-    size = _dot(normal, normal)
-    is_above = size > 0
-    best = np.full(points.shape[1], np.inf)
-    for start, end in ((a, b), (b, c), (c, a)):
-        side, arm = end - start, points - start
-        length = _dot(side, side)
-        along = np.divide(_dot(arm, side), length, out=np.zeros_like(length), where=length > 0)
-        rest = arm - np.clip(along, 0.0, 1.0) * side
-        best = np.minimum(best, _dot(rest, rest))
-        is_above &= _dot(_cross(side, arm), normal) >= 0
-    heights = np.divide(_dot(points - a, normal) ** 2, size, out=np.zeros_like(size), where=size > 0)
-    return np.where(is_above, np.minimum(best, heights), best)
-
-
-def _dot(first: Reals, second: Reals) -> Reals:
-    return np.asarray(first[0] * second[0] + first[1] * second[1] + first[2] * second[2])
-
-
-def _cross(first: Reals, second: Reals) -> Reals:
-    (ux, uy, uz), (vx, vy, vz) = first, second
-    return np.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx])
+    across = np.linalg.norm(cross(first, second), axis=0)
+    return np.asarray(np.degrees(np.arctan2(across, np.abs(dot(first, second)))))

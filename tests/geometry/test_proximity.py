@@ -75,8 +75,8 @@ def test_concentric_spheres() -> None:
     for name in ("hausdorff", "mean", "rms", "p50", "p99", "mean_forward", "mean_backward"):
         assert found[name] == pytest.approx(0.5, abs=2e-3)
     assert (found["fscore"], proximity(outer, inner, points=2000, threshold=0.6)["fscore"]) == (0, 1)
-    # Facets of 2.4 degrees or less.
-    assert found["normal_max"] < 2.5
+    # Between facets are 2.4 degrees or less, and a point beside an edge is as close to both of them.
+    assert found["normal_max"] < 3
 
 
 @pytest.mark.slow

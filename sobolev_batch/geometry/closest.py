@@ -1,0 +1,84 @@
+"""Distances of points from the triangles of a mesh, and the closest triangle, found by libigl's tree of boxes."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+
+from sobolev_batch.arrays import Indices, Reals
+from sobolev_batch.geometry.mesh import Mesh
+
+# libigl starts a thread on each core unless this variable says otherwise. Numerical libraries all know the other one,
+# by which a worker has one thread.
+os.environ.setdefault("IGL_NUM_THREADS", os.environ.get("OMP_NUM_THREADS", str(os.cpu_count() or 1)))
+
+import igl  # it reads the variable once
+
+
+class Triangles:
+    """The triangles of a mesh, with what the distance of a point from each of them takes.
+
+    Lengths are in units of a power of two near the largest coordinate: that loses no digit, and keeps squares of
+    lengths within the range of doubles.
+
+    Attributes:
+        scale: The unit.
+        corners: Corner of each triangle, three arrays (3, m) of the coordinates.
+        outward: For each side, from a corner to the next, the direction (3, m) in the plane that leads out of the
+            triangle; of any length, and zero where the triangle has no area.
+    """
+
+    def __init__(self, mesh: Mesh) -> None:
+        self.scale = 2.0 ** float(np.frexp(np.abs(mesh.vertices).max())[1])
+        self._vertices = np.ascontiguousarray(mesh.vertices / self.scale)
+        self._triangles = np.ascontiguousarray(mesh.triangles, dtype=np.int64)
+        self._tree = igl.AABB()
+        self._tree.init(self._vertices, self._triangles)
+        self.corners = [np.ascontiguousarray(self._vertices[self._triangles[:, k]].T) for k in range(3)]
+        a, b, c = self.corners
+        self._sides = [b - a, c - b, a - c]
+        self._normals = cross(self._sides[0], c - a)
+        self.outward = [cross(side, self._normals) for side in self._sides]
+        sizes = dot(self._normals, self._normals)
+        self._has_area = sizes > 0
+        self._inverse_sizes = _inverse(sizes)
+        self._inverse_lengths = [_inverse(dot(side, side)) for side in self._sides]
+
+    def closest(self, points: Reals) -> tuple[Reals, Indices]:
+        """Return the distance of points (n, 3) from the mesh, exact to rounding, and the triangle closest to each."""
+        scaled = np.ascontiguousarray(points / self.scale)
+        triangles = np.reshape(self._tree.squared_distance(self._vertices, self._triangles, scaled)[1], -1)
+        return self.scale * np.sqrt(self.squares(scaled.T, triangles)), triangles
+
+    def squares(self, points: Reals, triangles: Indices) -> Reals:
+        """Return the squared distance of points (3, n) from triangles (n,), each from its own, in units of the scale.
+
+        A point in the plane of its triangle, and within it, has exactly the distance zero.
+        """
+        is_above = self._has_area[triangles]
+        least = np.full(len(triangles), np.inf)
+        for corners, sides, inverse, outward in zip(
+            self.corners, self._sides, self._inverse_lengths, self.outward, strict=True
+        ):
+            arms, along = points - corners[:, triangles], sides[:, triangles]
+            rest = arms - np.clip(dot(arms, along) * inverse[triangles], 0.0, 1.0) * along
+            least = np.minimum(least, dot(rest, rest))
+            is_above &= dot(arms, outward[:, triangles]) <= 0
+        heights = dot(arms, self._normals[:, triangles]) ** 2 * self._inverse_sizes[triangles]
+        return np.where(is_above, np.minimum(least, heights), least)
+
+
+def dot(first: Reals, second: Reals) -> Reals:
+    """Return the products (n,) of vectors (3, n)."""
+    return np.asarray(first[0] * second[0] + first[1] * second[1] + first[2] * second[2])
+
+
+def cross(first: Reals, second: Reals) -> Reals:
+    """Return the vector products (3, n) of vectors (3, n)."""
+    (ux, uy, uz), (vx, vy, vz) = first, second
+    return np.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx])
+
+
+def _inverse(values: Reals) -> Reals:
+    return np.divide(1.0, values, out=np.zeros_like(values), where=values > 0)

@@ -1,0 +1,161 @@
+"""The largest deviation of two meshes lies between its bounds, which close."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import Delaunay
+
+import sobolev_batch as sb
+from sobolev_batch.arrays import Reals
+from sobolev_batch.geometry import deviation
+from sobolev_batch.geometry.closest import Triangles
+
+
+def distance_from_triangles(points: Reals, mesh: sb.Mesh) -> Reals:
+    """Distances (n,) by minimising over each triangle's plane, sides and corners, in barycentric coordinates."""
+    least = np.full(len(points), np.inf)
+    for corners in mesh.vertices[mesh.triangles]:
+        sides = corners[1:] - corners[0]
+        weights = np.linalg.lstsq(sides.T, (points - corners[0]).T, rcond=None)[0].T
+        inside = (weights >= 0).all(axis=1) & (weights.sum(axis=1) <= 1)
+        flat = np.linalg.norm(points - corners[0] - weights @ sides, axis=1)
+        candidates = [np.where(inside, flat, np.inf)]
+        for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            along = np.clip((points - start) @ (end - start) / max(((end - start) ** 2).sum(), 1e-300), 0, 1)
+            candidates.append(np.linalg.norm(points - start - along[:, None] * (end - start), axis=1))
+        least = np.minimum(least, np.min(candidates, axis=0))
+    return least
+
+
+def grid(mesh: sb.Mesh, steps: int) -> Reals:
+    """Points on every triangle, the corners among them."""
+    weights = np.array([(i, j, steps - i - j) for i in range(steps + 1) for j in range(steps + 1 - i)]) / steps
+    return np.einsum("wk,tkd->twd", weights, mesh.vertices[mesh.triangles]).reshape(-1, 3)
+
+
+def plate(hole: bool) -> sb.Mesh:
+    """A plate of 1,000 x 1,000, with a round hole of 6 or without."""
+    angles = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    ring = 3 * np.column_stack([np.cos(angles), np.sin(angles)])
+    flat = np.vstack([ring, [[-500, -500], [500, -500], [500, 500], [-500, 500]]])
+    triangles = Delaunay(flat).simplices
+    if hole:
+        triangles = triangles[(triangles >= len(ring)).any(axis=1)]
+    return sb.Mesh(np.column_stack([flat, np.zeros(len(flat))]), triangles)
+
+
+@pytest.mark.parametrize("seed", range(50))
+def test_bounds_hold_for_random_triangles_and_are_as_close_as_requested(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    # Far apart, beside each other, and through each other.
+    a, b = (
+        sb.Mesh(rng.normal(size=(3 * count, 3)) + shift, np.arange(3 * count).reshape(-1, 3))
+        for count, shift in zip(rng.integers(1, 12, 2), (0.0, rng.choice([0.0, 0.1, 3.0])), strict=True)
+    )
+    gap = float(rng.choice([1e-1, 1e-2, 1e-3]))
+    found = sb.largest_deviation(a, b, gap=gap)
+    for way, own, other in ((found.forward, a, b), (found.backward, b, a)):
+        assert way.upper <= (1 + gap) * way.lower + 1e-12
+        assert distance_from_triangles(grid(own, 20), other).max() <= way.upper * (1 + 1e-12)
+        # The lower bound is the distance of a point of the mesh.
+        place = np.array([way.place])
+        assert distance_from_triangles(place, own)[0] < 1e-12
+        assert distance_from_triangles(place, other)[0] == pytest.approx(way.lower, rel=1e-9)
+    assert found.both.lower == max(found.forward.lower, found.backward.lower)
+    assert found.both.upper == max(found.forward.upper, found.backward.upper)
+
+
+def test_simple_cases_are_exact() -> None:
+    box = sb.Mesh(*box_of((1.0, 2.0, 3.0)))
+    raised = sb.Mesh(box.vertices + np.array([0, 0, 0.25]), box.triangles)
+    assert sb.largest_deviation(box, raised).both.lower == sb.largest_deviation(box, raised).both.upper == 0.25
+    same = sb.largest_deviation(box, box).both
+    assert (same.lower, same.upper) == (0, 0)
+    # The other corner of each triangle is in the same plane.
+    other = sb.Mesh(*box_of((1.0, 2.0, 3.0), turn=1))
+    assert sb.largest_deviation(box, other).both.upper < 1e-15
+
+
+def box_of(sizes: tuple[float, float, float], turn: int = 0) -> tuple[Reals, Reals]:
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * sizes
+    quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    turned = [quad[turn:] + quad[:turn] for quad in quads]
+    return corners, np.array([[q[0], q[i], q[i + 1]] for q in turned for i in (1, 2)])
+
+
+def test_a_hole_that_was_closed_is_found_between_all_vertices() -> None:
+    found = sb.largest_deviation(plate(hole=False), plate(hole=True))
+    assert 2.9 <= found.forward.lower <= found.forward.upper <= 3.1
+    assert np.linalg.norm(found.forward.place) < 0.1
+    assert found.backward.upper < 1e-9
+    # No vertex and hardly a sample sees it.
+    assert sb.proximity(plate(hole=False), plate(hole=True))["hausdorff"] < 0.1
+
+
+def test_spheres_against_their_refinements() -> None:
+    coarse, fine = sb.shapes.icosphere(2), sb.shapes.icosphere(4)
+    found = sb.largest_deviation(coarse, fine, gap=1e-3)
+    # The middle of a flat triangle is farthest below the sphere, that of the largest by its circumscribed circle.
+    corners = coarse.vertices[coarse.triangles]
+    depth = 1 - np.linalg.norm(corners.mean(axis=1), axis=1).min()
+    assert found.forward.lower == pytest.approx(depth, rel=0.1)
+    assert found.backward.lower == pytest.approx(depth, rel=0.1)
+
+
+@pytest.mark.parametrize("size", [1e-60, 1e-9, 1e9, 1e60])
+def test_any_unit_gives_the_same_digits(size: float) -> None:
+    ball, egg = sb.shapes.icosphere(2), sb.shapes.Ellipsoid((1.0, 0.9, 0.8)).mesh(2)
+    found = sb.largest_deviation(ball, egg).both
+    scaled = sb.largest_deviation(*(sb.Mesh(size * mesh.vertices, mesh.triangles) for mesh in (ball, egg))).both
+    assert scaled.lower == pytest.approx(size * found.lower, rel=0.011)
+    assert scaled.upper <= 1.01 * scaled.lower
+
+
+def test_triangles_without_area_and_needles_hide_nothing() -> None:
+    ball = sb.shapes.icosphere(2)
+    line = np.array([[0, 0, 2.0], [0, 0, 3.0], [0, 0, 2.5]])
+    with_line = sb.Mesh(
+        np.vstack([ball.vertices, line]), np.vstack([ball.triangles, len(ball.vertices) + np.arange(3)])
+    )
+    found = sb.largest_deviation(with_line, ball)
+    assert found.forward.lower == pytest.approx(2.0, abs=0.01)
+    assert found.forward.place == pytest.approx((0, 0, 3))
+    # Distances from a segment are those from its points.
+    assert sb.largest_deviation(ball, with_line).forward.upper < 1e-12
+
+
+def test_a_clear_question_takes_fewer_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    ball, egg = sb.shapes.icosphere(3), sb.shapes.Ellipsoid((1.0, 0.95, 0.9)).mesh(4)
+    points = 0
+    squares = Triangles.squares
+
+    def counted(self: Triangles, at: Reals, triangles: Reals) -> Reals:
+        nonlocal points
+        points += len(triangles)
+        return squares(self, at, triangles)
+
+    monkeypatch.setattr(Triangles, "squares", counted)
+    value = sb.largest_deviation(ball, egg).both.lower
+    of_value, points = points, 0
+    for length, answer in ((2 * value, True), (value / 2, False)):
+        found, points = sb.largest_deviation(ball, egg, within=length).both, 0
+        assert found.is_within(length) is answer
+        assert points < of_value
+    # A length between two bounds that are far apart.
+    assert deviation.Deviation(0.1, 0.3, (0, 0, 0)).is_within(0.2) is None
+
+
+def test_a_question_on_the_edge_is_decided() -> None:
+    ball, egg = sb.shapes.icosphere(2), sb.shapes.Ellipsoid((1.0, 0.9, 0.8)).mesh(2)
+    found = sb.largest_deviation(ball, egg, gap=1e-4).both
+    for factor, answer in ((0.999, False), (1.001, True)):
+        assert (
+            sb.largest_deviation(ball, egg, within=factor * found.lower).both.is_within(factor * found.lower) is answer
+        )
+
+
+@pytest.mark.parametrize("wrong", [{"gap": 0}, {"gap": "1"}, {"within": -1.0}, {"within": float("nan")}])
+def test_refuses_what_is_no_length(wrong: dict[str, float]) -> None:
+    with pytest.raises(sb.errors.InputError, match="must be a positive number, found"):
+        sb.largest_deviation(sb.shapes.icosphere(0), sb.shapes.icosphere(1), **wrong)
