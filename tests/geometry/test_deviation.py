@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import Delaunay
 
 import sobolev_batch as sb
-from sobolev_batch.arrays import Reals
+from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.geometry import deviation
 from sobolev_batch.geometry.closest import Triangles
 
@@ -25,7 +25,7 @@ def distance_from_triangles(points: Reals, mesh: sb.Mesh) -> Reals:
             along = np.clip((points - start) @ (end - start) / max(((end - start) ** 2).sum(), 1e-300), 0, 1)
             candidates.append(np.linalg.norm(points - start - along[:, None] * (end - start), axis=1))
         least = np.minimum(least, np.min(candidates, axis=0))
-    return least
+    return np.asarray(least)
 
 
 def grid(mesh: sb.Mesh, steps: int) -> Reals:
@@ -130,7 +130,7 @@ def test_a_clear_question_takes_fewer_pieces(monkeypatch: pytest.MonkeyPatch) ->
     points = 0
     squares = Triangles.squares
 
-    def counted(self: Triangles, at: Reals, triangles: Reals) -> Reals:
+    def counted(self: Triangles, at: Reals, triangles: Indices) -> Reals:
         nonlocal points
         points += len(triangles)
         return squares(self, at, triangles)
