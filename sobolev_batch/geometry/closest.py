@@ -7,6 +7,7 @@ import os
 import numpy as np
 
 from sobolev_batch.arrays import Indices, Reals
+from sobolev_batch.compiled import pays
 from sobolev_batch.geometry.mesh import Mesh
 
 # libigl starts a thread on each core unless this variable says otherwise. Numerical libraries all know the other one,
@@ -14,6 +15,9 @@ from sobolev_batch.geometry.mesh import Mesh
 os.environ.setdefault("IGL_NUM_THREADS", os.environ.get("OMP_NUM_THREADS", str(os.cpu_count() or 1)))
 
 import igl  # it reads the variable once
+
+# Processor seconds of a pair of a point and a triangle in arrays; a compiled loop takes a tenth.
+_PAIR_SECONDS = 4e-7
 
 
 class Triangles:
@@ -35,6 +39,7 @@ class Triangles:
         self._triangles = np.ascontiguousarray(mesh.triangles, dtype=np.int64)
         self._tree = igl.AABB()
         self._tree.init(self._vertices, self._triangles)
+        self._by_triangle = self._vertices[self._triangles]
         self.corners = [np.ascontiguousarray(self._vertices[self._triangles[:, k]].T) for k in range(3)]
         a, b, c = self.corners
         self._sides = [b - a, c - b, a - c]
@@ -56,6 +61,12 @@ class Triangles:
 
         A point in the plane of its triangle, and within it, has exactly the distance zero.
         """
+        if pays(_PAIR_SECONDS * len(triangles)):
+            from sobolev_batch.compiled.point_triangle import fill_squares
+
+            squares = np.empty(len(triangles))
+            fill_squares(points, self._by_triangle, triangles, squares)
+            return squares
         is_above = self._has_area[triangles]
         least = np.full(len(triangles), np.inf)
         for corners, sides, inverse, outward in zip(

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial import Delaunay
 
 import sobolev_batch as sb
+from sobolev_batch import compiled
 from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.geometry import deviation
 from sobolev_batch.geometry.closest import Triangles
@@ -153,6 +154,22 @@ def test_a_question_on_the_edge_is_decided() -> None:
         assert (
             sb.largest_deviation(ball, egg, within=factor * found.lower).both.is_within(factor * found.lower) is answer
         )
+
+
+def test_the_compiled_loop_gives_the_distances_of_the_arrays() -> None:
+    rng = np.random.default_rng(5)
+    corners = rng.normal(size=(300, 3, 3)) * 10.0 ** rng.integers(-6, 6, (300, 1, 1))
+    corners[:50, 2] = corners[:50, 1]
+    corners[50:100, 2] = corners[50:100, 0] + 1e-9 * corners[50:100, 1]
+    triangles = Triangles(sb.Mesh(corners.reshape(-1, 3), np.arange(900).reshape(-1, 3)))
+    points = np.concatenate([corners.mean(axis=1), corners[:, 0], rng.normal(size=(300, 3))]).T / triangles.scale
+    tried = np.tile(np.arange(300), 3)
+    with compiled.by_itself():
+        arrays = triangles.squares(points, tried)
+        compiled.use()
+        loop = triangles.squares(points, tried)
+    np.testing.assert_allclose(loop, arrays, rtol=1e-9, atol=1e-28)
+    assert not loop[300:600].any()
 
 
 @pytest.mark.parametrize("wrong", [{"gap": 0}, {"gap": "1"}, {"within": -1.0}, {"within": float("nan")}])
