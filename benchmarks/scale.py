@@ -17,7 +17,8 @@ from benchmarks.timing import Effort, elapsed_seconds
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.status import Status
-from sobolev_batch.store.store import Store
+from sobolev_batch.store.layout import Store
+from sobolev_batch.store.records import Records
 
 _WORKERS = 2
 # Meshes that are added to those that are there.
@@ -41,7 +42,7 @@ def tiny_meshes(effort: Effort) -> Iterator[Row]:
         started = time.perf_counter()
         sb.run(study, store, client, on_progress=note)
         ended = time.perf_counter()
-        tasks = sum(record.seconds for record in Store(store).records() if record is not None)
+        tasks = sum(record.seconds for record in Records(Store(store)).read() if record is not None)
         peak_bytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
         status = elapsed_seconds(lambda: Status.from_store(store))
         again = elapsed_seconds(lambda: sb.run(study, store, client))

@@ -18,9 +18,9 @@ from sobolev_batch.norms.fields import Quality
 from sobolev_batch.norms.tail.values import SurfaceSize
 from sobolev_batch.parameters import available_cores, format_bytes
 from sobolev_batch.store.collection_store import for_each_object
+from sobolev_batch.store.layout import Store, stored_choice
 from sobolev_batch.store.location import Location
-from sobolev_batch.store.records import Record
-from sobolev_batch.store.store import Store, stored_choice
+from sobolev_batch.store.records import Record, Records
 from sobolev_batch.store.workspace import complete_records
 from sobolev_batch.study.lattice_choice import look_at_extents
 from sobolev_batch.study.plan import Plan, Row, make_plan
@@ -372,4 +372,4 @@ def _stored_records(location: Location) -> dict[str, Record]:
         return {}
     store.attributes()
     labels = store.labels()
-    return {labels[row]: record for row, record in complete_records(store.records()).items()}
+    return {labels[row]: record for row, record in complete_records(Records(store).read()).items()}

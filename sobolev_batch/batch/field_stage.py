@@ -15,7 +15,7 @@ from sobolev_batch.batch.field_tasks import Job, compute_mesh, compute_parts, fi
 from sobolev_batch.errors import ClusterError
 from sobolev_batch.sources.registry import ExpectedSize
 from sobolev_batch.store.lock import utc_now
-from sobolev_batch.store.records import Record
+from sobolev_batch.store.records import Record, Records
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.plan import Plan, Row
 from sobolev_batch.transform.fourier import TransformSettings, projected_bytes
@@ -53,7 +53,7 @@ def compute_fields(cluster: Cluster, workspace: Workspace, pending: Sequence[int
     def give_up(i: int, reason: str) -> None:
         record = Record(key=rows[i].key, status="failed", reason=reason, finished=utc_now())
         _log.error("%s: %s", rows[i].label, reason)
-        store.write_record(i, record)
+        Records(store).write(i, record)
         take(i, record)
 
     for i in pending:

@@ -26,9 +26,10 @@ from sobolev_batch.norms.fields import Quality, TailQuality, compute_field, fiel
 from sobolev_batch.norms.tail.remainder import Remainder, remainder
 from sobolev_batch.norms.tail.sampling import TailSampling
 from sobolev_batch.norms.tail.values import Settings, octave_values, settings_for
+from sobolev_batch.store.field_arrays import Fields
+from sobolev_batch.store.layout import Store
 from sobolev_batch.store.lock import utc_now
-from sobolev_batch.store.records import Facts, Record
-from sobolev_batch.store.store import Store
+from sobolev_batch.store.records import Facts, Record, Records
 from sobolev_batch.study.plan import Plan, Row
 from sobolev_batch.study.schema import Backends
 from sobolev_batch.transform.fourier import Execution, TransformSettings, choose_settings, transform_block
@@ -131,7 +132,7 @@ class Job:
 
     def stored_record(self) -> Record | None:
         """Return the completion record of the field if it exists: Dask repeats tasks whose worker was lost."""
-        record = self.store.read_record(self.index)
+        record = Records(self.store).read_one(self.index)
         return record if record is not None and record.completes(self.row.key) else None
 
     def failure_reason(self, error: Exception) -> str:
@@ -216,7 +217,7 @@ def _store_octaves(job: Job, surface: Surface) -> StoredBlocks:
         None if reference is None else _remainder_between(surface, reference, cutoff),
     )
     samples = np.concatenate([octave.values for octave in values])
-    checksum = job.store.write_field(job.index, (slice(0, len(samples)),), samples)
+    checksum = Fields(job.store).write(job.index, (slice(0, len(samples)),), samples)
     return StoredBlocks(quality=replace(Quality.from_surface(surface, Probe()), tail=quality), checksums=(checksum,))
 
 
@@ -236,7 +237,7 @@ def _store_whole(job: Job, surface: Surface) -> StoredBlocks:
         field = field_for(surface, lattice, error_target, transform, execution)
     else:
         field = compute_field(surface, lattice, transform, job.orders, execution)
-    checksum = job.store.write_field(job.index, lattice.place(lattice.half), field.values)
+    checksum = Fields(job.store).write(job.index, lattice.place(lattice.half), field.values)
     facts = _facts_of(surface, field.points)
     return StoredBlocks(facts, quality=field.quality, checksums=(checksum,), backends=(field.backend,))
 
@@ -250,7 +251,7 @@ def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block]) -> Stored
     probes, backends, checksums, points = [], [], [], 0
     for block in blocks:
         result = transform_block(surface, lattice, block, transform, execution, plan)
-        checksums.append(job.store.write_field(job.index, lattice.place(block), result.values))
+        checksums.append(Fields(job.store).write(job.index, lattice.place(block), result.values))
         probes.append(probe_block(surface, lattice, transform, block, result.values, draws, execution.backend))
         backends.append(result.backend)
         points = result.points
@@ -279,7 +280,7 @@ def _finished(job: Job, stored: Sequence[StoredBlocks]) -> Record:
         quality = replace(qualities[0], probe=join([quality.probe for quality in qualities]), tail=tail)
         checksums = tuple(checksum for blocks in stored for checksum in blocks.checksums)
         record = replace(record, facts=stored[0].facts, quality=quality.to_json(), checksums=checksums)
-    job.store.write_record(job.index, record)
+    Records(job.store).write(job.index, record)
     _log.info("%s: %s in %.2f s by %s", job.row.label, record.status, record.seconds, record.backend)
     return record
 

@@ -32,8 +32,8 @@ from sobolev_batch.geometry.proximity import (
 )
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms.columns import describe
-from sobolev_batch.store.records import ProximityRecord, Record
-from sobolev_batch.store.store import Store
+from sobolev_batch.store.layout import Store
+from sobolev_batch.store.records import ProximityRecord, Record, Records
 from sobolev_batch.store.stored_tables import table_attributes, write_table
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.plan import Row
@@ -93,7 +93,7 @@ def _measure(cluster: Cluster, workspace: Workspace, keys: Mapping[int, str]) ->
             reason = describe_failure(outcome)
             _log.error("%s: no proximity: %s", task.label, reason)
             record = replace(complete[task.row], proximity=ProximityRecord(keys[task.row], reason))
-            workspace.store.write_record(task.row, record)
+            Records(workspace.store).write(task.row, record)
         workspace.records[task.row] = record
         advance(task.label, None)
 
@@ -114,7 +114,7 @@ def measure_proximity(
     that of the reference, each with the digest of the mesh whose field is stored. A StoreError is not the mesh's fault.
     """
     # Dask has a task done again whose worker was lost with the result.
-    stored = store.read_record(index)
+    stored = Records(store).read_one(index)
     if stored is not None and stored.proximity is not None and stored.proximity.completes(key):
         return stored
     started = time.perf_counter()
@@ -130,7 +130,7 @@ def measure_proximity(
             _log.error("%s: proximity failed for a reason that is not its mesh's", pair[0][0].label, exc_info=error)
         measured = ProximityRecord(key, one_line(error))
     record = replace(record, proximity=replace(measured, seconds=time.perf_counter() - started))
-    store.write_record(index, record)
+    Records(store).write(index, record)
     return record
 
 

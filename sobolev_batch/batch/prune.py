@@ -6,9 +6,10 @@ from collections import Counter
 from contextlib import nullcontext
 
 from sobolev_batch.errors import StoreError
+from sobolev_batch.store.layout import FIELD, OCTAVES, ROOT, Store
 from sobolev_batch.store.location import PARTIAL_FILE, Location
 from sobolev_batch.store.lock import LOCK_KEYS, Lock, locked
-from sobolev_batch.store.store import FIELD, OCTAVES, ROOT, Store
+from sobolev_batch.store.records import Records
 from sobolev_batch.store.workspace import complete_records
 
 _LOST, _KILLED, _UNLISTED = (
@@ -29,7 +30,7 @@ def prune(location: Location, *, is_dry: bool = True) -> dict[str, int]:
         store = Store.open(location)
         if store.is_unfinished:
             raise StoreError(f"{location}: its creation was not finished; run the study again")
-        labels, removed, records = store.labels(), store.removed, store.records()
+        labels, removed, records = store.labels(), store.removed, Records(store).read()
         lost = {row for row, label in enumerate(labels) if label in removed}
         kept = complete_records(records).keys() - lost
         listed = {name.split("/")[0] for name in store.documents} | {ROOT, *LOCK_KEYS}
@@ -51,7 +52,7 @@ def prune(location: Location, *, is_dry: bool = True) -> dict[str, int]:
             # First: a record without its field would be damage.
             for row in lost:
                 if records[row] is not None:
-                    store.write_record(row, None)
+                    Records(store).write(row, None)
             location.remove_partial_files()
             for prefix in prefixes:
                 location.remove(prefix)

@@ -28,9 +28,10 @@ from sobolev_batch.parameters import available_cores, require_machine_memory
 from sobolev_batch.store.collection_store import CollectionStore, for_each_object, labelled
 from sobolev_batch.store.create import require_usable
 from sobolev_batch.store.heartbeat import Heartbeat
+from sobolev_batch.store.layout import stored_choice
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, locked
-from sobolev_batch.store.store import stored_choice
+from sobolev_batch.store.records import Records
 from sobolev_batch.store.workspace import Workspace, failed_proximities
 from sobolev_batch.study.plan import make_plan
 from sobolev_batch.study.study import AnyStudy, Study, StudyCollection, StudyLike
@@ -221,7 +222,7 @@ def carry_out(
         workspace.withdraw_lost_fields()
         if not workspace.pending and are_tabulated(workspace) and have_proximities(workspace):
             # The last run may have been killed before it did.
-            workspace.store.collect_records(workspace.records)
+            Records(workspace.store).collect(workspace.records)
             return _summary(workspace, set())
         client = start()
         with Watch(client, study.backend == "gpu").kept() as watch:
@@ -262,7 +263,7 @@ def _compute(cluster: Cluster, heartbeat: Heartbeat, workspace: Workspace) -> Su
         workspace.withdraw_lost_fields()
         rows = workspace.pending
     measure_proximities(cluster, workspace)
-    workspace.store.collect_records(workspace.records)
+    Records(workspace.store).collect(workspace.records)
     return _summary(workspace, computed)
 
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from sobolev_batch.errors import DamageError
 from sobolev_batch.store.collection_store import CollectionStore, labelled
 from sobolev_batch.store.heartbeat import LOST_AFTER_SECONDS
+from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, age_seconds, utc_now
-from sobolev_batch.store.records import Record, RunRecord
-from sobolev_batch.store.store import Store
+from sobolev_batch.store.records import Record, Records, RunRecord
 from sobolev_batch.store.stored_tables import rows_unlike_tables, table_attributes
 from sobolev_batch.store.workspace import complete_records, failed_proximities
 from sobolev_batch.tables.open import AnyStore, location_of
@@ -68,7 +68,7 @@ class Status(Shown):
         """Return the status of a store; see `sobolev_batch.status`."""
         place = location_of(store)
         opened = Store.open(place)
-        run, removed, records = opened.read_run(), opened.removed, opened.records()
+        run, removed, records = Records(opened).read_run(), opened.removed, Records(opened).read()
         labels = {row: label for row, label in enumerate(opened.labels()) if label not in removed}
         asks_for_proximity = opened.attributes()["study"]["table"].get("proximity") is not None
         complete = {row: record for row, record in complete_records(records).items() if row in labels}

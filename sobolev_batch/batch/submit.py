@@ -20,9 +20,9 @@ from sobolev_batch.errors import ClusterError, StoreError
 from sobolev_batch.store.collection_store import CollectionStore, for_each_object
 from sobolev_batch.store.create import require_usable
 from sobolev_batch.store.heartbeat import Heartbeat
+from sobolev_batch.store.layout import Store, stored_choice
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, acquire, release
-from sobolev_batch.store.store import Store, stored_choice
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.plan import make_plan
 from sobolev_batch.study.study import Study, StudyLike

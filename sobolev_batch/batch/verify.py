@@ -12,17 +12,13 @@ from sobolev_batch.batch.cluster.execution import Cluster, Task
 from sobolev_batch.errors import DamageError, LockError, StoreError
 from sobolev_batch.parameters import available_cores
 from sobolev_batch.store.collection_store import CollectionStore, labelled
+from sobolev_batch.store.field_arrays import Fields
+from sobolev_batch.store.layout import LABELS, PAIRS_KEYS, QUALITY, RECORDS, ROOT, SPECTRA_KEYS, Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, acquire, release
-from sobolev_batch.store.records import Record
-from sobolev_batch.store.store import LABELS, PAIRS_KEYS, QUALITY, RECORDS, ROOT, SPECTRA_KEYS, Store
-from sobolev_batch.store.stored_tables import (
-    damaged_chunks,
-    damaged_tables,
-    rows_unlike_tables,
-    table_attributes,
-    withdraw_chunk,
-)
+from sobolev_batch.store.records import Record, Records
+from sobolev_batch.store.sealed_chunks import damaged_chunks, withdraw_chunk
+from sobolev_batch.store.stored_tables import damaged_tables, rows_unlike_tables, table_attributes
 from sobolev_batch.store.workspace import Workspace, complete_records
 from sobolev_batch.tables.pairs import Pairs
 from sobolev_batch.tables.shells import spectrum_keys, stale_chunks
@@ -144,21 +140,21 @@ def _verify_study(store: str | Path | Location, on_progress: Callable[[int, int]
 def damaged_rows(cluster: Cluster, workspace: Workspace) -> list[int]:
     """Return the rows whose fields are not what their records say, found by the workers of a cluster."""
     tasks = (
-        Task(workspace.store.damage_of_field, (i, record), row=i, label=workspace.labels[i], stage="check")
+        Task(Fields(workspace.store).damage, (i, record), row=i, label=workspace.labels[i], stage="check")
         for i, record in workspace.complete.items()
     )
     return sorted(task.row for task, damage in cluster.results(tasks) if damage)
 
 
 def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: Lock | None) -> Verification:
-    records, unread = store.examine_records()
+    records, unread = Records(store).examine()
     complete = complete_records(records)
     damaged = {row: f"its completion record is damaged ({what})" for row, what in unread.items()}
     tables, chunks = damaged_tables(store), list[tuple[str, tuple[int, ...], str]]()
     if not tables and not store.has_digest():
         tables[ROOT] = "tables, coordinates or metadata are not what was written together"
     try:
-        store.read_run()
+        Records(store).read_run()
     except StoreError as error:
         tables[RECORDS] = error.what if isinstance(error, DamageError) else str(error)
     if table_attributes(store, "convergence") is not None:
@@ -177,10 +173,10 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: 
                 stale += [(PAIRS_KEYS, tile) for tile in pairs.stale()]
             known = {(keys, index) for keys, index, _ in chunks}
             chunks += [(*place, "it is not that of the stored fields") for place in stale if place not in known]
-    whole = store.rows_with_complete_fields() if complete else set()
+    whole = Fields(store).complete_rows() if complete else set()
 
     def damage_of(row: int) -> str:
-        return store.damage_of_field(row, complete[row]) if row in whole else "it is not there, or of another length"
+        return Fields(store).damage(row, complete[row]) if row in whole else "it is not there, or of another length"
 
     with ThreadPoolExecutor(_THREADS_PER_CORE * available_cores()) as pool:
         for done, (row, damage) in enumerate(zip(complete, pool.map(damage_of, complete), strict=True), 1):
@@ -192,7 +188,7 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: 
         # Whoever has unlocked the store may have changed it since.
         lock.require(store.location)
         for row in damaged:
-            store.write_record(row, None)
+            Records(store).write(row, None)
         for keys, index, _ in chunks:
             withdraw_chunk(store, keys, index)
     for keys, index, what in chunks:

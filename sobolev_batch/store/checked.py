@@ -22,10 +22,11 @@ from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import LocalStore, WrapperStore
 
 from sobolev_batch.errors import DamageError, StoreError
+from sobolev_batch.store.metadata import chunk_shape
 
 CHANGED = "it is not what was written"
 CHECKSUM_BYTES = 4
-# Of the codec of texts: their number, and the length of each.
+# The codec of texts writes their number, and the length of each, in as many bytes.
 _COUNT_BYTES = 4
 # Records have checksums of all blocks of a field, and are the longest texts.
 _LARGEST_TEXT_BYTES, _MEAN_TEXT_BYTES = 16 << 20, 16 << 10
@@ -93,7 +94,7 @@ class CheckedStore(WrapperStore[ZarrStore]):
 def largest_chunk_bytes(document: Mapping[str, Any]) -> int:
     """Return the most bytes that a chunk of an array may have, by its metadata."""
     dtype = document["data_type"]
-    count: int = math.prod(document["chunk_grid"]["configuration"]["chunk_shape"])
+    count: int = math.prod(chunk_shape(document))
     if dtype == "string":
         return max(_LARGEST_TEXT_BYTES, count * _MEAN_TEXT_BYTES)
     return count * int(np.dtype(dtype).itemsize) + CHECKSUM_BYTES
@@ -101,15 +102,15 @@ def largest_chunk_bytes(document: Mapping[str, Any]) -> int:
 
 def problem_of_chunk(content: NDArray[np.uint8], document: Mapping[str, Any]) -> str:
     """Return why the bytes of a chunk (n,) are not one of an array, by its metadata; empty if they are."""
-    chunk, dtype = document["chunk_grid"]["configuration"]["chunk_shape"], document["data_type"]
+    count, dtype = math.prod(chunk_shape(document)), document["data_type"]
     data = content
     if document["codecs"][-1]["name"] == "crc32c":
         data = content[:-CHECKSUM_BYTES]
         if len(content) < CHECKSUM_BYTES or checksum_of(data).to_bytes(4, "little") != content[len(data) :].tobytes():
             return CHANGED
     if dtype == "string":
-        return _problem_of_texts(data.tobytes(), math.prod(chunk))
-    size = math.prod(chunk) * np.dtype(dtype).itemsize
+        return _problem_of_texts(data.tobytes(), count)
+    size = count * np.dtype(dtype).itemsize
     return "" if len(data) == size else f"it has {len(data)} bytes, not {size}"
 
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from sobolev_batch.errors import DamageError, InputError, StoreError
+from sobolev_batch.store.layout import COLLECTION, DIGEST, ROOT, Store, digest_of
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.metadata import SCHEMA_VERSION
-from sobolev_batch.store.store import COLLECTION, DIGEST, ROOT, Store, digest_of
 from sobolev_batch.study.study import Study, StudyCollection
 
 Result = TypeVar("Result")

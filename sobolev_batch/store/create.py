@@ -20,11 +20,7 @@ from sobolev_batch.errors import DamageError, StoreError
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms.spectrum import RadialAxis
 from sobolev_batch.norms.tail.sampling import TailSampling
-from sobolev_batch.store.location import Location
-from sobolev_batch.store.lock import LOCK_KEYS
-from sobolev_batch.store.metadata import SCHEMA_VERSION
-from sobolev_batch.store.records import Record
-from sobolev_batch.store.store import (
+from sobolev_batch.store.layout import (
     FIELD,
     OCTAVES,
     OCTAVES_GROUP,
@@ -37,8 +33,14 @@ from sobolev_batch.store.store import (
     SPECTRA_KEYS,
     UNFINISHED,
     Store,
+    array_keys,
+    dataset_keys,
 )
-from sobolev_batch.store.stored_tables import array_keys, dataset_keys, hide_tables
+from sobolev_batch.store.location import Location
+from sobolev_batch.store.lock import LOCK_KEYS
+from sobolev_batch.store.metadata import SCHEMA_VERSION
+from sobolev_batch.store.records import Record, Records
+from sobolev_batch.store.stored_tables import hide_tables
 from sobolev_batch.study.plan import Plan
 from sobolev_batch.transform.lattice import AXES, smooth_step
 
@@ -87,7 +89,7 @@ def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
     store.location.remove_partial_files()
     with store.location.access("written"):
         if not attributes["study"].items() >= lattice.items():
-            done = sum(record is not None for record in store.records())
+            done = sum(record is not None for record in Records(store).read())
             _log.warning(
                 "%s: another lattice follows from the study now; all of %d fields are computed again", store.path, done
             )
@@ -96,7 +98,7 @@ def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
         stored = store.labels()
         # Only a row whose mesh the study has lost may serve another one.
         is_kept = set(stored) <= {row.label for row in plan.rows}
-        labels = _labels_for(plan, stored, [None] * len(stored) if is_kept else store.records(), is_trusted=True)
+        labels = _labels_for(plan, stored, [None] * len(stored) if is_kept else Records(store).read(), is_trusted=True)
         if labels != list(stored):
             _lay_out(store, plan, labels, store.read_strings(QUALITY))
         if attributes.get("similarity") != _similarity_entry(plan.similarity):
@@ -123,7 +125,7 @@ def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:
     count = max(1 + last, ROWS_PER_PAGE * (1 + last_page))
     fresh = Store(store.location)
     fresh.documents = _documents_of(_record_keys(count))
-    records, damaged = fresh.examine_records()
+    records, damaged = Records(fresh).examine()
     keys = {row.key for row in plan.rows}
     if damage is not None and not any(record is not None and record.key in keys for record in records):
         raise DamageError(
@@ -141,7 +143,7 @@ def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:
         _lay_out(fresh, plan, labels, ())
         # Nothing else replaces the record of a row that has lost its label.
         for row in damaged:
-            fresh.write_record(row, None)
+            Records(fresh).write(row, None)
         fresh.consolidate()
     return fresh
 

@@ -15,10 +15,10 @@ from types import TracebackType
 from typing import Self
 
 from sobolev_batch.errors import LockError, StoreError, one_line
+from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, age_seconds, break_lock, this_process, utc_now
-from sobolev_batch.store.records import RunRecord, RunState
-from sobolev_batch.store.store import Store
+from sobolev_batch.store.records import Records, RunRecord, RunState
 
 _log = logging.getLogger(__name__)
 
@@ -86,7 +86,7 @@ class Heartbeat:
     def write(self, state: RunState, error: str = "") -> None:
         """Replace the record."""
         driver = f"{this_process()}, cluster {self.cluster}" if self.cluster else this_process()
-        self._store.write_run(RunRecord(state, driver, self._started, utc_now(), self.stage, error))
+        Records(self._store).write_run(RunRecord(state, driver, self._started, utc_now(), self.stage, error))
 
     def _beat(self) -> None:
         while not self._ended.wait(HEARTBEAT_SECONDS):
@@ -151,7 +151,7 @@ def _silence_seconds(location: Location, lock: Lock) -> float:
     # If the store cannot be read, only the lock itself is known.
     with suppress(StoreError):
         store = Store(location)
-        run = store.read_run() if store.exists() else None
+        run = Records(store).read_run() if store.exists() else None
         if run is not None and run.driver.startswith(lock.driver):
             moments.append(run.seen)
     return min(map(age_seconds, moments), default=math.inf)

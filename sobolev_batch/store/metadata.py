@@ -38,6 +38,12 @@ _LONGEST_AXIS = 2**40
 _OF_MESHES = re.compile("octaves/octaves|spectra/.*")
 
 
+def chunk_shape(document: Mapping[str, Any]) -> list[int]:
+    """Return the shape of the chunks of an array, by its metadata document."""
+    shape: list[int] = document["chunk_grid"]["configuration"]["chunk_shape"]
+    return shape
+
+
 def check_documents(store: str, documents: Mapping[str, Any]) -> None:
     """Check metadata documents of a store, by the paths of their nodes; the root's path is empty."""
     for name, document in documents.items():

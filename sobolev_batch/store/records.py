@@ -1,42 +1,41 @@
-"""Records in a store: of the computation of each surface, and of the latest run."""
+"""Records in a store: of the computation of each surface, and of the latest run.
+
+A record is one chunk, which its task writes. Once a run has ended, records lie together in pages, since on object
+storage each chunk is a request.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Hashable, Mapping
+import logging
+from collections.abc import Hashable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from typing import Any, ClassVar, Literal, Self, TypeVar, cast
 
+import numpy as np
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from sobolev_batch.errors import DamageError
 from sobolev_batch.sources.mesh_cache import Cost
+from sobolev_batch.store.checked import CHANGED, largest_chunk_bytes
+from sobolev_batch.store.layout import DIGEST, PAGE, RECORD, RECORDS, ROOT, Store, digest_of
 from sobolev_batch.store.lock import Time
+from sobolev_batch.store.metadata import chunk_shape
+
+_log = logging.getLogger(__name__)
 
 Status = Literal["complete", "failed"]
 RunState = Literal["submitted", "running", "done", "failed"]
 
 _ROW = "row"
-# In JSON, in place of a record that a page holds and that counts no more.
-WITHDRAWN = "null"
+# The attribute of the group of records that holds the record of the latest run.
+_RUN = "run"
+# This JSON takes the place of a record that a page holds and that counts no more.
+_WITHDRAWN = "null"
 Kind = TypeVar("Kind")
 _adapter = cache(TypeAdapter)
-
-
-def record_from_table(kind: type[Kind], table: Any, name: str) -> Kind:
-    """Return the record that a table holds."""
-    try:
-        record: Kind = _adapter(cast(Hashable, kind)).validate_python(table)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        problem = ": ".join(filter(None, (".".join(map(str, first["loc"])), first["msg"])))
-        raise _damage(name, problem, table) from error
-    return record
-
-
-def _damage(name: str, problem: str, content: object) -> DamageError:
-    return DamageError(f"{name} is damaged ({problem}): {str(content)[:80]!r}; run the study again", problem)
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,7 @@ class Record:
         status: "complete" or "failed".
         reason: Reason of the failure; empty otherwise.
         quality: Data of the field from which errors of norms are computed, see `Quality.to_json`.
-        checksums: Checksums of the field's blocks, see `Store.write_field`. A field with others is damaged, or was
+        checksums: Checksums of the field's blocks, see `Fields.write`. A field with others is damaged, or was
             written by another task.
         worker: Address of the worker that finished it.
         finished: Time at which it was finished, in UTC.
@@ -138,7 +137,7 @@ class Record:
     @classmethod
     def from_json(cls, text: str, row: int) -> Self | None:
         """Return the record of a row that a line holds, if any; DamageError where it holds something else."""
-        if text in ("", WITHDRAWN):
+        if text in ("", _WITHDRAWN):
             return None
         name = "a completion record"
         try:
@@ -146,7 +145,7 @@ class Record:
         except (ValueError, TypeError, RecursionError) as error:
             raise _damage(name, f"no table: {error}", text) from error
         stored_row = table.pop(_ROW, None)
-        record = record_from_table(cls, table, name)
+        record = _from_table(cls, table, name)
         if stored_row != row:
             raise _damage(name, f"it is that of row {stored_row!r}", text)
         return record
@@ -170,3 +169,119 @@ class RunRecord:
     seen: Time
     stage: str = ""
     error: str = ""
+
+
+@dataclass(frozen=True)
+class Records:
+    """The records of a store: those of its rows, alone and in pages, and that of the latest run."""
+
+    store: Store
+
+    def examine(self) -> tuple[list[Record | None], dict[int, str]]:
+        """Return the completion record of each row, None if it has none that can be read, and the damage of those."""
+        records: list[Record | None] = [None] * self.store.document(RECORD)["shape"][0]
+        step, paged = self._pages()
+        own = [row for row in self.store.stored_chunks(RECORD) if row < len(records)]
+        lines, damage = self._lines(PAGE, range(paged), step) | self._lines(RECORD, own, 1), {}
+        for row, line in lines.items():
+            try:
+                if isinstance(line, DamageError):
+                    raise line
+                records[row] = Record.from_json(line, row)
+            except DamageError as error:
+                damage[row] = error.what
+        return records, damage
+
+    def _lines(self, name: str, rows: Sequence[int], step: int) -> dict[int, str | DamageError]:
+        """Return the texts of rows, which begin with a chunk of this length, or the damage of their chunk."""
+        if not rows:
+            return {}
+        try:
+            return dict(zip(rows, map(str, self.store.read(name, list(rows)).tolist()), strict=True))
+        except DamageError as error:
+            if len(rows) <= step:
+                return dict.fromkeys(rows, error)
+        # Each chunk is read by itself to see which.
+        parts = (rows[start : start + step] for start in range(0, len(rows), step))
+        return {row: line for part in parts for row, line in self._lines(name, part, step).items()}
+
+    def read(self) -> tuple[Record | None, ...]:
+        """Return the completion record of each row, or None if it has none that can be read."""
+        records, damage = self.examine()
+        names = self.store.names_of_rows(len(records)) if damage else ()
+        for row, what in damage.items():
+            name = f"{self.store.path}: the record of {names[row]}"
+            _log.warning("%s is damaged and counts as not there: %s", name, what)
+        return tuple(records)
+
+    def read_one(self, row: int) -> Record | None:
+        """Return the completion record of one row, or None if it has none that can be read."""
+        with suppress(DamageError):
+            line = str(self.store.read(RECORD, row))
+            if not line and row < self._pages()[1]:
+                line = str(self.store.read(PAGE, row))
+            return Record.from_json(line, row)
+        return None
+
+    def write(self, row: int, record: Record | None) -> None:
+        """Write the completion record of a row, or withdraw it: one chunk, replaced as a whole."""
+        self.store.write(RECORD, row, _WITHDRAWN if record is None else record.to_json(row))
+
+    def collect(self, records: Sequence[Record | None]) -> None:
+        """Collect the records of all rows in pages, each of rows that all have one, and remove their own chunks.
+
+        If the process ends in between, a page and the chunks beside it say the same.
+        """
+        step, paged = self._pages()
+        pages: dict[int, list[int]] = {}
+        for row in self.store.stored_chunks(RECORD) if paged else ():
+            pages.setdefault(row // step, []).append(row)
+        most_bytes = largest_chunk_bytes(self.store.document(PAGE))
+        for page, own in pages.items():
+            start = page * step
+            lines = [record.to_json(start + i) for i, record in enumerate(records[start : start + step]) if record]
+            if len(lines) == step and sum(map(len, lines)) < most_bytes // 2:
+                self.store.write(PAGE, slice(start, start + step), np.array(lines, dtype=object))
+                self.store.location.discard(*(f"{RECORD}/c/{row}" for row in own))
+
+    def _pages(self) -> tuple[int, int]:
+        """Return the number of rows of a page, and that of all rows that full pages may hold."""
+        document = self.store.document(PAGE)
+        (count,), (step,) = document["shape"], chunk_shape(document)
+        return step, count - count % step
+
+    def read_run(self) -> RunRecord | None:
+        """Return the record of the latest run, or None before the first one."""
+        document = self.store.stored_document(RECORDS)
+        if document is None:
+            raise self.store.damage(f"{RECORDS}/{ROOT}", "it is not there")
+        table = document.get("attributes", {}).get(_RUN)
+        if table is None:
+            return None
+        digest, name = table.pop(DIGEST, ""), f"{self.store.path}: {RECORDS}/{ROOT}, the record of the latest run,"
+        if digest != digest_of(table):
+            raise _damage(name, CHANGED, table)
+        return _from_table(RunRecord, table, name)
+
+    def write_run(self, record: RunRecord) -> None:
+        """Replace the record of the latest run: an attribute of the group of records, in one key."""
+        document = self.store.document(RECORDS)
+        # The store does not remember it: consolidated metadata would tell readers of a run that ended long ago.
+        run = {**asdict(record), DIGEST: digest_of(asdict(record))}
+        changed = {**document, "attributes": {**document.get("attributes", {}), _RUN: run}}
+        self.store.location.write({f"{RECORDS}/{ROOT}": json.dumps(changed).encode()})
+
+
+def _from_table(kind: type[Kind], table: Any, name: str) -> Kind:
+    """Return the record that a table holds."""
+    try:
+        record: Kind = _adapter(cast(Hashable, kind)).validate_python(table)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        problem = ": ".join(filter(None, (".".join(map(str, first["loc"])), first["msg"])))
+        raise _damage(name, problem, table) from error
+    return record
+
+
+def _damage(name: str, problem: str, content: object) -> DamageError:
+    return DamageError(f"{name} is damaged ({problem}): {str(content)[:80]!r}; run the study again", problem)

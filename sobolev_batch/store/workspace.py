@@ -10,9 +10,10 @@ from typing import Self
 import numpy as np
 
 from sobolev_batch.store.create import prepare_store
+from sobolev_batch.store.field_arrays import Fields
+from sobolev_batch.store.layout import QUALITY, Store
 from sobolev_batch.store.location import Location
-from sobolev_batch.store.records import Record
-from sobolev_batch.store.store import QUALITY, Store
+from sobolev_batch.store.records import Record, Records
 from sobolev_batch.store.stored_tables import hide_tables
 from sobolev_batch.study.plan import Plan, Row
 
@@ -42,7 +43,7 @@ class Workspace:
         """Return the workspace of a store that is laid out for a plan."""
         by_label, labels = {row.label: row for row in plan.rows}, store.labels()
         rows = {i: by_label[label] for i, label in enumerate(labels) if label in by_label}
-        return cls(store, plan, labels, rows, list(store.records()))
+        return cls(store, plan, labels, rows, list(Records(store).read()))
 
     @classmethod
     def prepared(cls, location: Location, plan: Plan) -> Self:
@@ -78,14 +79,14 @@ class Workspace:
         """Withdraw the records of fields that are not in the store, or not as a whole."""
         complete = self.complete
         if complete:
-            whole = self.store.rows_with_complete_fields()
+            whole = Fields(self.store).complete_rows()
             self.withdraw((i for i in complete if i not in whole), "it is not there, or not all of it")
 
     def withdraw(self, rows: Iterable[int], reason: str) -> None:
         """Withdraw the records of damaged fields, which makes them pending."""
         for i in rows:
             _log.warning("the field of %s is damaged (%s) and is computed again", self.rows[i].label, reason)
-            self.store.write_record(i, None)
+            Records(self.store).write(i, None)
             self.records[i] = None
 
     def withdraw_results_of(self, rows: Sequence[int]) -> None:

@@ -18,8 +18,9 @@ from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import DamageError
 from sobolev_batch.norms.budget import PARTS, NormEstimate
 from sobolev_batch.norms.columns import VARIABLES, describe
-from sobolev_batch.store.store import DISTANCES, PAIRS_KEYS, Store
-from sobolev_batch.store.stored_tables import array_keys, dataset_keys, key_in, key_of, missing_chunks, seal
+from sobolev_batch.store.layout import DISTANCES, PAIRS_KEYS, Store, array_keys, dataset_keys
+from sobolev_batch.store.metadata import chunk_shape
+from sobolev_batch.store.sealed_chunks import key_in, key_of, missing_chunks, seal
 from sobolev_batch.tables.reducer import Reducer
 from sobolev_batch.tables.shells import read_spectra
 
@@ -85,7 +86,7 @@ class Pairs:
         tiles = math.ceil(count / side)
         keys |= array_keys(PAIRS_KEYS, str, (tiles, tiles), (1, 1), ("tile", "other_tile"))
         before = self.store.stored_document(f"{DISTANCES}/{_COLUMNS[0]}")
-        if before is not None and before["chunk_grid"]["configuration"]["chunk_shape"] != list(chunks):
+        if before is not None and chunk_shape(before) != list(chunks):
             self.store.location.remove(DISTANCES)
         self.store.publish(keys)
 

@@ -30,7 +30,8 @@ from sobolev_batch.norms.spectrum import ComparedSpectra, RadialAxis, Spectra
 from sobolev_batch.norms.tail.remainder import Remainder
 from sobolev_batch.norms.tail.sampling import TailSampling
 from sobolev_batch.norms.tail.values import OctaveSums, OctaveWeights, Tail, squared_moduli
-from sobolev_batch.store.store import Store
+from sobolev_batch.store.field_arrays import Fields
+from sobolev_batch.store.layout import Store
 from sobolev_batch.study.lattice_choice import LatticeChoice
 from sobolev_batch.transform.lattice import Block, Lattice, SobolevWeights, shell_sums
 
@@ -107,7 +108,7 @@ class Reducer:
         return cls(
             store=store,
             lattice=choice.lattice,
-            blocks=store.blocks_of(choice.lattice),
+            blocks=Fields(store).blocks_of(choice.lattice),
             orders=orders,
             reference=known if compared_with is None else compared_with,
             areas=areas,
@@ -340,14 +341,14 @@ class Reducer:
     def read(self, rows: Sequence[int], number: int) -> Complexes:
         """Read one block of fields, and check it against their records."""
         expected = [self.checksums[row][number] for row in rows]
-        return self.store.read_fields(rows, self.lattice.place(self.blocks[number]), expected)
+        return Fields(self.store).read(rows, self.lattice.place(self.blocks[number]), expected)
 
     def read_octaves(self, row: int) -> NDArray[np.complexfloating]:
         """Return the values of a row at all samples of octaves (n,), and check them against its record."""
         if self.sampling is None:
             return np.zeros(0, dtype=np.complex128)
         place = (slice(0, self.sampling.size),)
-        values: NDArray[np.complexfloating] = self.store.read_fields([row], place, [self.checksums[row][-1]])[0]
+        values: NDArray[np.complexfloating] = Fields(self.store).read([row], place, [self.checksums[row][-1]])[0]
         return values
 
     def octave_sums(self, values: NDArray[np.complexfloating]) -> list[OctaveSums]:

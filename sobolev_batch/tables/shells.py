@@ -10,8 +10,9 @@ import numpy as np
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import DamageError
 from sobolev_batch.norms.spectrum import ComparedSpectra
-from sobolev_batch.store.store import SPECTRA_GROUP, SPECTRA_KEYS, Store
-from sobolev_batch.store.stored_tables import arrays_of, key_in, key_of, missing_chunks, read_chunk, seal
+from sobolev_batch.store.layout import SPECTRA_GROUP, SPECTRA_KEYS, Store
+from sobolev_batch.store.metadata import chunk_shape
+from sobolev_batch.store.sealed_chunks import arrays_of, key_in, key_of, missing_chunks, read_chunk, seal
 from sobolev_batch.tables.reducer import Reducer
 
 # Of a lower bound.
@@ -28,7 +29,7 @@ def chunks_of_spectra(store: Store) -> Iterator[range]:
     """Yield the rows of each chunk of spectra."""
     for before, part in store.parts:
         document = part.document(SPECTRA_KEYS)
-        (count,), (step,) = document["shape"], document["chunk_grid"]["configuration"]["chunk_shape"]
+        (count,), (step,) = document["shape"], chunk_shape(document)
         for first in range(0, count, step):
             yield range(before + first, before + min(first + step, count))
 

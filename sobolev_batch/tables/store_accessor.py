@@ -17,8 +17,8 @@ from sobolev_batch.norms.causes import band_coordinates
 from sobolev_batch.norms.columns import AREA, KERNEL, LENGTH, NUMBER, described, order_axis
 from sobolev_batch.norms.fields import Quality
 from sobolev_batch.sources.names import quoted
-from sobolev_batch.store.records import Record
-from sobolev_batch.store.store import QUALITY
+from sobolev_batch.store.layout import QUALITY
+from sobolev_batch.store.records import Record, Records
 from sobolev_batch.store.stored_tables import rows_unlike_tables
 from sobolev_batch.store.workspace import complete_records
 from sobolev_batch.tables.open import finished_group, reference_of, require_unchanged, source_of, store_of
@@ -235,7 +235,7 @@ def stored_reducer(tree: xr.DataTree, order: Orders, *meshes: str) -> tuple[Redu
         own = labels[first : first + part.row_count]
         known = ((i, label) for i, label in enumerate(own) if label and label not in removed)
         wanted = {i for i, label in known if not chosen or label in chosen}
-        read = {i: part.read_record(i) for i in wanted} if meshes else dict(enumerate(part.records()))
+        read = {i: Records(part).read_one(i) for i in wanted} if meshes else dict(enumerate(Records(part).read()))
         records = [read[i] if i in wanted else None for i in range(len(own))]
         for i, problem in (rows_unlike_tables(part, records, wanted) if wanted else {}).items():
             raise DamageError(

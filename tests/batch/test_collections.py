@@ -16,9 +16,10 @@ from distributed import Client
 
 import sobolev_batch as sb
 from sobolev_batch.store.collection_store import CollectionStore
+from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, locked
-from sobolev_batch.store.store import Store
+from sobolev_batch.store.records import Records
 from sobolev_batch.study.plan import Plan, make_plan
 from tests.support.commands import call
 from tests.support.stores import flip
@@ -174,14 +175,14 @@ def test_runs_lock_the_objects_that_they_plan(tmp_path: Path, monkeypatch: pytes
 
 def test_the_run_of_a_collection_is_the_one_that_did_not_end_well(changeable: Path) -> None:
     first = Store.open(changeable / "a")
-    ended = first.read_run()
+    ended = Records(first).read_run()
     assert ended is not None
     ended = replace(ended, started="2020-01-01T00:00:00Z", seen="2020-01-01T00:00:00Z", error="no disk")
-    first.write_run(replace(ended, state="failed"))
+    Records(first).write_run(replace(ended, state="failed"))
     failed = sb.status(changeable)
     assert (failed.run_store, failed.lost) == (first.path, False)
     assert f"the latest run of {first.path} failed: no disk" in str(failed)
-    first.write_run(replace(ended, state="running"))
+    Records(first).write_run(replace(ended, state="running"))
     lost = sb.status(changeable)
     assert (lost.run_store, lost.lost) == (first.path, True)
     assert f"unlock {first.path}" in str(lost)

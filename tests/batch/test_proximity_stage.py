@@ -20,7 +20,9 @@ from sobolev_batch.batch import proximity_stage as module
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.proximity_stage import measure_proximity
-from sobolev_batch.store.store import Store
+from sobolev_batch.store.field_arrays import Fields
+from sobolev_batch.store.layout import Store
+from sobolev_batch.store.records import Records
 from sobolev_batch.study.plan import make_plan
 from tests.support.stores import assert_same_results
 from tests.support.studies import small_table, variable
@@ -101,11 +103,11 @@ def test_what_a_change_of_the_study_measures(store: Path, threads: Client) -> No
 
 
 def test_distances_that_nobody_asks_for_any_more_go(store: Path, threads: Client) -> None:
-    fields = Store(store).rows_with_complete_fields()
+    fields = Fields(Store(store)).complete_rows()
     assert measured(study_of(proximity=None), store, threads) == []
     assert "proximity" not in sb.open_store(store).children
     assert not (store / "proximity").exists()
-    assert Store(store).rows_with_complete_fields() == fields
+    assert Fields(Store(store)).complete_rows() == fields
     # The records still have them.
     assert measured(study_of(), store, threads) == []
     assert_right(store, study_of())
@@ -166,14 +168,14 @@ def test_too_little_memory_is_foreseen_and_a_later_run_makes_up_for_it(
 
 def test_a_mesh_that_has_changed_is_not_measured(store: Path, tmp_path: Path) -> None:
     here, plan = Store.open(store), make_plan(study_of())
-    records = here.records()
+    records = Records(here).read()
     digests = [record.facts.digest for record in records if record is not None]
     assert records[1] is not None
     pair = (plan.rows[2], digests[1]), (plan.rows[-1], digests[-1])
     record = measure_proximity(here, 1, records[1], "key", pair, plan.similarity, 100)
     assert record.proximity is not None
     assert "is not the mesh whose field is stored" in record.proximity.reason
-    assert here.records()[1] is not None
+    assert Records(here).read()[1] is not None
     assert sb.verify(store).is_sound
 
 

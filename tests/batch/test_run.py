@@ -18,8 +18,8 @@ from sobolev_batch.batch.cluster.clients import remote_client
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.status import Status
 from sobolev_batch.store import workspace
-from sobolev_batch.store.records import Record
-from sobolev_batch.store.store import Store
+from sobolev_batch.store.layout import Store
+from sobolev_batch.store.records import Record, Records
 from tests.support.commands import call, command, finished
 from tests.support.processes import tcp_cluster, wait_until
 from tests.support.recipes import write_study
@@ -238,11 +238,13 @@ def test_the_worker_that_drives_is_lost_and_another_takes_over(study_path: Path,
     with tcp_cluster([], []) as (address, workers):
         assert command("submit", study_path, "--scheduler", address, "--store", store_path).returncode == 0
         store = Store.open(store_path)
-        begun = wait_until(lambda: (record := store.read_run()) and record.state != "submitted" and record)
+        begun = wait_until(lambda: (record := Records(store).read_run()) and record.state != "submitted" and record)
         assert begun
         driver = next(worker for worker in workers if f"process {worker.pid} " in begun.driver)
         driver.kill()
-        done = wait_until(lambda: (record := store.read_run()) and record.state in ("done", "failed") and record)
+        done = wait_until(
+            lambda: (record := Records(store).read_run()) and record.state in ("done", "failed") and record
+        )
         assert done
         assert done.state == "done"
     status = Status.from_store(store_path)

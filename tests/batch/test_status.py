@@ -19,8 +19,8 @@ import sobolev_batch as sb
 from sobolev_batch.batch.status import Status
 from sobolev_batch.cli import cli
 from sobolev_batch.cli.common import replace_line
-from sobolev_batch.store.records import Record, RunRecord
-from sobolev_batch.store.store import Store
+from sobolev_batch.store.layout import Store
+from sobolev_batch.store.records import Record, Records, RunRecord
 from sobolev_batch.store.stored_tables import hide_tables
 from tests.support.studies import small_table
 
@@ -42,11 +42,11 @@ def store() -> Store:
 
 def running(store: Store, *finished: float, begun: float = 0.0, state: str = "running") -> Status:
     """Return the status of a run in which surfaces were finished at these seconds, the first of them in vain."""
-    for row, end in zip_longest(range(len(store.records())), finished):
+    for row, end in zip_longest(range(len(Records(store).read())), finished):
         record = Record(key="k", status="complete" if row else "failed", finished=moment(end or 0.0))
-        store.write_record(row, None if end is None else record)
+        Records(store).write(row, None if end is None else record)
     now = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-    store.write_run(RunRecord(state, "process 1", moment(begun), now, "fields, 3 of 5"))  # type: ignore[arg-type]
+    Records(store).write_run(RunRecord(state, "process 1", moment(begun), now, "fields, 3 of 5"))  # type: ignore[arg-type]
     return Status.from_store(store.path)
 
 

@@ -28,6 +28,8 @@ from sobolev_batch.norms.tail.sampling import Octave
 from sobolev_batch.shapes import Similarity, icosphere
 from sobolev_batch.sources.registry import ExpectedSize
 from sobolev_batch.store.create import prepare_store
+from sobolev_batch.store.field_arrays import Fields
+from sobolev_batch.store.records import Records
 from sobolev_batch.study.plan import Plan, make_plan
 from sobolev_batch.transform.backends import CPU_COSTS, ComplexDtype, NufftSpec, Workload
 from sobolev_batch.transform.fourier import TransformSettings, fastest_spec, projected_bytes
@@ -56,7 +58,7 @@ def test_a_mesh_is_one_task_whatever_the_memory_allows(store_path: Path) -> None
     # Batches of triangles share no nodes with each other.
     assert whole.facts.points <= record.facts.points < 1.1 * whole.facts.points
     assert replace(record.facts, points=whole.facts.points) == whole.facts
-    expected, values = job.store.read_fields([0, 1], plan.lattice.place(plan.lattice.half))
+    expected, values = Fields(job.store).read([0, 1], plan.lattice.place(plan.lattice.half))
     assert np.abs(values - expected).max() < 2e-9 * whole.facts.area
 
 
@@ -109,8 +111,8 @@ def test_a_task_whose_record_is_there_writes_nothing(store_path: Path, monkeypat
     def refuse(*arguments: Any) -> None:
         raise AssertionError("it is written again")
 
-    for name in ("write_field", "write_record"):
-        monkeypatch.setattr(type(job.store), name, refuse)
+    for owner in (Fields, Records):
+        monkeypatch.setattr(owner, "write", refuse)
     again = [*(compute_parts(job, [block]) for block in blocks), compute_parts(job, octaves=True)]
     # Those whose worker was lost are done again; the results of others may be there still.
     for mixture in (parts, again, [*parts[:2], *again[2:]]):

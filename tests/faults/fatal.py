@@ -13,14 +13,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sobolev_batch.store.store import Store
+from sobolev_batch.store.field_arrays import Fields
+from sobolev_batch.store.records import Records
 
 VARIABLE = "FATAL_MOMENT"
 _FUNCTIONS: dict[str, tuple[type, str]] = {
-    "field": (Store, "write_field"),
+    "field": (Fields, "write"),
     "rename": (Path, "replace"),
-    "record": (Store, "write_record"),
-    "recorded": (Store, "write_record"),
+    "record": (Records, "write"),
+    "recorded": (Records, "write"),
 }
 
 

@@ -22,8 +22,9 @@ from sobolev_batch.batch.cluster.clients import local_client, thread_client
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.status import Status
 from sobolev_batch.errors import StoreError
+from sobolev_batch.store.layout import Store
 from sobolev_batch.store.metadata import SCHEMA_VERSION
-from sobolev_batch.store.store import Store
+from sobolev_batch.store.records import Records
 from sobolev_batch.study import plan as plan_module
 from tests.support.stores import assert_same_results, contents
 from tests.support.studies import small_table, variable
@@ -169,7 +170,8 @@ import os, sys
 from sobolev_batch import Study
 from sobolev_batch.study.plan import make_plan
 from sobolev_batch.store.workspace import Workspace
-from sobolev_batch.store.store import Store
+from sobolev_batch.store.layout import Store
+from sobolev_batch.store.records import Records
 from sobolev_batch.batch.field_tasks import Job, compute_mesh
 from tests.support.studies import small_table
 
@@ -182,7 +184,7 @@ for i, row in Workspace.for_plan(store, plan).rows.items():
         continue
     job = Job.for_row(plan, row, store, i)
     for _ in range(5):
-        store.write_record(i, None)
+        Records(store).write(i, None)
         assert compute_mesh(job, plan.blocks).status == "complete"
 """
 
@@ -205,7 +207,7 @@ def test_the_same_task_twice_at_once(study: Study, finished_store: Path, store_p
     assert_same_results(store_path, finished_store)
     # Facts as text, since those of a sphere hold NaN.
     ours, clean = (
-        [(str(record.facts), record.quality, record.checksums) for record in Store.open(path).records() if record]
+        [(str(record.facts), record.quality, record.checksums) for record in Records(Store.open(path)).read() if record]
         for path in (store_path, finished_store)
     )
     assert ours == clean

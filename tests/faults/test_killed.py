@@ -25,9 +25,10 @@ from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.watch import Watch
 from sobolev_batch.errors import ClusterError, LockError, StoreError
 from sobolev_batch.store.create import prepare_store
+from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, locked
-from sobolev_batch.store.store import Store
+from sobolev_batch.store.records import Records
 from sobolev_batch.study.plan import make_plan
 from tests.faults.conftest import LABELS
 from tests.faults.fatal import Moment
@@ -88,7 +89,7 @@ def test_the_next_run_computes_what_has_no_record(
         # Its workers end with it: what they were writing is then written or never will be.
         assert driver.stdout is not None
         driver.stdout.read()
-    complete = [record is not None for record in Store.open(store_path).records()].count(True)
+    complete = [record is not None for record in Records(Store.open(store_path)).read()].count(True)
     assert complete >= {"dashboard:": 0, "[2/5]": 2, "tables reduced": 5}[line]
     # The process is known to be gone, so that its claim keeps nobody out.
     again = call("run", study, "--store", store_path, "--workers", "1")
@@ -108,13 +109,14 @@ import numpy as np
 from sobolev_batch import Study
 from sobolev_batch.study.plan import make_plan
 from sobolev_batch.store.create import prepare_store
-from sobolev_batch.store.records import Record
+from sobolev_batch.store.field_arrays import Fields
+from sobolev_batch.store.records import Record, Records
 from tests.support.studies import small_table
 
 path = Path(sys.argv[1])
 plan = make_plan(Study.from_table(small_table(lattice={"xi_max": 3.0, "M": 64})))
 store = prepare_store(path, plan)
-(place,) = store.places()
+(place,) = Fields(store).places()
 shape = [part.stop for part in place]
 chunk = path / "fourier/fourier/c/0/0/0/0"
 chunk.parent.mkdir(parents=True)
@@ -126,8 +128,8 @@ for kill in range(%d):
     if child == 0:
         for number in range(1000 * kill + 1, 1000 * (kill + 1)):
             os.write(writer, b"x")
-            checksum = store.write_field(0, place, np.full(shape, number, dtype=complex))
-            store.write_record(0, Record(str(number), "complete", checksums=(checksum,)))
+            checksum = Fields(store).write(0, place, np.full(shape, number, dtype=complex))
+            Records(store).write(0, Record(str(number), "complete", checksums=(checksum,)))
         os._exit(1)
     for _ in range(int(rng.integers(1, 12))):
         os.read(reader, 1)
@@ -138,12 +140,12 @@ for kill in range(%d):
     assert os.waitpid(child, 0)[1] == signal.SIGKILL
     os.close(reader)
     os.close(writer)
-    values = store.read_fields([0], place)[0]
+    values = Fields(store).read([0], place)[0]
     written = not np.isnan(values).all()
     found["values"] += written
     found["torn"] += written and not (values == values.flat[0]).all()
     found["strays"] += len(list(path.rglob("*.partial")))
-    record = store.read_record(0)
+    record = Records(store).read_one(0)
     # The field is never older than its record.
     found["unfounded"] += record is not None and not int(record.key) <= values.flat[0].real
     # What every run does first.
@@ -184,7 +186,7 @@ def test_a_layout_that_was_interrupted_is_begun_anew(
             store = prepare_store(store_path, plan)
             break
     assert whole > 5
-    assert (store.labels(), store.records()) == (LABELS, (None,) * 5)
+    assert (store.labels(), Records(store).read()) == (LABELS, (None,) * 5)
 
 
 def write_part(folder: Path, shift: float) -> None:
@@ -223,13 +225,13 @@ def test_a_worker_that_goes_on_after_another_run_writes_nothing(
 def test_only_the_run_that_has_the_store_writes(store_path: Path, finished_store: Path) -> None:
     location, lock = Location(str(finished_store)), Lock.of_this_process()
     store = Store(location.fenced(lock.fence))
-    record = store.read_record(0)
+    record = Records(store).read_one(0)
     with pytest.raises(LockError, match="the store was unlocked, or its run is over"):
-        store.write_record(0, record)
+        Records(store).write(0, record)
     with locked(location, lock):
-        store.write_record(0, record)
+        Records(store).write(0, record)
         with pytest.raises(LockError, match=r"no longer has the store: process \d+ on .* has it now"):
-            Store(location.fenced(Lock.of_this_process().fence)).write_record(0, record)
+            Records(Store(location.fenced(Lock.of_this_process().fence))).write(0, record)
     assert json.loads(record.to_json(0) if record else "{}")["row"] == 0
 
 

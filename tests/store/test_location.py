@@ -16,8 +16,8 @@ from zarr.core.sync import sync
 from sobolev_batch import Study, run
 from sobolev_batch.batch.status import Status
 from sobolev_batch.errors import StoreError
+from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location, path_in
-from sobolev_batch.store.store import Store
 from tests.support.studies import small_table
 
 

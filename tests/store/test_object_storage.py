@@ -27,10 +27,11 @@ from sobolev_batch.errors import StoreError
 from sobolev_batch.store import create
 from sobolev_batch.store import location as locations
 from sobolev_batch.store.create import prepare_store
+from sobolev_batch.store.field_arrays import Fields
+from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import LOCK_KEY
-from sobolev_batch.store.records import Record
-from sobolev_batch.store.store import Store
+from sobolev_batch.store.records import Record, Records
 from sobolev_batch.store.stored_tables import table_attributes, write_table
 from sobolev_batch.study.plan import make_plan
 from tests.support.commands import STUDY, call, command, finished
@@ -116,8 +117,8 @@ def test_requests_for_records_grow_with_their_pages(server: Server, url: str, mo
     family = [{"name": f"f{i}", "source": "sphere", "radius": 0.5 + 0.01 * i} for i in range(40)]
     store = prepare_store(url, make_plan(Study.from_table(small_table(family=family))))
     for row in range(41):
-        store.write_record(row, Record(str(row), "complete"))
-    records = store.records()
+        Records(store).write(row, Record(str(row), "complete"))
+    records = Records(store).read()
 
     def requests_of(call: Callable[[], object]) -> int:
         before = len(server.requests())
@@ -125,13 +126,13 @@ def test_requests_for_records_grow_with_their_pages(server: Server, url: str, mo
         return len(server.requests()) - before
 
     # The chunks are listed; each page is written, and the chunks of its rows are removed at once.
-    assert requests_of(lambda: store.collect_records(records)) == 1 + 2 * 4
+    assert requests_of(lambda: Records(store).collect(records)) == 1 + 2 * 4
     assert [key for key in server.keys(key_of(url)) if "/record/c/" in key] == [f"{key_of(url)}/records/record/c/40"]
     # The record of the reference stays alone.
-    assert requests_of(store.records) == 1 + 4 + 1
-    assert store.records() == records
-    assert requests_of(lambda: store.read_record(7)) == 2
-    assert requests_of(lambda: store.collect_records(records)) == 1
+    assert requests_of(Records(store).read) == 1 + 4 + 1
+    assert Records(store).read() == records
+    assert requests_of(lambda: Records(store).read_one(7)) == 2
+    assert requests_of(lambda: Records(store).collect(records)) == 1
 
 
 def test_another_lattice_leaves_nothing_of_the_first(server: Server, url: str) -> None:
@@ -139,17 +140,17 @@ def test_another_lattice_leaves_nothing_of_the_first(server: Server, url: str) -
     store = prepare_store(url, plan)
     prefix = key_of(url)
     empty = server.keys(prefix)
-    store.write_field(1, plan.lattice.place(plan.blocks[0]), np.zeros(plan.lattice.shape))
-    store.write_record(1, Record("key", "complete"))
+    Fields(store).write(1, plan.lattice.place(plan.blocks[0]), np.zeros(plan.lattice.shape))
+    Records(store).write(1, Record("key", "complete"))
     write_table(store, "norms", xr.Dataset({"norm": ("mesh", np.ones(5))}))
     store.consolidate()
     assert len(server.keys(prefix)) == len(empty) + 5
     finer = plan.with_choice(replace(plan.choice, lattice=Lattice(plan.lattice.xi_max, 2 * plan.lattice.M)))
     again = prepare_store(url, finer)
     assert server.keys(prefix) == empty
-    assert again.records() == (None,) * 5
+    assert Records(again).read() == (None,) * 5
     assert table_attributes(again, "norms") is None
-    assert np.isnan(again.read_fields([1], finer.lattice.place(finer.blocks[0]))).all()
+    assert np.isnan(Fields(again).read([1], finer.lattice.place(finer.blocks[0]))).all()
     assert Store.open(url).labels() == store.labels()
 
 
@@ -420,7 +421,7 @@ def test_a_run_whose_store_fails_for_good_ends_and_is_resumed(
     assert (done.returncode, done.stdout) == (2, ""), done.stderr
     last = done.stderr.splitlines()[-1]
     assert re.match(rf"error: {location}: the store cannot be {verb}: .*InternalError", last), done.stderr
-    assert [record and record.status for record in Store(location).records()] == ["complete", None, None]
+    assert [record and record.status for record in Records(Store(location)).read()] == ["complete", None, None]
     again = command(*arguments, folder=tmp_path, AWS_MAX_ATTEMPTS="2")
     assert again.returncode == 0, again.stderr
     assert "2 computed, 1 reused, 0 failed" in again.stdout
@@ -435,7 +436,7 @@ def test_a_disk_without_room_for_more_fields(study: Study, store_path: Path, thr
 
         with pytest.raises(StoreError, match=rf"{store_path}: the store cannot be written: File too large"):
             run(study, store_path, threads, on_progress=fill_up)
-    records = Store(store_path).records()
+    records = Records(Store(store_path)).read()
     assert all(record is None or record.status == "complete" for record in records)
     stored = sum(record is not None for record in records)
     assert 2 <= stored < 5

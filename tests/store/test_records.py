@@ -16,9 +16,9 @@ from sobolev_batch import Study, run, status, verify
 from sobolev_batch.errors import StoreError
 from sobolev_batch.store import create
 from sobolev_batch.store.create import prepare_store
+from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import FolderStore
-from sobolev_batch.store.records import Record
-from sobolev_batch.store.store import Store
+from sobolev_batch.store.records import Record, Records
 from sobolev_batch.study.plan import Plan, make_plan
 from tests.support.stores import assert_same_results, delete, empty, flip, put_back, truncate
 from tests.support.studies import small_table
@@ -43,14 +43,14 @@ def plan_of(levels: int = 4) -> Plan:
 def filled(path: Path | str) -> Store:
     store = prepare_store(path, plan_of())
     for row in range(5):
-        store.write_record(row, Record(f"first {row}", "complete"))
+        Records(store).write(row, Record(f"first {row}", "complete"))
     return store
 
 
 def keys_of(store: Store) -> list[str | None]:
     """The key of each row's record, read row by row and all together."""
-    alone = [store.read_record(row) for row in range(len(store.labels()))]
-    assert list(store.records()) == alone
+    alone = [Records(store).read_one(row) for row in range(len(store.labels()))]
+    assert list(Records(store).read()) == alone
     return [None if record is None else record.key for record in alone]
 
 
@@ -65,35 +65,35 @@ FIRST = [f"first {row}" for row in range(5)]
 def test_full_pages_take_the_place_of_chunks(scheme: str, store_path: Path) -> None:
     store = filled(scheme + str(store_path))
     assert chunks(store) == [f"{OWN}/{row}" for row in range(5)]
-    store.collect_records(store.records())
+    Records(store).collect(Records(store).read())
     collected = [f"{PAGES}/0", f"{PAGES}/1", f"{OWN}/4"]
     assert chunks(store) == sorted(collected)
     assert keys_of(store) == FIRST
     # New rows make the last page a full one.
     grown = prepare_store(scheme + str(store_path), plan_of(5))
     assert keys_of(grown) == [*FIRST, None]
-    grown.write_record(5, Record("first 5", "failed"))
-    grown.collect_records(grown.records())
+    Records(grown).write(5, Record("first 5", "failed"))
+    Records(grown).collect(Records(grown).read())
     assert chunks(grown) == [f"{PAGES}/{page}" for page in range(3)]
     assert keys_of(Store.open(store.location)) == [*FIRST, "first 5"]
 
 
 def test_what_is_written_later_counts_more_than_a_page(store_path: Path) -> None:
     store = filled(store_path)
-    store.collect_records(store.records())
-    store.write_record(0, Record("second", "complete"))
-    store.write_record(1, None)
+    Records(store).collect(Records(store).read())
+    Records(store).write(0, Record("second", "complete"))
+    Records(store).write(1, None)
     expected = ["second", None, *FIRST[2:]]
     assert keys_of(store) == expected
     # A page that lacks one stays, with what lies over it.
-    store.collect_records(store.records())
+    Records(store).collect(Records(store).read())
     assert keys_of(store) == expected
     # Damaged, it does not give way to the page either.
     flip(store_path / OWN / "0")
     assert keys_of(store) == [None, None, *FIRST[2:]]
     for row in (0, 1):
-        store.write_record(row, Record(f"third {row}", "complete"))
-    store.collect_records(store.records())
+        Records(store).write(row, Record(f"third {row}", "complete"))
+    Records(store).collect(Records(store).read())
     assert chunks(store) == sorted([f"{PAGES}/0", f"{PAGES}/1", f"{OWN}/4"])
     assert keys_of(store) == ["third 0", "third 1", *FIRST[2:]]
 
@@ -116,12 +116,12 @@ def test_records_stay_the_same_wherever_collecting_ends(store_path: Path, monkey
         store, left = Store.open(store_path), itertools.count(-steps)
         with put_back(store_path):
             try:
-                store.collect_records(store.records())
+                Records(store).collect(Records(store).read())
                 break
             except StoreError:
                 assert keys_of(Store.open(store_path)) == FIRST
             left = itertools.count(1)
-            store.collect_records(store.records())
+            Records(store).collect(Records(store).read())
             assert chunks(store) == sorted([f"{PAGES}/0", f"{PAGES}/1", f"{OWN}/4"])
             assert keys_of(store) == FIRST
     # A page and two chunks, twice.
@@ -145,11 +145,11 @@ def test_a_run_collects_and_a_later_one_mends_what_was_killed(study: Study, stor
     there = Store.open(store)
     assert chunks(there) == sorted([f"{PAGES}/0", f"{PAGES}/1", f"{OWN}/4"])
     assert (status(store).complete, verify(store).complete, verify(store).is_sound) == (5, 5, True)
-    record = there.read_record(0)
-    there.write_record(0, record)
+    record = Records(there).read_one(0)
+    Records(there).write(0, record)
     assert run(study, store, threads).reused == LABELS
     assert f"{OWN}/0" not in chunks(there)
-    assert there.read_record(0) == record
+    assert Records(there).read_one(0) == record
     assert json.loads(there.read_strings("records/page")[1])["row"] == 1
 
 

@@ -21,10 +21,11 @@ from sobolev_batch.batch.status import Status
 from sobolev_batch.errors import LockError, StoreError
 from sobolev_batch.store import metadata as documents
 from sobolev_batch.store.create import prepare_store
+from sobolev_batch.store.field_arrays import Fields
+from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, locked
-from sobolev_batch.store.records import Record
-from sobolev_batch.store.store import Store
+from sobolev_batch.store.records import Record, Records
 from sobolev_batch.study.plan import Plan, make_plan
 from tests.support.commands import COMMAND, call, finished
 from tests.support.repository import ROOT, blocks, install
@@ -39,9 +40,9 @@ def small_plan(**changes: object) -> Plan:
 def test_fields_that_were_not_computed_are_nan_zeros_are_kept_and_all_arrays_have_checksums(store_path: Path) -> None:
     plan = small_plan()
     store = prepare_store(store_path, plan)
-    (place,) = store.places()
-    store.write_field(3, place, np.zeros(plan.lattice.shape, dtype=complex))
-    missing, zeros = store.read_fields([0, 3], place)
+    (place,) = Fields(store).places()
+    Fields(store).write(3, place, np.zeros(plan.lattice.shape, dtype=complex))
+    missing, zeros = Fields(store).read([0, 3], place)
     assert np.isnan(missing).all()
     assert (zeros == 0).all()
     metadata = [json.loads(path.read_text()) for path in store_path.rglob("zarr.json")]
@@ -79,11 +80,11 @@ def test_a_folder_of_other_files_is_refused_and_left_alone(store_path: Path) -> 
 
 def test_new_meshes_become_new_rows(store_path: Path) -> None:
     store = prepare_store(store_path, small_plan())
-    store.write_record(0, Record("k", "complete"))
+    Records(store).write(0, Record("k", "complete"))
     more = [{"name": name, "source": "icosphere", "levels": [0, 1]} for name in ("more", "ico")]
     grown = prepare_store(store_path, small_plan(family=more))
     assert grown.labels() == ("ico/0", "ico/1", "ico/2", "ico/3", "reference", "more/0", "more/1")
-    assert [record is None for record in grown.records()] == [False, *[True] * 6]
+    assert [record is None for record in Records(grown).read()] == [False, *[True] * 6]
 
 
 def test_opening_what_is_no_store(store_path: Path) -> None:

@@ -21,7 +21,9 @@ import xarray as xr
 import sobolev_batch as sb
 from sobolev_batch.errors import StoreError
 from sobolev_batch.norms.fields import Quality
-from sobolev_batch.store.store import Store
+from sobolev_batch.store.field_arrays import Fields
+from sobolev_batch.store.layout import Store
+from sobolev_batch.store.records import Records
 from sobolev_batch.tables import store_accessor
 from sobolev_batch.tables.accessor import SobolevAccessor
 from sobolev_batch.transform.exact import sphere_inner_product, sphere_norm
@@ -60,8 +62,8 @@ def test_one_pair_reads_no_other_mesh(finished_store: Path, monkeypatch: pytest.
         return parse(text)
 
     monkeypatch.setattr(Quality, "from_json", from_json)
-    monkeypatch.delattr(Store, "records")
-    monkeypatch.delattr(Store, "read_record")
+    monkeypatch.delattr(Records, "read")
+    monkeypatch.delattr(Records, "read_one")
     found = tree.sobolev.distance(-3.5, "ico/3")
     assert len(parsed) == 2
     monkeypatch.undo()
@@ -235,15 +237,15 @@ def test_the_nearest_meshes_are_found_without_the_fields_of_others(
     balls: str, mesh: str, order: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read: set[int] = set()
-    read_fields = Store.read_fields
+    read_fields = Fields.read
 
-    def recording(store: Store, rows: list[int], *arguments: Any) -> Any:
+    def recording(fields: Fields, rows: list[int], *arguments: Any) -> Any:
         read.update(rows)
-        return read_fields(store, rows, *arguments)
+        return read_fields(fields, rows, *arguments)
 
     monkeypatch.setattr(store_accessor, "_CANDIDATES", 2)
     expected = sb.matrix(balls, order)[mesh].drop([mesh, "lost/nowhere"]).nsmallest(3)
-    monkeypatch.setattr(Store, "read_fields", recording)
+    monkeypatch.setattr(Fields, "read", recording)
     found = sb.open_store(balls).sobolev.nearest(mesh, 3, order)
     pd.testing.assert_series_equal(found["distance"].to_series(), expected, rtol=1e-9, check_names=False)
     assert len(read) <= 8

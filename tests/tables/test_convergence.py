@@ -16,7 +16,8 @@ import xarray as xr
 import sobolev_batch as sb
 from sobolev_batch import smallest_below, table
 from sobolev_batch.errors import InputError
-from sobolev_batch.store.store import Store
+from sobolev_batch.store.field_arrays import Fields
+from sobolev_batch.store.records import Records
 from sobolev_batch.tables.conclusion import format_verdict
 from sobolev_batch.tables.convergence import format_smallest, format_table
 from sobolev_batch.tables.matrix import format_matrix
@@ -235,12 +236,12 @@ def test_matrices_of_any_order(stores: tuple[str, str]) -> None:
 def test_tables_of_any_order_read_no_field_and_no_record(
     stores: tuple[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.delattr(Store, "read_fields")
+    monkeypatch.delattr(Fields, "read")
     assert set(sb.table(stores[0], -3.7)["order"]) == {-3.7}
     assert sb.matrix(stores[0], -3).attrs["order"] == -3.0
-    with pytest.raises(AttributeError, match="read_fields"):
+    with pytest.raises(AttributeError, match="read"):
         sb.matrix(stores[0], -3.7)
-    monkeypatch.delattr(Store, "examine_records")
+    monkeypatch.delattr(Records, "examine")
     assert set(sb.table(stores[0], [-10, -3.7])["order"]) == {-10.0, -3.7}
 
 

@@ -14,7 +14,7 @@ from distributed import Client
 
 from sobolev_batch import Study, matrix, open_store, run, table, verify
 from sobolev_batch.errors import DamageError
-from sobolev_batch.store.store import Store
+from sobolev_batch.store.layout import Store
 from sobolev_batch.tables import pairs
 from sobolev_batch.tables.reducer import Reducer
 from tests.support.studies import small_table

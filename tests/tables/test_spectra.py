@@ -14,7 +14,8 @@ from distributed import Client
 
 from sobolev_batch import Study, open_store, run, table, verify
 from sobolev_batch.errors import DamageError
-from sobolev_batch.store.store import SPECTRA_KEYS, Store
+from sobolev_batch.store.field_arrays import Fields
+from sobolev_batch.store.layout import SPECTRA_KEYS, Store
 from tests.support.studies import small_table
 
 BALLS = [{"name": f"ball-{k}", "source": "sphere", "radius": 0.5 + 0.1 * k} for k in range(3)]
@@ -29,13 +30,13 @@ def balls(count: int = 3, **changes: Any) -> Study:
 def rows_read(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Return the rows whose fields are read from now on."""
     rows: list[int] = []
-    read = Store.read_fields
+    read = Fields.read
 
-    def recording(store: Store, chosen: list[int], *arguments: Any) -> Any:
+    def recording(fields: Fields, chosen: list[int], *arguments: Any) -> Any:
         rows.extend(chosen)
-        return read(store, chosen, *arguments)
+        return read(fields, chosen, *arguments)
 
-    monkeypatch.setattr(Store, "read_fields", recording)
+    monkeypatch.setattr(Fields, "read", recording)
     return rows
 
 

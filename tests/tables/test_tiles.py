@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sobolev_batch import Study, distance, fourier_transform
 from sobolev_batch.shapes import Sphere
 from sobolev_batch.store.create import prepare_store
+from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.study.plan import make_plan
 from sobolev_batch.tables.reducer import Reducer
 from sobolev_batch.transform.lattice import SobolevWeights, shell_sums
@@ -44,7 +45,7 @@ def reducer(store_path: Path, fields: NDArray[np.complex128]) -> Reducer:
     for block in plan.blocks:
         place = plan.lattice.place(block)
         for row, field in enumerate(fields):
-            checksums[row] += (store.write_field(row, place, field[place]),)
+            checksums[row] += (Fields(store).write(row, place, field[place]),)
     return Reducer(
         store=store,
         lattice=plan.lattice,

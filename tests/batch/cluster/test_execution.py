@@ -19,7 +19,8 @@ from sobolev_batch.batch.cluster.watch import Watch
 from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers, prepare_workers
 from sobolev_batch.batch.status import Status
 from sobolev_batch.errors import ClusterError, DamageError, InputError, StoreError
-from sobolev_batch.store.store import Store
+from sobolev_batch.store.layout import Store
+from sobolev_batch.store.records import Records
 from tests.support.processes import tcp_cluster
 from tests.support.studies import balls, methods_of, small_table
 
@@ -137,7 +138,7 @@ def test_a_lost_scheduler_ends_the_run_and_blames_no_mesh(store_path: Path, thre
         client._timeout = 1
         with pytest.raises(ClusterError, match=r"the scheduler at .* was lost; the same command goes on"):
             run(study, store_path, client, on_progress=end)
-    records = Store(store_path).records()
+    records = Records(Store(store_path)).read()
     assert all(record is None or record.status == "complete" for record in records)
     assert sum(record is not None for record in records) >= 3
     status = Status.from_store(store_path)

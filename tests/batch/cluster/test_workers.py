@@ -19,7 +19,8 @@ from sobolev_batch.batch.cluster.workers import MEMORY, prepare_workers, require
 from sobolev_batch.errors import ClusterError, InputError
 from sobolev_batch.parameters import machine_memory
 from sobolev_batch.shapes import icosphere
-from sobolev_batch.store.store import Store
+from sobolev_batch.store.layout import Store
+from sobolev_batch.store.records import Records
 from tests.support import gate
 from tests.support.processes import PATIENCE_SECONDS, WORKER, dask, tcp_cluster
 from tests.support.repository import install
@@ -129,7 +130,7 @@ def test_differences_are_reported_before_anything_is_computed(
     monkeypatch.setattr(client, "get_versions", answer)
     with pytest.raises(ClusterError, match=message):
         run(study, store_path, client)
-    assert Store(store_path).records() == (None,) * 5
+    assert Records(Store(store_path)).read() == (None,) * 5
 
 
 def test_other_numerics_and_libraries_that_the_study_needs(
@@ -178,6 +179,6 @@ def test_a_worker_that_leaves_hands_on_the_task_that_it_is_in_to_one_that_came_l
         os.close(writers[0])
         processes[1].communicate(timeout=PATIENCE_SECONDS)
     assert (len(summary.computed), summary.failed) == (5, {})
-    assert {record.worker for record in Store.open(store_path).records() if record} - {first}
+    assert {record.worker for record in Records(Store.open(store_path)).read() if record} - {first}
     run(study, tmp_path / "undisturbed.zarr", client)
     assert_same_results(store_path, tmp_path / "undisturbed.zarr")

@@ -1,0 +1,117 @@
+"""Fields in a store: their chunks, of blocks of the lattice and of octaves, written and read against checksums."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from zarr.buffer.cpu import NDBuffer
+
+from sobolev_batch.errors import DamageError
+from sobolev_batch.store.checked import checksum_of
+from sobolev_batch.store.layout import FIELD, OCTAVES, Store
+from sobolev_batch.store.records import Record
+from sobolev_batch.transform.lattice import AXES, Block, Lattice
+
+# The place of values of a field: slices of a block of the lattice, or the slice of all samples of octaves.
+Place = tuple[slice, ...]
+
+
+@dataclass(frozen=True)
+class Fields:
+    """The fields of a store."""
+
+    store: Store
+
+    def places(self) -> tuple[Place, ...]:
+        """Return the places of a field's values: its blocks, in the order of a plan's blocks, and then its octaves."""
+        array = self.store.array(FIELD)
+        axes = [
+            [slice(start, min(start + step, total)) for start in range(0, total, step)]
+            for total, step in zip(array.shape[1:], array.chunks[1:], strict=True)
+        ]
+        has_octaves = OCTAVES in self.store.documents
+        octaves = [(slice(0, self.store.document(OCTAVES)["shape"][1]),)] if has_octaves else []
+        return (*product(*axes), *octaves)
+
+    def blocks_of(self, lattice: Lattice) -> tuple[Block, ...]:
+        """Return the blocks of a field on its lattice, in the order of `places`."""
+        x, y, z = lattice.half.start
+        return tuple(
+            Block((x + i.start, y + j.start, z + k.start), (i.stop - i.start, j.stop - j.start, k.stop - k.start))
+            for i, j, k in (place for place in self.places() if len(place) == len(AXES))
+        )
+
+    def write(self, row: int, place: Place, values: NDArray[Any]) -> int:
+        """Write a row's values at a place, made of whole chunks, and return their checksum for `read`."""
+        array = self.store.array(_array_at(place))
+        values = np.ascontiguousarray(values, dtype=array.dtype)
+        with self.store.location.access("written"):
+            array.set_basic_selection((row, *place), values)
+        return checksum_of(values)
+
+    def read(self, rows: Sequence[int], place: Place, checksums: Sequence[int] | None = None) -> NDArray[Any]:
+        """Return the values of several rows at a place, complex (len(rows), ...).
+
+        They are compared with the checksums that the tasks returned; without these, missing values read as NaN. A
+        DamageError names the row whose values are damaged, lost, or others.
+        """
+        parts = self.store.parts
+        arrays = [part.array(_array_at(place)) for _, part in parts]
+        values = np.empty((len(rows), *(axis.stop - axis.start for axis in place)), dtype=arrays[0].dtype)
+
+        def read(i: int) -> None:
+            number = bisect_right(parts, rows[i], key=lambda part: part[0]) - 1
+            first, store = parts[number]
+            # On object storage, all but a wrong checksum is a failure of the access.
+            damage = ValueError if store.location.scheme else (OSError, ValueError)
+            with store.location.access("read"):
+                try:
+                    # In place: copying a field costs as much as reading it.
+                    buffer = NDBuffer.from_numpy_array(values[i])
+                    arrays[number].get_basic_selection((rows[i] - first, *place), out=buffer)
+                except damage as error:
+                    raise _damage(store, rows[i] - first, str(error)) from error
+            if checksums is not None and checksum_of(values[i]) != checksums[i]:
+                lost = bool(np.isnan(values[i]).all())
+                problem = "it is not there" if lost else "it is not what was written for its record"
+                raise _damage(store, rows[i] - first, problem)
+
+        # Most of the time of a request is spent waiting.
+        with ThreadPoolExecutor(max(1, len(rows)) if self.store.location.scheme else 1) as pool:
+            list(pool.map(read, range(len(rows))))
+        return values
+
+    def damage(self, row: int, record: Record) -> str:
+        """Read the field of a row, and return how it differs from its record; empty if it does not."""
+        places = self.places()
+        if len(record.checksums) != len(places):
+            return f"its record knows of {len(record.checksums)} blocks, and the store has {len(places)}"
+        try:
+            for place, checksum in zip(places, record.checksums, strict=True):
+                self.read([row], place, [checksum])
+        except DamageError as error:
+            return error.what
+        return ""
+
+    def complete_rows(self) -> set[int]:
+        """Return the rows whose blocks all exist in their full length. No block is read."""
+        rows = set(range(self.store.row_count))
+        for name in self.store.documents.keys() & {FIELD, OCTAVES}:
+            incomplete = self.store.incomplete_chunks(name, self.store.location.sizes(f"{name}/c"))
+            rows -= {index[0] for index in incomplete}
+        return rows
+
+
+def _damage(store: Store, row: int, problem: str) -> DamageError:
+    return store.damage(f"the field of {store.names_of_rows(row + 1)[row]}", problem, row)
+
+
+def _array_at(place: Place) -> str:
+    return FIELD if len(place) == len(AXES) else OCTAVES

@@ -1,0 +1,425 @@
+"""The layout of a store: which groups and arrays it has, their metadata documents, and the digest of these.
+
+The driver creates all arrays before any task starts (see `create`). Tasks fill whole chunks and nothing else, so
+no two of them write the same chunk. docs/store.md describes the layout for readers.
+
+The metadata of all arrays lie together in one document at the root. A store reads it once, and tasks take along what
+they need of it: on object storage every look at a key is a request. For the same reason the keys of new arrays are made
+in memory and then written as a whole: zarr and xarray look at a store again and again while they create arrays.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from itertools import accumulate
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import xarray as xr
+import zarr
+from zarr.abc.buffer import Buffer
+from zarr.abc.store import Store as ZarrStore
+from zarr.codecs import Crc32cCodec
+from zarr.storage import MemoryStore, StorePath
+
+from sobolev_batch.errors import DamageError, StoreError
+from sobolev_batch.store.checked import CheckedStore, largest_chunk_bytes
+from sobolev_batch.store.location import Location
+from sobolev_batch.store.metadata import MOST_BYTES, SCHEMA_VERSION, Document, check_documents, chunk_shape
+from sobolev_batch.study.lattice_choice import LatticeChoice
+
+ROOT = "zarr.json"
+FIELD = "fourier/fourier"
+LABELS = "fourier/mesh"
+QUALITY = "fourier/quality"
+OCTAVES_GROUP = "octaves"
+OCTAVES = "octaves/octaves"
+RECORDS = "records"
+RECORD = "records/record"
+PAGE = "records/page"
+# Radial spectra, see `sobolev_batch.norms.spectrum`, and distances, with their keys.
+SPECTRA_GROUP, DISTANCES = "spectra", "distances"
+SPECTRA_KEYS, PAIRS_KEYS = f"{SPECTRA_GROUP}/key", f"{DISTANCES}/key"
+# Attributes of the root: the digest of tables and metadata; true while the store is being created; the objects of a
+# collection; the labels of meshes that the study has lost.
+DIGEST, UNFINISHED, COLLECTION, REMOVED = "digest", "unfinished", "collection", "removed"
+# Arrays of tables above this size in memory, such as distances of all pairs of many meshes, have several chunks.
+_LARGEST_CHUNK_BYTES = 64 << 20
+# These arrays have chunks for rows, which need not be computed.
+_OF_ROWS = frozenset({FIELD, OCTAVES, RECORD, PAGE})
+# Missing values by the kind of a dtype: that of strings, of complex and of real numbers.
+_FILL_VALUES: dict[str, Any] = {"U": "", "c": complex(np.nan, np.nan), "f": np.nan}
+_REQUESTS_AT_ONCE = 64
+
+
+class Store:
+    """Store of a study, by its path or URL. Cheap to make and to pickle.
+
+    Methods raise a `StoreError` if the store cannot be read or written. Metadata that were read are kept: make another
+    store to see what other processes have changed of them. Chunks are read anew each time.
+
+    Attributes:
+        documents: Metadata documents by the path of their node. That of the root, under "", lacks the others.
+    """
+
+    def __init__(self, store: str | Path | Location) -> None:
+        self.location = Location.parse(store)
+        self.documents: dict[str, Document] = {}
+        # SHA-256 of keys below the digest, where this process knows them.
+        self._hashes: dict[str, str] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        carried = {name: self.documents[name] for name in self._arrays_in_progress if name in self.documents}
+        return {"location": self.location, "documents": carried, "_hashes": {}}
+
+    @classmethod
+    def open(cls, store: str | Path | Location) -> Self:
+        """Open a store that exists."""
+        opened = cls(store)
+        opened.attributes()
+        return opened
+
+    def fenced(self, fence: Callable[[Location], None]) -> Self:
+        """Return the same store for a writer that has to stop once another condition fails."""
+        store = type(self)(self.location.fenced(fence))
+        store.documents = self.documents
+        return store
+
+    @property
+    def path(self) -> str:
+        """Path or URL of the store."""
+        return self.location.name
+
+    def damage(self, what: str, problem: str, row: int | None = None) -> DamageError:
+        """Return the error for a part of the store that is not what was written."""
+        return DamageError(f"{self.path}: {what} is damaged ({problem}); run the study again", problem, row)
+
+    def exists(self) -> bool:
+        """Return whether a zarr hierarchy exists; DamageError where only its root is gone, which is written first."""
+        if "" not in self.documents:
+            root = self.stored_document("")
+            if root is None:
+                if self.stored_document(RECORDS) is not None:
+                    raise self.damage("the store", f"{ROOT}, the metadata at the root, is gone")
+                return False
+            for name, document in (root.pop("consolidated_metadata", None) or {}).get("metadata", {}).items():
+                # zarr repeats in each group what the root has.
+                document.pop("consolidated_metadata", None)
+                self.documents.setdefault(name, document)
+            self.documents[""] = root
+        return True
+
+    def attributes(self) -> dict[str, Any]:
+        """Return the attributes of the root: title, study, similarity, versions."""
+        if not self.exists() or self.documents[""].get("node_type") != "group":
+            raise StoreError(f"{self.path}: it holds no store of a study")
+        attributes: dict[str, Any] = self.documents[""].get("attributes", {})
+        if COLLECTION in attributes:
+            raise StoreError(
+                f"{self.path}: the store of a collection; each of its objects has its own, {self.path}/NAME; "
+                "sobolev-batch status shows their names"
+            )
+        if self.is_unfinished:
+            raise StoreError(
+                f"{self.path}: the store is being laid out, or whoever did that was interrupted; run the study again"
+            )
+        if "schema_version" not in attributes or "study" not in attributes:
+            raise StoreError(f"{self.path}: a zarr store, but not one of a study")
+        version = attributes["schema_version"]
+        if version != SCHEMA_VERSION:
+            raise StoreError(
+                f"{self.path}: its schema has version {version}, this program reads {SCHEMA_VERSION}; "
+                "run the study again into another store, or read this one with the version that has written it"
+            )
+        return attributes
+
+    def choice(self) -> LatticeChoice:
+        """Return the lattice of all fields, with the octaves beside it."""
+        study = self.attributes()["study"]
+        dtypes = {"dtype": study["dtype"], "transform_dtype": study["dtype"]}
+        given = {**study["lattice"], **dtypes, "closest": (), "reasons": (), "basis": ""}
+        return LatticeChoice.from_table(study.get("choice") or given, study.get("octaves"))
+
+    @property
+    def is_unfinished(self) -> bool:
+        """True if the creation of the store was not finished: nothing in it counts."""
+        return self.exists() and bool(self.documents[""].get("attributes", {}).get(UNFINISHED))
+
+    @property
+    def removed(self) -> frozenset[str]:
+        """Labels of the meshes that the study has lost; their fields stay, in case they come back."""
+        return frozenset(self.attributes().get(REMOVED, ()))
+
+    @property
+    def parts(self) -> tuple[tuple[int, Store], ...]:
+        """The stores that this one is made of, each with the number of rows before its own; see `JoinedStore`."""
+        return ((0, self),)
+
+    @property
+    def row_count(self) -> int:
+        """Number of rows."""
+        return int(self.document(FIELD)["shape"][0])
+
+    def labels(self) -> tuple[str, ...]:
+        """Return the label of each row."""
+        return self.read_strings(LABELS)
+
+    def names_of_rows(self, count: int) -> Sequence[str]:
+        """Return what messages call rows: their labels, or their numbers where labels are damaged."""
+        with suppress(DamageError):
+            return self.labels()
+        return [f"row {row}" for row in range(count)]
+
+    def document(self, name: str) -> Document:
+        """Return the metadata document of a node."""
+        if name not in self.documents and not (self.exists() and name in self.documents):
+            raise StoreError(
+                f"{self.path}: the store is incomplete: it has no {name}; remove it and run the study again"
+            )
+        return self.documents[name]
+
+    def stored_document(self, name: str) -> Document | None:
+        """Return the metadata document of a node that readers may not find yet; None if there is none."""
+        key = f"{name}/{ROOT}".lstrip("/")
+        text = self.location.read(key, MOST_BYTES)
+        if text is None:
+            return None
+        try:
+            document = dict(json.loads(text))
+        except (ValueError, TypeError, RecursionError) as error:
+            raise self.damage(key, str(error)) from error
+        check_documents(self.path, {name: document})
+        return document
+
+    def keyed_arrays(self) -> list[str]:
+        """Return the names of the arrays that tasks of the reduction fill, and of their keys; see `sealed_chunks`."""
+        groups = [keys.split("/")[0] for keys in (SPECTRA_KEYS, PAIRS_KEYS) if keys in self.documents]
+        names = (name for name in self.documents if "/" in name and name.split("/")[0] in groups)
+        return [name for name in names if name.endswith("/key") or len(self.documents[name]["shape"]) > 1]
+
+    def whole_arrays(self) -> list[str]:
+        """Return the names of the arrays of tables and coordinates, which are written as a whole.
+
+        Qualities are a copy of what records have, and not among them.
+        """
+        others = {*_OF_ROWS, QUALITY, *self.keyed_arrays()}
+        arrays = (name for name, document in self.documents.items() if document.get("node_type") == "array")
+        return [name for name in arrays if name not in others]
+
+    @property
+    def _arrays_in_progress(self) -> frozenset[str]:
+        """Names of the arrays that tasks fill, chunk by chunk: what they need of the metadata, a fiftieth of all."""
+        return _OF_ROWS.union(self.keyed_arrays())
+
+    def array(self, name: str) -> zarr.Array[Any]:
+        """Return an array, for reading and writing."""
+        # The values of fields are compared with their records, which does more.
+        path = StorePath(self._keys(name) if name in (FIELD, OCTAVES) else self.checked_keys(name), name)
+        metadata = zarr.AsyncArray.from_dict(path, self.document(name)).metadata
+        # Chunks of zeros are data too: they must exist, or they would read as never computed.
+        return zarr.Array(zarr.AsyncArray(metadata, path, config={"write_empty_chunks": True}))
+
+    def checked_keys(self, largest: str = FIELD, *, has_tables: bool = False) -> ZarrStore:
+        """Return the store that zarr and xarray take to read arrays up to the largest, whose chunks are checked.
+
+        Where it has tables, no spectrum and no distance of pairs is missing.
+        """
+        in_progress = _OF_ROWS if has_tables else self._arrays_in_progress
+        return CheckedStore(self._keys(largest), self.path, self.documents, in_progress)
+
+    def _keys(self, largest: str) -> ZarrStore:
+        return self.location.zarr_store(math.prod(chunk_shape(self.document(largest))) * np.dtype(complex).itemsize)
+
+    def read(self, name: str, selection: Any = ...) -> Any:
+        """Return a selection of an array; a damaged one raises a `DamageError`."""
+        array = self.array(name)
+        # Each record is a chunk, and a chunk a request.
+        with self.location.access("read"), zarr.config.set({"async.concurrency": _REQUESTS_AT_ONCE}):
+            return array[selection]
+
+    def read_strings(self, name: str) -> tuple[str, ...]:
+        """Return all elements of an array of strings; see `read`."""
+        return tuple(map(str, np.asarray(self.read(name)).tolist()))
+
+    def write(self, name: str, selection: Any, values: Any) -> None:
+        """Write a selection of an array, made of whole chunks."""
+        array = self.array(name)
+        self._forget(name)
+        with self.location.access("written"):
+            array[selection] = values
+
+    def publish(self, keys: Mapping[str, bytes]) -> None:
+        """Write keys of new nodes. Readers find the nodes after `consolidate`."""
+        self.location.write(keys)
+        for key, content in keys.items():
+            self._hashes[key] = hashlib.sha256(content).hexdigest()
+            if key.endswith(f"/{ROOT}"):
+                self.documents[key.removesuffix(f"/{ROOT}")] = json.loads(content)
+
+    def remove(self, group: str) -> None:
+        """Remove a group and everything in it, first from what readers find."""
+        self.hide([name for name in self.documents if name.split("/")[0] == group])
+        self.location.remove(group)
+        self._forget(group)
+
+    def hide(self, names: Sequence[str]) -> None:
+        """Take nodes out of what readers find; their keys stay."""
+        self.documents = {name: document for name, document in self.documents.items() if name not in names}
+        self.consolidate()
+
+    def consolidate(self) -> None:
+        """Collect the metadata of all nodes at the root, so that one read opens everything, with a new digest."""
+        root = self._root()
+        root["attributes"][DIGEST] = self._digest(root)
+        self.documents[""]["attributes"][DIGEST] = root["attributes"][DIGEST]
+        self.location.write({ROOT: json.dumps(root).encode()})
+
+    def has_digest(self) -> bool:
+        """Return whether tables, coordinates and metadata are those that were written together."""
+        try:
+            return bool(self.documents[""]["attributes"].get(DIGEST) == self._digest(self._root()))
+        except (DamageError, ValueError, TypeError, KeyError):
+            # zarr has no exception of its own for metadata that make no sense.
+            return False
+
+    def _root(self) -> Document:
+        """Return the document at the root with those of all nodes, as zarr consolidates them, without the digest."""
+        attributes = {name: value for name, value in self.documents[""]["attributes"].items() if name != DIGEST}
+        # Readers list the variables of a group in this order: the number and its error first.
+        names = sorted(filter(None, self.documents), key=lambda name: name.split("/")[0])
+        nodes = {name: self.documents[name] for name in names}
+        consolidated = {"kind": "inline", "must_understand": False, "metadata": nodes}
+        return {**self.documents[""], "attributes": attributes, "consolidated_metadata": consolidated}
+
+    def _digest(self, root: Document) -> str:
+        """Return the SHA-256 of a root and of all keys of the tables, coordinates and metadata that it lists."""
+        # The group of records has the state of the latest run.
+        keys = {f"{name}/{ROOT}": MOST_BYTES for name in self.documents if name not in ("", RECORDS)}
+        for name in self.whole_arrays():
+            keys |= dict.fromkeys(self.chunk_keys(name), largest_chunk_bytes(self.documents[name]))
+        unknown = {key: keys[key] for key in sorted(keys.keys() - self._hashes.keys())}
+        with ThreadPoolExecutor(_REQUESTS_AT_ONCE) as pool:
+            contents = pool.map(self.location.read, unknown, unknown.values())
+            for key, content in zip(unknown, contents, strict=True):
+                self._hashes[key] = hashlib.sha256(content or b"").hexdigest()
+        return digest_of([root, {key: self._hashes[key] for key in keys}])
+
+    def _forget(self, name: str) -> None:
+        self._hashes = {key: value for key, value in self._hashes.items() if not key.startswith(f"{name}/")}
+
+    def chunk_keys(self, name: str) -> dict[str, tuple[int, ...]]:
+        """Return the keys of all chunks of an array, with their indices."""
+        document = self.document(name)
+        counts = [-(-length // step) for length, step in zip(document["shape"], chunk_shape(document), strict=True)]
+        return {"/".join([f"{name}/c", *map(str, index)]): index for index in np.ndindex(*counts)}
+
+    def stored_chunks(self, name: str) -> list[int]:
+        """Return the numbers of the stored chunks of an array along its only axis. Its metadata need not be there."""
+        prefix = f"{name}/c/"
+        numbers = (key.removeprefix(prefix) for key in self.location.sizes(prefix.rstrip("/")))
+        return sorted(int(number) for number in numbers if number.isdigit())
+
+    def incomplete_chunks(self, name: str, sizes: Mapping[str, int]) -> list[tuple[int, ...]]:
+        """Return the indices of an array's chunks that are missing, or of a wrong length by the sizes of its keys."""
+        document = self.document(name)
+        # Strings have no size that is known in advance.
+        expected = 0 if document["data_type"] == "string" else largest_chunk_bytes(document)
+        stored = {index: sizes.get(key, 0) for key, index in self.chunk_keys(name).items()}
+        return [index for index, size in stored.items() if not size or (expected and size != expected)]
+
+
+class JoinedStore(Store):
+    """Stores of one lattice and one reference, read as one: rows follow each other, metadata are the first one's."""
+
+    def __init__(self, stores: Sequence[Store], labels: Sequence[str]) -> None:
+        super().__init__(stores[0].location)
+        self.documents = stores[0].documents
+        self._stores, self._labels = tuple(stores), tuple(labels)
+
+    @property
+    def parts(self) -> tuple[tuple[int, Store], ...]:
+        """The stores, each with the number of rows before its own."""
+        firsts = accumulate((store.row_count for store in self._stores), initial=0)
+        return tuple(zip(firsts, self._stores, strict=False))
+
+    def labels(self) -> tuple[str, ...]:
+        """Return the label of each row; empty for rows that are left out."""
+        return self._labels
+
+
+def stored_choice(store: str | Path | Location) -> LatticeChoice | None:
+    """Return the lattice that was chosen for a store; None where its study gave it, or metadata are damaged."""
+    existing = Store(store)
+    with suppress(DamageError):
+        if existing.exists() and not existing.is_unfinished and existing.attributes()["study"].get("choice"):
+            return existing.choice()
+    return None
+
+
+def digest_of(table: Any) -> str:
+    """Return the SHA-256 of a table, however its JSON is spelled."""
+    return hashlib.sha256(json.dumps(table, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def array_keys(
+    name: str,
+    dtype: Any,
+    shape: tuple[int, ...],
+    chunks: tuple[int, ...],
+    dimensions: tuple[str, ...],
+    **attributes: Any,
+) -> dict[str, bytes]:
+    """Return the keys of an array without chunks, with checksums. It reads as NaN, or as empty strings."""
+    keys: dict[str, Buffer] = {}
+    zarr.create_group(MemoryStore(keys), zarr_format=3).create_array(
+        name,
+        shape=shape,
+        dtype=dtype,
+        chunks=chunks,
+        compressors=(Crc32cCodec(),),
+        fill_value=_FILL_VALUES[np.dtype(dtype).kind],
+        dimension_names=dimensions,
+        attributes=attributes,
+    )
+    return _bytes_of(keys)
+
+
+def dataset_keys(group: str, dataset: xr.Dataset) -> dict[str, bytes]:
+    """Return the keys of a group with the arrays of a dataset, with checksums, one chunk each unless they are large."""
+    keys: dict[str, Buffer] = {}
+    encoding = {
+        str(name): {
+            "compressors": (Crc32cCodec(),),
+            "chunks": variable.encoding.get("chunks", (_steps(variable), *variable.shape[1:])),
+        }
+        for name, variable in dataset.variables.items()
+        if variable.ndim
+    }
+    # A missing chunk is a lost one, and never a table of zeros.
+    with zarr.config.set({"array.write_empty_chunks": True}):
+        dataset.to_zarr(MemoryStore(keys), group=group, mode="w", zarr_format=3, consolidated=False, encoding=encoding)
+    # xarray writes several at a time, in any order.
+    places = {str(name): place for place, name in enumerate(dataset.variables)}
+    written = _bytes_of(keys)
+    return {key: written[key] for key in sorted(written, key=lambda key: places.get(key.split("/")[1], -1))}
+
+
+def is_large(values: xr.DataArray) -> bool:
+    """Return whether an array of a table is stored in several chunks."""
+    return values.nbytes > _LARGEST_CHUNK_BYTES
+
+
+def _steps(variable: xr.Variable) -> int:
+    """Return the length of a chunk along the first axis."""
+    return max(1, min(variable.shape[0], _LARGEST_CHUNK_BYTES * variable.shape[0] // max(1, variable.nbytes)))
+
+
+def _bytes_of(keys: dict[str, Buffer]) -> dict[str, bytes]:
+    # The root is made by `Store.consolidate`.
+    return {key: value.to_bytes() for key, value in keys.items() if key != ROOT}
