@@ -5,14 +5,21 @@ A count is the same on each machine, where seconds are not. A change that raises
 
 from __future__ import annotations
 
+import time
+from collections import Counter
 from collections.abc import Callable
 from functools import partial
+from io import BufferedReader
+from pathlib import Path
 from typing import Any
 
 import finufft
 import pytest
 
 import sobolev_batch as sb
+from sobolev_batch.geometry.formats import parsing, readers
+from sobolev_batch.sources import files
+from sobolev_batch.sources.command import CommandSource
 from sobolev_batch.transform import kinds
 from tests.support.studies import SMALL_LATTICE, small_table
 
@@ -144,3 +151,110 @@ def test_a_count_sees_each_transform() -> None:
     one, two = work_of(norm), work_of(lambda: (norm(), norm()))
     assert min(one.values()) > 0
     assert two == {name: 2 * count for name, count in one.items()}
+
+
+# How often a run lists a source, checks a mesh, and asks for the version of a program; and reads each file as a whole.
+Counts = Counter[str]
+
+
+@pytest.fixture
+def counts(monkeypatch: pytest.MonkeyPatch) -> Counts:
+    """Count what happens in this process. Files count as written long ago, so that their digests may be kept."""
+    counted: Counts = Counter()
+
+    class Counted(BufferedReader):
+        def read(self, size: int | None = -1, /) -> bytes:
+            data = super().read(size)
+            counted[f"bytes of {Path(self.name).name}"] += len(data)
+            return data
+
+        def readinto(self, buffer: Any, /) -> int:
+            length = super().readinto(buffer)
+            counted[f"bytes of {Path(self.name).name}"] += length
+            return length
+
+    def counting(kind: type, name: str, what: str) -> None:
+        own = getattr(kind, name)
+
+        def call(*arguments: Any) -> Any:
+            counted[what] += 1
+            return own(*arguments)
+
+        monkeypatch.setattr(kind, name, call)
+
+    opened, now = parsing.open_regular, time.time_ns
+    for module in (parsing, readers, files):
+        monkeypatch.setattr(module, "open_regular", lambda path: Counted(opened(path).detach()))
+    monkeypatch.setattr(time, "time_ns", lambda: now() + 10**10)
+    counting(files.FileSource, "members", "lists of files")
+    counting(CommandSource, "members", "lists of a command")
+    counting(sb.Mesh, "__init__", "meshes")
+    return counted
+
+
+def five_files(folder: Path, **changes: Any) -> sb.Study:
+    """Return a study of five mesh files and a file for the reference, in another place and unit."""
+    for number in range(6):
+        mesh = sb.shapes.icosphere(5)
+        name = "reference" if number == 5 else f"mesh{number}"
+        sb.write_mesh(sb.Mesh(mesh.vertices * (30 + number), mesh.triangles), folder / f"{name}.ply")
+    family = [{"name": "f", "source": "files", "paths": ["mesh*.ply"]}]
+    reference = {"source": "files", "paths": ["reference.ply"]}
+    return sb.Study.from_table(small_table(**{"family": family, "reference": reference, **changes}), folder=folder)
+
+
+def test_a_run_lists_and_reads_and_checks_once(tmp_path: Path, counts: Counts) -> None:
+    study = five_files(tmp_path)
+    counts.clear()
+    assert len(sb.run(study, "memory://settled.zarr").computed) == 6
+    # The families and the reference; five meshes in their tasks, and the reference for the plan and in its task.
+    assert (counts["lists of files"], counts["meshes"]) == (2, 7)
+    for file in tmp_path.glob("*.ply"):
+        # For the plan and in the task, and some headers.
+        assert counts[f"bytes of {file.name}"] // file.stat().st_size == 2, file
+    counts.clear()
+    assert len(sb.run(study, "memory://settled.zarr").reused) == 6
+    assert (counts["lists of files"], counts["meshes"]) == (2, 1)
+    assert counts["bytes of mesh0.ply"] < 0.5 * (tmp_path / "mesh0.ply").stat().st_size
+
+
+@pytest.mark.slow
+def test_a_plan_that_looks_at_meshes_reads_none_of_them_twice(tmp_path: Path, counts: Counts) -> None:
+    study = five_files(tmp_path, lattice=None, accuracy={"rtol": 0.3}, norm={"orders": [-4.0]})
+    counts.clear()
+    plan = sb.plan(study, "memory://looked-at.zarr")
+    assert (len(plan.labels), plan.doubtful) == (6, {})
+    assert counts["lists of files"] == 2
+    for file in tmp_path.glob("*.ply"):
+        assert counts[f"bytes of {file.name}"] // file.stat().st_size == 1, file
+
+
+@pytest.mark.process
+def test_the_version_of_a_program_is_asked_once_where_anything_is_missing(tmp_path: Path, counts: Counts) -> None:
+    asked, version = tmp_path / "asked", tmp_path / "version"
+    version.write_text("1.0")
+    command = {
+        "source": "command",
+        "mesh": {"source": "icosphere", "levels": [1]},
+        "command": ["cp", "{input}", "{output}", "-{n}"],
+        "version": ["sh", "-c", f"echo >> {asked}; cat {version}"],
+    }
+
+    def run(*options: str) -> tuple[int, int, int]:
+        """Return how many meshes were made, how often the version was asked, and how often each family was listed."""
+        families = [{**command, "name": name, "n": list(options)} for name in ("one", "two")]
+        counts.clear()
+        asked.write_text("")
+        summary = sb.run(
+            sb.Study.from_table(small_table(family=families)), "memory://versions.zarr", allow_commands=True
+        )
+        return len(summary.computed), len(asked.read_text()), counts["lists of a command"] // 2
+
+    assert run("f", "p", "v") == (7, 1, 1)
+    assert run("f", "p", "v") == (0, 0, 1)
+    assert run("f", "p", "v", "u") == (2, 1, 1)
+    # Of another version they are other meshes, and the study is listed again. A finished study stays as it is.
+    version.write_text("1.1")
+    assert run("f", "p", "v", "u") == (0, 0, 1)
+    assert run("f", "p", "v", "u", "L") == (10, 1, 2)
+    assert run("f", "p", "v", "u", "L") == (0, 0, 1)

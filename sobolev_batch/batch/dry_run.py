@@ -9,19 +9,19 @@ from typing import Any, overload
 
 from distributed import Client
 
-from sobolev_batch.batch.checks import StoreLike, require_permission, settled, warnings_of
 from sobolev_batch.batch.cluster.clients import require_blocking
 from sobolev_batch.batch.cluster.workers import Workers, prepare_workers, worker_slowness
 from sobolev_batch.batch.field_stage import Sizes, size_rows
+from sobolev_batch.batch.start import StoreLike, require_permission, settled, warnings_of
 from sobolev_batch.geometry.surface import Similarity, placement_doubt
 from sobolev_batch.norms.fields import Quality
 from sobolev_batch.norms.tail.values import SurfaceSize
 from sobolev_batch.parameters import available_cores, format_bytes
 from sobolev_batch.store.collection_store import for_each_object
-from sobolev_batch.store.layout import Store, stored_choice
+from sobolev_batch.store.layout import stored_choice
 from sobolev_batch.store.location import Location
-from sobolev_batch.store.records import Record, Records
-from sobolev_batch.store.workspace import complete_records
+from sobolev_batch.store.records import Record
+from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.lattice_choice import look_at_extents
 from sobolev_batch.study.plan import Plan, Row, make_plan
 from sobolev_batch.study.study import Study, StudyCollection, StudyLike
@@ -299,10 +299,9 @@ def plan(
     ...
     """
     study, location = settled(study, store, may_run=allow_commands)
-    if isinstance(study, StudyCollection):
-        plans, refused = for_each_object(study, location, lambda _, part, place: _plan(part, place, client))
-        return CollectionPlan(plans, refused, warnings_of(study, location))
-    return replace(_plan(study, location, client), warnings=warnings_of(study, location))
+    plans, refused = for_each_object(study, location, lambda _, part, place: _plan(part, place, client))
+    warnings = warnings_of(study, location)
+    return replace(plans[""], warnings=warnings) if "" in plans else CollectionPlan(plans, refused, warnings)
 
 
 def _plan(study: Study, location: Location, client: Client | None) -> StudyPlan:
@@ -317,12 +316,8 @@ def _plan(study: Study, location: Location, client: Client | None) -> StudyPlan:
     study_plan = make_plan(study, earlier_choice)
     planning_seconds = 0.0 if study_plan.choice is earlier_choice else time.process_time() - started
     sizes, refused = size_rows(study_plan, study_plan.rows, workers.with_backend(study.backend))
-    records = _stored_records(location)
-    stored = {
-        row.label: records[row.label]
-        for row in study_plan.rows
-        if row.label in records and records[row.label].completes(row.key)
-    }
+    workspace = Workspace.found(location, study_plan)
+    stored = {} if workspace is None else {workspace.labels[i]: record for i, record in workspace.stored.items()}
     seconds, processor_seconds, (first, *others) = forecast(study_plan, stored, workers, client, planning_seconds)
     doubtful, count = _doubts_of(study_plan, stored), len(study_plan.rows)
     total_bytes = format_bytes(study_plan.field_bytes * count)
@@ -356,20 +351,13 @@ def _plan(study: Study, location: Location, client: Client | None) -> StudyPlan:
 
 
 def _doubts_of(study_plan: Plan, stored: Mapping[str, Record]) -> dict[str, str]:
+    """Return why surfaces cannot be read, or hardly be compared with the reference, by label; none is read twice."""
+    seen, reference = study_plan.look, study_plan.reference_extent
     rows = [row for row in study_plan.rows if row.label != study_plan.reference]
-    members = {row.label: (row.family, row.member) for row in rows if row.label not in stored}
-    extents, set_aside = look_at_extents(members, study_plan.similarity, study_plan.reference_extent)
-    # What is stored need not be read again.
-    extents |= {row.label: Quality.from_json(stored[row.label].quality).extent for row in rows if row.label in stored}
-    doubts = {label: placement_doubt(extent, study_plan.reference_extent) for label, extent in extents.items()}
-    return set_aside | {label: doubt for label, doubt in doubts.items() if doubt is not None}
-
-
-def _stored_records(location: Location) -> dict[str, Record]:
-    """Return the records of all stored fields by label."""
-    store = Store(location)
-    if not store.exists() or store.is_unfinished:
-        return {}
-    store.attributes()
-    labels = store.labels()
-    return {labels[row]: record for row, record in complete_records(Records(store).read()).items()}
+    known = {*stored, *seen.extents, *seen.set_aside}
+    unseen = {row.label: (row.family, row.member) for row in rows if row.label not in known}
+    look = look_at_extents(unseen, study_plan.similarity, reference)
+    of_fields = {row.label: Quality.from_json(stored[row.label].quality).extent for row in rows if row.label in stored}
+    extents = {**seen.extents, **look.extents, **of_fields}
+    doubts = {label: placement_doubt(extent, reference) for label, extent in extents.items()}
+    return {**seen.set_aside, **look.set_aside} | {label: doubt for label, doubt in doubts.items() if doubt is not None}

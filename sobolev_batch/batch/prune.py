@@ -10,7 +10,7 @@ from sobolev_batch.store.layout import FIELD, OCTAVES, ROOT, Store
 from sobolev_batch.store.location import PARTIAL_FILE, Location
 from sobolev_batch.store.lock import LOCK_KEYS, Lock, locked
 from sobolev_batch.store.records import Records
-from sobolev_batch.store.workspace import complete_records
+from sobolev_batch.store.workspace import Contents
 
 _LOST, _KILLED, _UNLISTED = (
     "fields of meshes that are no longer in the study",
@@ -30,9 +30,8 @@ def prune(location: Location, *, is_dry: bool = True) -> dict[str, int]:
         store = Store.open(location)
         if store.is_unfinished:
             raise StoreError(f"{location}: its creation was not finished; run the study again")
-        labels, removed, records = store.labels(), store.removed, Records(store).read()
-        lost = {row for row, label in enumerate(labels) if label in removed}
-        kept = complete_records(records).keys() - lost
+        contents = Contents.of_store(store)
+        lost, kept = set(range(len(contents.labels))) - contents.rows.keys(), contents.complete.keys()
         listed = {name.split("/")[0] for name in store.documents} | {ROOT, *LOCK_KEYS}
         counts: Counter[str] = Counter()
         prefixes = set()
@@ -51,7 +50,7 @@ def prune(location: Location, *, is_dry: bool = True) -> dict[str, int]:
         if not is_dry:
             # First: a record without its field would be damage.
             for row in lost:
-                if records[row] is not None:
+                if contents.records[row] is not None:
                     Records(store).write(row, None)
             location.remove_partial_files()
             for prefix in prefixes:

@@ -12,28 +12,26 @@ from typing import Any
 import numpy as np
 from distributed import Client
 
-from sobolev_batch.batch.checks import StoreLike, ready_to_run
 from sobolev_batch.batch.cluster.clients import local_client, memory_limit, require_blocking, thread_client
 from sobolev_batch.batch.cluster.execution import Cluster, Notify, Progress
 from sobolev_batch.batch.cluster.watch import Watch
 from sobolev_batch.batch.cluster.workers import require_store_access
 from sobolev_batch.batch.field_stage import compute_fields
 from sobolev_batch.batch.proximity_stage import have_proximities, measure_proximities
+from sobolev_batch.batch.start import StoreLike, ready_to_run
 from sobolev_batch.batch.table_stage import are_tabulated, tabulate_fields
 from sobolev_batch.batch.verify import damaged_rows
-from sobolev_batch.errors import DamageError, InputError
+from sobolev_batch.errors import DamageError, InputError, StoreError
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.norms.budget import NormEstimate
 from sobolev_batch.parameters import available_cores, require_machine_memory
 from sobolev_batch.store.collection_store import CollectionStore, for_each_object, labelled
 from sobolev_batch.store.create import require_usable
 from sobolev_batch.store.heartbeat import Heartbeat
-from sobolev_batch.store.layout import stored_choice
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, locked
 from sobolev_batch.store.records import Records
-from sobolev_batch.store.workspace import Workspace, failed_proximities
-from sobolev_batch.study.plan import make_plan
+from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.study import AnyStudy, Study, StudyCollection, StudyLike
 from sobolev_batch.visible import Shown, reasons, visible
 
@@ -146,18 +144,27 @@ def run(
         own = nullcontext(client) if client is not None else _own_cluster(study, location, workers, memory)
         start = cache(lambda: stack.enter_context(own))
 
-        def run_study(study: Study, location: Location, notify: Notify) -> Summary:
-            lock = Lock.of_this_process()
-            require_usable(location)
-            with locked(location, lock):
-                if client is not None:
-                    with Watch(client).kept():
-                        require_store_access(client, location, lock)
-                return carry_out(study, location, lock, start, notify)
+        if isinstance(study, StudyCollection):
+            CollectionStore.prepared(location, study)
+        names = list(study.studies)
 
-        if isinstance(study, Study):
-            return run_study(study, location, notify)
-        return _run_collection(study, location, run_study, notify)
+        def run_object(name: str, study: Study, place: Location) -> Summary:
+            part = f"{name}, {names.index(name) + 1} of {len(names)}" if name else ""
+            lock = Lock.of_this_process()
+            try:
+                require_usable(place)
+                with locked(place, lock):
+                    if client is not None:
+                        with Watch(client).kept():
+                            require_store_access(client, place, lock)
+                    return carry_out(study, place, lock, start, lambda progress: notify(replace(progress, part=part)))
+            except InputError as error:
+                if name and not isinstance(error, StoreError):
+                    _log.error("%s: %s", name, error)
+                raise
+
+        summaries, refused = for_each_object(study, location, run_object)
+    return summaries[""] if "" in summaries else _of_all(location, summaries, refused)
 
 
 def _ignore(progress: Progress) -> None:
@@ -168,7 +175,7 @@ def _own_cluster(
     study: AnyStudy, location: Location, workers: int | None, memory: float | str | None
 ) -> AbstractContextManager[Client]:
     """Return a cluster on this machine, not yet started, after a look at whether the machine has the memory."""
-    for part in [study] if isinstance(study, Study) else study.studies.values():
+    for part in study.studies.values():
         if part.accuracy is not None and part.accuracy.asks_for_memory:
             require_machine_memory(part.accuracy.allowed_bytes, "[accuracy]: memory")
     if memory is not None:
@@ -178,31 +185,14 @@ def _own_cluster(
     return thread_client(workers) if location.is_in_memory else local_client(workers, memory)
 
 
-def _run_collection(
-    collection: StudyCollection,
-    location: Location,
-    run_study: Callable[[Study, Location, Notify], Summary],
-    notify: Notify,
-) -> Summary:
-    """Run the study of each object of a collection."""
-    CollectionStore.prepared(location, collection)
-    names = list(collection.studies)
-
-    def run_object(name: str, study: Study, place: Location) -> Summary:
-        part = f"{name}, {names.index(name) + 1} of {len(names)}"
-        try:
-            return run_study(study, place, lambda progress: notify(replace(progress, part=part)))
-        except InputError as error:
-            _log.error("%s: %s", name, error)
-            raise
-
-    summaries, refused = for_each_object(collection, location, run_object)
+def _of_all(location: Location, summaries: Mapping[str, Summary], refused: Mapping[str, str]) -> Summary:
+    """Return the outcome of the objects of a collection together."""
 
     def of_all(part: str) -> dict[str, Any]:
         entries = {name: getattr(summary, part) for name, summary in summaries.items()}
         return labelled({name: dict.fromkeys(own) if isinstance(own, tuple) else own for name, own in entries.items()})
 
-    computed, reused, failed = of_all("computed"), of_all("reused"), refused | of_all("failed")
+    computed, reused, failed = of_all("computed"), of_all("reused"), {**refused, **of_all("failed")}
     return Summary(str(location), (*computed,), (*reused,), failed, of_all("not_compared"), of_all("imprecise"))
 
 
@@ -214,13 +204,9 @@ def carry_out(
     notify: Notify = _ignore,
 ) -> Summary:
     """Run a study in a store that this process has locked; a cluster starts if anything is missing."""
-    plan = make_plan(study, stored_choice(location))
-    # Planning may take minutes.
-    lock.require(location)
-    workspace = Workspace.prepared(location.fenced(lock.fence), plan)
+    workspace = Workspace.of_study(study, location, lock)
     with Heartbeat(workspace.store, lock) as heartbeat:
-        workspace.withdraw_lost_fields()
-        if not workspace.pending and are_tabulated(workspace) and have_proximities(workspace):
+        if lacks_nothing(workspace):
             # The last run may have been killed before it did.
             Records(workspace.store).collect(workspace.records)
             return _summary(workspace, set())
@@ -260,7 +246,6 @@ def _compute(cluster: Cluster, heartbeat: Heartbeat, workspace: Workspace) -> Su
         with heartbeat.paused():
             workspace = Workspace.prepared(workspace.store.location, workspace.plan.with_choice(choice))
         heartbeat.write("running")
-        workspace.withdraw_lost_fields()
         rows = workspace.pending
     measure_proximities(cluster, workspace)
     Records(workspace.store).collect(workspace.records)
@@ -287,18 +272,19 @@ def _compute_repairing(
             repaired.update(rows)
 
 
+def lacks_nothing(workspace: Workspace) -> bool:
+    """Return True where nothing of a plan is missing in its store: fields, tables and distances of other kinds."""
+    return not workspace.pending and are_tabulated(workspace) and have_proximities(workspace)
+
+
 def _summary(workspace: Workspace, computed: set[int]) -> Summary:
-    labels, failed = {i: row.label for i, row in workspace.rows.items()}, workspace.failures
-    complete = workspace.complete
-    not_compared: Mapping[str, str] = {}
-    if workspace.plan.study.proximity is not None:
-        not_compared = failed_proximities(dict(enumerate(workspace.labels)), complete)
+    labels, complete = workspace.labels, workspace.complete
     return Summary(
         workspace.store.path,
-        tuple(label for i, label in labels.items() if i in computed and label not in failed),
-        tuple(label for i, label in labels.items() if i not in computed and i in complete),
-        failed,
-        not_compared,
+        tuple(labels[i] for i in workspace.rows if i in computed and i in complete),
+        tuple(labels[i] for i in workspace.rows if i not in computed and i in complete),
+        workspace.failures,
+        workspace.not_compared,
         _imprecise(workspace),
     )
 

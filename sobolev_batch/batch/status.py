@@ -13,8 +13,7 @@ from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, age_seconds, utc_now
 from sobolev_batch.store.records import Record, Records, RunRecord
-from sobolev_batch.store.stored_tables import rows_unlike_tables, table_attributes
-from sobolev_batch.store.workspace import complete_records, failed_proximities
+from sobolev_batch.store.workspace import Contents
 from sobolev_batch.tables.open import AnyStore, location_of
 from sobolev_batch.tables.text import duration
 from sobolev_batch.visible import Shown, visible
@@ -68,25 +67,18 @@ class Status(Shown):
         """Return the status of a store; see `sobolev_batch.status`."""
         place = location_of(store)
         opened = Store.open(place)
-        run, removed, records = Records(opened).read_run(), opened.removed, Records(opened).read()
-        labels = {row: label for row, label in enumerate(opened.labels()) if label not in removed}
-        asks_for_proximity = opened.attributes()["study"]["table"].get("proximity") is not None
-        complete = {row: record for row, record in complete_records(records).items() if row in labels}
+        run, contents = Records(opened).read_run(), Contents.of_store(opened)
         return cls(
             str(place),
-            len(complete),
-            len(labels),
-            {
-                label: record.reason
-                for row, label in labels.items()
-                if (record := records[row]) is not None and record.status == "failed"
-            },
-            failed_proximities(labels, complete) if asks_for_proximity else {},
+            len(contents.complete),
+            len(contents.rows),
+            contents.failures,
+            contents.not_compared,
             run,
-            table_attributes(opened, "convergence") is not None,
+            contents.has_tables,
             age_seconds(run.seen) if run is not None and run.state in ("submitted", "running") else 0.0,
-            math.nan if run is None else _rate(records, run),
-            lost_records=tuple(labels[row] for row in rows_unlike_tables(opened, records) if row in labels),
+            math.nan if run is None else _rate(contents.records, run),
+            lost_records=tuple(contents.labels[row] for row in contents.unlike_tables),
         )
 
     @classmethod

@@ -10,22 +10,21 @@ from dataclasses import dataclass, field, replace
 
 from distributed import Client, Future, Status, fire_and_forget, get_worker, worker_client
 
-from sobolev_batch.batch.checks import StoreLike, ready_to_run
 from sobolev_batch.batch.cluster.clients import require_blocking
 from sobolev_batch.batch.cluster.execution import task_key
 from sobolev_batch.batch.cluster.watch import Watch
 from sobolev_batch.batch.cluster.workers import prepare_workers, require_store_access
 from sobolev_batch.batch.run import carry_out
+from sobolev_batch.batch.start import StoreLike, ready_to_run
 from sobolev_batch.errors import ClusterError, StoreError
 from sobolev_batch.store.collection_store import CollectionStore, for_each_object
 from sobolev_batch.store.create import require_usable
 from sobolev_batch.store.heartbeat import Heartbeat
-from sobolev_batch.store.layout import Store, stored_choice
+from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, acquire, release
 from sobolev_batch.store.workspace import Workspace
-from sobolev_batch.study.plan import make_plan
-from sobolev_batch.study.study import Study, StudyLike
+from sobolev_batch.study.study import Study, StudyCollection, StudyLike
 
 _log = logging.getLogger(__name__)
 
@@ -92,10 +91,11 @@ def submit(
     require_blocking(client)
     study, location = ready_to_run(study, store, allow_commands=allow_commands, only=only)
     location = location.absolute()
-    if isinstance(study, Study):
-        return _submit(study, location, client)
-    CollectionStore.prepared(location, study)
+    if isinstance(study, StudyCollection):
+        CollectionStore.prepared(location, study)
     objects, refused = for_each_object(study, location, lambda _, part, place: _submit(part, place, client))
+    if "" in objects:
+        return objects[""]
     surfaces = sum(submission.surfaces for submission in objects.values())
     missing = sum(submission.missing for submission in objects.values())
     return Submission(str(location), surfaces, missing, objects, refused)
@@ -111,8 +111,7 @@ def _submit(study: Study, location: Location, client: Client) -> Submission:
             workers = prepare_workers(client, study.libraries)
         workers.with_backend(study.backend)
         workers.require_accuracy(study.accuracy)
-        plan = make_plan(study, stored_choice(location))
-        workspace = Workspace.prepared(location.fenced(lock.fence), plan)
+        workspace = Workspace.of_study(study, location, lock)
         heartbeat = Heartbeat(workspace.store, lock)
         heartbeat.cluster = client.scheduler.address
         heartbeat.write("submitted")
@@ -125,7 +124,7 @@ def _submit(study: Study, location: Location, client: Client) -> Submission:
     except BaseException:
         release(location, lock)
         raise
-    return Submission(workspace.store.path, len(plan.rows), len(workspace.pending))
+    return Submission(workspace.store.path, len(workspace.rows), len(workspace.pending))
 
 
 def drive(study: Study, store: str, run: str) -> None:

@@ -18,8 +18,8 @@ from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, acquire, release
 from sobolev_batch.store.records import Record, Records
 from sobolev_batch.store.sealed_chunks import damaged_chunks, withdraw_chunk
-from sobolev_batch.store.stored_tables import damaged_tables, rows_unlike_tables, table_attributes
-from sobolev_batch.store.workspace import Workspace, complete_records
+from sobolev_batch.store.stored_tables import damaged_tables
+from sobolev_batch.store.workspace import Contents, Workspace
 from sobolev_batch.tables.pairs import Pairs
 from sobolev_batch.tables.shells import spectrum_keys, stale_chunks
 from sobolev_batch.visible import Shown, visible
@@ -148,7 +148,6 @@ def damaged_rows(cluster: Cluster, workspace: Workspace) -> list[int]:
 
 def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: Lock | None) -> Verification:
     records, unread = Records(store).examine()
-    complete = complete_records(records)
     damaged = {row: f"its completion record is damaged ({what})" for row, what in unread.items()}
     tables, chunks = damaged_tables(store), list[tuple[str, tuple[int, ...], str]]()
     if not tables and not store.has_digest():
@@ -157,9 +156,11 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: 
         Records(store).read_run()
     except StoreError as error:
         tables[RECORDS] = error.what if isinstance(error, DamageError) else str(error)
-    if table_attributes(store, "convergence") is not None:
+    labels = store.labels() if LABELS not in tables else tuple(f"row {row}" for row in range(len(records)))
+    contents = Contents(store, labels, dict.fromkeys(range(len(labels))), records)
+    if contents.has_tables:
         if not {"meshes/row", "meshes/status", "meshes/key"} & tables.keys():
-            damaged = rows_unlike_tables(store, records) | damaged
+            damaged = contents.unlike_tables | damaged
         if QUALITY not in tables and _have_other_qualities(records, store.read_strings(QUALITY)):
             tables[QUALITY] = "it is not what records have"
         if tables.keys().isdisjoint(store.keyed_arrays()):
@@ -173,6 +174,7 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: 
                 stale += [(PAIRS_KEYS, tile) for tile in pairs.stale()]
             known = {(keys, index) for keys, index, _ in chunks}
             chunks += [(*place, "it is not that of the stored fields") for place in stale if place not in known]
+    complete = contents.complete
     whole = Fields(store).complete_rows() if complete else set()
 
     def damage_of(row: int) -> str:
@@ -193,7 +195,6 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: 
             withdraw_chunk(store, keys, index)
     for keys, index, what in chunks:
         tables[f"chunk {'/'.join(map(str, index))} of {keys.split('/')[0]}"] = what
-    labels = store.labels() if LABELS not in tables else tuple(f"row {row}" for row in range(len(records)))
     return Verification(
         store.path,
         len(complete),

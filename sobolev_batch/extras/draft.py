@@ -19,9 +19,9 @@ from sobolev_batch.geometry.formats.by_name import is_mesh_name, mesh_stem
 from sobolev_batch.geometry.formats.readers import expected_size, read_mesh
 from sobolev_batch.sources.files import MOST_MESHES
 from sobolev_batch.sources.names import caseless_key, label_problem, name_problem, natural_key, quoted
-from sobolev_batch.study.plan import members_of
-from sobolev_batch.study.schema import RESERVED
-from sobolev_batch.study.study import METHOD, OBJECT, REFERENCE_LABEL, Study, StudyCollection
+from sobolev_batch.study.schema import REFERENCE_LABEL, RESERVED
+from sobolev_batch.study.study import Study, StudyCollection
+from sobolev_batch.study.templates import METHOD, OBJECT
 from sobolev_batch.visible import Shown, reasons, visible
 
 # Bytes of files that are read as a whole; the header or the length of others gives their size.
@@ -170,7 +170,8 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
         left_out |= {str(path): "its name is that of no object" for path in sizes if path not in used}
     text = _STUDY.format(name=_toml(_free_name(folder.resolve().name, fallback="study")), sections=sections)
     if several is None:
-        members_of(Study.from_table(tomllib.loads(text), folder=base))
+        # A study that cannot list its meshes is none to write down.
+        len(Study.from_table(tomllib.loads(text), folder=base).members)
     else:
         StudyCollection.from_table(tomllib.loads(text), folder=base)
     with written(output, "the study", StudyError), output.open("x", encoding="utf-8", newline="\n") as file:

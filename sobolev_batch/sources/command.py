@@ -11,7 +11,6 @@ import inspect
 import math
 import re
 import shlex
-import subprocess
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
@@ -37,7 +36,6 @@ from sobolev_batch.sources.mesh_cache import (
     Cost,
     Made,
     MeshCache,
-    environment,
     run_command,
 )
 from sobolev_batch.sources.names import label_problem, quoted
@@ -55,7 +53,6 @@ Parameter = str | int | float | bool
 
 # The placeholder for the folder of the study.
 _FOLDER = "folder"
-_VERSION_SECONDS = 60.0
 
 
 def _seconds(value: object) -> float:
@@ -239,30 +236,10 @@ class CommandSource(RemesherSource):
         return PLACEHOLDER.sub(lambda found: values.get(found[1], found[0]), word)
 
     def _found_version(self, folder: Path) -> str | None:
-        """Return what the version's command prints, or printed last where it may not run."""
+        """Return what the version's command prints; see `MeshCache.version`."""
         if self.version is None or self._cache is None:
             return None
-        key = f"version-{hashlib.sha256(shlex.join(self.version).encode()).hexdigest()}.txt"
-        known = (self._cache.folder.read(key) or b"").decode() or None
-        if not self._cache.may_run:
-            return known
-        words = [self._filled(word, {}, folder) for word in self.version]
-        try:
-            done = subprocess.run(  # noqa: S603 -- the user permitted it
-                words,
-                env=environment(),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                timeout=_VERSION_SECONDS,
-                check=True,
-            )
-        except (OSError, subprocess.SubprocessError) as error:
-            raise StudyError(f"version: {shlex.join(words)}: {one_line(error)}") from error
-        found = done.stdout.decode(errors="replace").strip()
-        if found != known:
-            self._cache.folder.write({key: found.encode()})
-        return found
+        return self._cache.version(self.version, [self._filled(word, {}, folder) for word in self.version])
 
 
 class FunctionSource(RemesherSource):

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import IO, Any, Protocol
 
 import numpy as np
 import psutil
 
-from sobolev_batch.errors import InputError, MeshError, one_line
+from sobolev_batch.errors import InputError, MeshError, StudyError, one_line
 from sobolev_batch.geometry.formats.by_name import WRITERS, is_mesh_name
 from sobolev_batch.geometry.formats.plain_formats import parse_ply, write_ply
 from sobolev_batch.geometry.formats.readers import as_mesh, read_mesh, write_mesh
@@ -27,6 +29,8 @@ from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.parameters import format_bytes
 
 _NOTHING_KNOWN = float("nan")
+# Time after which a command that prints a version is ended.
+_VERSION_SECONDS = 60.0
 
 
 class Folder(Protocol):
@@ -63,11 +67,18 @@ Made = tuple[Cost, Mesh | str]
 class MeshCache:
     """A folder of meshes that programs or functions made, and whether these may run.
 
-    A mesh is the file DIGEST.ply; DIGEST.json beside it says what made it and what that took.
+    A mesh is the file DIGEST.ply; DIGEST.json beside it says what made it and what that took. A file for each command
+    that prints the version of a program has what it printed last.
+
+    Attributes:
+        assumed: Commands whose versions were taken as they were printed last, by the keys of their files.
+        asked: Versions that commands have printed since this object was made, by the same keys.
     """
 
     folder: Folder
     may_run: bool = False
+    assumed: dict[str, Sequence[str]] = field(default_factory=dict, init=False, compare=False, repr=False)
+    asked: dict[str, str] = field(default_factory=dict, init=False, compare=False, repr=False)
 
     def read(self, digest: str) -> Mesh | None:
         """Return the mesh that is kept under a digest; None where there is none, or a damaged one."""
@@ -97,6 +108,46 @@ class MeshCache:
         kept, reason = (mesh.digest, "") if isinstance(mesh, Mesh) else (None, mesh)
         entry = {"mesh": kept, "cost": asdict(cost), "reason": reason, **about}
         self.folder.write({f"{digest}.json": json.dumps(entry, indent=1, default=str).encode()})
+
+    def version(self, command: Sequence[str], words: Sequence[str]) -> str | None:
+        """Return what a command, filled with words, printed last as the version of a program.
+
+        It runs where that is not known. None where it is not known, and the command may not run; StudyError where it
+        fails.
+        """
+        key = f"version-{hashlib.sha256(shlex.join(command).encode()).hexdigest()}.txt"
+        if key in self.asked:
+            return self.asked[key]
+        known = (self.folder.read(key) or b"").decode()
+        if known:
+            self.assumed[key] = words
+            return known
+        return self._ask(key, words) if self.may_run else None
+
+    def versions_changed(self) -> bool:
+        """Ask for the versions that were assumed, each once, and return whether any is another one."""
+        known = {key: (self.folder.read(key) or b"").decode() for key in self.assumed}
+        changed = [self._ask(key, words) != known[key] for key, words in self.assumed.items() if self.may_run]
+        self.assumed.clear()
+        return any(changed)
+
+    def _ask(self, key: str, words: Sequence[str]) -> str:
+        """Return what a command prints, and keep it."""
+        try:
+            done = subprocess.run(  # noqa: S603 -- the user permitted it
+                words,
+                env=environment(),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                timeout=_VERSION_SECONDS,
+                check=True,
+            )
+        except (OSError, subprocess.SubprocessError) as error:
+            raise StudyError(f"version: {shlex.join(words)}: {one_line(error)}") from error
+        self.asked[key] = done.stdout.decode(errors="replace").strip()
+        self.folder.write({key: self.asked[key].encode()})
+        return self.asked[key]
 
     def _entry(self, digest: str) -> dict[str, Any]:
         try:

@@ -12,7 +12,7 @@ from sobolev_batch.errors import DamageError, InputError, StoreError
 from sobolev_batch.store.layout import COLLECTION, DIGEST, ROOT, Store, digest_of
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.metadata import SCHEMA_VERSION
-from sobolev_batch.study.study import Study, StudyCollection
+from sobolev_batch.study.study import AnyStudy, Study, StudyCollection
 
 Result = TypeVar("Result")
 
@@ -87,20 +87,23 @@ class CollectionStore:
 
 
 def for_each_object(
-    collection: StudyCollection, location: Location, act: Callable[[str, Study, Location], Result]
+    study: AnyStudy, location: Location, act: Callable[[str, Study, Location], Result]
 ) -> tuple[dict[str, Result], dict[str, str]]:
     """Act on the name, the study and the store of each object; return results, and why others have none, by name.
 
-    A StoreError ends it: the store of the next object would not fare better.
+    A study that is none of a collection has the name "". Its errors are raised. Of objects, a StoreError ends it: the
+    store of the next one would not fare better.
     """
     results: dict[str, Result] = {}
     refused: dict[str, str] = {}
-    for name, study in collection.studies.items():
+    for name, one in study.studies.items():
         try:
-            results[name] = act(name, study, location.below(name))
+            results[name] = act(name, one, location.below(name) if name else location)
         except StoreError:
             raise
         except InputError as error:
+            if not name:
+                raise
             refused[name] = str(error)
     return results, refused
 

@@ -1,59 +1,49 @@
-"""The workspace of a run: a store, and how much of a plan it holds."""
+"""What a store has of a study, and what is missing; and the workspace of a run, which fills it."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
 
 from sobolev_batch.store.create import prepare_store
 from sobolev_batch.store.field_arrays import Fields
-from sobolev_batch.store.layout import QUALITY, Store
+from sobolev_batch.store.layout import QUALITY, Store, stored_choice
 from sobolev_batch.store.location import Location
+from sobolev_batch.store.lock import Lock
 from sobolev_batch.store.records import Record, Records
-from sobolev_batch.store.stored_tables import hide_tables
-from sobolev_batch.study.plan import Plan, Row
+from sobolev_batch.store.stored_tables import hide_tables, rows_unlike_tables, table_attributes
+from sobolev_batch.study.plan import Plan, Row, make_plan
+from sobolev_batch.study.study import Study
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
-class Workspace:
-    """A store and the plan that is carried out in it.
+class Contents:
+    """What a store has of a study, and what is missing: the answer of plans, runs, status, verification and pruning.
 
     Attributes:
-        store: Store, laid out for the plan.
         labels: Label of each row of the store.
-        rows: Rows of the plan, by their number in the store. The store may have others, of meshes that the study
-            has lost: their fields stay, in case the meshes come back.
+        rows: Rows of the plan, by their number in the store; None each where no plan is at hand. The store may have
+            others, of meshes that the study has lost: their fields stay, in case the meshes come back.
         records: Completion record of each row of the store, kept up to date; None without one.
     """
 
     store: Store
-    plan: Plan
-    labels: tuple[str, ...]
-    rows: Mapping[int, Row]
+    labels: Sequence[str]
+    rows: Mapping[int, Row | None]
     records: list[Record | None]
 
     @classmethod
-    def for_plan(cls, store: Store, plan: Plan) -> Self:
-        """Return the workspace of a store that is laid out for a plan."""
-        by_label, labels = {row.label: row for row in plan.rows}, store.labels()
-        rows = {i: by_label[label] for i, label in enumerate(labels) if label in by_label}
-        return cls(store, plan, labels, rows, list(Records(store).read()))
-
-    @classmethod
-    def prepared(cls, location: Location, plan: Plan) -> Self:
-        """Create or open the store of a plan; see `prepare_store`."""
-        return cls.for_plan(prepare_store(location, plan), plan)
-
-    @property
-    def reference(self) -> int:
-        """Row of the reference."""
-        return self.labels.index(self.plan.reference)
+    def of_store(cls, store: Store) -> Contents:
+        """Return the contents of a store without a plan of its study."""
+        labels, removed = store.labels(), store.removed
+        rows = dict.fromkeys(i for i, label in enumerate(labels) if label not in removed)
+        return Contents(store, labels, rows, list(Records(store).read()))
 
     @property
     def complete(self) -> dict[int, Record]:
@@ -61,21 +51,89 @@ class Workspace:
         return {i: record for i, record in complete_records(self.records).items() if i in self.rows}
 
     @property
-    def pending(self) -> list[int]:
-        """Rows whose fields are to be computed."""
-        records = {i: self.records[i] for i, row in self.rows.items() if row.is_chosen}
-        return [i for i, record in records.items() if record is None or not record.completes(self.rows[i].key)]
+    def failures(self) -> dict[str, str]:
+        """Reason of each row whose field could not be computed, by its label."""
+        found = {self.labels[i]: self.records[i] for i in self.rows}
+        return {label: record.reason for label, record in found.items() if record and record.status == "failed"}
 
     @property
-    def failures(self) -> dict[str, str]:
-        """Reason of each row without a field, by its label; those that a run leaves out have not failed."""
-        return {
-            row.label: record.reason if record else "not computed"
-            for row, record in ((row, self.records[i]) for i, row in self.rows.items())
-            if (record is None and row.is_chosen) or (record is not None and record.status == "failed")
-        }
+    def not_compared(self) -> dict[str, str]:
+        """Reason of each row whose Hausdorff and Chamfer distances could not be measured, where the study asks."""
+        if self.store.attributes()["study"]["table"].get("proximity") is None:
+            return {}
+        measured = {self.labels[i]: record.proximity for i, record in self.complete.items()}
+        return {label: f"no proximity: {one.reason}" for label, one in measured.items() if one and one.reason}
 
-    def withdraw_lost_fields(self) -> None:
+    @property
+    def has_tables(self) -> bool:
+        """True where readers find tables; those may be of other fields, see `unlike_tables`."""
+        return table_attributes(self.store, "convergence") is not None
+
+    @property
+    def unlike_tables(self) -> dict[int, str]:
+        """How the records of the study's rows differ from those that the tables were made from."""
+        return {i: how for i, how in rows_unlike_tables(self.store, self.records).items() if i in self.rows}
+
+
+@dataclass(frozen=True, eq=False)
+class Workspace(Contents):
+    """A store and the plan that is carried out in it."""
+
+    rows: Mapping[int, Row]
+    plan: Plan
+
+    @classmethod
+    def for_plan(cls, store: Store, plan: Plan) -> Self:
+        """Return the workspace of a store for a plan, whose rows it need not have all."""
+        by_label, labels = {row.label: row for row in plan.rows}, store.labels()
+        rows = {i: by_label[label] for i, label in enumerate(labels) if label in by_label}
+        return cls(store, labels, rows, list(Records(store).read()), plan)
+
+    @classmethod
+    def found(cls, location: Location, plan: Plan) -> Self | None:
+        """Return the workspace of a store that need not be there, or not be finished."""
+        store = Store(location)
+        if not store.exists() or store.is_unfinished:
+            return None
+        store.attributes()
+        return cls.for_plan(store, plan)
+
+    @classmethod
+    def prepared(cls, location: Location, plan: Plan) -> Self:
+        """Create or open the store of a plan, and withdraw the records of lost fields; see `prepare_store`."""
+        workspace = cls.for_plan(prepare_store(location, plan), plan)
+        workspace._withdraw_lost_fields()
+        return workspace
+
+    @classmethod
+    def of_study(cls, study: Study, location: Location, lock: Lock) -> Self:
+        """Plan a study and prepare its store, which this process has locked."""
+        plan = make_plan(study, stored_choice(location))
+        # Planning may take minutes.
+        lock.require(location)
+        workspace = cls.prepared(location.fenced(lock.fence), plan)
+        if workspace.pending and study.cache is not None and study.cache.versions_changed():
+            # A program of another version makes other meshes: the study is listed again.
+            return cls.of_study(replace(study), location, lock)
+        return workspace
+
+    @property
+    def reference(self) -> int:
+        """Row of the reference."""
+        return self.labels.index(self.plan.reference)
+
+    @property
+    def stored(self) -> dict[int, Record]:
+        """Records of the rows whose fields are those that the plan asks for."""
+        return {i: record for i, record in self.complete.items() if record.completes(self.rows[i].key)}
+
+    @property
+    def pending(self) -> list[int]:
+        """Rows whose fields are to be computed."""
+        stored = self.stored
+        return [i for i, row in self.rows.items() if row.is_chosen and i not in stored]
+
+    def _withdraw_lost_fields(self) -> None:
         """Withdraw the records of fields that are not in the store, or not as a whole."""
         complete = self.complete
         if complete:
@@ -103,12 +161,3 @@ class Workspace:
 def complete_records(records: Sequence[Record | None]) -> dict[int, Record]:
     """Return the records that are complete, by their rows."""
     return {row: record for row, record in enumerate(records) if record is not None and record.status == "complete"}
-
-
-def failed_proximities(labels: Mapping[int, str], records: Mapping[int, Record]) -> dict[str, str]:
-    """Return why distances could not be measured, by the labels of the meshes."""
-    return {
-        labels[row]: f"no proximity: {record.proximity.reason}"
-        for row, record in records.items()
-        if record.proximity is not None and record.proximity.reason
-    }

@@ -10,7 +10,7 @@ import json
 import logging
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Self
 
@@ -28,13 +28,10 @@ from sobolev_batch.norms.tail.sampling import FaceNormals, OctaveSampling, TailS
 from sobolev_batch.parameters import available_cores
 from sobolev_batch.sources.registry import Member
 from sobolev_batch.study.schema import MOST_OCTAVES
-from sobolev_batch.study.study import Study
+from sobolev_batch.study.study import Members, Study
 from sobolev_batch.transform.backends import ComplexDtype
 from sobolev_batch.transform.lattice import Lattice
 from sobolev_batch.transform.probe import estimate
-
-# Family and member of each surface, by label.
-Members = Mapping[str, tuple[str, Member]]
 
 _log = logging.getLogger(__name__)
 
@@ -60,8 +57,10 @@ _PILOT_FRACTION = 0.7
 # So often a best effort leaves out the pairs that cannot have the accuracy, and looks again.
 _MOST_RETRIES = 2
 
-
 _DTYPES = ("dtype", "transform_dtype")
+
+# The pair of each pilot with the reference, by label. All have the same orders, accuracy and sizes.
+_Problems = Mapping[str, Problem]
 
 
 @dataclass(frozen=True)
@@ -183,10 +182,21 @@ def choice_basis(study: Study, accuracy: Accuracy, similarity: Similarity, refer
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
-def look_at_extents(
-    members: Members, similarity: Similarity, reference: Extent
-) -> tuple[dict[str, Extent], dict[str, str]]:
-    """Return extents of quickly loaded surfaces, as memory permits, and why others cannot be compared, by label."""
+@dataclass(frozen=True)
+class Look:
+    """What loading some surfaces of a study has shown, by their labels.
+
+    Attributes:
+        extents: Extents in the study's unit of length.
+        set_aside: Reasons why others cannot be compared with the reference.
+    """
+
+    extents: Mapping[str, Extent] = field(default_factory=dict)
+    set_aside: Mapping[str, str] = field(default_factory=dict)
+
+
+def look_at_extents(members: Members, similarity: Similarity, reference: Extent) -> Look:
+    """Look at quickly loaded surfaces, as memory permits."""
     extents: dict[str, Extent] = {}
     set_aside: dict[str, str] = {}
     left = _MOST_BYTES
@@ -200,7 +210,7 @@ def look_at_extents(
             extents[label] = _comparable(member, similarity, reference).extent
         except Exception as error:  # its source may raise anything
             set_aside[label] = one_line(error)
-    return extents, set_aside
+    return Look(extents, set_aside)
 
 
 def choose_pilots(
@@ -244,8 +254,8 @@ def _comparable(member: Member, similarity: Similarity, reference: Extent) -> Su
 
 def choose_lattice(
     study: Study, accuracy: Accuracy, similarity: Similarity, reference: Surface, members: Members
-) -> LatticeChoice:
-    """Choose lattice, octaves and dtype for the accuracy that a study requests.
+) -> tuple[LatticeChoice, Look]:
+    """Choose lattice, octaves and dtype for the accuracy that a study requests; return also what was seen for it.
 
     The coarsest and the finest member of each family are compared with the reference on a small lattice. Where one
     lattice would be large, octaves follow a small one. Surfaces that cannot be read, or reach much farther than the
@@ -254,18 +264,19 @@ def choose_lattice(
     """
     pilots, set_aside = choose_pilots(members, similarity, reference.extent)
     others = {label: member for label, member in members.items() if label not in {*pilots, *set_aside}}
-    extents, unlike = look_at_extents(others, similarity, reference.extent)
-    set_aside |= unlike
-    for label, reason in set_aside.items():
+    look = look_at_extents(others, similarity, reference.extent)
+    of_pilots = {label: pilot.extent for label, pilot in pilots.items()}
+    look = Look({**of_pilots, **look.extents}, {**set_aside, **look.set_aside})
+    for label, reason in look.set_aside.items():
         _log.warning("%s has no say in the choice of the lattice: %s", label, reason)
     if not pilots:
-        examples = [f"{label}: {reason}" for label, reason in set_aside.items()]
+        examples = [f"{label}: {reason}" for label, reason in look.set_aside.items()]
         raise StudyError(
             "none of the study's surfaces can serve to choose a lattice"
             + (f" ({examples[0]})" if examples else ", since all are too large")
             + "; see what is wrong with them, or give a [lattice] instead of an [accuracy]"
         )
-    extent = Extent.union([reference.extent, *(pilot.extent for pilot in pilots.values()), *extents.values()])
+    extent = Extent.union([reference.extent, *look.extents.values()])
     widths, reach = _REACH_MARGIN * extent.widths, _REACH_MARGIN * extent.reach
     problems = {
         label: Problem(
@@ -282,7 +293,7 @@ def choose_lattice(
         choice, shortfalls = _best(problems, study.dtype)
         if choice is None or shortfalls:
             raise _worst(shortfalls)
-        return choice
+        return choice, look
     choice, short = _best_for_most(problems, study.dtype)
     notes = [f"{label} will miss rtol {accuracy.rtol:g}" for label in short if choice is not None]
     if choice is None:
@@ -297,11 +308,9 @@ def choose_lattice(
         choice, shortfalls = _on_one_lattice(_with_accuracy(problems, best_effort=True), study.dtype)
     if choice is None:
         raise _worst(shortfalls)
-    return replace(choice, reasons=(*choice.reasons, *notes))
+    return replace(choice, reasons=(*choice.reasons, *notes)), look
 
 
-# The pair of each pilot with the reference, by label. All have the same orders, accuracy and sizes.
-_Problems = Mapping[str, Problem]
 # A choice, if there is one for any pair, and why each pair misses the accuracy that does, by the label of its surface.
 _Outcome = tuple[LatticeChoice | None, Mapping[str, AccuracyError]]
 

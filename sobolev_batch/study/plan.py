@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -15,14 +15,13 @@ from sobolev_batch.errors import MeshError, StudyError, one_line
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Extent, Similarity, Surface
 from sobolev_batch.norms.accuracy.solve import DistanceTarget
-from sobolev_batch.norms.columns import TAKEN_NAMES
 from sobolev_batch.norms.fields import USUAL_DEGREE
 from sobolev_batch.norms.tail.sampling import TailSampling
 from sobolev_batch.sources.names import quoted
-from sobolev_batch.sources.registry import Member, single_member
-from sobolev_batch.study.lattice_choice import LatticeChoice, Members, choice_basis, choose_lattice
-from sobolev_batch.study.schema import FamilyReference
-from sobolev_batch.study.study import REFERENCE_LABEL, Study
+from sobolev_batch.sources.registry import Member
+from sobolev_batch.study.lattice_choice import LatticeChoice, Look, choice_basis, choose_lattice
+from sobolev_batch.study.schema import REFERENCE_LABEL, FamilyReference
+from sobolev_batch.study.study import Members, Study
 from sobolev_batch.transform.fourier import NUMERICS_VERSION, TransformSettings, require_inside
 from sobolev_batch.transform.kinds import kind_of
 from sobolev_batch.transform.lattice import Block, Lattice
@@ -54,7 +53,8 @@ class Row:
 class Plan:
     """Plan of a run: all surfaces in the order of the study, the label of the reference, the lattice of all fields.
 
-    Area and extent of the reference are in the study's unit of length. It has a sample if an accuracy is requested.
+    Area and extent of the reference are in the study's unit of length. It has a sample if an accuracy is requested. The
+    look is what was seen of the surfaces that the choice of the lattice made.
     """
 
     study: Study
@@ -65,6 +65,7 @@ class Plan:
     reference_area: float
     reference_extent: Extent
     sample: Sample | None = None
+    look: Look = field(default_factory=Look)
 
     @property
     def lattice(self) -> Lattice:
@@ -116,9 +117,9 @@ def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan
     """Plan a study: list its surfaces, choose its similarity and lattice, identify every field.
 
     Only the reference is loaded, and a few pilots for an accuracy. MeshError where the reference cannot be read,
-    LatticeError where it does not fit into the period; see also `members_of` and `choose_lattice`.
+    LatticeError where it does not fit into the period; see also `Study.members` and `choose_lattice`.
     """
-    members = members_of(study)
+    members = study.members
     reference = _reference_label(study, members)
     try:
         own = members[reference][1].load()
@@ -126,7 +127,7 @@ def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan
         raise MeshError(f"the reference cannot be made: {one_line(error)}") from error
     similarity = study.scaling or Similarity.to_unit_ball(own)
     surface = similarity.apply(own)
-    choice = _lattice_choice(study, similarity, members, reference, surface, earlier_choice)
+    choice, look = _lattice_choice(study, similarity, members, reference, surface, earlier_choice)
     if not kind_of(surface).is_closed_form:
         require_inside(surface, choice.lattice)
     if study.proximity is not None and not isinstance(surface, Mesh):
@@ -134,20 +135,15 @@ def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan
             "proximity: Hausdorff and Chamfer distances are measured between meshes, and the reference is not one "
             f"but a {type(surface).__name__}; take a fine mesh of it for the reference, or leave [proximity] out"
         )
+    chosen = {reference, *(study.chosen(study.only) if study.only else members)}
     rows = (
-        Row(
-            label,
-            family,
-            member,
-            _fingerprint(label, member),
-            is_chosen=label == reference or study.chooses(family, label),
-        )
+        Row(label, family, member, _fingerprint(label, member), is_chosen=label in chosen)
         for label, (family, member) in members.items()
     )
     sample = None
     if study.accuracy is not None:
         sample = Sample.from_surface(surface, draws_for([surface], choice.lattice, study.orders, USUAL_DEGREE))
-    plan = Plan(study, similarity, tuple(rows), reference, choice, surface.area, surface.extent, sample)
+    plan = Plan(study, similarity, tuple(rows), reference, choice, surface.area, surface.extent, sample, look)
     return plan.with_choice(choice)
 
 
@@ -158,47 +154,18 @@ def _lattice_choice(
     reference: str,
     surface: Surface,
     earlier: LatticeChoice | None,
-) -> LatticeChoice:
+) -> tuple[LatticeChoice, Look]:
     if study.lattice is not None:
         tail = TailSampling.usual(study.lattice.xi_max, study.octaves, [surface]) if study.octaves else None
-        return LatticeChoice(study.lattice, study.transform.dtype, study.transform.dtype, tail=tail)
+        return LatticeChoice(study.lattice, study.transform.dtype, study.transform.dtype, tail=tail), Look()
     if study.accuracy is None:
         raise ValueError("a study has a lattice or an accuracy")
     basis = choice_basis(study, study.accuracy, similarity, members[reference][1].fingerprint())
     if earlier is not None and earlier.basis == basis:
-        return earlier
+        return earlier, Look()
     others = {label: member for label, member in members.items() if label != reference}
-    return replace(choose_lattice(study, study.accuracy, similarity, surface, others), basis=basis)
-
-
-def members_of(study: Study) -> dict[str, tuple[str, Member]]:
-    """Return family and member of each surface of a study, by label. No surface is made."""
-    members: dict[str, tuple[str, Member]] = {}
-    for family in study.families:
-        try:
-            listed = family.source.members(study.folder)
-        except StudyError as error:
-            raise StudyError(f"family {family.name!r}: {error}") from error
-        for member in listed:
-            label = f"{family.name}/{member.name}"
-            if label in members:
-                raise StudyError(f"two surfaces of the study have the label {label!r}")
-            if member.names_wishes:
-                named = ((f"target_{name}" if name in TAKEN_NAMES else name, value) for name, value in member.metadata)
-                member = replace(member, metadata=tuple(named))
-            taken = next((name for name, _ in member.metadata if name in TAKEN_NAMES), None)
-            if taken is not None:
-                raise StudyError(
-                    f"family {family.name!r}: the metadata of {quoted(member.name)} have the name {taken!r}, which "
-                    f"tables use themselves; rename it, for example to {family.name}_{taken}"
-                )
-            members[label] = family.name, member
-    if not isinstance(study.reference, FamilyReference):
-        try:
-            members[REFERENCE_LABEL] = REFERENCE_LABEL, single_member(study.reference, study.folder)
-        except StudyError as error:
-            raise StudyError(f"reference: {error}") from error
-    return members
+    choice, look = choose_lattice(study, study.accuracy, similarity, surface, others)
+    return replace(choice, basis=basis), look
 
 
 def _reference_label(study: Study, members: Members) -> str:

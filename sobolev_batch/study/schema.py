@@ -70,6 +70,8 @@ _WORDS = {
     "bool": "be true or false",
     "string_type": "be text in quotes",
 }
+# The label of a reference that is no member of a family.
+REFERENCE_LABEL = "reference"
 # Characters of globs and templates, which the names of objects and methods cannot have.
 RESERVED = "*?[]{}/\\"
 

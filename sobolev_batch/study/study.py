@@ -1,55 +1,44 @@
-"""Studies: of one object, and collections of several, each with its own reference, by the same methods.
-
-The file of a collection has templates: texts with {object} and {method}, which are filled in, or matched with files.
-"""
+"""Studies: of one object, and collections of several, each with its own reference, by the same methods."""
 
 from __future__ import annotations
 
 import json
-import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
-from functools import partial
-from glob import has_magic
-from itertools import islice
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Self, TypeVar
 
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
+from sobolev_batch.norms.columns import TAKEN_NAMES
 from sobolev_batch.sources.command import function_name
-from sobolev_batch.sources.files import MeshTable, matching_files, number_as_text, read_mesh_list
 from sobolev_batch.sources.mesh_cache import MeshCache
-from sobolev_batch.sources.names import caseless_key, duplicate_names, natural_key, quoted
-from sobolev_batch.sources.registry import Source
+from sobolev_batch.sources.names import caseless_key, duplicate_names, quoted
+from sobolev_batch.sources.registry import Member, Source, single_member
 from sobolev_batch.study.schema import (
+    REFERENCE_LABEL,
     Backends,
     Family,
     FamilyReference,
-    ObjectSection,
     ProximitySection,
     StudyDocument,
     known_names,
     plain_tables,
     read_toml,
-    with_named_meshes,
 )
+from sobolev_batch.study.templates import is_collection, tables_of_objects
 from sobolev_batch.transform.backends import ComplexDtype
 from sobolev_batch.transform.fourier import TransformSettings
 from sobolev_batch.transform.lattice import Lattice, check_orders
 
 Parsed = TypeVar("Parsed")
 
-REFERENCE_LABEL = "reference"
-OBJECT, METHOD = "{object}", "{method}"
-
-_PART = re.compile(r"(\*\*/|\*\*|\*|\?|\[[^\]]*\]|\{object\}|\{method\})")
-_PATTERNS = {"**/": "(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
-
-# Meshes of a list as entries of a family, by object and method.
-_Listed = Mapping[tuple[str, str], Sequence[Mapping[str, Any]]]
+# Family and member of each surface, by label.
+Members = Mapping[str, tuple[str, Member]]
 
 
 @dataclass(frozen=True)
@@ -114,10 +103,38 @@ class Study:
     def __post_init__(self) -> None:
         check_orders(self.orders)
 
-    def chooses(self, family: str, label: str) -> bool:
-        """Return whether a run computes a member, where only a part is chosen."""
-        names = (family, label)
-        return not self.only or any(name == one or fnmatchcase(name, one) for one in self.only for name in names)
+    @cached_property
+    def members(self) -> Members:
+        """Family and member of each surface, by label. They are listed once, and none is made.
+
+        StudyError where a family or the reference cannot be listed, or labels or names of metadata collide.
+        """
+        members: dict[str, tuple[str, Member]] = {}
+        for family in self.families:
+            with _within(f"family {family.name!r}"):
+                listed = family.source.members(self.folder)
+            for member in listed:
+                label = f"{family.name}/{member.name}"
+                if label in members:
+                    raise StudyError(f"two surfaces of the study have the label {label!r}")
+                members[label] = family.name, _with_other_names(member, family.name)
+        if isinstance(self.reference, Source):
+            with _within("reference"):
+                members[REFERENCE_LABEL] = REFERENCE_LABEL, single_member(self.reference, self.folder)
+        return members
+
+    @property
+    def studies(self) -> dict[str, Self]:
+        """This study, as the only one of its kind; see `StudyCollection`."""
+        return {"": self}
+
+    def chosen(self, only: Sequence[str]) -> set[str]:
+        """Return the labels of the members that names of families or members, or patterns of these, choose."""
+        return {
+            label
+            for label, (family, _) in self.members.items()
+            if any(name == one or fnmatchcase(name, one) for one in only for name in (family, label))
+        }
 
     @property
     def libraries(self) -> tuple[str, ...]:
@@ -197,9 +214,9 @@ class Study:
         )
 
     def with_cache(self, cache: MeshCache) -> Self:
-        """Return the study with the place where its meshes are kept that take long to make."""
+        """Return the study, not listed yet, with the place where its meshes are kept that take long to make."""
         if not any(source.keeps_meshes for source in self._sources):
-            return self
+            return replace(self)
         families = tuple(f.model_copy(update={"source": f.source.with_cache(cache)}) for f in self.families)
         reference = self.reference.with_cache(cache) if isinstance(self.reference, Source) else self.reference
         return replace(self, families=families, reference=reference, cache=cache)
@@ -207,6 +224,29 @@ class Study:
     def with_only(self, only: tuple[str, ...]) -> Self:
         """Return the study for a run of a part; see `only`."""
         return replace(self, only=only)
+
+
+@contextmanager
+def _within(what: str) -> Iterator[None]:
+    """Name in a StudyError what it is about."""
+    try:
+        yield
+    except StudyError as error:
+        raise StudyError(f"{what}: {error}") from error
+
+
+def _with_other_names(member: Member, family: str) -> Member:
+    """Return a member whose metadata have no name that tables use themselves; StudyError where they have one."""
+    if member.names_wishes:
+        named = ((f"target_{name}" if name in TAKEN_NAMES else name, value) for name, value in member.metadata)
+        return replace(member, metadata=tuple(named))
+    taken = next((name for name, _ in member.metadata if name in TAKEN_NAMES), None)
+    if taken is not None:
+        raise StudyError(
+            f"family {family!r}: the metadata of {quoted(member.name)} have the name {taken!r}, which tables use "
+            f"themselves; rename it, for example to {family}_{taken}"
+        )
+    return member
 
 
 def _as_written(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -271,26 +311,12 @@ class StudyCollection:
 
         A pandas.DataFrame may take the place of ``meshes`` of objects.
         """
-        folder = Path(folder)
-        # Objects and lists may bring references and families.
-        written = plain_tables(table)
-        values = {"reference": None, "family": [], **written}
-        # A family may be of the mesh that has the name of the object: any will do to check it.
-        names = [section.get("name") for section in values.get("object") or [] if isinstance(section, dict)]
-        checked = _filled(values["family"], OBJECT, names[0]) if names and names[0] else values["family"]
-        document = StudyDocument.from_tables({**values, "family": checked})
-        listed = _listed_meshes(document.objects.get("meshes", ()), folder)
-        objects = _objects(document, values, list(dict.fromkeys(name for name, _ in listed)), folder)
-        families = [_families(family, [section.name for section in objects], folder) for family in values["family"]]
+        folder, written = Path(folder), plain_tables(table)
+        document, tables = tables_of_objects(written, folder)
         studies: dict[str, Study] = {}
-        for section in objects:
-            made = [entry for entries in families for entry in entries[section.name]]
-            try:
-                table_of_object = _table_of_object(values, section, listed, made)
-                one = Study.from_table(table_of_object, folder=folder)
-                studies[section.name] = replace(one, part=section.name)
-            except StudyError as error:
-                raise StudyError(f"object {quoted(section.name)}: {error}") from error
+        for name, of_object in tables.items():
+            with _within(f"object {quoted(name)}"):
+                studies[name] = replace(Study.from_table(of_object, folder=folder), part=name)
         own = {name: [family.name for family in study.families] for name, study in studies.items()}
         methods = dict.fromkeys(method for names in own.values() for method in names)
         lacking = {name: tuple(method for method in methods if method not in own[name]) for name in own}
@@ -310,12 +336,6 @@ class StudyCollection:
     def with_only(self, only: tuple[str, ...]) -> Self:
         """Return the collection for a run of a part of each study."""
         return replace(self, studies={name: study.with_only(only) for name, study in self.studies.items()})
-
-
-def is_collection(table: Mapping[str, Any]) -> bool:
-    """Return True where the table of a study file has several objects."""
-    templates = str([table.get(key) for key in ("mesh", "reference", "family")])
-    return "object" in table or "objects" in table or OBJECT in templates or METHOD in templates
 
 
 AnyStudy = Study | StudyCollection
@@ -338,160 +358,3 @@ def _parsed_file(path: str | Path, parse: Callable[..., Parsed]) -> Parsed:
         return parse(read_toml(path), folder=path.parent)
     except InputError as error:
         raise StudyError(f"{path}: {error}") from error
-
-
-def _listed_meshes(given: str | Sequence[MeshTable], folder: Path) -> _Listed:
-    """Return the meshes of the section [objects]."""
-    base = Path()
-    if isinstance(given, str):
-        base, given = Path(given).parent, read_mesh_list(folder / given)
-    meshes: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for mesh in given:
-        known = dict(mesh)
-        names: list[str] = []
-        for column in ("object", "method"):
-            if column not in known:
-                raise StudyError(f"[objects]: meshes: {quoted(mesh['path'])} has no {column}; each mesh needs both")
-            name = known.pop(column)
-            names.append(number_as_text(name) if isinstance(name, float) else str(name))
-        meshes.setdefault((names[0], names[1]), []).append({**known, "path": (base / known["path"]).as_posix()})
-    return meshes
-
-
-def _objects(
-    document: StudyDocument, values: Mapping[str, Any], listed: Sequence[str], folder: Path
-) -> Sequence[ObjectSection]:
-    """Return the objects that have sections, or those that a list or the files of the reference name."""
-    if document.object is None:
-        found = [{"name": name} for name in listed or _names_in_reference(values, folder)]
-        document = StudyDocument.from_tables({**values, "object": found})
-    objects = document.object or []
-    names = [section.name for section in objects]
-    unnamed = [name for name in listed if name not in names]
-    if unnamed:
-        raise StudyError(
-            f"[objects] lists {quoted(unnamed[0])}, and no [[object]] section has this name; list all objects, or give "
-            "all of them sections"
-        )
-    same = duplicate_names(names)
-    if same:
-        raise StudyError(f"object: names must differ by more than case, found {quoted(same[0][:3])}; rename one")
-    return objects
-
-
-def _names_in_reference(values: Mapping[str, Any], folder: Path) -> list[str]:
-    """Return the objects that the files of the reference name, in their natural order."""
-    paths = (with_named_meshes(values["reference"], values.get("mesh", {})) or {}).get("paths")
-    templates = [path for path in paths if isinstance(path, str) and OBJECT in path] if isinstance(paths, list) else []
-    if not templates:
-        raise StudyError(
-            "a collection needs its objects: [[object]] sections, a list in [objects], or a [reference] with paths "
-            'such as ["objects/{object}.obj"]'
-        )
-    names: set[str] = set()
-    for template in templates:
-        match = re.compile(_pattern(template)).fullmatch
-        texts = map(partial(_text, folder), matching_files(folder, _glob(template)))
-        found = {matched["object"] for matched in map(match, texts) if matched}
-        if not found:
-            raise StudyError(
-                f"no file gives {OBJECT} of {template!r} one name; it stands for a part of a path, without /"
-            )
-        names |= found
-    return sorted(names, key=natural_key)
-
-
-def _table_of_object(
-    values: Mapping[str, Any], section: ObjectSection, listed: _Listed, families: Iterable[Mapping[str, Any]]
-) -> dict[str, Any]:
-    """Return the study of an object as nested tables."""
-    name = section.name
-    common = {key: value for key, value in values.items() if key not in ("family", "object", "objects")}
-    common = _filled(common, OBJECT, name)
-    own = {method: meshes for (owner, method), meshes in listed.items() if owner == name}
-    is_reference = {method: caseless_key(method) == REFERENCE_LABEL for method in own}
-    references = [mesh["path"] for method, meshes in own.items() if is_reference[method] for mesh in meshes]
-    if section.reference is not None:
-        common["reference"] = _filled(section.reference, OBJECT, name)
-    elif references:
-        common["reference"] = {"source": "files", "paths": references}
-    if section.scaling is not None:
-        common["scaling"] = section.scaling
-    methods = [method for method in own if not is_reference[method]]
-    all_families = [*families, *({"name": method, "source": "files", "meshes": own[method]} for method in methods)]
-    if not all_families:
-        raise StudyError("no family has a file of it; add files, or leave it out")
-    return {**common, "study": {**common["study"], "name": f"{common['study']['name']} {name}"}, "family": all_families}
-
-
-def _families(family: Mapping[str, Any], names: Sequence[str], folder: Path) -> dict[str, list[dict[str, Any]]]:
-    """Return the families that a section gives for each object: one, or one for each method among its files."""
-    paths = family.get("paths")
-    templates = paths if isinstance(paths, list) and all(isinstance(path, str) for path in paths) else []
-    if not any(OBJECT in template or METHOD in template for template in templates):
-        return {name: [_filled(family, OBJECT, name)] for name in names}
-    methods: dict[str, dict[str, list[str]]] = {name: {} for name in names}
-    for template in templates:
-        for name, method, path in _files(template, names, folder):
-            methods[name].setdefault(method if METHOD in family["name"] else "", []).append(path)
-    if not any(methods.values()):
-        raise StudyError(f"family {quoted(family['name'])}: no file that it names is of an object; correct its paths")
-    return {
-        name: [
-            {**_filled(_filled(family, OBJECT, name), METHOD, method), "paths": own[method]}
-            for method in sorted(own, key=natural_key)
-        ]
-        for name, own in methods.items()
-    }
-
-
-def _files(template: str, names: Sequence[str], folder: Path) -> Iterator[tuple[str, str, str]]:
-    """Yield object, method and path of the files that match a template; the longest names that fit count."""
-    texts = {name: template.replace(OBJECT, name) for name in sorted(names, key=len, reverse=True)}
-    if not has_magic(_glob(template.replace(OBJECT, ""))):
-        # The files need not exist yet.
-        yield from ((name, "", text) for name, text in texts.items())
-        return
-    patterns = {name: re.compile(_pattern(text)).fullmatch for name, text in texts.items()}
-    for path in map(partial(_text, folder), matching_files(folder, _glob(template))):
-        candidates = (name for name in patterns if name in path or OBJECT not in template)
-        found = ((name, match) for name in candidates if (match := patterns[name](path)) is not None)
-        for name, match in found if OBJECT not in template else islice(found, 1):
-            yield name, match.groupdict().get("method", ""), path
-
-
-def _filled(value: Any, placeholder: str, name: str) -> Any:
-    """Return nested tables with a name in place of a placeholder."""
-    if isinstance(value, str):
-        return value.replace(placeholder, name)
-    if isinstance(value, Mapping):
-        return {key: _filled(entry, placeholder, name) for key, entry in value.items()}
-    return [_filled(entry, placeholder, name) for entry in value] if isinstance(value, list) else value
-
-
-def _glob(template: str) -> str:
-    return template.replace(OBJECT, "*").replace(METHOD, "*")
-
-
-def _text(folder: Path, path: Path) -> str:
-    """Return a path as a template of the study would have it."""
-    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.as_posix()
-
-
-def _pattern(template: str) -> str:
-    """Return the regular expression of a template, with the groups object and method.
-
-    A placeholder stands for as many characters as it can, of one part of the path; where it is repeated, for the same.
-    """
-    seen: set[str] = set()
-    pattern = ""
-    for part in _PART.split(Path(template).as_posix()):
-        if part in (OBJECT, METHOD):
-            group = part.strip("{}")
-            pattern += f"(?P={group})" if part in seen else f"(?P<{group}>[^/]+)"
-            seen.add(part)
-        elif part.startswith("[") and part.endswith("]"):
-            pattern += "[^" + re.escape(part[2:-1]) + "]" if part[1:2] == "!" else part
-        else:
-            pattern += _PATTERNS.get(part) or re.escape(part)
-    return pattern

@@ -167,7 +167,7 @@ def test_runs_lock_the_objects_that_they_plan(tmp_path: Path, monkeypatch: pytes
         seen.append(sb.status(tmp_path / "s.zarr").going_on)
         return make_plan(*arguments)
 
-    monkeypatch.setattr("sobolev_batch.batch.run.make_plan", planned)
+    monkeypatch.setattr("sobolev_batch.store.workspace.make_plan", planned)
     sb.run(collection([GONE, {**GONE, "name": "too"}]), tmp_path / "s.zarr")
     assert seen == [True, True]
     assert not sb.status(tmp_path / "s.zarr").going_on

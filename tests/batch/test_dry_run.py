@@ -16,9 +16,9 @@ import tomli_w
 from distributed import Client
 
 import sobolev_batch as sb
-from sobolev_batch.batch.checks import warnings_of
 from sobolev_batch.batch.cluster.workers import Workers
 from sobolev_batch.batch.dry_run import forecast
+from sobolev_batch.batch.start import warnings_of
 from sobolev_batch.geometry.formats.readers import write_mesh
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.records import Record

@@ -19,11 +19,10 @@ import pytest
 from distributed import Client
 
 from sobolev_batch import Study, run, status, unlock
-from sobolev_batch.batch import run as run_module
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.errors import LockError, StoreError
 from sobolev_batch.result_types import Summary
-from sobolev_batch.store import heartbeat
+from sobolev_batch.store import heartbeat, workspace
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import LOCK_KEY, Lock, acquire, locked, utc_now
@@ -115,7 +114,7 @@ def test_a_run_that_loses_its_store_while_it_plans_leaves_it_alone(
         under_way.write_text("what the other run is writing")
         return planned
 
-    monkeypatch.setattr(run_module, "make_plan", plan_slowly)
+    monkeypatch.setattr(workspace, "make_plan", plan_slowly)
     with pytest.raises(LockError, match="the store was unlocked"):
         run(study, store_path, threads)
     assert under_way.exists()

@@ -12,7 +12,7 @@ import trimesh
 from sobolev_batch import Study
 from sobolev_batch.errors import LatticeError, MeshError, StudyError
 from sobolev_batch.sources.registry import SurfaceMember
-from sobolev_batch.study.plan import make_plan, members_of
+from sobolev_batch.study.plan import make_plan
 from tests.support.members import SilentError
 from tests.support.studies import small_table
 
@@ -118,7 +118,7 @@ def test_two_surfaces_of_one_label_are_refused(monkeypatch: pytest.MonkeyPatch) 
     members = source.members(study.folder)
     monkeypatch.setattr(type(source), "members", lambda self, folder: [*members, members[0]])
     with pytest.raises(StudyError, match="two surfaces of the study have the label 'ico/0'"):
-        members_of(study)
+        make_plan(study)
 
 
 def test_what_a_source_of_another_package_raises_stops_no_plan(monkeypatch: pytest.MonkeyPatch) -> None:

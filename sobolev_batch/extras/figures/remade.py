@@ -25,7 +25,6 @@ from sobolev_batch.sources.mesh_cache import MeshCache
 from sobolev_batch.sources.names import file_stem
 from sobolev_batch.sources.registry import Member
 from sobolev_batch.store.location import Location
-from sobolev_batch.study.plan import members_of
 from sobolev_batch.study.study import Study
 from sobolev_batch.tables.open import AnyStore, as_tree, fields_read, finished_group, reference_of
 from sobolev_batch.transform.backends import ComplexDtype
@@ -58,7 +57,7 @@ class StudyMeshes:
             study = Study.from_table(tree.attrs["study"]["table"], folder=folder)
             if tree.attrs["study"].get("mesh_cache"):
                 study = study.with_cache(MeshCache(Location.parse(tree.attrs["study"]["mesh_cache"])))
-            members = members_of(study)
+            members = study.members
         except SobolevBatchError as error:
             raise InputError(f"the study's meshes cannot be listed here: {error}") from error
         similarity = tree.attrs["similarity"]

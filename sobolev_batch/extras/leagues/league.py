@@ -15,7 +15,6 @@ import pandas as pd
 import xarray as xr
 
 from sobolev_batch.arrays import Reals
-from sobolev_batch.batch.checks import SIGNIFICANCE, gap_of, least_objects
 from sobolev_batch.errors import InputError, StoreError
 from sobolev_batch.extras.leagues.costs import DEFAULT_COST, CostLeague, cost_leagues_of
 from sobolev_batch.extras.leagues.statistics import (
@@ -30,6 +29,7 @@ from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.store.collection_store import CollectionStore
 from sobolev_batch.store.location import Location
+from sobolev_batch.study.comparable import SIGNIFICANCE, gap_of, least_objects
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.convergence import table, tables_of
 from sobolev_batch.tables.open import EDGE_LENGTH, AnyStore, as_tree, finished_group, reference_of, stores_of

@@ -13,7 +13,7 @@ import pandas as pd
 from scipy.special import stdtrit
 
 from sobolev_batch.arrays import Reals
-from sobolev_batch.batch.checks import Range, common_range
+from sobolev_batch.study.comparable import Range, common_range
 from sobolev_batch.tables.open import sizes_of
 
 # Sizes at which curves are compared, evenly spaced on a logarithmic axis.

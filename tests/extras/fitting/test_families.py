@@ -19,7 +19,6 @@ from sobolev_batch.extras.fitting import families
 from sobolev_batch.extras.fitting.fit import FitRun
 from sobolev_batch.extras.fitting.objective import FitProblem
 from sobolev_batch.sources.registry import parse_source
-from sobolev_batch.study.plan import members_of
 from tests.support.members import listed, loaded, members
 
 SPHERE: dict[str, Any] = {"source": "sphere", "radius": 30.0, "center": [100.0, 0.0, 0.0]}
@@ -136,7 +135,7 @@ def test_fits_have_the_parameters_of_the_remesher_before_them() -> None:
         "triangles": [9],
     }
     study = sb.Study.from_table(table(mesh={**FIT, "mesh": remeshed}))
-    assert members_of(study)["fitted/9"][1].metadata == (("target_triangles", 9.0),)
+    assert study.members["fitted/9"][1].metadata == (("target_triangles", 9.0),)
 
 
 def test_the_reference_is_handed_down_to_nested_sources() -> None:

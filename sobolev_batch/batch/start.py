@@ -1,0 +1,103 @@
+"""What `plan`, `run` and `submit` settle first: the place of the store, permissions, and what to warn of."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from sobolev_batch.errors import InputError, StudyError
+from sobolev_batch.parameters import format_bytes
+from sobolev_batch.sources.mesh_cache import MeshCache
+from sobolev_batch.sources.names import quoted
+from sobolev_batch.store.location import Location
+from sobolev_batch.study.comparable import comparison_warnings
+from sobolev_batch.study.schema import known_names
+from sobolev_batch.study.study import AnyStudy, StudyLike, as_study
+from sobolev_batch.tables.pairs import PAIR_BYTES
+
+_log = logging.getLogger(__name__)
+
+# A store as functions take it that have a default.
+StoreLike = str | Path | Location | None
+
+_DEFAULT_FOLDER = Path("storage")
+# Folder beside a store for the meshes that its study makes, and commands that a refusal lists.
+_MADE_MESHES, _MOST_COMMANDS = "made-meshes", 3
+
+
+def settled(study: StudyLike, store: StoreLike, *, may_run: bool) -> tuple[AnyStudy, Location]:
+    """Return a study that keeps the meshes that it makes beside its store, and the place of the store.
+
+    Stores there share the meshes. The place is storage/NAME.zarr where none is named.
+    """
+    study = as_study(study)
+    location = Location.parse(_DEFAULT_FOLDER / f"{study.name}.zarr" if store is None else store)
+    return study.with_cache(MeshCache(location.absolute().beside(_MADE_MESHES), may_run)), location
+
+
+def ready_to_run(
+    study: StudyLike, store: StoreLike, *, allow_commands: bool, only: Sequence[str] = ()
+) -> tuple[AnyStudy, Location]:
+    """Return a study that may run, or a part of it, and its place; log what would make the run useless."""
+    study, location = settled(as_study(study).with_only(tuple(only)), store, may_run=True)
+    require_permission(study, allow_commands)
+    _require_members(study, only)
+    if store is None:
+        # Other folders are not made: their names may be mistakes.
+        with location.access("written"):
+            _DEFAULT_FOLDER.mkdir(exist_ok=True)
+    for text in warnings_of(study, location):
+        _log.warning("%s", text)
+    return study, location
+
+
+def require_permission(study: AnyStudy, allow_commands: bool) -> None:
+    """Refuse a study that runs commands and may not, by a StudyError."""
+    if study.commands and not allow_commands:
+        raise StudyError(
+            f"the study runs commands: {', '.join(study.commands[:_MOST_COMMANDS])}; if you trust it, allow them by "
+            "--allow-commands (in Python: allow_commands=True)"
+        )
+
+
+def warnings_of(study: AnyStudy, store: Location) -> tuple[str, ...]:
+    """Return a line for each thing that makes a run fail late, or useless: sizes, too few objects, or no space."""
+    return (*comparison_warnings(study), *_space_warnings(study, store))
+
+
+def _require_members(study: AnyStudy, only: Sequence[str]) -> None:
+    """Refuse names of families and members that no object of a study has."""
+    known: dict[str, None] = {}
+    unknown = list(only)
+    for one in study.studies.values() if only else ():
+        # The run reports what cannot be listed.
+        with suppress(InputError):
+            known |= dict.fromkeys([*(family for family, _ in one.members.values()), *one.members])
+            unknown = [name for name in unknown if not one.chosen([name])]
+    if unknown:
+        raise StudyError(f"no family or member of the study is {quoted(unknown[0])}; {known_names(unknown[0], known)}")
+
+
+def _space_warnings(study: AnyStudy, store: Location) -> Iterator[str]:
+    """Yield the need for space of the distances of all pairs, where a disk does not have it."""
+    needed = stored = 0
+    for name, one in study.studies.items() if not store.scheme else ():
+        # The run reports what cannot be listed.
+        with suppress(InputError):
+            if one.pairs == "all":
+                needed += PAIR_BYTES * len(one.orders) * len(one.members) ** 2
+                stored += sum((store.below(name) if name else store).sizes("distances").values())
+    if not needed:
+        return
+    folder = Path(str(store)).absolute()
+    disk = shutil.disk_usage(next(one for one in (folder, *folder.parents) if one.exists()))
+    # Some file systems do not say how large they are.
+    if disk.total and needed - stored > disk.free:
+        yield (
+            f'pairs = "all": the distances of all pairs take {format_bytes(needed)} on disk, and '
+            f"{format_bytes(disk.free)} are free at {store}; "
+            'set pairs = "reference" in [compare], or choose another place with --store'
+        )
