@@ -11,8 +11,9 @@ task; a reduction over the stored fields makes the tables. Data flows one way th
     store      the zarr hierarchy of a study
     tables     stored fields -> norms, distances, convergence; a lazy DataTree
     batch      a study as tasks on a cluster
-    extras     plots, reports, leagues, fitting: the rest works without them
     testing    verdicts on two surfaces, for test suites
+    cli        the commands
+    extras     plots, reports, leagues, fitting: the rest works without them
 
 No folder imports one below it; the first four import neither dask nor zarr. See docs/design.md.
 

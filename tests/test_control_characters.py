@@ -21,7 +21,7 @@ import pytest
 from distributed import Client
 
 import sobolev_batch as sb
-from sobolev_batch.cli.common import overwrite, progress_bar
+from sobolev_batch.cli.output import overwrite, progress_bar
 from sobolev_batch.sources import files
 from sobolev_batch.tables import FORMATS
 from sobolev_batch.tables.text import machine_table, printed_table, prose

@@ -10,6 +10,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import pandas as pd
 import pytest
@@ -137,7 +138,9 @@ def test_commands_of_the_gallery_take_their_options() -> None:
             program, name, *arguments = shlex.split(line)
             assert program == "sobolev-batch"
             # Options and arguments are parsed, and nothing is run.
-            cli.commands[name].make_context(name, arguments).close()
+            command = cli.get_command(click.Context(cli), name)
+            assert command is not None, name
+            command.make_context(name, arguments).close()
 
 
 def test_every_query_runs_and_answers(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,6 +16,7 @@ LAYERS = (
         "arrays",
         "visible",
         "errors",
+        "plugins",
         "parameters",
         "compiled",
         "geometry",
@@ -25,7 +26,7 @@ LAYERS = (
         "study",
         "store",
     ),
-    *("tables", "batch", "extras", "testing", "shapes", "result_types", "cli"),
+    *("tables", "batch", "testing", "shapes", "result_types", "cli", "extras"),
 )
 
 Path = tuple[str, ...]
@@ -61,6 +62,15 @@ def test_layers_know_only_those_below(arrows: list[tuple[Path, Path]]) -> None:
     assert not backwards
 
 
+def test_nothing_but_the_extras_names_one_of_them() -> None:
+    # Public names are a list of places, and plugins find the extras by their folder.
+    listed = {"__init__.pyi", "result_types.pyi", "plugins.py"}
+    for file in PACKAGE.rglob("*.py*"):
+        parts = file.relative_to(PACKAGE).parts
+        if parts[0] not in ("extras", *listed) and file.suffix in (".py", ".pyi"):
+            assert "sobolev_batch.extras" not in file.read_text(encoding="utf-8"), file
+
+
 def test_no_folder_and_no_module_is_in_a_circle(arrows: list[tuple[Path, Path]]) -> None:
     # At every depth: the folders of a folder, and the modules in the innermost ones.
     for depth in range(1, max(len(a) for a, _ in arrows) + 1):
@@ -88,6 +98,7 @@ def test_numbers_know_neither_dask_nor_zarr(layer: str) -> None:
         assert not {name.split(".")[0] for name in imported(file)} & {"dask", "distributed", "zarr"}, file
 
 
+@pytest.mark.extras
 def test_names_are_sorted_and_unknown_ones_refused() -> None:
     for module in (sb, *MODULES.values()):
         assert module.__all__ == sorted(set(module.__all__))

@@ -35,6 +35,18 @@ class Deadline:
         self._has_results: Callable[[], bool] | None = None
         self._is_met = threading.Event()
 
+    def expect(self, remark: str, seconds: float) -> None:
+        """Let the command that begins have a remark, and seconds to clean up."""
+        self._remark, self._seconds = remark, seconds
+
+    def end(self, number: int) -> NoReturn:
+        """End a command that has cleaned up after a request, of this number unless it has another."""
+        ignore_requests()
+        with suppress(OSError):
+            sys.stdout.flush()
+        # The interpreter would wait at its end for threads that may still compute.
+        end_process(number, self._remark)
+
     def start(self) -> None:
         """Raise KeyboardInterrupt at Ctrl-C and SystemExit at SIGTERM from now on, and see that the process ends."""
         # Python's tracker of semaphores outlives a process that ends at once and cleans up after it, with a warning

@@ -1,4 +1,4 @@
-"""Commands that make or take a study: init, run, submit, plan."""
+"""Commands that take a study: run, submit, plan."""
 
 from __future__ import annotations
 
@@ -10,22 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sobolev_batch.cli.common import (
-    EXIT_SOME_FAILED,
-    PATH,
-    Command,
-    allow_commands_option,
-    cli,
-    echo,
-    echo_json,
-    echo_lines,
-    json_option,
-    memory_size,
-    progress_reports,
-    store_option,
-    study_argument,
-    trust_option,
-)
+from sobolev_batch.cli.options import PATH, Callback, json_option, location, memory_size
+from sobolev_batch.cli.output import echo, echo_lines, echo_result, progress_reports
+from sobolev_batch.cli.program import EXIT_SOME_FAILED, cli
+from sobolev_batch.cli.table_commands import table_command
+from sobolev_batch.errors import InputError
 
 if TYPE_CHECKING:
     from sobolev_batch.store.location import Location
@@ -34,7 +23,22 @@ if TYPE_CHECKING:
 _MOST_IMPRECISE = 10
 
 
-def _scheduler_option(*, required: bool = False) -> Callable[[Command], Command]:
+_study_argument = click.argument("study", type=PATH)
+_store_option = click.option(
+    "--store", type=location, metavar="PATH|URL", help="Keep the results in this store. [default: storage/NAME.zarr]"
+)
+_allow_commands_option = click.option(
+    "--allow-commands", is_flag=True, help="Let the commands of STUDY run, which make its meshes: you trust its file."
+)
+_trust_option = click.option(
+    "--trust-network",
+    is_flag=True,
+    help="Use a scheduler that is neither encrypted (tls://) nor on loopback. Everyone who reaches its ports or "
+    "those of its workers can then run programs on these machines and read the meshes.",
+)
+
+
+def _scheduler_option(*, required: bool = False) -> Callable[[Callback], Callback]:
     text = "Take the workers of this Dask scheduler, such as tls://host:8786."
     return click.option("--scheduler", metavar="ADDRESS", required=required, help=text)
 
@@ -47,32 +51,11 @@ _only_option = click.option(
 )
 
 
-@cli.command("init", short_help="Write a study file for a folder of meshes.")
-@click.argument("folder", type=PATH, default=".")
-@click.option(
-    *("-o", "--output"),
-    type=PATH,
-    default="study.toml",
-    show_default=True,
-    help="Write the study to this file, which must not exist.",
-)
-def init_command(folder: Path, output: Path) -> None:
-    """Write a study file for the meshes in FOLDER.
-
-    It runs as it is, and says what to change. The reference is the mesh that is called original, reference, target or
-    ground truth, or else the one with the most triangles. Folders are families, and so are meshes whose names differ
-    in the number at the end. Several references are several objects. [default: current folder]
-    """
-    from sobolev_batch.extras.draft import init_study
-
-    echo_lines(init_study(folder, output))
-
-
-@cli.command("run")
-@study_argument
-@store_option
+@cli.command("run", shows_progress=True, locks=True, remark="; the same command continues from the store")
+@_study_argument
+@_store_option
 @_scheduler_option()
-@trust_option
+@_trust_option
 @click.option(
     "--workers",
     type=click.IntRange(min=1),
@@ -85,7 +68,7 @@ def init_command(folder: Path, output: Path) -> None:
     metavar="SIZE",
     help="Limit the memory of each process, such as 4GB. [default: equal parts]",
 )
-@allow_commands_option
+@_allow_commands_option
 @_only_option
 @click.pass_context
 def run_command(
@@ -125,7 +108,7 @@ def run_command(
         echo()
         echo_lines(format_verdict(tree))
     else:
-        _print_league(summary.store)
+        _print_league(context, summary.store)
     echo()
     echo(str(summary).partition("\n")[0])
     for label, reason in summary.not_compared.items():
@@ -140,12 +123,12 @@ def run_command(
         context.exit(EXIT_SOME_FAILED)
 
 
-@cli.command("submit")
-@study_argument
+@cli.command("submit", locks=True)
+@_study_argument
 @_scheduler_option(required=True)
-@trust_option
-@store_option
-@allow_commands_option
+@_trust_option
+@_store_option
+@_allow_commands_option
 @_only_option
 @click.pass_context
 def submit_command(
@@ -178,11 +161,11 @@ def submit_command(
 
 
 @cli.command("plan")
-@study_argument
-@store_option
+@_study_argument
+@_store_option
 @_scheduler_option()
-@trust_option
-@allow_commands_option
+@_trust_option
+@_allow_commands_option
 @json_option
 @click.pass_context
 def plan_command(
@@ -204,20 +187,16 @@ def plan_command(
 
     with remote_client(scheduler, trust_network) if scheduler else nullcontext() as client:
         made = plan(study, store, client, allow_commands=allow_commands)
-    if style == "json":
-        echo_json(made.to_table())
-    else:
-        echo_lines(made)
+    echo_result(style, made, made.to_table())
     if isinstance(made, CollectionPlan) and made.refused:
         context.exit(EXIT_SOME_FAILED)
 
 
-def _print_league(place: str) -> None:
-    """Print the league of a collection, or why there is none."""
-    from sobolev_batch.errors import InputError
-    from sobolev_batch.extras.leagues.league import format_league, league
-
+def _print_league(context: click.Context, place: str) -> None:
+    """Print the league of a collection as `table league` does, or why there is none."""
     try:
-        echo_lines(format_league(league(place)))
+        command = table_command.get_command(context, "league")
+        if command is not None:
+            context.invoke(command, store=location(place), orders=None)
     except InputError as error:
         echo(f"no league: {error}")

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import wraps
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from sobolev_batch.cli.common import (
-    Command,
-    below_option,
-    cli,
-    echo_lines,
-    format_option,
-    location,
-    orders_option,
-    store_argument,
-)
+from sobolev_batch.cli.options import below_option, format_option, orders_option, store_argument
+from sobolev_batch.cli.output import echo_lines
+from sobolev_batch.cli.program import NamedCommands, cli
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -26,12 +22,45 @@ if TYPE_CHECKING:
 _DEFAULT = "convergence"
 
 
-class _Tables(click.Group):
+class _Tables(NamedCommands):
     """Sub-commands; a first word that is none of them is the STORE of the default one."""
 
+    prefix = "table "
+
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        is_default = bool(args) and args[0] not in (*self.commands, *self.get_help_option_names(ctx))
+        is_default = bool(args) and args[0] not in self.get_help_option_names(ctx) and not self.knows(args[0])
         return super().parse_args(ctx, [_DEFAULT, *args] if is_default else args)
+
+
+@dataclass(frozen=True)
+class TableOptions:
+    """What all tables take: the store, the format, and the orders; None for those of the study."""
+
+    store: Location
+    style: Format
+    orders: tuple[float, ...] | None
+
+    @property
+    def tree(self) -> xr.DataTree:
+        """The store of one object, opened; a usage error for that of a collection."""
+        from sobolev_batch.store.collection_store import CollectionStore
+        from sobolev_batch.tables.open import open_store
+
+        collection = CollectionStore.read(self.store)
+        if collection is not None:
+            raise click.UsageError(f"name the store of one object, such as {self.store}/{collection.objects[0]}")
+        return open_store(self.store)
+
+
+def table_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the argument and the options of all tables to a command, which takes them as one value."""
+
+    @wraps(command)
+    def with_options(store: Location, style: Format, orders: tuple[float, ...] | None, **more: Any) -> None:
+        command(TableOptions(store, style, orders), **more)
+
+    order = orders_option("Print the table of this order, which may be any below -1/2.", "the study's")
+    return store_argument(format_option(order(with_options)))
 
 
 @cli.group("table", cls=_Tables, no_args_is_help=False, subcommand_metavar="[KIND] STORE")
@@ -42,122 +71,47 @@ def table_command() -> None:
     """
 
 
-def _table_options(command: Command) -> Command:
-    """Add what all tables take."""
-    order = orders_option("Print the table of this order, which may be any below -1/2.", "the study's")
-    return store_argument(format_option(order(command)))
-
-
-def _tree_of_one(store: Location) -> xr.DataTree:
-    """Open the store of one object."""
-    from sobolev_batch.store.collection_store import CollectionStore
-    from sobolev_batch.tables.open import open_store
-
-    collection = CollectionStore.read(store)
-    if collection is not None:
-        raise click.UsageError(f"name the store of one object, such as {store}/{collection.objects[0]}")
-    return open_store(store)
-
-
 @table_command.command(_DEFAULT)
-@_table_options
+@table_options
 @click.option(
     "--x",
     default="edge_length",
     show_default=True,
     help="Observe rates in edge_length, triangles, vertices, seconds, or a number among the metadata of the meshes.",
 )
-def convergence_command(store: Location, style: Format, orders: tuple[float, ...], x: str) -> None:
+def convergence_command(table: TableOptions, x: str) -> None:
     """Print distances to the reference, with rates.
 
     A collection has the tables of all its objects.
     """
     from sobolev_batch.tables.convergence import format_table
 
-    echo_lines(format_table(store, style, orders or None, x=x))
+    echo_lines(format_table(table.store, table.style, table.orders, x=x))
 
 
 @table_command.command("matrix")
-@_table_options
-def matrix_command(store: Location, style: Format, orders: tuple[float, ...]) -> None:
+@table_options
+def matrix_command(table: TableOptions) -> None:
     """Print distances of all pairs of meshes."""
     from sobolev_batch.tables.matrix import format_matrix
 
-    echo_lines(format_matrix(_tree_of_one(store), style, orders or None))
+    echo_lines(format_matrix(table.tree, table.style, table.orders))
 
 
 @table_command.command("verdict")
-@_table_options
-def verdict_command(store: Location, style: Format, orders: tuple[float, ...]) -> None:
+@table_options
+def verdict_command(table: TableOptions) -> None:
     """Print the nearest mesh at each size, and the smallest below 5 % and 1 %."""
     from sobolev_batch.tables.conclusion import format_verdict
 
-    echo_lines(format_verdict(_tree_of_one(store), style, orders or None))
-
-
-@table_command.command("time")
-@_table_options
-@click.option(
-    "--truth",
-    metavar="FAMILY",
-    help="Measure from this family, which is the true surface. [default: the reference]",
-)
-@click.option(
-    "--factor",
-    type=click.FloatRange(min=1.0, min_open=True),
-    default=2.0,
-    show_default=True,
-    help="Report when the distance has grown by this factor.",
-)
-def time_command(store: Location, style: Format, orders: tuple[float, ...], truth: str | None, factor: float) -> None:
-    """Print distances of moving meshes over time."""
-    from sobolev_batch.extras.leagues.evolution import format_evolution
-
-    echo_lines(format_evolution(_tree_of_one(store), style, orders or None, truth=truth, factor=factor))
+    echo_lines(format_verdict(table.tree, table.style, table.orders))
 
 
 @table_command.command("smallest")
-@_table_options
+@table_options
 @below_option("Take what is below FRACTION, such as 1%, of the norm of the reference.", required=True)
-def smallest_command(store: Location, style: Format, orders: tuple[float, ...], below: float) -> None:
+def smallest_command(table: TableOptions, below: float) -> None:
     """Print the smallest mesh below a bound."""
     from sobolev_batch.tables.convergence import format_smallest
 
-    echo_lines(format_smallest(_tree_of_one(store), style, orders or None, below=below))
-
-
-@table_command.command("league")
-@_table_options
-@click.option(
-    "--by",
-    type=click.Choice(["size", "cost"]),
-    default="size",
-    show_default=True,
-    help="Compare at equal sizes, or list the meshes that no other beats in distance and cost.",
-)
-@click.option("--x", help="Take this size or cost of a mesh. [default: triangles by size, make_seconds by cost]")
-@click.option("--family", "families", multiple=True, help="Compare this method; may be repeated. [default: all]")
-@click.option("--against", type=location, metavar="STORE", help="Compare with this earlier study instead.")
-def league_command(
-    store: Location,
-    style: Format,
-    orders: tuple[float, ...],
-    by: str,
-    x: str | None,
-    families: tuple[str, ...],
-    against: Location | None,
-) -> None:
-    """Rank methods over the objects of STORE.
-
-    With --by cost, STORE may also be that of one object. With --against, compare each method with itself in an earlier
-    study instead.
-    """
-    from sobolev_batch.extras.leagues.costs import format_cost_leagues
-    from sobolev_batch.extras.leagues.league import compare_studies, format_changes, format_league, league
-
-    if against is not None:
-        echo_lines(format_changes(compare_studies(store, against, orders or None), style))
-    elif by == "cost":
-        echo_lines(format_cost_leagues(league(store, orders or None, by="cost", x=x, methods=families or None), style))
-    else:
-        echo_lines(format_league(league(store, orders or None, x=x, methods=families or None), style))
+    echo_lines(format_smallest(table.tree, table.style, table.orders, below=below))

@@ -16,7 +16,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, version
+from importlib.metadata import EntryPoint, PackageNotFoundError, version
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self, TypeVar
 
@@ -25,27 +25,25 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, SerializeAsA
 from sobolev_batch.errors import MeshError, StudyError
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Surface, is_finite_number
+from sobolev_batch.plugins import SOURCES, registered
 from sobolev_batch.sources.mesh_cache import Cost, MeshCache
 from sobolev_batch.sources.names import quoted
 
 # Levels, or triangle counts of one mesh, that one source takes; and times.
 MOST_ENTRIES, _MOST_TIMES = 1000, 100_000
 
-_GROUP = "sobolev_batch.sources"
 _HERE = "sobolev_batch.sources"
-# The package's own sources, by name.
+# The sources of this folder, by name.
 _OWN = {
     "command": f"{_HERE}.command:CommandSource",
     "decimate": f"{_HERE}.generated:DecimateSource",
     "ellipsoid": f"{_HERE}.generated:EllipsoidSource",
     "files": f"{_HERE}.files:FileSource",
-    "fit": "sobolev_batch.extras.fitting.families:FitSource",
     "flow": f"{_HERE}.generated:FlowSource",
     "function": f"{_HERE}.command:FunctionSource",
     "icosphere": f"{_HERE}.generated:IcosphereSource",
     "moved": f"{_HERE}.generated:MovedSource",
     "noisy": f"{_HERE}.generated:NoisySource",
-    "refine": "sobolev_batch.extras.fitting.families:RefineSource",
     "remesh": f"{_HERE}.generated:RemeshSource",
     "sphere": f"{_HERE}.generated:SphereSource",
     "spherical-levels": f"{_HERE}.generated:SphericalLevelsSource",
@@ -419,5 +417,6 @@ def installed_version(distribution: str) -> str:
 
 @lru_cache(maxsize=1)
 def _registry() -> dict[str, EntryPoint]:
-    own = [EntryPoint(name, value, _GROUP) for name, value in _OWN.items()]
-    return {point.name: point for point in (*entry_points(group=_GROUP), *own)}
+    own = [EntryPoint(name, value, SOURCES) for name, value in _OWN.items()]
+    # The first one that has a name keeps it.
+    return {point.name: point for point in reversed((*own, *registered(SOURCES)))}

@@ -1,4 +1,4 @@
-"""Verdicts on two surfaces: the same to a tolerance, different, or undecided; an assertion, and files that show why."""
+"""Verdicts on two surfaces: the same to a tolerance, different, or undecided; and an assertion for test suites."""
 
 from __future__ import annotations
 
@@ -7,27 +7,15 @@ from pathlib import Path
 from tempfile import mkdtemp
 from typing import Literal
 
-import numpy as np
-
-from sobolev_batch.errors import InputError, SobolevBatchError, from_extra, one_line
+from sobolev_batch.errors import InputError, SobolevBatchError, one_line
 from sobolev_batch.geometry.formats.readers import SurfaceLike, as_surface
-from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.geometry.proximity import vertex_distances
-from sobolev_batch.geometry.surface import (
-    Extent,
-    Similarity,
-    Surface,
-    centering,
-    is_finite_number,
-    placement_doubt,
-)
+from sobolev_batch.geometry.surface import Similarity, is_finite_number, placement_doubt
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.accuracy.threshold import Method, relative_distance
-from sobolev_batch.norms.accuracy.tolerance import Accuracy, core_lattice
-from sobolev_batch.norms.budget import Support
-from sobolev_batch.norms.fields import fourier_transform
+from sobolev_batch.norms.accuracy.tolerance import Accuracy
 from sobolev_batch.parameters import available, available_cores, check_seed
 from sobolev_batch.tables.text import rounded_outwards, with_error
+from sobolev_batch.testing.difference import write_difference
 from sobolev_batch.transform.lattice import single_order
 from sobolev_batch.visible import table_html
 
@@ -36,11 +24,10 @@ Outcome = Literal["same", "different", "undecided"]
 _DEFAULT_TOLERANCE = 1e-3
 # A larger relative error says less than the bounds themselves.
 _WIDEST = 0.25
-_PICTURES = (".png", ".svg", ".pdf")
 # From here on per cents are whole numbers.
 _WHOLE = 10
-# Accuracy of the fields and of images in files, which are to be looked at.
-_ACCURACY, _EPS = 1e-2, 1e-6
+# An accuracy must have one; only its memory counts for a verdict.
+_ANY_RTOL = 1e-2
 
 
 @dataclass(frozen=True)
@@ -161,7 +148,7 @@ def same_surface(
     check_seed(seed)
     if not (is_finite_number(tolerance) and 0 < tolerance < 1):
         raise InputError(f"tolerance must be a number between 0 and 1, found {tolerance!r}")
-    accuracy = Accuracy(_ACCURACY) if memory is None else Accuracy(_ACCURACY, available(memory))
+    accuracy = Accuracy(_ANY_RTOL) if memory is None else Accuracy(_ANY_RTOL, available(memory))
     checked_order = single_order(order)
     surface, reference = (as_surface(one) for one in (a, b))
     area_change = surface.area / reference.area - 1
@@ -227,73 +214,3 @@ def assert_same_surface(
         # The test must fail for its own reason.
         message += f"; no witness: {one_line(error)}"
     raise AssertionError(message)
-
-
-def require_place(path: Path) -> None:
-    """Create the folder of the files that `write_difference` writes; InputError where that cannot be done."""
-    if path.suffix in _PICTURES:
-        with from_extra("plot", "a picture needs"):
-            from sobolev_batch.extras.figures.views import write_difference_picture  # noqa: F401 -- at once
-    if not path.name:
-        raise InputError(f"{str(path)!r} names no file; files get {str(Path('failures', 'part'))!r} and an ending")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{str(path)!r}: its folder cannot be created: {error}") from error
-
-
-def write_difference(
-    a: Surface,
-    b: Surface,
-    path: Path,
-    order: float,
-    *,
-    scaling: bool = True,
-    names: tuple[str, str] = ("a", "b"),
-    distances: str | None = None,
-) -> str:
-    """Write the meshes among two surfaces, each with the witness function of a against b at its vertices.
-
-    If their unit is given, each vertex also has its distance from the other mesh. The path is that of a picture, .png,
-    .svg or .pdf, or the beginning of those of files, to which "-a.ply" and "-b.ply" are added. Return where the
-    surfaces differ most, and the files, as the end of a line in which surfaces have these names. StoreError where a
-    file cannot be written; see also `require_place`.
-    """
-    # Files load what reads stores, which a verdict does without.
-    from sobolev_batch.extras.figures.remade import witness_at_vertices, write_vertex_values
-
-    similarity = Similarity.to_unit_ball(b) if scaling else Similarity()
-    pair = [similarity.apply(surface) for surface in (a, b)]
-    centered = list(map(centering(pair).apply, pair))
-    extent = Extent.union([surface.extent for surface in centered])
-    area = np.array(sum(surface.area for surface in centered))
-    lattice = core_lattice(Support(area, extent.widths, extent.reach), (order,), Accuracy(_ACCURACY))
-    of_a, of_b = (fourier_transform(surface, lattice, _EPS, dtype="complex64", order=order) for surface in centered)
-    require_place(path)
-    written, drawn, greatest, place = [], [], 0.0, (0.0, 0.0, 0.0)
-    for label, name, own, other, mesh in zip("ab", names, (a, b), (b, a), centered, strict=True):
-        if not isinstance(own, Mesh) or not isinstance(mesh, Mesh):
-            continue
-        values = witness_at_vertices(of_a, of_b, (order,), mesh, dtype="complex64")
-        vertex = int(np.nanargmax(np.abs(values[0])))
-        if abs(values[0, vertex]) > abs(greatest):
-            greatest, place = float(values[0, vertex]), tuple(own.vertices[vertex].tolist())
-        if path.suffix in _PICTURES:
-            drawn.append((name, mesh))
-            continue
-        file = path.with_name(f"{path.name}-{label}.ply")
-        title = f"{label} against b, comparison {path.name}"
-        lengths = vertex_distances(own, other) if distances is not None and isinstance(other, Mesh) else None
-        write_vertex_values(
-            file, own, values, (order,), title, 1 / similarity.scale, context="comparison", distances=lengths
-        )
-        written.append(file)
-    if drawn:
-        from sobolev_batch.extras.figures.views import write_difference_picture
-
-        written += write_difference_picture(path, drawn, (of_a, of_b), order, distances, similarity.scale)
-    if not written:
-        return "no witness: neither surface is a mesh"
-    kind = "more" if greatest > 0 else "less"
-    near = f"{names[0]} has {kind} area near ({', '.join(f'{x:.4g}' for x in place)})"
-    return f"{near if greatest else 'they differ nowhere'}; witness: {' '.join(map(str, written))}"

@@ -196,6 +196,7 @@ def test_a_second_run_computes_what_is_new(store: Path, threads: Client) -> None
         sb.run(collection(balls(a=1.0), "other"), store, threads)
 
 
+@pytest.mark.extras
 def test_a_league_needs_no_more_than_the_store(store: Path) -> None:
     leagues = sb.league(store)
     assert [one.order for one in leagues] == [-10.0, -3.0]
@@ -210,6 +211,7 @@ def test_a_league_needs_no_more_than_the_store(store: Path) -> None:
         sb.league({"a": store / "a", "b": store / "nowhere"})
 
 
+@pytest.mark.extras
 @pytest.mark.parametrize(
     "changes",
     [{"reference": {"source": "ellipsoid", "axes": [1.0, 1.0, 0.9]}}, {"scaling": {"mode": "fixed", "scale": 0.5}}],

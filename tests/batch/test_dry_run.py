@@ -84,6 +84,7 @@ def test_nothing_is_foretold_where_nothing_is_missing(plan: Plan, monkeypatch: p
     assert found == (0.0, 0.0, ["nothing is missing"])
 
 
+@pytest.mark.extras
 def test_meshes_that_take_long_to_make_count(plan: Plan) -> None:
     fit = {"name": "fitted", "source": "fit", "mesh": {"source": "icosphere", "levels": [1]}}
     fitted, *_ = make_plan(sb.Study.from_table(small_table(family=[fit]))).rows

@@ -18,7 +18,7 @@ from distributed import Client
 import sobolev_batch as sb
 from sobolev_batch.batch.status import Status
 from sobolev_batch.cli import cli
-from sobolev_batch.cli.common import replace_line
+from sobolev_batch.cli.output import replace_line
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.records import Record, Records, RunRecord
 from sobolev_batch.store.stored_tables import hide_tables

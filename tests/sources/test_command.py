@@ -265,6 +265,7 @@ def test_a_study_of_remeshers_keeps_what_fails_apart(tmp_path: Path) -> None:
     assert len((tmp_path / "log").read_text()) == 1
 
 
+@pytest.mark.extras
 def test_methods_without_a_size_in_common_have_a_plot_by_cost(tmp_path: Path) -> None:
     half = {"name": "half", "source": halved, "mesh": {"source": "icosphere", "levels": [2]}, "size": [0.5, 1.0]}
     coarse = {"name": "coarse", "source": "icosphere", "levels": [0]}

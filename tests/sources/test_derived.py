@@ -220,6 +220,7 @@ def test_levels_need_enough_vertices_and_a_convex_map(tmp_path: Path) -> None:
             members({**LEVELS, **changes}, tmp_path)[0].load()
 
 
+@pytest.mark.extras
 @pytest.mark.parametrize("key", ["mesh", "sphere"])
 def test_both_sources_of_levels_are_meshes_and_hear_of_the_reference_and_their_libraries(key: str) -> None:
     with pytest.raises(MeshError, match="sphere is no mesh"):

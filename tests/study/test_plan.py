@@ -59,6 +59,7 @@ def test_the_reference_may_be_a_member_of_a_family(box_file: Path) -> None:
         plan_of(family=family, reference={"source": "family", "family": "f"}, folder=box_file.parent)
 
 
+@pytest.mark.extras
 def test_a_named_mesh_is_the_source_that_it_names(box_file: Path) -> None:
     box, fine = {"source": "files", "paths": ["box.off"]}, {"source": "icosphere", "levels": [3]}
     names = {"box": box, "fine": fine, "coarse": {"source": "decimate", "mesh": "fine", "triangles": [100]}}

@@ -74,6 +74,7 @@ def keys_of(model: type[BaseModel]) -> dict[str, Any]:
     return keys
 
 
+@pytest.mark.extras
 def test_the_reference_of_study_files_names_every_key_and_source_with_its_defaults() -> None:
     text = (ROOT / "docs" / "studies.md").read_text(encoding="utf-8")
     keys = keys_of(StudyDocument)
@@ -93,6 +94,7 @@ def test_the_reference_of_study_files_names_every_key_and_source_with_its_defaul
         assert (list(value) if isinstance(value, tuple) else value) == tomllib.loads(f"x = {default}")["x"], key
 
 
+@pytest.mark.extras
 def test_its_example_and_the_workflows_are_valid(tmp_path: Path) -> None:
     study, lattice, listed = blocks("docs/studies.md", "toml")
     (tmp_path / "remeshed.csv").write_text(blocks("docs/studies.md", "csv")[0])
@@ -203,7 +205,7 @@ PLACES: list[tuple[str, Any, str]] = [
     ("mesh", {"a/b": {"source": "sphere"}}, r"^\[mesh.a/b\]: .*it holds '/'"),
     ("mesh", {"ball": {"source": "sphere", "radius": "x"}}, r"^\[mesh.ball\]: radius must be a number, found 'x'$"),
     ("mesh", {"ball": {**DECIMATED, "mesh": "bal"}}, r"^\[mesh.ball\]: no mesh is named 'bal'; did you mean ball\?"),
-    ("mesh", {"a": {"source": "fit", "mesh": "b"}, "b": {"source": "fit", "mesh": "a"}}, "'a' is made from itself, or"),
+    ("mesh", {"a": {**DECIMATED, "mesh": "b"}, "b": {**DECIMATED, "mesh": "a"}}, "'a' is made from itself, or"),
     ("mesh", {"a": 3, "b": {"mesh": "a"}}, r"^\[mesh.a\] must be a table, found 3; \[mesh.b\] must be a table"),
     ("family", [{**DECIMATED, "mesh": {"source": "files", "path": []}}], r"named 'd'\): mesh.path is unknown; .*paths"),
     ("family", [{**DECIMATED, "mesh": {"paths": ["a.ply"]}}], "source is missing"),

@@ -15,9 +15,10 @@ from typing import Any
 
 import pytest
 
+import sobolev_batch as sb
 from sobolev_batch import cli
-from sobolev_batch.cli import common
 from sobolev_batch.cli.interruption import Deadline
+from sobolev_batch.shapes import icosphere
 
 # The study of small_table, and a smaller one.
 TOML = """
@@ -39,6 +40,9 @@ levels = [0, 1, 2, 3]
 """
 STUDY = TOML.replace('"small"', '"cli"').replace("[0, 1, 2, 3]", "[0, 1]")
 
+LATTICE = "[lattice]\nxi_max = 3.0\nM = 16"
+_NAN = "OFF\n3 1 0\n0 0 0\n1 0 0\n0 nan 0\n3 0 1 2\n"
+
 COMMAND = [sys.executable, "-m", "sobolev_batch"]
 
 
@@ -46,6 +50,26 @@ def write_toml(folder: Path) -> Path:
     path = folder / "study.toml"
     path.write_text(TOML)
     return path
+
+
+def ball(level: int, radius: float = 1.0) -> sb.Mesh:
+    """A ball in millimetres, away from the origin."""
+    return sb.Mesh(30 * radius * icosphere(level).vertices + [100.0, 0, 0], icosphere(level).triangles)
+
+
+def write_inputs(folder: Path) -> None:
+    """Write studies and meshes, and some that are refused."""
+    for name, mesh in {"1.off": ball(1), "3.off": ball(3)}.items():
+        sb.write_mesh(mesh, folder / name)
+    (folder / "nan.off").write_text(_NAN)
+    (folder / "study.toml").write_text(STUDY)
+    # Files that are refused.
+    (folder / "broken.toml").write_text(STUDY.replace("M = 16", "m = 16"))
+    (folder / "other.toml").write_text(STUDY.replace('"cli"', '"other"'))
+    (folder / "lacking.toml").write_text(f'{STUDY}[[family]]\nname = "f"\nsource = "files"\npaths = ["*.xyz"]')
+    (folder / "greedy.toml").write_text(STUDY.replace(LATTICE, '[accuracy]\nrtol = 0.1\nmemory = "1000TB"'))
+    (folder / "taken").mkdir()
+    (folder / "taken" / "precious").write_text("text")
 
 
 def call(*arguments: object, folder: Path = Path(), patience_seconds: float = 1e6) -> subprocess.CompletedProcess[str]:
@@ -58,19 +82,26 @@ def call(*arguments: object, folder: Path = Path(), patience_seconds: float = 1e
         patch.setattr(Deadline, "start", lambda deadline: None)
         patch.setattr(cli, "make_messages_visible", lambda: None)
         # How long it takes decides whether it says that it goes on.
-        patch.setattr(common, "_PATIENCE_SECONDS", patience_seconds)
+        patch.setattr("sobolev_batch.cli.output._PATIENCE_SECONDS", patience_seconds)
         patch.setattr(logging.root, "handlers", [])
         patch.setattr(logging.root, "level", logging.root.level)
         # It tells of connections that earlier tests of this process left open.
         patch.setattr(logging.getLogger("asyncio"), "disabled", True)
         with (
-            redirect_stdout(StringIO()) as output,
+            redirect_stdout(StringIO()) as printed,
             redirect_stderr(StringIO()) as errors,
             pytest.raises(SystemExit) as end,
         ):
             cli.main()
     assert isinstance(end.value.code, int)
-    return subprocess.CompletedProcess(sys.argv, end.value.code, output.getvalue(), errors.getvalue())
+    return subprocess.CompletedProcess(sys.argv, end.value.code, printed.getvalue(), errors.getvalue())
+
+
+def output(*arguments: str, folder: Path, status: int = 0) -> str:
+    """What a command prints, which ends with this status."""
+    done = call(*arguments, folder=folder)
+    assert done.returncode == status, done.stderr
+    return done.stdout
 
 
 def finished(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,9 @@ KINDS: dict[str, dict[str, Any]] = {
     "flow": {"source": "flow", "mesh": BALL, "times": [2.0, 0.5], "period": 4.0, "strength": 1.0},
     "spherical-levels": {"source": "spherical-levels", "mesh": BALL, "sphere": BALL, "levels": [2, 1]},
 }
+
+if find_spec("sobolev_batch.extras") is None:
+    del KINDS["fit"], KINDS["refine"]
 
 
 class SilentError(Exception):

@@ -13,10 +13,11 @@ import sobolev_batch as sb
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = Path(sb.__file__).parent
-# Those of public names, beside the package itself.
+# Those of public names, beside the package itself; without the extras there are fewer.
 MODULES = {
-    module.__name__.rpartition(".")[2]: module
-    for module in (sb.errors, sb.fitting, sb.plot, sb.result_types, sb.shapes, sb.sources, sb.testing)
+    name: getattr(sb, name)
+    for name in ("errors", "fitting", "plot", "result_types", "shapes", "sources", "testing")
+    if name not in ("fitting", "plot") or (PACKAGE / "extras").exists()
 }
 
 

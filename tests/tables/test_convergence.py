@@ -247,6 +247,6 @@ def test_tables_of_any_order_read_no_field_and_no_record(
 
 @pytest.mark.slow
 def test_other_orders_are_refused(stores: tuple[str, str]) -> None:
-    for ask, order in product((sb.table, sb.matrix, sb.evolution), (-0.5, 1.0, [], "all")):
+    for ask, order in product((sb.table, sb.matrix), (-0.5, 1.0, [], "all")):
         with pytest.raises(sb.errors.OrderError):
             ask(stores[0], order)

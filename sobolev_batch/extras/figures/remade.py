@@ -11,28 +11,24 @@ from functools import cached_property
 from pathlib import Path
 from typing import Self
 
-import numpy as np
 import xarray as xr
 
-from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError, SobolevBatchError, from_extra, written
-from sobolev_batch.geometry.formats.plain_formats import write_ply
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.proximity import vertex_distances
 from sobolev_batch.geometry.surface import Similarity
-from sobolev_batch.norms.causes import witness
 from sobolev_batch.sources.mesh_cache import MeshCache
 from sobolev_batch.sources.names import file_stem
 from sobolev_batch.sources.registry import Member
 from sobolev_batch.store.location import Location
 from sobolev_batch.study.study import Study
 from sobolev_batch.tables.open import AnyStore, as_tree, fields_read, finished_group, reference_of
-from sobolev_batch.transform.backends import ComplexDtype
+from sobolev_batch.testing.difference import VertexWitness, order_text, witness_at_vertices
 from sobolev_batch.transform.lattice import Orders, check_orders
 
 SUFFIXES = (".ply", ".vtp")
-# Labels that a message lists as examples, and characters of a comment in a file.
-_MOST_LISTED, _LONGEST_COMMENT = 3, 600
+# Labels that a message lists as examples.
+_MOST_LISTED = 3
 
 
 @dataclass(frozen=True)
@@ -85,12 +81,6 @@ class StudyMeshes:
             raise InputError("the study makes another mesh here than the one that was computed; its files have changed")
         return own, scaled
 
-    def with_witness(self, label: str, orders: Sequence[float]) -> tuple[Mesh, Reals]:
-        """Return the mesh of a label in its own unit, and its witness function (orders, vertices) in the study's."""
-        own, scaled = self.make(label)
-        with fields_read(self.tree):
-            return own, witness_at_vertices(*fields_of(self.tree, label), orders, scaled)
-
     @cached_property
     def reference(self) -> Mesh:
         """The reference in its own unit; InputError where it is no mesh, or see `make`."""
@@ -100,13 +90,14 @@ class StudyMeshes:
         except SobolevBatchError as error:
             raise InputError(f"distances from the reference {label!r} cannot be written: {error}") from error
 
-    def write(
-        self, path: Path, label: str, mesh: Mesh, values: Reals, orders: Sequence[float], *, distances: bool = False
-    ) -> None:
-        """Write what `with_witness` returns, and distances from the reference; see `write_vertex_values`."""
-        lengths = vertex_distances(mesh, self.reference) if distances else None
+    def with_witness(self, label: str, orders: Sequence[float], reference: Mesh | None = None) -> VertexWitness:
+        """Return the mesh of a label with its witness function, and with distances from a reference if one is given."""
+        own, scaled = self.make(label)
+        with fields_read(self.tree):
+            values = witness_at_vertices(*fields_of(self.tree, label), orders, scaled)
         title = f"{label} against {reference_of(self.tree)}, study {self.tree.attrs['study']['name']}"
-        write_vertex_values(path, mesh, values, orders, title, 1 / self.similarity.scale, distances=lengths)
+        lengths = None if reference is None else vertex_distances(own, reference)
+        return VertexWitness(own, values, orders, title, 1 / self.similarity.scale, lengths)
 
     def stem(self, label: str) -> str:
         """Return the file name of a mesh without suffix: its number in the store and the plain letters of its label."""
@@ -151,16 +142,6 @@ def fields_of(tree: xr.DataTree, label: str) -> tuple[xr.DataArray, xr.DataArray
     """Return the stored fields of a mesh and of the reference."""
     fields = tree["fourier"].to_dataset()["fourier"]
     return fields.sel(mesh=label), fields.sel(mesh=reference_of(tree))
-
-
-def witness_at_vertices(
-    a: xr.DataArray, b: xr.DataArray, orders: Sequence[float], mesh: Mesh, dtype: ComplexDtype = "complex128"
-) -> Reals:
-    """Return the witness function of two fields, (orders, n), at a mesh's vertices; NaN where no triangle uses them."""
-    used = mesh.used_vertices
-    values = np.full((len(orders), len(mesh.vertices)), np.nan)
-    values[:, used] = witness(a, b, list(orders), mesh.vertices[used], dtype=dtype)
-    return values
 
 
 def exported(
@@ -228,64 +209,32 @@ def write_witness(
     made, labels, orders = exported(store, [mesh], order, folder)
     if len(labels) > 1:
         raise InputError(f"{mesh!r} stands for several meshes, and one is written; give its label")
-    made.write(path, labels[0], *made.with_witness(labels[0], orders), orders, distances=distances)
+    found = made.with_witness(labels[0], orders, made.reference if distances else None)
+    write_vertex_witness(path, found)
     return path
 
 
-def write_vertex_values(
-    path: Path,
-    mesh: Mesh,
-    values: Reals,
-    orders: Sequence[float],
-    title: str,
-    unit: float,
-    context: str = "study",
-    distances: Reals | None = None,
-) -> None:
+def write_vertex_witness(path: Path, found: VertexWitness) -> None:
     """Write a mesh with its witness function, in the format of the path's suffix, one of `SUFFIXES`.
 
-    The values (orders, vertices) are in 1 / unit length of the context, a "study" or a "comparison", whose unit is
-    given in that of the mesh, as are distances (vertices,) from the reference. The title says what was compared with
-    what.
+    StoreError where the file cannot be written.
     """
-    escaped = title.encode("unicode_escape").decode("ascii")
-    notes = [
-        f"witness function of the mesh {escaped[:_LONGEST_COMMENT]}",
-        "positive where the mesh has area that the reference lacks, negative where it lacks area",
-        f"in 1 / unit length of the {context}, orders " + ", ".join(map(_number, orders)),
-        f"coordinates are in the unit of the mesh; one unit of the {context} is {unit!r} of them",
-    ]
-    if distances is not None:
-        notes.append("distance to the closest point of the reference, in the unit of the mesh")
-    others = {} if distances is None else {"distance": distances}
-    data = (_ply if path.suffix == ".ply" else _vtp)(mesh, dict(zip(orders, values, strict=True)), others, notes)
+    data = found.to_ply() if path.suffix == ".ply" else _vtp(found)
     with written(path, "the witness"):
         path.write_bytes(data)
 
 
-def _number(order: float) -> str:
-    return repr(float(order)).removesuffix(".0")
-
-
-def _ply(mesh: Mesh, values: Mapping[float, Reals], others: Mapping[str, Reals], notes: Sequence[str]) -> bytes:
-    # Letters, digits and underscores, which readers of PLY accept.
-    rows = {f"witness_minus_{_number(-order)}".replace(".", "_").replace("+", ""): row for order, row in values.items()}
-    first = next(iter(rows))
-    # The quality is the scalar that MeshLab and similar programs show.
-    quality = {"quality": rows[first].astype(np.float32)}
-    return write_ply(mesh, {**quality, **rows, **others}, [*notes, f"quality repeats {first}"])
-
-
-def _vtp(mesh: Mesh, values: Mapping[float, Reals], others: Mapping[str, Reals], notes: Sequence[str]) -> bytes:
+def _vtp(found: VertexWitness) -> bytes:
     with from_extra("vtk", "a .vtp file needs"):
         from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
-    surface = mesh.to_pyvista()
-    for order, row in values.items():
-        surface.point_data[f"witness, order {_number(order)}"] = row
-    for name, row in others.items():
+    surface = found.mesh.to_pyvista()
+    names = [f"witness, order {order_text(order)}" for order in found.orders]
+    for name, row in zip(names, found.values, strict=True):
         surface.point_data[name] = row
-    surface.point_data.active_scalars_name = f"witness, order {_number(next(iter(values)))}"
-    surface.field_data["notes"] = list(notes)
+    if found.distances is not None:
+        surface.point_data["distance"] = found.distances
+    surface.point_data.active_scalars_name = names[0]
+    surface.field_data["notes"] = found.notes
     # In memory: VTK does not report a full disk.
     writer = vtkXMLPolyDataWriter()
     writer.SetInputData(surface)

@@ -24,7 +24,7 @@ from shapely import MultiPoint
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError, SobolevBatchError
-from sobolev_batch.extras.figures.remade import StudyMeshes, fields_of, matching_labels, witness_at_vertices
+from sobolev_batch.extras.figures.remade import StudyMeshes, fields_of, matching_labels
 from sobolev_batch.extras.figures.selection import Selection
 from sobolev_batch.extras.figures.style import (
     EXTENDS,
@@ -49,6 +49,7 @@ from sobolev_batch.tables.open import (
     chosen_families,
     finished_group,
 )
+from sobolev_batch.testing.difference import witness_at_vertices
 
 Triangles = NDArray[np.int32]
 # Of a surface and of what it is compared with.

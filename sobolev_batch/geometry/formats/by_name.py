@@ -8,22 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
-from importlib.util import find_spec
 from pathlib import Path, PurePath
 
 from sobolev_batch.geometry.formats.parsing import Raw, is_gzipped
 from sobolev_batch.geometry.formats.plain_formats import (
     parse_obj,
     parse_off,
-    parse_ply,
     parse_stl,
     write_obj,
     write_off,
-    write_ply,
     write_stl,
 )
+from sobolev_batch.geometry.formats.ply import announced_size, parse_ply, write_ply
 from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.plugins import FORMATS, registered
 
 
 @dataclass(frozen=True)
@@ -37,6 +35,8 @@ class Format:
         memory_bytes: Bytes of each triangle, at the measured peak of reading it.
         write: Function of a mesh, which returns the contents of a file; None for a format that is only read.
         is_name: Tells whether a name in lower case, without .gz, is that of a file of the format, where no suffix does.
+        announced_size: Function of the beginning of a file and its length, which estimates its triangles and the peak
+            of the memory that reading takes, where the beginning tells more than the length.
     """
 
     suffixes: tuple[str, ...]
@@ -45,23 +45,21 @@ class Format:
     memory_bytes: int
     write: Callable[[Mesh], bytes] | None = None
     is_name: Callable[[str], bool] | None = None
+    announced_size: Callable[[bytes, int], tuple[int, float]] | None = None
 
 
 _PLAIN = (
-    Format((".ply",), parse_ply, 19, 90, write_ply),
+    Format((".ply",), parse_ply, 19, 110, write_ply, announced_size=announced_size),
     Format((".obj",), parse_obj, 35, 240, write_obj),
     Format((".stl",), parse_stl, 50, 270, write_stl),
     Format((".off",), parse_off, 35, 240, write_off),
 )
-_GROUP = "sobolev_batch.formats"
-_EXTRAS = "sobolev_batch.extras"
 
 
 def _known() -> dict[str, Format]:
     """Return the formats by suffix; the first one that has a suffix keeps it."""
-    own = [EntryPoint("extras", f"{_EXTRAS}.formats.read_only:FORMATS", _GROUP)] if find_spec(_EXTRAS) else []
     known: dict[str, Format] = {}
-    for form in (*_PLAIN, *(form for point in (*own, *entry_points(group=_GROUP)) for form in point.load())):
+    for form in (*_PLAIN, *(form for point in registered(FORMATS) for form in point.load())):
         for suffix in form.suffixes:
             known.setdefault(suffix, form)
     return known

@@ -24,7 +24,7 @@ from plyfile import PlyData
 import sobolev_batch as sb
 from sobolev_batch import open_store
 from sobolev_batch.extras.figures import views
-from sobolev_batch.extras.figures.remade import StudyMeshes, fields_of, witness_at_vertices
+from sobolev_batch.extras.figures.remade import StudyMeshes, fields_of
 from sobolev_batch.extras.figures.selection import Selection
 from sobolev_batch.extras.figures.views import (
     FRONT,
@@ -35,6 +35,7 @@ from sobolev_batch.extras.figures.views import (
     write_witness_plots,
 )
 from sobolev_batch.shapes import icosphere
+from sobolev_batch.testing.difference import witness_at_vertices
 from tests.support.commands import call
 from tests.support.spheres import LABELS, LONG, ORDERS, RADIUS, RIGHT, STRANGE
 

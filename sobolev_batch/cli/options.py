@@ -1,0 +1,84 @@
+"""Arguments and options that several commands share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from sobolev_batch.tables import FORMATS
+
+if TYPE_CHECKING:
+    from sobolev_batch.store.location import Location
+
+PATH = click.Path(path_type=Path)
+Callback = TypeVar("Callback", bound=Callable[..., Any])
+
+
+def _numbers(value: Any) -> tuple[float, ...]:
+    """Return one number, or several with commas between them."""
+    try:
+        # A default was converted already.
+        return value if isinstance(value, tuple) else tuple(float(part) for part in str(value).split(","))
+    except ValueError as error:
+        raise click.BadParameter(f"{value!r} is neither a number nor a list of numbers such as -4,-6") from error
+
+
+def orders_option(text: str, default: str) -> Callable[[Callback], Callback]:
+    """Return the option --order of a command, whose value is each of several orders once, or None."""
+
+    def flattened(context: click.Context, param: click.Parameter, lists: tuple[tuple[float, ...], ...]) -> Any:
+        return tuple(dict.fromkeys(number for numbers in lists for number in numbers)) or None
+
+    return click.option(
+        *("--order", "orders"),
+        type=_numbers,
+        multiple=True,
+        callback=flattened,
+        metavar="ORDERS",
+        help=f"{text} Give several as --order -4,-6, or repeat the option. [default: {default}]",
+    )
+
+
+def location(value: Any) -> Location:
+    """Return the location of a store that an option names."""
+    from sobolev_batch.store.location import Location
+
+    return Location.parse(value)
+
+
+def memory_size(value: Any) -> int:
+    """Return the bytes of a size such as 4GB."""
+    from sobolev_batch.parameters import byte_count
+
+    return byte_count(value)
+
+
+store_argument = click.argument("store", type=location, metavar="STORE")
+format_option = click.option(
+    *("--format", "style"),
+    type=click.Choice(FORMATS),
+    default="text",
+    show_default=True,
+    help="Print text, markdown or latex for people, csv or json for programs.",
+)
+json_option = click.option(
+    *("--format", "style"),
+    type=click.Choice(["text", "json"]),
+    default="text",
+    show_default=True,
+    help="Print text for people, or one JSON document for programs.",
+)
+
+
+def below_option(text: str, *, required: bool = False) -> Callable[[Callback], Callback]:
+    """Return the option --below of a command: a fraction of the norm of the reference, such as 0.01 or 1%."""
+
+    def fraction_of_norm(value: str) -> float:
+        from sobolev_batch.parameters import fraction
+
+        return fraction(value)
+
+    return click.option("--below", type=fraction_of_norm, metavar="FRACTION", required=required, help=text)

@@ -1,0 +1,446 @@
+"""Commands of the extras: init, fit, plot, witness, report, table time, table league.
+
+As all modules of commands, this one imports whatever computes inside of its functions.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext, suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from threading import Event
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from sobolev_batch.cli.interruption import Deadline
+from sobolev_batch.cli.options import PATH, Callback, location, orders_option, store_argument
+from sobolev_batch.cli.output import echo, echo_lines, progress_bar
+from sobolev_batch.cli.program import EXIT_SOME_FAILED, Command
+from sobolev_batch.cli.table_commands import TableOptions, table_options
+from sobolev_batch.errors import InputError, MeshError, SobolevBatchError, StoreError, from_extra
+from sobolev_batch.extras.fitting import DEFAULT_SMOOTHING, DEFAULT_STEPS
+from sobolev_batch.norms import DEFAULT_ORDER
+
+if TYPE_CHECKING:
+    from sobolev_batch.extras.figures.style import PictureFormat, Size
+    from sobolev_batch.extras.figures.views import Axis, Colors
+    from sobolev_batch.extras.fitting.fit import FitProgress, FitQuality
+    from sobolev_batch.geometry.mesh import Mesh
+    from sobolev_batch.geometry.surface import Similarity
+    from sobolev_batch.store.location import Location
+
+# In radii of the target; distances have about as many digits.
+_MOST_ROUNDING = 1e-6
+
+_folder_option = click.option(
+    "--folder",
+    type=PATH,
+    default=".",
+    help="Rebuild the meshes of the study with its relative paths starting here. [default: current folder]",
+)
+_up_option = click.option(
+    "--up",
+    type=click.Choice(["x", "y", "z"]),
+    help="Draw the meshes with this axis pointing up. [default: y or z, what they seem to rest on]",
+)
+
+
+def _meshes_option(text: str, default: str) -> Callable[[Callback], Callback]:
+    return click.option(
+        *("--mesh", "meshes"),
+        multiple=True,
+        metavar="MESH",
+        help=f"{text} A pattern such as 'scans/*' stands for several. The option may be repeated. [default: {default}]",
+    )
+
+
+def _output_option(text: str, default: str) -> Callable[[Callback], Callback]:
+    return click.option("--output", type=PATH, default=default, show_default=True, help=text)
+
+
+@click.command("init", cls=Command, short_help="Write a study file for a folder of meshes.")
+@click.argument("folder", type=PATH, default=".")
+@click.option(
+    *("-o", "--output"),
+    type=PATH,
+    default="study.toml",
+    show_default=True,
+    help="Write the study to this file, which must not exist.",
+)
+def init_command(folder: Path, output: Path) -> None:
+    """Write a study file for the meshes in FOLDER.
+
+    It runs as it is, and says what to change. The reference is the mesh that is called original, reference, target or
+    ground truth, or else the one with the most triangles. Folders are families, and so are meshes whose names differ
+    in the number at the end. Several references are several objects. [default: current folder]
+    """
+    from sobolev_batch.extras.draft import init_study
+
+    echo_lines(init_study(folder, output))
+
+
+@click.command(
+    "fit", cls=Command, shows_progress=True, short_help="Move the vertices of START to bring it nearer to TARGET."
+)
+@click.argument("start", type=PATH)
+@click.argument("target", type=PATH)
+@click.option("-o", "--output", type=PATH, required=True, help="Write the mesh to this file, .ply, .obj, .off or .stl.")
+@click.option("--order", type=float, default=DEFAULT_ORDER, show_default=True, help="Lower the distance of this order.")
+@click.option("--steps", type=int, default=DEFAULT_STEPS, metavar="N", show_default=True, help="Take N steps at most.")
+@click.option(
+    "--smoothing",
+    type=float,
+    default=DEFAULT_SMOOTHING,
+    show_default=True,
+    help="Smooth the steps: more keeps triangles better, less lowers the distance more. A far START takes at least 4.",
+)
+@click.option(
+    *("--refine-to", "triangles"),
+    type=int,
+    metavar="N",
+    help="Also split the edges that lower the distance most, until there are N triangles.",
+)
+@click.option("--keep-boundary", is_flag=True, help="Leave vertices of open boundaries where they are.")
+@click.option("--no-scaling", is_flag=True, help="Keep the files' unit. Otherwise TARGET is scaled to the unit sphere.")
+def fit_command(
+    start: Path,
+    target: Path,
+    output: Path,
+    triangles: int | None,
+    no_scaling: bool,
+    **settings: Any,
+) -> None:
+    """Move the vertices of START to bring it nearer to TARGET, and write the mesh.
+
+    Both are mesh files in the same unit. The triangles stay as they are, unless you refine them. Ctrl-C ends with the
+    best mesh so far, and so does SIGTERM.
+    """
+    import numpy as np
+
+    from sobolev_batch.extras.fitting.fit import fit, refine
+    from sobolev_batch.extras.fitting.objective import require_comparable
+    from sobolev_batch.geometry.formats.readers import read_mesh, require_writable, write_mesh
+    from sobolev_batch.geometry.mesh import Mesh
+    from sobolev_batch.geometry.surface import Similarity
+
+    require_writable(output)
+    if output.exists() and output.samefile(target):
+        raise InputError(f"{output}: this is the target, which would be lost; name another file")
+    own, goal = read_mesh(start), read_mesh(target)
+    # Refused in the files' own unit.
+    require_comparable(own, goal)
+    similarity = Similarity() if no_scaling else Similarity.to_unit_ball(goal)
+    method = fit if triangles is None else partial(refine, triangles=triangles)
+    has_begun = Event()
+    bar = progress_bar(1, "steps", show_count=False) if sys.stderr.isatty() else None
+
+    def show(progress: FitProgress) -> None:
+        has_begun.set()
+        if bar is not None:
+            bar.length = progress.steps
+            # Earlier rounds may have needed fewer steps than they had.
+            bar.update(progress.step - bar.pos)
+
+    with bar or nullcontext(), Deadline.with_results(has_begun.is_set):
+        fitted = method(similarity.apply(own), similarity.apply(goal), **settings, notify=show)
+    vertices = np.asarray(fitted.mesh.vertices) / similarity.scale + np.asarray(similarity.origin)
+    result = Mesh(vertices, fitted.mesh.triangles)
+    write_mesh(result, output)
+    echo(f"{len(fitted.mesh.triangles):,} triangles; {fitted.steps} steps; {fitted.end}")
+    echo(f"before: {_text(fitted.before, similarity.scale)}")
+    echo(f"after:  {_text(fitted.after, similarity.scale)}")
+    for remark in (*fitted.remarks, *_lost_digits(result, output, similarity)):
+        echo(f"note: {remark}")
+
+
+def _lost_digits(mesh: Mesh, path: Path, similarity: Similarity) -> Iterator[str]:
+    """Yield a remark if the file of a mesh, or the mesh's own unit, lacks digits for its vertices."""
+    import numpy as np
+
+    from sobolev_batch.geometry.formats.readers import read_mesh
+
+    try:
+        written = read_mesh(path)
+    except MeshError as error:
+        yield f"the file cannot be read back: {error}"
+        return
+    moved = float(np.finfo(np.float64).eps * np.abs(mesh.vertices).max())
+    if len(written.triangles) == len(mesh.triangles):
+        moved += float(np.abs(np.subtract(written.corners(), mesh.corners())).max())
+    if similarity.scale * moved > _MOST_ROUNDING:
+        yield (
+            f"so far from the origin, numbers in {path.name} have too few digits: vertices are off by up to "
+            f"{moved:.1g}, and the distance is not that of the file; move the meshes to the origin, or write a .ply"
+        )
+
+
+def _text(quality: FitQuality, scale: float) -> str:
+    """Return the numbers on one line, lengths in the files' unit."""
+    from sobolev_batch.tables.text import percent, with_error
+
+    if not math.isfinite(quality.distance):
+        return "not measured"
+    relative = percent(quality.relative, quality.relative_error)
+    parts = [f"differs by {relative}, distance {with_error(quality.distance, quality.error)}"]
+    if math.isfinite(quality.hausdorff):
+        parts.append(f"Hausdorff ≥ {quality.hausdorff / scale:.3g}")
+        parts.append(f"Chamfer {quality.chamfer / scale:.3g}")
+    return ", ".join([*parts, f"smallest angle {quality.smallest_angle:.3g} degrees"])
+
+
+@click.command("plot", cls=Command)
+@store_argument
+@_output_option("Write the pictures into this folder.", ".")
+@click.option(
+    *("--format", "formats"),
+    type=click.Choice(["png", "svg", "pdf"]),
+    multiple=True,
+    default=["png"],
+    show_default=True,
+    help="Write this format; may be repeated.",
+)
+@click.option(
+    "--size",
+    metavar="WIDTHxHEIGHT",
+    help="Make each panel this large, in cm, mm or in, such as 8.4x6cm. Panels of several orders are stacked.",
+)
+@orders_option("Draw only this order.", "all of the store")
+@click.option(
+    *("--family", "families"), multiple=True, metavar="NAME|GLOB", help="Draw only this family; may be repeated."
+)
+@click.option(
+    "--x",
+    help="Draw convergence over this: edge_length, triangles, vertices, seconds, or a number among the metadata of the "
+    "meshes. [default: edge_length, triangles for a league]",
+)
+@_meshes_option("Draw this mesh with its witness function.", "a few")
+@_folder_option
+@_up_option
+@click.option(
+    "--colors",
+    type=click.Choice(["own", "common"]),
+    default="own",
+    show_default=True,
+    help="Give each mesh its own scale of colours, or all a common one.",
+)
+@click.pass_context
+def plot_command(context: click.Context, /, size: str | None, **options: Any) -> None:
+    """Draw the results of STORE as pictures.
+
+    They show convergence, distances and spectra, and some of the meshes. Those of a collection show its
+    league.
+
+    Meshes are coloured by their witness functions, which show where they differ from the reference. They are rebuilt
+    from the study. Pictures need the extra "plot". By default a few are chosen by their distances.
+    """
+    from sobolev_batch.store.collection_store import CollectionStore
+
+    with from_extra("plot", "a plot needs"):
+        from sobolev_batch.extras.figures.style import parse_size
+    chosen = _PlotOptions(panel=None if size is None else parse_size(size), **options)
+    _require_folder(chosen.output)
+    if CollectionStore.read(chosen.store) is not None:
+        chosen.draw_collection()
+    elif chosen.draw_store() and chosen.meshes:
+        context.exit(EXIT_SOME_FAILED)
+
+
+@dataclass(frozen=True)
+class _PlotOptions:
+    """The arguments and options of plot, by the names of its parameters; the size of a panel in inches."""
+
+    store: Location
+    output: Path
+    formats: tuple[PictureFormat, ...]
+    orders: tuple[float, ...] | None
+    families: tuple[str, ...]
+    x: str | None
+    meshes: tuple[str, ...]
+    folder: Path
+    up: Axis | None
+    colors: Colors
+    panel: Size | None
+
+    def draw_store(self) -> bool:
+        """Draw the results of one object and some of its meshes; return whether a mesh could not be drawn."""
+        from sobolev_batch.extras.figures.drawing import write_plots
+        from sobolev_batch.extras.figures.selection import Selection
+        from sobolev_batch.extras.figures.views import write_witness_plots
+        from sobolev_batch.tables.open import EDGE_LENGTH, fields_read
+
+        with fields_read(self.store):
+            selection = Selection.from_store(self.store, self.orders, self.families or None, self.x or EDGE_LENGTH)
+            # First, since a label may be wrong.
+            witness_paths, missing = write_witness_plots(
+                selection, self.output, self.folder, self.meshes, self.up, self.colors, self.formats, self.panel
+            )
+            paths, omissions = write_plots(selection, self.output, self.formats, self.panel)
+        for path in (*paths, *witness_paths):
+            echo(path)
+        for name, notes in omissions.items():
+            echo(f"{name}: {'; '.join(notes)}", err=True)
+        for label, reason in missing.items():
+            echo(f"{label}: not drawn with its witness function: {reason}", err=True)
+        return bool(missing)
+
+    def draw_collection(self) -> None:
+        """Draw the leagues of a collection, by size and where costs are known by cost."""
+        from sobolev_batch.extras.figures.drawing import COST_LEAGUE, LEAGUE
+        from sobolev_batch.extras.figures.style import drawing, write_figures
+        from sobolev_batch.extras.leagues.league import league
+
+        if self.meshes:
+            raise click.UsageError("--mesh draws meshes of one object: name its store, such as STORE/OBJECT")
+        figures = {}
+        with drawing(self.panel):
+            with suppress(InputError):
+                by_cost = league(self.store, self.orders, by="cost", methods=self.families or None)
+                figures["league-by-cost"] = COST_LEAGUE.figure(by_cost, size=self.panel)
+            try:
+                by_size = league(self.store, self.orders, x=self.x, methods=self.families or None)
+                figures["league"] = LEAGUE.figure(by_size, size=self.panel)
+            except InputError as error:
+                if self.x or not figures:
+                    raise
+                echo(f"league: {error}", err=True)
+        for path in write_figures(figures, self.output, self.formats, self.panel):
+            echo(path)
+
+
+def _require_folder(path: Path) -> None:
+    """Refuse a folder that files cannot be written into, before they are made. It need not exist yet."""
+    nearest = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    if not nearest.is_dir() or not os.access(nearest, os.W_OK):
+        raise StoreError(f"{path}: no files can be written there: {nearest} is no folder that can be written")
+
+
+@click.command("witness", cls=Command)
+@store_argument
+@_meshes_option("Write this mesh.", "all")
+@orders_option("Write witness functions of this order, which may be any below -1/2.", "the study's")
+@click.option(
+    *("--format", "style"),
+    type=click.Choice(["ply", "vtp"]),
+    default="ply",
+    show_default=True,
+    help="Write ply for MeshLab and similar programs, or vtp for ParaView.",
+)
+@click.option("--distances", is_flag=True, help="Also write the distance of each vertex from the reference.")
+@_output_option("Write the files into this folder.", ".")
+@_folder_option
+@click.pass_context
+def witness_command(
+    context: click.Context,
+    store: Location,
+    meshes: tuple[str, ...],
+    orders: tuple[float, ...] | None,
+    style: str,
+    distances: bool,
+    output: Path,
+    folder: Path,
+) -> None:
+    """Write the meshes of STORE with their witness functions.
+
+    The witness function shows where a mesh differs from the reference. Each mesh gets one file, in its own unit of
+    length. The study makes the meshes again; a mesh is skipped and named if that fails, or if it is not the one that
+    was computed.
+    """
+    from sobolev_batch.extras.figures.remade import exported, write_vertex_witness
+
+    made, labels, chosen = exported(store, meshes, orders, folder)
+    _require_folder(output)
+    output.mkdir(parents=True, exist_ok=True)
+    reference, is_complete = made.reference if distances else None, True
+    for label in labels:
+        try:
+            found = made.with_witness(label, chosen, reference)
+        except SobolevBatchError as error:
+            echo(f"{label}: {error}", err=True)
+            is_complete = False
+            continue
+        path = output / f"{made.stem(label)}.{style}"
+        write_vertex_witness(path, found)
+        echo(path)
+    if not is_complete:
+        context.exit(EXIT_SOME_FAILED)
+
+
+@click.command("report", cls=Command)
+@store_argument
+@_output_option("Write the page to this file.", "report.html")
+@_folder_option
+@_up_option
+@_meshes_option("Show this mesh with its witness function.", "a few")
+def report_command(store: Location, output: Path, folder: Path, up: Axis | None, meshes: tuple[str, ...]) -> None:
+    """Write the results of STORE as one HTML page.
+
+    The page needs no other files and makes no requests. What it leaves out is listed. The page of a collection has its
+    league; each object has a store, and a report, of its own.
+    """
+    from sobolev_batch.extras.report.build import make_report, write_page
+
+    page, omissions = make_report(store, folder=folder, witnesses=meshes, up=up)
+    write_page(output, page)
+    echo(output)
+    for omission in omissions:
+        echo(f"left out: {omission}", err=True)
+
+
+@click.command("time")
+@table_options
+@click.option(
+    "--truth",
+    metavar="FAMILY",
+    help="Measure from this family, which is the true surface. [default: the reference]",
+)
+@click.option(
+    "--factor",
+    type=click.FloatRange(min=1.0, min_open=True),
+    default=2.0,
+    show_default=True,
+    help="Report when the distance has grown by this factor.",
+)
+def time_command(table: TableOptions, truth: str | None, factor: float) -> None:
+    """Print distances of moving meshes over time."""
+    from sobolev_batch.extras.leagues.evolution import format_evolution
+
+    echo_lines(format_evolution(table.tree, table.style, table.orders, truth=truth, factor=factor))
+
+
+@click.command("league")
+@table_options
+@click.option(
+    "--by",
+    type=click.Choice(["size", "cost"]),
+    default="size",
+    show_default=True,
+    help="Compare at equal sizes, or list the meshes that no other beats in distance and cost.",
+)
+@click.option("--x", help="Take this size or cost of a mesh. [default: triangles by size, make_seconds by cost]")
+@click.option("--family", "families", multiple=True, help="Compare this method; may be repeated. [default: all]")
+@click.option("--against", type=location, metavar="STORE", help="Compare with this earlier study instead.")
+def league_command(
+    table: TableOptions, by: str, x: str | None, families: tuple[str, ...], against: Location | None
+) -> None:
+    """Rank methods over the objects of STORE.
+
+    With --by cost, STORE may also be that of one object. With --against, compare each method with itself in an earlier
+    study instead.
+    """
+    from sobolev_batch.extras.leagues.costs import format_cost_leagues
+    from sobolev_batch.extras.leagues.league import compare_studies, format_changes, format_league, league
+
+    if against is not None:
+        text = format_changes(compare_studies(table.store, against, table.orders), table.style)
+    elif by == "cost":
+        by_cost = league(table.store, table.orders, by="cost", x=x, methods=families or None)
+        text = format_cost_leagues(by_cost, table.style)
+    else:
+        text = format_league(league(table.store, table.orders, x=x, methods=families or None), table.style)
+    echo_lines(text)
