@@ -252,7 +252,7 @@ def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block]) -> Stored
     for block in blocks:
         result = transform_block(surface, lattice, block, transform, execution, plan)
         checksums.append(Fields(job.store).write(job.index, lattice.place(block), result.values))
-        probes.append(probe_block(surface, lattice, transform, block, result.values, draws, execution.backend))
+        probes.append(probe_block(surface, lattice, transform, block, result.values, draws, execution))
         backends.append(result.backend)
         points = result.points
     quality = Quality.from_surface(surface, join(probes))

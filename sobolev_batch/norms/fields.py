@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Literal, Self
 
 import numpy as np
@@ -18,6 +18,7 @@ from sobolev_batch.geometry.surface import Extent, Surface
 from sobolev_batch.norms.tail.remainder import Remainder
 from sobolev_batch.transform.backends import ComplexDtype, backend_named
 from sobolev_batch.transform.fourier import (
+    FINEST_EPS,
     ON_CPU,
     ErrorTarget,
     Execution,
@@ -43,6 +44,9 @@ PROBED_ORDERS = (-2.0, -5.0, -10.0)
 # The degree of the rule that most triangles get: samples drawn for it serve coarser and equal ones.
 USUAL_DEGREE = 2
 _ATTEMPTS = 3
+# FINUFFT rounds eps to whole widths of its kernel, and errs by up to five times what `choose_settings` expects. A wider
+# kernel costs a tenth of a field, but one that misses its target is computed twice.
+_EPS_CAUTION = 4.0
 
 
 @dataclass(frozen=True)
@@ -201,10 +205,10 @@ def compute_field(
     if not needs_probe(surface, settings):
         probe = Probe()
     elif sample is not None and plan.lowest_degree <= USUAL_DEGREE:
-        probe = probe_block(surface, lattice, settings, block, values, sample.draws, execution.backend, sample)
+        probe = probe_block(surface, lattice, settings, block, values, sample.draws, execution, sample)
     else:
         draws = draws_for([surface], lattice, orders, plan.lowest_degree, COMMON)
-        probe = probe_block(surface, lattice, settings, block, values, draws, execution.backend)
+        probe = probe_block(surface, lattice, settings, block, values, draws, execution)
     quality = Quality.from_surface(surface, probe)
     return Field(values, transformed.points, transformed.backend, quality, settings)
 
@@ -226,6 +230,7 @@ def field_for(
         return compute_field(surface, lattice, settings, target.orders, sample=sample)
     for _ in range(_ATTEMPTS):
         chosen = choose_settings(surface, lattice, target, settings)
+        chosen = replace(chosen, eps=max(chosen.eps / _EPS_CAUTION, FINEST_EPS[chosen.dtype]))
         field = compute_field(surface, lattice, chosen, target.orders, execution, sample=sample)
         excess = float(np.max(field.quality.probe.norms(SobolevWeights(lattice, target.orders)) / target.norms))
         if excess <= 1:

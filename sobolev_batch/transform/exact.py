@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
 from itertools import pairwise
@@ -49,27 +49,31 @@ _BATCH = {"cpu": 1 << 13, "gpu": 1 << 18}
 _PAIRS = {"cpu": 1 << 11, "gpu": 1 << 21}
 # With fewer pairs a GPU takes longer than the processor.
 _FEWEST_FOR_GPU = 1 << 15
-# Of compiled loops: their exponentials at the vertices stay in a processor's cache.
+# Triangles at a time in compiled loops: the exponentials at their vertices stay in a processor's cache.
 _COMPILED_BATCH = 1 << 12
+# Compiled loops take frequencies in vectors of this many: 7 further ones would take three times as long as 8.
+_VECTOR = 8
+# With fewer frequencies for each thread, threads take different triangles instead.
+_FEWEST_PER_THREAD = 32
 # Processor time of a pair of a triangle and a frequency on arrays, at least.
 _PAIR_SECONDS = 4e-8
 # Splits a double into halves of 26 bits each.
 _SPLITTER = 2.0**27 + 1
 
 
-def exact_transform(mesh: Mesh, frequencies: Reals, backend: Backend = CPU) -> Complexes:
+def exact_transform(mesh: Mesh, frequencies: Reals, backend: Backend = CPU, threads: int = 1) -> Complexes:
     """Return the transform ∫ exp(-2πi ξ·x) dμ(x) of a mesh's area measure, free of quadrature error.
 
     For ξ, float64 (P, 3), in cycles per unit length, it is complex128 (P,). The error of each triangle is about 1e-15
     of its contribution, or of its area if that is smaller; the area itself is exact to rounding even on slivers. A GPU
-    and compiled loops change the last digits.
+    and compiled loops change the last digits; threads, which these loops take, do not.
     """
     frequencies = np.asarray(frequencies, dtype=np.float64)
     columns = [np.ascontiguousarray(column) for column in mesh.vertices.T]
 
     def sums(backend: Backend) -> Complexes:
         if backend is CPU and pays(_PAIR_SECONDS * len(mesh.triangles) * len(frequencies)):
-            return _compiled_exact_transform(mesh, frequencies)
+            return _compiled_exact_transform(mesh, frequencies, threads)
         batch = _BATCH[backend.name]
         parts = []
         for start in range(0, len(mesh.triangles), batch):
@@ -81,18 +85,14 @@ def exact_transform(mesh: Mesh, frequencies: Reals, backend: Backend = CPU) -> C
     return compute_on(_faster(backend, mesh, frequencies), sums)
 
 
-def _compiled_exact_transform(mesh: Mesh, frequencies: Reals, threads: int = 1) -> Complexes:
+def _compiled_exact_transform(mesh: Mesh, frequencies: Reals, threads: int) -> Complexes:
     from sobolev_batch.compiled.divided_differences import exact_sums
 
     doubled = _compiled_doubled_areas(mesh)
     # Sums of sums round less often.
     batches = [slice(start, start + _COMPILED_BATCH) for start in range(0, len(doubled), _COMPILED_BATCH)]
-
-    def sums(rows: Reals) -> Complexes:
-        parts = (exact_sums(mesh.vertices, mesh.triangles[batch], doubled[batch], rows) for batch in batches)
-        return sum(parts, np.zeros(rows.shape[1], dtype=np.complex128))
-
-    return _by_threads(sums, frequencies, threads)
+    faces = [(mesh.vertices, mesh.triangles[batch], doubled[batch]) for batch in batches]
+    return _by_threads(exact_sums, faces, frequencies, threads)
 
 
 def _compiled_sampled_transform(mesh: Mesh, frequencies: Reals, threads: int) -> Complexes:
@@ -101,7 +101,7 @@ def _compiled_sampled_transform(mesh: Mesh, frequencies: Reals, threads: int) ->
     total = np.zeros(len(frequencies), dtype=np.complex128)
     for _, batch in mesh.batches(_COMPILED_BATCH):
         doubled = _compiled_doubled_areas(batch)
-        total += _by_threads(partial(sampled_sums, batch.vertices, batch.triangles, doubled), frequencies, threads)
+        total += _by_threads(sampled_sums, [(batch.vertices, batch.triangles, doubled)], frequencies, threads)
     return total
 
 
@@ -115,13 +115,22 @@ def _compiled_doubled_areas(mesh: Mesh) -> Reals:
     return np.asarray(doubled)
 
 
-def _by_threads(sums: Callable[[Reals], Complexes], frequencies: Reals, threads: int) -> Complexes:
-    """Return sums at frequencies (P, 3). Each thread takes a part of them, as rows (3, k)."""
-    parts = [np.ascontiguousarray(part.T) for part in np.array_split(frequencies, threads)]
-    if threads == 1:
-        return sums(parts[0])
+def _by_threads(
+    sums: Callable[..., Complexes], faces: Sequence[tuple[Array, ...]], frequencies: Reals, threads: int
+) -> Complexes:
+    """Return the sums (P,) of batches of faces at frequencies (P, 3), whose digits do not depend on the threads."""
+    parts = np.array_split(frequencies, threads if len(frequencies) >= _FEWEST_PER_THREAD * threads else 1)
+
+    def over_faces(part: Reals) -> Iterator[Complexes]:
+        rows = np.zeros((3, -(-len(part) // _VECTOR) * _VECTOR))
+        rows[:, : len(part)] = part.T
+        return each(lambda batch: sums(*batch, rows)[: len(part)], faces)
+
     with ThreadPoolExecutor(threads) as pool:
-        return np.concatenate(list(pool.map(sums, parts)))
+        each = pool.map if threads > 1 and len(parts) * len(faces) > 1 else map
+        found = [over_faces(part) for part in parts]
+        totals = [sum(of_part, np.zeros(len(part), np.complex128)) for of_part, part in zip(found, parts, strict=True)]
+    return np.concatenate(totals)
 
 
 def _faster(backend: Backend, mesh: Mesh, frequencies: Reals) -> Backend:
@@ -366,11 +375,12 @@ def sampled_transform(mesh: Mesh, frequencies: Reals, threads: int = 1, backend:
     values = np.empty(len(frequencies), dtype=np.complex128)
     if backend is CPU and pays(_PAIR_SECONDS * len(mesh.triangles) * len(frequencies)):
         fine = gaps < _SERIES_GAP
-        values[fine] = _compiled_exact_transform(mesh, frequencies[fine], threads)
-        values[~fine] = _compiled_sampled_transform(mesh, frequencies[~fine], threads)
+        for chosen, transform in ((fine, _compiled_exact_transform), (~fine, _compiled_sampled_transform)):
+            if chosen.any():
+                values[chosen] = transform(mesh, frequencies[chosen], threads)
         return values
     fine = gaps < _FINE_MESH
-    values[fine] = exact_transform(mesh, frequencies[fine], backend)
+    values[fine] = exact_transform(mesh, frequencies[fine], backend, threads)
     others = frequencies[~fine]
 
     def sums(backend: Backend) -> Complexes:

@@ -177,7 +177,7 @@ def _nufft_eps(
 
 # Raise it whenever the numbers for a given surface and settings change: stored fields of another version are then
 # computed again instead of being compared with new ones.
-NUMERICS_VERSION = 6
+NUMERICS_VERSION = 7
 
 # The smallest batch holds eight node sets of the largest triangle rule.
 _SMALLEST_BATCH = 1 << 12

@@ -227,8 +227,8 @@ class SurfaceKind(ABC):
         """Yield the points in nearly equal batches of at most a number, 8 times that of the largest rule or more."""
 
     @abstractmethod
-    def exact_values(self, frequencies: Reals, backend: Backend = CPU) -> Complexes:
-        """Return the exact transform at frequencies (P, 3), complex128 (P,). A backend may help."""
+    def exact_values(self, frequencies: Reals, threads: int = 1, backend: Backend = CPU) -> Complexes:
+        """Return the exact transform at frequencies (P, 3), complex128 (P,). Threads and a backend may help."""
 
     def sampled_values(self, frequencies: Reals, threads: int, backend: Backend = CPU) -> Complexes:
         """Return the transform at frequencies (P, 3) by the fastest formula, complex128 (P,)."""
@@ -290,8 +290,8 @@ class _Triangles(SurfaceKind):
             for first in range(0, len(points.weights), capacity):
                 yield points.part(slice(first, first + capacity))
 
-    def exact_values(self, frequencies: Reals, backend: Backend = CPU) -> Complexes:
-        return exact_transform(self.surface, frequencies, backend)
+    def exact_values(self, frequencies: Reals, threads: int = 1, backend: Backend = CPU) -> Complexes:
+        return exact_transform(self.surface, frequencies, backend, threads)
 
     def sampled_values(self, frequencies: Reals, threads: int, backend: Backend = CPU) -> Complexes:
         return sampled_transform(self.surface, frequencies, threads, backend)
@@ -332,7 +332,7 @@ class _Parametrised(SurfaceKind):
             count += len(weights)
         yield WeightedPoints.concatenated(gathered)
 
-    def exact_values(self, frequencies: Reals, backend: Backend = CPU) -> Complexes:
+    def exact_values(self, frequencies: Reals, threads: int = 1, backend: Backend = CPU) -> Complexes:
         return exact_values(self.surface, frequencies)
 
     def loosest_tolerance(self, lattice: FrequencyLattice, orders: Sequence[float], norms: Reals) -> float:
@@ -347,7 +347,7 @@ class _ClosedForm(SurfaceKind):
     def batches(self, capacity: int, backend: Backend = CPU) -> Iterator[WeightedPoints]:
         yield from ()
 
-    def exact_values(self, frequencies: Reals, backend: Backend = CPU) -> Complexes:
+    def exact_values(self, frequencies: Reals, threads: int = 1, backend: Backend = CPU) -> Complexes:
         return sphere_transform(self.surface, frequencies)
 
     def block_values(self, lattice: FrequencyLattice, block: Block) -> Complexes:

@@ -47,7 +47,7 @@ def transform_points(
         turned = points.coordinates if lattice.rotation is None else combine(lattice.rotation, points.coordinates)
         angles = scale * turned
         # Whole turns change the strengths of a shifted lattice, and nothing else.
-        folded = angles - 2 * np.pi * np.rint(angles / (2 * np.pi)) if lattice.tolerates_images else angles
+        folded = _folded(angles) if lattice.tolerates_images else angles
         # setpts keeps references, not copies: the angles live until execute has returned.
         plan.setpts(*(np.ascontiguousarray(row, dtype=spec.real_dtype, like=row) for row in folded))
         for sub_block, (x, y, z) in block.tiles(spec.shape):
@@ -67,6 +67,14 @@ def transform_points(
     if total is None:
         total = backend.upload(np.zeros(block.shape, dtype=spec.dtype))
     return total, count
+
+
+def _folded(angles: Array) -> Array:
+    """Return angles without their whole turns. Each temporary of many points would be fresh memory, which is slow."""
+    turns = angles / (2 * np.pi)
+    np.rint(turns, out=turns)
+    turns *= 2 * np.pi
+    return np.subtract(angles, turns, out=turns)
 
 
 def evaluate_at(coordinates: Reals, coefficients: Complexes, lattice: Lattice, block: Block, spec: NufftSpec) -> Reals:

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Complexes, Indices, Reals
 from sobolev_batch.geometry.surface import Surface
-from sobolev_batch.transform.backends import CPU, Backend
-from sobolev_batch.transform.fourier import TransformSettings
+from sobolev_batch.transform.fourier import ON_CPU, Execution, TransformSettings
 from sobolev_batch.transform.kinds import kind_of
 from sobolev_batch.transform.lattice import Block, Lattice, SobolevWeights, shell_volumes
 
@@ -34,7 +33,7 @@ _BANDS = 8
 _TINY = np.finfo(np.float64).tiny
 # The fraction of draws that are made before a field is known, and how many follow its values for each of them; fewer
 # where the exact values at the former are known already, and only the latter take time.
-COMMON, _OWN, _OWN_BESIDE_SAMPLE = 2 / 3, 0.5, 0.25
+COMMON, _OWN, _OWN_BESIDE_SAMPLE = 2 / 3, 0.5, 1.0
 # Values among which those are drawn: to look at more takes longer than the rest of the probe.
 _LOOKED_AT = 1 << 18
 
@@ -216,12 +215,13 @@ class Sample:
     exact: Complexes
 
     @classmethod
-    def from_surface(cls, surface: Surface, draws: Draws, backend: Backend = CPU, *, fast: bool = False) -> Sample:
+    def from_surface(
+        cls, surface: Surface, draws: Draws, execution: Execution = ON_CPU, *, fast: bool = False
+    ) -> Sample:
         """Return the sample of a surface at given draws; a fast one may be off by some 1e-13 of the area."""
         kind = kind_of(surface)
-        if fast:
-            return cls(draws, kind.sampled_values(draws.frequencies, 1, backend))
-        return cls(draws, kind.exact_values(draws.frequencies, backend))
+        values = kind.sampled_values if fast else kind.exact_values
+        return cls(draws, values(draws.frequencies, execution.threads, execution.backend))
 
 
 def draws_for(
@@ -244,7 +244,7 @@ def probe_block(
     block: Block,
     values: Complexes,
     draws: Draws,
-    backend: Backend = CPU,
+    execution: Execution = ON_CPU,
     sample: Sample | None = None,
 ) -> Probe:
     """Compare one block of a field with the exact transform, at the draws that fall into the block and some of its own.
@@ -260,9 +260,10 @@ def probe_block(
     pooled, common = with_own(draws, count, lattice, block, values), draws.inside(block)
     if sample is None:
         # What a fast sample is off by can only make the field look worse.
-        exact = Sample.from_surface(surface, pooled, backend, fast=True).exact
+        exact = Sample.from_surface(surface, pooled, execution, fast=True).exact
     else:
-        own = kind_of(surface).sampled_values(pooled.frequencies[np.count_nonzero(common) :], 1, backend)
+        further = pooled.frequencies[np.count_nonzero(common) :]
+        own = kind_of(surface).sampled_values(further, execution.threads, execution.backend)
         exact = np.concatenate([sample.exact[common], own])
     probe = measure(pooled, values[pooled.places(block)], exact)
     change = settings.plan(surface, lattice).change
