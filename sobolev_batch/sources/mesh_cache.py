@@ -23,7 +23,7 @@ import psutil
 
 from sobolev_batch.errors import InputError, MeshError, StudyError, one_line
 from sobolev_batch.geometry.formats.by_name import WRITERS, is_mesh_name
-from sobolev_batch.geometry.formats.plain_formats import parse_ply, write_ply
+from sobolev_batch.geometry.formats.ply import parse_ply, write_ply
 from sobolev_batch.geometry.formats.readers import as_mesh, read_mesh, write_mesh
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.parameters import format_bytes

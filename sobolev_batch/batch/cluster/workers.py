@@ -54,7 +54,7 @@ _own: dict[str, socket.socket] = {}
 _locking = ThreadLock()
 
 _OF_DASK = ("dask", "distributed")
-_OF_NUMBERS = (*("cloudpickle", "sobolev-batch", "numpy", "scipy", "finufft", "zarr", "xarray", "plyfile"),)
+_OF_NUMBERS = (*("cloudpickle", "sobolev-batch", "numpy", "scipy", "finufft", "zarr", "xarray"),)
 # Not every study needs these. Processes that have them must have the same.
 _OF_EXTRAS = ("fast-simplification", "pyacvd", "vtk")
 

@@ -8,14 +8,14 @@ import io
 import os
 import stat
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from io import BufferedReader
 from pathlib import Path, PurePath
 from typing import IO, Any, cast
 from xml.parsers import expat
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Indices
 from sobolev_batch.errors import MeshError
@@ -38,6 +38,8 @@ _MEMORY_PART = 0.75
 # five deep and a few hundred.
 _LONGEST_MARKUP, _DEEPEST, _MOST_ELEMENTS = 1 << 16, 100, 100_000
 _XML_BYTES = 1 << 14
+# The index that ends a strip of triangles within a list.
+_BREAK = -1
 
 
 def open_regular(path: Path) -> BufferedReader:
@@ -184,12 +186,24 @@ def triangle_fans(corners: Indices, sizes: Indices) -> Indices:
     return np.stack([corners[first], corners[first + rank + 1], corners[first + rank + 2]], axis=1)
 
 
-def triangle_fans_of_lists(polygons: Sequence[ArrayLike]) -> Indices:
-    """Cut polygons, each a sequence of vertex indices, as `triangle_fans` does."""
-    if not len(polygons):
-        raise MeshError("the file has no faces")
-    sizes = np.array([len(np.asarray(polygon)) for polygon in polygons], dtype=np.int64)
-    return triangle_fans(np.concatenate([np.asarray(polygon, dtype=np.int64) for polygon in polygons]), sizes)
+def triangle_strips(corners: Indices, sizes: Indices) -> Indices:
+    """Cut strips into triangles (m, 3), every second one turned round, so that all face the same side.
+
+    The corners are vertex indices of all lists, one after the other, the sizes their numbers. A list may hold several
+    strips, with -1 between them. Triangles without area, which join strips, stay.
+    """
+    corners = np.insert(corners, np.cumsum(sizes), _BREAK)
+    ends = np.flatnonzero(corners == _BREAK)
+    begins = np.concatenate([[0], ends[:-1] + 1])[: len(ends)]
+    # Breaks that follow each other have no strip between them.
+    begins, ends = begins[ends > begins], ends[ends > begins]
+    if (ends - begins < 3).any():
+        raise MeshError(f"a strip of triangles has {(ends - begins).min()} vertices, expected three or more")
+    counts = ends - begins - 2
+    # The rank of each triangle in its strip, and the place of its first corner.
+    ranks = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    places, odd = np.repeat(begins, counts) + ranks, ranks % 2
+    return np.stack([corners[places + odd], corners[places + 1 - odd], corners[places + 2]], axis=1)
 
 
 def merge_coincident(vertices: NDArray[np.floating], triangles: Indices) -> tuple[NDArray[np.floating], Indices]:

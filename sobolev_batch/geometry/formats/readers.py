@@ -30,7 +30,7 @@ from sobolev_batch.geometry.formats.parsing import (
     require_memory_to_read,
     unpacked_limit,
 )
-from sobolev_batch.geometry.formats.plain_formats import HEADER_BYTES, announced_sizes
+from sobolev_batch.geometry.formats.ply import HEADER_BYTES
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.smooth import Smooth
 from sobolev_batch.geometry.surface import Surface
@@ -53,12 +53,6 @@ _WITHOUT_AREA = ("vertex", "line", "line3")
 _LONGEST_REASON = 250
 # Factor by which gzip usually shrinks mesh files.
 _PACKING = 4
-# Smallest possible sizes of a vertex and a face in a PLY file.
-_LEAST_VERTEX_BYTES, _LEAST_FACE_BYTES = 3, 4
-# Usual sizes in a PLY file: of a vertex in double precision, and of a corner.
-_VERTEX_BYTES, _CORNER_BYTES = 24, 4.4
-# Memory of reading a PLY file: factor of reading row by row, and bytes of each vertex beyond one for two triangles.
-_TEXT_FACTOR, _VERTEX_MEMORY = 7.0, 70.0
 
 
 def read_mesh(path: str | Path) -> Mesh:
@@ -126,8 +120,7 @@ def expected_size(path: Path) -> tuple[int, float]:
     The estimate rests on the header of a PLY file, and on the length of others. It never exceeds what a file
     of this length can hold. Both are zero where the file cannot be read.
     """
-    suffix = mesh_format(path)
-    form = BY_SUFFIX.get(suffix)
+    form = BY_SUFFIX.get(mesh_format(path))
     if form is None:
         return 0, 0.0
     try:
@@ -135,24 +128,13 @@ def expected_size(path: Path) -> tuple[int, float]:
             length = checked_length(file)
             if is_gzipped(path):
                 length = min(_PACKING * length, unpacked_limit(length))
-            if suffix == ".ply":
+            if form.announced_size is not None:
                 unpacked = gzip.GzipFile(fileobj=file) if is_gzipped(path) else file
-                return _announced_size(unpacked.read(HEADER_BYTES), length)
+                return form.announced_size(unpacked.read(HEADER_BYTES), length)
     except (OSError, EOFError, ValueError, zlib.error, MeshError):
         return 0, 0.0
     triangles = int(length / form.file_bytes)
     return triangles, float(triangles * form.memory_bytes)
-
-
-def _announced_size(header: bytes, length: int) -> tuple[int, float]:
-    """Estimate the same for a PLY file of this length, whose header may announce anything."""
-    vertices, faces, text = announced_sizes(header)
-    vertices, faces = min(vertices, length // _LEAST_VERTEX_BYTES), min(faces, length // _LEAST_FACE_BYTES)
-    # The length of the file shows whether faces have more than three corners.
-    corners = (length - vertices * _VERTEX_BYTES) / max(faces, 1) / _CORNER_BYTES
-    triangles = faces if text or corners < 4 else 2 * faces
-    memory_bytes = BY_SUFFIX[".ply"].memory_bytes * (_TEXT_FACTOR if text or triangles > faces else 1)
-    return triangles, triangles * memory_bytes + _VERTEX_MEMORY * max(0.0, vertices - triangles / 2)
 
 
 def _shortened(error: Exception) -> str:

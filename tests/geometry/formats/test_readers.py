@@ -6,7 +6,9 @@ import codecs
 import gzip
 import os
 import re
-from collections.abc import Callable
+import struct
+from collections.abc import Callable, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -130,6 +132,92 @@ def with_edges(encoding: str) -> bytes:
     return content + (b"0 1\n1 2\n" if encoding == "ascii" else np.array([0, 1, 1, 2], dtype="<i4").tobytes())
 
 
+def relaid(separators: str) -> bytes:
+    """The box in text, with other characters between its numbers, taken in turn."""
+    header, end, body = ply(BOX_VERTICES, BOX_TRIANGLES).partition(b"end_header\n")
+    words = [word + separators[i % len(separators)].encode() for i, word in enumerate(body.split())]
+    return header + end + b"".join(words)
+
+
+def with_header(*edits: tuple[bytes, bytes], encoding: str = "ascii", end: bytes = b"\n") -> bytes:
+    """The box with changes in its header, whose lines end in some way."""
+    header, line, body = ply(BOX_VERTICES, BOX_TRIANGLES, encoding).partition(b"end_header\n")
+    for old, new in edits:
+        assert old in header
+        header = header.replace(old, new, 1)
+    return (header + line).replace(b"\n", end) + body
+
+
+FACES = b"element face 12\nproperty list uchar int vertex_indices\n"
+# Two strips in the first list, which share no edge, beside one in the second.
+STRIPS = [[0, 1, 2, 3, -1, 3, 2, 4], [4, 5, 6, 7, 8]]
+STRIP_TRIANGLES = [[0, 1, 2], [2, 1, 3], [3, 2, 4], [4, 5, 6], [6, 5, 7], [6, 7, 8]]
+
+
+@pytest.mark.parametrize("encoding", ["ascii", LITTLE, BIG])
+@pytest.mark.parametrize(
+    "lists", [STRIPS, STRIPS[:1], [[*STRIPS[0], -1, *STRIPS[1], -1]]], ids=["two", "one", "joined"]
+)
+def test_ply_strips_turn_every_second_triangle(read: Read, encoding: str, lists: list[list[int]]) -> None:
+    vertices = np.random.default_rng(3).random((9, 3))
+    content = ply(vertices, lists, encoding, real="double", length="int").replace(b"element face", b"element tristrips")
+    mesh = read(".ply", content)
+    assert mesh.triangles.tolist() == STRIP_TRIANGLES[: 3 if lists == STRIPS[:1] else 6]
+    assert mesh.vertices.tolist() == vertices.tolist()
+
+
+def ply_of_many_elements(encoding: str, lengths: Sequence[int]) -> bytes:
+    """The box behind, between and before lists of some lengths in its vertices, its faces and elements of their own."""
+    order = {"ascii": "", LITTLE: "<", BIG: ">"}[encoding]
+    lists = cycle(lengths)
+
+    def packed(*numbers: tuple[str, float]) -> bytes:
+        if not order:
+            return (" ".join(f"{number:g}" for _, number in numbers) + "\n").encode()
+        return b"".join(struct.pack(order + code, number) for code, number in numbers)
+
+    def noise(code: str) -> list[tuple[str, float]]:
+        size = next(lists)
+        return [("H", size), *[(code, 7)] * size]
+
+    header = f"""ply
+format {encoding} 1.0
+comment end_header
+obj_info made by hand
+element before 2
+property list ushort double a
+property char b
+element vertex 8
+property double z
+property list uint16 int8 y2
+comment between
+property float32 y
+property uchar red
+property double x
+element none 5
+element face 12
+property float quality
+property list int8 uint32 vertex_index
+property list ushort short more
+element after 1
+property list uint16 float c
+end_header
+"""
+    body = [packed(*noise("d"), ("b", 3)) for _ in range(2)]
+    body += [packed(("d", z), *noise("b"), ("f", y), ("B", 255), ("d", x)) for x, y, z in BOX_VERTICES]
+    body += [packed(("f", 0.5), ("b", 3), *[("I", i) for i in face], *noise("h")) for face in BOX_TRIANGLES]
+    return header.encode() + b"".join(body) + packed(*noise("f"))
+
+
+@pytest.mark.parametrize("encoding", ["ascii", LITTLE, BIG])
+@pytest.mark.parametrize("lengths", [[0], [2], [0, 3, 1, 2]], ids=["empty", "even", "uneven"])
+def test_ply_properties_and_elements_of_any_width_are_passed_over(
+    read: Read, encoding: str, lengths: list[int]
+) -> None:
+    mesh = read(".ply", ply_of_many_elements(encoding, lengths))
+    assert (mesh.vertices.tolist(), mesh.triangles.tolist()) == (BOX_VERTICES.tolist(), BOX_TRIANGLES)
+
+
 def obj_in_parts() -> bytes:
     third = b"f " + b" ".join(b"%d" % (vertex + 1) for vertex in BOX_TRIANGLES[4]) + b"\n"
     content = insert(OBJ_BOX, b"f 1 2 4\n", b"mtllib missing.mtl\no first\n")
@@ -151,6 +239,23 @@ VARIANTS: dict[str, dict[str, bytes]] = {
         "colors": with_colors(),
         "edges": with_edges("ascii"),
         "edges, binary": with_edges(LITTLE),
+        "a number on each line": relaid("\n"),
+        "one line": relaid(" "),
+        "lines of any length": relaid(" \t  \n \r\n  \n\n"),
+        "no newline at the end": ply(BOX_VERTICES, BOX_TRIANGLES).rstrip(),
+        **{
+            f"header lines end in {end!r}, {encoding}": with_header(encoding=encoding, end=end)
+            for end in (b"\r", b"\r\n")
+            for encoding in (LITTLE, BIG)
+        },
+        "comments everywhere": with_header(
+            (b"format", b"comment end_header\nobj_info 1\nformat"), (b"property", b"comment\nproperty"), encoding=LITTLE
+        ),
+        "blanks in the header": with_header((b"element face", b"\n  element  face "), (b"ply", b"ply ")),
+        "faces and strips": with_header(
+            (FACES, FACES.replace(b"12", b"11") + FACES.replace(b"12", b"1").replace(b"face", b"tristrips")),
+            encoding=LITTLE,
+        ),
     },
     ".obj": {
         "parts": obj_in_parts(),

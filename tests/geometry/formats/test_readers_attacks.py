@@ -43,7 +43,7 @@ REASONS = {
     "gifti, deep elements unpacked": "at the depth 101",
     "gifti, many elements unpacked": "element 100001",
     "obj, continued lines unpacked": "goes on for more than",
-    "ply ascii, long line unpacked": "a line of the PLY file has more than",
+    "ply ascii, long line unpacked": "but 1 numbers more follow",
     "glb, one part in many nodes": "repeats parts",
     "glb, stride 0": "every 0 bytes",
     "ply, indices with fractions": "not integers",
