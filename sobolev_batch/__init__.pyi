@@ -31,7 +31,7 @@ from .norms.distances import distance as distance
 from .norms.distances import norm as norm
 from .norms.distances import yardsticks as yardsticks
 from .norms.fields import fourier_transform as fourier_transform
-from .store.heartbeat import unlock as unlock
+from .store.unlock import unlock as unlock
 from .study.study import Study as Study
 from .study.study import StudyCollection as StudyCollection
 from .tables.convergence import smallest_below as smallest_below

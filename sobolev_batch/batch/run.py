@@ -14,7 +14,7 @@ from distributed import Client
 
 from sobolev_batch.batch.cluster.clients import local_client, memory_limit, require_blocking, thread_client
 from sobolev_batch.batch.cluster.execution import Cluster, Notify, Progress
-from sobolev_batch.batch.cluster.watch import Watch
+from sobolev_batch.batch.cluster.watch import Heartbeat, Watch
 from sobolev_batch.batch.cluster.workers import require_store_access
 from sobolev_batch.batch.field_stage import compute_fields
 from sobolev_batch.batch.proximity_stage import have_proximities, measure_proximities
@@ -27,7 +27,6 @@ from sobolev_batch.norms.budget import NormEstimate
 from sobolev_batch.parameters import available_cores, require_machine_memory
 from sobolev_batch.store.collection_store import CollectionStore, for_each_object, labelled
 from sobolev_batch.store.create import require_usable
-from sobolev_batch.store.heartbeat import Heartbeat
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, locked
 from sobolev_batch.store.records import Records
@@ -205,21 +204,19 @@ def carry_out(
 ) -> Summary:
     """Run a study in a store that this process has locked; a cluster starts if anything is missing."""
     workspace = Workspace.of_study(study, location, lock)
-    with Heartbeat(workspace.store, lock) as heartbeat:
+    with Heartbeat(workspace.store, lock).kept() as heartbeat:
         if lacks_nothing(workspace):
             # The last run may have been killed before it did.
             Records(workspace.store).collect(workspace.records)
             return _summary(workspace, set())
         client = start()
         with Watch(client, study.backend == "gpu").kept() as watch:
-            heartbeat.find_obstacle = lambda: watch.obstacle
-            heartbeat.cluster = client.scheduler.address
+            heartbeat.watch = watch
             heartbeat.write("running")
             notify(Progress("cluster", 0, 0, client.dashboard_link))
 
             def beat(progress: Progress) -> None:
-                heartbeat.require_lock()
-                heartbeat.stage = f"{progress.stage}, {progress.done} of {progress.total}"
+                heartbeat.advance(f"{progress.stage}, {progress.done} of {progress.total}")
                 notify(progress)
 
             cluster = Cluster.prepare(client, study, beat)

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 from sobolev_batch.errors import DamageError
 from sobolev_batch.store.collection_store import CollectionStore, labelled
-from sobolev_batch.store.heartbeat import LOST_AFTER_SECONDS
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, age_seconds, utc_now
 from sobolev_batch.store.records import Record, Records, RunRecord
+from sobolev_batch.store.unlock import LOST_AFTER_SECONDS
 from sobolev_batch.store.workspace import Contents
 from sobolev_batch.tables.open import AnyStore, location_of
 from sobolev_batch.tables.text import duration

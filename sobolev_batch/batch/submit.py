@@ -12,14 +12,13 @@ from distributed import Client, Future, Status, fire_and_forget, get_worker, wor
 
 from sobolev_batch.batch.cluster.clients import require_blocking
 from sobolev_batch.batch.cluster.execution import task_key
-from sobolev_batch.batch.cluster.watch import Watch
+from sobolev_batch.batch.cluster.watch import Heartbeat, Watch
 from sobolev_batch.batch.cluster.workers import prepare_workers, require_store_access
 from sobolev_batch.batch.run import carry_out
 from sobolev_batch.batch.start import StoreLike, ready_to_run
 from sobolev_batch.errors import ClusterError, StoreError
 from sobolev_batch.store.collection_store import CollectionStore, for_each_object
 from sobolev_batch.store.create import require_usable
-from sobolev_batch.store.heartbeat import Heartbeat
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, acquire, release
@@ -106,15 +105,13 @@ def _submit(study: Study, location: Location, client: Client) -> Submission:
     lock = Lock.of_this_process(outlives_process=True)
     acquire(location, lock)
     try:
-        with Watch(client).kept():
+        with Watch(client).kept() as watch:
             require_store_access(client, location, lock)
             workers = prepare_workers(client, study.libraries)
         workers.with_backend(study.backend)
         workers.require_accuracy(study.accuracy)
         workspace = Workspace.of_study(study, location, lock)
-        heartbeat = Heartbeat(workspace.store, lock)
-        heartbeat.cluster = client.scheduler.address
-        heartbeat.write("submitted")
+        Heartbeat(workspace.store, lock, watch).write("submitted")
         arguments = replace(study, folder=study.folder.absolute()), workspace.store.path, lock.run
         # Before all tasks of other studies, from which it takes no thread: it leaves its own at once.
         key = task_key("drive", study.name, study.part, "")
@@ -148,10 +145,7 @@ def drive(study: Study, store: str, run: str) -> None:
         # The run's own heartbeat has written most errors by now, but not that a file of the study is missing
         # on this machine.
         with suppress(StoreError):  # it may be what failed
-            if lock.is_held(location):
-                Heartbeat(Store(location.fenced(lock.fence)), lock).write(
-                    "failed", f"{error} (on the worker that drove the study)"
-                )
+            Heartbeat(Store(location), lock).write("failed", f"{error} (on the worker that drove the study)")
     release(location, lock)
 
 

@@ -87,26 +87,25 @@ def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
         return _mended(store, plan, None if is_same else _ALTERED)
     _check_same_study(store, plan)
     store.location.remove_partial_files()
-    with store.location.access("written"):
-        if not attributes["study"].items() >= lattice.items():
-            done = sum(record is not None for record in Records(store).read())
-            _log.warning(
-                "%s: another lattice follows from the study now; all of %d fields are computed again", store.path, done
-            )
-            _create(store, plan)
-        _require_same_samples(store, plan, is_trusted=True)
-        stored = store.labels()
-        # Only a row whose mesh the study has lost may serve another one.
-        is_kept = set(stored) <= {row.label for row in plan.rows}
-        labels = _labels_for(plan, stored, [None] * len(stored) if is_kept else Records(store).read(), is_trusted=True)
-        if labels != list(stored):
-            _lay_out(store, plan, labels, store.read_strings(QUALITY))
-        if attributes.get("similarity") != _similarity_entry(plan.similarity):
-            # Tables are in another unit of length, and the run may end before there are others.
-            hide_tables(store)
-        store.documents[""]["attributes"].update(_attributes(plan, labels))
-        # Written even if nothing changed: a location that cannot be written must fail before tasks start.
-        store.consolidate()
+    if not attributes["study"].items() >= lattice.items():
+        done = sum(record is not None for record in Records(store).read())
+        _log.warning(
+            "%s: another lattice follows from the study now; all of %d fields are computed again", store.path, done
+        )
+        _create(store, plan)
+    _require_same_samples(store, plan, is_trusted=True)
+    stored = store.labels()
+    # Only a row whose mesh the study has lost may serve another one.
+    is_kept = set(stored) <= {row.label for row in plan.rows}
+    labels = _labels_for(plan, stored, [None] * len(stored) if is_kept else Records(store).read(), is_trusted=True)
+    if labels != list(stored):
+        _lay_out(store, plan, labels, store.read_strings(QUALITY))
+    if attributes.get("similarity") != _similarity_entry(plan.similarity):
+        # Tables are in another unit of length, and the run may end before there are others.
+        hide_tables(store)
+    store.documents[""]["attributes"].update(_attributes(plan, labels))
+    # Written even if nothing changed: a location that cannot be written must fail before tasks start.
+    store.consolidate()
     return store
 
 
@@ -135,16 +134,15 @@ def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:
         )
     _log.warning("%s: tables or metadata are not what was written, and are made again", store.path)
     store.location.remove_partial_files()
-    with store.location.access("written"):
-        if plan.tail is not None:
-            fresh.documents |= _documents_of(dataset_keys(OCTAVES_GROUP, xr.Dataset(coords=_sample_columns(plan.tail))))
-        _require_same_samples(fresh, plan, is_trusted=False)
-        labels = _labels_for(plan, (stored + ("",) * count)[:count], records, is_trusted=False)
-        _lay_out(fresh, plan, labels, ())
-        # Nothing else replaces the record of a row that has lost its label.
-        for row in damaged:
-            Records(fresh).write(row, None)
-        fresh.consolidate()
+    if plan.tail is not None:
+        fresh.documents |= _documents_of(dataset_keys(OCTAVES_GROUP, xr.Dataset(coords=_sample_columns(plan.tail))))
+    _require_same_samples(fresh, plan, is_trusted=False)
+    labels = _labels_for(plan, (stored + ("",) * count)[:count], records, is_trusted=False)
+    _lay_out(fresh, plan, labels, ())
+    # Nothing else replaces the record of a row that has lost its label.
+    for row in damaged:
+        Records(fresh).write(row, None)
+    fresh.consolidate()
     return fresh
 
 

@@ -165,9 +165,9 @@ class Location:
 
     def remove_partial_files(self) -> None:
         """Remove what writers left behind that were killed in the middle of a key. No other run may be writing."""
-        with self.access("written"):
-            for file in () if self.scheme else _files_below(self.name):
-                if PARTIAL_FILE.search(file.name):
+        for file in () if self.scheme else _files_below(self.name):
+            if PARTIAL_FILE.search(file.name):
+                with self.access("written"):
                     # It may have got its final name since, from a task that outlived its run.
                     Path(file.path).unlink(missing_ok=True)
 

@@ -119,9 +119,10 @@ class Lock:
         return current is not None and current.holder == self.holder
 
     def require(self, location: Location) -> None:
-        """Check that its holder still has the store."""
-        if not self.is_held(location):
-            raise LockError(f"{location}: the store was unlocked, or removed, and is no longer that of this process")
+        """Check that its holder still has the store: a stricter fence, for the process that drives the run."""
+        current = Lock.read(location)
+        if current is None or current.holder != self.holder:
+            raise _lost(location, current)
 
 
 _adapter = TypeAdapter(Lock)
@@ -129,10 +130,14 @@ _adapter = TypeAdapter(Lock)
 
 def _require_run(run: str, location: Location) -> None:
     """Check that a run still has the store."""
-    lock = Lock.read(location)
-    if lock is None or lock.run != run:
-        others = "the store was unlocked, or its run is over" if lock is None else f"{lock.driver} has it now"
-        raise LockError(f"{location}: nothing more is written by a run that no longer has the store: {others}")
+    current = Lock.read(location)
+    if current is None or current.run != run:
+        raise _lost(location, current)
+
+
+def _lost(location: Location, current: Lock | None) -> LockError:
+    others = "the store was unlocked, or its run is over" if current is None else f"{current.driver} has it now"
+    return LockError(f"{location}: nothing more is written by a run that no longer has the store: {others}")
 
 
 @contextmanager

@@ -109,8 +109,6 @@ class Workspace(Contents):
     def of_study(cls, study: Study, location: Location, lock: Lock) -> Self:
         """Plan a study and prepare its store, which this process has locked."""
         plan = make_plan(study, stored_choice(location))
-        # Planning may take minutes.
-        lock.require(location)
         workspace = cls.prepared(location.fenced(lock.fence), plan)
         if workspace.pending and study.cache is not None and study.cache.versions_changed():
             # A program of another version makes other meshes: the study is listed again.

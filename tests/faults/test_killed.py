@@ -22,7 +22,7 @@ from distributed import Client, wait
 from sobolev_batch import Mesh, Study, open_store, run, verify, write_mesh
 from sobolev_batch.batch.cluster import watch
 from sobolev_batch.batch.cluster.clients import local_client
-from sobolev_batch.batch.cluster.watch import Watch
+from sobolev_batch.batch.cluster.watch import Silence, Watch
 from sobolev_batch.errors import ClusterError, LockError, StoreError
 from sobolev_batch.store.create import prepare_store
 from sobolev_batch.store.layout import Store
@@ -325,6 +325,6 @@ def test_a_cluster_without_workers_is_told() -> None:
 
 
 def test_a_silence_counts_only_what_was_heard_missing() -> None:
-    silence = watch._silence(1.0, watch._silence(1.0, watch._silence(1.0), 5.0), 2.5)
-    assert silence[2] == 7.5
-    assert watch._silence(2.0, silence, 100.0)[2] == 0.0
+    silence = Silence(heard=1.0).after(5.0, heard=1.0).after(2.5, heard=1.0)
+    assert silence.seconds == 7.5
+    assert silence.after(100.0, heard=2.0).seconds == 0.0

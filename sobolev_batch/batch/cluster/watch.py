@@ -1,7 +1,8 @@
-"""The watch over a cluster: it reports what keeps a run from going on, and ends a run whose scheduler stays silent.
+"""Signs of life: a thread renews the record of a run in its store, another asks whether its cluster is alive.
 
-A process that was stopped, or whose machine hangs, keeps its connections open and says nothing. Dask gives up such a
-worker after the time ``distributed.scheduler.worker-ttl``. For such a scheduler, a run would wait for ever.
+A store whose run has no heartbeat any more can be unlocked. A scheduler or worker that was stopped, or whose machine
+hangs, keeps its connections open and says nothing. Dask gives up such a worker after the time
+``distributed.scheduler.worker-ttl``. For such a scheduler, a run would wait for ever.
 """
 
 from __future__ import annotations
@@ -10,10 +11,11 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, Self
 
 import dask
 from dask.utils import parse_timedelta
@@ -21,92 +23,122 @@ from distributed import CancelledError, Client
 from distributed.comm import CommClosedError
 
 from sobolev_batch.batch.cluster.workers import GPU
-from sobolev_batch.errors import ClusterError
+from sobolev_batch.errors import ClusterError, LockError, StoreError, one_line
+from sobolev_batch.store.layout import Store
+from sobolev_batch.store.lock import Lock, this_process, utc_now
+from sobolev_batch.store.records import Records, RunRecord, RunState
+from sobolev_batch.store.unlock import LOST_AFTER_SECONDS
 
 _log = logging.getLogger(__name__)
 
+# A few beats may be lost, or take long, before others take the run for lost.
+HEARTBEAT_SECONDS = LOST_AFTER_SECONDS / 6
 # A silence is told after this time. Workers tell of themselves every half a second, among thousands every half a
 # minute.
 _TELL_AFTER_SECONDS = 30.0
 _POLL_SECONDS = 5.0
 _MOST_NAMED = 4
 
-# When a process was last heard of, the time from which on it has said nothing, and the seconds since. The first is
-# compared with nothing else: clocks differ, and this process may itself be stopped for a while, in which it hears
-# nobody.
-_Silence = tuple[object, str, float]
+
+@contextmanager
+def _repeated(act: Callable[[], bool], seconds: float, name: str) -> Iterator[None]:
+    """Act every so many seconds in a thread, until the block ends or the action returns False."""
+    ended = threading.Event()
+
+    def repeat() -> None:
+        while not ended.wait(seconds) and act():
+            pass
+
+    thread = threading.Thread(target=repeat, name=f"sobolev-batch-{name}", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        # It may wait for an answer of the store or of the cluster, which it does for a limited time.
+        thread.join()
+
+
+@dataclass(frozen=True)
+class Silence:
+    """The time since a process was heard of, for which others listened: they may be stopped for a while themselves.
+
+    The time ``heard`` is by the clock of that process, and is compared with nothing else.
+    """
+
+    heard: object = None
+    since: str = field(default_factory=lambda: f"{datetime.now(UTC):%H:%M:%S} UTC")
+    seconds: float = 0.0
+
+    def after(self, elapsed: float, heard: object = None) -> Silence:
+        """Return the silence after some more seconds; it begins anew if the process was heard of meanwhile."""
+        return replace(self, seconds=self.seconds + elapsed) if heard == self.heard else Silence(heard)
 
 
 class Watch:
-    """A watch over the cluster of a run, in a thread of its own.
+    """A watch over a cluster: it finds what keeps a run from going on, and ends a run whose scheduler stays silent.
 
     Attributes:
+        address: Address of the scheduler.
         obstacle: What keeps the run from going on, for people; empty if nothing does.
     """
 
     def __init__(self, client: Client, needs_gpu: bool = False) -> None:
-        self.obstacle = ""
+        self.address, self.obstacle = str(client.scheduler.address), ""
         self._client, self._needs_gpu = client, needs_gpu
         # A scheduler gets as long as it gives to its workers; without a limit, for ever.
         limit = dask.config.get("distributed.scheduler.worker-ttl")
         self._patience_seconds = parse_timedelta(limit) if limit else math.inf
-        self._address = str(client.scheduler.address)
-        self._workers: dict[str, _Silence] = {}
-        self._scheduler = _silence(None)
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._look_out, name="sobolev-batch-watch", daemon=True)
+        self._workers: dict[str, Silence] = {}
+        self._scheduler = Silence()
+        self._looked = time.monotonic()
 
     @contextmanager
-    def kept(self) -> Iterator[Watch]:
+    def kept(self) -> Iterator[Self]:
         """Keep the watch; ClusterError where the scheduler was silent for too long."""
-        self._thread.start()
         try:
-            yield self
+            with _repeated(self._look_out, _POLL_SECONDS, "watch"):
+                yield self
         except (OSError, CommClosedError, CancelledError, TimeoutError) as error:
             if not self._has_lost_scheduler:
                 raise
             raise ClusterError(
                 f"{self._silent_scheduler()}, and was given up; the same command goes on from what is stored"
             ) from error
-        finally:
-            self._ended.set()
-            # It may wait for an answer of the cluster.
-            self._thread.join(2 * _POLL_SECONDS)
 
     @property
     def _has_lost_scheduler(self) -> bool:
-        return self._scheduler[2] > self._patience_seconds
+        return self._scheduler.seconds > self._patience_seconds
 
-    def _look_out(self) -> None:
-        before = time.monotonic()
-        while not self._has_lost_scheduler and not self._ended.wait(_POLL_SECONDS):
-            now = time.monotonic()
+    def _look_out(self) -> bool:
+        """Find the obstacle, and return whether the scheduler may still answer."""
+        before, self._looked = self._looked, time.monotonic()
+        try:
             # More has passed only if this process was stopped too.
-            elapsed, before = min(now - before, 2 * _POLL_SECONDS), now
-            try:
-                obstacle = self._look(elapsed)
-            except Exception as error:  # a cluster that is closing does not answer, but the run is alive
-                _log.debug("the cluster could not be asked: %r", error)
-                continue
-            if obstacle != self.obstacle and obstacle:
-                _log.warning("%s", obstacle)
-            self.obstacle = obstacle
+            obstacle = self._look(min(self._looked - before, 2 * _POLL_SECONDS))
+        except Exception as error:  # a cluster that is closing does not answer, but the run is alive
+            _log.debug("the cluster could not be asked: %r", error)
+            return True
+        if obstacle != self.obstacle and obstacle:
+            _log.warning("%s", obstacle)
+        self.obstacle = obstacle
+        return not self._has_lost_scheduler
 
     def _look(self, elapsed: float) -> str:
         try:
             workers = self._ask("identity", n_workers=-1)["workers"]
         except TimeoutError:
-            self._scheduler = _silence(None, self._scheduler, elapsed)
+            self._scheduler = self._scheduler.after(elapsed)
             if self._has_lost_scheduler:
                 # What waits for its answer wakes up, as if it had ended.
                 self._client.loop.add_callback(self._hang_up)
-            return self._silent_scheduler() if self._scheduler[2] > _TELL_AFTER_SECONDS else ""
-        self._scheduler = _silence(None)
+            return self._silent_scheduler() if self._scheduler.seconds > _TELL_AFTER_SECONDS else ""
+        self._scheduler = Silence()
         self._workers = {
-            address: _silence(worker["last_seen"], self._workers.get(address), elapsed)
+            address: self._workers.get(address, Silence()).after(elapsed, worker["last_seen"])
             for address, worker in workers.items()
         }
-        silent = {name: since for name, (_, since, seconds) in self._workers.items() if seconds > _TELL_AFTER_SECONDS}
+        silent = {name: one.since for name, one in self._workers.items() if one.seconds > _TELL_AFTER_SECONDS}
         if silent:
             return self._silent_workers(silent)
         if not workers:
@@ -128,10 +160,10 @@ class Watch:
         return f"{'; '.join(told)}. Dask gives up whoever stays silent (worker-ttl), and others get the tasks"
 
     def _silent_scheduler(self) -> str:
-        return f"the scheduler at {self._address} has said nothing since {self._scheduler[1]}"
+        return f"the scheduler at {self.address} has said nothing since {self._scheduler.since}"
 
     def _hang_up(self) -> None:
-        self._client.rpc.remove(self._address)
+        self._client.rpc.remove(self.address)
         self._client.scheduler_comm.comm.abort()
 
     def _ask(self, operation: str, **arguments: Any) -> Any:
@@ -141,11 +173,65 @@ class Watch:
         )
 
 
-def _silence(heard: object, before: _Silence | None = None, elapsed: float = 0.0) -> _Silence:
-    """Return the silence of a process after some time; it ends if the process was heard of since."""
-    if before is not None and before[0] == heard:
-        return heard, before[1], before[2] + elapsed
-    return heard, f"{datetime.now(UTC):%H:%M:%S} UTC", 0.0
+class Heartbeat:
+    """The record in a store that says where a run goes on, and how it ended.
+
+    Attributes:
+        stage: What the run does, for people.
+        watch: The watch over its cluster, once there is one.
+    """
+
+    def __init__(self, store: Store, lock: Lock, watch: Watch | None = None) -> None:
+        self.stage, self.watch = "", watch
+        # Another driver of the same run may take its lock over, as when this one's worker was retired.
+        self._records = Records(store.fenced(lock.require))
+        self._lost: LockError | None = None
+        self._writing = threading.Lock()
+        self._started = utc_now()
+
+    @contextmanager
+    def kept(self) -> Iterator[Self]:
+        """Renew the record while the run goes on, and write how it ended; LockError if it has lost its store."""
+        self.write("running")
+        try:
+            with _repeated(self._beat, HEARTBEAT_SECONDS, "heartbeat"):
+                yield self
+        except BaseException as error:
+            is_interrupted = isinstance(error, KeyboardInterrupt | SystemExit)
+            try:
+                self.write("failed", "interrupted" if is_interrupted else one_line(error))
+            except LockError:
+                pass  # the end of the run that has the store now counts
+            except StoreError as failure:
+                # It may be what ended the run, and must not hide that.
+                _log.warning("how the run ended could not be written: %s", failure)
+            raise
+        self.write("done")
+
+    def paused(self) -> AbstractContextManager[object]:
+        """Return a context in which nothing is written."""
+        return self._writing
+
+    def advance(self, stage: str) -> None:
+        """Take down what the run does now; LockError if it had lost its store at the latest beat."""
+        if self._lost is not None:
+            raise self._lost
+        self.stage = stage
+
+    def write(self, state: RunState, error: str = "") -> None:
+        """Replace the record."""
+        driver = f"{this_process()}, cluster {self.watch.address}" if self.watch else this_process()
+        self._records.write_run(RunRecord(state, driver, self._started, utc_now(), self.stage, error))
+
+    def _beat(self) -> bool:
+        try:
+            with self._writing:
+                self.write("running", self.watch.obstacle if self.watch else "")
+        except LockError as error:
+            self._lost = error
+        except Exception as error:  # the store may answer again at the next beat
+            _log.warning("the run's record could not be written: %s", error)
+        return self._lost is None
 
 
 def _label_of(key: object) -> str:

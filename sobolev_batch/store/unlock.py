@@ -1,0 +1,73 @@
+"""Unlocking a store whose run is gone, as far as its record tells."""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from pathlib import Path
+
+from sobolev_batch.errors import LockError, StoreError
+from sobolev_batch.store.layout import Store
+from sobolev_batch.store.location import Location
+from sobolev_batch.store.lock import Lock, age_seconds, break_lock
+from sobolev_batch.store.records import Records
+
+# A run counts as lost if its record was not renewed for this time.
+LOST_AFTER_SECONDS = 60.0
+
+
+def unlock(store: str | Path | Location, *, force: bool = False) -> Lock | None:
+    """Remove the lock of a run that cannot do so itself, because it or its machine was killed.
+
+    A run that is still going on notices within seconds, and ends.
+
+    Args:
+        store: Path or URL of the store.
+        force: Whether to also remove the lock of a run that was alive a moment ago.
+
+    Returns:
+        The lock, or None if the store had none. Its `driver` names the process that held it since the UTC time `since`.
+
+    Raises:
+        LockError: The run was alive a moment ago.
+        StoreError: There is no store, or it cannot be read or written; or it is that of a collection, whose objects
+            have locks of their own.
+
+    >>> import sobolev_batch as sb
+    >>> sb.unlock("memory://new.zarr")
+    Traceback (most recent call last):
+        ...
+    sobolev_batch.errors.StoreError: memory://new.zarr: it holds no store of a study
+    """
+    location = Location.parse(store)
+    lock = Lock.read(location)
+    if lock is None:
+        Store.open(location)
+        return None
+    if not force and lock.holder_is_alive:
+        raise LockError(f"{location}: {lock.driver} is alive; stop it, or unlock the store all the same by --force")
+    silence = math.inf if force or lock.holder_is_gone else _silence_seconds(location, lock)
+    if silence < -LOST_AFTER_SECONDS:
+        raise LockError(
+            f"{location}: the last sign of life of {lock.driver} is {-silence:.0f} s ahead of the clock here, so its "
+            "age is unknown; stop it, or if it is gone, unlock the store by --force"
+        )
+    if silence < LOST_AFTER_SECONDS:
+        raise LockError(
+            f"{location}: {lock.driver} was alive {max(silence, 0):.0f} s ago; stop it, or wait until it has been "
+            f"silent for {LOST_AFTER_SECONDS:.0f} s; --force unlocks the store all the same"
+        )
+    break_lock(location)
+    return lock
+
+
+def _silence_seconds(location: Location, lock: Lock) -> float:
+    """Return the time since the latest heartbeat of a lock's holder."""
+    moments = [lock.since] if lock.run else []
+    # If the store cannot be read, only the lock itself is known.
+    with suppress(StoreError):
+        store = Store(location)
+        run = Records(store).read_run() if store.exists() else None
+        if run is not None and run.driver.startswith(lock.driver):
+            moments.append(run.seen)
+    return min(map(age_seconds, moments), default=math.inf)
