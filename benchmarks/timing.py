@@ -14,7 +14,7 @@ from pathlib import Path
 from statistics import median
 from typing import TypeVar
 
-from sobolev_batch.parameters import available_cores
+from sobolev_batch.machine import available_cores
 
 Given = TypeVar("Given")
 

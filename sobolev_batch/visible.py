@@ -1,4 +1,4 @@
-"""Text as it is shown, also in HTML: characters that a terminal or page would obey, or hide, are replaced by escapes.
+"""Text as it is shown: characters that a terminal or page would obey, or hide, are replaced by escapes.
 
 Names of files and messages of other programs may hold any characters. Data keep them as they are; whatever is shown
 to people passes through here.
@@ -10,8 +10,6 @@ import logging
 import re
 import sys
 import warnings
-from collections.abc import Iterable, Mapping
-from html import escape
 from traceback import format_exception
 from typing import Any, TextIO
 
@@ -19,10 +17,6 @@ from typing import Any, TextIO
 HAZARDOUS = re.compile("[\0-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u206f\ud800-\udfff]")
 # The unit of length of files where it has no name.
 FILE_UNITS = "file units"
-# More rows of one kind, or at either end of a text in a notebook, would hide the others.
-_MOST_ALIKE = 20
-# Notebooks align the cells of tables to the right and keep them short.
-_CELL_STYLE = 'style="text-align: left; vertical-align: top; white-space: pre-wrap"'
 
 
 def visible(text: str) -> str:
@@ -69,34 +63,3 @@ def _show_warning(
 ) -> None:
     text = warnings.formatwarning(visible(str(message)), category, filename, lineno, line)
     (file or sys.stderr).write(visible_lines(text))
-
-
-def table_html(caption: str, rows: Iterable[tuple[str, str]]) -> str:
-    """Return rows of names and texts as an HTML table; an empty name goes on with the row before."""
-    cells = "".join(
-        f"<tr><th {_CELL_STYLE}>{_escaped(name)}</th><td {_CELL_STYLE}>{_escaped(text)}</td></tr>"
-        for name, text in rows
-    )
-    return f"<div><strong>{_escaped(caption)}</strong><table>{cells}</table></div>"
-
-
-class Shown:
-    """A value that notebooks show as ``print`` does, its first line above the others."""
-
-    def _repr_html_(self) -> str:
-        caption, *lines = str(self).splitlines()
-        if len(lines) > 2 * _MOST_ALIKE + 1:
-            lines[_MOST_ALIKE:-_MOST_ALIKE] = [f"and {len(lines) - 2 * _MOST_ALIKE:,} more"]
-        return table_html(caption, [("", line) for line in lines])
-
-
-def reasons(name: str, by_label: Mapping[str, str]) -> Iterable[tuple[str, str]]:
-    """Yield rows of what happened to surfaces: label and reason of each, up to some."""
-    for label, reason in list(by_label.items())[:_MOST_ALIKE]:
-        yield name, f"{label}: {reason}"
-    if len(by_label) > _MOST_ALIKE:
-        yield name, f"and {len(by_label) - _MOST_ALIKE:,} more"
-
-
-def _escaped(text: str) -> str:
-    return escape(visible(text))

@@ -25,7 +25,7 @@ from sobolev_batch.cli.output import overwrite, progress_bar
 from sobolev_batch.sources import files
 from sobolev_batch.tables import FORMATS
 from sobolev_batch.tables.text import machine_table, printed_table, prose
-from sobolev_batch.visible import VisibleRecord, table_html, visible, visible_lines
+from sobolev_batch.visible import VisibleRecord, visible, visible_lines
 from tests.support.commands import COMMAND, call
 
 pytestmark = pytest.mark.process
@@ -197,7 +197,6 @@ def test_pages_and_pictures_of_hostile_labels(folder: Path, foreign: str) -> Non
         # It could not be read with control characters.
         ElementTree.parse(folder / picture)
         assert not harmful((folder / picture).read_text(encoding="utf-8"))
-    assert table_html(f"a {HOSTILE}", [(HOSTILE, f"b {HOSTILE}")]).count(SHOWN) == 3
 
 
 def test_cells_are_neither_formulas_nor_markup_nor_commands() -> None:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import doctest
+from collections.abc import Iterator
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from distributed import Client
@@ -32,9 +35,20 @@ BESIDE_A_STORE = tuple(
 WITH_CLUSTER = f"{PACKAGE.name}.batch.run"
 
 
+def examples(module: ModuleType) -> Iterator[doctest.DocTest]:
+    """Yield the examples of a module, also those of cached properties, which doctest does not look at."""
+    finder = doctest.DocTestFinder(exclude_empty=True)
+    yield from finder.find(module)
+    for name, kind in vars(module).items():
+        if isinstance(kind, type) and kind.__module__ == module.__name__:
+            for attribute, value in vars(kind).items():
+                if isinstance(value, cached_property):
+                    yield from finder.find(value.func, f"{name}.{attribute}", globs=vars(module).copy())
+
+
 def run(name: str) -> None:
     runner = doctest.DocTestRunner(optionflags=FLAGS)
-    for test in doctest.DocTestFinder(exclude_empty=True).find(import_module(name)):
+    for test in examples(import_module(name)):
         runner.run(test)
     assert runner.tries > 0
     assert runner.failures == 0

@@ -14,7 +14,7 @@ import pytest
 import sobolev_batch as sb
 from sobolev_batch.batch.cluster.clients import memory_limit
 from sobolev_batch.batch.cluster.workers import Workers, allowed_bytes
-from sobolev_batch.parameters import available_cores, machine_memory, require_machine_memory
+from sobolev_batch.machine import available_cores, machine_memory, require_machine_memory
 from sobolev_batch.transform.fourier import thread_count
 from tests.support.repository import public_names
 from tests.support.studies import small_table

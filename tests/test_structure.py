@@ -15,9 +15,11 @@ LAYERS = (
     *(
         "arrays",
         "visible",
+        "shown",
         "errors",
         "plugins",
         "parameters",
+        "machine",
         "compiled",
         "geometry",
         "sources",

@@ -14,9 +14,11 @@ from sobolev_batch.batch.cluster.workers import Workers, prepare_workers, worker
 from sobolev_batch.batch.field_stage import Sizes, size_rows
 from sobolev_batch.batch.start import StoreLike, require_permission, settled, warnings_of
 from sobolev_batch.geometry.surface import Similarity, placement_doubt
+from sobolev_batch.machine import available_cores
 from sobolev_batch.norms.fields import Quality
 from sobolev_batch.norms.tail.values import SurfaceSize
-from sobolev_batch.parameters import available_cores, format_bytes
+from sobolev_batch.parameters import format_bytes
+from sobolev_batch.shown import Shown, reasons
 from sobolev_batch.store.collection_store import for_each_object
 from sobolev_batch.store.layout import stored_choice
 from sobolev_batch.store.location import Location
@@ -29,7 +31,7 @@ from sobolev_batch.tables.pairs import PAIR_BYTES, tile_count
 from sobolev_batch.tables.text import beside, duration
 from sobolev_batch.transform.fourier import field_seconds, slowness
 from sobolev_batch.transform.lattice import Lattice
-from sobolev_batch.visible import Shown, reasons, visible
+from sobolev_batch.visible import visible
 
 # Time to describe and record a surface, and that of each of its triangles.
 _ROW_SECONDS, _TRIANGLE_SECONDS = 0.1, 5e-6

@@ -22,9 +22,10 @@ from sobolev_batch.batch.start import StoreLike, ready_to_run
 from sobolev_batch.batch.table_stage import are_tabulated, tabulate_fields
 from sobolev_batch.batch.verify import damaged_rows
 from sobolev_batch.errors import DamageError, InputError, StoreError
+from sobolev_batch.machine import available_cores, require_machine_memory
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.norms.budget import NormEstimate
-from sobolev_batch.parameters import available_cores, require_machine_memory
+from sobolev_batch.shown import Shown, reasons
 from sobolev_batch.store.collection_store import CollectionStore, for_each_object, labelled
 from sobolev_batch.store.create import require_usable
 from sobolev_batch.store.location import Location
@@ -32,7 +33,7 @@ from sobolev_batch.store.lock import Lock, locked
 from sobolev_batch.store.records import Records
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.study import AnyStudy, Study, StudyCollection, StudyLike
-from sobolev_batch.visible import Shown, reasons, visible
+from sobolev_batch.visible import visible
 
 _log = logging.getLogger(__name__)
 

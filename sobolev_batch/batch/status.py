@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from sobolev_batch.errors import DamageError
+from sobolev_batch.shown import Shown
 from sobolev_batch.store.collection_store import CollectionStore, labelled
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
@@ -16,7 +17,7 @@ from sobolev_batch.store.unlock import LOST_AFTER_SECONDS
 from sobolev_batch.store.workspace import Contents
 from sobolev_batch.tables.open import AnyStore, location_of
 from sobolev_batch.tables.text import duration
-from sobolev_batch.visible import Shown, visible
+from sobolev_batch.visible import visible
 
 # A run that waits for a busy cluster, or plans on another machine, has no heartbeat. It counts as lost after this time.
 _PATIENCE_SECONDS = 600.0

@@ -10,7 +10,8 @@ from pathlib import Path
 
 from sobolev_batch.batch.cluster.execution import Cluster, Task
 from sobolev_batch.errors import DamageError, LockError, StoreError
-from sobolev_batch.parameters import available_cores
+from sobolev_batch.machine import available_cores
+from sobolev_batch.shown import Shown
 from sobolev_batch.store.collection_store import CollectionStore, labelled
 from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.store.layout import LABELS, PAIRS_KEYS, QUALITY, RECORDS, ROOT, SPECTRA_KEYS, Store
@@ -22,7 +23,7 @@ from sobolev_batch.store.stored_tables import damaged_tables
 from sobolev_batch.store.workspace import Contents, Workspace
 from sobolev_batch.tables.pairs import Pairs
 from sobolev_batch.tables.shells import spectrum_keys, stale_chunks
-from sobolev_batch.visible import Shown, visible
+from sobolev_batch.visible import visible
 
 _log = logging.getLogger(__name__)
 

@@ -17,12 +17,13 @@ from pathlib import Path, PurePosixPath
 from sobolev_batch.errors import MeshError, StudyError, written
 from sobolev_batch.geometry.formats.by_name import is_mesh_name, mesh_stem
 from sobolev_batch.geometry.formats.readers import expected_size, read_mesh
+from sobolev_batch.shown import Shown, reasons
 from sobolev_batch.sources.files import MOST_MESHES
 from sobolev_batch.sources.names import caseless_key, label_problem, name_problem, natural_key, quoted
 from sobolev_batch.study.schema import REFERENCE_LABEL, RESERVED
 from sobolev_batch.study.study import Study, StudyCollection
 from sobolev_batch.study.templates import METHOD, OBJECT
-from sobolev_batch.visible import Shown, reasons, visible
+from sobolev_batch.visible import visible
 
 # Bytes of files that are read as a whole; the header or the length of others gives their size.
 _MOST_BYTES = 32 << 20

@@ -200,8 +200,8 @@ class Mesh:
         inconsistent edges.
 
         >>> import sobolev_batch as sb
-        >>> f"{sb.icosphere(5).volume:.3f}"
-        '4.184'
+        >>> f"{sb.shapes.icosphere(5).volume:.3f}"
+        '4.187'
         """
         if any(self.counts[f"{kind}_edges"] for kind in ("boundary", "nonmanifold", "inconsistent")):
             return np.nan

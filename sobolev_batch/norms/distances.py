@@ -21,6 +21,7 @@ from sobolev_batch.geometry.closed_forms import Sphere
 from sobolev_batch.geometry.formats.readers import MeshLike, as_mesh, as_surface
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import DIRECTIONS, Extent
+from sobolev_batch.machine import available, available_cores
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.accuracy.frequencies import Frequencies, Reference
 from sobolev_batch.norms.accuracy.problem import Problem, Solution, SurfaceValues, are_equal, support_of
@@ -37,7 +38,7 @@ from sobolev_batch.norms.fields import (
     shells_against,
     shells_of,
 )
-from sobolev_batch.parameters import available, available_cores, check_seed
+from sobolev_batch.parameters import check_seed
 from sobolev_batch.sources.generated import decimated, with_noise
 from sobolev_batch.transform.exact import sphere_distance, sphere_inner_product, sphere_norm
 from sobolev_batch.transform.fourier import ErrorTarget, Execution

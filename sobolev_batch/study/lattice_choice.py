@@ -19,13 +19,13 @@ import numpy as np
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import AccuracyError, MeshError, StudyError, one_line
 from sobolev_batch.geometry.surface import Extent, Similarity, Surface
+from sobolev_batch.machine import available_cores
 from sobolev_batch.norms.accuracy.octaves import solve_in_octaves
 from sobolev_batch.norms.accuracy.problem import ESTIMATE_CAUTION, Problem, error_target
 from sobolev_batch.norms.accuracy.solve import coarser_than, permits_octaves, prefers_octaves, run_pilot
 from sobolev_batch.norms.accuracy.tolerance import FINER_LATTICE, Accuracy, core_lattice, good_intervals, lattice_of
 from sobolev_batch.norms.budget import NormEstimate, Support
 from sobolev_batch.norms.tail.sampling import FaceNormals, OctaveSampling, TailSampling
-from sobolev_batch.parameters import available_cores
 from sobolev_batch.sources.registry import Member
 from sobolev_batch.study.schema import MOST_OCTAVES
 from sobolev_batch.study.study import Members, Study

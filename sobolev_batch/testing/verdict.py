@@ -10,14 +10,15 @@ from typing import Literal
 from sobolev_batch.errors import InputError, SobolevBatchError, one_line
 from sobolev_batch.geometry.formats.readers import SurfaceLike, as_surface
 from sobolev_batch.geometry.surface import Similarity, is_finite_number, placement_doubt
+from sobolev_batch.machine import available, available_cores
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.accuracy.threshold import Method, relative_distance
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
-from sobolev_batch.parameters import available, available_cores, check_seed
+from sobolev_batch.parameters import check_seed
+from sobolev_batch.shown import Shown
 from sobolev_batch.tables.text import rounded_outwards, with_error
 from sobolev_batch.testing.difference import write_difference
 from sobolev_batch.transform.lattice import single_order
-from sobolev_batch.visible import table_html
 
 Outcome = Literal["same", "different", "undecided"]
 
@@ -31,7 +32,7 @@ _ANY_RTOL = 1e-2
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Verdict(Shown):
     """Answer to whether two surfaces are the same, to a tolerance. It is true if they are the same.
 
     Attributes:
@@ -75,9 +76,6 @@ class Verdict:
     def __bool__(self) -> bool:
         """Tell whether the surfaces are the same."""
         return self.outcome == "same"
-
-    def _repr_html_(self) -> str:
-        return table_html(f"Verdict: {self.outcome}", [("", str(self))])
 
     def __str__(self) -> str:
         """Return the verdict in one line."""

@@ -21,7 +21,8 @@ from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.errors import InputError, LatticeError, one_line
 from sobolev_batch.geometry.subdivision import icosphere
 from sobolev_batch.geometry.surface import Similarity, Surface
-from sobolev_batch.parameters import available_cores, is_whole_number
+from sobolev_batch.machine import available_cores
+from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.transform.backends import (
     CPU,
     CPU_COSTS,

@@ -24,7 +24,8 @@ from distributed.comm.addressing import get_address_host_port, parse_address
 
 from sobolev_batch.batch.cluster import workers as workers_module
 from sobolev_batch.errors import ClusterError, InputError, one_line
-from sobolev_batch.parameters import available_cores, byte_count, format_bytes, machine_memory, require_machine_memory
+from sobolev_batch.machine import available_cores, machine_memory, require_machine_memory
+from sobolev_batch.parameters import byte_count, format_bytes
 
 # In less, a worker with all its libraries has no memory left for any transform.
 _LEAST_BYTES = 700_000_000

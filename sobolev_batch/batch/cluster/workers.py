@@ -24,8 +24,9 @@ from distributed import Client, Worker, WorkerPlugin, get_worker
 from distributed.core import Status
 
 from sobolev_batch.errors import BackendError, ClusterError, InputError, StoreError
+from sobolev_batch.machine import machine_memory
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
-from sobolev_batch.parameters import format_bytes, machine_memory
+from sobolev_batch.parameters import format_bytes
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock
 from sobolev_batch.store.metadata import SCHEMA_VERSION

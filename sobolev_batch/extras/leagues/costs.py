@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
+from sobolev_batch.shown import ShownTables
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.open import EDGE_LENGTH, sizes_of
 from sobolev_batch.tables.text import Column, column_table, machine_table, percent, prose, section, wrapped
@@ -36,7 +37,7 @@ METHOD_COLUMNS = (
 
 
 @dataclass(frozen=True, eq=False)
-class CostLeague:
+class CostLeague(ShownTables):
     """The meshes of a study or collection by distance and cost, at one order. Make it by `league` with ``by="cost"``.
 
     Attributes:
@@ -124,10 +125,10 @@ class CostLeague:
         means = self.means[self.means["front"]]
         return means.assign(member=means["method"] + "/" + means["member"], objects=len(self.objects))
 
-    def _repr_html_(self) -> str:
-        # pandas escapes the names.
-        tables = "".join(frame.to_html(index=False, float_format="{:.3g}".format) for frame in (self.table, self.means))
-        return f"<div><strong>{self.caption}</strong>{tables}</div>"
+    @property
+    def _tables(self) -> tuple[pd.DataFrame, ...]:
+        """`table` and `means`, which notebooks show."""
+        return self.table, self.means
 
 
 def cost_leagues_of(

@@ -26,6 +26,7 @@ from sobolev_batch.extras.leagues.statistics import (
     within_objects,
 )
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
+from sobolev_batch.shown import ShownTables
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.store.collection_store import CollectionStore
 from sobolev_batch.store.location import Location
@@ -100,7 +101,7 @@ _CHANGE_COLUMNS = (
 
 
 @dataclass(frozen=True, eq=False)
-class League:
+class League(ShownTables):
     """The methods of a collection, compared over its objects at one order. Make it by `league`.
 
     Attributes:
@@ -193,11 +194,10 @@ class League:
         frame["nearer"] = np.where(frame["p"] < SIGNIFICANCE, nearer, "")
         return frame
 
-    def _repr_html_(self) -> str:
-        frames = [self.table, *([self.pairs] if len(self.pairs) else [])]
-        # pandas escapes the names of methods.
-        tables = "".join(frame.to_html(index=False, float_format="{:.3g}".format) for frame in frames)
-        return f"<div><strong>{self.caption}</strong>{tables}</div>"
+    @property
+    def _tables(self) -> tuple[pd.DataFrame, ...]:
+        """`table` and `pairs`, which notebooks show."""
+        return self.table, self.pairs
 
 
 def _objects(count: int) -> str:

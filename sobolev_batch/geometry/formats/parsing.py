@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Indices
 from sobolev_batch.errors import MeshError
-from sobolev_batch.parameters import format_bytes, machine_memory
+from sobolev_batch.machine import machine_memory
+from sobolev_batch.parameters import format_bytes
 
 # What a parser makes of a file: vertices (n, 3) and triangles (m, 3).
 Raw = tuple[NDArray[Any], NDArray[Any]]

@@ -17,7 +17,7 @@ from sobolev_batch.batch.cluster.clients import local_client, remote_client
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.cluster.workers import MEMORY, prepare_workers, require_same_versions
 from sobolev_batch.errors import ClusterError, InputError
-from sobolev_batch.parameters import machine_memory
+from sobolev_batch.machine import machine_memory
 from sobolev_batch.shapes import icosphere
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.records import Records

@@ -1,0 +1,60 @@
+"""What notebooks show of a value: its text, or its tables, as HTML in which nothing is markup but our own."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from typing import TYPE_CHECKING
+
+from sobolev_batch.visible import visible
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+# More rows of one kind, or at either end of a text in a notebook, would hide the others.
+_MOST_ALIKE = 20
+# Notebooks align the cells of tables to the right and keep them short.
+_CELL_STYLE = 'style="text-align: left; vertical-align: top; white-space: pre-wrap"'
+
+
+class Shown:
+    """A value that notebooks show as ``print`` does, its first line above the others."""
+
+    def _repr_html_(self) -> str:
+        caption, *lines = str(self).splitlines()
+        if len(lines) > 2 * _MOST_ALIKE + 1:
+            lines[_MOST_ALIKE:-_MOST_ALIKE] = [f"and {len(lines) - 2 * _MOST_ALIKE:,} more"]
+        rows = "".join(f"<tr><td {_CELL_STYLE}>{escape(visible(line))}</td></tr>" for line in lines)
+        return _below(caption, f"<table>{rows}</table>")
+
+
+class ShownTables(ABC):
+    """A value that notebooks show as tables below a caption."""
+
+    @property
+    @abstractmethod
+    def caption(self) -> str:
+        """What the tables hold."""
+
+    @property
+    @abstractmethod
+    def _tables(self) -> Sequence[pd.DataFrame]:
+        """The tables."""
+
+    def _repr_html_(self) -> str:
+        # pandas escapes names.
+        tables = (table.to_html(index=False, float_format="{:.3g}".format) for table in self._tables if len(table))
+        return _below(self.caption, "".join(tables))
+
+
+def reasons(name: str, by_label: Mapping[str, str]) -> Iterable[tuple[str, str]]:
+    """Yield rows of what happened to surfaces: label and reason of each, up to some."""
+    for label, reason in list(by_label.items())[:_MOST_ALIKE]:
+        yield name, f"{label}: {reason}"
+    if len(by_label) > _MOST_ALIKE:
+        yield name, f"and {len(by_label) - _MOST_ALIKE:,} more"
+
+
+def _below(caption: str, content: str) -> str:
+    return f"<div><strong>{escape(visible(caption))}</strong>{content}</div>"
