@@ -40,9 +40,9 @@ from sobolev_batch.norms.fields import (
 )
 from sobolev_batch.parameters import check_seed
 from sobolev_batch.sources.generated import decimated, with_noise
-from sobolev_batch.transform.exact import sphere_distance, sphere_inner_product, sphere_norm
 from sobolev_batch.transform.fourier import ErrorTarget, Execution
 from sobolev_batch.transform.lattice import Lattice, Orders, SobolevWeights, check_orders
+from sobolev_batch.transform.spheres import sphere_distance, sphere_inner_product, sphere_norm
 
 # Relative accuracy of the closed forms of spheres.
 _CLOSED_FORM_ACCURACY = 1e-13

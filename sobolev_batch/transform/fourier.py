@@ -39,7 +39,7 @@ from sobolev_batch.transform.backends import (
 from sobolev_batch.transform.kinds import SurfaceKind, kind_of
 from sobolev_batch.transform.lattice import Block, FrequencyLattice, Lattice
 from sobolev_batch.transform.nufft import transform_points
-from sobolev_batch.transform.quadrature import weight_masses
+from sobolev_batch.transform.rule_errors import weight_masses
 from sobolev_batch.transform.rules import fixed_rule
 
 DEFAULT_EPS: dict[ComplexDtype, float] = {"complex128": 1e-9, "complex64": 1e-6}

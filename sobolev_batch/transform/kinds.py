@@ -23,9 +23,11 @@ from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.smooth import MOST_GAUSS_NODES, MOST_NODES, Counts, Smooth, doubled
 from sobolev_batch.geometry.surface import DIRECTIONS
 from sobolev_batch.transform.backends import CPU, Backend, cosine_and_sine
-from sobolev_batch.transform.exact import exact_transform, sampled_transform, sphere_block, sphere_transform
+from sobolev_batch.transform.exact import exact_transform, sampled_transform
 from sobolev_batch.transform.lattice import Block, FrequencyLattice
-from sobolev_batch.transform.quadrature import RuleUse, WeightedPoints, assign_rules, loosest_tolerance, weight_masses
+from sobolev_batch.transform.quadrature import RuleUse, WeightedPoints, assign_rules
+from sobolev_batch.transform.rule_errors import loosest_tolerance, weight_masses
+from sobolev_batch.transform.spheres import sphere_block, sphere_transform
 
 # Less is rounding: of the transform, and of derivatives that come from an interpolant.
 FINEST_CHANGE = 1e-13

@@ -1,12 +1,9 @@
-"""Triangle meshes as weighted points: the rule of each triangle, its points, and the error to be expected."""
+"""Triangle meshes as weighted points: the rule of each triangle, and its points."""
 
 from __future__ import annotations
 
-import math
-from bisect import bisect_left
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,16 +11,8 @@ from numpy.typing import NDArray
 from sobolev_batch.arrays import Array, Indices, Reals
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.transform.backends import Backend, combine, sums_at, sums_of_runs
-from sobolev_batch.transform.coherence import RANGES, coherence, unpaired
-from sobolev_batch.transform.lattice import FrequencyLattice
-from sobolev_batch.transform.rules import (
-    FINEST_TOLERANCE,
-    TriangleRule,
-    choose_rules,
-    fixed_rule,
-    rule_ranges,
-    typical_errors,
-)
+from sobolev_batch.transform.rule_errors import shares_vertices, tolerance_for
+from sobolev_batch.transform.rules import TriangleRule, choose_rules, fixed_rule, rule_ranges
 
 _Corners = tuple[Array, Array, Array]
 # Vertices (n, 3), triangles (m, 3) and areas (m,) of a mesh, as arrays of a backend.
@@ -129,8 +118,8 @@ def assign_rules(
     fixed = fixed_rule(quadrature)
     if fixed is not None:
         return (RuleUse(fixed, 0, np.arange(len(mesh.triangles), dtype=np.uint32)),)
-    tolerance = _tolerance_for(mesh, highest_frequency, eps) if tolerance is None else tolerance
-    rules, ranges = rule_ranges(tolerance, _shares_vertices(mesh))
+    tolerance = tolerance_for(mesh, highest_frequency, eps) if tolerance is None else tolerance
+    rules, ranges = rule_ranges(tolerance, shares_vertices(mesh))
     sizes = mesh.centroid_radii
     # Meshes have tens of millions of triangles: temporaries are small, and four bytes for each are kept.
     keys = np.empty(len(sizes), dtype=np.uint16)
@@ -141,11 +130,6 @@ def assign_rules(
         RuleUse(rules[key % len(rules)], key // len(rules), np.flatnonzero(keys == key).astype(np.uint32))
         for key in np.flatnonzero(np.bincount(keys)).tolist()
     )
-
-
-def _shares_vertices(mesh: Mesh) -> bool:
-    """Tell whether triangles share vertices, as those of a surface do, and not each have their own as in a soup."""
-    return len(mesh.used_vertices) <= len(mesh.triangles)
 
 
 def _rule_numbers(sizes: Reals, ranges: Reals) -> Indices:
@@ -229,152 +213,3 @@ def merged_edges(corners: Array, areas: Array, vertex_count: int) -> tuple[Array
     firsts = ordered[starts]
     ends = np.stack([firsts >> bits, firsts & ((1 << bits) - 1)])
     return ends if used is None else used[ends], sums_of_runs(sums, starts)
-
-
-# Fraction of the odd errors that was seen to remain between neighbouring triangles.
-_ODD_REMAINDER = 0.2
-_BINS = 48
-_LOOSEST_TOLERANCE = 0.1
-_STEPS_PER_DECADE = 4
-# The typical error of a frequency for a largest one, and the phases (radians) at which triangles may repeat.
-_TYPICAL_OF_LARGEST, _RESONANCE = 0.3, 2.0
-
-
-def loosest_tolerance(mesh: Mesh, lattice: FrequencyLattice, orders: Sequence[float], norms: Reals) -> float:
-    """Return the largest tolerance of triangle rules whose error is predicted to have at most some norms (orders,).
-
-    On fine meshes the prediction was measured to be one to ten times the true error, on coarse ones down to a fifth.
-    """
-    classes, shared = size_classes(mesh), _shares_vertices(mesh)
-    return _loosest(
-        FINEST_TOLERANCE,
-        lambda tolerance: bool(np.all(quadrature_error(classes, lattice, orders, tolerance, shared) <= norms)),
-    )
-
-
-def _tolerance_for(mesh: Mesh, highest_frequency: float, eps: float) -> float:
-    """Return the largest tolerance of triangle rules with a predicted error of eps · area at most up to a frequency.
-
-    It is eps at least. The errors of triangles that are small beside the wavelength cancel, unless pieces of the mesh
-    repeat. Of icospheres, scans and random triangles the largest error was measured to be at most 0.8 eps, of arrays of
-    boxes, tetrahedra and spheres 0.6, and of two layers of opposite triangles 1.5.
-    """
-    classes, shared = size_classes(mesh), _shares_vertices(mesh)
-    radii, alike = highest_frequency * (np.arange(RANGES) + 1) / RANGES, unpaired(mesh) ** 2
-    allowed = (_TYPICAL_OF_LARGEST * eps * float(classes[2].sum())) ** 2
-    mean, none, whole = _mean_coherence(radii, classes), np.zeros(RANGES), np.ones(RANGES)
-
-    @cache
-    def parts(tolerance: float) -> _ErrorParts:
-        return _error_parts(classes, highest_frequency, radii, tolerance, shared, _RESONANCE)
-
-    def suffices(tolerance: float, found: Reals) -> bool:
-        energies = parts(tolerance).energies(np.maximum(found, mean), np.maximum(found, alike))
-        return bool(energies.max() <= allowed)
-
-    tolerance = _loosest(eps, partial(suffices, found=none))
-    # Most coarse meshes keep eps even if all errors were in phase.
-    if tolerance == eps or suffices(tolerance, whole):
-        return tolerance
-    return _loosest(eps, partial(suffices, found=coherence(mesh, highest_frequency)))
-
-
-def _loosest(finest: float, suffices: Callable[[float], bool]) -> float:
-    """Return the largest tolerance that suffices, in steps from the finest one, which is taken where none does."""
-    decades = max(0.0, math.log10(_LOOSEST_TOLERANCE / finest))
-    tolerances = (finest * 10 ** np.linspace(decades, 0, round(decades * _STEPS_PER_DECADE) + 1)).tolist()
-    return float(tolerances[bisect_left(tolerances[:-1], True, key=suffices)])
-
-
-def size_classes(mesh: Mesh) -> Reals:
-    """Return the triangles of a mesh in classes of similar size, (4, classes).
-
-    The rows are the least and the greatest centroid radius of each class, in units of length, and the sums of the
-    areas and of the squared areas in it.
-    """
-    radii, areas = mesh.centroid_radii, mesh.areas
-    largest = float(radii.max())
-    smallest = max(float(radii.min()), 1e-6 * largest)
-    count = max(1, min(_BINS, math.ceil(8 * math.log(largest / smallest))))
-    edges = np.geomspace(smallest, largest, count + 1)
-    if count == 1:
-        return np.array([[edges[0]], [edges[1]], [areas.sum()], [np.square(areas).sum()]])
-    classes = np.searchsorted(edges[1:-1], radii)
-    return np.stack(
-        [edges[:-1], edges[1:], *(np.bincount(classes, values, count) for values in (areas, areas * areas))]
-    )
-
-
-def quadrature_error(
-    classes: Reals, lattice: FrequencyLattice, orders: Sequence[float], tolerance: float, shared: bool
-) -> Reals:
-    """Predict the norm of the quadrature's part of a field's error (orders,), from the `size_classes` of a mesh."""
-    radii = _radii(lattice)
-    parts = _error_parts(classes, lattice.highest_frequency, radii, tolerance, shared)
-    energies = parts.energies(_mean_coherence(radii, classes), np.zeros(RANGES))
-    return np.asarray(np.sqrt(_radial_integrals(energies, radii, orders)))
-
-
-def _mean_coherence(radii: Reals, classes: Reals) -> Reals:
-    """Return the mean energy of a surface's transform on |ξ| = r over area² (n,): 1 near zero, and 1 / (2π r² area)."""
-    return np.asarray(np.minimum(1.0, 1 / (2 * np.pi * radii**2 * classes[2].sum())))
-
-
-@dataclass(frozen=True, eq=False)
-class _ErrorParts:
-    """Predicted squared errors of a mesh's points at frequencies |ξ| (n,) each.
-
-    Attributes:
-        even: The part of the even errors of triangles, if all were in phase.
-        odd: The same for the odd errors.
-        rest: The part that adds up like random numbers, or in any case.
-    """
-
-    even: Reals
-    odd: Reals
-    rest: Reals
-
-    def energies(self, even: Reals, odd: Reals) -> Reals:
-        """Return the squared errors (n,) where these fractions (n,) of what would be in phase add up."""
-        return np.asarray(self.even * even + self.odd * odd + self.rest)
-
-
-def _error_parts(
-    classes: Reals, highest_frequency: float, radii: Reals, tolerance: float, shared: bool, resonance: float = math.inf
-) -> _ErrorParts:
-    """Predict the squared error of a mesh's points at frequencies |ξ| (n,), from its `size_classes`.
-
-    The even parts of the triangles' errors add up like the surface's transform itself. The odd parts add up like random
-    numbers, but for those without an opposite one. Triangles that are larger than a phase may repeat with the
-    wavelength: there both parts add up.
-    """
-    smallest, largest, areas, squares = classes
-    rules, ranges = rule_ranges(tolerance, shared)
-    # The rule for the smallest of a class, applied to the largest of it: never less than the truth.
-    splits, choice = choose_rules(2 * np.pi * highest_frequency * smallest, ranges)
-    phases = 2 * np.pi * radii[:, None] * (largest / 2.0**splits)
-    even, odd = np.empty_like(phases), np.empty_like(phases)
-    for rule in np.unique(choice):
-        members = choice == rule
-        even[:, members], odd[:, members] = typical_errors(rules[rule], phases[:, members])
-    repeats = phases > resonance
-    rest = (np.where(repeats, even + odd, 0) @ areas) ** 2
-    rest += (even**2 + (_ODD_REMAINDER * odd) ** 2) @ (squares / 4.0**splits)
-    return _ErrorParts((np.where(repeats, 0, even) @ areas) ** 2, (odd @ areas) ** 2, rest)
-
-
-def _radii(lattice: FrequencyLattice) -> Reals:
-    low, high = lattice.radial_range
-    radii: Reals = low + (np.arange(RANGES) + 0.5) / RANGES * (high - low)
-    return radii
-
-
-def weight_masses(lattice: FrequencyLattice, orders: Sequence[float]) -> Reals:
-    """Return ∫ (1+|ξ|²)^s over the range of a lattice (orders,)."""
-    return _radial_integrals(np.ones(RANGES), _radii(lattice), orders)
-
-
-def _radial_integrals(energy: Reals, radii: Reals, orders: Sequence[float]) -> Reals:
-    """Return ∫ (1+r²)^s energy(r) 4πr² dr by the midpoint rule (orders,)."""
-    step = radii[1] - radii[0]
-    return np.array([np.sum((1 + radii**2) ** order * energy * 4 * np.pi * radii**2) * step for order in orders])

@@ -14,7 +14,7 @@ from distributed import Client
 
 import sobolev_batch as sb
 from sobolev_batch.store.layout import Store
-from sobolev_batch.transform.exact import sphere_inner_product
+from sobolev_batch.transform.spheres import sphere_inner_product
 from tests.support.stores import delete, flip, put_back, truncate
 from tests.support.studies import small_table, variable
 

@@ -12,8 +12,8 @@ import pytest
 
 from sobolev_batch import Lattice, Mesh, distance, fourier_transform, norm
 from sobolev_batch.shapes import Ellipsoid, Sphere, Torus, icosphere
-from sobolev_batch.transform.exact import sphere_block
 from sobolev_batch.transform.lattice import SobolevWeights, shell_sums
+from sobolev_batch.transform.spheres import sphere_block
 from tests.support.repository import ROOT
 
 FIGURE_1B = {

@@ -12,9 +12,9 @@ from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms.budget import NormEstimate, Sums, Support, truncated
 from sobolev_batch.norms.fields import Quality
 from sobolev_batch.shapes import Sphere, icosphere
-from sobolev_batch.transform.exact import sphere_distance, sphere_inner_product
 from sobolev_batch.transform.lattice import SobolevWeights
 from sobolev_batch.transform.probe import draw
+from sobolev_batch.transform.spheres import sphere_distance, sphere_inner_product
 from tests.support.shapes import CENTRED_BOX as BOX
 
 ORDERS = (-2.0, -3.0, -5.0, -10.0)

@@ -26,7 +26,7 @@ from sobolev_batch.store.layout import Store
 from sobolev_batch.store.records import Records
 from sobolev_batch.tables import store_accessor
 from sobolev_batch.tables.accessor import SobolevAccessor
-from sobolev_batch.transform.exact import sphere_inner_product, sphere_norm
+from sobolev_batch.transform.spheres import sphere_inner_product, sphere_norm
 from tests.support.studies import small_table, variable
 
 ORDERS = [-1.5, -7.0]

@@ -18,7 +18,7 @@ from sobolev_batch import Lattice, Mesh
 from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.geometry import mesh as meshes
 from sobolev_batch.shapes import icosphere
-from sobolev_batch.transform import coherence, exact, quadrature
+from sobolev_batch.transform import coherence, exact, rule_errors
 from sobolev_batch.transform.exact import exact_transform, sampled_transform
 from sobolev_batch.transform.fourier import TransformSettings, transform_block
 from tests.support.shapes import box
@@ -125,7 +125,7 @@ def test_loops_measure_meshes_to_the_last_digit(name: str) -> None:
 
     def measured() -> list[Reals]:
         fresh = Mesh.from_checked(mesh.vertices, mesh.triangles)
-        return [fresh.areas, fresh.centroid_radii, np.array(fresh.edge_length_range), quadrature.size_classes(fresh)]
+        return [fresh.areas, fresh.centroid_radii, np.array(fresh.edge_length_range), rule_errors.size_classes(fresh)]
 
     arrays, loops = both_ways(measured)
     assert all(map(np.array_equal, arrays, loops))

@@ -12,13 +12,8 @@ from sobolev_batch import Lattice, Mesh, norm
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import OrderError
 from sobolev_batch.shapes import Sphere, icosphere
-from sobolev_batch.transform.exact import (
-    exact_transform,
-    sampled_transform,
-    sphere_block,
-    sphere_inner_product,
-    sphere_transform,
-)
+from sobolev_batch.transform.exact import exact_transform, sampled_transform
+from sobolev_batch.transform.spheres import sphere_block, sphere_inner_product, sphere_transform
 from tests.support.shapes import box, tetrahedron
 
 

@@ -7,7 +7,7 @@ import pytest
 
 import sobolev_batch as sb
 from sobolev_batch.norms.accuracy.apart import product_apart
-from sobolev_batch.transform.exact import sphere_inner_product, sphere_norm
+from sobolev_batch.transform.spheres import sphere_inner_product, sphere_norm
 from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES
 
 ORDERS = [-0.75, -1.0, -2.0, -5.0]

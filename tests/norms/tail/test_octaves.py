@@ -22,9 +22,10 @@ from sobolev_batch.norms.tail.values import (
     statistical_errors,
 )
 from sobolev_batch.shapes import Sphere, Torus, icosphere
-from sobolev_batch.transform.exact import exact_transform, sphere_transform
+from sobolev_batch.transform.exact import exact_transform
 from sobolev_batch.transform.fourier import ErrorTarget
 from sobolev_batch.transform.lattice import smooth_step
+from sobolev_batch.transform.spheres import sphere_transform
 from tests.support.oracles import torus_value
 from tests.support.rectangles import Rectangles
 
