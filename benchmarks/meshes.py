@@ -10,8 +10,8 @@ import trimesh
 
 import sobolev_batch as sb
 from benchmarks.timing import Effort
+from sobolev_batch.sources.derived import decimated
 from sobolev_batch.sources.files import FileSource
-from sobolev_batch.sources.generated import decimated
 
 _CORTEX = "nilearn/datasets/data/fsaverage5/pial_left.gii.gz"
 

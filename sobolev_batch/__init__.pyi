@@ -18,11 +18,11 @@ from .extras.leagues.evolution import evolution as evolution
 from .extras.leagues.league import compare_studies as compare_studies
 from .extras.leagues.league import league as league
 from .extras.report.build import report as report
-from .geometry.formats.readers import as_mesh as as_mesh
-from .geometry.formats.readers import read_mesh as read_mesh
-from .geometry.formats.readers import write_mesh as write_mesh
-from .geometry.mesh import Mesh as Mesh
 from .geometry.deviation import largest_deviation as largest_deviation
+from .geometry.formats.conversion import as_mesh as as_mesh
+from .geometry.formats.readers import read_mesh as read_mesh
+from .geometry.formats.writing import write_mesh as write_mesh
+from .geometry.mesh import Mesh as Mesh
 from .geometry.proximity import proximity as proximity
 from .geometry.proximity import vertex_distances as vertex_distances
 from .norms.causes import spectrum as spectrum

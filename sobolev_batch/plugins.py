@@ -19,7 +19,7 @@ FEATURES = "sobolev_batch.features"
 _EXTRAS = "sobolev_batch.extras"
 _OF_EXTRAS = {
     SOURCES: {"fit": "fitting.families:FitSource", "refine": "fitting.families:RefineSource"},
-    FORMATS: {"read-only": "formats.read_only:FORMATS"},
+    FORMATS: {name: f"formats.{name}:FORMATS" for name in ("gltf", "gifti", "freesurfer", "vtk")},
     COMMANDS: {
         "fit": "commands:fit_command",
         "init": "commands:init_command",

@@ -21,8 +21,8 @@ from sobolev_batch.errors import DamageError
 from sobolev_batch.norms.budget import NormEstimate
 from sobolev_batch.norms.columns import describe
 from sobolev_batch.norms.fields import Quality
-from sobolev_batch.sources.mesh_cache import Cost
 from sobolev_batch.sources.names import natural_key
+from sobolev_batch.sources.programs import Cost
 from sobolev_batch.store.layout import DISTANCES, PAIRS_KEYS, QUALITY
 from sobolev_batch.store.records import Facts, Record
 from sobolev_batch.store.stored_tables import hide_tables, table_attributes, write_table

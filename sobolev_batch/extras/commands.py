@@ -125,7 +125,8 @@ def fit_command(
 
     from sobolev_batch.extras.fitting.fit import fit, refine
     from sobolev_batch.extras.fitting.objective import require_comparable
-    from sobolev_batch.geometry.formats.readers import read_mesh, require_writable, write_mesh
+    from sobolev_batch.geometry.formats.readers import read_mesh
+    from sobolev_batch.geometry.formats.writing import require_writable, write_mesh
     from sobolev_batch.geometry.mesh import Mesh
     from sobolev_batch.geometry.surface import Similarity
 

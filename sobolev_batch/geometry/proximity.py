@@ -7,7 +7,7 @@ import numpy as np
 from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.closest import Triangles, cross, dot
-from sobolev_batch.geometry.formats.readers import MeshLike, as_mesh
+from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import is_finite_number
 from sobolev_batch.parameters import check_seed, is_whole_number

@@ -13,7 +13,7 @@ from pydantic import TypeAdapter
 
 from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.errors import InputError, LatticeError
-from sobolev_batch.geometry.formats.readers import SurfaceLike, as_surface
+from sobolev_batch.geometry.formats.conversion import SurfaceLike, as_surface
 from sobolev_batch.geometry.surface import Extent, Surface
 from sobolev_batch.norms.tail.remainder import Remainder
 from sobolev_batch.transform.backends import ComplexDtype, backend_named

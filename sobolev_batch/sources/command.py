@@ -25,20 +25,13 @@ import pandas as pd
 from pydantic import BeforeValidator, ConfigDict, Field, PrivateAttr, model_validator
 
 from sobolev_batch.errors import MeshError, StudyError, one_line, refused_by_pydantic
-from sobolev_batch.geometry.formats.readers import as_mesh
+from sobolev_batch.geometry.formats.conversion import as_mesh
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.parameters import byte_count
 from sobolev_batch.sources.files import file_digest, number_as_text
-from sobolev_batch.sources.mesh_cache import (
-    INPUT,
-    OUTPUT,
-    PLACEHOLDER,
-    Cost,
-    Made,
-    MeshCache,
-    run_command,
-)
+from sobolev_batch.sources.mesh_cache import MeshCache
 from sobolev_batch.sources.names import label_problem, quoted
+from sobolev_batch.sources.programs import INPUT, OUTPUT, PLACEHOLDER, Cost, Made, run_command
 from sobolev_batch.sources.registry import (
     MOST_ENTRIES,
     ExpectedSize,

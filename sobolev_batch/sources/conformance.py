@@ -12,7 +12,7 @@ from unittest import mock
 
 from pydantic import ValidationError
 
-from sobolev_batch.geometry.formats.readers import SURFACE_KINDS
+from sobolev_batch.geometry.formats.conversion import SURFACE_KINDS
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.sources.names import duplicate_names, label_problem, quoted

@@ -26,8 +26,9 @@ from sobolev_batch.errors import MeshError, StudyError
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Surface, is_finite_number
 from sobolev_batch.plugins import SOURCES, registered
-from sobolev_batch.sources.mesh_cache import Cost, MeshCache
+from sobolev_batch.sources.mesh_cache import MeshCache
 from sobolev_batch.sources.names import quoted
+from sobolev_batch.sources.programs import Cost
 
 # Levels, or triangle counts of one mesh, that one source takes; and times.
 MOST_ENTRIES, _MOST_TIMES = 1000, 100_000
@@ -36,17 +37,17 @@ _HERE = "sobolev_batch.sources"
 # The sources of this folder, by name.
 _OWN = {
     "command": f"{_HERE}.command:CommandSource",
-    "decimate": f"{_HERE}.generated:DecimateSource",
+    "decimate": f"{_HERE}.derived:DecimateSource",
     "ellipsoid": f"{_HERE}.generated:EllipsoidSource",
     "files": f"{_HERE}.files:FileSource",
-    "flow": f"{_HERE}.generated:FlowSource",
+    "flow": f"{_HERE}.derived:FlowSource",
     "function": f"{_HERE}.command:FunctionSource",
     "icosphere": f"{_HERE}.generated:IcosphereSource",
-    "moved": f"{_HERE}.generated:MovedSource",
-    "noisy": f"{_HERE}.generated:NoisySource",
-    "remesh": f"{_HERE}.generated:RemeshSource",
+    "moved": f"{_HERE}.derived:MovedSource",
+    "noisy": f"{_HERE}.derived:NoisySource",
+    "remesh": f"{_HERE}.derived:RemeshSource",
     "sphere": f"{_HERE}.generated:SphereSource",
-    "spherical-levels": f"{_HERE}.generated:SphericalLevelsSource",
+    "spherical-levels": f"{_HERE}.derived:SphericalLevelsSource",
     "torus": f"{_HERE}.generated:TorusSource",
 }
 

@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from sobolev_batch.errors import DamageError
-from sobolev_batch.sources.mesh_cache import Cost
+from sobolev_batch.sources.programs import Cost
 from sobolev_batch.store.checked import CHANGED, largest_chunk_bytes
 from sobolev_batch.store.layout import DIGEST, PAGE, RECORD, RECORDS, ROOT, Store, digest_of
 from sobolev_batch.store.lock import Time

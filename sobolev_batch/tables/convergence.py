@@ -16,7 +16,7 @@ from sobolev_batch.geometry.proximity import METRICS, OF_ONE_MESH
 from sobolev_batch.norms.budget import AREA_AND_SHAPE, PARTS
 from sobolev_batch.norms.columns import observed_rates, parts_as_variables
 from sobolev_batch.parameters import fraction
-from sobolev_batch.sources.mesh_cache import Cost
+from sobolev_batch.sources.programs import Cost
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.open import (
     EDGE_LENGTH,

@@ -14,7 +14,7 @@ from sobolev_batch.arrays import Reals
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
 from sobolev_batch.norms.budget import AREA_AND_SHAPE, NormEstimate
 from sobolev_batch.norms.columns import dataset_of, describe, observed_rates
-from sobolev_batch.sources.mesh_cache import Cost
+from sobolev_batch.sources.programs import Cost
 from sobolev_batch.tables.reducer import Reducer
 from sobolev_batch.tables.shells import chunks_of_spectra, read_spectra
 

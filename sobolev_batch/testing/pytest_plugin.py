@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
-    from sobolev_batch.geometry.formats.readers import SurfaceLike
+    from sobolev_batch.geometry.formats.conversion import SurfaceLike
     from sobolev_batch.testing.verdict import Verdict
 
 _OPTION = "--sobolev-witness-folder"

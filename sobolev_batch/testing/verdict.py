@@ -8,7 +8,7 @@ from tempfile import mkdtemp
 from typing import Literal
 
 from sobolev_batch.errors import InputError, SobolevBatchError, one_line
-from sobolev_batch.geometry.formats.readers import SurfaceLike, as_surface
+from sobolev_batch.geometry.formats.conversion import SurfaceLike, as_surface
 from sobolev_batch.geometry.surface import Similarity, is_finite_number, placement_doubt
 from sobolev_batch.machine import available, available_cores
 from sobolev_batch.norms import DEFAULT_ORDER

@@ -19,7 +19,7 @@ import sobolev_batch as sb
 from sobolev_batch.batch.cluster.workers import Workers
 from sobolev_batch.batch.dry_run import forecast
 from sobolev_batch.batch.start import warnings_of
-from sobolev_batch.geometry.formats.readers import write_mesh
+from sobolev_batch.geometry.formats.writing import write_mesh
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.records import Record
 from sobolev_batch.study.plan import Plan, make_plan

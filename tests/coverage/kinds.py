@@ -13,8 +13,8 @@ from sobolev_batch import Mesh
 from sobolev_batch.arrays import Reals
 from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.shapes import Similarity, Sphere, icosphere
+from sobolev_batch.sources.derived import decimated
 from sobolev_batch.sources.files import FileSource
-from sobolev_batch.sources.generated import decimated
 from sobolev_batch.sources.registry import load_mesh
 from tests.coverage.truth import Pair
 from tests.support.shapes import CENTRED_BOX as BOX

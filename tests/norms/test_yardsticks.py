@@ -9,7 +9,7 @@ import trimesh
 from sobolev_batch import Lattice, Mesh, distance, yardsticks
 from sobolev_batch.errors import InputError
 from sobolev_batch.shapes import Sphere, icosphere
-from sobolev_batch.sources.generated import decimated, with_noise
+from sobolev_batch.sources.derived import decimated, with_noise
 
 LATTICE = Lattice(3.0, 32)
 ORDERS = [-3.0, -5.0]

@@ -156,7 +156,7 @@ def test_a_program_ends_with_the_process_that_waits_for_it(tmp_path: Path) -> No
     both = "until [ $(wc -l < begun) = 2 ]; do sleep 0.01; done; mv begun numbers"
     script = f"cd {tmp_path}; echo $$ > begun; {apart} >> begun & sleep 1000 & {both}; sleep 1000"
     run = (
-        "import sobolev_batch as sb; from sobolev_batch.sources.mesh_cache import run_command; "
+        "import sobolev_batch as sb; from sobolev_batch.sources.programs import run_command; "
         f"run_command(sb.shapes.icosphere(0), ['sh', '-c', {script!r}], ('.ply', '.ply'), 1000.0, 10**9)"
     )
     scratch = tmp_path / "scratch"

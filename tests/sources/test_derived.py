@@ -16,7 +16,7 @@ import sobolev_batch as sb
 from sobolev_batch import Mesh
 from sobolev_batch.errors import MeshError, StudyError
 from sobolev_batch.shapes import icosphere
-from sobolev_batch.sources.generated import carried, with_noise
+from sobolev_batch.sources.derived import carried, with_noise
 from sobolev_batch.sources.registry import parse_source
 from tests.support.members import BALL, connectivity, listed, loaded, members
 from tests.support.mesh_files import off

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.extras.fitting.adjoint import MeshTransform
 from sobolev_batch.extras.fitting.derivatives import factors_of
-from sobolev_batch.geometry.formats.readers import MeshLike, as_mesh
+from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.transform.backends import NufftSpec
 from sobolev_batch.transform.fourier import TransformSettings

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.errors import InputError, from_extra
 from sobolev_batch.extras.fitting.adjoint import MeshTransform
-from sobolev_batch.geometry.formats.readers import MeshLike, as_mesh
+from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Extent
 from sobolev_batch.norms import DEFAULT_ORDER

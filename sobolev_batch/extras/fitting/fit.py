@@ -15,7 +15,7 @@ from sobolev_batch.errors import AccuracyError, InputError
 from sobolev_batch.extras.fitting import DEFAULT_SMOOTHING, DEFAULT_STEPS
 from sobolev_batch.extras.fitting.descent import Descent, End, Smoothing
 from sobolev_batch.extras.fitting.objective import FitProblem, FitSettings, OrderWeights, welded
-from sobolev_batch.geometry.formats.readers import MeshLike, as_mesh
+from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.proximity import proximity
 from sobolev_batch.geometry.subdivision import Edges

@@ -23,7 +23,7 @@ from sobolev_batch.extras.fitting.descent import (
     triangle_qualities,
 )
 from sobolev_batch.geometry.subdivision import Edges
-from sobolev_batch.sources.generated import decimated
+from sobolev_batch.sources.derived import decimated
 
 
 def bumpy(level: int) -> sb.Mesh:

@@ -1,0 +1,101 @@
+"""GIFTI: surfaces of brains in XML.
+
+The library at hand expands the entities of XML, unpacks data of any size, believes any counts, and only warns of
+missing arrays; here they are refused. Source: "GIFTI surface data format" 1.0 (2011), https://www.nitrc.org/projects/gifti.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+import zlib
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.errors import MeshError
+from sobolev_batch.geometry.formats.by_name import Format
+from sobolev_batch.geometry.formats.parsing import Raw, unpacked_limit, xml_events
+
+_MOST_DIMENSIONS = 6
+_GIFTI_TYPES = {
+    f"NIFTI_TYPE_{name}": np.dtype(name.lower())
+    for name in ("UINT8", "INT16", "UINT16", "INT32", "UINT32", "INT64", "UINT64", "FLOAT32", "FLOAT64")
+}
+_POINTS, _FACES = "NIFTI_INTENT_POINTSET", "NIFTI_INTENT_TRIANGLE"
+
+
+def parse_gifti(data: bytes) -> Raw:
+    """Return the vertices and triangles of a GIFTI surface."""
+    arrays: dict[str, list[NDArray[Any]]] = {_POINTS: [], _FACES: []}
+    announced, found = None, 0
+    attributes: Mapping[str, str] = {}
+    texts: list[str] | None = None
+    for event, name, values in xml_events(data, "GIFTI"):
+        match event, name:
+            case "start", "GIFTI":
+                announced = values.get("NumberOfDataArrays")
+            case "start", "DataArray":
+                attributes, found = values, found + 1
+            case "start", "Data":
+                # Others hold normals, or values at vertices.
+                texts = [] if attributes.get("Intent") in arrays else None
+            case "text", piece if texts is not None:
+                texts.append(piece)
+            case "end", "Data" if texts is not None:
+                of_kind = arrays[attributes["Intent"]]
+                of_kind.append(_decoded("".join(texts), attributes, found, unpacked_limit(len(data))))
+                texts = None
+                if len(of_kind) > 1:
+                    break
+    else:
+        if announced is not None and int(announced) != found:
+            raise MeshError(f"the GIFTI header announces {announced[:20]} arrays, found {found}")
+    points, faces = arrays.values()
+    if len(points) != 1 or len(faces) != 1:
+        raise MeshError(
+            f"a GIFTI surface has one point set and one triangle array, found {len(points)} and {len(faces)}"
+        )
+    return points[0], faces[0]
+
+
+def _decoded(text: str, attributes: Mapping[str, str], number: int, most_bytes: int) -> NDArray[Any]:
+    """Return the data of a DataArray, which is the file's array of that number, from 1."""
+    encoding = attributes.get("Encoding", "")
+    if attributes.get("ExternalFileName") or "External" in encoding:
+        raise MeshError("its data lie in another file; write it with them inside")
+    dtype = _GIFTI_TYPES.get(kind := attributes.get("DataType", ""))
+    if dtype is None:
+        raise MeshError(f"array {number} of the file is of the type {kind[:40]!r}, expected {', '.join(_GIFTI_TYPES)}")
+    count = int(attributes.get("Dimensionality", 0))
+    if not 1 <= count <= _MOST_DIMENSIONS:
+        raise MeshError(f"array {number} of the file has {count} dimensions, expected 1 to {_MOST_DIMENSIONS}")
+    shape = [int(attributes[f"Dim{axis}"]) for axis in range(count)]
+    if min(shape) < 0:
+        raise MeshError(f"array {number} of the file has a negative dimension: {shape}")
+    size = math.prod(shape) * dtype.itemsize
+    order: Literal["C", "F"] = "F" if attributes.get("ArrayIndexingOrder") == "ColumnMajorOrder" else "C"
+    if encoding == "ASCII":
+        if not text.strip():
+            raise MeshError(f"array {number} of the file is empty")
+        values: NDArray[Any] = np.loadtxt(io.StringIO(text), dtype, comments=None, ndmin=1)
+    else:
+        decoded = base64.b64decode(text)
+        if encoding == "GZipBase64Binary":
+            if size > most_bytes:
+                raise MeshError(f"its arrays unpack to more than {most_bytes} bytes: no mesh file shrinks that far")
+            # One byte more shows whether there are more.
+            decoded = zlib.decompressobj().decompress(decoded, size + 1)
+        elif encoding != "Base64Binary":
+            raise MeshError(f"array {number} of the file has the encoding {encoding[:40]!r}, which GIFTI does not have")
+        if len(decoded) != size:
+            wrong = "more" if len(decoded) > size else "fewer"
+            raise MeshError(f"array {number} of the file unpacks to {wrong} than the {size} bytes announced")
+        values = np.frombuffer(decoded, dtype.newbyteorder(">" if attributes.get("Endian") == "BigEndian" else "<"))
+    return np.asarray(values.reshape(shape, order=order))
+
+
+FORMATS = (Format((".gii",), parse_gifti, 10, 90),)

@@ -1,0 +1,315 @@
+"""Families that are made of one other mesh: coarser, displaced, or carried along by a flow.
+
+docs/studies.md has the keys of each source.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from sobolev_batch.arrays import Indices, Reals
+from sobolev_batch.errors import MeshError, from_extra
+from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.geometry.surface import Point, normals
+from sobolev_batch.sources.generated import Levels, Triple
+from sobolev_batch.sources.registry import (
+    MadeMember,
+    Member,
+    NestedSource,
+    OtherSource,
+    Several,
+    Times,
+    single_member,
+)
+
+# Measured peak of simplifying and of clustering, for each triangle of the original.
+_REDUCING_BYTES = 450
+# No mesh that can be read has as many.
+_MOST_TRIANGLES = 10**9
+# Even cells need several input vertices for each output vertex; pyacvd advises to subdivide until there are.
+_VERTICES_PER_CLUSTER = 10
+
+# Raise it whenever a mesh is displaced or carried in another way.
+_VERSION = 1
+# Measured peaks of displacing a mesh and of carrying it along, for each of its triangles.
+_DISPLACING_BYTES, _CARRYING_BYTES = 400, 200
+
+# Lengths as fractions of the radius of the mesh's bounding sphere.
+Fractions = Several[Annotated[float, Field(gt=0, allow_inf_nan=False, strict=False)]]
+
+
+def decimated(mesh: Mesh, triangles: int) -> Mesh:
+    """Return a mesh with its edges collapsed down to a number of triangles."""
+    with from_extra("studies", "decimation needs", MeshError):
+        import fast_simplification
+
+    vertices, faces = fast_simplification.simplify(
+        np.array(mesh.vertices), np.array(mesh.triangles, dtype=np.int32), target_count=triangles
+    )
+    return Mesh(vertices, faces)
+
+
+def remeshed(mesh: Mesh, triangles: int) -> Mesh:
+    """Return a mesh of about a number of triangles, around clusters of the vertices of another one."""
+    with from_extra("studies", "remeshing needs", MeshError):
+        import pyacvd
+        import pyvista
+    # A closed surface of genus g has V = F/2 + 2 - 2g: two vertices more than half the triangles.
+    clusters = triangles // 2 + 2
+    with warnings.catch_warnings():
+        # pyacvd 0.4 still reads an attribute that pyvista has renamed.
+        warnings.filterwarnings("ignore", message=".*_connectivity_array")
+        clustering = pyacvd.Clustering(pyvista.PolyData.from_regular_faces(mesh.vertices, mesh.triangles))
+        while len(clustering.mesh.points) < _VERTICES_PER_CLUSTER * clusters:
+            clustering.subdivide(2)
+        clustering.cluster(clusters)
+        result = clustering.create_mesh()
+    return Mesh(np.asarray(result.points), np.asarray(result.regular_faces))
+
+
+class DecimateSource(NestedSource):
+    """Simplifications of one mesh by quadric edge collapse.
+
+    M. Garland, P. S. Heckbert, "Surface simplification using quadric error metrics" (1997),
+    doi:10.1145/258734.258849; by the library fast-simplification.
+    """
+
+    triangles: Several[Annotated[int, Field(ge=4, le=_MOST_TRIANGLES)]]
+
+    kind: ClassVar[str] = "decimate"
+    library: ClassVar[str] = "fast-simplification"
+    # What the library does to a mesh, down to a number of triangles.
+    reduce: ClassVar[Callable[[Mesh, int], Mesh]] = staticmethod(decimated)
+
+    def members(self, folder: Path) -> tuple[Member, ...]:
+        """Return one member per triangle count, coarse to fine."""
+        original = single_member(self.mesh, folder)
+        return tuple(
+            MadeMember(
+                str(count),
+                rank,
+                _reduced,
+                {"triangles": count},
+                (type(self).reduce, count),
+                originals={self.kind: original},
+                libraries=(self.library,),
+                triangles=count,
+                triangle_bytes=_REDUCING_BYTES,
+            )
+            for rank, count in enumerate(sorted(set(self.triangles)))
+        )
+
+
+def _reduced(mesh: Mesh, reduce: Callable[[Mesh, int], Mesh], triangles: int) -> Mesh:
+    if triangles >= len(mesh.triangles):
+        raise MeshError(
+            f"the mesh has {len(mesh.triangles)} triangles and cannot be reduced to {triangles}: choose fewer"
+        )
+    return reduce(mesh, triangles)
+
+
+class RemeshSource(DecimateSource):
+    """Even remeshings of one mesh, by clustering its vertices into cells of similar area; keys as for `decimate`.
+
+    A closed mesh comes out within a few triangles of the counts. S. Valette, J.-M. Chassery, "Approximated
+    centroidal Voronoi diagrams for uniform polygonal mesh coarsening" (2004),
+    doi:10.1111/j.1467-8659.2004.00769.x; by the library pyacvd, which the extra ``studies`` installs.
+    """
+
+    kind, library = "remesh", "pyacvd"
+    reduce: ClassVar[Callable[[Mesh, int], Mesh]] = staticmethod(remeshed)
+
+    @property
+    def libraries(self) -> tuple[str, ...]:
+        """The clustering library, and the distributions that the other source needs."""
+        return "pyacvd", *super().libraries
+
+
+class SphericalLevelsSource(NestedSource):
+    """Coarse versions of a surface whose vertices follow an icosahedral refinement.
+
+    The vertices of such a surface (FreeSurfer's fsaverage is one) come in the order of their levels:
+    the first 10*4^N + 2 form level N. Its map to the sphere has the same vertices in the same order,
+    and the convex hull of the first ones gives the triangles of the level.
+    """
+
+    sphere: OtherSource
+    levels: Levels
+
+    def members(self, folder: Path) -> tuple[Member, ...]:
+        """Return one member per level, coarse to fine."""
+        surface, sphere = single_member(self.mesh, folder), single_member(self.sphere, folder)
+        return tuple(
+            MadeMember(
+                str(level),
+                level,
+                _first_vertices,
+                {"spherical level": level},
+                (level,),
+                originals={"surface": surface, "sphere": sphere},
+                triangles=20 * 4**level,
+                # The hull takes memory like a reduction of the surface.
+                triangle_bytes=_REDUCING_BYTES,
+            )
+            for level in sorted(set(self.levels))
+        )
+
+
+def _first_vertices(surface: Mesh, sphere: Mesh, level: int) -> Mesh:
+    """Take the vertices of a level from a surface, and its triangles from the hull of its map to the sphere."""
+    count = 10 * 4**level + 2
+    if len(surface.vertices) != len(sphere.vertices) or count > len(surface.vertices):
+        raise MeshError(
+            f"level {level} needs the first {count} vertices of a surface and of its map to the sphere, "
+            f"found {len(surface.vertices)} and {len(sphere.vertices)}"
+        )
+    from scipy.spatial import ConvexHull
+
+    hull = ConvexHull(sphere.vertices[:count] - sphere.vertices[:count].mean(axis=0))
+    if len(hull.simplices) != 2 * count - 4:
+        raise MeshError(
+            f"the first {count} vertices of the map to the sphere are not in convex position: their hull has "
+            f"{len(hull.simplices)} triangles, expected {2 * count - 4}"
+        )
+    return Mesh(surface.vertices[:count], hull.simplices.astype(np.int64))
+
+
+class MovedSource(NestedSource):
+    """A mesh moved by some distances, as fractions of the radius of its bounding sphere."""
+
+    distances: Fractions
+    direction: Triple = (1.0, 0.0, 0.0)
+
+    @field_validator("direction")
+    @classmethod
+    def _check_direction(cls, direction: Point) -> Point:
+        if not any(direction):
+            raise ValueError("must not be zero")
+        return direction
+
+    def members(self, folder: Path) -> tuple[Member, ...]:
+        """Return one member for each distance, the smallest first."""
+        direction = (np.asarray(self.direction) / np.linalg.norm(self.direction)).tolist()
+        return _displaced("moved", single_member(self.mesh, folder), self.distances, _moved, direction=direction)
+
+
+class NoisySource(NestedSource):
+    """A mesh whose vertices are displaced along its normals at random; see `with_noise`.
+
+    Amplitudes are fractions of the radius of its bounding sphere. The noise is the same for all, but for its size.
+    """
+
+    amplitudes: Fractions
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    def members(self, folder: Path) -> tuple[Member, ...]:
+        """Return one member for each amplitude, the smallest first."""
+        return _displaced("noisy", single_member(self.mesh, folder), self.amplitudes, _noisy, seed=self.seed)
+
+
+class FlowSource(NestedSource):
+    """A mesh at several times, with its vertices carried along by a flow on the spheres around the origin.
+
+    The flow winds the sphere up while it turns, and back: after one period each vertex is where it began. It is the
+    fourth case of Nair and Lauritzen: the second with a background rotation, without divergence. Vertices follow it
+    exactly; triangles stay flat.
+
+    Source: R. Nair, P. Lauritzen, "A class of deformational flow test cases for linear transport problems on the
+    sphere" (2010), doi:10.1016/j.jcp.2010.08.014.
+    """
+
+    times: Times
+    period: Annotated[float, Field(gt=0, allow_inf_nan=False, strict=False)] = 5.0
+    strength: Annotated[float, Field(allow_inf_nan=False, strict=False)] = 2.0
+
+    def members(self, folder: Path) -> tuple[Member, ...]:
+        """Return one member for each time, in their order."""
+        start = single_member(self.mesh, folder)
+        return tuple(
+            MadeMember(
+                repr(time),
+                -1,
+                carried,
+                {"time": time, "settings": [self.period, self.strength], "version": _VERSION},
+                (time, self.period, self.strength),
+                originals={"flow": start},
+                triangle_bytes=_CARRYING_BYTES,
+                time=time,
+            )
+            for time in sorted(self.times)
+        )
+
+
+def _displaced(
+    kind: str, original: Member, amounts: tuple[float, ...], displace: Callable[..., Mesh], **settings: Any
+) -> tuple[Member, ...]:
+    """Return a member for each fraction of the radius by which a mesh is displaced, the smallest first."""
+    return tuple(
+        MadeMember(
+            f"{amount:g}",
+            -1,
+            displace,
+            {"amount": amount, "version": _VERSION, **settings},
+            (amount, *settings.values()),
+            originals={kind: original},
+            triangle_bytes=_DISPLACING_BYTES,
+        )
+        for amount in sorted(set(amounts))
+    )
+
+
+def _moved(mesh: Mesh, amount: float, direction: Point) -> Mesh:
+    _, radius = mesh.bounding_sphere
+    return Mesh(mesh.vertices + amount * radius * np.asarray(direction), mesh.triangles)
+
+
+def _noisy(mesh: Mesh, amount: float, seed: int) -> Mesh:
+    _, radius = mesh.bounding_sphere
+    return with_noise(mesh, amount * radius, seed)
+
+
+def with_noise(mesh: Mesh, amplitude: float, seed: int) -> Mesh:
+    """Return a mesh whose vertices are displaced along its normals by independent Gaussian numbers.
+
+    Vertices at the same place are displaced together, so that no cracks open. The amplitude is the standard deviation,
+    in units of length.
+    """
+    places, place_of_vertex = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    place_of_vertex = place_of_vertex.reshape(-1)
+    directions = _vertex_normals(places, place_of_vertex[mesh.triangles])
+    sizes = amplitude * np.random.default_rng(seed).standard_normal(len(places))
+    return Mesh((places + sizes[:, None] * directions)[place_of_vertex], mesh.triangles)
+
+
+def _vertex_normals(vertices: Reals, triangles: Indices) -> Reals:
+    """Return the mean normal of the triangles at each vertex, weighted by area, (m, 3); zero where they cancel."""
+    crosses = normals(vertices, triangles)
+    sums = np.stack(
+        [np.bincount(triangles.ravel(), np.repeat(crosses[:, axis], 3), len(vertices)) for axis in range(3)], axis=1
+    )
+    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
+    return np.asarray(np.divide(sums, lengths, out=np.zeros_like(sums), where=lengths > 0))
+
+
+def carried(mesh: Mesh, time: float, period: float, strength: float) -> Mesh:
+    """Return a mesh whose vertices the flow of `FlowSource` has carried along from time 0 on.
+
+    On the unit sphere, in a frame that turns once around z in a period T, the velocity at x is
+    2k cos(πt/T) y (x × e_y), where y is the point's own coordinate and k the strength, in radians per unit of time.
+    It keeps y, so each circle around the y axis turns as a whole, by the angle -(2kT/π) sin(πt/T) y.
+    """
+    x, y, z = mesh.vertices.T
+    radii = np.linalg.norm(mesh.vertices, axis=1)
+    heights = np.divide(y, radii, out=np.zeros_like(y), where=radii > 0)
+    angles = -2 * strength * period / np.pi * np.sin(np.pi * time / period) * heights
+    cosines, sines = np.cos(angles), np.sin(angles)
+    wound = np.stack([cosines * x + sines * z, y, cosines * z - sines * x])
+    turn = 2 * np.pi * time / period
+    rotation = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
+    return Mesh((rotation @ wound).T, mesh.triangles)

@@ -1,0 +1,240 @@
+"""A program that makes a mesh of another one: it runs in a folder of its own, within limits, and leaves nothing."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import psutil
+
+from sobolev_batch.errors import InputError, MeshError, StudyError, one_line
+from sobolev_batch.geometry.formats.by_name import WRITERS, is_mesh_name
+from sobolev_batch.geometry.formats.conversion import as_mesh
+from sobolev_batch.geometry.formats.readers import read_mesh
+from sobolev_batch.geometry.formats.writing import write_mesh
+from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.parameters import format_bytes
+
+INPUT, OUTPUT = "input", "output"
+_NOTHING_KNOWN = float("nan")
+# Time after which a command that prints a version is ended.
+_VERSION_SECONDS = 60.0
+PLACEHOLDER = re.compile(r"\{(\w+)\}")
+# Characters of what a program said last, in the reason of its failure.
+_LONGEST_TAIL = 300
+# Seconds between looks at a program that runs: at first, and at most.
+_FIRST_PAUSE, _LONGEST_PAUSE = 0.005, 0.1
+# Variable of a program's environment with its folder. On Linux it shows which processes left the program's session.
+_MARK = "SOBOLEV_BATCH_FOLDER"
+# It is told the number of a process. When the writer ends, however it does, it kills the session of the process and
+# those that left it, and removes the folder.
+_GUARD = f"""
+read -r number || exit
+exec 2> /dev/null
+read -r _
+kill -s KILL -- "-$number"
+for place in $(grep -lFzx -e "{_MARK}=$1" /proc/[0-9]*/environ); do
+    place=${{place%/environ}}
+    kill -s KILL "${{place#/proc/}}"
+done
+rm -rf -- "$1"
+"""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Time, memory and exit status of making a mesh; NaN where they are not known.
+
+    Attributes:
+        make_seconds: Time from the start to the end.
+        make_peak_bytes: Largest memory of the process.
+        exit_status: Exit status of the program; negative if a signal ended it.
+    """
+
+    make_seconds: float = _NOTHING_KNOWN
+    make_cpu_seconds: float = _NOTHING_KNOWN
+    make_peak_bytes: float = _NOTHING_KNOWN
+    exit_status: float = _NOTHING_KNOWN
+
+
+# What making a mesh took, and the mesh, or why there is none.
+Made = tuple[Cost, Mesh | str]
+
+
+def environment() -> dict[str, str]:
+    """Return the environment of programs: ``python`` is the one that runs this, with its libraries."""
+    own = str(Path(sys.executable).parent)
+    return {**os.environ, "PATH": os.pathsep.join(filter(None, (own, os.environ.get("PATH"))))}
+
+
+def printed(words: Sequence[str]) -> str:
+    """Return what a program prints, such as its version; StudyError where it fails."""
+    try:
+        done = subprocess.run(  # noqa: S603 -- the user permitted it
+            words,
+            env=environment(),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            timeout=_VERSION_SECONDS,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError) as error:
+        raise StudyError(f"version: {shlex.join(words)}: {one_line(error)}") from error
+    return done.stdout.decode(errors="replace").strip()
+
+
+def run_command(mesh: Mesh, words: list[str], suffixes: tuple[str, str], timeout: float, largest_output: int) -> Made:
+    """Run a program on files {input} and {output}, and return its mesh, or why it failed and what it said last.
+
+    It ends with this process at the latest.
+    """
+    with ExitStack() as stack:
+        try:
+            scratch = tempfile.TemporaryDirectory(prefix="sobolev-batch-", ignore_cleanup_errors=True)
+            folder = Path(stack.enter_context(scratch))
+            # Without names, so that the program can neither remove nor replace them.
+            out, err = (stack.enter_context(tempfile.TemporaryFile()) for _ in range(2))
+            # In a session of its own, so that what kills this process does not kill it too.
+            watching = ["sh", "-c", _GUARD, "sh", str(folder)]
+            guard = subprocess.Popen(watching, stdin=subprocess.PIPE, bufsize=0, start_new_session=True)  # noqa: S603
+            stack.enter_context(guard)
+        except OSError as error:
+            return Cost(), f"it has no scratch folder: {one_line(error)}; set TMPDIR to one that can be written"
+        files = {name: folder / f"{name}{suffix}" for name, suffix in zip((INPUT, OUTPUT), suffixes, strict=True)}
+        try:
+            _write(mesh, files[INPUT])
+        except InputError as error:
+            return Cost(), f"its input cannot be written: {error}"
+        filled = [PLACEHOLDER.sub(lambda found: str(files.get(found[1], found[0])), word) for word in words]
+        started = time.perf_counter()
+        try:
+            process = subprocess.Popen(  # noqa: S603 -- the user permitted it
+                filled,
+                cwd=folder,
+                env=environment() | {_MARK: str(folder)},
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=err,
+                start_new_session=True,
+            )
+        except (OSError, ValueError) as error:
+            return Cost(), f"{words[0]} cannot be started on this machine: {one_line(error)}"
+        if guard.stdin is not None:
+            guard.stdin.write(b"%d\n" % process.pid)
+        problem, cpu_seconds, peak_bytes = _awaited(process, folder, (out, err), timeout, largest_output)
+        status = process.returncode
+        cost = Cost(time.perf_counter() - started, cpu_seconds, peak_bytes, status)
+        if not problem and status:
+            name = signal.Signals(-status).name if status < 0 else ""
+            problem = f"{words[0]} was ended by {name}" if name else f"{words[0]} ended with exit status {status}"
+        if not problem and not os.path.isfile(files[OUTPUT]):
+            problem = f"{words[0]} wrote no mesh (output{suffixes[1]})"
+        if not problem:
+            try:
+                return cost, _read(files[OUTPUT])
+            except InputError as error:
+                problem = f"{words[0]} wrote no mesh: {str(error).removeprefix(f'{files[OUTPUT]}: ')}"
+        return cost, ": ".join(filter(None, (problem, _tail(err, out))))
+
+
+def _awaited(
+    process: subprocess.Popen[bytes], folder: Path, said: tuple[IO[bytes], ...], timeout: float, largest_output: int
+) -> tuple[str, float, float]:
+    """Wait for a program, and return why it was ended before its time, its processor time and its largest memory."""
+    problem, pause, deadline, peak_bytes = "", _FIRST_PAUSE, time.monotonic() + timeout, float("nan")
+    while True:
+        # Nothing in subprocess tells the time of a single process. Its peak of memory would count this process, from
+        # which it was forked.
+        found, status, usage = os.wait4(process.pid, 0 if problem else os.WNOHANG)
+        if found:
+            process.returncode = os.waitstatus_to_exitcode(status)
+            return problem, usage.ru_utime + usage.ru_stime, peak_bytes
+        peak_bytes = float(np.fmax(peak_bytes, _resident_bytes(process.pid)))
+        if time.monotonic() > deadline:
+            problem = f"it was ended after {timeout:g} s, its timeout"
+        elif (written := _bytes_below(folder) + sum(map(_size, said))) > largest_output:
+            problem = f"it was ended after it had written {format_bytes(written)}"
+        if problem:
+            # What else is in its session ends with the guard.
+            os.kill(process.pid, signal.SIGKILL)
+        time.sleep(pause)
+        pause = min(2 * pause, _LONGEST_PAUSE)
+
+
+def _resident_bytes(pid: int) -> float:
+    """Return the memory of a process and of those that it started; NaN once it has ended."""
+    with suppress(psutil.Error):
+        process = psutil.Process(pid)
+        return float(sum(one.memory_info().rss for one in (process, *process.children(recursive=True))))
+    return float("nan")
+
+
+def _bytes_below(folder: Path) -> int:
+    total = 0
+    for place, _, names in os.walk(folder):
+        for name in names:
+            try:
+                total += os.lstat(os.path.join(place, name)).st_size
+            except OSError:
+                continue
+    return total
+
+
+def _size(file: IO[bytes]) -> int:
+    return os.fstat(file.fileno()).st_size
+
+
+def _tail(*files: IO[bytes]) -> str:
+    """Return the end of the first file that says something, on one line."""
+    for file in files:
+        file.seek(max(0, _size(file) - 4 * _LONGEST_TAIL))
+        text = " ".join(file.read(4 * _LONGEST_TAIL).decode(errors="replace").split())
+        if text:
+            return text if len(text) <= _LONGEST_TAIL else f"... {text[-_LONGEST_TAIL:]}"
+    return ""
+
+
+def _write(mesh: Mesh, path: Path) -> None:
+    """Write a mesh in a format of this package or of meshio."""
+    if path.suffix in WRITERS:
+        write_mesh(mesh, path)
+        return
+    meshio = _meshio(path)
+    meshio.write(path, meshio.Mesh(mesh.vertices, [("triangle", mesh.triangles)]))
+
+
+def _read(path: Path) -> Mesh:
+    """Read a mesh in a format of this package or of meshio."""
+    if is_mesh_name(path):
+        return read_mesh(path)
+    meshio = _meshio(path)
+    try:
+        return as_mesh(meshio.read(path))
+    except InputError:
+        raise
+    # On damaged input its readers raise anything.
+    except (Exception, SystemExit) as error:
+        raise MeshError(f"{path}: {one_line(error)}") from error
+
+
+def _meshio(path: Path) -> Any:
+    try:
+        import meshio
+    except ImportError as error:
+        raise MeshError(f"the format {path.suffix} needs the library meshio: pip install meshio") from error
+    if path.suffix not in meshio.extension_to_filetypes:
+        raise MeshError(f"neither this package nor meshio knows the format {path.suffix}")
+    return meshio
