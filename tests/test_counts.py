@@ -20,7 +20,9 @@ import sobolev_batch as sb
 from sobolev_batch.geometry.formats import parsing, readers
 from sobolev_batch.sources import files
 from sobolev_batch.sources.command import CommandSource
+from sobolev_batch.tables import convergence
 from sobolev_batch.transform import kinds
+from tests.support.commands import call, write_toml
 from tests.support.studies import SMALL_LATTICE, small_table
 
 COARSE, FINE, SPHERE = sb.shapes.icosphere(1), sb.shapes.icosphere(2), sb.shapes.Sphere()
@@ -227,6 +229,15 @@ def test_a_plan_that_looks_at_meshes_reads_none_of_them_twice(tmp_path: Path, co
     assert counts["lists of files"] == 2
     for file in tmp_path.glob("*.ply"):
         assert counts[f"bytes of {file.name}"] // file.stat().st_size == 1, file
+
+
+def test_the_command_builds_the_tables_that_it_prints_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    built: list[object] = []
+    frames = convergence.convergence_at
+    monkeypatch.setattr(convergence, "convergence_at", lambda *arguments: built.append(None) or frames(*arguments))
+    done = call("run", write_toml(tmp_path), "--store", "memory://printed.zarr")
+    assert "Verdict at order -10" in done.stdout
+    assert len(built) == 1
 
 
 @pytest.mark.process

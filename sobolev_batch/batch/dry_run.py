@@ -24,7 +24,7 @@ from sobolev_batch.store.layout import stored_choice
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.records import Record
 from sobolev_batch.store.workspace import Workspace
-from sobolev_batch.study.lattice_choice import look_at_extents
+from sobolev_batch.study.pilots import look_at_extents
 from sobolev_batch.study.plan import Plan, Row, make_plan
 from sobolev_batch.study.study import Study, StudyCollection, StudyLike
 from sobolev_batch.tables.pairs import PAIR_BYTES, tile_count

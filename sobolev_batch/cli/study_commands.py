@@ -91,7 +91,7 @@ def run_command(
     from sobolev_batch.batch.run import run
     from sobolev_batch.study.study import Study, as_study
     from sobolev_batch.tables.conclusion import format_verdict
-    from sobolev_batch.tables.convergence import format_table
+    from sobolev_batch.tables.convergence import format_table, table
     from sobolev_batch.tables.open import open_store
 
     if scheduler and (settings["workers"] or settings["memory"]):
@@ -104,9 +104,10 @@ def run_command(
         summary = run(parsed, store, client, on_progress=show, **settings)
     if isinstance(parsed, Study):
         tree = open_store(summary.store)
-        echo_lines(format_table(tree))
+        frame = table(tree)
+        echo_lines(format_table(tree, frames={"": frame}))
         echo()
-        echo_lines(format_verdict(tree))
+        echo_lines(format_verdict(tree, frame=frame))
     else:
         _print_league(context, summary.store)
     echo()

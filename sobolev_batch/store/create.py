@@ -84,7 +84,8 @@ def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
     attributes, lattice = store.attributes(), _lattice_entry(plan)
     if not store.has_digest():
         is_same = attributes["study"].items() >= {"name": plan.study.name, **lattice}.items()
-        return _mended(store, plan, None if is_same else _ALTERED)
+        altered = DamageError("the metadata at the root are damaged", "they are not what was written")
+        return _mended(store, plan, None if is_same else altered)
     _check_same_study(store, plan)
     store.location.remove_partial_files()
     if not attributes["study"].items() >= lattice.items():
@@ -107,9 +108,6 @@ def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
     # Written even if nothing changed: a location that cannot be written must fail before tasks start.
     store.consolidate()
     return store
-
-
-_ALTERED = DamageError("the metadata at the root are damaged", "they are not what was written")
 
 
 def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:

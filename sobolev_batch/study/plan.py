@@ -19,7 +19,8 @@ from sobolev_batch.norms.fields import USUAL_DEGREE
 from sobolev_batch.norms.tail.sampling import TailSampling
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.sources.registry import Member
-from sobolev_batch.study.lattice_choice import LatticeChoice, Look, choice_basis, choose_lattice
+from sobolev_batch.study.lattice_choice import LatticeChoice, choice_basis
+from sobolev_batch.study.pilots import Look, choose_lattice
 from sobolev_batch.study.schema import REFERENCE_LABEL, FamilyReference
 from sobolev_batch.study.study import Members, Study
 from sobolev_batch.transform.fourier import NUMERICS_VERSION, TransformSettings, require_inside

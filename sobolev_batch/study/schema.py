@@ -57,8 +57,10 @@ MOST_OCTAVES = 24
 _LARGEST_FILE_BYTES = 4 << 20
 # Most refusals of one study; longer keys are not compared with others.
 _MOST_OFFENDERS, _LONGEST_KEY = 10, 40
-# Sections that are lists.
-_REPEATED = ("family", "object")
+# Sections that are lists, and keys of a family that are none of its source.
+_REPEATED, _KEYS_OF_FAMILY = ("family", "object"), ("name", "order_by")
+# The place of a value in nested tables and lists.
+_Key = tuple[int | str, ...]
 # What a value must be in the words of TOML, by the type of pydantic's error or the first word of it.
 _WORDS = {
     "list": "be a list",
@@ -265,9 +267,6 @@ class Family(Section):
         return {**own, "source": {key: value for key, value in table.items() if key not in own}}
 
 
-_KEYS_OF_FAMILY = ("name", "order_by")
-
-
 def _reference(table: object, info: ValidationInfo) -> object:
     if isinstance(table, dict) and table.get("source") == "family":
         return FamilyReference.model_validate({key: value for key, value in table.items() if key != "source"})
@@ -377,13 +376,10 @@ def _plain(value: Any, key: tuple[object, ...]) -> Any:
     return os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
-Key = tuple[int | str, ...]
-
-
 def _refusals(error: ValidationError, values: Mapping[str, Any]) -> list[str]:
     """Return what is wrong in the tables of a study, a message for each key."""
     messages: list[str] = []
-    allowed: dict[Key, list[str]] = {}
+    allowed: dict[_Key, list[str]] = {}
     items = error.errors(include_url=False)
     # What is wrong with a named mesh is wrong wherever it is named.
     for item in [item for item in items if item["loc"][:1] == ("mesh",)] or items:
@@ -437,7 +433,7 @@ def _demand(item: ErrorDetails) -> str:
     return words or re.sub(r"^\w+ should | after validation.*$", "", said)
 
 
-def _key_in(values: object, item: ErrorDetails) -> Key:
+def _key_in(values: object, item: ErrorDetails) -> _Key:
     """Return the location of an error without the parts that name the alternatives of a type."""
     location = item["loc"]
     if location[:1] == ("family",) and location[2:3] == ("source",):
@@ -454,13 +450,13 @@ def _key_in(values: object, item: ErrorDetails) -> Key:
     return tuple(key)
 
 
-def _value_at(values: Any, key: Key) -> Any:
+def _value_at(values: Any, key: _Key) -> Any:
     for part in key:
         values = values[part]
     return values
 
 
-def _known_keys(values: Mapping[str, Any], key: Key) -> Iterable[str]:
+def _known_keys(values: Mapping[str, Any], key: _Key) -> Iterable[str]:
     """Return the keys that the table at a key may have."""
     if not key:
         return StudyDocument.model_fields
@@ -481,7 +477,7 @@ def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
         yield from models_in(part)
 
 
-def _named(key: Key, values: Mapping[str, Any]) -> str:
+def _named(key: _Key, values: Mapping[str, Any]) -> str:
     """Return a key with its place: ``[norm]: entry 2 of orders``. Entries count from one."""
     if not key:
         return ""

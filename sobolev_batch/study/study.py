@@ -118,7 +118,7 @@ class Study:
                 if label in members:
                     raise StudyError(f"two surfaces of the study have the label {label!r}")
                 members[label] = family.name, _with_other_names(member, family.name)
-        if isinstance(self.reference, Source):
+        if not isinstance(self.reference, FamilyReference):
             with _within("reference"):
                 members[REFERENCE_LABEL] = REFERENCE_LABEL, single_member(self.reference, self.folder)
         return members

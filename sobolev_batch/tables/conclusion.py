@@ -180,9 +180,15 @@ def _names(labels: Sequence[str]) -> str:
     return ", ".join(labels[:MOST_NAMED]) + (f" and {more:,} more" if more > 0 else "")
 
 
-def format_verdict(tree: xr.DataTree, style: Format = "text", orders: Sequence[float] | None = None) -> str:
-    """Return the verdict on the study of an open store as text, or its rows for programs."""
-    frame = table(tree, orders)
+def format_verdict(
+    tree: xr.DataTree,
+    style: Format = "text",
+    orders: Sequence[float] | None = None,
+    *,
+    frame: pd.DataFrame | None = None,
+) -> str:
+    """Return the verdict on the study of an open store as text, or its rows for programs; its `table` may be given."""
+    frame = table(tree, orders) if frame is None else frame
     reasons = frame[frame["status"] != "complete"].drop_duplicates("mesh").set_index("mesh")["reason"]
     _, rows, omitted = study_verdict(frame, reasons.to_dict())
     if style in ("csv", "json"):

@@ -224,10 +224,14 @@ def format_table(
     orders: Sequence[float] | None = None,
     *,
     x: str = EDGE_LENGTH,
+    frames: Mapping[str, pd.DataFrame] | None = None,
 ) -> str:
-    """Return the convergence tables of a store, or of several objects by their names, as text; see `table`."""
+    """Return the convergence tables of a store, or of several objects by their names, as text.
+
+    What `tables_of` returns for them may be given.
+    """
     trees = {name: as_tree(place) for name, place in stores_of(store).items()}
-    frames = tables_of(trees, orders, x=x)
+    frames = tables_of(trees, orders, x=x) if frames is None else frames
     if style in ("csv", "json"):
         return machine_table(frames[""] if "" in frames else _joined(frames), style)
     sections: list[str] = []

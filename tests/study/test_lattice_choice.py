@@ -19,8 +19,9 @@ from sobolev_batch.norms.accuracy.solve import run_pilot
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
 from sobolev_batch.norms.budget import NormEstimate
 from sobolev_batch.store.layout import stored_choice
-from sobolev_batch.study import lattice_choice as search_module
-from sobolev_batch.study.lattice_choice import LatticeChoice, choose_pilots
+from sobolev_batch.study import pilots as search_module
+from sobolev_batch.study.lattice_choice import LatticeChoice
+from sobolev_batch.study.pilots import choose_pilots
 from sobolev_batch.study.plan import make_plan
 from sobolev_batch.tables.convergence import format_table
 from sobolev_batch.transform.backends import ComplexDtype
