@@ -32,9 +32,8 @@ from sobolev_batch.geometry.proximity import (
 )
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms.columns import describe
-from sobolev_batch.store.layout import Store
+from sobolev_batch.store.layout import Store, table_attributes, write_table
 from sobolev_batch.store.records import ProximityRecord, Record, Records
-from sobolev_batch.store.stored_tables import table_attributes, write_table
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.plan import Row
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from contextlib import nullcontext
 
-from sobolev_batch.errors import StoreError
 from sobolev_batch.store.layout import FIELD, OCTAVES, ROOT, Store
 from sobolev_batch.store.location import PARTIAL_FILE, Location
 from sobolev_batch.store.lock import LOCK_KEYS, Lock, locked
@@ -28,8 +27,6 @@ def prune(location: Location, *, is_dry: bool = True) -> dict[str, int]:
     """
     with nullcontext() if is_dry else locked(location, Lock.of_this_process()):
         store = Store.open(location)
-        if store.is_unfinished:
-            raise StoreError(f"{location}: its creation was not finished; run the study again")
         contents = Contents.of_store(store)
         lost, kept = set(range(len(contents.labels))) - contents.rows.keys(), contents.complete.keys()
         listed = {name.split("/")[0] for name in store.documents} | {ROOT, *LOCK_KEYS}
@@ -48,7 +45,7 @@ def prune(location: Location, *, is_dry: bool = True) -> dict[str, int]:
                 counts[_UNLISTED] += size
                 prefixes.add(group)
         if not is_dry:
-            # First: a record without its field would be damage.
+            # Records go first: one without its field would be damage.
             for row in lost:
                 if contents.records[row] is not None:
                     Records(store).write(row, None)

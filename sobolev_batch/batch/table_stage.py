@@ -23,9 +23,8 @@ from sobolev_batch.norms.columns import describe
 from sobolev_batch.norms.fields import Quality
 from sobolev_batch.sources.names import natural_key
 from sobolev_batch.sources.programs import Cost
-from sobolev_batch.store.layout import DISTANCES, PAIRS_KEYS, QUALITY
+from sobolev_batch.store.layout import DISTANCES, PAIRS_KEYS, QUALITY, hide_tables, table_attributes, write_table
 from sobolev_batch.store.records import Facts, Record
-from sobolev_batch.store.stored_tables import hide_tables, table_attributes, write_table
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.plan import Row
 from sobolev_batch.study.study import Study

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,12 +14,21 @@ from sobolev_batch.machine import available_cores
 from sobolev_batch.shown import Shown
 from sobolev_batch.store.collection_store import CollectionStore, labelled
 from sobolev_batch.store.field_arrays import Fields
-from sobolev_batch.store.layout import LABELS, PAIRS_KEYS, QUALITY, RECORDS, ROOT, SPECTRA_KEYS, Store
+from sobolev_batch.store.layout import (
+    GROUPS_OF_TASKS,
+    LABELS,
+    PAIRS_KEYS,
+    QUALITY,
+    RECORDS,
+    ROOT,
+    SPECTRA_KEYS,
+    Store,
+    table_names,
+)
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, acquire, release
 from sobolev_batch.store.records import Record, Records
-from sobolev_batch.store.sealed_chunks import damaged_chunks, withdraw_chunk
-from sobolev_batch.store.stored_tables import damaged_tables
+from sobolev_batch.store.sealed_chunks import Index, damaged_chunks, withdraw_chunk
 from sobolev_batch.store.workspace import Contents, Workspace
 from sobolev_batch.tables.pairs import Pairs
 from sobolev_batch.tables.shells import spectrum_keys, stale_chunks
@@ -132,7 +141,7 @@ def _verify_study(store: str | Path | Location, on_progress: Callable[[int, int]
         _log.info("%s: read without the right to write (%s)", opened.path, error)
         return _verify(opened, on_progress, None)
     try:
-        # Opened again: the last run may have ended since.
+        # It is opened again: the last run may have ended since.
         return _verify(Store.open(store), on_progress, lock)
     finally:
         release(opened.location, lock)
@@ -150,7 +159,7 @@ def damaged_rows(cluster: Cluster, workspace: Workspace) -> list[int]:
 def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: Lock | None) -> Verification:
     records, unread = Records(store).examine()
     damaged = {row: f"its completion record is damaged ({what})" for row, what in unread.items()}
-    tables, chunks = damaged_tables(store), list[tuple[str, tuple[int, ...], str]]()
+    tables, chunks = _damaged_tables(store), dict[tuple[str, Index], str]()
     if not tables and not store.has_digest():
         tables[ROOT] = "tables, coordinates or metadata are not what was written together"
     try:
@@ -165,16 +174,9 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: 
         if QUALITY not in tables and _have_other_qualities(records, store.read_strings(QUALITY)):
             tables[QUALITY] = "it is not what records have"
         if tables.keys().isdisjoint(store.keyed_arrays()):
-            chunks = list(damaged_chunks(store))
+            chunks = dict(damaged_chunks(store))
         if not tables:
-            pairs = Pairs.tabulated(store)
-            stale: list[tuple[str, tuple[int, ...]]] = [
-                (SPECTRA_KEYS, (number,)) for number in stale_chunks(store, spectrum_keys(pairs.keys, pairs.reference))
-            ]
-            if PAIRS_KEYS in store.documents:
-                stale += [(PAIRS_KEYS, tile) for tile in pairs.stale()]
-            known = {(keys, index) for keys, index, _ in chunks}
-            chunks += [(*place, "it is not that of the stored fields") for place in stale if place not in known]
+            chunks = dict.fromkeys(_stale(store), "it is not that of the stored fields") | chunks
     complete = contents.complete
     whole = Fields(store).complete_rows() if complete else set()
 
@@ -189,12 +191,12 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: 
                 on_progress(done, len(complete))
     if lock is not None and (damaged or chunks):
         # Whoever has unlocked the store may have changed it since.
-        lock.require(store.location)
+        fenced = store.fenced(lock.require)
         for row in damaged:
-            Records(store).write(row, None)
-        for keys, index, _ in chunks:
-            withdraw_chunk(store, keys, index)
-    for keys, index, what in chunks:
+            Records(fenced).write(row, None)
+        for place in chunks:
+            withdraw_chunk(fenced, *place)
+    for (keys, index), what in chunks.items():
         tables[f"chunk {'/'.join(map(str, index))} of {keys.split('/')[0]}"] = what
     return Verification(
         store.path,
@@ -204,6 +206,33 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: 
         tables,
         lock is not None and bool(damaged or tables),
     )
+
+
+def _damaged_tables(store: Store) -> dict[str, str]:
+    """Return the damage of each small array, of tables and coordinates, that cannot be read."""
+    keyed, names = store.keyed_arrays(), store.whole_arrays()
+    expected = [*names, QUALITY, *keyed] if table_names(store) else names
+    groups = {name: name.split("/")[0] for name in expected}
+    # Groups of tasks have the fields besides, which are many.
+    prefixes = {name if group in GROUPS_OF_TASKS else group for name, group in groups.items()}
+    sizes = {key: size for prefix in prefixes for key, size in store.location.sizes(prefix).items()}
+    incomplete = (name for name in expected if store.incomplete_chunks(name, sizes))
+    damage = dict.fromkeys(incomplete, "it is not there, or not all of it")
+    for name in expected:
+        if name not in damage and name not in keyed:
+            try:
+                store.read(name)
+            except DamageError as error:
+                damage[name] = error.what
+    return damage
+
+
+def _stale(store: Store) -> Iterator[tuple[str, Index]]:
+    """Yield the places of chunks of spectra, and of distances of pairs, whose fields are others by now."""
+    pairs = Pairs.tabulated(store)
+    yield from ((SPECTRA_KEYS, (n,)) for n in stale_chunks(store, spectrum_keys(pairs.keys, pairs.reference)))
+    if PAIRS_KEYS in store.documents:
+        yield from ((PAIRS_KEYS, tile) for tile in pairs.stale())
 
 
 def _have_other_qualities(records: Sequence[Record | None], qualities: Sequence[str]) -> bool:

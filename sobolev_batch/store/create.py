@@ -35,12 +35,12 @@ from sobolev_batch.store.layout import (
     Store,
     array_keys,
     dataset_keys,
+    hide_tables,
 )
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import LOCK_KEYS
 from sobolev_batch.store.metadata import SCHEMA_VERSION
 from sobolev_batch.store.records import Record, Records
-from sobolev_batch.store.stored_tables import hide_tables
 from sobolev_batch.study.plan import Plan
 from sobolev_batch.transform.lattice import AXES, smooth_step
 

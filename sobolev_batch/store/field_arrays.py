@@ -19,7 +19,7 @@ from sobolev_batch.store.layout import FIELD, OCTAVES, Store
 from sobolev_batch.store.records import Record
 from sobolev_batch.transform.lattice import AXES, Block, Lattice
 
-# The place of values of a field: slices of a block of the lattice, or the slice of all samples of octaves.
+# A place of values of a field is given by slices of a block of the lattice, or by the slice of all samples of octaves.
 Place = tuple[slice, ...]
 
 
@@ -73,7 +73,7 @@ class Fields:
             damage = ValueError if store.location.scheme else (OSError, ValueError)
             with store.location.access("read"):
                 try:
-                    # In place: copying a field costs as much as reading it.
+                    # It is read in place: copying a field costs as much as reading it.
                     buffer = NDBuffer.from_numpy_array(values[i])
                     arrays[number].get_basic_selection((rows[i] - first, *place), out=buffer)
                 except damage as error:

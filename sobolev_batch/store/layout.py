@@ -43,19 +43,22 @@ OCTAVES = "octaves/octaves"
 RECORDS = "records"
 RECORD = "records/record"
 PAGE = "records/page"
-# Radial spectra, see `sobolev_batch.norms.spectrum`, and distances, with their keys.
+# These groups have radial spectra, see `sobolev_batch.norms.spectrum`, and distances, with arrays of their keys.
 SPECTRA_GROUP, DISTANCES = "spectra", "distances"
 SPECTRA_KEYS, PAIRS_KEYS = f"{SPECTRA_GROUP}/key", f"{DISTANCES}/key"
-# Attributes of the root: the digest of tables and metadata; true while the store is being created; the objects of a
-# collection; the labels of meshes that the study has lost.
+# The root has these attributes: the digest of tables and metadata; true while the store is being created; the objects
+# of a collection; the labels of meshes that the study has lost.
 DIGEST, UNFINISHED, COLLECTION, REMOVED = "digest", "unfinished", "collection", "removed"
 # Arrays of tables above this size in memory, such as distances of all pairs of many meshes, have several chunks.
 _LARGEST_CHUNK_BYTES = 64 << 20
 # These arrays have chunks for rows, which need not be computed.
 _OF_ROWS = frozenset({FIELD, OCTAVES, RECORD, PAGE})
-# Missing values by the kind of a dtype: that of strings, of complex and of real numbers.
+# Missing values depend on the kind of a dtype: that of strings, of complex and of real numbers.
 _FILL_VALUES: dict[str, Any] = {"U": "", "c": complex(np.nan, np.nan), "f": np.nan}
+# Most of the time of a request is spent waiting.
 _REQUESTS_AT_ONCE = 64
+# Tasks write into the chunks of these groups; all others are tables, written, listed and hidden as a whole.
+GROUPS_OF_TASKS = ("fourier", OCTAVES_GROUP, SPECTRA_GROUP, RECORDS)
 
 
 class Store:
@@ -71,7 +74,7 @@ class Store:
     def __init__(self, store: str | Path | Location) -> None:
         self.location = Location.parse(store)
         self.documents: dict[str, Document] = {}
-        # SHA-256 of keys below the digest, where this process knows them.
+        # These are the SHA-256 of keys below the digest, where this process knows them.
         self._hashes: dict[str, str] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -367,6 +370,34 @@ def digest_of(table: Any) -> str:
     return hashlib.sha256(json.dumps(table, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
+def table_names(store: Store) -> list[str]:
+    """Return the names of the groups and arrays of tables that are listed."""
+    return [name for name in store.documents if name and name.split("/")[0] not in GROUPS_OF_TASKS]
+
+
+def table_attributes(store: Store, group: str) -> dict[str, Any] | None:
+    """Return the attributes of a group, or None if it is not listed."""
+    listed = store.exists() and group in store.documents
+    return store.documents[group].get("attributes", {}) if listed else None
+
+
+def hide_tables(store: Store) -> list[str]:
+    """Hide the tables, which do not fit together while they are written, and return the names of their nodes."""
+    names = table_names(store)
+    if names:
+        store.hide(names)
+    return names
+
+
+def write_table(store: Store, group: str, dataset: xr.Dataset) -> None:
+    """Write a group. Readers find it after `Store.consolidate`."""
+    large = [name for name, values in dataset.items() if values.nbytes > _LARGEST_CHUNK_BYTES]
+    store.publish(dataset_keys(group, dataset.drop_vars(large)))
+    # They are written one after the other, since keys are copies.
+    for name in large:
+        store.publish(dataset_keys(group, dataset[[name]].drop_vars(list(dataset.coords), errors="ignore")))
+
+
 def array_keys(
     name: str,
     dtype: Any,
@@ -408,11 +439,6 @@ def dataset_keys(group: str, dataset: xr.Dataset) -> dict[str, bytes]:
     places = {str(name): place for place, name in enumerate(dataset.variables)}
     written = _bytes_of(keys)
     return {key: written[key] for key in sorted(written, key=lambda key: places.get(key.split("/")[1], -1))}
-
-
-def is_large(values: xr.DataArray) -> bool:
-    """Return whether an array of a table is stored in several chunks."""
-    return values.nbytes > _LARGEST_CHUNK_BYTES
 
 
 def _steps(variable: xr.Variable) -> int:

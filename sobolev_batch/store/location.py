@@ -14,8 +14,8 @@ import errno
 import os
 import re
 import stat
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import AsyncIterator, Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
 from glob import escape
@@ -35,7 +35,7 @@ _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)(://|::)(.*)", re.DOTALL)
 _FOLDER_SCHEMES = ("file", "local")
 _BUCKET_SCHEMES = ("s3", "s3a", "gs", "gcs")
 _EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs"}
-# Names that zarr gives to files until they are complete.
+# zarr gives such names to files until they are complete.
 PARTIAL_FILE = re.compile(r"\.[0-9a-f]{32}\.partial")
 # A run that cannot go on should say so within a minute.
 _ANSWER_SECONDS = 30.0
@@ -160,7 +160,7 @@ class Location:
     def remove_empty_folder(self) -> None:
         """Remove the local folder if nothing is in it."""
         if not self.scheme:
-            with suppress(OSError):  # it holds a store
+            with suppress(OSError):  # It holds a store.
                 Path(self.name).rmdir()
 
     def remove_partial_files(self) -> None:
@@ -209,7 +209,7 @@ class Location:
             raise
         except Exception as error:
             if not self.scheme and not isinstance(error, OSError):
-                raise  # a defect
+                raise  # This is a defect.
             text = " ".join((getattr(error, "strerror", None) or str(error) or type(error).__name__).split())
             if not self.scheme and getattr(error, "filename", None):
                 text += f": {getattr(error, 'filename', None)}"
@@ -248,7 +248,7 @@ def _folder_name(store: str | Path) -> str:
         raise StoreError(
             f"this begins with {first}/ and a URL with {first}//; a Path cannot hold a URL, give it as a string"
         )
-    # Expanded here, since libraries underneath would do so in some places and not in others.
+    # It is expanded here, since libraries underneath would do so in some places and not in others.
     try:
         return str(Path(store).expanduser())
     except RuntimeError as error:
@@ -270,7 +270,7 @@ def path_in(root: str | Path, key: str) -> Path:
     if key.startswith("/") or ".." in key.split("/"):
         raise StoreError(f"{root}: {key} leads out of the store")
     path = os.fspath(root)
-    # One by one, since resolving a whole path takes ten times as long, and each record is a key.
+    # Names are looked at one by one: resolving a whole path takes ten times as long, and each record is a key.
     for name in filter(None, key.split("/")):
         path = f"{path}/{name}"
         try:
@@ -298,7 +298,7 @@ class FolderStore(LocalStore):
         super().__init__(_Root(root), read_only=read_only)
 
     async def _open(self, *, mode: AccessModeLiteral | None = None) -> None:
-        # zarr's makes the folder, also of a store that is only read.
+        # That of zarr makes the folder, also of a store that is only read.
         self._is_open = True
 
     async def delete_keys(self, keys: Sequence[str]) -> None:
@@ -314,7 +314,7 @@ class FolderStore(LocalStore):
         """Return the sizes of all files below a prefix; links count as empty, and are refused once they are read."""
         sizes, root = {}, len(os.path.join(self.root, ""))
         for file in _files_below(path_in(self.root, prefix)):
-            with suppress(FileNotFoundError):  # removed since
+            with suppress(FileNotFoundError):  # It was removed since.
                 is_file = file.is_file(follow_symlinks=False)
                 size = file.stat(follow_symlinks=False).st_size if is_file else 0
                 sizes[file.path[root:].replace(os.sep, "/")] = size
@@ -352,9 +352,8 @@ class RemoteStore(FsspecStore):
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
         """Return the bytes of a key or of a range of it, or None if it does not exist."""
-        with _absence_ignored():
-            async with _in_time(self.largest_bytes):
-                return await super().get(key, prototype, byte_range)
+        async with _if_present(self.largest_bytes):
+            return await super().get(key, prototype, byte_range)
         return None
 
     async def set(self, key: str, value: Buffer, byte_range: tuple[int, int] | None = None) -> None:
@@ -370,9 +369,8 @@ class RemoteStore(FsspecStore):
 
     async def delete(self, key: str) -> None:
         """Remove a key if it exists."""
-        with _absence_ignored():
-            async with _in_time():
-                await self.fs._rm_file(f"{self.path}/{key}")
+        async with _if_present():
+            await self.fs._rm_file(f"{self.path}/{key}")
 
     async def delete_keys(self, keys: Sequence[str]) -> None:
         """Remove keys that exist, several by one request."""
@@ -381,21 +379,19 @@ class RemoteStore(FsspecStore):
             return
         # Drivers take a path for a pattern.
         paths = [escape(f"{self.path}/{key}") for key in keys]
-        with _absence_ignored():
-            async with _in_time():
-                await self.fs._rm(paths)
+        async with _if_present():
+            await self.fs._rm(paths)
 
     async def delete_dir(self, prefix: str) -> None:
         """Remove all keys below a prefix."""
         path = f"{self.path}/{prefix}"
-        with _absence_ignored():
-            async with _in_time():
-                # A server may remove some of them only, and s3fs neither checks nor repeats.
-                for _ in range(2):
-                    await self.fs._rm(path, recursive=True)
-                    if not (remaining := await self.fs._find(path)):
-                        return
-                raise OSError(f"{len(remaining)} keys are still there, such as {remaining[0]}")
+        async with _if_present():
+            # A server may remove some of them only, and s3fs neither checks nor repeats.
+            for _ in range(2):
+                await self.fs._rm(path, recursive=True)
+                if not (remaining := await self.fs._find(path)):
+                    return
+            raise OSError(f"{len(remaining)} keys are still there, such as {remaining[0]}")
 
     async def names(self) -> frozenset[str]:
         """Return the names of keys at the first level."""
@@ -432,16 +428,17 @@ def _remote_store(url: str, scheme: str, largest_bytes: int) -> RemoteStore:
     return remote
 
 
-if hasattr(os, "register_at_fork"):  # not on Windows
+if hasattr(os, "register_at_fork"):  # Windows has no fork.
     # The child has no thread that would answer.
     os.register_at_fork(after_in_child=_remote_store.cache_clear)
 
 
-@contextmanager
-def _absence_ignored() -> Iterator[None]:
-    """Ignore that a key is missing, but not that its bucket is."""
+@asynccontextmanager
+async def _if_present(size_bytes: int = 0) -> AsyncIterator[None]:
+    """Limit the time of a request, and ignore that its key is missing, but not that its bucket is."""
     try:
-        yield
+        async with _in_time(size_bytes):
+            yield
     except _ABSENT as error:
         if _lacks_bucket(error):
             raise

@@ -16,10 +16,9 @@ import logging
 import os
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Self
 from uuid import uuid4
@@ -32,11 +31,11 @@ from sobolev_batch.store.location import Location
 _log = logging.getLogger(__name__)
 
 _TIME_FORMAT = "%Y-%m-%dT%H:%M:%SZ"
-# States of a process that only waits for its parent to take notice.
+# In these states, a process only waits for its parent to take notice.
 _ENDED = ("Z", "X")
 
 LOCK_KEY = "claim.json"
-# Held during a takeover, since several drivers may try.
+# This one is held during a takeover, since several drivers may try.
 _TAKEOVER_KEY = "claim.succession.json"
 LOCK_KEYS = frozenset({LOCK_KEY, _TAKEOVER_KEY})
 
@@ -46,7 +45,7 @@ def _checked_time(text: str) -> str:
     return text
 
 
-# A time that `utc_now` returned.
+# Such a time is one that `utc_now` returned.
 Time = Annotated[str, AfterValidator(_checked_time)]
 
 
@@ -93,46 +92,36 @@ class Lock:
             return cls("", "", "a process that has not written its name", "an unknown time")
 
     @property
-    def fence(self) -> Callable[[Location], None]:
-        """Condition that the run of this lock has the store, which tasks take along."""
-        return partial(_require_run, self.run)
-
-    @property
     def holder_is_gone(self) -> bool:
         """True if the holder's process has certainly ended."""
-        return self._is_of_this_machine and not self.holder_is_alive
+        machine = self.process.rpartition("/")[0]
+        return bool(machine) and machine == _machine() and not self.holder_is_alive
 
     @property
     def holder_is_alive(self) -> bool:
         """True if the holder's process certainly runs."""
         number = self.process.rpartition("/")[2].partition("@")[0]
-        return self._is_of_this_machine and number.isdecimal() and _process_mark(int(number)) == self.process
-
-    @property
-    def _is_of_this_machine(self) -> bool:
-        machine = self.process.rpartition("/")[0]
-        return bool(machine) and machine == _machine()
+        return number.isdecimal() and _process_mark(int(number)) == self.process
 
     def is_held(self, location: Location) -> bool:
         """Return whether its holder still has the store."""
         current = Lock.read(location)
         return current is not None and current.holder == self.holder
 
+    def fence(self, location: Location) -> None:
+        """Check that its run still has the store; tasks take this along, see `Location.fenced`."""
+        current = Lock.read(location)
+        if current is None or current.run != self.run:
+            raise _lost(location, current)
+
     def require(self, location: Location) -> None:
-        """Check that its holder still has the store: a stricter fence, for the process that drives the run."""
+        """Check that its holder still has the store: the fence of a process that another one may replace."""
         current = Lock.read(location)
         if current is None or current.holder != self.holder:
             raise _lost(location, current)
 
 
 _adapter = TypeAdapter(Lock)
-
-
-def _require_run(run: str, location: Location) -> None:
-    """Check that a run still has the store."""
-    current = Lock.read(location)
-    if current is None or current.run != run:
-        raise _lost(location, current)
 
 
 def _lost(location: Location, current: Lock | None) -> LockError:
@@ -196,12 +185,6 @@ def release(location: Location, lock: Lock) -> None:
                 location.remove_empty_folder()
     except StoreError as error:
         _log.warning("the store stays locked, unlock it with: sobolev-batch unlock %s (%s)", location, error)
-
-
-def break_lock(location: Location) -> None:
-    """Remove any lock on a store."""
-    for key in LOCK_KEYS:
-        location.discard(key)
 
 
 def this_process() -> str:

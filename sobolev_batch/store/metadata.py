@@ -14,12 +14,12 @@ from typing import Any, TypeGuard
 
 from sobolev_batch.errors import StoreError
 
-# Version of the layout that docs/store.md describes.
+# The layout that docs/store.md describes has this version.
 SCHEMA_VERSION = 10
 
 Document = dict[str, Any]
 
-# Size of one document. That of the root repeats all others, with about 1 kB for each.
+# No document is larger. That of the root repeats all others, with about 1 kB for each.
 MOST_BYTES = 64_000_000
 
 _NODE = re.compile(r"[A-Za-z0-9_]+(/[A-Za-z0-9_]+)?")  # a group, or an array in one
@@ -30,11 +30,12 @@ _ARRAY_KEYS = {
 }
 _DATA_TYPES = ("bool", "int64", "float32", "float64", "complex64", "complex128", "string")
 _CODECS = ("bytes", "crc32c", "vlen-utf8")
-# By the number of axes. An array without a single chunk takes no space in a store, and any amount of memory once it
-# is read. Arrays with one axis are read when a store is opened, tables with two for a report, all others on demand.
+# Arrays have no more elements than this, by the number of their axes: one without a single chunk takes no space in a
+# store, and any amount of memory once it is read. Arrays with one axis are read when a store is opened, tables with two
+# for a report, all others on demand.
 _MOST_ELEMENTS = {0: 1, 1: 10**7, 2: 10**8}
 _LONGEST_AXIS = 2**40
-# Values of all meshes at all samples of octaves, and their spectra, which are read a few meshes at a time.
+# These have values of all meshes, of which a few are read at a time: samples of octaves, and spectra.
 _OF_MESHES = re.compile("octaves/octaves|spectra/.*")
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache
@@ -20,7 +20,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from sobolev_batch.errors import DamageError
 from sobolev_batch.sources.programs import Cost
 from sobolev_batch.store.checked import CHANGED, largest_chunk_bytes
-from sobolev_batch.store.layout import DIGEST, PAGE, RECORD, RECORDS, ROOT, Store, digest_of
+from sobolev_batch.store.layout import DIGEST, PAGE, RECORD, RECORDS, ROOT, Store, digest_of, table_attributes
 from sobolev_batch.store.lock import Time
 from sobolev_batch.store.metadata import chunk_shape
 
@@ -270,6 +270,24 @@ class Records:
         run = {**asdict(record), DIGEST: digest_of(asdict(record))}
         changed = {**document, "attributes": {**document.get("attributes", {}), _RUN: run}}
         self.store.location.write({f"{RECORDS}/{ROOT}": json.dumps(changed).encode()})
+
+
+def rows_unlike_tables(
+    store: Store, records: Sequence[Record | None], among: Collection[int] | None = None
+) -> dict[int, str]:
+    """Return how records differ from those that the tables were made from, by their rows; of some rows, or of all."""
+    if table_attributes(store, "convergence") is None:
+        return {}
+    columns = (np.asarray(store.read(f"meshes/{name}")).tolist() for name in ("row", "status", "key"))
+    tabulated = {row: entry for row, *entry in zip(*columns, strict=True) if among is None or row in among}
+    unlike = {}
+    for row, entry in tabulated.items():
+        record = records[row] if row < len(records) else None
+        if record is None and entry[0] != "missing":
+            unlike[row] = "its completion record is missing"
+        elif record is not None and [record.status, record.key] != entry:
+            unlike[row] = "its completion record is not the one that the tables were made from"
+    return unlike
 
 
 def _from_table(kind: type[Kind], table: Any, name: str) -> Kind:

@@ -20,7 +20,7 @@ from sobolev_batch.store.metadata import chunk_shape
 
 # Raise it where other numbers are computed from the same fields: all chunks are then stale.
 _VERSION = "2"
-# Place of a chunk of keys, counted in chunks.
+# An index is the place of a chunk of keys, counted in chunks.
 Index = tuple[int, ...]
 
 
@@ -42,15 +42,15 @@ def missing_chunks(store: Store, keys: str) -> set[Index]:
     return {index[:axes] for name in names for index in store.incomplete_chunks(name, sizes)}
 
 
-def damaged_chunks(store: Store) -> Iterator[tuple[str, Index, str]]:
-    """Yield the array of keys, place and damage of each chunk that is not what was written."""
+def damaged_chunks(store: Store) -> Iterator[tuple[tuple[str, Index], str]]:
+    """Yield the array of keys with the place, and the damage, of each chunk that is not what was written."""
     for keys in store.keyed_arrays():
         if keys.endswith("/key"):
             for index in store.chunk_keys(keys).values():
                 try:
                     read_chunk(store, keys, index)
                 except DamageError as error:
-                    yield keys, index, error.what
+                    yield (keys, index), error.what
 
 
 def read_chunk(store: Store, keys: str, index: Index) -> tuple[list[str], dict[str, Reals]]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from sobolev_batch.errors import LockError, StoreError
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
-from sobolev_batch.store.lock import Lock, age_seconds, break_lock
+from sobolev_batch.store.lock import LOCK_KEYS, Lock, age_seconds
 from sobolev_batch.store.records import Records
 
 # A run counts as lost if its record was not renewed for this time.
@@ -57,7 +57,8 @@ def unlock(store: str | Path | Location, *, force: bool = False) -> Lock | None:
             f"{location}: {lock.driver} was alive {max(silence, 0):.0f} s ago; stop it, or wait until it has been "
             f"silent for {LOST_AFTER_SECONDS:.0f} s; --force unlocks the store all the same"
         )
-    break_lock(location)
+    for key in LOCK_KEYS:
+        location.discard(key)
     return lock
 
 

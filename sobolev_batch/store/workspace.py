@@ -11,11 +11,10 @@ import numpy as np
 
 from sobolev_batch.store.create import prepare_store
 from sobolev_batch.store.field_arrays import Fields
-from sobolev_batch.store.layout import QUALITY, Store, stored_choice
+from sobolev_batch.store.layout import QUALITY, Store, hide_tables, stored_choice, table_attributes
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock
-from sobolev_batch.store.records import Record, Records
-from sobolev_batch.store.stored_tables import hide_tables, rows_unlike_tables, table_attributes
+from sobolev_batch.store.records import Record, Records, rows_unlike_tables
 from sobolev_batch.study.plan import Plan, Row, make_plan
 from sobolev_batch.study.study import Study
 

@@ -21,9 +21,16 @@ from sobolev_batch.norms.columns import describe
 from sobolev_batch.norms.fields import Quality
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.store.collection_store import CollectionStore
-from sobolev_batch.store.layout import DIGEST, OCTAVES_GROUP, RECORDS, SPECTRA_GROUP, JoinedStore, Store
+from sobolev_batch.store.layout import (
+    DIGEST,
+    OCTAVES_GROUP,
+    RECORDS,
+    SPECTRA_GROUP,
+    JoinedStore,
+    Store,
+    table_attributes,
+)
 from sobolev_batch.store.location import Location
-from sobolev_batch.store.stored_tables import table_attributes
 from sobolev_batch.visible import FILE_UNITS
 
 # Names of families, or globs of names; None is all of them.

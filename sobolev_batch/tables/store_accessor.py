@@ -18,8 +18,7 @@ from sobolev_batch.norms.columns import AREA, KERNEL, LENGTH, NUMBER, described,
 from sobolev_batch.norms.fields import Quality
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.store.layout import QUALITY
-from sobolev_batch.store.records import Record, Records
-from sobolev_batch.store.stored_tables import rows_unlike_tables
+from sobolev_batch.store.records import Record, Records, rows_unlike_tables
 from sobolev_batch.store.workspace import complete_records
 from sobolev_batch.tables.open import finished_group, reference_of, require_unchanged, source_of, store_of
 from sobolev_batch.tables.pairs import pair_distances

@@ -19,9 +19,8 @@ import sobolev_batch as sb
 from sobolev_batch.batch.status import Status
 from sobolev_batch.cli import cli
 from sobolev_batch.cli.output import replace_line
-from sobolev_batch.store.layout import Store
+from sobolev_batch.store.layout import Store, hide_tables
 from sobolev_batch.store.records import Record, Records, RunRecord
-from sobolev_batch.store.stored_tables import hide_tables
 from tests.support.studies import small_table
 
 # One instant for all moments of a test: records have whole seconds, and two readings of the clock may differ by one.

@@ -28,11 +28,10 @@ from sobolev_batch.store import create
 from sobolev_batch.store import location as locations
 from sobolev_batch.store.create import prepare_store
 from sobolev_batch.store.field_arrays import Fields
-from sobolev_batch.store.layout import Store
+from sobolev_batch.store.layout import Store, table_attributes, write_table
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import LOCK_KEY
 from sobolev_batch.store.records import Record, Records
-from sobolev_batch.store.stored_tables import table_attributes, write_table
 from sobolev_batch.study.plan import make_plan
 from tests.support.commands import STUDY, call, command, finished
 from tests.support.object_storage import (

@@ -116,7 +116,7 @@ class Watch:
         try:
             # More has passed only if this process was stopped too.
             obstacle = self._look(min(self._looked - before, 2 * _POLL_SECONDS))
-        except Exception as error:  # a cluster that is closing does not answer, but the run is alive
+        except Exception as error:  # A cluster that is closing does not answer, but the run is alive.
             _log.debug("the cluster could not be asked: %r", error)
             return True
         if obstacle != self.obstacle and obstacle:
@@ -201,7 +201,7 @@ class Heartbeat:
             try:
                 self.write("failed", "interrupted" if is_interrupted else one_line(error))
             except LockError:
-                pass  # the end of the run that has the store now counts
+                pass  # The end of the run that has the store now counts.
             except StoreError as failure:
                 # It may be what ended the run, and must not hide that.
                 _log.warning("how the run ended could not be written: %s", failure)
@@ -229,7 +229,7 @@ class Heartbeat:
                 self.write("running", self.watch.obstacle if self.watch else "")
         except LockError as error:
             self._lost = error
-        except Exception as error:  # the store may answer again at the next beat
+        except Exception as error:  # The store may answer again at the next beat.
             _log.warning("the run's record could not be written: %s", error)
         return self._lost is None
 

@@ -28,8 +28,7 @@ from sobolev_batch.extras.leagues.league import leagues_of
 from sobolev_batch.extras.report import build, content
 from sobolev_batch.extras.report.build import make_report
 from sobolev_batch.shapes import icosphere
-from sobolev_batch.store.layout import Store
-from sobolev_batch.store.stored_tables import hide_tables
+from sobolev_batch.store.layout import Store, hide_tables
 from tests.support.browser import Browser, browser
 from tests.support.studies import GONE, balls, method_rows, methods_of, small_table
 
