@@ -11,8 +11,9 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import takewhile
+from itertools import chain, takewhile
 from pathlib import Path, PurePosixPath
+from string import Template
 
 from sobolev_batch.errors import MeshError, StudyError, written
 from sobolev_batch.geometry.formats.by_name import is_mesh_name, mesh_stem
@@ -34,59 +35,22 @@ _REFERENCES = re.compile(r"(originals|references|targets|objects)", re.IGNORECAS
 # The size of a mesh at the end of its name: cow_500, cow-1k7, cow 20.5.
 _SIZE = re.compile(r"\d+(?:[.,]\d+)?(?:[kKmM]\d*)?$")
 _LONGEST_NAME = 100
+# Characters between the parts of a name.
+_BETWEEN = " _-."
 # More families, or objects on a line, would hide what comes next.
 _MOST_LINES, _MOST_OBJECTS = 10, 6
 # What the optional decimated family has, as fractions of the triangles of the reference.
 _FRACTIONS = (16, 8, 4, 2)
 _FEWEST_TRIANGLES = 4
 
-_STUDY = """\
-# `sobolev-batch plan` says what this study would do, and how long that takes; `sobolev-batch run` computes it.
-
-[study]
-name = {name}
-
-[accuracy]                 # of the distance of every mesh to the reference
-rtol = 1e-2                # the largest relative error: 1 % of the distance itself
-best_effort = true         # where that is out of reach, compute the nearest attainable accuracy and mark it
-
-[norm]
-orders = [-2.0]            # add -4.0 for the overall form, or -1.5 for finer details, which takes longer
-{sections}
-# More to ask for: remove the # in front of the lines.
-
-# [compare]
-# pairs = "all"            # the distance of every mesh to every other, not to the reference alone
-
-# [proximity]              # the usual distances beside ours, also "mean", "rms", "percentiles", "fscore", "normals"
-# metrics = ["hausdorff", "chamfer"]
-"""
-_REFERENCE_SECTION = """
-[reference]                # {remark}
-source = "files"
-paths = [{path}]
-"""
-_FAMILY_SECTION = """
-[[family]]
-name = {name}
-source = "files"
-paths = [  # {size}
-{paths}]
-"""
-_DECIMATED_SECTION = """
-[[family]]
-name = "quadric decimation"
-source = "decimate"
-mesh = {{ source = "files", paths = [{path}] }}
-triangles = {sizes}
-"""
-_OBJECTS_SECTION = """
-[objects]
-meshes = [
-{rows}]
-"""
-# The files of each object and method.
-_Methods = Mapping[tuple[str, str], Sequence[PurePosixPath]]
+# The pieces of a study file by their names. Values are filled in as JSON spells them, which TOML shares.
+_PIECES = dict(
+    re.findall(
+        r"^##### (\w+)\n(.*?)(?=^#####|\Z)", Path(__file__).with_name("draft.toml").read_text("utf-8"), re.M | re.S
+    )
+)
+# The files of each object and family; a study of one object calls that "".
+_Families = Mapping[tuple[str, str], Sequence[PurePosixPath]]
 
 
 @dataclass(frozen=True)
@@ -162,15 +126,15 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
     if problem is not None:
         raise StudyError(f"{folder}: its path cannot be in a study file: {problem}; rename it")
     sizes, left_out = _look_at(folder)
-    several = _several_objects(list(sizes))
-    if several is None:
-        sections, summary = _sections_of_one(_reference(folder, sizes, left_out), sizes, below)
-    else:
-        sections, summary = _sections_of_several(*several, below)
-        used = {*several[0].values(), *(path for paths in several[1].values() for path in paths)}
-        left_out |= {str(path): "its name is that of no object" for path in sizes if path not in used}
-    text = _STUDY.format(name=_toml(_free_name(folder.resolve().name, fallback="study")), sections=sections)
-    if several is None:
+    references = _references(list(sizes)) or {"": _reference(folder, sizes, left_out)}
+    families = _families(sizes, references)
+    used = {*references.values(), *chain.from_iterable(families.values())}
+    left_out |= {str(path): "its name is that of no object" for path in sizes if path not in used}
+    describe = _one_object if "" in references else _several_objects
+    sections, summary = describe(references, families, sizes, below)
+    name = _json(_free_name(folder.resolve().name, fallback="study"))
+    text = _filled("study", name=name, sections="".join(f"\n{section}" for section in sections))
+    if "" in references:
         # A study that cannot list its meshes is none to write down.
         len(Study.from_table(tomllib.loads(text), folder=base).members)
     else:
@@ -251,56 +215,49 @@ def _free_name(wanted: str, taken: Iterable[str] = (), fallback: str = "meshes")
     return next(candidate for candidate in numbered if caseless_key(candidate) not in known)
 
 
-def _without_size(stem: str) -> str:
-    return _SIZE.sub("", stem).strip(" _-.")
-
-
-def _families(owned: Sequence[tuple[PurePosixPath, str]], own_folders: Mapping[str, Sequence[str]]) -> list[str]:
-    """Return the family of each file, which comes with its object, by its folder or by its name.
-
-    Objects have folders of their own, which say nothing of families; a single object is called "".
-    """
-    folders = [[part for part in path.parent.parts if part not in own_folders[name]] for path, name in owned]
-    shared = sum(1 for _ in takewhile(lambda parts: len(set(parts)) == 1, zip(*folders, strict=False)))
-    wanted = []
-    for (path, name), parts in zip(owned, folders, strict=True):
-        # What the name of the file says beside object and size; cowboy in the folder of cow is a family.
-        rest = mesh_stem(path).removeprefix(name)
-        rest = _without_size(mesh_stem(path) if rest[:1].isalnum() else rest)
-        # With slashes, or the families of a/b and "a b" would be one.
-        wanted.append("/".join(parts[shared:]) or rest or "".join(parts[-1:]))
-    # Meshes of one object that are alone, in no folder of their own, are a family together.
-    counts, names = Counter(wanted), dict[str, str]()
-    for place, ((_, name), parts) in enumerate(zip(owned, folders, strict=True)):
-        if not name and not parts[shared:] and counts[wanted[place]] == 1:
-            wanted[place] = ""
-    return [names.setdefault(one, _free_name(one, names.values())) for one in wanted]
-
-
-def _several_objects(paths: Sequence[PurePosixPath]) -> tuple[dict[str, PurePosixPath], _Methods] | None:
-    """Return the references by their objects, and the files of these; None where all files are of one object.
+def _references(paths: Sequence[PurePosixPath]) -> dict[str, PurePosixPath]:
+    """Return the references by their objects; none where all files are of one object.
 
     There are several objects if several files are called references, and each has files of its name.
     """
     called = [path for path in paths if _is_called_reference(path)]
     references = {_object_of(path): path for path in called}
+    owners = {_owner(path, references) for path in paths if path not in called}
     are_names = all(
         name_problem(name, _LONGEST_NAME, RESERVED) is None and not name.startswith((".", "__")) for name in references
     )
-    owned = [(path, owner) for path in paths if path not in called and (owner := _owner(path, references)) is not None]
-    are_all_owners = references.keys() == {owner for _, owner in owned}
-    if not are_names or not are_all_owners or not 2 <= len({*map(caseless_key, references)}) == len(called):
-        return None
-    methods: dict[tuple[str, str], list[PurePosixPath]] = {}
-    own_folders = {name: (name, *path.parent.parts) for name, path in references.items()}
-    for (path, name), family in zip(owned, _families(owned, own_folders), strict=True):
-        methods.setdefault((name, family), []).append(path)
-    return references, methods
+    are_different = 2 <= len({*map(caseless_key, references)}) == len(called)
+    return references if are_names and are_different and references.keys() <= owners else {}
+
+
+def _families(paths: Iterable[PurePosixPath], references: Mapping[str, PurePosixPath]) -> _Families:
+    """Return the files of each object and family, which is that of their folder or of their name."""
+    others = [(path, _owner(path, references)) for path in paths if path not in references.values()]
+    owned = [(path, name) for path, name in others if name is not None]
+    # Objects have folders of their own, which say nothing of families.
+    own = {name: {name, *(reference.parent.parts if name else ())} for name, reference in references.items()}
+    folders = [[part for part in path.parent.parts if part not in own[name]] for path, name in owned]
+    shared = sum(1 for _ in takewhile(lambda parts: len(set(parts)) == 1, zip(*folders, strict=False)))
+    wanted = []
+    for (path, name), parts in zip(owned, folders, strict=True):
+        # What the name of the file says beside object and size; cowboy in the folder of cow is a family.
+        rest = mesh_stem(path).removeprefix(name)
+        rest = _SIZE.sub("", mesh_stem(path) if rest[:1].isalnum() else rest).strip(_BETWEEN)
+        # With slashes, or the families of a/b and "a b" would be one.
+        wanted.append("/".join(parts[shared:]) or rest or "".join(parts[-1:]))
+    families: dict[tuple[str, str], list[PurePosixPath]] = {}
+    counts, names = Counter(wanted), dict[str, str]()
+    for (path, name), parts, family in zip(owned, folders, wanted, strict=True):
+        # Meshes of one object that are alone, in no folder of their own, are a family together.
+        is_alone = not name and not parts[shared:] and counts[family] == 1
+        family = "" if is_alone else family
+        families.setdefault((name, names.setdefault(family, _free_name(family, names.values()))), []).append(path)
+    return families
 
 
 def _object_of(reference: PurePosixPath) -> str:
     """Return the name of the object of a reference: cow of objects/cow.ply, cow/original.ply, cow_original.ply."""
-    rest = _REFERENCE.sub("", mesh_stem(reference)).strip(" _-.")
+    rest = _REFERENCE.sub("", mesh_stem(reference)).strip(_BETWEEN)
     own = [part for part in reference.parent.parts if not _REFERENCE.search(part) and not _REFERENCES.fullmatch(part)]
     return rest or "".join(own[-1:])
 
@@ -310,18 +267,18 @@ def _owner(path: PurePosixPath, references: Mapping[str, PurePosixPath]) -> str 
     stem = mesh_stem(path)
     # cow_big_500 is of cow_big, not of cow.
     beginnings = (stem[:end] for end in range(len(stem), 0, -1) if not stem[end : end + 1].isalnum())
-    return next((name for name in (*beginnings, *path.parent.parts) if name in references), None)
+    return next((name for name in (*beginnings, *path.parent.parts, "") if name in references), None)
 
 
-def _sections_of_one(
-    reference: PurePosixPath, sizes: Mapping[PurePosixPath, int], folder: PurePosixPath
-) -> tuple[str, tuple[str, ...]]:
+def _one_object(
+    references: Mapping[str, PurePosixPath],
+    families: _Families,
+    sizes: Mapping[PurePosixPath, int],
+    folder: PurePosixPath,
+) -> tuple[list[str], tuple[str, ...]]:
     """Return the sections of a study of one object, and what they hold."""
+    (reference,) = references.values()
     path, triangles = str(folder / reference), sizes[reference]
-    others = [(other, "") for other in sizes if other != reference]
-    families: dict[str, list[PurePosixPath]] = {}
-    for (other, _), family in zip(others, _families(others, {"": ()}), strict=True):
-        families.setdefault(family, []).append(other)
     counts = [count for part in _FRACTIONS if (count := triangles // part) >= _FEWEST_TRIANGLES]
     if not families and not counts:
         raise StudyError(
@@ -329,46 +286,47 @@ def _sections_of_one(
             "meshes to compare with it"
         )
     remark = "its name says so" if _is_called_reference(reference) else "the mesh with the most triangles"
-    sections = _REFERENCE_SECTION.format(remark=remark, path=_toml(path))
-    summary = [f"reference {path}, {triangles:,} triangles"]
-    for family, members in families.items():
+    sections, summary = (
+        [_filled("reference", remark=remark, path=_json(path))],
+        [f"reference {path}, {triangles:,} triangles"],
+    )
+    for (_, family), members in families.items():
         ends = dict.fromkeys(f"{end(sizes[member] for member in members):,}" for end in (min, max))
         size = f"{_count(len(members))}, {' to '.join(ends)} triangles"
-        texts = "".join(f"    {_toml(str(folder / member))},\n" for member in members)
-        sections += _FAMILY_SECTION.format(name=_toml(family), paths=texts, size=size)
+        paths = "".join(f"    {_json(str(folder / member))},\n" for member in members)
+        sections.append(_filled("family", name=_json(family), paths=paths, size=size))
         summary.append(f"family {family}: {size}")
     if counts:
-        decimated = _DECIMATED_SECTION.format(path=_toml(path), sizes=counts)
-        if families:
-            lines = ["Compare with decimation: remove the # in front of these lines.", *decimated.split("\n")[1:-1]]
-            decimated = "\n" + "".join(f"# {line}\n" for line in lines)
-        sections += decimated
+        sections.append(_filled("optional" if families else "decimated", path=_json(path), counts=counts))
     return sections, tuple(summary)
 
 
-def _sections_of_several(
-    references: Mapping[str, PurePosixPath], methods: _Methods, folder: PurePosixPath
-) -> tuple[str, tuple[str, ...]]:
+def _several_objects(
+    references: Mapping[str, PurePosixPath],
+    families: _Families,
+    _: Mapping[PurePosixPath, int],
+    folder: PurePosixPath,
+) -> tuple[list[str], tuple[str, ...]]:
     """Return the section of a study of several objects, which lists their meshes, and what it holds."""
     listed = [(name, REFERENCE_LABEL, path) for name, path in references.items()]
-    counts: Counter[str] = Counter()
-    for (name, method), paths in methods.items():
-        listed += [(name, method, path) for path in paths]
-        counts[method] += len(paths)
-    rows = (
-        f"    {{ object = {_toml(name)}, method = {_toml(method)}, path = {_toml(str(folder / path))} }},\n"
+    listed += [(name, method, path) for (name, method), paths in families.items() for path in paths]
+    meshes = "".join(
+        _filled("mesh", name=_json(name), method=_json(method), path=_json(str(folder / path)))
         for name, method, path in listed
     )
-    names = list(references)
+    names, counts = list(references), Counter(method for _, method, _ in listed[len(references) :])
     more = f" and {len(names) - _MOST_OBJECTS} more" if len(names) > _MOST_OBJECTS else ""
-    return _OBJECTS_SECTION.format(rows="".join(rows)), (
+    return [_filled("objects", meshes=meshes)], (
         f"{len(names)} objects: {', '.join(names[:_MOST_OBJECTS])}{more}",
         *(f"method {method}: {_count(count)}" for method, count in counts.items()),
     )
 
 
-def _toml(text: str) -> str:
-    """Return a text as TOML spells it, as JSON does."""
+def _filled(piece: str, **values: object) -> str:
+    return Template(_PIECES[piece]).substitute(values)
+
+
+def _json(text: str) -> str:
     return json.dumps(text, ensure_ascii=False)
 
 
