@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
+import tomllib
 from collections import Counter
 from graphlib import CycleError, TopologicalSorter
 
 import pytest
 
 import sobolev_batch as sb
-from tests.support.repository import MODULES, PACKAGE, imported, public_names
+from tests.support.repository import MODULES, PACKAGE, ROOT, imported, public_names
 
 # Each may import those before it.
 LAYERS = (
@@ -98,6 +100,14 @@ def test_numbers_know_neither_dask_nor_zarr(layer: str) -> None:
     assert len(files) > 5
     for file in files:
         assert not {name.split(".")[0] for name in imported(file)} & {"dask", "distributed", "zarr"}, file
+
+
+def test_the_core_imports_whatever_is_required() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    required = {re.split("[>=<]", line)[0].replace("-", "_") for line in project["dependencies"]}
+    required = {name.removeprefix("lib") for name in required}  # libigl is imported as igl
+    files = [PACKAGE.joinpath(*parts).with_suffix(".py") for parts in modules().values() if parts[0] != "extras"]
+    assert required <= {name.split(".")[0] for file in files for name in imported(file)}
 
 
 @pytest.mark.extras

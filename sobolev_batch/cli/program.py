@@ -67,18 +67,14 @@ class NamedCommands(click.Group):
         return sorted({*self.commands, *self._registered()})
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Return a command; None if there is none of this name, InputError if it cannot be loaded."""
+        """Return a command; None if there is none of this name, InputError if it is one of extras that are lacking."""
         if cmd_name in self.commands:
             return self.commands[cmd_name]
         name = f"{self.prefix}{cmd_name}"
         if is_extra(COMMANDS, name):
             return extra(COMMANDS, name, f"the command {name!r}")  # type: ignore[no-any-return]
         point = self._registered().get(cmd_name)
-        return None if point is None else _loaded(point)
-
-    def knows(self, name: str) -> bool:
-        """Return whether a word is the name of a command, also of one that is not installed."""
-        return name in self.commands or is_extra(COMMANDS, f"{self.prefix}{name}") or name in self._registered()
+        return None if point is None else point.load()
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the list of commands; to load those of other packages for their help could take long, or fail."""
@@ -101,16 +97,6 @@ class NamedCommands(click.Group):
         }
         # Names of several words are those of commands of groups.
         return {name: point for name, point in points.items() if " " not in name}
-
-
-def _loaded(point: EntryPoint) -> click.Command:
-    try:
-        command = point.load()
-    except (ImportError, AttributeError) as error:
-        raise InputError(f"the command {point.name!r} cannot be loaded: {error}") from error
-    if not isinstance(command, click.Command):
-        raise InputError(f"the entry point of the command {point.name!r} is no command of click: {point.value}")
-    return command
 
 
 class _Program(NamedCommands):

@@ -28,8 +28,8 @@ class _Tables(NamedCommands):
     prefix = "table "
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        is_default = bool(args) and args[0] not in self.get_help_option_names(ctx) and not self.knows(args[0])
-        return super().parse_args(ctx, [_DEFAULT, *args] if is_default else args)
+        is_named = not args or args[0] in self.get_help_option_names(ctx) or self.get_command(ctx, args[0]) is not None
+        return super().parse_args(ctx, args if is_named else [_DEFAULT, *args])
 
 
 @dataclass(frozen=True)

@@ -12,17 +12,7 @@ import xarray as xr
 
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.convergence import nearest, smallest_of, table
-from sobolev_batch.tables.text import (
-    Column,
-    column_table,
-    count,
-    machine_table,
-    minus,
-    percent,
-    prose,
-    section,
-    spread,
-)
+from sobolev_batch.tables.text import Column, Section, count, minus, percent, rendered, spread
 
 # A row of a table: a record of a frame. It may also have its "order"; a "mark", a short remark about its marked number;
 # the number of its "color"; and the text "absent" in place of all numbers, with the section "reasons" that explains it.
@@ -191,12 +181,12 @@ def format_verdict(
     frame = table(tree, orders) if frame is None else frame
     reasons = frame[frame["status"] != "complete"].drop_duplicates("mesh").set_index("mesh")["reason"]
     _, rows, omitted = study_verdict(frame, reasons.to_dict())
-    if style in ("csv", "json"):
-        names = ("order", "verdict", "mesh", "relative", "relative_error", "triangles", "remark", "absent")
-        return machine_table(pd.DataFrame(rows, columns=[*names]).astype({"triangles": "Int64"}), style)
-    sections = []
+    names = ("order", "verdict", "mesh", "relative", "relative_error", "triangles", "remark", "absent")
+    for_programs = pd.DataFrame(rows, columns=[*names]).astype({"triangles": "Int64"})
     blank = {"mesh": "", "relative": math.nan, "triangles": pd.NA}
-    for order in frame["order"].drop_duplicates():
-        own = [{**blank, "remark": row.get("absent", ""), **row, "absent": ""} for row in rows if row["order"] == order]
-        sections.append(section(f"Verdict at order {order:g}", [column_table(VERDICT_COLUMNS, own, style)], [], style))
-    return "\n\n".join([*sections, *([prose([f"Only {omitted} are shown."], style)] if omitted else [])])
+    full = [{**blank, "remark": row.get("absent", ""), **row, "absent": ""} for row in rows]
+    sections = [
+        Section(f"Verdict at order {order:g}", [(VERDICT_COLUMNS, [row for row in full if row["order"] == order])])
+        for order in frame["order"].drop_duplicates()
+    ]
+    return rendered(style, for_programs, sections, [f"Only {omitted} are shown."] if omitted else [])

@@ -13,8 +13,8 @@ import xarray as xr
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.proximity import METRICS, OF_ONE_MESH
-from sobolev_batch.norms.budget import AREA_AND_SHAPE, PARTS
-from sobolev_batch.norms.columns import observed_rates, parts_as_variables
+from sobolev_batch.norms.columns import parts_as_variables
+from sobolev_batch.norms.estimate import AREA_AND_SHAPE, PARTS
 from sobolev_batch.parameters import fraction
 from sobolev_batch.sources.programs import Cost
 from sobolev_batch.tables import Format
@@ -32,18 +32,9 @@ from sobolev_batch.tables.open import (
     study_unit,
     unit_of,
 )
+from sobolev_batch.tables.results import observed_rates
 from sobolev_batch.tables.store_accessor import convergence_at, order_note
-from sobolev_batch.tables.text import (
-    Column,
-    column_table,
-    count,
-    machine_table,
-    percent,
-    prose,
-    section,
-    with_error,
-    wrapped,
-)
+from sobolev_batch.tables.text import Column, Section, count, percent, rendered, with_error, wrapped
 from sobolev_batch.transform.lattice import Orders
 
 _ABOUT = ("family", "name", "level", "rank", "ordered_by", "status", "reason", "triangles", "vertices", "seconds")
@@ -232,32 +223,29 @@ def format_table(
     """
     trees = {name: as_tree(place) for name, place in stores_of(store).items()}
     frames = tables_of(trees, orders, x=x) if frames is None else frames
-    if style in ("csv", "json"):
-        return machine_table(frames[""] if "" in frames else _joined(frames), style)
-    sections: list[str] = []
-    for name, frame in frames.items():
-        tree = trees[name]
-        sections += [prose([f"Object {name}"], style)] if name else []
-        sections += _tables(tree, frame, style, x)
-        computed = order_note(tree, frame.attrs["computed"]) if "computed" in frame.attrs else []
-        doubts = [f"{mesh}: {doubt}" for mesh, doubt in placement_doubts(tree).items()]
-        sections += [prose(lines, style) for lines in (computed, [*_failures(tree, frame), *doubts]) if lines]
-    return "\n\n".join([*sections, prose(_notes([trees[name] for name in frames], list(frames.values()), x), style)])
+    rows = frames[""] if "" in frames else _joined(frames)
+    sections = (part for name, frame in frames.items() for part in _sections(name, trees[name], frame, x))
+    return rendered(style, rows, sections, _notes([trees[name] for name in frames], list(frames.values()), x))
 
 
-def _tables(tree: xr.DataTree, frame: pd.DataFrame, style: Format, x: str) -> Iterator[str]:
-    """Yield the table of each order with its caption, and that of other distances where there are any."""
+def _sections(name: str, tree: xr.DataTree, frame: pd.DataFrame, x: str) -> Iterator[Section]:
+    """Yield the tables of an object, and what is to be known of its meshes."""
+    if name:
+        yield Section(f"Object {name}")
     marked = with_remarks(frame)
     columns = list(_COLUMNS)
     if x not in {column.name for column in columns}:
         columns.insert(2, Column(x, x, "{:.4g}".format))
     for order, rows in marked.groupby("order", sort=False):
-        caption = f"Sobolev distance of order {order:g} to {frame.attrs['reference']}"
-        yield section(caption, [column_table(columns, rows.to_dict(orient="records"), style)], [], style)
+        yield Section(f"Sobolev distance of order {order:g} to {frame.attrs['reference']}", [(columns, rows)])
     if has_proximity(tree):
         once = marked[marked["order"] == marked["order"].iloc[0]]
-        others = column_table((_MESH, *_metric_columns(tree)), once.to_dict(orient="records"), style)
-        yield section("Other distances, the same at all orders", [others], [], style)
+        others = (_MESH, *_metric_columns(tree)), once
+        yield Section("Other distances, the same at all orders", [others])
+    if "computed" in frame.attrs:
+        yield Section(sentences=order_note(tree, frame.attrs["computed"]))
+    doubts = [f"{mesh}: {doubt}" for mesh, doubt in placement_doubts(tree).items()]
+    yield Section(sentences=[*_failures(tree, frame), *doubts])
 
 
 def nearest(frame: pd.DataFrame) -> tuple[pd.Series, tuple[str, ...]] | None:
@@ -395,17 +383,15 @@ def format_smallest(
 ) -> str:
     """Return the smallest meshes below a bound as text; see `smallest_below`."""
     frame = smallest_below(tree, below, orders)
-    if style in ("csv", "json"):
-        return machine_table(frame, style)
+    amount = f"{100 * frame.attrs['below']:g} %"
     sections = []
     for order, rows in frame.groupby("order", sort=False):
-        amount = f"{100 * frame.attrs['below']:g} %"
         caption = f"Smallest mesh below {amount} of the norm of {frame.attrs['reference']}, order {order:g}"
         cells = [
             {**row, "mesh": row["mesh"] or "none", "remark": _remark(row)} for row in rows.to_dict(orient="records")
         ]
-        sections.append(section(caption, [column_table(_SMALLEST_COLUMNS, cells, style)], [], style))
-    return "\n\n".join([*sections, prose(wrapped(_SMALLEST_NOTE), style)])
+        sections.append(Section(caption, [(_SMALLEST_COLUMNS, cells)]))
+    return rendered(style, frame, sections, wrapped(_SMALLEST_NOTE))
 
 
 def _smallest(members: pd.DataFrame, most: float) -> dict[str, Any]:

@@ -10,19 +10,12 @@ import xarray as xr
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError
-from sobolev_batch.norms.budget import PARTS, quotients
 from sobolev_batch.norms.columns import parts_as_variables
+from sobolev_batch.norms.estimate import PARTS, quotients
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.open import AnyStore, as_tree, complete_meshes, finished_group, reference_of
 from sobolev_batch.tables.store_accessor import distances_at, norms_at, order_note
-from sobolev_batch.tables.text import (
-    machine_table,
-    middle_cut,
-    printed_table,
-    prose,
-    section,
-    with_error,
-)
+from sobolev_batch.tables.text import Column, Section, middle_cut, rendered, with_error
 from sobolev_batch.transform.lattice import check_orders
 
 _COLUMNS = ("distance", "error", *PARTS)
@@ -101,23 +94,37 @@ def format_matrix(tree: xr.DataTree, style: Format = "text", orders: Sequence[fl
     """Return the distance matrices of an open store as text; InputError where they are too large for people."""
     distances = distances_at(tree, orders)
     chosen = list(dict.fromkeys(distances["order"].values.tolist()))
-    if style in ("csv", "json"):
-        return machine_table(pd.concat([matrix_frame(distances, order) for order in chosen]), style)
     count = distances.sizes["mesh"]
-    if count > _MOST_MESHES:
+    if count > _MOST_MESHES and style not in ("csv", "json"):
         raise InputError(
             f"a matrix of {count} meshes is too large to be read as {style}, which goes up to {_MOST_MESHES}: "
             "take --format csv or json"
         )
-    sections = []
-    for order in chosen:
-        values, errors, unit = _shown_numbers(tree, distances.sel(order=order).load())
-        caption = f"Sobolev distances of order {order:g}, {unit}"
-        sections.append(section(caption, [_table(distances, values, errors, style)], [], style))
+    frame = pd.concat([matrix_frame(distances, order) for order in chosen])
+    sections = (_section(tree, distances.sel(order=order).load()) for order in chosen)
     notes = [_NOTE]
     if "computed" in distances.attrs:
         notes += order_note(tree, distances.attrs["computed"])
-    return "\n\n".join([*sections, prose(notes, style)])
+    return rendered(style, frame, sections, notes)
+
+
+def _section(tree: xr.DataTree, distances: xr.Dataset) -> Section:
+    """Return the matrix of one order; a symmetric one has only the cells below its diagonal."""
+    values, errors, unit = _shown_numbers(tree, distances)
+    labels, others = (distances[name].values.tolist() for name in ("mesh", "other"))
+    is_symmetric = labels == others
+    rows = [
+        {"label": f"{i + 1} {middle_cut(label, _LONGEST_LABEL)}"}
+        | {
+            str(j): with_error(float(values[i, j]), float(errors[i, j])) or "missing"
+            for j in range(i if is_symmetric else len(others))
+        }
+        for i, label in enumerate(labels)
+    ]
+    kept = {str(j): labels.index(other) + 1 for j, other in enumerate(others) if any(str(j) in row for row in rows)}
+    columns = [Column("label", ""), *(Column(j, str(number)) for j, number in kept.items())]
+    caption = f"Sobolev distances of order {distances['order'].item():g}, {unit}"
+    return Section(caption, [(columns, [dict.fromkeys(kept, "") | row for row in rows])])
 
 
 def _shown_numbers(tree: xr.DataTree, distances: xr.Dataset) -> tuple[Reals, Reals, str]:
@@ -129,21 +136,3 @@ def _shown_numbers(tree: xr.DataTree, distances: xr.Dataset) -> tuple[Reals, Rea
         if norm["norm"].notnull():
             return 100 * relative, 100 * bounds, f"in % of the norm of {reference_of(tree)}"
     return values, errors, "in the square root of a unit length"
-
-
-def _table(distances: xr.Dataset, numbers: Reals, errors: Reals, style: Format) -> str:
-    """Return a matrix as a table; a symmetric one has only the cells below its diagonal."""
-    labels, others = (distances[name].values.tolist() for name in ("mesh", "other"))
-    is_symmetric = labels == others
-    numbers_of = {label: str(i) for i, label in enumerate(labels, 1)}
-    rows = [
-        [f"{i + 1} {middle_cut(label, _LONGEST_LABEL)}"]
-        + [
-            "" if is_symmetric and i <= j else with_error(float(numbers[i, j]), float(errors[i, j])) or "missing"
-            for j in range(len(others))
-        ]
-        for i, label in enumerate(labels)
-    ]
-    kept = [0, *(column for column in range(1, 1 + len(others)) if any(row[column] for row in rows))]
-    headers = ["", *(numbers_of[label] for label in others)]
-    return printed_table([[row[k] for k in kept] for row in rows], [headers[k] for k in kept], style)

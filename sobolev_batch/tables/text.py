@@ -10,7 +10,7 @@ import shutil
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 Item = TypeVar("Item")
+# Rows of a table: a frame, or its records.
+Rows: TypeAlias = pd.DataFrame | Sequence[Mapping[Any, Any]]
 
 
 # More digits are hard to read, whatever the error.
@@ -39,6 +41,21 @@ _LARGEST_SHARE_ERROR, _WHOLE_PERCENT = 0.1, 0.01
 # Area is called lost or gained if the surface really lost or gained at least this fraction of what fits best.
 _LEAST_CHANGE = 0.5
 _PLAIN = {ord(raised): plain for plain, raised in zip("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹", strict=True)}
+# What follows a number in a text, by the mark of its row.
+_MARKS = {"": "", "below its error": "*", "above rtol": "!"}
+_TABULATE_FORMATS = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
+
+# Length of lines without a terminal, longest line of prose, and the least that remains of a label or a text.
+_LINE_LENGTH, _LONGEST_PROSE, _SHORTEST_TEXT = 100, 100, 20
+# Spaces between columns, and beside headers, by tabulate.
+_GAP, _PADDING = 2, 2
+# Spreadsheets take texts that begin so for formulas, and run them; those of East Asia also take the wide ones.
+_FORMULA_SIGNS = tuple("=+-@＝＋－＠")
+# What divides cells of Markdown, or begins code, links, HTML, entities, formulas and headings; and emphasis, which
+# underscores within words do not begin.
+_MARKDOWN_MARKS = re.compile(r"[\\|`\[\]<>&~$#*]|(?<![^\W_])_|_(?![^\W_])")
+# After the end of a row, LaTeX takes these for options of that end.
+_LATEX_OPTIONS = re.compile(r"^( *)(?=[\[*])", re.MULTILINE)
 
 
 def with_error(value: float, error: float = math.nan, unit: str = "") -> str:
@@ -241,23 +258,6 @@ def _power(power: int) -> str:
     return _POWER + str(power).translate(_SUPERSCRIPTS)
 
 
-# Of numbers, in texts.
-_MARKS = {"": "", "below its error": "*", "above rtol": "!"}
-_TABULATE_FORMATS = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
-
-# Length of lines without a terminal, longest line of prose, and the least that remains of a label or a text.
-_LINE_LENGTH, _LONGEST_PROSE, _SHORTEST_TEXT = 100, 100, 20
-# Spaces between columns, and beside headers, by tabulate.
-_GAP, _PADDING = 2, 2
-# Spreadsheets take texts that begin so for formulas, and run them; those of East Asia also take the wide ones.
-_FORMULA_SIGNS = tuple("=+-@＝＋－＠")
-# What divides cells of Markdown, or begins code, links, HTML, entities, formulas and headings; and emphasis, which
-# underscores within words do not begin.
-_MARKDOWN_MARKS = re.compile(r"[\\|`\[\]<>&~$#*]|(?<![^\W_])_|_(?![^\W_])")
-# After the end of a row, LaTeX takes these for options of that end.
-_LATEX_OPTIONS = re.compile(r"^( *)(?=[\[*])", re.MULTILINE)
-
-
 @dataclass(frozen=True)
 class Column:
     """A column of a table: of a text, and of a page.
@@ -285,7 +285,29 @@ class Column:
         return self.format(value, row[self.error]) if self.error else self.format(value)
 
 
-def column_table(columns: Sequence[Column], rows: Iterable[Mapping[Any, Any]], style: Format) -> str:
+@dataclass(frozen=True)
+class Section:
+    """A part of a result for people: a caption, tables of columns and rows, and sentences below each other."""
+
+    caption: str = ""
+    tables: Sequence[tuple[Sequence[Column], Rows]] = ()
+    sentences: Sequence[str] = ()
+
+    def text(self, style: Format) -> str:
+        """Return the part as text, Markdown or LaTeX; tables without rows are left out."""
+        tables = [column_table(columns, rows, style) for columns, rows in self.tables if len(rows)]
+        parts = prose([self.caption] if self.caption else [], style), *tables, prose(self.sentences, style)
+        return ("\n" if style == "latex" else "\n\n").join(filter(None, parts))
+
+
+def rendered(style: Format, frame: pd.DataFrame, sections: Iterable[Section], notes: Sequence[str]) -> str:
+    """Return a result in a format: its rows for programs, or its sections and notes for people."""
+    if style in ("csv", "json"):
+        return machine_table(frame, style)
+    return "\n\n".join(filter(None, (one.text(style) for one in (*sections, Section(sentences=notes)))))
+
+
+def column_table(columns: Sequence[Column], rows: Rows, style: Format) -> str:
     """Return rows of a frame as a table for people, with marks, and where numbers are absent; see `printed_table`."""
     cells = [
         [
@@ -294,16 +316,10 @@ def column_table(columns: Sequence[Column], rows: Iterable[Mapping[Any, Any]], s
             else column.text(row) + (_MARKS[row.get("mark", "")] if column.is_marked else "")
             for column in columns
         ]
-        for row in rows
+        for row in (rows.to_dict(orient="records") if isinstance(rows, pd.DataFrame) else rows)
     ]
     texts = [number for number, column in enumerate(columns) if column.kind == "text"]
     return printed_table(cells, [column.header for column in columns], style, texts)
-
-
-def section(caption: str, tables: Iterable[str], sentences: Iterable[str], style: Format) -> str:
-    """Return a caption, tables and sentences below each other."""
-    parts = prose([caption], style), *tables, prose(sentences, style)
-    return ("\n" if style == "latex" else "\n\n").join(filter(None, parts))
 
 
 def machine_table(frame: pd.DataFrame, style: Format) -> str:

@@ -55,6 +55,12 @@ class VertexWitness:
     context: str = "study"
 
     @property
+    def largest(self) -> tuple[float, Reals]:
+        """Value of the first order whose modulus is largest, and its place (3,) in the unit of the mesh."""
+        vertex = int(np.nanargmax(np.abs(self.values[0])))
+        return float(self.values[0, vertex]), self.mesh.vertices[vertex]
+
+    @property
     def notes(self) -> list[str]:
         """What the numbers of a file mean, for its comments."""
         escaped = self.title.encode("unicode_escape").decode("ascii")
@@ -135,19 +141,26 @@ def write_difference(
     pair = [similarity.apply(surface) for surface in (a, b)]
     centered = list(map(centering(pair).apply, pair))
     fields = _fields(centered, order)
-    sides = [
-        _Side(label, name, own, other, mesh, witness_at_vertices(*fields, (order,), mesh, dtype="complex64"))
-        for label, name, own, other, mesh in zip("ab", names, (a, b), (b, a), centered, strict=True)
-        if isinstance(own, Mesh) and isinstance(mesh, Mesh)
-    ]
-    if not sides:
+    is_picture = path.suffix in _PICTURES
+    found, drawn = dict[Path, VertexWitness](), []
+    for label, name, own, other, mesh in zip("ab", names, (a, b), (b, a), centered, strict=True):
+        if isinstance(own, Mesh) and isinstance(mesh, Mesh):
+            values = witness_at_vertices(*fields, (order,), mesh, dtype="complex64")
+            is_measured = distances is not None and isinstance(other, Mesh) and not is_picture
+            lengths = vertex_distances(own, other) if is_measured else None
+            title = f"{label} against b, comparison {path.name}"
+            one = VertexWitness(own, values, (order,), title, 1 / similarity.scale, lengths, "comparison")
+            found[path.with_name(f"{path.name}-{label}.ply")] = one
+            drawn.append((name, mesh))
+    if not found:
         return "no witness: neither surface is a mesh"
-    if path.suffix in _PICTURES:
-        drawn = [(side.name, side.mesh) for side in sides]
+    files = [*found]
+    if is_picture:
         files = extra(FEATURES, "picture", _PURPOSE)(path, drawn, fields, order, distances, similarity.scale)
-    else:
-        files = [side.write(path, order, 1 / similarity.scale, distances is not None) for side in sides]
-    greatest, place = max((side.largest for side in sides), key=lambda largest: abs(largest[0]))
+    for file, one in () if is_picture else found.items():
+        with written(file, "the witness"):
+            file.write_bytes(one.to_ply())
+    greatest, place = max((one.largest for one in found.values()), key=lambda largest: abs(largest[0]))
     kind = "more" if greatest > 0 else "less"
     near = f"{names[0]} has {kind} area near ({', '.join(f'{x:.4g}' for x in place)})"
     return f"{near if greatest else 'they differ nowhere'}; witness: {' '.join(map(str, files))}"
@@ -160,32 +173,3 @@ def _fields(surfaces: Sequence[Surface], order: float) -> tuple[xr.DataArray, xr
     lattice = core_lattice(Support(area, extent.widths, extent.reach), (order,), Accuracy(_ACCURACY))
     a, b = (fourier_transform(surface, lattice, _EPS, dtype="complex64", order=order) for surface in surfaces)
     return a, b
-
-
-@dataclass(frozen=True, eq=False)
-class _Side:
-    """A mesh of a comparison, in its own unit and in that of the fields, with its witness function (1, vertices)."""
-
-    label: str
-    name: str
-    own: Mesh
-    other: Surface
-    mesh: Mesh
-    values: Reals
-
-    @property
-    def largest(self) -> tuple[float, Reals]:
-        """Value of the witness function whose modulus is largest, and its place (3,) in the mesh's own unit."""
-        vertex = int(np.nanargmax(np.abs(self.values[0])))
-        return float(self.values[0, vertex]), self.own.vertices[vertex]
-
-    def write(self, path: Path, order: float, unit: float, with_distances: bool) -> Path:
-        """Write the mesh as PLY, where asked with the distance of each vertex from the other mesh; return its path."""
-        file = path.with_name(f"{path.name}-{self.label}.ply")
-        title = f"{self.label} against b, comparison {path.name}"
-        is_measured = with_distances and isinstance(self.other, Mesh)
-        lengths = vertex_distances(self.own, self.other) if is_measured else None
-        found = VertexWitness(self.own, self.values, (order,), title, unit, lengths, "comparison")
-        with written(file, "the witness"):
-            file.write_bytes(found.to_ply())
-        return file

@@ -15,7 +15,7 @@ from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.shown import ShownTables
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.open import EDGE_LENGTH, sizes_of
-from sobolev_batch.tables.text import Column, column_table, machine_table, percent, prose, section, wrapped
+from sobolev_batch.tables.text import Column, Section, percent, rendered, wrapped
 
 DEFAULT_COST = "make_seconds"
 # Members that a row of a table names, and objects whose fronts a text has.
@@ -205,17 +205,13 @@ def _is_unbeaten(costs: pd.Series, own: pd.Series, others: pd.Series) -> NDArray
 
 def format_cost_leagues(leagues: Sequence[CostLeague], style: Format = "text") -> str:
     """Return leagues by cost as text, or their meshes for programs; see `league`."""
-    if style in ("csv", "json"):
-        frame = pd.concat([one.meshes.assign(order=one.order) for one in leagues], ignore_index=True)
-        return machine_table(frame[["order", *frame.columns.drop("order")]], style)
-    sections = []
-    for one in leagues:
-        methods = column_table(METHOD_COLUMNS, one.table.to_dict(orient="records"), style)
-        rows = one.front.to_dict(orient="records")
-        tables = [methods, *([column_table(front_columns(one.x), rows, style)] if rows else [])]
-        sections.append(section(one.caption, tables, _front_lines(one), style))
+    frame = pd.concat([one.meshes.assign(order=one.order) for one in leagues], ignore_index=True)
+    sections = [
+        Section(one.caption, [(METHOD_COLUMNS, one.table), (front_columns(one.x), one.front)], _front_lines(one))
+        for one in leagues
+    ]
     notes = [*wrapped(COST_NOTE), *(f"{name} is left out: {why}." for name, why in leagues[0].left_out.items())]
-    return "\n\n".join([*sections, prose(notes, style)])
+    return rendered(style, frame[["order", *frame.columns.drop("order")]], sections, notes)
 
 
 def front_columns(x: str) -> tuple[Column, ...]:

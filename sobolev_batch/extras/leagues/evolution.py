@@ -15,7 +15,7 @@ from sobolev_batch.sources.names import quoted
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.open import AnyStore, as_tree, complete_meshes, finished_group, has_times, reference_of
 from sobolev_batch.tables.store_accessor import StoreAccessor, convergence_at
-from sobolev_batch.tables.text import machine_table, printed_table, prose, section, with_error, wrapped
+from sobolev_batch.tables.text import Column, Section, rendered, with_error, wrapped
 from sobolev_batch.transform.lattice import Orders, check_orders
 
 # A mesh whose distance has grown by this factor since its first time is worth a new one.
@@ -101,22 +101,22 @@ def format_evolution(
 ) -> str:
     """Return the distances of moving meshes as text; see `evolution`."""
     found = evolution(tree, orders, truth=truth, factor=factor)
-    if style in ("csv", "json"):
-        columns = [*_NUMBERS, "growth"]
-        frame: pd.DataFrame = found[columns].to_dataframe().dropna(how="all").reset_index()
-        return machine_table(frame[["order", "family", "time", *columns]], style)
-    families = found["family"].values.tolist()
+    columns = [*_NUMBERS, "growth"]
+    frame: pd.DataFrame = found[columns].to_dataframe().dropna(how="all").reset_index()
+    names = found["family"].values.tolist()
+    table = (Column("time", "time"), *(Column(f"family {name}", name) for name in names))
     sections = []
     for order in found["order"].values.tolist():
-        rows = found.sel(order=order)
+        families = {name: found.sel(order=order, family=name) for name in names}
         cells = [
-            [_time(time), *(_cell(rows.sel(family=family, time=time)) for family in families)]
-            for time in rows["time"].values.tolist()
+            {"time": _time(time), **{f"family {name}": _cell(rows.sel(time=time)) for name, rows in families.items()}}
+            for time in found["time"].values.tolist()
         ]
         caption = f"Sobolev distance of order {order:g} to {truth or reference_of(tree)} over time, in % of its norm"
-        moments = [f"{family}: {_moment(rows.sel(family=family), factor)}" for family in families]
-        sections.append(section(caption, [printed_table(cells, ["time", *families], style)], moments, style))
-    return "\n\n".join([*sections, prose(wrapped(_NOTE.format(factor=factor)), style)])
+        moments = [f"{name}: {_moment(rows, factor)}" for name, rows in families.items()]
+        sections.append(Section(caption, [(table, cells)], moments))
+    notes = wrapped(_NOTE.format(factor=factor))
+    return rendered(style, frame[["order", "family", "time", *columns]], sections, notes)
 
 
 def _labels_by_time(tree: xr.DataTree, truth: str | None) -> tuple[dict[str, dict[float, str]], dict[float, str]]:

@@ -34,7 +34,7 @@ from sobolev_batch.study.comparable import SIGNIFICANCE, gap_of, least_objects
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.convergence import table, tables_of
 from sobolev_batch.tables.open import EDGE_LENGTH, AnyStore, as_tree, finished_group, reference_of, stores_of
-from sobolev_batch.tables.text import Column, column_table, machine_table, prose, section, wrapped
+from sobolev_batch.tables.text import Column, Section, rendered, wrapped
 from sobolev_batch.transform.lattice import Orders
 
 LEAGUE_NOTE = """\
@@ -447,17 +447,11 @@ def _change(meshes: pd.DataFrame) -> dict[str, object]:
 
 def format_league(leagues: Sequence[League], style: Format = "text") -> str:
     """Return leagues as text; see `league`."""
-    if style in ("csv", "json"):
-        frames = [one.table.assign(order=one.order) for one in leagues]
-        frame = pd.concat(frames, ignore_index=True)
-        return machine_table(frame[["order", *frame.columns.drop("order")]], style)
-    sections = []
-    for one in leagues:
-        rows = column_table(LEAGUE_COLUMNS[:-1], one.table.to_dict(orient="records"), style)
-        sections.append(section(one.caption, [rows], pair_lines(one), style))
+    frame = pd.concat([one.table.assign(order=one.order) for one in leagues], ignore_index=True)
+    sections = [Section(one.caption, [(LEAGUE_COLUMNS[:-1], one.table)], pair_lines(one)) for one in leagues]
     notes = wrapped(LEAGUE_NOTE.format(x=leagues[0].x))
     notes += [f"{name} is left out{where}: {reason}." for name, where, reason in left_out(leagues)]
-    return "\n\n".join([*sections, prose(notes, style)])
+    return rendered(style, frame[["order", *frame.columns.drop("order")]], sections, notes)
 
 
 def left_out(leagues: Sequence[League]) -> Iterator[tuple[str, str, str]]:
@@ -473,18 +467,16 @@ def left_out(leagues: Sequence[League]) -> Iterator[tuple[str, str, str]]:
 
 def format_changes(changes: pd.DataFrame, style: Format = "text") -> str:
     """Return the result of `compare_studies` as text."""
-    if style in ("csv", "json"):
-        return machine_table(changes, style)
-    sections = []
-    for order, frame in changes.groupby("order", sort=False):
-        rows = column_table(_CHANGE_COLUMNS, frame.to_dict(orient="records"), style)
-        sections.append(section(f"New study against the old one at order {order:g}", [rows], [], style))
+    sections = [
+        Section(f"New study against the old one at order {order:g}", [(_CHANGE_COLUMNS, rows)])
+        for order, rows in changes.groupby("order", sort=False)
+    ]
     units = "objects" if (changes["objects"] > 1).all() else "meshes"
     notes = wrapped(_CHANGES_NOTE.format(units=units))
     least = least_objects(changes["method"].nunique())
     if (changes[units] < least).any():
         notes.append(f"With fewer than {least} {units}, the test decides nothing; look at the intervals.")
-    return "\n\n".join([*sections, prose(notes, style)])
+    return rendered(style, changes, sections, notes)
 
 
 def pair_lines(league: League) -> list[str]:
