@@ -29,8 +29,8 @@ from .norms.causes import spectrum as spectrum
 from .norms.causes import witness as witness
 from .norms.distances import distance as distance
 from .norms.distances import norm as norm
-from .norms.distances import yardsticks as yardsticks
 from .norms.fields import fourier_transform as fourier_transform
+from .norms.yardsticks import yardsticks as yardsticks
 from .store.unlock import unlock as unlock
 from .study.study import Study as Study
 from .study.study import StudyCollection as StudyCollection

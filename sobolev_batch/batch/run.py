@@ -24,7 +24,7 @@ from sobolev_batch.batch.verify import damaged_rows
 from sobolev_batch.errors import DamageError, InputError, StoreError
 from sobolev_batch.machine import available_cores, require_machine_memory
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
-from sobolev_batch.norms.budget import NormEstimate
+from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.shown import Shown, reasons
 from sobolev_batch.store.collection_store import CollectionStore, for_each_object, labelled
 from sobolev_batch.store.create import require_usable

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from sobolev_batch.batch.cluster.execution import Cluster, Task
 from sobolev_batch.errors import DamageError
-from sobolev_batch.norms.budget import NormEstimate
 from sobolev_batch.norms.columns import describe
+from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.norms.fields import Quality
 from sobolev_batch.sources.names import natural_key
 from sobolev_batch.sources.programs import Cost

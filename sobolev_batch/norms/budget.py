@@ -7,10 +7,9 @@ docs/numerics.md says how well these estimates hold.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import product
-from typing import Self
 
 import numpy as np
 from scipy.special import beta, exprel, gamma, gammaln, kve, zeta
@@ -79,56 +78,6 @@ class Support:
     reach: float = 0.0
 
 
-# Of an error, in the order of `NormEstimate`.
-PARTS = ("truncation", "aliasing", "discretisation", "statistical")
-# Of a distance, each with its error, in the order of `ReferenceEstimate.parts`.
-AREA_AND_SHAPE = ("area_part", "area_part_error", "shape_part", "shape_part_error")
-
-
-@dataclass(frozen=True)
-class NormEstimate:
-    """Norms or distances with their errors, each (orders, ...).
-
-    Attributes:
-        truncation: Bound on the error by frequencies beyond the highest one; without octaves they can only add.
-        aliasing: Estimate of the change by the lattice's spacing, either way.
-        discretisation: Bound on the error by the triangle rules and the NUFFT.
-        statistical: Bound on the error by random frequencies, which holds with a probability; zero without these.
-    """
-
-    values: Reals
-    truncation: Reals
-    aliasing: Reals
-    discretisation: Reals
-    statistical: Reals = field(default_factory=lambda: np.zeros(()))
-
-    def __iter__(self) -> Iterator[Reals]:
-        yield from (self.values, self.truncation, self.aliasing, self.discretisation)
-        yield np.broadcast_to(self.statistical, np.shape(self.values))
-
-    @property
-    def errors(self) -> Reals:
-        """Total error: the true value differs from the reported one by no more."""
-        return self.truncation + self.aliasing + self.discretisation + self.statistical
-
-    def relative_to(self, norms: NormEstimate) -> tuple[Reals, Reals]:
-        """Return the values over some norms, and bounds on the errors; see `quotients`."""
-        return quotients((self.values, self.errors), (norms.values, norms.errors))
-
-    def named(self, name: str) -> dict[str, Reals]:
-        """Return the values under a name, the error, and as "error_part" its `PARTS` (orders, ..., part)."""
-        return {name: self.values, "error": self.errors, "error_part": np.stack([*self][1:], axis=-1)}
-
-
-def quotients(values: tuple[Reals, Reals], norms: tuple[Reals, Reals]) -> tuple[Reals, Reals]:
-    """Return values over norms, and bounds on the errors, from both with their errors; NaN up to a norm's own error."""
-    (value, error), (norm, norm_error) = values, norms
-    with np.errstate(divide="ignore", invalid="ignore"):
-        relative = value / norm
-        errors = (error + relative * norm_error) / (norm - norm_error)
-    return relative, np.where(norm_error < norm, errors, np.nan)
-
-
 def add_sums(sums: Sequence[Sums]) -> Sums:
     """Return the sums of a whole field from those of its blocks."""
     return Sums(np.sum([one.squares for one in sums], axis=0), np.sum([one.outer for one in sums], axis=0))
@@ -149,25 +98,6 @@ def outer_windows(weights: SobolevWeights) -> Reals:
     return np.stack(
         [((radii >= low) & (radii < high)) / ((high - low) * lattice.xi_max) for low, high in ranges]
     ).astype(np.float64)
-
-
-def estimate_norms(sums: Sums, weights: SobolevWeights, support: Support, discretisation: Reals) -> NormEstimate:
-    """Return norms from the sums of fields or of differences, and from the norms of their own errors (orders, ...).
-
-    The errors of both fields of a difference are added.
-    """
-    totals: Reals = np.maximum(sums.totals, 0.0)
-    values = np.sqrt(totals)
-    tails = truncated(sums, weights, support)
-    images = aliased(sums, weights, support.widths)
-    return NormEstimate(values, np.sqrt(totals + tails) - values, change_of_root(totals, images), discretisation)
-
-
-def change_of_root(totals: Reals, changes: Reals) -> Reals:
-    """Return how much the root of totals changes at most if the totals are off by some changes, either way."""
-    values = np.sqrt(totals)
-    lower = np.sqrt(np.maximum(totals - changes, 0.0))
-    return np.asarray(np.maximum(np.sqrt(totals + changes) - values, values - lower))
 
 
 def truncated(sums: Sums, weights: SobolevWeights, support: Support, highest: float | None = None) -> Reals:
@@ -199,7 +129,7 @@ def truncated(sums: Sums, weights: SobolevWeights, support: Support, highest: fl
         growth = outer * (middles[1] * lattice.xi_max) ** -power * start**exponent * np.log(saturated / start)
         growing = growth * exprel(exponent * np.log(saturated / start))
         flat = ceiling * saturated ** (order + 0.5) / (-order - 0.5)
-        # Of lattices that reach next to nothing the tail is unknown.
+        # The tail of a lattice that reaches next to nothing is unknown.
         with np.errstate(divide="ignore", invalid="ignore"):
             tails.append(np.where(outer > 0, (growing + flat) / (2 * ratio), 0.0))
     periods = float(support.widths.max()) * lattice.xi_max
@@ -292,88 +222,3 @@ def image_weight(spacing: float, order: float, widths: Reals, images: Reals = _P
         logs = nu * np.log(arguments) + np.log(kve(nu, arguments)) - arguments - gammaln(nu) - (nu - 1) * np.log(2)
     # Never exactly zero, so that ratios exist.
     return float(np.sum(np.maximum(np.exp(np.minimum(logs, 0.0)), 1e-280)))
-
-
-@dataclass(frozen=True, eq=False)
-class ReferenceEstimate:
-    """The norm of the reference b of a distance ||a - b||, and the product <a - b, b>, each (orders,).
-
-    Attributes:
-        products: Products of the difference with the reference, in units of length.
-        product_errors: Bounds on the errors of the products.
-    """
-
-    norms: NormEstimate
-    products: Reals
-    product_errors: Reals
-
-    @classmethod
-    def of_equal(cls, count: int) -> Self:
-        """Return the estimate for equal surfaces at some orders: whatever the norm, they differ by none of it."""
-        zeros = np.zeros(count)
-        return cls(NormEstimate(zeros + 1, zeros, zeros, zeros), zeros, zeros)
-
-    @classmethod
-    def on_lattice(
-        cls, products: Sums, distances: NormEstimate, norms: NormEstimate, weights: SobolevWeights, widths: Reals
-    ) -> Self:
-        """Return the estimate where the surfaces are known on a lattice alone, from the sums of <a - b, b>.
-
-        Beyond the lattice a product is at most the product of the norms of both factors there.
-        """
-        ours, own = ((one.values + one.truncation) ** 2 - one.values**2 for one in (distances, norms))
-        errors = np.sqrt(ours * own) + aliased(products, weights, widths)
-        return cls(norms, products.totals, errors + product_rounding(distances, norms))
-
-    def area_shares(self, distances: NormEstimate) -> tuple[Reals, Reals]:
-        """Return which share of the squared distances a change of total area explains, and bounds on their errors.
-
-        The best multiple c b of the reference explains <a - b, b>² / ||b||² of ||a - b||².
-        """
-        products, norms = np.abs(self.products), self.norms
-        lowest, highest = self._area_bounds
-        with np.errstate(divide="ignore", invalid="ignore"):
-            shares = np.minimum((products / (distances.values * norms.values)) ** 2, 1.0)
-            fewest = lowest / (distances.values + distances.errors)
-            most = highest / np.maximum(distances.values - distances.errors, 0.0)
-        return shares, np.maximum(shares - fewest**2, np.minimum(most**2, 1.0) - shares)
-
-    @property
-    def _area_bounds(self) -> tuple[Reals, Reals]:
-        """Bounds on |<a - b, b>| / ||b||."""
-        products, norms, error = np.abs(self.products), self.norms, self.product_errors
-        with np.errstate(divide="ignore", invalid="ignore"):
-            lowest = np.maximum(products - error, 0.0) / (norms.values + norms.errors)
-            return lowest, (products + error) / np.maximum(norms.values - norms.errors, 0.0)
-
-    def parts(self, distances: NormEstimate) -> dict[str, Reals]:
-        """Return two orthogonal parts of distances, that of area and the rest, by name, and bounds on their errors.
-
-        For the difference e = a - b they follow from ||e||, <e, b> and ||b||. The multiple of b nearest to a is c b
-        with c = 1 + <e, b>/<b, b>, in which nothing cancels for near-duplicates. Then e = (c - 1) b + (a - c b). The
-        squares of the norms of both parts are good to 1e-15 of the squared distance.
-        """
-        (lowest, highest), values = self._area_bounds, distances.values
-        least, most = np.maximum(values - distances.errors, 0.0), values + distances.errors
-        with np.errstate(divide="ignore", invalid="ignore"):
-            # Rounding may make the projection longer than what it projects.
-            area = np.minimum(np.abs(self.products) / self.norms.values, values)
-            highest = np.minimum(highest, most)
-        shape, shortest, longest = (
-            np.sqrt(np.maximum(distance**2 - part**2, 0.0))
-            for distance, part in ((values, area), (least, highest), (most, lowest))
-        )
-        errors = (np.maximum(area - lowest, highest - area), np.maximum(shape - shortest, longest - shape))
-        return dict(zip(AREA_AND_SHAPE, (area, errors[0], shape, errors[1]), strict=True))
-
-    @property
-    def excesses(self) -> Reals:
-        """Difference from one of the multiple of the reference that is nearest to the other surface (orders,)."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(self.products / self.norms.values**2)
-
-
-def product_rounding(distances: NormEstimate, norms: NormEstimate) -> Reals:
-    """Return how far off products may be by the errors of the values of both factors (orders,)."""
-    rounding, of_reference = distances.discretisation, norms.discretisation
-    return np.asarray(rounding * (norms.values + of_reference) + of_reference * distances.values)

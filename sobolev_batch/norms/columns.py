@@ -1,4 +1,4 @@
-"""Datasets of metrics, with units, long names, and the lattice and kernel that they belong to; observed rates."""
+"""Datasets of norms and distances, with units, long names, and the lattice and kernel that they belong to."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Reals
-from sobolev_batch.norms.budget import PARTS, NormEstimate, ReferenceEstimate
+from sobolev_batch.norms.estimate import PARTS, NormEstimate, ReferenceEstimate
 from sobolev_batch.transform.lattice import AXES, Lattice, Orders
 
 KERNEL = "weight (1 + |xi|^2)^s, xi in cycles per unit length"
@@ -191,33 +191,3 @@ def lattice_attributes(lattice: Lattice, *fields: xr.DataArray) -> dict[str, Any
     """Return the attributes of a dataset that was computed from fields on a lattice."""
     dtypes = dict.fromkeys(str(field.dtype) for field in fields)
     return {"xi_max": lattice.xi_max, "M": lattice.M, "dtype": ", ".join(dtypes)}
-
-
-# Of the sizes of two meshes between which a rate is formed.
-_LEAST_RATIO = 1.1
-
-
-def observed_rates(distances: Reals, errors: Reals, sizes: Reals) -> tuple[Reals, Reals]:
-    """Return the observed order p in distance ~ size^p between each mesh and a coarser one, with its error.
-
-    The coarser one is the next whose size is larger by a tenth at least: between nearly equal sizes chance decides.
-    From distances, their errors and mean edge lengths (n,) follow log(d_coarse/d)/log(h_coarse/h) and its error, (n,)
-    each: NaN for the coarsest meshes, for meshes without a distance or size, and for distances below their error.
-
-    >>> sizes = np.array([0.4, 0.2, 0.1])
-    >>> observed_rates(3 * sizes**2, np.zeros(3), sizes)[0].round(6)
-    array([nan,  2.,  2.])
-    """
-    rates, uncertainties = np.full(len(distances), np.nan), np.full(len(distances), np.nan)
-    usable = np.flatnonzero(np.isfinite(sizes) & (sizes > 0) & (distances > 0) & (errors < distances))
-    by_size = usable[np.argsort(-sizes[usable], kind="stable")]
-    coarser_counts = np.searchsorted(-sizes[by_size], -_LEAST_RATIO * sizes[by_size], side="right")
-    for fine, count in zip(by_size, coarser_counts, strict=True):
-        if count:
-            coarse = by_size[count - 1]
-            span = np.log(sizes[coarse] / sizes[fine])
-            rates[fine] = np.log(distances[coarse] / distances[fine]) / span
-            # The widest that both distances allow.
-            widest = sum(-np.log1p(-errors[i] / distances[i]) for i in (coarse, fine))
-            uncertainties[fine] = widest / span
-    return rates, uncertainties

@@ -60,18 +60,18 @@ class Arrangement:
         lattice = weights.lattice
         shells = lattice.shells(block).ravel()
         windows = outer_windows(weights)
-        kinds = (shells % 4 * 3).astype(np.uint8)
+        numbers = (shells % 4 * 3).astype(np.uint8)
         for i, window in enumerate(windows):
             members = np.flatnonzero(window[shells])
             # Drawn, not strided: strides would follow the lattice's rows. The same for every tile.
             count = min(len(members), max(-(-len(members) // _SAMPLED_ONE_IN), _FEWEST_SAMPLED))
-            kinds[np.random.default_rng(i).choice(members, count, replace=False)] += i + 1
+            numbers[np.random.default_rng(i).choice(members, count, replace=False)] += i + 1
             window *= len(members) / max(count, 1)
-        order = np.argsort(kinds, kind="stable")
-        ends = np.cumsum(np.bincount(kinds, minlength=12)).tolist()
+        order = np.argsort(numbers, kind="stable")
+        ends = np.cumsum(np.bincount(numbers, minlength=12)).tolist()
         runs = tuple(
-            (slice(start, end), kind // 3, kind % 3 - 1 if kind % 3 else None)
-            for kind, (start, end) in enumerate(zip([0, *ends], ends, strict=False))
+            (slice(start, end), number // 3, number % 3 - 1 if number % 3 else None)
+            for number, (start, end) in enumerate(zip([0, *ends], ends, strict=False))
             if end > start
         )
         trapezoid = lattice.trapezoid_weights(block).ravel()[order]

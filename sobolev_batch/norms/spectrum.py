@@ -9,7 +9,7 @@ doi:10.1137/S0036144502417715).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from typing import Any, Self
@@ -17,8 +17,8 @@ from typing import Any, Self
 import numpy as np
 
 from sobolev_batch.arrays import Indices, Reals
-from sobolev_batch.norms.tail.sampling import OctaveSampling, SamplePart, TailSampling
-from sobolev_batch.norms.tail.values import quantile_of_sum
+from sobolev_batch.norms.tail.integrals import Scatter, error_of_sum, pooled
+from sobolev_batch.norms.tail.sampling import OctaveSampling, SampleSet, TailSampling
 from sobolev_batch.transform.lattice import Lattice, smooth_step
 
 # Radii for a group of samples of an octave: the weights of orders down to -12 are exact to 1e-13 of the largest one.
@@ -42,82 +42,74 @@ class Spectra:
     moments: Reals
     peaks: Reals
 
-    @classmethod
-    def joined(cls, several: Sequence[Self]) -> Self:
-        """Return several spectra as one, field by field."""
-        return cls(*(np.concatenate([getattr(one, field.name) for one in several]) for field in fields(cls)))
-
-    def __getitem__(self, chosen: Any) -> Spectra:
-        """Return the spectra of some fields."""
-        return Spectra(self.sums[chosen], self.moments[chosen], self.peaks[chosen])
+    def named(self, name: str) -> dict[str, Reals]:
+        """Return the arrays by the names that `RadialAxis.arrays` describes; those without entries are left out."""
+        arrays = {name: self.sums, f"{name}_moments": self.moments, f"{name}_peaks": self.peaks}
+        return {key: values for key, values in arrays.items() if values.shape[1]}
 
 
 @dataclass(frozen=True, eq=False)
 class ComparedSpectra:
-    """Radial spectra of some fields: of their norms, their distances from a reference b, and products <a - b, b>."""
+    """Radial spectra of some fields: of their norms, their distances from a reference b, and products <a - b, b>.
 
-    norm: Spectra
-    distance: Spectra
-    product: Spectra
+    Attributes:
+        arrays: Arrays by the names that `RadialAxis.arrays` describes, each (fields, ...).
+    """
+
+    arrays: Mapping[str, Reals]
 
     @classmethod
     def joined(cls, several: Sequence[Self]) -> Self:
         """Return several of these as one, field by field."""
-        return cls(*(Spectra.joined([getattr(one, field.name) for one in several]) for field in fields(cls)))
+        return cls({name: np.concatenate([one.arrays[name] for one in several]) for name in several[0].arrays})
 
     def __getitem__(self, chosen: Any) -> ComparedSpectra:
         """Return the spectra of some fields."""
-        return ComparedSpectra(self.norm[chosen], self.distance[chosen], self.product[chosen])
+        return ComparedSpectra({name: values[chosen] for name, values in self.arrays.items()})
 
-    def bounded_product(self, reference: Spectra) -> Spectra:
-        """Return the spectra of products with moments and peaks that theirs do not exceed, by Schwarz's inequality."""
+    @property
+    def norm(self) -> Spectra:
+        """Spectra of the norms."""
+        return self._spectra("norm")
+
+    @property
+    def distance(self) -> Spectra:
+        """Spectra of the distances from the reference."""
+        return self._spectra("distance")
+
+    def product(self, reference: Spectra) -> Spectra:
+        """Return the spectra of the products, whose moments and peaks are bounded by Schwarz's inequality."""
+        difference = self.distance
         moments, peaks = (
-            np.sqrt(np.maximum(getattr(self.distance, name), 0.0) * np.maximum(getattr(reference, name), 0.0))
-            for name in ("moments", "peaks")
+            np.sqrt(np.maximum(one, 0.0) * np.maximum(other, 0.0))
+            for one, other in ((difference.moments, reference.moments), (difference.peaks, reference.peaks))
         )
-        return Spectra(self.product.sums, moments, peaks)
+        return Spectra(self.arrays["product"], moments, peaks)
 
-    def to_arrays(self) -> dict[str, Reals]:
-        """Return the arrays by the names that `RadialAxis.arrays` describes."""
-        arrays = {
-            _array_name(of.name, part.name): getattr(getattr(self, of.name), part.name)
-            for of in fields(self)
-            for part in fields(Spectra)
-        }
-        return {name: values for name, values in arrays.items() if values.shape[1]}
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, Reals]) -> Self:
-        """Return the spectra that arrays hold, each (fields, ...)."""
-        none = np.zeros((len(arrays["norm"]), 0))
-        spectra = (
-            Spectra(*(arrays.get(_array_name(of.name, part.name), none) for part in fields(Spectra)))
-            for of in fields(cls)
-        )
-        return cls(*spectra)
-
-
-def _array_name(of: str, part: str) -> str:
-    return of if part == "sums" else f"{of}_{part}"
+    def _spectra(self, name: str) -> Spectra:
+        sums = self.arrays[name]
+        none = np.zeros((len(sums), 0))
+        return Spectra(sums, self.arrays.get(f"{name}_moments", none), self.arrays.get(f"{name}_peaks", none))
 
 
 @dataclass(frozen=True, eq=False)
-class _Part:
-    """A part of an octave's samples: one lattice in eight groups, or all drawn samples.
+class _Segment:
+    """The radii for a set of an octave's samples: one lattice in eight groups, or all drawn samples.
 
-    `number` counts the parts of an octave. `samples` is its place among all samples, `first` that on the axis.
+    `number` counts the sets of an octave. `samples` is the place of the set among all samples, `first` that of its
+    radii on the axis.
     """
 
     sampling: OctaveSampling
-    part: SamplePart
+    sample_set: SampleSet
     number: int
     samples: slice
     first: int
 
     @property
     def starts(self) -> list[int]:
-        """First sample of each group, counted from the part's first."""
-        return [0] if self.part.starts is None else [int(start) for start in self.part.starts]
+        """First sample of each group, counted from the set's first."""
+        return [0] if self.sample_set.starts is None else [int(start) for start in self.sample_set.starts]
 
     @property
     def count(self) -> int:
@@ -126,7 +118,7 @@ class _Part:
 
     @property
     def place(self) -> slice:
-        """Place of the part's radii on the axis."""
+        """Place of these radii on the axis."""
         return slice(self.first, self.first + len(self.starts) * _NODES)
 
     @cached_property
@@ -138,7 +130,7 @@ class _Part:
     @cached_property
     def lengths(self) -> Reals:
         """1 + |ξ|² of each sample."""
-        return np.asarray(1 + self.sampling.radii[self.part.samples] ** 2)
+        return np.asarray(1 + self.sampling.radii[self.sample_set.samples] ** 2)
 
     def moved(self, terms: Reals) -> Reals:
         """Move terms (fields, n) to the radii of each group, (fields, groups · _NODES)."""
@@ -183,6 +175,19 @@ class _Part:
             found.append(np.exp(chord + order * np.log(self.least_length)))
         return np.stack(found)
 
+    def scatter(self, sums: Reals, moments: Reals, peaks: Reals, orders: Sequence[float]) -> Scatter:
+        """Return how sums over these samples vary (orders, fields), from the segment's columns of `Spectra`.
+
+        A lattice's eight groups of samples vary as independent ones do, and so do single drawn samples.
+        """
+        weights, count = np.stack([self.node_lengths**order for order in orders]), self.count
+        groups = np.einsum("oj,fgj->gof", weights, sums.reshape(len(sums), -1, _NODES))
+        largest = self.peaks_at(peaks, orders)
+        if not self.sample_set.is_drawn:
+            return Scatter(False, len(groups) * groups.var(axis=0, ddof=1), largest, len(groups) - 1)
+        spread = np.maximum((weights**2 @ moments.T) - groups[0] ** 2 / count, 0.0)
+        return Scatter(True, spread * count / max(count - 1, 1), largest, count - 1)
+
 
 def _chebyshev_points() -> Reals:
     return -np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
@@ -206,26 +211,26 @@ class RadialAxis:
         return {"lattice": self.lattice, "sampling": self.sampling}
 
     @cached_property
-    def parts(self) -> tuple[_Part, ...]:
-        """Parts of all octaves that have samples, in their order on the axis."""
-        parts: list[_Part] = []
+    def segments(self) -> tuple[_Segment, ...]:
+        """Segments of the axis beyond the lattice: one for each set of samples of each octave, in their order."""
+        segments: list[_Segment] = []
         start, first = 0, self.lattice.shell_count
         for sampling in () if self.sampling is None else self.sampling.octaves:
-            for number, part in enumerate(sampling.parts):
-                samples = slice(start + part.samples.start, start + part.samples.stop)
+            for number, sample_set in enumerate(sampling.sample_sets):
+                samples = slice(start + sample_set.samples.start, start + sample_set.samples.stop)
                 if samples.stop > samples.start:
-                    parts.append(_Part(sampling, part, number, samples, first))
-                    first = parts[-1].place.stop
+                    segments.append(_Segment(sampling, sample_set, number, samples, first))
+                    first = segments[-1].place.stop
             start += len(sampling)
-        return tuple(parts)
+        return tuple(segments)
 
     def __len__(self) -> int:
-        return self.parts[-1].place.stop if self.parts else self.lattice.shell_count
+        return self.segments[-1].place.stop if self.segments else self.lattice.shell_count
 
     def arrays(self) -> dict[str, tuple[int, str, str]]:
         """Return for each array of `ComparedSpectra` its length, and what it goes over and means."""
-        moments = _NODES * sum(part.part.is_drawn for part in self.parts)
-        peaks = len(_PEAK_ORDERS) * len(self.parts)
+        moments = _NODES * sum(segment.sample_set.is_drawn for segment in self.segments)
+        peaks = len(_PEAK_ORDERS) * len(self.segments)
         arrays = {"product": (len(self), "shell", "radial spectrum of the product <a - b, b> with the reference b")}
         for name, meaning in (("norm", "norm"), ("distance", "distance to the reference")):
             arrays |= {
@@ -240,7 +245,7 @@ class RadialAxis:
         """|ξ| of each entry, in cycles per unit length (radii,)."""
         shells = self.lattice.spacing * np.sqrt(np.arange(self.lattice.shell_count))
         return np.concatenate(
-            [shells, *(np.tile(np.sqrt(part.node_lengths - 1), len(part.starts)) for part in self.parts)]
+            [shells, *(np.tile(np.sqrt(segment.node_lengths - 1), len(segment.starts)) for segment in self.segments)]
         )
 
     @cached_property
@@ -255,9 +260,9 @@ class RadialAxis:
     def labels(self) -> dict[str, Indices]:
         """Return the octave of each entry, 0 for the lattice; the number of its lattice in it, -1 for drawn samples."""
         octaves, lattices = np.zeros(len(self), dtype=np.int64), np.zeros(len(self), dtype=np.int64)
-        for part in self.parts:
-            octaves[part.place] = part.sampling.octave.index
-            lattices[part.place] = -1 if part.part.is_drawn else part.number
+        for segment in self.segments:
+            octaves[segment.place] = segment.sampling.octave.index
+            lattices[segment.place] = -1 if segment.sample_set.is_drawn else segment.number
         return {"octave": octaves, "lattice": lattices}
 
     def spectra(self, shell_sums: Reals, octaves: Reals, *, is_square: bool = True) -> Spectra:
@@ -267,55 +272,35 @@ class RadialAxis:
         errors, and has no moments and peaks.
         """
         sums, moments, peaks = [shell_sums], [np.zeros((len(shell_sums), 0))], [np.zeros((len(shell_sums), 0))]
-        for part in self.parts:
-            terms = part.sampling.weights[part.part.samples] * octaves[:, part.samples]
-            sums.append(part.moved(terms))
+        for segment in self.segments:
+            terms = segment.sampling.weights[segment.sample_set.samples] * octaves[:, segment.samples]
+            sums.append(segment.moved(terms))
             if is_square:
-                if part.part.is_drawn:
-                    moments.append(part.moved(terms**2))
+                if segment.sample_set.is_drawn:
+                    moments.append(segment.moved(terms**2))
                 sizes = np.abs(terms)
-                peaks.append(np.stack([(sizes * weights).max(axis=1) for weights in part.peak_weights], axis=1))
-        return Spectra(*(np.concatenate(parts, axis=1) for parts in (sums, moments, peaks)))
-
-    def octave_integrals(self, spectra: Spectra, orders: Sequence[float]) -> Reals:
-        """Return ∫ window (1+|ξ|²)^s |field|² over all octaves (orders, fields)."""
-        beyond = slice(self.lattice.shell_count, len(self))
-        weights = np.stack([(1 + self.radii[beyond] ** 2) ** order for order in orders])
-        return np.asarray(weights @ spectra.sums[:, beyond].T)
+                peaks.append(np.stack([(sizes * weights).max(axis=1) for weights in segment.peak_weights], axis=1))
+        return Spectra(*(np.concatenate(columns, axis=1) for columns in (sums, moments, peaks)))
 
     def energies(self, spectra: Spectra) -> Reals:
         """Return the mean of ∫_{|ξ|=r} |field|² dS over each octave (fields, octaves)."""
         octaves = () if self.sampling is None else self.sampling.octaves
         energies = np.zeros((len(spectra.sums), len(octaves)))
-        for part in self.parts:
-            octave = part.sampling.octave
-            energies[:, octave.index - 1] += spectra.sums[:, part.place].sum(axis=1) / octave.integral(0.0)
+        for segment in self.segments:
+            octave = segment.sampling.octave
+            energies[:, octave.index - 1] += spectra.sums[:, segment.place].sum(axis=1) / octave.integral(0.0)
         return energies
 
-    def statistical_errors(self, spectra: Spectra, orders: Sequence[float]) -> Reals:
-        """Return how far off the integrals over all octaves may be (orders, fields), at 99 %.
-
-        A lattice's eight groups of samples vary as independent ones do, and so do single drawn samples. A sample may
-        stand for others like it that were not met.
-        """
-        variances: dict[tuple[int, bool], Reals] = {}
-        degrees: dict[tuple[int, bool], int] = {}
-        drawn = 0
-        for number, part in enumerate(self.parts):
-            weights = np.stack([part.node_lengths**order for order in orders])
-            grouped = spectra.sums[:, part.place].reshape(len(spectra.sums), -1, _NODES)
-            groups = np.einsum("oj,fgj->gof", weights, grouped)
-            if part.part.is_drawn:
-                moments = spectra.moments[:, drawn : drawn + _NODES]
-                drawn += _NODES
-                spread = (weights**2 @ moments.T) - groups[0] ** 2 / part.count
-                variance, degree = np.maximum(spread, 0.0) * part.count / max(part.count - 1, 1), part.count - 1
-            else:
-                variance, degree = len(groups) * groups.var(axis=0, ddof=1), len(groups) - 1
-            count = len(_PEAK_ORDERS)
-            peaks = part.peaks_at(spectra.peaks[:, number * count : (number + 1) * count], orders)
-            # Draws are counted apart: few groups of lattices stay few beside many draws.
-            key = part.sampling.octave.index, part.part.is_drawn
-            variances[key] = variances.get(key, np.zeros(1)) + variance + peaks**2
-            degrees[key] = degrees.get(key, 0) + degree
-        return quantile_of_sum(np.stack(list(variances.values())), np.array(list(degrees.values())))
+    def octave_integrals(self, spectra: Spectra, orders: Sequence[float]) -> tuple[Reals, Reals]:
+        """Return ∫ window (1+|ξ|²)^s |field|² over all octaves, and how far off it may be at 99 % (orders, fields)."""
+        scatters: dict[int, list[Scatter]] = {}
+        count, drawn = len(_PEAK_ORDERS), 0
+        for number, segment in enumerate(self.segments):
+            peaks, moments = spectra.peaks[:, number * count :][:, :count], spectra.moments[:, drawn:][:, :_NODES]
+            drawn += _NODES * segment.sample_set.is_drawn
+            found = segment.scatter(spectra.sums[:, segment.place], moments, peaks, orders)
+            scatters.setdefault(segment.sampling.octave.index, []).append(found)
+        beyond = slice(self.lattice.shell_count, len(self))
+        weights = np.stack([(1 + self.radii[beyond] ** 2) ** order for order in orders])
+        integrals = np.asarray(weights @ spectra.sums[:, beyond].T)
+        return integrals, error_of_sum([pooled(octave) for octave in scatters.values()])

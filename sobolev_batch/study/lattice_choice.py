@@ -15,7 +15,7 @@ import numpy as np
 from sobolev_batch.arrays import Reals
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms.accuracy.tolerance import FINER_LATTICE, Accuracy, good_intervals, lattice_of
-from sobolev_batch.norms.budget import NormEstimate
+from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.norms.tail.sampling import TailSampling
 from sobolev_batch.study.schema import MOST_OCTAVES
 from sobolev_batch.study.study import Study

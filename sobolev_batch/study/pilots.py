@@ -22,7 +22,8 @@ from sobolev_batch.norms.accuracy.problem import ESTIMATE_CAUTION, Problem, erro
 from sobolev_batch.norms.accuracy.solve import coarser_than, permits_octaves, prefers_octaves, run_pilot
 from sobolev_batch.norms.accuracy.tolerance import Accuracy, core_lattice, lattice_of
 from sobolev_batch.norms.budget import Support
-from sobolev_batch.norms.tail.sampling import FaceNormals, OctaveSampling, TailSampling
+from sobolev_batch.norms.tail.face_normals import FaceNormals
+from sobolev_batch.norms.tail.sampling import OctaveSampling, TailSampling
 from sobolev_batch.sources.registry import Member
 from sobolev_batch.study.lattice_choice import LatticeChoice
 from sobolev_batch.study.study import Members, Study

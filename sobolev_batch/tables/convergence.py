@@ -51,7 +51,7 @@ _NUMBERS = (
     "resolved",
     "within",
 )
-# Of meshes that a program or function made.
+# Columns that only meshes made by a program or function have.
 _MADE = tuple(item.name for item in fields(Cost))
 # Integers, or missing where a mesh failed.
 _COUNTS = ("triangles", "vertices")

@@ -36,10 +36,11 @@ from sobolev_batch.visible import FILE_UNITS
 # Names of families, or globs of names; None is all of them.
 Families = str | Sequence[str] | None
 
-# Of the columns of a table. The finer a mesh is, the smaller is the first, and the larger are the others.
+# Columns of a table that are sizes: the finer a mesh is, the smaller is the first, and the larger are the others.
 EDGE_LENGTH = "edge_length"
 _GROWING = ("triangles", "vertices", "seconds", "make_seconds", "make_cpu_seconds", "make_peak_bytes")
-_FROM_COARSE_TO_FINE = ("level", "triangles")
+# What orders families that go from coarse to fine.
+FROM_COARSE_TO_FINE = ("level", "triangles")
 
 _LABELS = {
     EDGE_LENGTH: "mean edge length in {unit}",
@@ -382,4 +383,4 @@ def sizes_of(frame: pd.DataFrame, x: str) -> Reals:
 
 def is_sequence(rows: pd.DataFrame) -> bool:
     """Return True where the meshes of a family go from coarse to fine, so that a line may join them."""
-    return bool(rows["ordered_by"].isin(_FROM_COARSE_TO_FINE).all())
+    return bool(rows["ordered_by"].isin(FROM_COARSE_TO_FINE).all())

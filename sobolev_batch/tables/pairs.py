@@ -16,8 +16,8 @@ import xarray as xr
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import DamageError
-from sobolev_batch.norms.budget import PARTS, NormEstimate
 from sobolev_batch.norms.columns import VARIABLES, describe
+from sobolev_batch.norms.estimate import PARTS, NormEstimate
 from sobolev_batch.store.layout import DISTANCES, PAIRS_KEYS, Store, array_keys, dataset_keys
 from sobolev_batch.store.metadata import chunk_shape
 from sobolev_batch.store.sealed_chunks import key_in, key_of, missing_chunks, seal
@@ -26,9 +26,9 @@ from sobolev_batch.tables.shells import read_spectra
 
 # Meshes along a side of a tile: with fewer, small studies keep their workers busy; with more, there are fewer keys.
 _FEWEST, _MOST, _TILES_OF_A_ROW = 32, 512, 8
-# Of the distances and the parts of their errors, as `NormEstimate.named` gives them.
+# Arrays of the distances and their errors, as `NormEstimate.named` names them.
 _COLUMNS = ("distance", "error", "error_part")
-# Of a pair on disk, for each order.
+# What a pair takes on disk, for each order.
 PAIR_BYTES = 8 * (2 + len(PARTS))
 
 
@@ -163,6 +163,6 @@ def pair_distances(reducer: Reducer, rows: Sequence[int], others: Sequence[int])
         of_reference = read_spectra(reducer.store, [reference]).norm
         for side, opposite, axis in ((rows, others, 2), (others, rows, 3)):
             if reference in side:
-                _, found, _ = reducer.norms_of(opposite, read_spectra(reducer.store, opposite), of_reference)
+                found = reducer.norms_of(opposite, read_spectra(reducer.store, opposite), of_reference).distances
                 distances.swapaxes(2, axis)[:, :, side.index(reference)] = np.stack(list(found))
     return NormEstimate(*distances)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Self
@@ -13,23 +13,14 @@ from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.geometry.surface import DIRECTIONS, Extent
-from sobolev_batch.norms.budget import (
-    NormEstimate,
-    ReferenceEstimate,
-    Sums,
-    Support,
-    add_sums,
-    aliased,
-    estimate_norms,
-    product_rounding,
-    sums_of_shells,
-)
+from sobolev_batch.norms.budget import Sums, Support, add_sums, sums_of_shells
+from sobolev_batch.norms.estimate import NormEstimate, ReferenceEstimate, Tail, estimate_norms
 from sobolev_batch.norms.fields import Quality, TailQuality
 from sobolev_batch.norms.gram import Arrangement, differences
 from sobolev_batch.norms.spectrum import ComparedSpectra, RadialAxis, Spectra
+from sobolev_batch.norms.tail.integrals import OctaveSums, OctaveWeights, integral_over, squared_moduli
 from sobolev_batch.norms.tail.remainder import Remainder
 from sobolev_batch.norms.tail.sampling import TailSampling
-from sobolev_batch.norms.tail.values import OctaveSums, OctaveWeights, Tail, squared_moduli
 from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.store.layout import Store
 from sobolev_batch.study.lattice_choice import LatticeChoice
@@ -40,19 +31,32 @@ _GROUP = 32
 _READ_AT_ONCE = 8
 # For fewer rows than this, products do not earn what arranging the samples costs: pairs are taken one by one.
 _FEWEST_ROWS = 4
-# Factor of the errors of surfaces that are not equal.
-_APART = np.ones(())
-# Of two surfaces that were not compared: the mean energy beyond the octaves is at least this fraction of the last
-# measured one. It exceeds the sum of both own ones by no more than this multiple of the last distance from it; or this
-# fraction of it, where the energy has just grown by more than a factor from octave to octave.
+# Two surfaces may not have been compared beyond the octaves. Their mean energy there is at least this fraction of the
+# last measured one. It exceeds the sum of both own ones by no more than this multiple of the last distance from it; or
+# this fraction of it, where the energy has just grown by more than a factor from octave to octave.
 _LEAST_LIMIT, _SWING, _RISE, _STEEPEST_GROWTH = 0.7, 1.25, 0.9, 2.5
 # Rows of a tile whose values in octaves are held at a time take this many bytes.
 _HELD_BYTES = 128 << 20
-# Of a sample of octaves: its frequency, weight and place, values of three fields with their squares, and what moves
-# them to the radii of spectra.
+# A sample of octaves takes this many bytes: its frequency, weight and place, values of three fields with their squares,
+# and what moves them to the radii of spectra.
 _SAMPLE_BYTES = 400.0
-# Of a sample of a row while its spectra are computed.
+# A sample of a row takes this much more while its spectra are computed.
 _SPECTRUM_BYTES = 100.0
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """Norms of rows and their distances to the reference, each (orders, rows), NaN without the reference's field.
+
+    Attributes:
+        reference: What the distances are relative to.
+        beyond: What lies beyond the last octave in the squared norms, and in the squared distances.
+    """
+
+    norms: NormEstimate
+    distances: NormEstimate
+    reference: ReferenceEstimate
+    beyond: tuple[Reals, Reals]
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,63 +169,51 @@ class Reducer:
     def _read_at_once(self) -> int:
         return max(1, min(_READ_AT_ONCE, self._capacity // 16))
 
-    def norms(self, rows: Sequence[int]) -> tuple[NormEstimate, NormEstimate, Reals]:
-        """Return the norms of rows, and their distances to the reference, from their fields; see `norms_of`."""
+    def norms(self, rows: Sequence[int]) -> Compared:
+        """Return the norms of rows, and their distances to the reference, from their fields."""
         reference = None if self.reference is None else self.spectra([self.reference]).norm
         return self.norms_of(rows, self.spectra(rows), reference)
 
-    def norms_of(
-        self, rows: Sequence[int], spectra: ComparedSpectra, reference: Spectra | None
-    ) -> tuple[NormEstimate, NormEstimate, Reals]:
-        """Return norms of rows, distances to the reference, and parts of both, each over (orders, rows).
+    def norms_of(self, rows: Sequence[int], spectra: ComparedSpectra, reference: Spectra | None) -> Compared:
+        """Return the norms of rows, and their distances to the reference, from the spectra of both.
 
-        The six parts are the distance's area part and shape part, each with its error, see `ReferenceEstimate.parts`,
-        and what lies beyond the last octave in the squared norm and in the squared distance. Without the field of the
-        reference, its spectrum (1, radii) is None, and distances are NaN.
+        That of the reference is (1, radii), or None without its field.
         """
-        rows, has_octaves = list(rows), self.sampling is not None
-        own_tail = self._tail(spectra.norm, [self.qualities[row].own for row in rows]) if has_octaves else None
-        own = self._estimate(self._sums(spectra.norm), own_tail, self.areas[rows], self.errors[:, rows])
-        beyond = np.zeros_like(own.values) if own_tail is None else own_tail.beyond
-        if self.reference is None or reference is None:
-            unknown = np.full_like(own.values, np.nan)
-            return own, NormEstimate(*[unknown] * 5), np.stack([*[unknown] * 4, beyond, unknown])
+        rows, b = list(rows), self.reference
+        tail = self._tail(spectra.norm, lambda row, _: self.qualities[row].own, rows)
+        norms = self._estimate(self._sums(spectra.norm), tail, self.areas[rows], self.errors[:, rows])
+        zeros, unknown = np.zeros_like(norms.values), np.full_like(norms.values, np.nan)
+        beyond = zeros if tail is None else tail.remainder
+        if b is None or reference is None:
+            nothing = NormEstimate(*[unknown] * 5)
+            return Compared(norms, nothing, ReferenceEstimate(nothing, unknown, unknown), (beyond, unknown))
+        of_b = self._tail(reference, lambda row, _: self.qualities[row].own, [b])
+        norm_of_b = self._estimate(self._sums(reference), of_b, self.areas[[b]], self.errors[:, [b]])
+        of_difference = self._tail(spectra.distance, lambda row, energies: self._remainder(row, b, energies), rows)
+        areas, errors = self.areas[rows] + self.areas[b], self.errors[:, rows] + self.errors[:, [b]]
         # The reference's distance to itself is zero, and nothing is uncertain about that.
-        apart = np.array([row != self.reference for row in rows], dtype=np.float64)
-        areas, errors = self.areas[rows] + self.areas[self.reference], self.errors[:, rows]
-        errors = errors + self.errors[:, [self.reference]]
-        tail = of_reference = None
-        products = self._sums(spectra.product)
-        beyond_difference = np.zeros_like(beyond)
-        if has_octaves:
-            energies = self.axis.energies(spectra.distance)
-            remainders = [self._remainder(row, self.reference, it) for row, it in zip(rows, energies, strict=True)]
-            tail = self._tail(spectra.distance, remainders)
-            of_reference = self._tail(reference, [self.qualities[self.reference].own])
-            beyond_difference = tail.beyond * apart
-        distances = self._estimate(self._sums(spectra.distance), tail, areas, errors, apart)
-        place = [self.reference]
-        norms = self._estimate(self._sums(reference), of_reference, self.areas[place], self.errors[:, place])
-        if own_tail is None or tail is None or of_reference is None:
-            found = ReferenceEstimate.on_lattice(products, distances, norms, self.weights, self.widths)
-        else:
-            # Beyond the octaves ||a||² - ||b||² - ||a - b||² is twice the product <a - b, b>.
-            product = products.totals + self.axis.octave_integrals(spectra.product, self.orders)
-            product = product + (beyond - of_reference.beyond - beyond_difference) / 2 * apart
-            uncertainty = (own_tail.uncertainty + of_reference.uncertainty + tail.uncertainty) / 2
-            uncertainty = uncertainty + self.axis.statistical_errors(spectra.bounded_product(reference), self.orders)
-            uncertainty = uncertainty + aliased(products, self.weights, self.widths)
-            found = ReferenceEstimate(norms, product, (uncertainty + product_rounding(distances, norms)) * apart)
-        return own, distances, np.stack([*found.parts(distances).values(), beyond, beyond_difference])
+        errors *= np.not_equal(rows, b)
+        distances = self._estimate(self._sums(spectra.distance), of_difference, areas, errors)
+        products = spectra.product(reference)
+        of_product = Tail.of_product(self.axis.octave_integrals(products, self.orders), tail, of_b, of_difference)
+        against = ReferenceEstimate.from_products(
+            self._sums(products), self.weights, self.widths, distances, norm_of_b, of_product
+        )
+        beyond_difference = zeros if of_difference is None else of_difference.remainder
+        return Compared(norms, distances, against, (beyond, beyond_difference))
 
     def _sums(self, spectra: Spectra) -> Sums:
         return sums_of_shells(spectra.sums[:, : self.lattice.shell_count], self.weights)
 
-    def _tail(self, spectra: Spectra, remainders: Sequence[Remainder]) -> Tail:
-        """Return the tails of squared norms (orders, fields), from what lies beyond the octaves of each field."""
-        beyond = np.array([remainder.at(self.orders) for remainder in remainders])
-        octaves = self.axis.octave_integrals(spectra, self.orders)
-        return Tail(octaves, self.axis.statistical_errors(spectra, self.orders), *np.moveaxis(beyond, 0, -1))
+    def _tail(
+        self, spectra: Spectra, remainder: Callable[[int, Sequence[float]], Remainder], rows: Sequence[int]
+    ) -> Tail | None:
+        """Return the tails (orders, rows) by spectra, and a function of a row and its energies in octaves."""
+        if self.sampling is None:
+            return None
+        energies = self.axis.energies(spectra)
+        found = [remainder(row, of_row).at(self.orders) for row, of_row in zip(rows, energies, strict=True)]
+        return Tail(*self.axis.octave_integrals(spectra, self.orders), *np.moveaxis(np.array(found), 0, -1))
 
     def only(self, rows: Iterable[int]) -> Self:
         """Return what is needed for some rows alone: of many rows, the rest is much to send."""
@@ -251,11 +243,12 @@ class Reducer:
         parts = []
         for batch in _slices(len(rows), max(1, int(_HELD_BYTES // (_SPECTRUM_BYTES * max(samples, 1))))):
             octaves = np.stack([self.read_octaves(row) for row in rows[batch]]).astype(np.complex128)
-            norms = self.axis.spectra(own[batch], squared_moduli(octaves))
+            arrays = self.axis.spectra(own[batch], squared_moduli(octaves)).named("norm")
             octaves -= reference_octaves
-            distances = self.axis.spectra(differences[batch], squared_moduli(octaves))
+            arrays |= self.axis.spectra(differences[batch], squared_moduli(octaves)).named("distance")
             inner = (octaves * reference_octaves.conj()).real
-            parts.append(ComparedSpectra(norms, distances, self.axis.spectra(products[batch], inner, is_square=False)))
+            arrays |= self.axis.spectra(products[batch], inner, is_square=False).named("product")
+            parts.append(ComparedSpectra(arrays))
         return ComparedSpectra.joined(parts)
 
     def pairs(self, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
@@ -285,23 +278,15 @@ class Reducer:
         if shared:
             for square in (sums.squares[..., :shared], sums.outer[..., :shared]):
                 square[...] = np.triu(square) + np.swapaxes(np.triu(square, 1), -1, -2)
-        unequal = np.not_equal.outer(rows, others).astype(np.float64)
         areas = self.areas[list(rows)][:, None] + self.areas[list(others)]
         errors = self.errors[:, list(rows)][:, :, None] + self.errors[:, list(others)][:, None, :]
+        errors *= np.not_equal.outer(rows, others)
         tail = None if self.sampling is None else self._tails_of_pairs(self.sampling, rows, others, shared)
-        return self._estimate(sums, tail, areas, errors, unequal)
+        return self._estimate(sums, tail, areas, errors)
 
-    def _estimate(
-        self, sums: Sums, tail: Tail | None, areas: Reals, errors: Reals, apart: Reals = _APART
-    ) -> NormEstimate:
-        """Return norms from sums over the lattice and tails beyond it, with errors: zero where surfaces are not apart.
-
-        Areas and norms of the errors of fields are those of both surfaces of a pair together.
-        """
-        if tail is None:
-            return estimate_norms(sums, self.weights, Support(areas * apart, self.widths), errors * apart)
-        images = aliased(sums, self.weights, self.widths) * apart
-        return tail.scaled(apart).estimate(sums.totals, images, errors * apart)
+    def _estimate(self, sums: Sums, tail: Tail | None, areas: Reals, errors: Reals) -> NormEstimate:
+        """Return norms; areas and norms of the fields' own errors are those of both surfaces of a pair together."""
+        return estimate_norms(sums, self.weights, Support(areas, self.widths), errors, tail)
 
     def _block_sums(
         self, rows: Sequence[int], others: Sequence[int], number: int, shared: int
@@ -367,7 +352,7 @@ class Reducer:
                     if i < j or j >= shared:
                         sums = self.octave_sums(own - values)
                         beyond = self._remainder(rows[i], others[j], [octave.energy for octave in sums])
-                        parts[..., i, j] = astuple(Tail.from_sums(sums, *beyond.at(self.orders)))
+                        parts[..., i, j] = astuple(Tail(*integral_over(sums), *beyond.at(self.orders)))
         if shared:
             parts[..., :shared] += np.swapaxes(np.triu(parts[..., :shared], 1), -1, -2)
         return Tail(*parts)

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
-from sobolev_batch.norms.budget import AREA_AND_SHAPE, NormEstimate
-from sobolev_batch.norms.columns import dataset_of, describe, observed_rates
+from sobolev_batch.norms.columns import dataset_of, describe
+from sobolev_batch.norms.estimate import AREA_AND_SHAPE, NormEstimate
 from sobolev_batch.sources.programs import Cost
+from sobolev_batch.tables.open import FROM_COARSE_TO_FINE
 from sobolev_batch.tables.reducer import Reducer
 from sobolev_batch.tables.shells import chunks_of_spectra, read_spectra
 
@@ -23,8 +24,8 @@ COORDINATES = ("family", "name", "level", "status", "vertices", "triangles", "ed
 # Those that only some studies have.
 SOME_COORDINATES = {"time", *(item.name for item in fields(Cost))}
 
-# Criteria of families that go from coarse to fine.
-_FROM_COARSE_TO_FINE = ("level", "triangles")
+# A rate is formed between meshes whose sizes differ by this factor at least: between nearly equal ones chance decides.
+_LEAST_RATIO = 1.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +35,8 @@ class Results:
     Attributes:
         norms: (5, orders, meshes), norms and their errors; see `NormEstimate`.
         to_reference: (5, orders, meshes), distances to the reference.
-        parts: (6, orders, meshes), see `Reducer.norms`.
+        parts: (4, orders, meshes), the distance's parts of area and shape, each with its error; see `AREA_AND_SHAPE`.
+        beyond: (2, orders, meshes), see `Compared`.
     """
 
     meshes: xr.Dataset
@@ -43,27 +45,30 @@ class Results:
     norms: Reals
     to_reference: Reals
     parts: Reals
+    beyond: Reals
 
     @classmethod
     def from_spectra(cls, reducer: Reducer, meshes: xr.Dataset, reference: str) -> Self:
         """Return norms, and distances to the reference, from the spectra that the reducer's store holds."""
         count, orders = meshes.sizes["mesh"], len(reducer.orders)
-        arrays = [np.full((parts, orders, count), np.nan) for parts in (5, 5, 6)]
+        arrays = [np.full((parts, orders, count), np.nan) for parts in (5, 5, 4, 2)]
         places = {row: place for place, row in enumerate(meshes["row"].values.tolist())}
         complete = {row for row in reducer.complete if row in places}
         of_reference = None if reducer.reference is None else read_spectra(reducer.store, [reducer.reference]).norm
         for chunk in chunks_of_spectra(reducer.store):
             rows = [row for row in chunk if row in complete]
             if rows:
-                norms, distances, parts = reducer.norms_of(rows, read_spectra(reducer.store, rows), of_reference)
+                found = reducer.norms_of(rows, read_spectra(reducer.store, rows), of_reference)
+                parts = found.reference.area_and_shape(found.distances).values()
                 of_rows = [places[row] for row in rows]
-                for array, numbers in zip(arrays, (np.stack([*norms]), np.stack([*distances]), parts), strict=True):
-                    array[..., of_rows] = numbers
+                numbers = ([*found.norms], [*found.distances], [*parts], [*found.beyond])
+                for array, values in zip(arrays, numbers, strict=True):
+                    array[..., of_rows] = np.stack(values)
         return cls(meshes, reference, reducer.orders, *arrays)
 
     def norms_table(self) -> xr.Dataset:
         """Return `norm` (mesh, order) with its error."""
-        columns = {**NormEstimate(*self.norms).named("norm"), "beyond": self.parts[4]}
+        columns = {**NormEstimate(*self.norms).named("norm"), "beyond": self.beyond[0]}
         return table_of(columns, self.meshes, self.orders)
 
     def distances_table(self) -> xr.Dataset:
@@ -90,8 +95,8 @@ class Results:
             **to_reference.named("distance"),
             "relative": relative,
             "relative_error": relative_errors,
-            **dict(zip(AREA_AND_SHAPE, self.parts, strict=False)),
-            "beyond": self.parts[5],
+            **dict(zip(AREA_AND_SHAPE, self.parts, strict=True)),
+            "beyond": self.beyond[1],
             "rate": rates,
             "rate_error": rate_errors,
             "resolved": errors < distances,
@@ -105,7 +110,7 @@ class Results:
         families: dict[str, list[int]] = {}
         criteria = self.meshes["ordered_by"].values.tolist()
         for place, (family, criterion) in enumerate(zip(self.meshes["family"].values.tolist(), criteria, strict=True)):
-            if criterion in _FROM_COARSE_TO_FINE:
+            if criterion in FROM_COARSE_TO_FINE:
                 families.setdefault(family, []).append(place)
         return list(families.values())
 
@@ -126,3 +131,29 @@ def coordinates_of(meshes: xr.Dataset, orders: Sequence[float]) -> xr.Dataset:
     return describe(
         xr.Dataset(coords={**coordinates.variables, "order": ("order", np.array(orders, dtype=np.float64))})
     )
+
+
+def observed_rates(distances: Reals, errors: Reals, sizes: Reals) -> tuple[Reals, Reals]:
+    """Return the observed order p in distance ~ size^p between each mesh and a coarser one, with its error.
+
+    The coarser one is the next whose size is larger by a tenth at least. From distances, their errors and mean edge
+    lengths (n,) follow log(d_coarse/d)/log(h_coarse/h) and its error, (n,) each: NaN for the coarsest meshes, for
+    meshes without a distance or size, and for distances below their error.
+
+    >>> sizes = np.array([0.4, 0.2, 0.1])
+    >>> observed_rates(3 * sizes**2, np.zeros(3), sizes)[0].round(6)
+    array([nan,  2.,  2.])
+    """
+    rates, uncertainties = np.full(len(distances), np.nan), np.full(len(distances), np.nan)
+    usable = np.flatnonzero(np.isfinite(sizes) & (sizes > 0) & (distances > 0) & (errors < distances))
+    by_size = usable[np.argsort(-sizes[usable], kind="stable")]
+    coarser_counts = np.searchsorted(-sizes[by_size], -_LEAST_RATIO * sizes[by_size], side="right")
+    for fine, count in zip(by_size, coarser_counts, strict=True):
+        if count:
+            coarse = by_size[count - 1]
+            span = np.log(sizes[coarse] / sizes[fine])
+            rates[fine] = np.log(distances[coarse] / distances[fine]) / span
+            # The widest that both distances allow.
+            widest = sum(-np.log1p(-errors[i] / distances[i]) for i in (coarse, fine))
+            uncertainties[fine] = widest / span
+    return rates, uncertainties

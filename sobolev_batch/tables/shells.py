@@ -15,7 +15,7 @@ from sobolev_batch.store.metadata import chunk_shape
 from sobolev_batch.store.sealed_chunks import arrays_of, key_in, key_of, missing_chunks, read_chunk, seal
 from sobolev_batch.tables.reducer import Reducer
 
-# Of a lower bound.
+# Rounding may raise a lower bound by this fraction of it.
 _ROUNDING = 1e-9
 
 
@@ -64,7 +64,7 @@ def fill_chunk(reducer: Reducer, number: int, keys: Mapping[int, str]) -> None:
         for name, values in stored.items():
             arrays[name][_places(kept, rows)] = values[_places(kept, rows)]
     missing = {row for row in rows if row in keys} - kept
-    for name, values in reducer.spectra(sorted(missing)).to_arrays().items() if missing else ():
+    for name, values in reducer.spectra(sorted(missing)).arrays.items() if missing else ():
         arrays[f"{SPECTRA_GROUP}/{name}"][_places(missing, rows)] = values
 
     def write_keys(of: set[int]) -> None:
@@ -94,7 +94,7 @@ def read_spectra(store: Store, rows: Sequence[int]) -> ComparedSpectra:
             if of_chunk:
                 _, arrays = read_chunk(part, SPECTRA_KEYS, (number,))
                 chosen = {name.partition("/")[2]: values[_places(of_chunk, chunk)] for name, values in arrays.items()}
-                parts.append(ComparedSpectra.from_arrays(chosen))
+                parts.append(ComparedSpectra(chosen))
     places = {row: place for place, row in enumerate(sorted(wanted))}
     return ComparedSpectra.joined(parts)[[places[row] for row in rows]]
 

@@ -12,9 +12,9 @@ from sobolev_batch.errors import DamageError, InputError
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
-from sobolev_batch.norms.budget import AREA_AND_SHAPE, NormEstimate
 from sobolev_batch.norms.causes import band_coordinates
 from sobolev_batch.norms.columns import AREA, KERNEL, LENGTH, NUMBER, described, order_axis
+from sobolev_batch.norms.estimate import AREA_AND_SHAPE, NormEstimate
 from sobolev_batch.norms.fields import Quality
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.store.layout import QUALITY
@@ -112,10 +112,9 @@ class StoreAccessor:
         complete = meshes["mesh"].values[meshes["status"].values == "complete"].tolist()
         labels = [mesh] if isinstance(mesh, str) else complete if mesh is None else list(mesh)
         reducer, rows = stored_reducer(self._tree, order, *labels, other)
-        _, distances, parts = reducer.norms(rows[:-1])
-        of_other, _, _ = reducer.norms(rows[-1:])
-        columns = {**distances.named("distance"), **dict(zip(AREA_AND_SHAPE, parts, strict=False))}
-        columns["relative"], columns["relative_error"] = distances.relative_to(of_other)
+        found = reducer.norms(rows[:-1])
+        columns = {**found.distances.named("distance"), **found.reference.area_and_shape(found.distances)}
+        columns["relative"], columns["relative_error"] = found.distances.relative_to(found.reference.norms)
         table = table_of(columns, meshes.sel(mesh=labels), reducer.orders)
         return self._chosen(table, order, mesh if isinstance(mesh, str) else labels)
 

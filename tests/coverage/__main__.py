@@ -14,7 +14,7 @@ import xarray as xr
 
 from sobolev_batch import distance, fourier_transform
 from sobolev_batch.errors import AccuracyError
-from sobolev_batch.norms.budget import PARTS
+from sobolev_batch.norms.estimate import PARTS
 from tests.coverage.cases import KINDS, Case, all_cases
 
 LEAST_COVERED, LARGEST_MEDIAN = 0.99, 30.0

@@ -12,7 +12,7 @@ from scipy.special import gamma, kv
 
 from sobolev_batch import Mesh, distance
 from sobolev_batch.geometry.surface import Surface
-from sobolev_batch.norms.budget import PARTS
+from sobolev_batch.norms.estimate import PARTS
 from sobolev_batch.shapes import Sphere, icosphere
 from tests.coverage.__main__ import described, judge, judged, show
 from tests.coverage.cases import KINDS, cases_of

@@ -12,7 +12,7 @@ import xarray as xr
 from click.testing import CliRunner
 
 from sobolev_batch import Mesh
-from sobolev_batch.norms.budget import PARTS
+from sobolev_batch.norms.estimate import PARTS
 from sobolev_batch.transform.exact import exact_transform
 from tests.coverage import __main__ as program
 from tests.coverage.cases import KINDS, all_cases, cases_of

@@ -9,7 +9,8 @@ import pytest
 
 from sobolev_batch import Lattice, Mesh, distance, fourier_transform, norm
 from sobolev_batch.geometry.surface import Surface
-from sobolev_batch.norms.budget import NormEstimate, Sums, Support, truncated
+from sobolev_batch.norms.budget import Sums, Support, truncated
+from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.norms.fields import Quality
 from sobolev_batch.shapes import Sphere, icosphere
 from sobolev_batch.transform.lattice import SobolevWeights

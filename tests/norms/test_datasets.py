@@ -9,7 +9,6 @@ import pytest
 import xarray as xr
 
 from sobolev_batch import Lattice, distance, fourier_transform, norm, spectrum, witness
-from sobolev_batch.norms.columns import observed_rates
 from sobolev_batch.shapes import Sphere, icosphere
 
 LATTICE = Lattice(2.0, 16)
@@ -47,39 +46,3 @@ def test_witness_keeps_the_points() -> None:
     values = witness(A, B, [-2.0], POINTS)
     assert np.array_equal(np.stack([values[axis].values for axis in "xyz"], axis=1), POINTS)
     assert values["x"].dims == ("point",)
-
-
-NAN = np.nan
-
-
-@pytest.mark.parametrize(
-    ("sizes", "distances", "errors", "rates"),
-    [
-        # They follow the sizes, not the order of the meshes.
-        ([0.1, 0.4, 0.2], [0.01, 0.16, 0.04], [0, 0, 0], [2, NAN, 2]),
-        # Missing meshes are bridged, and so are sizes that are nearly equal.
-        ([0.4, 0.2, 0.1, NAN], [0.16, NAN, 0.01, 0.001], [0, 0, 0, 0], [NAN, NAN, 2, NAN]),
-        ([0.4, 0.2, 0.19], [0.16, 0.04, 0.0361], [0, 0, 0], [NAN, 2, 2]),
-        # Distances below their error, distances of zero and equal sizes carry no rate.
-        ([0.4, 0.2, 0.1], [0.16, 0.04, 0.01], [0, 0, 0.011], [NAN, 2, NAN]),
-        ([0.2, 0.1], [1, 0], [0, 0], [NAN, NAN]),
-        ([0.1, 0.1], [1, 2], [0, 0], [NAN, NAN]),
-    ],
-)
-def test_observed_rates(sizes: list[float], distances: list[float], errors: list[float], rates: list[float]) -> None:
-    found, uncertainties = observed_rates(np.array(distances), np.array(errors), np.array(sizes))
-    np.testing.assert_allclose(found, rates, rtol=1e-12)
-    assert np.array_equal(np.isnan(uncertainties), np.isnan(rates))
-
-
-def test_errors_of_rates_cover_what_the_distances_allow() -> None:
-    sizes, distances, errors = np.array([0.2, 0.1]), np.array([0.4, 0.1]), np.array([0.02, 0.01])
-    rates, uncertainties = observed_rates(distances, errors, sizes)
-    extremes = [
-        observed_rates(distances + a * errors * [1, 0] + b * errors * [0, 1], np.zeros(2), sizes)[0][1]
-        for a in (-1, 1)
-        for b in (-1, 1)
-    ]
-    assert rates[1] - uncertainties[1] <= min(extremes)
-    assert rates[1] + uncertainties[1] >= max(extremes)
-    assert uncertainties[1] < 1.2 * (max(extremes) - min(extremes)) / 2

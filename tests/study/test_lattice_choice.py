@@ -17,7 +17,7 @@ from sobolev_batch.batch import run as run_module
 from sobolev_batch.norms.accuracy.problem import Problem
 from sobolev_batch.norms.accuracy.solve import run_pilot
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
-from sobolev_batch.norms.budget import NormEstimate
+from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.store.layout import stored_choice
 from sobolev_batch.study import pilots as search_module
 from sobolev_batch.study.lattice_choice import LatticeChoice

@@ -12,7 +12,7 @@ import xarray as xr
 
 from sobolev_batch import matrix
 from sobolev_batch.errors import InputError
-from sobolev_batch.norms.budget import PARTS
+from sobolev_batch.norms.estimate import PARTS
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.matrix import format_matrix, matrix_frame, pairs_of
 from sobolev_batch.tables.store_accessor import distances_at

@@ -1,17 +1,21 @@
-"""Results of a reduction in tables."""
+"""Results of a reduction in tables, and the rates that follow from them."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import xarray as xr
 from distributed import Client
 
 from sobolev_batch import Study, open_store, run, verify
 from sobolev_batch.store import layout
+from sobolev_batch.tables.results import observed_rates
 from tests.support.stores import assert_same_results
 from tests.support.studies import small_table
+
+NAN = np.nan
 
 
 def test_tables_in_many_chunks_are_those_in_one(
@@ -49,3 +53,36 @@ def test_tables_have_coordinates_and_nothing_but_nan_of_a_mesh_that_failed(store
     smallest = tree["convergence"].to_dataset()["relative"].groupby("family").min()
     assert smallest["family"].values.tolist() == ["ico", "lost", "reference"]
     assert smallest.isnull().any("order").values.tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("sizes", "distances", "errors", "rates"),
+    [
+        # They follow the sizes, not the order of the meshes.
+        ([0.1, 0.4, 0.2], [0.01, 0.16, 0.04], [0, 0, 0], [2, NAN, 2]),
+        # Missing meshes are bridged, and so are sizes that are nearly equal.
+        ([0.4, 0.2, 0.1, NAN], [0.16, NAN, 0.01, 0.001], [0, 0, 0, 0], [NAN, NAN, 2, NAN]),
+        ([0.4, 0.2, 0.19], [0.16, 0.04, 0.0361], [0, 0, 0], [NAN, 2, 2]),
+        # Distances below their error, distances of zero and equal sizes carry no rate.
+        ([0.4, 0.2, 0.1], [0.16, 0.04, 0.01], [0, 0, 0.011], [NAN, 2, NAN]),
+        ([0.2, 0.1], [1, 0], [0, 0], [NAN, NAN]),
+        ([0.1, 0.1], [1, 2], [0, 0], [NAN, NAN]),
+    ],
+)
+def test_observed_rates(sizes: list[float], distances: list[float], errors: list[float], rates: list[float]) -> None:
+    found, uncertainties = observed_rates(np.array(distances), np.array(errors), np.array(sizes))
+    np.testing.assert_allclose(found, rates, rtol=1e-12)
+    assert np.array_equal(np.isnan(uncertainties), np.isnan(rates))
+
+
+def test_errors_of_rates_cover_what_the_distances_allow() -> None:
+    sizes, distances, errors = np.array([0.2, 0.1]), np.array([0.4, 0.1]), np.array([0.02, 0.01])
+    rates, uncertainties = observed_rates(distances, errors, sizes)
+    extremes = [
+        observed_rates(distances + a * errors * [1, 0] + b * errors * [0, 1], np.zeros(2), sizes)[0][1]
+        for a in (-1, 1)
+        for b in (-1, 1)
+    ]
+    assert rates[1] - uncertainties[1] <= min(extremes)
+    assert rates[1] + uncertainties[1] >= max(extremes)
+    assert uncertainties[1] < 1.2 * (max(extremes) - min(extremes)) / 2

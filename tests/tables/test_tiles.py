@@ -91,7 +91,10 @@ def test_tiles_whose_others_are_all_other_rows(
 
 def test_norms_are_those_of_the_fields(reducer: Reducer, fields: NDArray[np.complex128]) -> None:
     rows = [1, 3, REFERENCE]
-    norms, to_reference, (areas, _, shapes, *_) = reducer.norms(rows)
+    compared = reducer.norms(rows)
+    norms, to_reference = compared.norms, compared.distances
+    parts = compared.reference.area_and_shape(to_reference)
+    areas, shapes = parts["area_part"], parts["shape_part"]
     for found, values in (norms, fields), (to_reference, fields - fields[REFERENCE]):
         assert found.values == pytest.approx(norms_of(values[rows], reducer), rel=1e-13)
     # The parts of each distance are those of the library, whatever the chunks.
@@ -107,9 +110,10 @@ def test_norms_are_those_of_the_fields(reducer: Reducer, fields: NDArray[np.comp
 
 
 def test_without_a_reference_there_are_norms_alone(reducer: Reducer) -> None:
-    norms, to_reference, parts = replace(reducer, reference=None).norms([1, 3])
-    assert norms.values == pytest.approx(reducer.norms([1, 3])[0].values, rel=1e-14)
-    assert (parts[4] == 0).all()
-    for found in (*to_reference, *parts[[0, 1, 2, 3, 5]]):
-        assert found.shape == norms.values.shape
+    compared = replace(reducer, reference=None).norms([1, 3])
+    assert compared.norms.values == pytest.approx(reducer.norms([1, 3]).norms.values, rel=1e-14)
+    assert (compared.beyond[0] == 0).all()
+    parts = compared.reference.area_and_shape(compared.distances).values()
+    for found in (*compared.distances, *parts, compared.beyond[1]):
+        assert found.shape == compared.norms.values.shape
         assert np.isnan(found).all()

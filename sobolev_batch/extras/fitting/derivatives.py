@@ -17,8 +17,9 @@ from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Extent
 from sobolev_batch.norms import DEFAULT_ORDER
-from sobolev_batch.norms.budget import ALIASING_CAUTION, PARTS, Support, decay_to_period, sums_of_shells, truncated
+from sobolev_batch.norms.budget import ALIASING_CAUTION, Support, decay_to_period, sums_of_shells, truncated
 from sobolev_batch.norms.columns import NUMBER, VARIABLES, labelled, lattice_attributes
+from sobolev_batch.norms.estimate import PARTS
 from sobolev_batch.norms.fields import (
     Operand,
     OperandLike,

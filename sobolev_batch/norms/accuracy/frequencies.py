@@ -20,28 +20,13 @@ from sobolev_batch.norms.accuracy.problem import (
     support_of,
 )
 from sobolev_batch.norms.accuracy.solve import solve
-from sobolev_batch.norms.budget import (
-    NormEstimate,
-    ReferenceEstimate,
-    Sums,
-    Support,
-    aliased,
-    estimate_norms,
-    product_rounding,
-    sums_of_shells,
-)
+from sobolev_batch.norms.budget import Sums, Support, sums_of_shells
+from sobolev_batch.norms.estimate import NormEstimate, ReferenceEstimate, Tail, estimate_norms
 from sobolev_batch.norms.fields import field_for
+from sobolev_batch.norms.tail.integrals import OctaveWeights, integral_over, squared_moduli
 from sobolev_batch.norms.tail.remainder import mean_sinc, remainder
 from sobolev_batch.norms.tail.sampling import OctaveSampling
-from sobolev_batch.norms.tail.values import (
-    OctaveSums,
-    OctaveWeights,
-    Tail,
-    octave_values,
-    settings_for,
-    squared_moduli,
-    statistical_errors,
-)
+from sobolev_batch.norms.tail.values import octave_values, settings_for
 from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, permits_single
 from sobolev_batch.transform.lattice import Lattice, SobolevWeights, shell_sums
 
@@ -111,7 +96,8 @@ class Frequencies:
 
     def norms(self, values: Sequence[SurfaceValues], surfaces: Sequence[Surface], signs: Sequence[int]) -> NormEstimate:
         """Return the norms of a signed sum of surfaces."""
-        return self.norms_of(Measure.from_values(values, signs), surfaces, signs, self.errors(values))
+        measure = Measure.from_values(values, signs)
+        return self.norms_of(measure, surfaces, self.errors(values), self.tail(measure, surfaces, signs))
 
     def moved(self, values: SurfaceValues, surface: Surface, length: float) -> Reals:
         """Return the distance (orders,) of a surface to itself moved by a length: the rms over all directions."""
@@ -123,47 +109,58 @@ class Frequencies:
         for weights, octave in zip(self._octave_weights, own.octaves, strict=True):
             factors = 2 - 2 * np.sinc(2 * weights.sampling.radii * length)
             squares = squares + weights.integrals(squared_moduli(octave) * factors)
-        if self.has_tail:
+        if (tail := self.tail(own, [surface], [1])) is not None:
             means = np.array([mean_sinc(self._cutoff, order, length) for order in self.orders])
-            squares = squares + (2 - 2 * means) * self.tail(own, [surface], [1]).beyond
+            squares = squares + (2 - 2 * means) * tail.remainder
         return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
 
     def errors(self, values: Sequence[SurfaceValues]) -> Reals:
         """Return the norms of the values' own errors (orders,), added."""
         return np.asarray(np.sum([one.error_norms(self.weights) for one in values], axis=0))
 
-    def norms_of(
-        self,
-        measure: Measure,
-        surfaces: Sequence[Surface],
-        signs: Sequence[int],
-        errors: Reals,
-        tail: Tail | None = None,
-    ) -> NormEstimate:
-        """Return the norms of a measure from the norms of its values' own errors (orders,); the tail may be known."""
-        sums = self.lattice_sums(measure, measure)
-        if not self.has_tail:
-            support = Support(support_of(surfaces).areas, self.widths)
-            return estimate_norms(sums, self.weights, support, errors)
-        images = aliased(sums, self.weights, self.widths)
-        return (tail or self.tail(measure, surfaces, signs)).estimate(sums.totals, images, errors)
+    def norms_of(self, measure: Measure, surfaces: Sequence[Surface], errors: Reals, tail: Tail | None) -> NormEstimate:
+        """Return the norms of a measure from its tail and the norms of its values' own errors (orders,)."""
+        support = Support(support_of(surfaces).areas, self.widths)
+        return estimate_norms(self.lattice_sums(measure, measure), self.weights, support, errors, tail)
 
     def lattice_sums(self, measure: Measure, other: Measure) -> Sums:
         """Return the sums of Re(a conj b) over the lattice."""
         return sums_of_shells(shell_sums(measure.lattice, other.lattice, self.lattice, self.lattice.half), self.weights)
 
-    def octave_sums(self, measure: Measure, other: Measure) -> list[OctaveSums]:
-        """Return the integrals of Re(a conj b) over each octave."""
-        return [
-            weights.sums((a.astype(np.complex128) * b.conj()).real)
-            for weights, a, b in zip(self._octave_weights, measure.octaves, other.octaves, strict=True)
-        ]
+    def octave_integral(self, measure: Measure, other: Measure) -> tuple[Reals, Reals]:
+        """Return the integral of Re(a conj b) over all octaves (orders,), and how far off it may be at 99 %."""
+        octaves = zip(self._octave_weights, measure.octaves, other.octaves, strict=True)
+        return integral_over([weights.sums((a.astype(np.complex128) * b.conj()).real) for weights, a, b in octaves])
 
-    def tail(self, measure: Measure, surfaces: Sequence[Surface], signs: Sequence[int]) -> Tail:
-        """Return the tail from the octaves, and what is known to lie beyond them."""
+    def tail(self, measure: Measure, surfaces: Sequence[Surface], signs: Sequence[int]) -> Tail | None:
+        """Return the tail from the octaves and what is known to lie beyond them; None where the lattice is all."""
+        if not self.has_tail:
+            return None
         # Norms of single surfaces serve as scales.
         beyond = remainder(surfaces, signs, self._cutoff, self.orders, is_scale=len(surfaces) == 1)
-        return Tail.from_sums(self.octave_sums(measure, measure), *beyond.at(self.orders))
+        return Tail(*self.octave_integral(measure, measure), *beyond.at(self.orders))
+
+    def against(
+        self,
+        difference: Sequence[SurfaceValues],
+        reference: SurfaceValues,
+        surfaces: Sequence[Surface],
+        signs: Sequence[int],
+        pair: Sequence[Surface],
+        moved: Reals | float = 0.0,
+    ) -> ReferenceEstimate:
+        """Return the norm of the reference b of a pair a, b, and the product <a - b, b>.
+
+        The difference a - b is a signed sum of surfaces, whose values are given: what a and b both have may be left
+        out, and it may lack a norm that is moved, see `Problem`.
+        """
+        a_minus_b, b = Measure.from_values(difference, signs), Measure.from_values([reference], [1])
+        a = Measure.from_values([*difference, reference], [*signs, 1])
+        tails = self.tail(a, pair[:1], [1]), self.tail(b, pair[1:], [1]), self.tail(a_minus_b, surfaces, signs)
+        norms = self.norms_of(b, pair[1:], self.errors([reference]), tails[1])
+        distances = self.norms_of(a_minus_b, surfaces, self.errors(difference) + moved, tails[2])
+        products, tail = self.lattice_sums(a_minus_b, b), Tail.of_product(self.octave_integral(a_minus_b, b), *tails)
+        return ReferenceEstimate.from_products(products, self.weights, self.widths, distances, norms, tail)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,22 +168,14 @@ class Reference:
     """The reference b of a distance ||a - b||, and what is known of it.
 
     Attributes:
-        difference: Values of surfaces whose signed sum is a - b.
-        surfaces: These surfaces, moved like the pair; what a and b both have may be left out.
-        signs: Signs of these.
-        pair: The surfaces a and b, moved together to the centre of the lattice's period; of surfaces far apart b alone.
-        known: Estimate for surfaces far apart, which follows from the norm of b; None for others.
-        moved: What the difference lacks, see `Problem`.
+        surface: The surface b as its values are of it, moved to the centre of the lattice's period.
+        estimate: The norm of b, and the product <a - b, b>.
     """
 
     frequencies: Frequencies
     values: SurfaceValues
-    difference: Sequence[SurfaceValues]
-    surfaces: Sequence[Surface]
-    signs: Sequence[int]
-    pair: Sequence[Surface]
-    known: ReferenceEstimate | None = None
-    moved: Reals | float = 0.0
+    surface: Surface
+    estimate: ReferenceEstimate
 
     @classmethod
     def for_problem(cls, problem: Problem, solution: Solution, seed: int) -> Self:
@@ -198,14 +187,13 @@ class Reference:
         if problem.is_whole and problem.apart is not None:
             own, of_own = problem.alone[1], solution.alone[1]
             norms = of_own.estimate
-            known = ReferenceEstimate(
-                norms, -(norms.values**2), (2 * norms.values + norms.errors) * norms.errors + problem.apart
-            )
-            frequencies = Frequencies.from_solution(own, of_own)
-            return cls(frequencies, of_own.values[0], of_own.values, own.surfaces, own.signs, own.surfaces, known)
+            errors = (2 * norms.values + norms.errors) * norms.errors + problem.apart
+            known = ReferenceEstimate(norms, -(norms.values**2), errors)
+            return cls(Frequencies.from_solution(own, of_own), of_own.values[0], own.surfaces[0], known)
         if problem.is_whole:
-            frequencies = Frequencies.from_solution(problem, solution)
-            return cls(frequencies, solution.values[1], solution.values, problem.surfaces, problem.signs, problem.pair)
+            frequencies, pair = Frequencies.from_solution(problem, solution), problem.pair
+            found = frequencies.against(solution.values, solution.values[1], pair, problem.signs, pair)
+            return cls(frequencies, solution.values[1], pair[1], found)
         move = centering(problem.pair, OFF_CENTER)
         pair = [move.apply(surface) for surface in problem.pair]
         support = replace(support_of(pair), areas=np.array(pair[1].area))
@@ -213,36 +201,9 @@ class Reference:
         alone = replace(problem, signs=(1,), label="the reference", apart=None, moved=0.0)
         own = replace(alone, surfaces=pair[1:], support=support, accuracy=accuracy)
         of_reference = solve(own, seed)
-        frequencies = Frequencies.from_solution(own, of_reference)
+        frequencies, values = Frequencies.from_solution(own, of_reference), of_reference.values[0]
         target = error_target(solution.estimate.values, problem.orders, problem.accuracy, problem.area)
         surfaces = [move.apply(surface) for surface in problem.surfaces]
         difference = [frequencies.values(surface, target, problem.execution) for surface in surfaces]
-        return cls(frequencies, of_reference.values[0], difference, surfaces, problem.signs, pair, moved=problem.moved)
-
-    def estimate(self) -> ReferenceEstimate:
-        """Return the norm of b, and the product <a - b, b>."""
-        if self.known is not None:
-            return self.known
-        at, values = self.frequencies, self.values
-        difference, own = Measure.from_values(self.difference, self.signs), Measure.from_values([values], [1])
-        other = Measure.from_values([*self.difference, values], [*self.signs, 1])
-        # Of a, b and their difference.
-        parts = (other, self.pair[:1], [1]), (own, self.pair[1:], [1]), (difference, self.surfaces, self.signs)
-        tails = [at.tail(*part) for part in parts] if at.has_tail else [None] * len(parts)
-        norms = at.norms_of(*parts[1], at.errors([values]), tails[1])
-        distances = at.norms_of(*parts[2], at.errors(self.difference) + self.moved, tails[2])
-        products = at.lattice_sums(difference, own)
-        if not at.has_tail:
-            return ReferenceEstimate.on_lattice(products, distances, norms, at.weights, at.widths)
-        of_a, of_b, of_difference = (cast(Tail, tail) for tail in tails)
-        in_octaves = at.octave_sums(difference, own)
-        statistical = statistical_errors(in_octaves) if in_octaves else 0.0
-        # Beyond the octaves ||a||² - ||b||² - ||a - b||² is twice the product <a - b, b>.
-        beyond = (of_a.beyond - of_b.beyond - of_difference.beyond) / 2
-        uncertainty = np.sum([tail.uncertainty for tail in (of_a, of_b, of_difference)], axis=0) / 2 + statistical
-        images = aliased(products, at.weights, at.widths)
-        return ReferenceEstimate(
-            norms,
-            products.totals + np.sum([one.squares for one in in_octaves], axis=0) + beyond,
-            uncertainty + images + product_rounding(distances, norms),
-        )
+        found = frequencies.against(difference, values, surfaces, problem.signs, pair, problem.moved)
+        return cls(frequencies, values, pair[1], found)

@@ -26,22 +26,15 @@ from sobolev_batch.norms.accuracy.problem import (
     sums_on,
 )
 from sobolev_batch.norms.accuracy.tolerance import FINER_LATTICE, core_lattice, good_intervals
-from sobolev_batch.norms.budget import aliased, change_of_root
+from sobolev_batch.norms.budget import Sums, aliased
+from sobolev_batch.norms.estimate import Tail, change_of_root, estimate_norms
 from sobolev_batch.norms.fields import Field
+from sobolev_batch.norms.tail.face_normals import FaceNormals
+from sobolev_batch.norms.tail.integrals import OctaveSums, OctaveWeights, integral_over, squared_moduli
 from sobolev_batch.norms.tail.potentials import tail_integral
 from sobolev_batch.norms.tail.remainder import MOSTLY, Remainder, remainder
-from sobolev_batch.norms.tail.sampling import FaceNormals, Octave, OctaveSampling
-from sobolev_batch.norms.tail.values import (
-    POINTS_PER_SQUARE,
-    OctaveSums,
-    OctaveValues,
-    OctaveWeights,
-    SurfaceSize,
-    Tail,
-    octave_values,
-    settings_for,
-    squared_moduli,
-)
+from sobolev_batch.norms.tail.sampling import Octave, OctaveSampling
+from sobolev_batch.norms.tail.values import POINTS_PER_SQUARE, OctaveValues, SurfaceSize, octave_values, settings_for
 from sobolev_batch.transform.lattice import Lattice, OctaveLattice, SobolevWeights
 from sobolev_batch.transform.probe import estimate as estimate_from
 
@@ -81,18 +74,15 @@ class Core:
     """The innermost frequencies: fields on a small lattice, under a smooth step that ends at a cutoff.
 
     Attributes:
-        squares: Squared norm of their difference under the step (orders,).
-        images: Bound on the change of the squares by the lattice's spacing (orders,).
+        weights: Weights of the lattice, with the step.
+        sums: Sums of the squared difference of the fields under the step.
         errors: Norms of the fields' own errors (orders,).
-        energy: Energy ∫_{|ξ|=r} |field|² dS in the last octave below ξ_max.
     """
 
-    lattice: Lattice
+    weights: SobolevWeights
     fields: tuple[Field, ...]
-    squares: Reals
-    images: Reals
+    sums: Sums
     errors: Reals
-    energy: float
 
     @classmethod
     def on_lattice(cls, problem: Problem, lattice: Lattice, cutoff: float) -> Self:
@@ -106,9 +96,17 @@ class Core:
         )
         fields = problem.fields(lattice, samples, target, problem.dtype(lattice, target))
         weights = SobolevWeights(lattice, problem.orders, cutoff)
-        sums, errors = sums_on(problem, fields, weights)
-        images = aliased(sums, weights, problem.support.widths)
-        return cls(lattice, fields, np.maximum(sums.totals, 0.0), images, errors, float(sums.outer[1]))
+        return cls(weights, fields, *sums_on(problem, fields, weights))
+
+    @property
+    def squares(self) -> Reals:
+        """Squared norm of the difference under the step (orders,)."""
+        return np.maximum(self.sums.totals, 0.0)
+
+    @property
+    def energy(self) -> float:
+        """Energy ∫_{|ξ|=r} |field|² dS in the last octave below ξ_max."""
+        return float(self.sums.outer[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,18 +164,18 @@ class State:
     @cached_property
     def tail(self) -> Tail:
         """All beyond the core. What two ways to it disagree about counts as uncertain."""
-        last = self.remainders[-1].at(self.problem.orders)
-        tail = Tail.from_sums([octave.sums for octave in self.octaves], *last)
-        return replace(tail, uncertainty=tail.uncertainty + self.disagreements.max(axis=0))
+        octaves = integral_over([octave.sums for octave in self.octaves])
+        tail = Tail(*octaves, *self.remainders[-1].at(self.problem.orders))
+        return replace(tail, remainder_error=tail.remainder_error + self.disagreements.max(axis=0))
 
     @cached_property
     def disagreements(self) -> Reals:
         """Gap of each remainder to what was measured there otherwise, outside of both errors (remainders, orders)."""
         orders, disagreements = self.problem.orders, []
         for number, beyond in enumerate(self.remainders):
-            sums = [octave.sums for octave in self.octaves[number:]]
-            outer, (value, error) = Tail.from_sums(sums, *self.remainders[-1].at(orders)), beyond.at(orders)
-            disagreements.append(np.abs(outer.squares - value) - outer.statistical - outer.uncertainty - error)
+            octaves = integral_over([octave.sums for octave in self.octaves[number:]])
+            outer, (value, error) = Tail(*octaves, *self.remainders[-1].at(orders)), beyond.at(orders)
+            disagreements.append(np.abs(outer.totals - value) - outer.octaves_error - outer.remainder_error - error)
         disagreements[-1] = self._missing
         return np.maximum(disagreements, 0.0)
 
@@ -201,7 +199,7 @@ class State:
     @cached_property
     def squares(self) -> Reals:
         """Squared norms (orders,): what has been measured, and what lies beyond it for certain."""
-        certain = np.maximum(self.tail.beyond - self.tail.uncertainty, 0.0)
+        certain = np.maximum(self.tail.remainder - self.tail.remainder_error, 0.0)
         return np.asarray(self.core.squares + self.tail.octaves + certain)
 
     @cached_property
@@ -290,14 +288,14 @@ def solve_in_octaves(problem: Problem, seed: int, aim: float = 1.0, for_others: 
 
 def solution_of(state: State) -> Solution:
     """Return the numbers by what is known so far."""
-    core, orders = state.core, state.problem.orders
-    squares = core.errors**2 + np.sum([octave.error_norms(orders) ** 2 for octave in state.octaves], axis=0)
-    found = state.tail.estimate(core.squares, core.images, np.sqrt(squares))
+    core, support = state.core, state.problem.support
+    errors = core.errors**2 + np.sum([octave.error_norms(core.weights.orders) ** 2 for octave in state.octaves], axis=0)
+    found = estimate_norms(core.sums, core.weights, support, np.sqrt(errors), state.tail)
     values = tuple(
         SurfaceValues(field, tuple(octave.values[number] for octave in state.octaves))
         for number, field in enumerate(core.fields)
     )
-    return Solution(found, core.lattice, values, has_tail=True)
+    return Solution(found, core.weights.lattice, values, has_tail=True)
 
 
 def farther_out(state: State) -> State | None:
@@ -325,11 +323,12 @@ def farther_out(state: State) -> State | None:
 def refined(state: State) -> State | None:
     """Return a state with more samples where they are needed most; None where no more can be taken."""
     problem, accuracy, core = state.problem, state.problem.accuracy, state.core
-    values = accuracy.scale(np.sqrt(state.squares))
-    if np.any(change_of_root(state.squares, core.images) > accuracy.aliasing_part * values):
-        larger = good_intervals(FINER_LATTICE * core.lattice.M)
+    values, lattice = accuracy.scale(np.sqrt(state.squares)), core.weights.lattice
+    images = aliased(core.sums, core.weights, problem.support.widths)
+    if np.any(change_of_root(state.squares, images) > accuracy.aliasing_part * values):
+        larger = good_intervals(FINER_LATTICE * lattice.M)
         if larger <= accuracy.largest_intervals:
-            core = Core.on_lattice(problem, Lattice(core.lattice.xi_max, larger), state.cutoff)
+            core = Core.on_lattice(problem, Lattice(lattice.xi_max, larger), state.cutoff)
     finer = _finer_samplings(state)
     seconds = sum(state.sampling_seconds(sampling, state.octaves[n].sampling) for n, sampling in finer.items())
     if state.seconds + seconds > _MOST_SECONDS:
@@ -440,7 +439,7 @@ def _finer_sampling(state: State, octave: MeasuredOctave, order: int, permitted:
         return replace(
             sampling, lattices=(first,), draws=beside, seed=_seed(rng), uniform_fraction=_UNIFORM_BESIDE_LATTICE
         )
-    of_lattices, of_draws = sums.parts[:, order]
+    of_lattices, of_draws = sums.variances_by_origin[:, order]
     if of_draws > of_lattices:
         return replace(sampling, draws=count, seed=_seed(rng))
     intervals = 2 * round(sampling.lattices[-1].M * np.clip(excess**0.5, 1.25, 2.0) / 2)

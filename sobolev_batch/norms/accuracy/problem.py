@@ -16,7 +16,8 @@ from sobolev_batch.geometry.overlap import SINGLE_ROUNDING, rests_of
 from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Similarity, Surface, centering
 from sobolev_batch.norms.accuracy.apart import APART_FRACTION, product_apart
 from sobolev_batch.norms.accuracy.tolerance import Accuracy, first_lattice, unreachable
-from sobolev_batch.norms.budget import NormEstimate, Sums, Support, change_of_root, norm_of_moves, sums_of_shells
+from sobolev_batch.norms.budget import Sums, Support, norm_of_moves, sums_of_shells
+from sobolev_batch.norms.estimate import NormEstimate, change_of_root
 from sobolev_batch.norms.fields import USUAL_DEGREE, Field, field_for
 from sobolev_batch.norms.tail.sampling import OctaveSampling
 from sobolev_batch.norms.tail.values import OctaveValues

@@ -34,10 +34,11 @@ from sobolev_batch.norms.accuracy.tolerance import (
     lattice_of,
     refined,
 )
-from sobolev_batch.norms.budget import NormEstimate, Sums, Support, estimate_norms, modulus_bound
+from sobolev_batch.norms.budget import Sums, Support, modulus_bound
+from sobolev_batch.norms.estimate import NormEstimate, estimate_norms
 from sobolev_batch.norms.fields import Field
+from sobolev_batch.norms.tail.face_normals import FaceNormals
 from sobolev_batch.norms.tail.remainder import LOWEST_ORDER, remainder
-from sobolev_batch.norms.tail.sampling import FaceNormals
 from sobolev_batch.transform.backends import ComplexDtype
 from sobolev_batch.transform.fourier import ErrorTarget
 from sobolev_batch.transform.kinds import kind_of

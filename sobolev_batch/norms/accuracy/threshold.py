@@ -34,7 +34,7 @@ _NARROWEST, _OF_MARGIN, _LEAST_RTOL_OF_OCTAVES = 3e-3, 0.4, 0.01
 # Errors of octaves are partly estimates: the law of energies, and random frequencies. Of a hundred verdicts that took
 # the side which they permit, two had errors that were too small, by a factor below 2.
 _OCTAVES_CAUTION = 3.0
-# Of the distance between surfaces that are far apart, which is beyond every threshold.
+# The rtol of the distance between surfaces that are far apart, which is beyond every threshold.
 _APART_RTOL = 0.01
 # The prediction of a field's error may be too small by this factor.
 _PREDICTION_CAUTION = 4.0

@@ -22,13 +22,13 @@ from sobolev_batch.errors import AccuracyError, InputError
 from sobolev_batch.norms.budget import (
     ALIASING_CAUTION,
     TRUNCATION_CAUTION,
-    NormEstimate,
     Sums,
     Support,
     aliased,
     image_weight,
     truncated,
 )
+from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.transform.fourier import FINEST_EPS, TransformSettings, projected_bytes
 from sobolev_batch.transform.lattice import LARGEST_M, Lattice, SobolevWeights
 

@@ -20,124 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Indices, Reals
-from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Surface
+from sobolev_batch.norms.tail.face_normals import FaceNormals
 from sobolev_batch.transform.backends import combine
 from sobolev_batch.transform.lattice import STEP_START, OctaveLattice, smooth_step
-
-# Normals whose entries agree to this many parts are one direction.
-_DIRECTION_PARTS = 500
-# Numbers that an entry can be rounded to; three of them make a key of 32 bits.
-_KEYS_PER_AXIS = 2 * _DIRECTION_PARTS + 1
-# Triangles whose normals are taken at a time.
-_BATCH = 1 << 14
-# A direction counts if the faces along it hold this fraction of the area; this many directions at most.
-_LEAST_SHARE, _MOST_DIRECTIONS = 0.01, 64
-# κ as a fraction of 2π |ξ| · size of the faces: the spots around normals are about 1/κ wide.
-_SPOT_FRACTION = 0.5
-# No direction of small whole numbers is orthogonal to this one, where rounding would decide.
-_UPWARDS = np.array([1.0, np.sqrt(2.0), np.pi])
-_NO_NORMALS = (np.zeros((0, 3)), np.zeros(0), np.zeros(0))
-
-
-@dataclass(frozen=True, eq=False)
-class FaceNormals:
-    """Directions of the flat faces of some surfaces, and a density of directions that follows them.
-
-    The transform of a flat face is concentrated around its normal, in a spot as wide as the inverse size of the face,
-    and falls off from there like the inverse third power. So does the density around each normal n, which is
-    (1 + κ²) / (4π (1 + κ² sin²θ)^(3/2)) at an angle θ to n, with κ in proportion to |ξ| times the size.
-
-    Attributes:
-        directions: Unit normals, float64 (n, 3); the density is the same at opposite directions.
-        shares: Area of the faces along each normal over that along all of them, float64 (n,).
-        sizes: Typical width of these faces, float64 (n,), in units of length.
-    """
-
-    directions: Reals
-    shares: Reals
-    sizes: Reals
-
-    @classmethod
-    def from_surfaces(cls, surfaces: Sequence[Surface]) -> Self:
-        """Return the normals of the flat faces of surfaces; none for curved ones."""
-        found = [_main_normals(surface) for surface in surfaces if isinstance(surface, Mesh)]
-        directions, areas, sizes = (np.concatenate(rows) for rows in zip(_NO_NORMALS, *found, strict=True))
-        return cls(directions, areas / max(float(areas.sum()), np.finfo(np.float64).tiny), sizes)
-
-    def __bool__(self) -> bool:
-        return len(self.shares) > 0
-
-    def draw(self, radii: Reals, rng: np.random.Generator) -> Reals:
-        """Draw a unit direction on the side of a normal for each |ξ| (n,) by the density, float64 (n, 3)."""
-        chosen = rng.choice(len(self.shares), len(radii), p=self.shares)
-        axes = self.directions[chosen]
-        squares = self._concentrations(radii, self.sizes[chosen])
-        levels = rng.random(len(radii))
-        # The distribution of u = |cos θ| is u / √(1 + κ² - κ² u²), which inverts in closed form.
-        cosines = levels * np.sqrt((1 + squares) / (1 + squares * levels**2))
-        sines = np.sqrt(np.maximum(1 - cosines**2, 0.0))
-        turns = 2 * np.pi * rng.random(len(radii))
-        across = np.cross(axes, np.eye(3)[np.abs(axes).argmin(axis=1)])
-        across /= np.linalg.norm(across, axis=1, keepdims=True)
-        sideways = np.cos(turns)[:, None] * across + np.sin(turns)[:, None] * np.cross(axes, across)
-        # Of each direction and its opposite one will do: all integrands are even.
-        return np.asarray(cosines[:, None] * axes + sines[:, None] * sideways)
-
-    def density(self, directions: Reals, radii: Reals) -> Reals:
-        """Return the density per solid angle (n,) at unit directions (n, 3), for their |ξ| (n,)."""
-        total, columns = np.zeros(len(radii)), np.ascontiguousarray(directions.T)
-        for axis, share, size in zip(self.directions, self.shares, self.sizes, strict=True):
-            squares = self._concentrations(radii, size)
-            spread = 1 + squares * np.maximum(1 - combine(axis, columns) ** 2, 0.0)
-            total += share / (4 * np.pi) * (1 + squares) / (spread * np.sqrt(spread))
-        return total
-
-    @staticmethod
-    def _concentrations(radii: Reals, sizes: Reals | float) -> Reals:
-        """Return κ² of the density."""
-        return np.asarray((_SPOT_FRACTION * 2 * np.pi * radii * sizes) ** 2)
-
-
-def without_sign(normals: Reals) -> Reals:
-    """Return of each normal (n, 3) and its opposite the same one."""
-    return np.where((combine(_UPWARDS, normals.T) < 0)[:, None], -normals, normals)
-
-
-def _main_normals(mesh: Mesh) -> tuple[Reals, Reals, Reals]:
-    """Return the normals, areas and face sizes of the directions that hold much of a mesh's area."""
-    count = len(mesh.triangles)
-    normals, areas, keys = np.empty((count, 3)), np.empty(count), np.empty(count, dtype=np.int32)
-    # The corners and temporaries of all triangles of a fine mesh would take gigabytes.
-    for start in range(0, count, _BATCH):
-        part = slice(start, start + _BATCH)
-        normals[part], areas[part] = _normals_and_areas(mesh, part)
-        # A number for each normal, the same for those that count as one direction.
-        x, y, z = np.round(normals[part] * _DIRECTION_PARTS).astype(np.int32).T
-        keys[part] = (x * _KEYS_PER_AXIS + y) * _KEYS_PER_AXIS + z
-    _, members = np.unique(keys, return_inverse=True)
-    sums = np.bincount(members, weights=areas)
-    largest = np.argsort(-sums)[:_MOST_DIRECTIONS]
-    largest = largest[sums[largest] > _LEAST_SHARE * areas.sum()]
-    directions, sizes = np.empty((len(largest), 3)), np.empty(len(largest))
-    for number, group in enumerate(largest):
-        face = members == group
-        directions[number] = areas[face] @ normals[face]
-        used = np.zeros(len(mesh.vertices), dtype=bool)
-        used[mesh.triangles[face]] = True
-        # Between the width of one triangle and that of all faces along the normal: spots of both lie there.
-        sizes[number] = np.sqrt(np.ptp(mesh.vertices[used], axis=0).max() * np.sqrt(areas[face].mean()))
-    directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    return directions, sums[largest], sizes
-
-
-def _normals_and_areas(mesh: Mesh, part: slice) -> tuple[Reals, Reals]:
-    """Return the unit normals (k, 3), without sign, and areas (k,) of some triangles; 0 for those without area."""
-    a, b, c = mesh.corners(part)
-    crosses = np.cross(b - a, c - a)
-    doubled = np.linalg.norm(crosses, axis=1)
-    return without_sign(crosses / np.where(doubled > 0, doubled, 1.0)[:, None]), doubled / 2
-
 
 # Samples along an axis of the lattice of each octave, and draws beside it where surfaces have flat faces.
 USUAL_M, _USUAL_DRAWS, _USUAL_UNIFORM = 64, 20_000, 0.1
@@ -178,12 +64,12 @@ class Octave:
 
 
 @dataclass(frozen=True, eq=False)
-class SamplePart:
+class SampleSet:
     """Neighbouring samples of an octave: those of one lattice, or the drawn ones.
 
     Attributes:
         samples: Place of the samples in the octave.
-        starts: First sample of each of the eight sublattices, counted from the part's first, int64 (8,). Sums over
+        starts: First sample of each of the eight sublattices, counted from the set's first, int64 (8,). Sums over
             sublattices are nearly independent. None for drawn samples, which are all independent.
         places: Indices of the samples in the lattice's block, flattened, int64 (n,); empty for drawn ones.
     """
@@ -254,7 +140,7 @@ class OctaveSampling:
         return self._samples[1]
 
     @property
-    def parts(self) -> tuple[SamplePart, ...]:
+    def sample_sets(self) -> tuple[SampleSet, ...]:
         """The samples of each lattice, and the drawn ones last."""
         return self._samples[2]
 
@@ -264,18 +150,18 @@ class OctaveSampling:
         return np.asarray(np.linalg.norm(self.frequencies, axis=1))
 
     @cached_property
-    def _samples(self) -> tuple[Reals, Reals, tuple[SamplePart, ...]]:
+    def _samples(self) -> tuple[Reals, Reals, tuple[SampleSet, ...]]:
         found = [_lattice_samples(lattice) for lattice in self.lattices]
         frequencies = np.concatenate([*(samples[0] for samples in found), self._drawn()])
         multiples = np.concatenate([*(samples[1] for samples in found), np.ones(self.draws)])
         density = sum(lattice.spacing**-3 for lattice in self.lattices) + self._density(frequencies)
         weights = multiples * self.octave.window(np.linalg.norm(frequencies, axis=1)) / density
-        parts, first = [], 0
+        sets, first = [], 0
         for places, starts in (samples[2:] for samples in found):
-            parts.append(SamplePart(slice(first, first + len(places)), starts, places))
+            sets.append(SampleSet(slice(first, first + len(places)), starts, places))
             first += len(places)
-        parts.append(SamplePart(slice(first, len(weights)), None, _NOWHERE))
-        return frequencies, weights, tuple(parts)
+        sets.append(SampleSet(slice(first, len(weights)), None, _NOWHERE))
+        return frequencies, weights, tuple(sets)
 
     def _drawn(self) -> Reals:
         """Draw frequencies, float64 (draws, 3)."""
@@ -438,11 +324,11 @@ class TailSampling:
         octaves, lattices, sublattices = [], [], []
         for number, octave in enumerate(self.octaves, 1):
             octaves.append(np.full(len(octave), number))
-            for lattice, part in enumerate(octave.parts):
-                count = part.samples.stop - part.samples.start
-                lattices.append(np.full(count, -1 if part.starts is None else lattice))
-                counts = [count] if part.starts is None else np.diff([*part.starts, count])
-                names = [-1] if part.starts is None else range(_SUBLATTICES)
+            for lattice, sample_set in enumerate(octave.sample_sets):
+                count = sample_set.samples.stop - sample_set.samples.start
+                lattices.append(np.full(count, -1 if sample_set.starts is None else lattice))
+                counts = [count] if sample_set.starts is None else np.diff([*sample_set.starts, count])
+                names = [-1] if sample_set.starts is None else range(_SUBLATTICES)
                 sublattices.append(np.repeat(names, counts))
         columns = {"octave": octaves, "lattice": lattices, "sublattice": sublattices}
         return {name: np.concatenate(values).astype(np.int64) for name, values in columns.items()}

@@ -1,20 +1,17 @@
-"""Transforms of surfaces at the samples of octaves: values with errors, integrals of their squares, processor time."""
+"""Transforms of surfaces at the samples of octaves: values with their errors, and the processor time that they take."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
-from functools import cached_property
-from typing import Any, Self
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.geometry.surface import Surface
-from sobolev_batch.norms.budget import NormEstimate, change_of_root
 from sobolev_batch.norms.tail.sampling import OctaveSampling
 from sobolev_batch.transform.backends import Backend, ComplexDtype
 from sobolev_batch.transform.fourier import (
@@ -46,8 +43,6 @@ POINTS_PER_SQUARE, _POINTS_PER_TRIANGLE = 4.0, 1.5
 _OVERHEAD_TRIANGLES = 50
 # Draws of an octave, for the time that one of them takes.
 _USUAL_DRAWS = 20_000
-# The true value lies within the statistical error with this probability, if sums over groups are normal.
-_CONFIDENCE = 0.99
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,20 +95,20 @@ def octave_values(
     """
     values: list[NDArray[np.complexfloating]] = []
     finished = 0 if known is None else len(known.sampling.lattices)
-    for number, part in enumerate(sampling.parts):
+    for number, sample_set in enumerate(sampling.sample_sets):
         if known is not None and number < finished:
-            values.append(known.values[known.sampling.parts[number].samples])
+            values.append(known.values[known.sampling.sample_sets[number].samples])
             continue
-        if known is not None and part.is_drawn and sampling.has_draws_of(known.sampling):
-            values.append(known.values[known.sampling.parts[-1].samples])
+        if known is not None and sample_set.is_drawn and sampling.has_draws_of(known.sampling):
+            values.append(known.values[known.sampling.sample_sets[-1].samples])
             continue
-        lattice = None if part.is_drawn else sampling.lattices[number]
+        lattice = None if sample_set.is_drawn else sampling.lattices[number]
         if lattice is None or SurfaceSize.from_surface(surface).prefers_exact(lattice):
-            frequencies = sampling.frequencies[part.samples]
+            frequencies = sampling.frequencies[sample_set.samples]
             values.append(kind_of(surface).sampled_values(frequencies, execution.threads, execution.backend))
         else:
             block = transform_block(surface, lattice, lattice.half, settings(surface, lattice), execution).values
-            values.append(block.ravel()[part.places])
+            values.append(block.ravel()[sample_set.places])
     joined = np.concatenate(values)
     return OctaveValues(sampling, joined, *_compared(surface, sampling, joined, orders, execution.backend))
 
@@ -129,16 +124,16 @@ def _compared(
     kind = kind_of(surface)
     count = 0 if kind.is_closed_form else int(np.clip(_PAIRS // max(kind.triangles, 1), _FEWEST_CHECKS, _MOST_CHECKS))
     chosen, scales = [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
-    for number, part in enumerate(sampling.parts):
-        if part.is_drawn or not count:
+    for number, sample_set in enumerate(sampling.sample_sets):
+        if sample_set.is_drawn or not count:
             continue
-        weights = sampling.weights[part.samples]
+        weights = sampling.weights[sample_set.samples]
         # Relative to the lowest frequency, so that high powers do not all underflow.
-        lengths = 1 + sampling.radii[part.samples] ** 2
+        lengths = 1 + sampling.radii[sample_set.samples] ** 2
         by_order = weights * [(lengths / lengths[weights > 0].min()) ** order for order in orders]
         chances = (by_order / by_order.sum(axis=1, keepdims=True)).mean(axis=0)
         drawn = np.random.default_rng(number).choice(len(chances), count, p=chances)
-        chosen.append(part.samples.start + drawn)
+        chosen.append(sample_set.samples.start + drawn)
         scales.append(weights[drawn] / (count * chances[drawn]))
     places = np.concatenate(chosen)
     exact = kind.sampled_values(sampling.frequencies[places], ON_CPU.threads, backend)
@@ -198,139 +193,3 @@ class SurfaceSize:
         """Return the time of the exact transform, the same whatever the process has done before."""
         pairs = frequencies * (self.triangles + _OVERHEAD_TRIANGLES)
         return min(_ARRAY_SECONDS * pairs, _START_SECONDS + _LOOP_SECONDS * pairs)
-
-
-@dataclass(frozen=True, eq=False)
-class OctaveSums:
-    """Integrals of |field|² over an octave.
-
-    Attributes:
-        squares: ∫ window (1+|ξ|²)^s |field|² for each order (orders,).
-        parts: Variances of their parts from lattices and from drawn frequencies (2, orders).
-        degrees: Degrees of freedom of these variances (2,).
-        energy: Mean of ∫_{|ξ|=r} |field|² dS over the octave.
-        energy_deviation: Standard error of the energy.
-    """
-
-    squares: Reals
-    parts: Reals
-    degrees: Reals
-    energy: float
-    energy_deviation: float
-
-    @property
-    def variances(self) -> Reals:
-        """Variance of the integrals (orders,)."""
-        return np.asarray(self.parts.sum(axis=0))
-
-
-@dataclass(frozen=True, eq=False)
-class OctaveWeights:
-    """Weights of the samples of an octave for some orders s."""
-
-    sampling: OctaveSampling
-    orders: tuple[float, ...]
-
-    @cached_property
-    def by_order(self) -> Reals:
-        """Weight times (1+|ξ|²)^s for each order, and the weight alone, float64 (orders + 1, n)."""
-        lengths, weights = 1 + self.sampling.radii**2, self.sampling.weights
-        return np.stack([*(weights * lengths**order for order in self.orders), weights])
-
-    @cached_property
-    def width(self) -> float:
-        """Integral of the octave's window over |ξ|."""
-        return self.sampling.octave.integral(0.0)
-
-    def integrals(self, products: Reals) -> Reals:
-        """Return ∫ window (1+|ξ|²)^s products for each order (orders,), from values at all samples (n,)."""
-        return np.asarray(self.by_order[:-1] @ products)
-
-    def sums(self, squares: Reals) -> OctaveSums:
-        """Return the integrals of |field|², or of products of two fields, with variances, from all samples (n,).
-
-        What is known of the integrals otherwise may have been subtracted from the samples.
-        """
-        sums, variances, degrees = np.zeros(len(self.by_order)), np.zeros((2, len(self.by_order))), np.zeros(2)
-        for part in self.sampling.parts:
-            if part.samples.start == part.samples.stop:
-                continue
-            kind = int(part.is_drawn)
-            for i, weights in enumerate(self.by_order):
-                terms = weights[part.samples] * squares[part.samples]
-                groups = terms if part.starts is None else np.add.reduceat(terms, part.starts)
-                sums[i] += groups.sum()
-                # A single sample may stand for others like it that were not met.
-                variances[kind, i] += len(groups) * groups.var(ddof=1) + np.abs(terms).max() ** 2
-            degrees[kind] += len(groups) - 1
-        deviation = float(np.sqrt(variances[:, -1].sum())) / self.width
-        energy = float(sums[-1]) / self.width
-        return OctaveSums(sums[:-1], variances[:, :-1], degrees, energy, deviation)
-
-
-def squared_moduli(values: NDArray[np.complexfloating]) -> Reals:
-    """Return |values|² in double precision."""
-    return np.asarray(values.real.astype(np.float64) ** 2 + values.imag.astype(np.float64) ** 2)
-
-
-def statistical_errors(octaves: Sequence[OctaveSums]) -> Reals:
-    """Return how far off the sum of integrals over several octaves may be (orders,), at 99 %."""
-    # Few sublattices stay few beside many draws.
-    variances = np.concatenate([octave.parts for octave in octaves])
-    return quantile_of_sum(variances, np.concatenate([octave.degrees for octave in octaves]))
-
-
-def quantile_of_sum(variances: Reals, degrees: NDArray[Any]) -> Reals:
-    """Return how far off a sum may be at 99 %, from the variances of its parts (parts, ...) and their degrees.
-
-    It is Student's quantile for the degrees of freedom of the sum (F. E. Satterthwaite 1946, doi:10.2307/3002019).
-    """
-    total, tiny = variances.sum(axis=0), np.finfo(np.float64).tiny
-    shares = variances**2 / np.maximum(degrees, 1).reshape(-1, *[1] * (variances.ndim - 1))
-    effective = total**2 / np.maximum(np.sum(shares, axis=0), tiny)
-    return np.asarray(np.sqrt(total) * stdtrit(np.maximum(effective, 1.0), (1 + _CONFIDENCE) / 2))
-
-
-@dataclass(frozen=True, eq=False)
-class Tail:
-    """Squared norms of fields beyond the innermost frequencies, each (orders, ...).
-
-    Attributes:
-        octaves: Part of the octaves.
-        statistical: How far off that may be, at 99 %.
-        beyond: Part beyond the last octave.
-        uncertainty: How far off that may be.
-    """
-
-    octaves: Reals
-    statistical: Reals
-    beyond: Reals
-    uncertainty: Reals
-
-    @classmethod
-    def from_sums(cls, sums: Sequence[OctaveSums], beyond: Reals, uncertainty: Reals) -> Self:
-        """Return the tail by the sums over octaves, and what lies beyond them (orders,)."""
-        none = np.zeros(len(beyond))
-        measured = np.sum([octave.squares for octave in sums], axis=0) if sums else none
-        return cls(measured, statistical_errors(sums) if sums else none, beyond, uncertainty)
-
-    def scaled(self, factors: Reals) -> Tail:
-        """Return the tails of several fields, (orders, fields), each times a factor."""
-        parts = (getattr(self, field.name) for field in fields(self))
-        return Tail(*(part * factors for part in parts))
-
-    @property
-    def squares(self) -> Reals:
-        """The whole tail."""
-        return self.octaves + self.beyond
-
-    def estimate(self, core: Reals, images: Reals, discretisation: Reals) -> NormEstimate:
-        """Return norms (orders, ...) from squares of the innermost frequencies, images, and errors of all values."""
-        squares = np.maximum(np.maximum(core, 0.0) + self.squares, 0.0)
-        return NormEstimate(
-            np.sqrt(squares),
-            change_of_root(squares, self.uncertainty),
-            change_of_root(squares, images),
-            discretisation,
-            change_of_root(squares, self.statistical),
-        )

@@ -14,7 +14,8 @@ import sobolev_batch as sb
 from sobolev_batch.norms.accuracy.problem import Problem, support_of
 from sobolev_batch.norms.accuracy.solve import run_pilot
 from sobolev_batch.norms.accuracy.tolerance import Accuracy, first_lattice
-from sobolev_batch.norms.budget import NormEstimate, Support
+from sobolev_batch.norms.budget import Support
+from sobolev_batch.norms.estimate import NormEstimate
 from tests.support.shapes import CENTRED_BOX as BOX
 
 

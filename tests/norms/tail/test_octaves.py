@@ -11,16 +11,10 @@ from scipy.integrate import quad
 
 from sobolev_batch import Mesh
 from sobolev_batch.geometry.surface import Surface
-from sobolev_batch.norms.tail.sampling import FaceNormals, Octave, OctaveSampling, TailSampling
-from sobolev_batch.norms.tail.values import (
-    OctaveSums,
-    OctaveValues,
-    OctaveWeights,
-    octave_values,
-    settings_for,
-    squared_moduli,
-    statistical_errors,
-)
+from sobolev_batch.norms.tail.face_normals import FaceNormals
+from sobolev_batch.norms.tail.integrals import OctaveSums, OctaveWeights, integral_over, squared_moduli
+from sobolev_batch.norms.tail.sampling import Octave, OctaveSampling, TailSampling
+from sobolev_batch.norms.tail.values import OctaveValues, octave_values, settings_for
 from sobolev_batch.shapes import Sphere, Torus, icosphere
 from sobolev_batch.transform.exact import exact_transform
 from sobolev_batch.transform.fourier import ErrorTarget
@@ -73,7 +67,7 @@ def test_the_ball_and_its_octaves_are_a_partition_of_one() -> None:
 def test_values_on_a_random_lattice_are_those_at_its_frequencies(surface: Surface) -> None:
     sampling = sampling_of(surface, 3)
     values = values_of(surface, sampling)
-    chosen = np.random.default_rng(0).integers(sampling.parts[0].samples.stop, size=20)
+    chosen = np.random.default_rng(0).integers(sampling.sample_sets[0].samples.stop, size=20)
     frequencies = sampling.frequencies[chosen]
     if isinstance(surface, Mesh):
         expected = exact_transform(surface, frequencies)
@@ -133,7 +127,7 @@ def test_known_values_are_not_computed_again() -> None:
     # What is known is taken as it is, wrong or right.
     marked = replace(known, values=known.values + 1)
     found, fresh = values_of(BOX, more, marked), values_of(BOX, more)
-    (lattice, drawn), (first, second, last) = sampling.parts, more.parts
+    (lattice, drawn), (first, second, last) = sampling.sample_sets, more.sample_sets
     assert (found.values[first.samples] == marked.values[lattice.samples]).all()
     assert (found.values[last.samples] == marked.values[drawn.samples]).all()
     assert found.values[second.samples] == pytest.approx(fresh.values[second.samples], abs=1e-12)
@@ -145,11 +139,15 @@ def test_known_values_are_not_computed_again() -> None:
 
 def test_statistical_errors_grow_with_few_degrees_of_freedom() -> None:
     few, many = (sums_of(BOX, sampling) for sampling in (sampling_of(BOX, 0, 16, 0), sampling_of(BOX, 0, 0, 2000)))
-    assert (statistical_errors([few]) / np.sqrt(few.variances) > 3.4).all()
-    assert (statistical_errors([many]) / np.sqrt(many.variances) < 2.7).all()
+    assert (integral_over([few])[1] / np.sqrt(few.variances) > 3.4).all()
+    assert (integral_over([many])[1] / np.sqrt(many.variances) < 2.7).all()
     # Eight sublattices that carry the variance have no more degrees of freedom for many draws beside them.
-    mixed = replace(few, parts=few.parts[0] * np.array([[1.0], [1e-6]]), degrees=np.array([few.degrees[0], 2000]))
-    assert (statistical_errors([mixed]) / np.sqrt(mixed.variances) > 3.4).all()
+    mixed = replace(
+        few,
+        variances_by_origin=few.variances_by_origin[0] * np.array([[1.0], [1e-6]]),
+        degrees=np.array([few.degrees[0], 2000]),
+    )
+    assert (integral_over([mixed])[1] / np.sqrt(mixed.variances) > 3.4).all()
 
 
 def test_one_sample_that_carries_the_sum_may_stand_for_others() -> None:
