@@ -195,7 +195,7 @@ def _is_called_reference(path: PurePosixPath) -> bool:
 
 def _reference(folder: Path, sizes: Mapping[PurePosixPath, int], left_out: Mapping[str, str]) -> PurePosixPath:
     """Return the finest file that is called a reference, or else the finest of all."""
-    # Of equals the one with the shortest path: original.ply before original_2.ply.
+    # The shortest path comes first among equals: original.ply before original_2.ply.
     for path in sorted(sizes, key=lambda path: (not _is_called_reference(path), -sizes[path], len(str(path)))):
         with suppress(MeshError):
             read_mesh(folder / path)

@@ -38,7 +38,7 @@ _UNITS = {
     1000: "millimetres and the other in metres",
 }
 _UNIT_MARGIN = 0.02
-# Of the smaller box, the fraction that overlaps with the other one at least.
+# The least fraction of the smaller box that overlaps with the other one.
 _LEAST_OVERLAP = 0.3
 # Around each box, as a fraction of the smaller size.
 _MARGIN = 0.05

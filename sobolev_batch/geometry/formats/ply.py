@@ -92,7 +92,7 @@ def parse_ply(data: bytes) -> Raw:
     # The last number of a text need not be followed by anything.
     if sum(one.count * one.least_bytes(is_text) for one in elements.values()) - is_text > left:
         raise MeshError(f"the PLY header announces {counts}, but only {left} bytes follow")
-    numbers, lines = _numbers(data, start) if is_text else (data, array("I"))
+    numbers, lines = _numbers(data, start, sum(counts.values())) if is_text else (data, array("I"))
     body, place = memoryview(numbers).cast("B"), 0 if is_text else start
     columns, rows = dict[str, dict[str, _Column]](), [np.zeros(0, np.int64)]
     for name, element in elements.items():
@@ -185,8 +185,8 @@ def _parsed_header(data: bytes) -> tuple[dict[str, _Element], int, bool]:
     return elements, header.end(), order == "="
 
 
-def _numbers(data: bytes, start: int) -> tuple[array[float], array[int]]:
-    """Return all numbers of a text from a place on, and how many each line has that has some."""
+def _numbers(data: bytes, start: int, rows: int) -> tuple[array[float], array[int]]:
+    """Return all numbers of a text from a place on, and how many each line has that has some, up to a line too many."""
     if data.find(b"_", start) >= 0:
         raise MeshError("the PLY file has a number with an underscore, which is Python's spelling and not that of PLY")
     numbers, sizes, carried = array("d"), array("I"), 0
@@ -200,6 +200,7 @@ def _numbers(data: bytes, start: int) -> tuple[array[float], array[int]]:
             # The last line goes on in the next chunk.
             *whole, carried = first + carried, *others
             sizes.extend(filter(None, whole))
+            del sizes[rows + 1 :]
             start = end
     except ValueError as error:
         raise MeshError(f"the PLY file has a word that is no number: {error}") from error

@@ -105,6 +105,18 @@ BAD: dict[str, dict[str, bytes]] = {
         "a coordinate too many": changed(PLY_BOX, (b"0.0 2.0 4.0", b"0.0 2.0 4.0 1.0")),
         "no coordinate z": changed(PLY_BOX, (b"property float z\n", b"property float w\n")),
         "no end of header": changed(PLY_BOX, (b"end_header\n", b"")),
+        "a number on the line of a neighbour": changed(PLY_BOX, (b"0.0 2.0 4.0\n", b"0.0 2.0\n4.0 ")),
+        "two formats": changed(PLY_BOX, (b"comment", b"format ascii 1.0\ncomment")),
+        "two elements of one name": changed(PLY_BOX, (b"end_header", b"element face 0\nend_header")),
+        "two properties of one name": changed(PLY_BOX, (b"property float y", b"property float x\nproperty float y")),
+        "a property of no element": changed(PLY_BOX, (b"element vertex", b"property int a\nelement vertex")),
+        "a type that PLY lacks": changed(PLY_BOX, (b"float z", b"half z")),
+        "lengths with fractions": changed(PLY_BOX, (b"list uchar", b"list float")),
+        "coordinates in lists": changed(PLY_BOX, (b"property float z", b"property list uchar float z")),
+        "indices in no list": changed(PLY_BOX, (b"list uchar int", b"int")),
+        "a strip of two corners": ply(BOX_VERTICES, [[0, 1, 2, -1, 3, 4]], BIG).replace(b"face 1", b"tristrips 1"),
+        "strips without corners": ply(BOX_VERTICES, [[-1, -1]], BIG).replace(b"face 1", b"tristrips 1"),
+        "an index beyond its type": ply(BOX_VERTICES, [*BOX_TRIANGLES, [0, 1, 258]], index="uchar"),
     },
     ".obj": {
         **{
