@@ -22,6 +22,7 @@ from plyfile import PlyData
 import sobolev_batch as sb
 from sobolev_batch.tables import FORMATS
 from tests.support.commands import LATTICE, STUDY, ball, call, command, finished, output, write_inputs
+from tests.support.repository import install
 
 pytestmark = pytest.mark.process
 
@@ -361,6 +362,38 @@ def test_help_imports_nothing_that_computes() -> None:
     # Every option has a sentence.
     for text in re.findall(r"^  -.*(?:\n {10,}.*)*", done.stdout, re.MULTILINE):
         assert re.search(r"\w[)']?\.( |$)", " ".join(text.split())), text
+
+
+OTHERS = """
+import click
+
+@click.command()
+def tidy():
+    click.echo("tidied")
+
+@click.command()
+@click.argument("store")
+def ages(store):
+    click.echo(f"ages of {store}")
+"""
+ENTRY_POINTS = "[sobolev_batch.commands]\ntidy = tidy_meshes:tidy\ntable ages = tidy_meshes:ages\nlost = nowhere:lost\n"
+
+
+def test_other_packages_add_commands_that_are_loaded_when_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install(tmp_path, "tidy_meshes", ENTRY_POINTS, OTHERS)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    shown = call("--help").stdout + call("table", "--help").stdout
+    for name in ("tidy", "ages", "lost"):
+        assert re.search(rf"^  {name} +See the package tidy_meshes\.$", shown, re.M)
+    assert "tidy_meshes" not in sys.modules
+    assert call("tidy").stdout == "tidied\n"
+    assert call("table", "ages", "x.zarr").stdout == "ages of x.zarr\n"
+    lost = call("lost")
+    assert (lost.returncode, lost.stdout) == (1, "")
+    assert "No module named 'nowhere'" in lost.stderr
+    sys.modules.pop("tidy_meshes")
 
 
 def test_shells_complete_commands_and_options() -> None:

@@ -24,7 +24,7 @@ import sobolev_batch as sb
 from sobolev_batch.cli.output import overwrite, progress_bar
 from sobolev_batch.sources import files
 from sobolev_batch.tables import FORMATS
-from sobolev_batch.tables.text import machine_table, printed_table, prose
+from sobolev_batch.tables.rendering import machine_table, printed_table, prose
 from sobolev_batch.visible import VisibleRecord, visible, visible_lines
 from tests.support.commands import COMMAND, call
 

@@ -338,7 +338,8 @@ def _remarks(meshes: Mapping[str, Mesh], doubt: str | None, size: float, unit: s
 
 def _proximity_lines(found: Mapping[str, float], meshes: tuple[Mesh, Mesh], unit: str) -> Iterator[str]:
     """Yield the usual distances in both directions, what is made of them, and the shapes of both meshes."""
-    from sobolev_batch.tables.text import printed_table, with_error
+    from sobolev_batch.tables.rendering import printed_table
+    from sobolev_batch.tables.text import with_error
 
     rows = []
     for name, title in _DISTANCES.items():

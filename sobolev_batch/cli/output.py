@@ -73,7 +73,7 @@ def echo_lines(text: object, *, err: bool = False) -> None:
 
 def echo_result(style: str, text: object, document: Mapping[str, Any]) -> None:
     """Print a result: its text for people, or one JSON document, whose keys docs/commands.md lists."""
-    from sobolev_batch.tables.text import json_text
+    from sobolev_batch.tables.rendering import json_text
 
     echo_lines(json_text(document) if style == "json" else text)
 

@@ -12,7 +12,8 @@ import xarray as xr
 
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.convergence import nearest, smallest_of, table
-from sobolev_batch.tables.text import Column, Section, count, minus, percent, rendered, spread
+from sobolev_batch.tables.rendering import Column, Section, rendered
+from sobolev_batch.tables.text import count, minus, percent, spread
 
 # A row of a table: a record of a frame. It may also have its "order"; a "mark", a short remark about its marked number;
 # the number of its "color"; and the text "absent" in place of all numbers, with the section "reasons" that explains it.

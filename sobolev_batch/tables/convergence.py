@@ -32,9 +32,10 @@ from sobolev_batch.tables.open import (
     study_unit,
     unit_of,
 )
+from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.results import observed_rates
 from sobolev_batch.tables.store_accessor import convergence_at, order_note
-from sobolev_batch.tables.text import Column, Section, count, percent, rendered, with_error, wrapped
+from sobolev_batch.tables.text import count, percent, with_error, wrapped
 from sobolev_batch.transform.lattice import Orders
 
 _ABOUT = ("family", "name", "level", "rank", "ordered_by", "status", "reason", "triangles", "vertices", "seconds")
@@ -51,7 +52,7 @@ _NUMBERS = (
     "resolved",
     "within",
 )
-# Columns that only meshes made by a program or function have.
+# Of meshes that a program or function made.
 _MADE = tuple(item.name for item in fields(Cost))
 # Integers, or missing where a mesh failed.
 _COUNTS = ("triangles", "vertices")

@@ -10,7 +10,7 @@ import xarray as xr
 from sobolev_batch.errors import from_extra, written
 from sobolev_batch.tables.convergence import table
 from sobolev_batch.tables.open import AnyStore, as_tree, finished_group, stores_of
-from sobolev_batch.tables.text import json_text, machine_table
+from sobolev_batch.tables.rendering import json_text, machine_table
 from sobolev_batch.transform.lattice import Orders
 
 ExportFormat = Literal["parquet", "netcdf", "csv"]

@@ -21,7 +21,7 @@ from sobolev_batch.store.records import Records
 from sobolev_batch.tables.conclusion import format_verdict
 from sobolev_batch.tables.convergence import format_smallest, format_table
 from sobolev_batch.tables.matrix import format_matrix
-from sobolev_batch.tables.text import printed_table
+from sobolev_batch.tables.rendering import printed_table
 from tests.support.studies import small_table
 
 

@@ -15,7 +15,8 @@ from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.shown import ShownTables
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.open import EDGE_LENGTH, sizes_of
-from sobolev_batch.tables.text import Column, Section, percent, rendered, wrapped
+from sobolev_batch.tables.rendering import Column, Section, rendered
+from sobolev_batch.tables.text import percent, wrapped
 
 DEFAULT_COST = "make_seconds"
 # Members that a row of a table names, and objects whose fronts a text has.

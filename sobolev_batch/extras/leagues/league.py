@@ -34,7 +34,8 @@ from sobolev_batch.study.comparable import SIGNIFICANCE, gap_of, least_objects
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.convergence import table, tables_of
 from sobolev_batch.tables.open import EDGE_LENGTH, AnyStore, as_tree, finished_group, reference_of, stores_of
-from sobolev_batch.tables.text import Column, Section, rendered, wrapped
+from sobolev_batch.tables.rendering import Column, Section, rendered
+from sobolev_batch.tables.text import wrapped
 from sobolev_batch.transform.lattice import Orders
 
 LEAGUE_NOTE = """\

@@ -37,7 +37,8 @@ from sobolev_batch.store.collection_store import CollectionStore
 from sobolev_batch.tables.conclusion import MOST_NAMED, VERDICT_COLUMNS, Row, study_verdict
 from sobolev_batch.tables.convergence import page_columns, table, tables_of, unit_notes, with_remarks
 from sobolev_batch.tables.open import finished_group, has_proximity, open_store, placement_doubts
-from sobolev_batch.tables.text import Column, duration, minus, percent
+from sobolev_batch.tables.rendering import Column
+from sobolev_batch.tables.text import duration, minus, percent
 from sobolev_batch.transform.lattice import Lattice
 
 # Rows of all convergence tables together, of the table of meshes, and of reasons; browsers become slow beyond.

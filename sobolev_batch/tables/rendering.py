@@ -1,0 +1,236 @@
+"""Results in every format: rows for programs (csv, json), sections of tables and sentences for people."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import textwrap
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, TypeAlias
+
+import pandas as pd
+from tabulate import tabulate
+
+from sobolev_batch.tables import Format
+from sobolev_batch.tables.text import POWER, SHORTEST_TEXT, line_length, middle_cut
+from sobolev_batch.visible import visible
+
+# Rows of a table: a frame, or its records.
+Rows: TypeAlias = pd.DataFrame | Sequence[Mapping[Any, Any]]
+
+_PLAIN = {ord(raised): plain for plain, raised in zip("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹", strict=True)}
+# What follows a number in a text, by the mark of its row.
+_MARKS = {"": "", "below its error": "*", "above rtol": "!"}
+_TABULATE_FORMATS = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
+# Spaces between columns, and beside headers, by tabulate.
+_GAP, _PADDING = 2, 2
+# Spreadsheets take texts that begin so for formulas, and run them; those of East Asia also take the wide ones.
+_FORMULA_SIGNS = tuple("=+-@＝＋－＠")
+# What divides cells of Markdown, or begins code, links, HTML, entities, formulas and headings; and emphasis, which
+# underscores within words do not begin.
+_MARKDOWN_MARKS = re.compile(r"[\\|`\[\]<>&~$#*]|(?<![^\W_])_|_(?![^\W_])")
+# After the end of a row, LaTeX takes these for options of that end.
+_LATEX_OPTIONS = re.compile(r"^( *)(?=[\[*])", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table: of a text, and of a page.
+
+    Attributes:
+        name: Column of the frame that has its values, and its name in the CSV of a page.
+        format: Function that returns the text of a value, and of the error where there is one.
+        error: Column of the frame with the errors, or with other second numbers; empty where there are none.
+        kind: "label" for the first column of a page, else what the cells hold.
+        is_marked: True where the mark of a row follows the number.
+    """
+
+    name: str
+    header: str
+    format: Callable[..., str] = str
+    error: str = ""
+    kind: Literal["number", "text", "label"] = "number"
+    is_marked: bool = False
+
+    def text(self, row: Mapping[Any, Any]) -> str:
+        """Return the cell of a row of the frame; it is empty where the value is missing."""
+        value = row[self.name]
+        if value is None or value is pd.NA or (isinstance(value, float) and math.isnan(value)):
+            return ""
+        return self.format(value, row[self.error]) if self.error else self.format(value)
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of a result for people: a caption, tables of columns and rows, and sentences below each other."""
+
+    caption: str = ""
+    tables: Sequence[tuple[Sequence[Column], Rows]] = ()
+    sentences: Sequence[str] = ()
+
+    def text(self, style: Format) -> str:
+        """Return the part as text, Markdown or LaTeX; tables without rows are left out."""
+        tables = [column_table(columns, rows, style) for columns, rows in self.tables if len(rows)]
+        parts = prose([self.caption] if self.caption else [], style), *tables, prose(self.sentences, style)
+        return ("\n" if style == "latex" else "\n\n").join(filter(None, parts))
+
+
+def rendered(style: Format, frame: pd.DataFrame, sections: Iterable[Section], notes: Sequence[str]) -> str:
+    """Return a result in a format: its rows for programs, or its sections and notes for people."""
+    if style in ("csv", "json"):
+        return machine_table(frame, style)
+    return "\n\n".join(filter(None, (one.text(style) for one in (*sections, Section(sentences=notes)))))
+
+
+def column_table(columns: Sequence[Column], rows: Rows, style: Format) -> str:
+    """Return rows of a frame as a table for people, with marks, and where numbers are absent; see `printed_table`."""
+    cells = [
+        [
+            "missing"
+            if row.get("absent") and column.kind != "label"
+            else column.text(row) + (_MARKS[row.get("mark", "")] if column.is_marked else "")
+            for column in columns
+        ]
+        for row in (rows.to_dict(orient="records") if isinstance(rows, pd.DataFrame) else rows)
+    ]
+    texts = [number for number, column in enumerate(columns) if column.kind == "text"]
+    return printed_table(cells, [column.header for column in columns], style, texts)
+
+
+def machine_table(frame: pd.DataFrame, style: Format) -> str:
+    """Return a table as CSV or JSON, which spells control characters itself; missing numbers are blank or null."""
+    if style == "csv":
+        texts = frame.rename(columns=_csv_cell).apply(
+            lambda cells: cells if pd.api.types.is_numeric_dtype(cells) else cells.map(_csv_cell)
+        )
+        return str(texts.to_csv(index=False, lineterminator="\n")).rstrip("\n")
+    return json_text(frame.astype(object).where(frame.notna(), None).to_dict(orient="records"))
+
+
+def json_text(value: Any) -> str:
+    """Return dataclasses, paths, tables and lists as ASCII JSON; null are numbers that are unknown or unbounded."""
+    text = json.dumps(value, default=_plain)
+    return json.dumps(json.loads(text, parse_constant=lambda _: None), indent=2)
+
+
+def _plain(value: Any) -> Any:
+    return os.fspath(value) if isinstance(value, os.PathLike) else asdict(value)
+
+
+def printed_table(
+    rows: Sequence[Sequence[str]], headers: Sequence[str], style: Format, texts: Sequence[int] = ()
+) -> str:
+    """Return cells as a table whose columns are aligned to the right, but for the first and for those of texts.
+
+    In a text, labels of the first column and texts give way where lines would be too long: labels lose what they repeat
+    and then their middle, and texts are wrapped. Columns that still have no room follow in a table of their own,
+    without rows that have no cells there. Tabulate escapes LaTeX's special characters.
+    """
+    rows, headers = (
+        [[_escaped(cell, style) for cell in row] for row in rows],
+        [_escaped(text, style) for text in headers],
+    )
+    groups: list[list[int]] = [list(range(1, len(headers)))]
+    if style == "text":
+        rows = _with_short_texts(rows, headers, texts)
+        groups, room = [], 0
+        first, *widths = _widths(rows, headers)
+        for column, width in enumerate(widths, 1):
+            if not groups or width + _GAP > room:
+                groups.append([])
+                room = line_length() - first
+            groups[-1].append(column)
+            room -= width + _GAP
+    tables = [
+        str(
+            tabulate(
+                [
+                    [row[0], *(row[column] for column in group)]
+                    for row in rows
+                    if group is groups[0] or any(row[column] for column in group)
+                ],
+                headers=[headers[0], *(headers[column] for column in group)],
+                tablefmt=_TABULATE_FORMATS[style],
+                disable_numparse=True,
+                colalign=("left", *("left" if column in texts else "right" for column in group)),
+            )
+        )
+        for group in groups
+    ]
+    table = "\n\n".join(tables)
+    return _LATEX_OPTIONS.sub(r"\1{}", latex_powers(table)) if style == "latex" else table
+
+
+def _widths(rows: Sequence[Sequence[str]], headers: Sequence[str]) -> list[int]:
+    return [
+        max(len(header) + _PADDING, *(len(line) for cell in column for line in cell.split("\n")))
+        for header, *column in zip(headers, *rows, strict=True)
+    ]
+
+
+def _with_short_texts(
+    rows: Sequence[Sequence[str]], headers: Sequence[str], texts: Sequence[int]
+) -> Sequence[Sequence[str]]:
+    """Return rows whose labels and texts are shortened so that lines fit, unless two labels would then be the same."""
+
+    def missing() -> int:
+        widths = _widths(rows, headers)
+        return sum(widths) + _GAP * (len(widths) - 1) - line_length()
+
+    for column in texts:
+        if (lacking := missing()) > 0:
+            width = max(_widths(rows, headers)[column] - lacking, SHORTEST_TEXT)
+            cells = ["\n".join(textwrap.wrap(row[column], width, break_long_words=False)) for row in rows]
+            rows = [[*row[:column], cell, *row[column + 1 :]] for row, cell in zip(rows, cells, strict=True)]
+    for shorten in (_without_repeats, lambda names, longest: [middle_cut(name, longest) for name in names]):
+        if (lacking := missing()) > 0:
+            labels = [row[0] for row in rows]
+            shorter = shorten(labels, max(_widths(rows, headers)[0] - lacking, SHORTEST_TEXT))
+            if len(set(shorter)) == len(set(labels)):
+                rows = [[label, *row[1:]] for label, row in zip(shorter, rows, strict=True)]
+    return rows
+
+
+def _without_repeats(labels: Sequence[str], _longest: int) -> list[str]:
+    """Return labels FAMILY/NAME without the family, or the beginning of all names, at the beginning of the name."""
+    parts = [label.partition("/") for label in labels]
+    names = {name for _, slash, name in parts if slash}
+    common = os.path.commonprefix([*names]) if len(names) > 1 else ""  # noqa: RUF071 -- of characters
+    # Words and numbers stay whole.
+    common = common[: max(map(common.rfind, "_-. ")) + 1]
+    shorter = []
+    for family, slash, name in parts:
+        rest = name.removeprefix(family if name.startswith(family) else common)
+        shorter.append(f"{family}/…{rest}" if slash and rest and len(name) - len(rest) > 1 else family + slash + name)
+    return shorter
+
+
+def prose(lines: Iterable[str], style: Format) -> str:
+    """Return lines printed beside tables; LaTeX takes them as comments."""
+    return "\n".join(f"{'% ' * (style == 'latex')}{_escaped(line, style)}" for line in lines)
+
+
+def latex_powers(text: str) -> str:
+    r"""Return a text whose powers of ten are formulas of LaTeX, which has no raised digits.
+
+    >>> latex_powers("1.2 × 10⁻⁵ %")
+    '1.2 $\\times 10^{-5}$ %'
+    """
+    return re.sub(
+        rf"{POWER.strip()}([⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)", lambda found: rf"$\times 10^{{{found[1].translate(_PLAIN)}}}$", text
+    )
+
+
+def _escaped(text: str, style: Format) -> str:
+    """Return a text whose characters have no meaning of their own to terminals and Markdown."""
+    return _MARKDOWN_MARKS.sub(r"\\\g<0>", visible(text)) if style == "markdown" else visible(text)
+
+
+def _csv_cell(value: Any) -> Any:
+    """Return a cell that no spreadsheet takes for a formula; an apostrophe makes it a text."""
+    if not isinstance(value, str):
+        return value
+    return f"'{visible(value)}" if value.startswith(_FORMULA_SIGNS) else visible(value)
