@@ -27,6 +27,8 @@ from sobolev_batch.tables.results import Results, table_of
 from sobolev_batch.tables.shells import lower_bounds, spectrum_keys, stale_chunks
 from sobolev_batch.transform.lattice import Orders, check_orders, shell_sums, single_order, smooth_step
 
+# The upper end of a band, its squares (orders,), its energy, and the standard error of that.
+Band = tuple[float, Reals, float, float]
 # Labels of meshes: one, several, or all.
 Meshes = str | Sequence[str] | None
 _OF_DISTANCES = ("distance", "error", "error_part", "relative", "relative_error", *AREA_AND_SHAPE)
@@ -366,11 +368,8 @@ def _joined(tree: xr.DataTree, stored: xr.Dataset, computed: xr.Dataset, chosen:
     return table.assign_attrs({**stored.attrs, "computed": computed["order"].values.tolist()})
 
 
-Band = tuple[float, Reals, float, float]
-
-
 def _inner_bands(reducer: Reducer, rows: list[int]) -> list[Band]:
-    """Return the upper end, squares (orders,), energy and its error of each octave within the lattice."""
+    """Return the octaves within the lattice."""
     lattice, orders = reducer.lattice, reducer.orders
     sums = np.zeros(lattice.shell_count)
     for number, block in enumerate(reducer.blocks):
@@ -391,7 +390,7 @@ def _inner_bands(reducer: Reducer, rows: list[int]) -> list[Band]:
 
 
 def _octaves(reducer: Reducer, rows: list[int]) -> list[Band]:
-    """Return the same of each octave beyond the lattice."""
+    """Return the octaves beyond the lattice."""
     if reducer.sampling is None:
         return []
     values = [reducer.read_octaves(row) for row in rows]

@@ -14,7 +14,7 @@ from scipy.special import stdtrit
 from sobolev_batch.arrays import Reals
 from sobolev_batch.norms.tail.sampling import OctaveSampling
 
-# The true value lies within the statistical error with this probability, if sums over groups are normal.
+# The true value lies within an error by chance with this probability, if sums over groups, or over points, are normal.
 _CONFIDENCE = 0.99
 
 
@@ -132,4 +132,9 @@ def error_of_sum(octaves: Sequence[tuple[Reals, Reals]]) -> Reals:
     total, tiny = variances.sum(axis=0), np.finfo(np.float64).tiny
     shares = variances**2 / np.maximum(degrees, 1).reshape(-1, *[1] * (variances.ndim - 1))
     effective = total**2 / np.maximum(np.sum(shares, axis=0), tiny)
-    return np.asarray(np.sqrt(total) * stdtrit(np.maximum(effective, 1.0), (1 + _CONFIDENCE) / 2))
+    return np.asarray(np.sqrt(total) * quantile(np.maximum(effective, 1.0)))
+
+
+def quantile(degrees: Reals | float) -> Reals:
+    """Return how many standard errors a mean may be off at 99 %, by Student's law with some degrees of freedom."""
+    return np.asarray(stdtrit(degrees, (1 + _CONFIDENCE) / 2))

@@ -21,11 +21,11 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from scipy.special import stdtrit
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms.tail.close_points import Draw, Sheets
+from sobolev_batch.norms.tail.integrals import quantile
 from sobolev_batch.norms.tail.potentials import (
     Kernels,
     add_of_triangles,
@@ -58,7 +58,6 @@ _UNEVEN, _NOTHING = 2.0, 1e-11
 _HELD = 1 << 18
 # Orders between which the mean energy beyond a frequency is interpolated; those below the lowest are bounded by it.
 _USUAL_ORDERS, LOWEST_ORDER = (-0.55, -0.7, -1.0, -1.5, -2.0, -2.5, -3.0), -4.0
-_CONFIDENCE = 0.99
 # Nodes for each octave of frequencies, and cycles after which a sinc counts as averaged out.
 _NODES, _SINC_CYCLES = np.polynomial.legendre.leggauss(48), 8.0
 
@@ -171,7 +170,7 @@ def _estimate(seen_by: _Seen, count: int, rng: np.random.Generator, *, is_exact:
     missed = (draw.weights.max() * seen_by.alone) ** 2 * float(total < covering)
     variances += missed
     hidden = float((missed / np.maximum(variances, np.finfo(np.float64).tiny)).max())
-    errors = np.sqrt(variances) * _quantile(n)
+    errors = np.sqrt(variances) * quantile(n - 1)
     cut, left = (part * sheets.area * seen_by.alone for part in (_CUT, _CUT_LEFT))
     if is_exact and np.any(cut > _CUT_FRACTION * errors):
         corrections, cut = seen_by.corrections(draw, potentials, rng)
@@ -180,11 +179,6 @@ def _estimate(seen_by: _Seen, count: int, rng: np.random.Generator, *, is_exact:
     scales = np.array([tail_integral(kernels.cutoff, order) for order in kernels.orders])
     energies, errors = (tuple(values.tolist()) for values in (means / scales, (errors + cut + left) / scales))
     return Remainder(kernels.cutoff, kernels.orders, energies, errors, total, pairs, covering, hidden)
-
-
-def _quantile(count: int) -> float:
-    """Return how many standard errors a mean of some numbers may be off, at 99 %."""
-    return float(stdtrit(count - 1, (1 + _CONFIDENCE) / 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,7 +231,7 @@ class _Seen:
         finer = _Seen(self.sheets, self.kernels.finer, self.threads)
         changes = finer.potentials(controls.points)[0] - potentials[chosen]
         changes *= n * (controls.weights * controls.own)[:, None]
-        return changes.mean(axis=0), changes.std(axis=0, ddof=1) / np.sqrt(count) * _quantile(count)
+        return changes.mean(axis=0), changes.std(axis=0, ddof=1) / np.sqrt(count) * quantile(count - 1)
 
     def affordable(self, rng: np.random.Generator) -> int:
         """Return the number of points that do not take long."""
