@@ -15,12 +15,13 @@ from typing import Any
 
 import finufft
 import pytest
+import xarray as xr
 
 import sobolev_batch as sb
 from sobolev_batch.geometry.formats import parsing, readers
 from sobolev_batch.sources import files
 from sobolev_batch.sources.command import CommandSource
-from sobolev_batch.tables import convergence
+from sobolev_batch.tables.store_accessor import convergence_at
 from sobolev_batch.transform import kinds
 from tests.support.commands import call, write_toml
 from tests.support.studies import SMALL_LATTICE, small_table
@@ -232,12 +233,16 @@ def test_a_plan_that_looks_at_meshes_reads_none_of_them_twice(tmp_path: Path, co
 
 
 def test_the_command_builds_the_tables_that_it_prints_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    built: list[object] = []
-    frames = convergence.convergence_at
-    monkeypatch.setattr(convergence, "convergence_at", lambda *arguments: built.append(None) or frames(*arguments))
+    built: list[str] = []
+
+    def counted(tree: xr.DataTree, orders: Any) -> xr.Dataset:
+        built.append(str(tree.attrs["title"]))
+        return convergence_at(tree, orders)
+
+    monkeypatch.setattr("sobolev_batch.tables.convergence.convergence_at", counted)
     done = call("run", write_toml(tmp_path), "--store", "memory://printed.zarr")
     assert "Verdict at order -10" in done.stdout
-    assert len(built) == 1
+    assert built == ["small"]
 
 
 @pytest.mark.process

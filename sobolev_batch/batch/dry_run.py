@@ -12,6 +12,7 @@ from distributed import Client
 from sobolev_batch.batch.cluster.clients import require_blocking
 from sobolev_batch.batch.cluster.workers import Workers, prepare_workers, worker_slowness
 from sobolev_batch.batch.field_stage import Sizes, size_rows
+from sobolev_batch.batch.run import lacks_nothing
 from sobolev_batch.batch.start import StoreLike, require_permission, settled, warnings_of
 from sobolev_batch.geometry.surface import Similarity, placement_doubt
 from sobolev_batch.machine import available_cores
@@ -24,7 +25,7 @@ from sobolev_batch.store.layout import stored_choice
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.records import Record
 from sobolev_batch.store.workspace import Workspace
-from sobolev_batch.study.pilots import look_at_extents
+from sobolev_batch.study.pilots import Look
 from sobolev_batch.study.plan import Plan, Row, make_plan
 from sobolev_batch.study.study import Study, StudyCollection, StudyLike
 from sobolev_batch.tables.pairs import PAIR_BYTES, tile_count
@@ -321,6 +322,8 @@ def _plan(study: Study, location: Location, client: Client | None) -> StudyPlan:
     workspace = Workspace.found(location, study_plan)
     stored = {} if workspace is None else {workspace.labels[i]: record for i, record in workspace.stored.items()}
     seconds, processor_seconds, (first, *others) = forecast(study_plan, stored, workers, client, planning_seconds)
+    if workspace is not None and len(stored) == len(study_plan.rows) and not lacks_nothing(workspace):
+        first = "no field is missing, and tables follow from them"
     doubtful, count = _doubts_of(study_plan, stored), len(study_plan.rows)
     total_bytes = format_bytes(study_plan.field_bytes * count)
     lines = [
@@ -354,12 +357,11 @@ def _plan(study: Study, location: Location, client: Client | None) -> StudyPlan:
 
 def _doubts_of(study_plan: Plan, stored: Mapping[str, Record]) -> dict[str, str]:
     """Return why surfaces cannot be read, or hardly be compared with the reference, by label; none is read twice."""
-    seen, reference = study_plan.look, study_plan.reference_extent
-    rows = [row for row in study_plan.rows if row.label != study_plan.reference]
-    known = {*stored, *seen.extents, *seen.set_aside}
-    unseen = {row.label: (row.family, row.member) for row in rows if row.label not in known}
-    look = look_at_extents(unseen, study_plan.similarity, reference)
-    of_fields = {row.label: Quality.from_json(stored[row.label].quality).extent for row in rows if row.label in stored}
-    extents = {**seen.extents, **look.extents, **of_fields}
-    doubts = {label: placement_doubt(extent, reference) for label, extent in extents.items()}
-    return {**seen.set_aside, **look.set_aside} | {label: doubt for label, doubt in doubts.items() if doubt is not None}
+    others = {row.label: row for row in study_plan.rows if row.label != study_plan.reference}
+    # What is stored need not be read again.
+    known = {label: Quality.from_json(stored[label].quality).extent for label in others if label in stored}
+    look = Look({**study_plan.look.extents, **known}, dict(study_plan.look.set_aside))
+    members = {label: (row.family, row.member) for label, row in others.items()}
+    look.at_all(members, study_plan.similarity, study_plan.reference_extent)
+    doubts = {label: placement_doubt(extent, study_plan.reference_extent) for label, extent in look.extents.items()}
+    return look.set_aside | {label: doubt for label, doubt in doubts.items() if doubt is not None}

@@ -69,29 +69,11 @@ class Job:
 
     @classmethod
     def for_row(
-        cls,
-        plan: Plan,
-        row: Row,
-        store: Store,
-        index: int,
-        allowed_bytes: float | None = None,
-        reference: Row | None = None,
+        cls, plan: Plan, row: Row, store: Store, index: int, allowed: float | None = None, reference: Row | None = None
     ) -> Self:
         """Return the job of a row of a plan."""
-        return cls(
-            store,
-            index,
-            row,
-            plan.lattice,
-            plan.transform,
-            plan.study.orders,
-            plan.similarity,
-            plan.study.backend,
-            plan.tail,
-            plan.distance_target(row),
-            allowed_bytes,
-            reference,
-        )
+        shared = plan.lattice, plan.transform, plan.study.orders, plan.similarity, plan.study.backend, plan.tail
+        return cls(store, index, row, *shared, plan.distance_target(row), allowed, reference)
 
     @property
     def execution(self) -> Execution:

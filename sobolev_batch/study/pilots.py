@@ -61,32 +61,36 @@ class Look:
         set_aside: Reasons why others cannot be compared with the reference.
     """
 
-    extents: Mapping[str, Extent] = field(default_factory=dict)
-    set_aside: Mapping[str, str] = field(default_factory=dict)
+    extents: dict[str, Extent] = field(default_factory=dict)
+    set_aside: dict[str, str] = field(default_factory=dict)
 
-
-def look_at_extents(members: Members, similarity: Similarity, reference: Extent) -> Look:
-    """Look at quickly loaded surfaces, as memory permits."""
-    extents: dict[str, Extent] = {}
-    set_aside: dict[str, str] = {}
-    left = _MOST_BYTES
-    for label, (_, member) in members.items():
-        if not member.is_quickly_loaded:
-            continue
-        left -= member.expected_size().projected_bytes
-        if left < 0:
-            break
+    def at(self, label: str, member: Member, similarity: Similarity, reference: Extent) -> Surface | None:
+        """Return a surface in the study's unit; None where it cannot be made, or reaches far beyond the reference."""
         try:
-            extents[label] = _comparable(member, similarity, reference).extent
+            surface = similarity.apply(member.load())
+            times = surface.extent.reach / reference.reach
+            if times > _FARTHEST:
+                raise MeshError(f"its extent is {times:.3g} times that of the reference; are both in the same unit?")
         except Exception as error:  # its source may raise anything
-            set_aside[label] = one_line(error)
-    return Look(extents, set_aside)
+            self.set_aside[label] = one_line(error)
+            return None
+        self.extents[label] = surface.extent
+        return surface
+
+    def at_all(self, members: Members, similarity: Similarity, reference: Extent) -> None:
+        """Look at the quickly loaded surfaces that were not looked at yet, as memory permits."""
+        left = _MOST_BYTES
+        for label, (_, member) in members.items():
+            if label in self.extents or label in self.set_aside or not member.is_quickly_loaded:
+                continue
+            left -= member.expected_size().projected_bytes
+            if left < 0:
+                break
+            self.at(label, member, similarity, reference)
 
 
-def choose_pilots(
-    members: Members, similarity: Similarity, reference: Extent
-) -> tuple[dict[str, Surface], dict[str, str]]:
-    """Return the coarsest and finest surface of a few families, and why others cannot be compared, by label."""
+def choose_pilots(members: Members, similarity: Similarity, reference: Extent, look: Look) -> dict[str, Surface]:
+    """Return the coarsest and the finest surface of a few families, by label."""
     families: dict[str, list[str]] = {}
     for label, (family, _) in members.items():
         families.setdefault(family, []).append(label)
@@ -96,30 +100,20 @@ def choose_pilots(
         return member.level, 0 if member.level >= 0 else member.expected_size().triangles
 
     pilots: dict[str, Surface] = {}
-    set_aside: dict[str, str] = {}
     for labels in list(families.values())[:_MOST_FAMILIES]:
         labels.sort(key=fineness)
         for candidates in (labels, labels[::-1]):
             for label in candidates:
                 member = members[label][1]
-                if label in set_aside or member.expected_size().projected_bytes > _MOST_BYTES:
-                    continue
-                try:
-                    if label not in pilots:
-                        pilots[label] = _comparable(member, similarity, reference)
+                if label in pilots:
                     break
-                except Exception as error:
-                    set_aside[label] = one_line(error)
-    return pilots, set_aside
-
-
-def _comparable(member: Member, similarity: Similarity, reference: Extent) -> Surface:
-    """Return a surface in the study's unit, unless it reaches much farther than the reference."""
-    surface = similarity.apply(member.load())
-    times = surface.extent.reach / reference.reach
-    if times > _FARTHEST:
-        raise MeshError(f"its extent is {times:.3g} times that of the reference; are both in the same unit?")
-    return surface
+                if label in look.set_aside or member.expected_size().projected_bytes > _MOST_BYTES:
+                    continue
+                surface = look.at(label, member, similarity, reference)
+                if surface is not None:
+                    pilots[label] = surface
+                    break
+    return pilots
 
 
 def choose_lattice(
@@ -132,11 +126,9 @@ def choose_lattice(
     reference, have no say. For a best effort, neither have pairs that cannot have the accuracy, as long as others can.
     AccuracyError where it is out of reach, and StudyError where no pilot could be made.
     """
-    pilots, set_aside = choose_pilots(members, similarity, reference.extent)
-    others = {label: member for label, member in members.items() if label not in {*pilots, *set_aside}}
-    look = look_at_extents(others, similarity, reference.extent)
-    of_pilots = {label: pilot.extent for label, pilot in pilots.items()}
-    look = Look({**of_pilots, **look.extents}, {**set_aside, **look.set_aside})
+    look = Look()
+    pilots = choose_pilots(members, similarity, reference.extent, look)
+    look.at_all(members, similarity, reference.extent)
     for label, reason in look.set_aside.items():
         _log.warning("%s has no say in the choice of the lattice: %s", label, reason)
     if not pilots:

@@ -20,8 +20,9 @@ from sobolev_batch.batch.cluster.workers import Workers
 from sobolev_batch.batch.dry_run import forecast
 from sobolev_batch.batch.start import warnings_of
 from sobolev_batch.geometry.formats.writing import write_mesh
+from sobolev_batch.store.layout import Store, hide_tables
 from sobolev_batch.store.location import Location
-from sobolev_batch.store.records import Record
+from sobolev_batch.store.records import Record, Records
 from sobolev_batch.study.plan import Plan, make_plan
 from sobolev_batch.transform.fourier import TransformSettings, expected_points, field_seconds, transform_block
 from tests.support.commands import call
@@ -173,6 +174,28 @@ def test_pairs_that_the_disk_has_no_place_for_are_told(tmp_path: Path, monkeypat
     assert found(0, compare=None) == ()
     place.write({"distances/c/0": bytes(needed)})
     assert found(0) == ()
+
+
+def test_a_plan_and_a_status_and_a_run_agree_on_what_is_missing() -> None:
+    place, study = "memory://agreed.zarr", sb.Study.from_table(small_table())
+    levels = [0, 1, 2, 3, 4]
+    more = sb.Study.from_table(small_table(family=[{"name": "ico", "source": "icosphere", "levels": levels}]))
+    sb.run(study, place)
+    # First nothing is missing, then tables, then a field.
+    assert "nothing is missing" in str(sb.plan(study, place))
+    hide_tables(Store.open(place))
+    assert not sb.status(place).reduced
+    assert "no field is missing, and tables follow" in str(sb.plan(study, place))
+    assert sb.run(study, place).computed == ()
+    assert "nothing is missing" in str(sb.plan(study, place))
+    Records(Store.open(place)).write(0, None)
+    (missing,) = sb.status(place).lost_records
+    assert (sb.verify(place).complete, sb.status(place).complete) == (4, 4)
+    assert set(sb.plan(study, place).labels) - set(sb.plan(study, place).stored) == {missing}
+    # Surfaces that the store does not know yet are missing too.
+    assert set(sb.plan(more, place).labels) - set(sb.plan(more, place).stored) == {missing, "ico/4"}
+    assert set(sb.run(more, place).computed) == {missing, "ico/4"}
+    assert (sb.status(place).complete, sb.status(place).lost_records) == (6, ())
 
 
 def test_a_plan_fits_the_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,7 +21,7 @@ from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.store.layout import stored_choice
 from sobolev_batch.study import pilots as search_module
 from sobolev_batch.study.lattice_choice import LatticeChoice
-from sobolev_batch.study.pilots import choose_pilots
+from sobolev_batch.study.pilots import Look, choose_pilots
 from sobolev_batch.study.plan import make_plan
 from sobolev_batch.tables.convergence import format_table
 from sobolev_batch.transform.backends import ComplexDtype
@@ -196,7 +196,7 @@ def test_a_mesh_beyond_the_pilots_has_its_place_in_the_lattice_and_wrong_ones_ha
     ball = sb.shapes.icosphere(1)
     sb.write_mesh(sb.Mesh(1.5 * ball.vertices, ball.triangles), folder / "large.off")
     found = {f"f/{member.name}": ("f", member) for member in members({"source": "files", "paths": ["*.off"]}, folder)}
-    pilots, _ = choose_pilots(found, sb.shapes.Similarity(), sb.shapes.Sphere().extent)
+    pilots = choose_pilots(found, sb.shapes.Similarity(), sb.shapes.Sphere().extent, Look())
     # The coarsest and the finest that can be compared, by their triangles.
     assert set(pilots) == {"f/z", "f/y"}
     plan = sb.plan(study(folder), folder / "s.zarr")
