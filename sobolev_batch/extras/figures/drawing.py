@@ -35,7 +35,7 @@ from sobolev_batch.extras.figures.style import (
     style_of,
     write_figures,
 )
-from sobolev_batch.extras.leagues.costs import CostLeague
+from sobolev_batch.extras.leagues.costs import CostLeague, objects_text
 from sobolev_batch.extras.leagues.evolution import evolution
 from sobolev_batch.extras.leagues.league import League
 from sobolev_batch.tables.convergence import table
@@ -159,10 +159,7 @@ def draw_league(_leagues: Sequence[League], league: League, axes: Axes) -> None:
     for number, method in enumerate(league.methods):
         mean = league.mean_curve(method)
         draw_curve(axes, np.exp(mean.sizes), np.exp(mean.values), mean.bars, style_of(number), shortened(method))
-    count = len(league.objects)
-    set_title(axes, f"order {league.order:g}, mean of {count} object{'s' if count > 1 else ''}")
-    axes.set_xlabel(escaped(label_of(league.x)))
-    axes.set_ylabel("relative Sobolev distance")
+    _describe(axes, league)
 
 
 def draw_cost_league(_leagues: Sequence[CostLeague], league: CostLeague, axes: Axes) -> None:
@@ -178,12 +175,15 @@ def draw_cost_league(_leagues: Sequence[CostLeague], league: CostLeague, axes: A
     for row in front.head(_MOST_LABELS).itertuples():
         place = getattr(row, league.x), row.relative
         axes.annotate(shortened(row.member), place, (3, 3), textcoords="offset points", fontsize="x-small")
-    members, count = league.meshes[["method", "member"]].drop_duplicates(), len(league.objects)
-    gone = len(members) - len(means)
+    gone = len(league.meshes[["method", "member"]].drop_duplicates()) - len(means)
     note = f"not drawn: {gone} member{'s' if gone > 1 else ''} that not all objects have" if gone else ""
-    set_title(axes, f"order {league.order:g}, mean of {count} object{'s' if count > 1 else ''}", note)
     if means.empty:
         axes.text(0.5, 0.5, "no member to draw", transform=axes.transAxes, ha="center")
+    _describe(axes, league, note)
+
+
+def _describe(axes: Axes, league: League | CostLeague, note: str = "") -> None:
+    set_title(axes, f"order {league.order:g}, mean of {objects_text(len(league.objects))}", note)
     axes.set_xlabel(escaped(label_of(league.x)))
     axes.set_ylabel("relative Sobolev distance")
 

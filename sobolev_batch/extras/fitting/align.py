@@ -78,11 +78,6 @@ def align(a: MeshLike, b: MeshLike, *, order: float = -2.0) -> Reals:
     return matrix
 
 
-def moved_by(mesh: Mesh, matrix: Reals) -> Mesh:
-    """Return a mesh after a rigid motion (4, 4), as `align` returns it."""
-    return Mesh(mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3], mesh.triangles)
-
-
 class _Stage:
     """The squared distance of two sets of points on a lattice, as a function of a rigid motion of the first one."""
 

@@ -68,8 +68,7 @@ class CostLeague(ShownTables):
     @property
     def caption(self) -> str:
         """Caption of its table."""
-        count = len(self.objects)
-        return f"League by {self.x} at order {self.order:g}, over {count} object{'s' if count > 1 else ''}"
+        return f"League by {self.x} at order {self.order:g}, over {objects_text(len(self.objects))}"
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -185,6 +184,11 @@ def _cost_league(
     columns = ["object", "method", "member", "mesh", x, "relative", "relative_error", "front", "undecided"]
     made = pd.concat(parts, ignore_index=True)[columns]
     return CostLeague(order, x, tuple(dict.fromkeys(made["object"])), tuple(methods), left_out, made)
+
+
+def objects_text(count: int) -> str:
+    """Return a number of objects in words."""
+    return f"{count} object{'s' if count > 1 else ''}"
 
 
 def _is_unbeaten(costs: pd.Series, own: pd.Series, others: pd.Series) -> NDArray[np.bool_]:

@@ -16,7 +16,7 @@ import xarray as xr
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError, StoreError
-from sobolev_batch.extras.leagues.costs import DEFAULT_COST, CostLeague, cost_leagues_of
+from sobolev_batch.extras.leagues.costs import DEFAULT_COST, CostLeague, cost_leagues_of, objects_text
 from sobolev_batch.extras.leagues.statistics import (
     Curve,
     adjusted,
@@ -151,7 +151,7 @@ class League(ShownTables):
     @property
     def caption(self) -> str:
         """Caption of its table."""
-        return f"League at order {self.order:g}, over {_objects(len(self.objects))}"
+        return f"League at order {self.order:g}, over {objects_text(len(self.objects))}"
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -199,10 +199,6 @@ class League(ShownTables):
     def _tables(self) -> tuple[pd.DataFrame, ...]:
         """`table` and `pairs`, which notebooks show."""
         return self.table, self.pairs
-
-
-def _objects(count: int) -> str:
-    return f"{count} object{'s' if count > 1 else ''}"
 
 
 @overload
@@ -493,6 +489,6 @@ def pair_lines(league: League) -> list[str]:
         lines.append(
             "No two methods differ beyond chance and error."
             if count >= least
-            else f"The test cannot tell {methods} methods from chance with {_objects(count)}; take {least} or more."
+            else f"The test cannot tell {methods} methods from chance with {objects_text(count)}; take {least} or more."
         )
     return lines

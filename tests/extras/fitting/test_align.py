@@ -8,7 +8,10 @@ from scipy.spatial.transform import Rotation
 
 import sobolev_batch as sb
 from sobolev_batch.arrays import Reals
-from sobolev_batch.extras.fitting.align import moved_by
+
+
+def moved_by(mesh: sb.Mesh, matrix: Reals) -> sb.Mesh:
+    return sb.Mesh(mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3], mesh.triangles)
 
 
 def shape(level: int) -> sb.Mesh:
