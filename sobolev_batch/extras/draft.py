@@ -130,11 +130,14 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
     families = _families(sizes, references)
     used = {*references.values(), *chain.from_iterable(families.values())}
     left_out |= {str(path): "its name is that of no object" for path in sizes if path not in used}
-    describe = _one_object if "" in references else _several_objects
-    sections, summary = describe(references, families, sizes, below)
+    is_single = "" in references
+    if is_single:
+        sections, summary = _one_object(references[""], families, sizes, below)
+    else:
+        sections, summary = _several_objects(references, families, below)
     name = _json(_free_name(folder.resolve().name, fallback="study"))
     text = _filled("study", name=name, sections="".join(f"\n{section}" for section in sections))
-    if "" in references:
+    if is_single:
         # A study that cannot list its meshes is none to write down.
         len(Study.from_table(tomllib.loads(text), folder=base).members)
     else:
@@ -271,13 +274,9 @@ def _owner(path: PurePosixPath, references: Mapping[str, PurePosixPath]) -> str 
 
 
 def _one_object(
-    references: Mapping[str, PurePosixPath],
-    families: _Families,
-    sizes: Mapping[PurePosixPath, int],
-    folder: PurePosixPath,
+    reference: PurePosixPath, families: _Families, sizes: Mapping[PurePosixPath, int], folder: PurePosixPath
 ) -> tuple[list[str], tuple[str, ...]]:
     """Return the sections of a study of one object, and what they hold."""
-    (reference,) = references.values()
     path, triangles = str(folder / reference), sizes[reference]
     counts = [count for part in _FRACTIONS if (count := triangles // part) >= _FEWEST_TRIANGLES]
     if not families and not counts:
@@ -302,10 +301,7 @@ def _one_object(
 
 
 def _several_objects(
-    references: Mapping[str, PurePosixPath],
-    families: _Families,
-    _: Mapping[PurePosixPath, int],
-    folder: PurePosixPath,
+    references: Mapping[str, PurePosixPath], families: _Families, folder: PurePosixPath
 ) -> tuple[list[str], tuple[str, ...]]:
     """Return the section of a study of several objects, which lists their meshes, and what it holds."""
     listed = [(name, REFERENCE_LABEL, path) for name, path in references.items()]
