@@ -139,10 +139,10 @@ def _verify_study(store: str | Path | Location, on_progress: Callable[[int, int]
         raise
     except StoreError as error:
         _log.info("%s: read without the right to write (%s)", opened.path, error)
-        return _verify(opened, on_progress, None)
+        return _verify(opened, on_progress, may_write=False)
     try:
-        # It is opened again: the last run may have ended since.
-        return _verify(Store.open(store), on_progress, lock)
+        # It is opened again: the last run may have ended since. Whoever unlocks it may change it.
+        return _verify(Store.open(opened.location.fenced(lock.require)), on_progress, may_write=True)
     finally:
         release(opened.location, lock)
 
@@ -156,7 +156,7 @@ def damaged_rows(cluster: Cluster, workspace: Workspace) -> list[int]:
     return sorted(task.row for task, damage in cluster.results(tasks) if damage)
 
 
-def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: Lock | None) -> Verification:
+def _verify(store: Store, on_progress: Callable[[int, int], None] | None, *, may_write: bool) -> Verification:
     records, unread = Records(store).examine()
     damaged = {row: f"its completion record is damaged ({what})" for row, what in unread.items()}
     tables, chunks = _damaged_tables(store), dict[tuple[str, Index], str]()
@@ -189,13 +189,11 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: 
                 damaged[row] = damage
             if on_progress is not None:
                 on_progress(done, len(complete))
-    if lock is not None and (damaged or chunks):
-        # Whoever has unlocked the store may have changed it since.
-        fenced = store.fenced(lock.require)
+    if may_write:
         for row in damaged:
-            Records(fenced).write(row, None)
+            Records(store).write(row, None)
         for place in chunks:
-            withdraw_chunk(fenced, *place)
+            withdraw_chunk(store, *place)
     for (keys, index), what in chunks.items():
         tables[f"chunk {'/'.join(map(str, index))} of {keys.split('/')[0]}"] = what
     return Verification(
@@ -204,7 +202,7 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, lock: 
         len(labels),
         {labels[row]: damaged[row] for row in sorted(damaged)},
         tables,
-        lock is not None and bool(damaged or tables),
+        may_write and bool(damaged or tables),
     )
 
 

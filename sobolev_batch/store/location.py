@@ -165,11 +165,13 @@ class Location:
 
     def remove_partial_files(self) -> None:
         """Remove what writers left behind that were killed in the middle of a key. No other run may be writing."""
-        for file in () if self.scheme else _files_below(self.name):
-            if PARTIAL_FILE.search(file.name):
-                with self.access("written"):
-                    # It may have got its final name since, from a task that outlived its run.
-                    Path(file.path).unlink(missing_ok=True)
+        with self.access("read"):
+            files = () if self.scheme else _files_below(self.name)
+            partial = [file.path for file in files if PARTIAL_FILE.search(file.name)]
+        for path in partial:
+            with self.access("written"):
+                # It may have got its final name since, from a task that outlived its run.
+                Path(path).unlink(missing_ok=True)
 
     def sizes(self, prefix: str) -> dict[str, int]:
         """Return the number of bytes of every key below a prefix."""
