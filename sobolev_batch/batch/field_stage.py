@@ -6,10 +6,11 @@ import logging
 import math
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
-from sobolev_batch.batch.cluster.execution import Cluster, Task, describe_failure
+from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, describe_failure
 from sobolev_batch.batch.cluster.workers import Workers
 from sobolev_batch.batch.field_tasks import Job, compute_mesh, compute_parts, finish_mesh
 from sobolev_batch.errors import ClusterError
@@ -39,7 +40,7 @@ Sizes = tuple[_Groups, float, float]
 _LARGEST_REFERENCE = 3 << 20
 
 
-def compute_fields(cluster: Cluster, workspace: Workspace, pending: Sequence[int]) -> None:
+def compute_fields(cluster: Cluster, workspace: Workspace, pending: Sequence[int]) -> Stages[None]:
     """Compute the fields of rows, and take their records into the workspace; a StoreError is no mesh's failure."""
     plan, store, rows = workspace.plan, workspace.store, workspace.rows
     advance = cluster.count_steps("fields", len(pending))
@@ -69,11 +70,14 @@ def compute_fields(cluster: Cluster, workspace: Workspace, pending: Sequence[int
                 yield _field_task(Job.for_row(plan, row, store, i, allowed_bytes, reference), groups, task_bytes)
 
     projected_bytes = max((task_bytes for *_, task_bytes in sizes.values()), default=0.0)
-    for task, outcome in cluster.run(tasks(), projected_bytes):
+
+    def take_outcome(task: Task, outcome: Any) -> None:
         if isinstance(outcome, Record):
             take(task.row, outcome)
         else:
             give_up(task.row, describe_failure(outcome))
+
+    yield Wave(cluster, tasks(), take_outcome, projected_bytes)
 
 
 def _field_task(job: Job, groups: _Groups, projected_bytes: float) -> Task:

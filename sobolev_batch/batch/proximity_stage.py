@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from sobolev_batch.batch.cluster.execution import Cluster, Task, describe_failure
+from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, describe_failure
 from sobolev_batch.batch.field_stage import MESH_BYTES
 from sobolev_batch.batch.table_stage import table_order
 from sobolev_batch.errors import InputError, MeshError, StoreError, one_line
@@ -53,11 +53,11 @@ def have_proximities(workspace: Workspace) -> bool:
     return is_listed and not _pending(workspace)
 
 
-def measure_proximities(cluster: Cluster, workspace: Workspace) -> None:
+def measure_proximities(cluster: Cluster, workspace: Workspace) -> Stages[None]:
     """Measure the distances that the records lack, and write their table, or remove one that nobody requests."""
     pending = _pending(workspace)
     if pending:
-        _measure(cluster, workspace, pending)
+        yield from _measure(cluster, workspace, pending)
     if have_proximities(workspace):
         return
     workspace.store.remove(_GROUP)
@@ -66,7 +66,7 @@ def measure_proximities(cluster: Cluster, workspace: Workspace) -> None:
         workspace.store.consolidate()
 
 
-def _measure(cluster: Cluster, workspace: Workspace, keys: Mapping[int, str]) -> None:
+def _measure(cluster: Cluster, workspace: Workspace, keys: Mapping[int, str]) -> Stages[None]:
     plan, complete, reference = workspace.plan, workspace.complete, workspace.reference
     requested = plan.study.proximity
     if requested is None:
@@ -86,7 +86,8 @@ def _measure(cluster: Cluster, workspace: Workspace, keys: Mapping[int, str]) ->
             Task(measure_proximity, arguments, projected_bytes, row=i, label=workspace.labels[i], stage="proximity")
         )
     advance = cluster.count_steps("proximity", len(tasks))
-    for task, outcome in cluster.run(tasks, max(task.projected_bytes for task in tasks)):
+
+    def take(task: Task, outcome: Any) -> None:
         record = outcome
         if not isinstance(outcome, Record):
             reason = describe_failure(outcome)
@@ -95,6 +96,8 @@ def _measure(cluster: Cluster, workspace: Workspace, keys: Mapping[int, str]) ->
             Records(workspace.store).write(task.row, record)
         workspace.records[task.row] = record
         advance(task.label, None)
+
+    yield Wave(cluster, tasks, take, max(task.projected_bytes for task in tasks))
 
 
 def measure_proximity(

@@ -6,16 +6,26 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 from distributed import Client
 
+from sobolev_batch import compiled
 from sobolev_batch.batch.cluster.clients import local_client, memory_limit, require_blocking, thread_client
-from sobolev_batch.batch.cluster.execution import Cluster, Notify, Progress
+from sobolev_batch.batch.cluster.execution import (
+    Cluster,
+    Notify,
+    Progress,
+    Stages,
+    Task,
+    Wave,
+    result_of,
+    side_by_side,
+)
 from sobolev_batch.batch.cluster.watch import Heartbeat, Watch
-from sobolev_batch.batch.cluster.workers import require_store_access
+from sobolev_batch.batch.cluster.workers import prepare_workers, require_store_access
 from sobolev_batch.batch.field_stage import compute_fields
 from sobolev_batch.batch.proximity_stage import have_proximities, measure_proximities
 from sobolev_batch.batch.start import StoreLike, ready_to_run
@@ -26,12 +36,14 @@ from sobolev_batch.machine import available_cores, require_machine_memory
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.shown import Shown, reasons
-from sobolev_batch.store.collection_store import CollectionStore, for_each_object, labelled
+from sobolev_batch.store.collection_store import CollectionStore, labelled
 from sobolev_batch.store.create import require_usable
+from sobolev_batch.store.layout import stored_choice
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, locked
 from sobolev_batch.store.records import Records
 from sobolev_batch.store.workspace import Workspace
+from sobolev_batch.study.plan import Plan, make_plan
 from sobolev_batch.study.study import AnyStudy, Study, StudyCollection, StudyLike
 from sobolev_batch.visible import visible
 
@@ -139,32 +151,71 @@ def run(
     study, location = ready_to_run(study, store, allow_commands=allow_commands, only=only)
     location = location if client is None else location.absolute()
     notify = on_progress or _ignore
+    if isinstance(study, StudyCollection):
+        CollectionStore.prepared(location, study)
+    names = list(study.studies)
     with ExitStack() as stack:
-        # One cluster serves all studies, and none is started where nothing is missing.
-        own = nullcontext(client) if client is not None else _own_cluster(study, location, workers, memory)
-        start = cache(lambda: stack.enter_context(own))
 
-        if isinstance(study, StudyCollection):
-            CollectionStore.prepared(location, study)
-        names = list(study.studies)
+        @cache
+        def start() -> tuple[Client, Watch]:
+            """Start the cluster of all objects, which is not needed where nothing is missing."""
+            own = nullcontext(client) if client is not None else _own_cluster(study, location, workers, memory)
+            started = stack.enter_context(own)
+            needs_gpu = any(one.backend == "gpu" for one in study.studies.values())
+            watch = stack.enter_context(Watch(started, needs_gpu).kept())
+            return started, watch
 
-        def run_object(name: str, study: Study, place: Location) -> Summary:
+        known_workers = cache(lambda libraries: prepare_workers(start()[0], libraries))
+        announce = cache(lambda: notify(Progress("cluster", 0, 0, start()[0].dashboard_link)))
+
+        def equip(study: Study) -> tuple[Cluster, Watch]:
+            started, watch = start()
+            announce()
+            return Cluster(started, known_workers(study.libraries), study=study.name, part=study.part), watch
+
+        def run_object(name: str, study: Study, place: Location) -> Stages[Summary]:
             part = f"{name}, {names.index(name) + 1} of {len(names)}" if name else ""
             lock = Lock.of_this_process()
-            try:
-                require_usable(place)
-                with locked(place, lock):
-                    if client is not None:
-                        with Watch(client).kept():
-                            require_store_access(client, place, lock)
-                    return carry_out(study, place, lock, start, lambda progress: notify(replace(progress, part=part)))
-            except InputError as error:
-                if name and not isinstance(error, StoreError):
-                    _log.error("%s: %s", name, error)
-                raise
+            require_usable(place)
+            with locked(place, lock):
+                if client is not None and name == names[0]:
+                    # The others lie beside it.
+                    require_store_access(start()[0], place, lock)
+                notify_of_part = partial(_notify_of, notify, part)
+                return (yield from carry_out(study, place, lock, equip, notify_of_part))
 
-        summaries, refused = for_each_object(study, location, run_object)
-    return summaries[""] if "" in summaries else _of_all(location, summaries, refused)
+        return _outcome_of_all(study, location, run_object)
+
+
+def _notify_of(notify: Notify, part: str, progress: Progress) -> None:
+    notify(replace(progress, part=part))
+
+
+def _outcome_of_all(
+    study: AnyStudy, location: Location, run_object: Callable[[str, Study, Location], Stages[Summary]]
+) -> Summary:
+    """Run all objects of a study beside each other.
+
+    What ends the run of an object is raised where it is the only one. Of several, a StoreError ends all: the stores of
+    the others would not fare better.
+    """
+    summaries: dict[str, Summary] = {}
+    refused: dict[str, str] = {}
+
+    def is_fatal(error: Exception) -> bool:
+        return "" in study.studies or isinstance(error, StoreError) or not isinstance(error, InputError)
+
+    runs = (
+        (name, run_object(name, one, location.below(name) if name else location)) for name, one in study.studies.items()
+    )
+    for name, outcome in side_by_side(runs, is_fatal):
+        if isinstance(outcome, Exception):
+            refused[name] = str(outcome)
+            _log.error("%s: %s", name, outcome)
+        else:
+            summaries[name] = outcome
+    in_order = {name: summaries[name] for name in study.studies if name in summaries}
+    return summaries[""] if "" in summaries else _of_all(location, in_order, refused)
 
 
 def _ignore(progress: Progress) -> None:
@@ -200,40 +251,56 @@ def carry_out(
     study: Study,
     location: Location,
     lock: Lock,
-    start: Callable[[], Client],
+    equip: Callable[[Study], tuple[Cluster, Watch]],
     notify: Notify = _ignore,
-) -> Summary:
-    """Run a study in a store that this process has locked; a cluster starts if anything is missing."""
-    workspace = Workspace.of_study(study, location, lock)
+) -> Stages[Summary]:
+    """Run a study in a store that this process has locked; a cluster is asked for if anything is missing."""
+    plan: Plan | None = None
+    if study.accuracy is not None and stored_choice(location) is None:
+        # Pilots are made and compared, which takes as long as some of the study's tasks.
+        plan = yield from _planned(study, equip(study)[0])
+    workspace = Workspace.of_study(study, location, lock, plan)
     with Heartbeat(workspace.store, lock).kept() as heartbeat:
         if lacks_nothing(workspace):
             # The last run may have been killed before it did.
             Records(workspace.store).collect(workspace.records)
             return _summary(workspace, set())
-        client = start()
-        with Watch(client, study.backend == "gpu").kept() as watch:
-            heartbeat.watch = watch
-            heartbeat.write("running")
-            notify(Progress("cluster", 0, 0, client.dashboard_link))
 
-            def beat(progress: Progress) -> None:
-                heartbeat.advance(f"{progress.stage}, {progress.done} of {progress.total}")
-                notify(progress)
+        def beat(progress: Progress) -> None:
+            heartbeat.advance(f"{progress.stage}, {progress.done} of {progress.total}")
+            notify(progress)
 
-            cluster = Cluster.prepare(client, study, beat)
-            # Asked before anything is computed: a GPU that nobody has would be waited for.
-            cluster.workers.with_backend(study.backend)
-            cluster.workers.require_accuracy(study.accuracy)
-            return _compute(cluster, heartbeat, workspace)
+        cluster, heartbeat.watch = equip(study)
+        cluster = replace(cluster, notify=beat)
+        heartbeat.write("running")
+        # Asked before anything is computed: a GPU that nobody has would be waited for.
+        cluster.workers.with_backend(study.backend)
+        cluster.workers.require_accuracy(study.accuracy)
+        return (yield from _compute(cluster, heartbeat, workspace))
 
 
-def _compute(cluster: Cluster, heartbeat: Heartbeat, workspace: Workspace) -> Summary:
+def _planned(study: Study, cluster: Cluster) -> Stages[Plan]:
+    """Plan a study on a worker."""
+    cluster.workers.require_accuracy(study.accuracy)
+    plans: list[Plan] = []
+    task = Task(plan_by_itself, (study,), stage="plan")
+    yield Wave(cluster, [task], lambda _, outcome: plans.append(result_of(outcome)))
+    return plans[0]
+
+
+def plan_by_itself(study: Study) -> Plan:
+    """Plan a study, with digits that do not depend on what else the process computes."""
+    with compiled.by_itself():
+        return make_plan(study)
+
+
+def _compute(cluster: Cluster, heartbeat: Heartbeat, workspace: Workspace) -> Stages[Summary]:
     """Compute what a workspace lacks, on larger lattices until the accuracy is reached, and measure proximities."""
     rows, study = workspace.pending, workspace.plan.study
     workspace.withdraw_results_of(rows)
     computed: set[int] = set()
     for rounds_left in reversed(range(_MOST_ROUNDS)):
-        repaired, distances = _compute_repairing(cluster, workspace, rows)
+        repaired, distances = yield from _compute_repairing(cluster, workspace, rows)
         computed.update(rows, repaired)
         if not rounds_left or distances is None or study.accuracy is None:
             break
@@ -245,27 +312,27 @@ def _compute(cluster: Cluster, heartbeat: Heartbeat, workspace: Workspace) -> Su
             workspace = Workspace.prepared(workspace.store.location, workspace.plan.with_choice(choice))
         heartbeat.write("running")
         rows = workspace.pending
-    measure_proximities(cluster, workspace)
+    yield from measure_proximities(cluster, workspace)
     Records(workspace.store).collect(workspace.records)
     return _summary(workspace, computed)
 
 
 def _compute_repairing(
     cluster: Cluster, workspace: Workspace, rows: Sequence[int]
-) -> tuple[set[int], NormEstimate | None]:
+) -> Stages[tuple[set[int], NormEstimate | None]]:
     """Compute fields and tables, and damaged fields again; return their rows, and distances if they are new."""
     repairs, repaired = 0, set[int]()
     while True:
         try:
-            compute_fields(cluster, workspace, rows)
-            return repaired, tabulate_fields(cluster, workspace)
+            yield from compute_fields(cluster, workspace, rows)
+            return repaired, (yield from tabulate_fields(cluster, workspace))
         except DamageError as error:
             if repairs == _MOST_REPAIRS:
                 raise
             repairs += 1
             _log.warning("%s", error)
             # Where one is damaged, others may be.
-            rows = damaged_rows(cluster, workspace)
+            rows = yield from damaged_rows(cluster, workspace)
             workspace.withdraw(rows, "its values are not what was stored")
             repaired.update(rows)
 

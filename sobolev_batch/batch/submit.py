@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from distributed import Client, Future, Status, fire_and_forget, get_worker, worker_client
 
 from sobolev_batch.batch.cluster.clients import require_blocking
-from sobolev_batch.batch.cluster.execution import task_key
+from sobolev_batch.batch.cluster.execution import Cluster, side_by_side, task_key
 from sobolev_batch.batch.cluster.watch import Heartbeat, Watch
 from sobolev_batch.batch.cluster.workers import prepare_workers, require_store_access
 from sobolev_batch.batch.run import carry_out
@@ -134,8 +134,13 @@ def drive(study: Study, store: str, run: str) -> None:
             _log.warning("%s: the store was unlocked since the study was submitted, or is done; left alone", store)
             return
         acquire(location, lock)
-        with worker_client() as client:
-            carry_out(study, location, lock, lambda: client)
+        with worker_client() as client, Watch(client, study.backend == "gpu").kept() as watch:
+
+            def equip(study: Study) -> tuple[Cluster, Watch]:
+                return Cluster.prepare(client, study), watch
+
+            for _ in side_by_side([("", carry_out(study, location, lock, equip))], is_fatal=lambda error: True):
+                pass
     except Exception as error:
         if get_worker().status != Status.running:
             # Dask has another worker drive, which takes the lock over.

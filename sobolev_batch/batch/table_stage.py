@@ -16,7 +16,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sobolev_batch.batch.cluster.execution import Cluster, Task
+from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, result_of
 from sobolev_batch.errors import DamageError
 from sobolev_batch.norms.columns import describe
 from sobolev_batch.norms.estimate import NormEstimate
@@ -50,7 +50,7 @@ _SMALLEST_STEP = 1.2
 _MOST_OF_ONE_SIZE = 10
 
 
-def tabulate_fields(cluster: Cluster, workspace: Workspace) -> NormEstimate | None:
+def tabulate_fields(cluster: Cluster, workspace: Workspace) -> Stages[NormEstimate | None]:
     """Write the tables, and return the distances to the reference, or None where the tables were there."""
     placed = table_order(workspace)
     digest = _digest(workspace, placed)
@@ -87,9 +87,13 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> NormEstimate | No
         Task(fill_tile, (reducer.only(part.keys), part, tile), projected_bytes, stage="pairs")
         for part, tile in ((pairs.only(tile), tile) for tile in tiles if pairs is not None)
     )
+
+    def take(task: Task, outcome: Any) -> None:
+        result_of(outcome)
+        advance("", None)
+
     for tasks in (of_spectra, of_pairs):
-        for _ in cluster.results(tasks, projected_bytes):
-            advance("", None)
+        yield Wave(cluster, tasks, take, projected_bytes)
     results = Results.from_spectra(reducer, meshes, plan.reference)
     _write_tables(workspace, results, digest, replaced)
     return NormEstimate(*results.to_reference)

@@ -7,8 +7,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
-from sobolev_batch.batch.cluster.execution import Cluster, Task
+from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, result_of
 from sobolev_batch.errors import DamageError, LockError, StoreError
 from sobolev_batch.machine import available_cores
 from sobolev_batch.shown import Shown
@@ -147,13 +148,20 @@ def _verify_study(store: str | Path | Location, on_progress: Callable[[int, int]
         release(opened.location, lock)
 
 
-def damaged_rows(cluster: Cluster, workspace: Workspace) -> list[int]:
+def damaged_rows(cluster: Cluster, workspace: Workspace) -> Stages[list[int]]:
     """Return the rows whose fields are not what their records say, found by the workers of a cluster."""
     tasks = (
         Task(Fields(workspace.store).damage, (i, record), row=i, label=workspace.labels[i], stage="check")
         for i, record in workspace.complete.items()
     )
-    return sorted(task.row for task, damage in cluster.results(tasks) if damage)
+    damaged: list[int] = []
+
+    def take(task: Task, damage: Any) -> None:
+        if result_of(damage):
+            damaged.append(task.row)
+
+    yield Wave(cluster, tasks, take)
+    return sorted(damaged)
 
 
 def _verify(store: Store, on_progress: Callable[[int, int], None] | None, *, may_write: bool) -> Verification:

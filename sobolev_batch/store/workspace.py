@@ -105,11 +105,11 @@ class Workspace(Contents):
         return workspace
 
     @classmethod
-    def of_study(cls, study: Study, location: Location, lock: Lock) -> Self:
-        """Plan a study and prepare its store, which this process has locked."""
-        plan = make_plan(study, stored_choice(location))
-        workspace = cls.prepared(location.fenced(lock.fence), plan)
-        if workspace.pending and study.cache is not None and study.cache.versions_changed():
+    def of_study(cls, study: Study, location: Location, lock: Lock, plan: Plan | None = None) -> Self:
+        """Plan a study, unless it is planned, and prepare its store, which this process has locked."""
+        plan = plan or make_plan(study, stored_choice(location))
+        workspace, cache = cls.prepared(location.fenced(lock.fence), plan), plan.study.cache
+        if workspace.pending and cache is not None and cache.versions_changed():
             # A program of another version makes other meshes: the study is listed again.
             return cls.of_study(replace(study), location, lock)
         return workspace

@@ -32,7 +32,8 @@ def distance_from_triangles(points: Reals, mesh: sb.Mesh) -> Reals:
 def grid(mesh: sb.Mesh, steps: int) -> Reals:
     """Points on every triangle, the corners among them."""
     weights = np.array([(i, j, steps - i - j) for i in range(steps + 1) for j in range(steps + 1 - i)]) / steps
-    return np.einsum("wk,tkd->twd", weights, mesh.vertices[mesh.triangles]).reshape(-1, 3)
+    points: Reals = np.einsum("wk,tkd->twd", weights, mesh.vertices[mesh.triangles])
+    return points.reshape(-1, 3)
 
 
 def plate(hole: bool) -> sb.Mesh:

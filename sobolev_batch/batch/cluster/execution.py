@@ -1,14 +1,16 @@
-"""Tasks on a cluster: handed out a few at a time, in the free memory, and their outcomes taken back.
+"""Tasks of many runs on a cluster: handed out in turn, in the free memory, and their outcomes taken back.
 
 Each step is reported to those who watch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import count
-from typing import Any, Literal, Self
+from typing import Any, Generic, Literal, Self, TypeVar
 from uuid import uuid4
 
 from distributed import CancelledError, Client, Future, as_completed
@@ -20,6 +22,7 @@ from sobolev_batch.errors import ClusterError, StoreError, one_line
 from sobolev_batch.store.records import Record
 from sobolev_batch.study.study import Study
 
+Result = TypeVar("Result")
 Stage = Literal["cluster", "fields", "reduction", "proximity"]
 
 
@@ -55,6 +58,9 @@ class Progress:
 
 
 Notify = Callable[[Progress], None]
+
+# Runs that have begun and not ended: each has a thread for its heartbeat, and its records in memory.
+_MOST_RUNS = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,89 +121,24 @@ class Cluster:
         """Prepare the workers of a cluster for a study; see `prepare_workers`."""
         return cls(client, prepare_workers(client, study.libraries), notify, study=study.name, part=study.part)
 
+    @property
+    def most_in_flight(self) -> int:
+        """Number of tasks that the scheduler knows of at a time."""
+        return max(self.in_flight, self.in_flight_per_thread * self.workers.threads)
+
     def count_steps(self, stage: Stage, total: int) -> Callable[[str, Record | None], None]:
         """Report the start of a stage with its number of steps, and return a function that reports each by label."""
         done = count(1)
         self.notify(Progress(stage, 0, total))
         return lambda label, record: self.notify(Progress(stage, next(done), total, label, record))
 
-    def run(self, tasks: Iterable[Task], projected_bytes: float = 0.0) -> Iterator[tuple[Task, Any]]:
-        """Have tasks done. Those whose workers died are tried again alone, after all others.
-
-        Args:
-            tasks: Tasks, read as they are handed out.
-            projected_bytes: Most memory that any of them takes. Where as many tasks as a worker has threads fit
-                beside each other, none has to claim its memory, and the scheduler is free to place them.
-
-        Yields:
-            Each task with its result, or with the exception that ended it: a `ClusterError` where no worker has
-            the memory, or where every worker died of it.
-
-        Raises:
-            StoreError: A task could not read or write the store, which is not the fault of its mesh.
-            ClusterError: The scheduler was lost.
-        """
-        claims_memory = projected_bytes > self.workers.allowed_bytes_per_task
-        most = max(self.in_flight, self.in_flight_per_thread * self.workers.threads)
-        suspects: list[Task] = []
-        for task, outcome in self._run_once(tasks, claims_memory, most):
-            # It need not be what killed them: another task beside it may have been. Alone, it shows.
-            if isinstance(outcome, KilledWorker):
-                suspects.append(task)
-            else:
-                yield task, outcome
-        suspects.sort(key=lambda task: task.row)
-        for task, outcome in self._run_once(suspects, claims_memory, 1):
-            yield task, _deadly(outcome) if isinstance(outcome, KilledWorker) else outcome
-
-    def results(self, tasks: Iterable[Task], projected_bytes: float = 0.0) -> Iterator[tuple[Task, Any]]:
-        """Have tasks done that must not fail; see `run`. The first exception is raised."""
-        for task, outcome in self.run(tasks, projected_bytes):
-            if isinstance(outcome, BaseException):
-                raise outcome
-            yield task, outcome
-
-    def _run_once(self, tasks: Iterable[Task], claims_memory: bool, in_flight: int) -> Iterator[tuple[Task, Any]]:
-        running: dict[Future, Task] = {}
-        remaining = iter(tasks)
-        completed = as_completed(loop=self.client.loop)
-
-        def hand_out(number: int) -> list[tuple[Task, ClusterError]]:
-            """Submit `count` tasks, and return those before them that fit into no worker."""
-            refused = []
-            for task in remaining:
-                try:
-                    self.workers.require_memory(task.projected_bytes)
-                except ClusterError as error:
-                    refused.append((task, error))
-                    continue
-                future = self._submit(task, claims_memory, {}, task.label)
-                running[future] = task
-                completed.add(future)
-                number -= 1
-                if not number:
-                    break
-            return refused
-
-        try:
-            yield from hand_out(in_flight)
-            for batch in completed.batches():
-                outcomes = self._outcomes(batch)
-                yield from zip([running.pop(future) for future in batch], outcomes, strict=True)
-                # Only now: a task that is tried alone has to be alone.
-                yield from hand_out(len(batch))
-        finally:
-            # The client may outlive this run, and the cluster would go on for it.
-            for future in running:
-                future.release()
-
-    def _submit(self, task: Task, claims_memory: bool, futures: dict[int, Future], label: str) -> Future:
+    def submit(self, task: Task, claims_memory: bool, futures: dict[int, Future], label: str) -> Future:
         """Submit a task after those among its arguments, each of these once."""
 
         def submitted(argument: Any) -> Any:
             if isinstance(argument, list):
                 return [submitted(item) for item in argument]
-            return self._submit(argument, claims_memory, futures, label) if isinstance(argument, Task) else argument
+            return self.submit(argument, claims_memory, futures, label) if isinstance(argument, Task) else argument
 
         if id(task) not in futures:
             resources = {MEMORY: task.projected_bytes} if claims_memory and task.projected_bytes else {}
@@ -211,25 +152,258 @@ class Cluster:
             )
         return futures[id(task)]
 
-    def _outcomes(self, futures: Sequence[Future]) -> list[Any]:
-        """Fetch the results of futures that have ended, or their exceptions, all at once."""
-        lost = (
-            f"the scheduler at {self.client.scheduler.address} was lost; the same command goes on from what is stored, "
-            "after `sobolev-batch unlock` where it was submit"
-        )
-        if self.client.status != "running" or any(future.cancelled() for future in futures):
-            raise ClusterError(lost)
+
+@dataclass(frozen=True, eq=False)
+class Wave:
+    """Tasks of a run that may go on beside each other. What comes after them waits for all of them, and for no others.
+
+    Attributes:
+        cluster: Cluster that does them, prepared for the run.
+        tasks: Read as they are handed out.
+        take: Called with each task and its result, or the exception that ended it: a `ClusterError` where no worker has
+            the memory, or where every worker died of it. What it raises ends the wave, and is raised where the wave was
+            yielded; so is a StoreError of a task, which is not the fault of its mesh.
+        projected_bytes: Most memory that any of them takes. Where as many tasks as a worker has threads fit beside each
+            other, none has to claim its memory, and the scheduler is free to place them.
+    """
+
+    cluster: Cluster
+    tasks: Iterable[Task]
+    take: Callable[[Task, Any], None]
+    projected_bytes: float = 0.0
+
+    @property
+    def claims_memory(self) -> bool:
+        """True where the scheduler has to count the memory of the tasks."""
+        return self.projected_bytes > self.cluster.workers.allowed_bytes_per_task
+
+
+# A run, or a part of one, as a generator: it yields the waves that it waits for, and returns its result.
+Stages = Generator[Wave, None, Result]
+
+
+def result_of(outcome: Any) -> Any:
+    """Return the result of a task that must not fail; its exception is raised."""
+    if isinstance(outcome, BaseException):
+        raise outcome
+    return outcome
+
+
+def side_by_side(
+    runs: Iterable[tuple[str, Stages[Result]]], is_fatal: Callable[[Exception], bool] = lambda error: False
+) -> Iterator[tuple[str, Result | Exception]]:
+    """Carry out runs beside each other, so that a worker is free only where none of them has a task for it.
+
+    Tasks whose workers died are tried again alone, when nothing else is left to do: what killed a worker need not be
+    the task itself, but another one beside it. Alone, it shows.
+
+    Args:
+        runs: Runs by their names, begun as there is room for more tasks.
+        is_fatal: Tells of the exception that ended a run whether it ends all of them. It is raised in each.
+
+    Yields:
+        The name of each run with its result, or the exception that ended it.
+
+    Raises:
+        ClusterError: The scheduler was lost.
+    """
+    yield from _Loop(iter(runs), is_fatal).outcomes()
+
+
+class _Run(Generic[Result]):
+    """A run that has begun: where it is, and the tasks of its wave."""
+
+    def __init__(self, name: str, stages: Stages[Result]) -> None:
+        self.name, self.stages = name, stages
+        self.wave: Wave | None = None
+        self.tasks: Iterator[Task] = iter(())
+        self.in_flight, self.has_more = 0, False
+        self.suspects: list[Task] = []
+
+    def advance(self, error: BaseException | None = None) -> None:
+        """Go on to the next wave, or raise StopIteration with the result. An error is raised where the run waits."""
+        self.suspects.clear()
+        self.wave = next(self.stages) if error is None else self.stages.throw(error)
+        self.tasks, self.has_more = iter(self.wave.tasks), True
+
+
+class _Loop(Generic[Result]):
+    """The loop over all tasks of all runs."""
+
+    def __init__(self, waiting: Iterator[tuple[str, Stages[Result]]], is_fatal: Callable[[Exception], bool]) -> None:
+        self._waiting, self._is_fatal = waiting, is_fatal
+        self._begun: list[_Run[Result]] = []
+        # Those with tasks to hand out, which they do in turn.
+        self._ready = deque[_Run[Result]]()
+        self._running: dict[Future, tuple[_Run[Result], Wave, Task]] = {}
+        self._client: Client | None = None
+        self._completed: as_completed | None = None
+        self._alone: Task | None = None
+        self._ended = deque[tuple[str, Result | Exception]]()
+
+    def outcomes(self) -> Iterator[tuple[str, Result | Exception]]:
+        """Yield the outcome of each run; see `side_by_side`."""
         try:
-            results = iter(self.client.gather([future for future in futures if future.status == "finished"]))
-            outcomes = [next(results) if future.status == "finished" else future.exception() for future in futures]
-        except (CommClosedError, CancelledError) as error:
-            raise ClusterError(lost) from error
-        for outcome in outcomes:
+            while True:
+                self._hand_out()
+                while self._ended:
+                    yield self._ended.popleft()
+                if self._running:
+                    self._take_back()
+                elif not self._ready and not self._try_alone():
+                    break
+        except BaseException as error:
+            for run in self._begun:
+                with suppress(BaseException):
+                    run.stages.throw(error)
+                with suppress(BaseException):
+                    run.stages.close()
+            raise
+        finally:
+            # The client may outlive this loop, and the cluster would go on for it.
+            for future in self._running:
+                future.release()
+
+    def _hand_out(self) -> None:
+        """Submit tasks of all runs in turn, up to what the scheduler should know of; begin runs where none has any."""
+        while self._alone is None:
+            if not self._ready and not self._begin():
+                return
+            if not self._ready:
+                continue
+            run = self._ready[0]
+            wave = run.wave
+            if wave is None or len(self._running) >= wave.cluster.most_in_flight:
+                return
+            self._ready.rotate(-1)
+            try:
+                task = next(run.tasks, None)
+            except Exception as error:
+                self._end_wave(run, error)
+                continue
+            if task is None:
+                run.has_more = False
+                self._ready.remove(run)
+                self._go_on(run)
+                continue
+            try:
+                wave.cluster.workers.require_memory(task.projected_bytes)
+            except ClusterError as error:
+                self._give(run, task, error)
+                continue
+            self._submit(run, task)
+
+    def _begin(self) -> bool:
+        """Begin the next run; False where none is waiting, or enough have begun."""
+        if len(self._begun) >= _MOST_RUNS:
+            return False
+        name, stages = next(self._waiting, ("", None))
+        if stages is None:
+            return False
+        run = _Run(name, stages)
+        self._begun.append(run)
+        self._advance(run)
+        return True
+
+    def _submit(self, run: _Run[Result], task: Task) -> None:
+        wave = run.wave
+        if wave is None:
+            raise ValueError("the run waits for nothing")
+        if self._completed is None:
+            self._client = wave.cluster.client
+            self._completed = as_completed(loop=self._client.loop)
+        future = wave.cluster.submit(task, wave.claims_memory, {}, task.label)
+        self._running[future] = run, wave, task
+        run.in_flight += 1
+        self._completed.add(future)
+
+    def _take_back(self) -> None:
+        """Wait for tasks that end, and give their outcomes to their runs."""
+        if self._completed is None or self._client is None:
+            return
+        # Others were given up.
+        batch = [future for future in self._completed.next_batch() if future in self._running]
+        outcomes = _outcomes(self._client, batch)
+        ended = [self._running.pop(future) for future in batch]
+        for run, _, _ in ended:
+            run.in_flight -= 1
+        for (run, wave, task), outcome in zip(ended, outcomes, strict=True):
+            if run.wave is not wave:
+                continue  # an outcome before this one ended the wave
+            if isinstance(outcome, KilledWorker) and task is not self._alone:
+                run.suspects.append(task)
+            else:
+                self._give(run, task, _deadly(outcome) if isinstance(outcome, KilledWorker) else outcome)
+        self._alone = None
+        for run in dict.fromkeys(run for run, _, _ in ended):
+            self._go_on(run)
+
+    def _give(self, run: _Run[Result], task: Task, outcome: Any) -> None:
+        """Give the outcome of a task to its run."""
+        if run.wave is None:
+            raise ValueError("the run waits for nothing")
+        try:
             if type(outcome) is StoreError:
                 raise StoreError(f"{outcome}; then the same command goes on from what is stored") from outcome
             if isinstance(outcome, StoreError):
                 raise outcome
-        return outcomes
+            run.wave.take(task, outcome)
+        except Exception as error:
+            self._end_wave(run, error)
+
+    def _end_wave(self, run: _Run[Result], error: Exception) -> None:
+        """Give the other tasks of a run up, and raise an error where it waits."""
+        for future in [future for future, (owner, _, _) in self._running.items() if owner is run]:
+            del self._running[future]
+            future.release()
+        run.in_flight, run.has_more = 0, False
+        if run in self._ready:
+            self._ready.remove(run)
+        self._advance(run, error)
+
+    def _go_on(self, run: _Run[Result]) -> None:
+        """Let a run go on whose wave is done."""
+        if run in self._begun and not (run.has_more or run.in_flight or run.suspects):
+            self._advance(run)
+
+    def _advance(self, run: _Run[Result], error: Exception | None = None) -> None:
+        try:
+            run.advance(error)
+        except StopIteration as end:
+            self._begun.remove(run)
+            self._ended.append((run.name, end.value))
+        except Exception as failure:
+            self._begun.remove(run)
+            if self._is_fatal(failure):
+                raise
+            self._ended.append((run.name, failure))
+        else:
+            self._ready.append(run)
+
+    def _try_alone(self) -> bool:
+        """Hand one of the tasks out whose workers died; False where there is none."""
+        suspects = [(run, task) for run in self._begun for task in run.suspects]
+        if not suspects:
+            return False
+        run, self._alone = min(suspects, key=lambda suspect: suspect[1].row)
+        run.suspects.remove(self._alone)
+        self._submit(run, self._alone)
+        return True
+
+
+def _outcomes(client: Client, futures: Sequence[Future]) -> list[Any]:
+    """Fetch the results of futures that have ended, or their exceptions, all at once."""
+    lost = (
+        f"the scheduler at {client.scheduler.address} was lost; the same command goes on from what is stored, "
+        "after `sobolev-batch unlock` where it was submit"
+    )
+    if client.status != "running" or any(future.cancelled() for future in futures):
+        raise ClusterError(lost)
+    try:
+        results = iter(client.gather([future for future in futures if future.status == "finished"]))
+        return [next(results) if future.status == "finished" else future.exception() for future in futures]
+    except (CommClosedError, CancelledError) as error:
+        raise ClusterError(lost) from error
 
 
 def describe_failure(error: BaseException) -> str:

@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from distributed import Client, Future, KilledWorker, LocalCluster
+from distributed import Client, Event, Future, KilledWorker, LocalCluster
 from distributed.utils import key_split
 
 from sobolev_batch import Study, StudyCollection, plan, run, submit
-from sobolev_batch.batch.cluster.execution import Cluster, Progress, Task, describe_failure
+from sobolev_batch.batch.cluster import execution
+from sobolev_batch.batch.cluster.execution import (
+    Cluster,
+    Progress,
+    Stages,
+    Task,
+    Wave,
+    describe_failure,
+    result_of,
+    side_by_side,
+)
 from sobolev_batch.batch.cluster.watch import Watch
 from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers, prepare_workers
 from sobolev_batch.batch.status import Status
@@ -32,13 +42,27 @@ def cluster(client: Client) -> Cluster:
     return Cluster(client, Workers((WorkerInfo("tcp://a", 1, 2e9, "cpu", ""),)))
 
 
+def outcomes_of(cluster: Cluster, tasks: Iterable[Task], projected_bytes: float = 0.0) -> list[tuple[Task, Any]]:
+    """Have tasks done as the only wave of a run."""
+    found: list[tuple[Task, Any]] = []
+
+    def stages() -> Stages[str]:
+        yield Wave(cluster, tasks, lambda task, outcome: found.append((task, outcome)), projected_bytes)
+        return "done"
+
+    assert list(side_by_side([("", stages())], is_fatal=lambda error: True)) == [("", "done")]
+    return found
+
+
 def test_each_task_comes_back_with_its_outcome(cluster: Cluster) -> None:
-    outcomes = {task.row: outcome for task, outcome in cluster.run(Task(divmod, (7, k), row=k) for k in range(3))}
+    tasks = (Task(divmod, (7, k), row=k) for k in range(3))
+    outcomes = {task.row: outcome for task, outcome in outcomes_of(cluster, tasks)}
     assert (outcomes[1], outcomes[2]) == ((7, 0), (3, 1))
     assert isinstance(outcomes[0], ZeroDivisionError)
     assert describe_failure(outcomes[0]).startswith("ZeroDivisionError: ")
+    assert result_of(outcomes[1]) == (7, 0)
     with pytest.raises(ZeroDivisionError):
-        list(cluster.results([Task(divmod, (7, 0))]))
+        result_of(outcomes[0])
 
 
 def few_at_a_time(cluster: Cluster, count: int) -> Cluster:
@@ -57,14 +81,15 @@ def _total(number: int, others: list[int]) -> int:
 
 def test_a_task_among_the_arguments_of_others_is_done_once(cluster: Cluster, tmp_path: Path) -> None:
     first = Task(_append, (tmp_path / "calls",))
-    ((_, total),) = cluster.run([Task(_total, (first, [first, Task(abs, (-4,)), 5]))])
+    ((_, total),) = outcomes_of(cluster, [Task(_total, (first, [first, Task(abs, (-4,)), 5]))])
     assert total == 3 + 3 + 4 + 5
     assert (tmp_path / "calls").read_text() == "called\n"
 
 
 def test_tasks_that_fit_into_no_worker_are_not_tried(cluster: Cluster, tmp_path: Path) -> None:
     large = [Task(_append, (tmp_path / "calls",), 3e9) for _ in range(5)]
-    outcomes = [outcome for _, outcome in few_at_a_time(cluster, 1).run([*large, Task(abs, (-4,), 1e6)], 3e9)]
+    tasks = [*large, Task(abs, (-4,), 1e6)]
+    outcomes = [outcome for _, outcome in outcomes_of(few_at_a_time(cluster, 1), tasks, 3e9)]
     assert outcomes.pop() == 4
     assert all(isinstance(outcome, ClusterError) for outcome in outcomes)
     assert describe_failure(outcomes[0]).startswith(
@@ -83,29 +108,47 @@ def test_tasks_are_read_as_they_are_handed_out(cluster: Cluster) -> None:
             yield Task(abs, (-k,))
 
     done = 0
-    for _ in few_at_a_time(cluster, 2).run(tasks()):
+
+    def take(task: Task, outcome: Any) -> None:
+        nonlocal done
         done += 1
-        assert len(read) <= done + 1
+        assert len(read) <= done + 2
+
+    def stages() -> Stages[None]:
+        yield Wave(few_at_a_time(cluster, 2), tasks(), take)
+
+    assert list(side_by_side([("", stages())])) == [("", None)]
     assert (done, read) == (9, list(range(9)))
 
 
 def test_tasks_whose_workers_died_are_tried_alone(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[tuple[list[int], int]] = []
     worker: Any = SimpleNamespace(address="tcp://127.0.0.1:1")
+    fetched, submit_task = execution._outcomes, Cluster.submit
+    tried: list[tuple[int, int]] = []
+    outcomes: dict[int, Any] = {}
 
-    def run_once(
-        self: Cluster, tasks: Iterable[Task], claims_memory: bool, in_flight: int
-    ) -> Iterator[tuple[Task, object]]:
-        given = list(tasks)
-        asked.append(([task.row for task in given], in_flight))
-        for task in given:
-            dies = task.row == 3 or (task.row == 1 and in_flight > 1)
-            yield task, KilledWorker(f"task-{task.row}", worker, 1) if dies else task.row
+    def submitted(self: Cluster, task: Task, *arguments: Any) -> Future:
+        tried.append((task.row, len(outcomes)))
+        return submit_task(self, task, *arguments)
 
-    monkeypatch.setattr(Cluster, "_run_once", run_once)
-    outcomes = {task.row: outcome for task, outcome in cluster.run(Task(abs, (-4,), row=row) for row in (3, 2, 1))}
-    assert asked[1:] == [([1, 3], 1)]
-    assert (outcomes[1], outcomes[2]) == (1, 2)
+    def died(client: Client, futures: Sequence[Future]) -> list[Any]:
+        rows = fetched(client, futures)
+        dies = {3, 1} if len(tried) <= 4 else {3}
+        return [KilledWorker(f"task-{row}", worker, 1) if row in dies else row for row in rows]
+
+    def stages(*rows: int) -> Stages[None]:
+        yield Wave(
+            cluster,
+            [Task(abs, (-row,), row=row) for row in rows],
+            lambda task, found: outcomes.update({task.row: found}),
+        )
+
+    monkeypatch.setattr(execution, "_outcomes", died)
+    monkeypatch.setattr(Cluster, "submit", submitted)
+    # What is beside a task may be of another run.
+    list(side_by_side([("a", stages(3, 2)), ("b", stages(4, 1))]))
+    assert tried[4:] == [(1, 2), (3, 3)]
+    assert (outcomes[1], outcomes[2], outcomes[4]) == (1, 2, 4)
     assert "at last with nothing else beside them" in str(outcomes[3])
 
 
@@ -113,12 +156,70 @@ def _fail(error: Exception) -> None:
     raise error
 
 
-def test_failures_of_the_store_end_all(cluster: Cluster) -> None:
+def test_failures_of_the_store_are_raised_where_the_run_waits(cluster: Cluster) -> None:
     with pytest.raises(StoreError, match="disk full; then the same command goes on from what is stored"):
-        list(cluster.run([Task(_fail, (StoreError("disk full"),))]))
+        outcomes_of(cluster, [Task(_fail, (StoreError("disk full"),))])
     with pytest.raises(DamageError) as caught:
-        list(cluster.run([Task(_fail, (DamageError("message", "what", 3),))]))
+        outcomes_of(cluster, [Task(_fail, (DamageError("message", "what", 3),))])
     assert caught.value.row == 3
+
+    def mended() -> Stages[int | None]:
+        try:
+            yield Wave(cluster, [Task(_fail, (DamageError("message", "what", 3),)), Task(abs, (-1,))], ignore)
+        except DamageError as error:
+            yield Wave(cluster, [Task(abs, (-2,))], ignore)
+            return error.row
+        return None
+
+    assert list(side_by_side([("", mended())])) == [("", 3)]
+
+
+def ignore(task: Task, outcome: Any) -> None:
+    """Make nothing of an outcome."""
+
+
+def _meet(own: str, other: str) -> bool:
+    Event(own).set()
+    return bool(Event(other).wait(timeout=60))
+
+
+def test_runs_go_on_beside_each_other(cluster: Cluster) -> None:
+    met: list[bool] = []
+
+    def stages(own: str, other: str) -> Stages[str]:
+        # The first wave of one run needs that of the other, and so do the second ones.
+        for step in "12":
+            task = Task(_meet, (own + step, other + step))
+            yield Wave(cluster, [task], lambda _, outcome: met.append(outcome))
+        return own
+
+    names = dict(side_by_side([("first", stages("here", "there")), ("second", stages("there", "here"))]))
+    assert names == {"first": "here", "second": "there"}
+    assert met == [True] * 4
+
+
+def test_the_end_of_one_run_is_none_of_the_others(cluster: Cluster) -> None:
+    closed: list[str] = []
+
+    def stages(name: str) -> Stages[str]:
+        try:
+            yield Wave(cluster, [Task(abs, (-1,)) for _ in range(3)], ignore)
+            if name == "bad":
+                raise InputError("a mesh of another unit")
+            yield Wave(cluster, [Task(abs, (-1,))], ignore)
+            return name
+        finally:
+            closed.append(name)
+
+    runs = ["good", "bad", "other"]
+    outcomes = dict(side_by_side((name, stages(name)) for name in runs))
+    assert (outcomes["good"], outcomes["other"]) == ("good", "other")
+    assert isinstance(outcomes["bad"], InputError)
+    closed.clear()
+    with pytest.raises(InputError, match="another unit"):
+        list(side_by_side(((name, stages(name)) for name in runs), is_fatal=lambda error: True))
+    # All of them gave up what they had.
+    assert set(closed) >= {"bad", "other"}
 
 
 @pytest.mark.all
