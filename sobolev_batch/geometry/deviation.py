@@ -19,6 +19,7 @@ distance" (2024). The cut along planes is ours.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -36,7 +37,7 @@ DEFAULT_GAP = 0.01
 _ROUNDING = 32 * np.finfo(float).eps
 # Lengths that people write down are met up to this fraction.
 _EQUAL = 1e-9
-# Triangles whose pieces are in memory at a time, some 2 kB for each piece; and pieces after which bounds stay apart.
+# Pieces that are cut at a time, in some 2 kB each; and pieces after which bounds stay apart.
 _BATCH, _MOST_PIECES = 1 << 15, 100_000_000
 # A plane that cuts off less of the sides than these fractions leaves slivers, and the piece is cut into four.
 _LEAST_CUT, _LEAST_SHORTER_CUT, _LARGEST_CUT = 0.05, 0.003, 0.97
@@ -172,6 +173,12 @@ class _Pieces:
     corners: Reals
     close: Indices
 
+    def batches(self) -> Iterator[_Pieces]:
+        """Yield them in groups that memory holds."""
+        for start in range(0, self.corners.shape[2], _BATCH):
+            group = slice(start, start + _BATCH)
+            yield _Pieces(self.corners[..., group], self.close[:, group])
+
 
 def _largest_distance(mesh: Mesh, other: Triangles, gap: float, within: float | None) -> Deviation:
     """Bound the largest distance of a mesh's points from triangles."""
@@ -187,9 +194,11 @@ def _largest_distance(mesh: Mesh, other: Triangles, gap: float, within: float | 
     order = np.argsort(-distances[mesh.triangles].max(axis=1), kind="stable")
     for start in range(0, len(order), _BATCH):
         corners = mesh.triangles[order[start : start + _BATCH]].T
-        pieces: _Pieces | None = _Pieces(np.stack([vertices[:, corner] for corner in corners]), closest[corners])
-        while pieces is not None:
-            pieces = _cut(pieces, other, bounds)
+        pending = [_Pieces(np.stack([vertices[:, corner] for corner in corners]), closest[corners])]
+        while pending:
+            # The last ones are cut to their end before the others, so that few are in memory.
+            parts = _cut(pending.pop(), other, bounds)
+            pending += [] if parts is None else parts.batches()
     x, y, z = (scale * bounds.place).tolist()
     return Deviation(scale * bounds.lower, scale * max(bounds.lower, bounds.upper), (x, y, z))
 
