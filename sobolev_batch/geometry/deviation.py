@@ -123,7 +123,7 @@ def largest_deviation(a: MeshLike, b: MeshLike, *, gap: float = DEFAULT_GAP, wit
             raise InputError(f"{name} must be a positive number, found {value!r}")
     meshes = as_mesh(a), as_mesh(b)
     forward, backward = (
-        _largest_distance(mesh, Triangles(other), gap, within) for mesh, other in (meshes, meshes[::-1])
+        directed_deviation(mesh, Triangles(other), gap, within) for mesh, other in (meshes, meshes[::-1])
     )
     return Deviations(forward, backward)
 
@@ -180,8 +180,10 @@ class _Pieces:
             yield _Pieces(self.corners[..., group], self.close[:, group])
 
 
-def _largest_distance(mesh: Mesh, other: Triangles, gap: float, within: float | None) -> Deviation:
-    """Bound the largest distance of a mesh's points from triangles."""
+def directed_deviation(
+    mesh: Mesh, other: Triangles, gap: float = DEFAULT_GAP, within: float | None = None
+) -> Deviation:
+    """Bound the largest distance of a mesh's points from triangles; see `largest_deviation`."""
     scale, used = other.scale, mesh.used_vertices
     vertices, closest = mesh.vertices.T / scale, np.zeros(len(mesh.vertices), dtype=np.int64)
     distances = np.zeros(len(closest))

@@ -7,6 +7,7 @@ import numpy as np
 from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.closest import Triangles, cross, dot
+from sobolev_batch.geometry.deviation import Deviations, directed_deviation
 from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import is_finite_number
@@ -18,7 +19,7 @@ MOST_POINTS = 10_000_000
 DEFAULT_THRESHOLD = 0.01
 _PERCENTILES = (50, 95, 99)
 
-_SYMMETRIC = ("hausdorff", "mean", "rms", *(f"p{percent}" for percent in _PERCENTILES))
+_SYMMETRIC = ("hausdorff", "hausdorff_upper", "mean", "rms", *(f"p{percent}" for percent in _PERCENTILES))
 _BOTH_WAYS = (*_SYMMETRIC, "normal_mean", "normal_max")
 LENGTHS = (
     *(f"{name}{way}" for name in _SYMMETRIC for way in ("", "_forward", "_backward")),
@@ -31,7 +32,7 @@ NUMBERS = (
 )
 # What a study may show in its tables, with the numbers of `proximity` that belong to it.
 METRICS = {
-    "hausdorff": ("hausdorff",),
+    "hausdorff": ("hausdorff", "hausdorff_upper"),
     "mean": ("mean", "mean_error"),
     "rms": ("rms", "rms_error"),
     "percentiles": tuple(f"p{percent}" for percent in _PERCENTILES),
@@ -66,7 +67,8 @@ def proximity(
         those of points of a and their distances from b, names with ``_backward`` those of points of b; the same name
         alone is the larger of both.
 
-        - hausdorff: largest distance of all random points and vertices: the true one may be larger, not smaller;
+        - hausdorff and hausdorff_upper: the largest distance of all points, not only of random ones, is between them;
+          they are the bounds of `largest_deviation`, 1 % apart;
         - mean and rms: mean distance, and root of the mean squared distance, by area; their standard errors, since
           points are random, are mean_error and rms_error;
         - p50, p95 and p99: the distance below which 50, 95 and 99 % of the area are;
@@ -88,9 +90,18 @@ def proximity(
     >>> square = sb.Mesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
     >>> raised = sb.Mesh(square.vertices + [0, 0, 0.25], square.triangles)
     >>> distances = sb.proximity(square, raised, points=1000)
+    >>> distances["hausdorff"] <= 0.25 <= distances["hausdorff_upper"]
+    True
     >>> f"{distances['hausdorff']:.6f} {distances['rms']:.6f} {distances['chamfer']:.6f}"
     '0.250000 0.250000 0.500000'
     """
+    return proximity_and_deviations(a, b, points=points, threshold=threshold, seed=seed)[0]
+
+
+def proximity_and_deviations(
+    a: MeshLike, b: MeshLike, *, points: int = DEFAULT_POINTS, threshold: float | None = None, seed: int = 0
+) -> tuple[dict[str, float], Deviations]:
+    """Measure the same, and return also the largest deviations, which know their places."""
     if not is_whole_number(points) or not 1 < points <= MOST_POINTS:
         raise InputError(f"points must be an integer from 2 to {MOST_POINTS}, found {points!r}")
     if threshold is not None and not (is_finite_number(threshold) and threshold > 0):
@@ -100,11 +111,11 @@ def proximity(
     limit = DEFAULT_THRESHOLD * meshes[1].bounding_sphere[1] if threshold is None else float(threshold)
     searches = [Triangles(mesh) for mesh in meshes]
     found: dict[str, float] = {}
-    means, matched = [], []
+    means, matched, deviations = [], [], []
     for way, own, seeds in zip((0, 1), meshes, np.random.SeedSequence(seed).spawn(2), strict=True):
         drawn, triangles = _drawn(own, points, np.random.default_rng(seeds))
         distances, closest = searches[1 - way].closest(drawn)
-        of_vertices = searches[1 - way].closest(own.vertices[own.used_vertices])[0]
+        deviations.append(directed_deviation(own, searches[1 - way]))
         # Powers of two lose no digit, and keep squares of lengths within the range of doubles.
         scale = 2.0 ** np.frexp(distances.max(initial=np.finfo(float).tiny))[1]
         squares = (distances / scale) ** 2
@@ -112,7 +123,8 @@ def proximity(
         angles = _angles(_normals(own, triangles), _normals(meshes[1 - way], closest))
         error = float(distances.std(ddof=1)) / np.sqrt(points)
         numbers = {
-            "hausdorff": max(distances.max(), of_vertices.max()),
+            "hausdorff": deviations[way].lower,
+            "hausdorff_upper": deviations[way].upper,
             "mean": distances.mean(),
             "rms": scale * rms,
             **{f"p{percent}": np.percentile(distances, percent) for percent in _PERCENTILES},
@@ -125,7 +137,7 @@ def proximity(
         found["rms_error"] = max(found.get("rms_error", 0.0), rms_error)
         matched.append(float(np.mean(distances <= limit)))
     precision, recall = matched
-    return {
+    numbers = {
         **found,
         **{name: max(found[f"{name}_forward"], found[f"{name}_backward"]) for name in _BOTH_WAYS},
         "mean_error": max(error for _, error in means),
@@ -136,6 +148,7 @@ def proximity(
         "recall": recall,
         "threshold": limit,
     }
+    return numbers, Deviations(*deviations)
 
 
 def vertex_distances(mesh: MeshLike, other: MeshLike) -> Reals:

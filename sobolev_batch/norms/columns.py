@@ -104,7 +104,8 @@ VARIABLES: Mapping[str, Mapping[str, str]] = {
     **{
         f"{name}{way}": described(f"{title}, {whose}", ANGLE if name.startswith("normal") else FILE_LENGTH)
         for name, title in (
-            ("hausdorff", "Hausdorff distance, a lower bound"),
+            ("hausdorff", "lower bound of the Hausdorff distance"),
+            ("hausdorff_upper", "upper bound of the Hausdorff distance"),
             ("mean", "mean distance"),
             ("rms", "root mean square of distances"),
             *((f"p{percent}", f"distance within which {percent} % of the area are") for percent in (50, 95, 99)),

@@ -35,7 +35,7 @@ from sobolev_batch.tables.open import (
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.results import observed_rates
 from sobolev_batch.tables.store_accessor import convergence_at, order_note
-from sobolev_batch.tables.text import count, percent, with_error, wrapped
+from sobolev_batch.tables.text import between, count, percent, with_error, wrapped
 from sobolev_batch.transform.lattice import Orders
 
 _ABOUT = ("family", "name", "level", "rank", "ordered_by", "status", "reason", "triangles", "vertices", "seconds")
@@ -67,10 +67,10 @@ _UNIT_NOTE = """\
 Edges and other lengths are in {}.
 Distances of orders are computed in {}."""
 _PROXIMITY_NOTE = """\
-Other distances are the same at all orders. They are those of sampled points to the other
-mesh, the larger of both directions, with standard errors. Hausdorff is a lower bound: the
-largest distance of any vertex or sampled point. Chamfer is the sum of the mean distances
-of both directions. Normals are compared as lines."""
+Other distances are the same at all orders. They are those of points to the other mesh, the
+larger of both directions. The Hausdorff distance is between the bounds; other numbers are
+those of sampled points, with standard errors. Chamfer is the sum of the mean distances of
+both directions. Normals are compared as lines."""
 _ACCURACY_NOTE = """\
 The study requests an error of at most {rtol:g} of each distance; a distance
 marked ! has a larger one."""
@@ -95,7 +95,7 @@ _COLUMNS = (
     Column("area_fraction", "area", lambda fraction: f"{100 * fraction:.0f} %"),
 )
 _METRIC_COLUMNS = (
-    Column("hausdorff", "Hausdorff ≥", "{:.3g}".format),
+    Column("hausdorff", "Hausdorff", between, "hausdorff_upper"),
     Column("mean", "mean ± s.e.", with_error, "mean_error"),
     Column("rms", "RMS ± s.e.", with_error, "rms_error"),
     *(Column(f"p{percent}", f"{percent} % ≤", "{:.3g}".format) for percent in (50, 95, 99)),
@@ -176,6 +176,9 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
         proximity = finished_group(tree, "proximity").sel(mesh=labels[others])
         asked = [f"{name}{way}" for name in _metrics_of(tree) for way in ("", "_forward", "_backward")]
         nearness = {name: proximity[name].values for name in asked if name in proximity}
+        if "hausdorff" in nearness:
+            # Older stores lack the upper bounds.
+            nearness.setdefault("hausdorff_upper", np.full(others.sum(), np.nan))
         nearness |= {name: meshes[name].values[others] for name in asked if name in OF_ONE_MESH}
         if "volume" in nearness:
             nearness["volume"] = nearness["volume"] * unit_of(tree)[1] ** 3

@@ -75,14 +75,26 @@ def bound(fraction: float) -> str:
     return f"{_shown(rounded, _magnitude(rounded) - 1)} %"
 
 
-def rounded_outwards(lower: float, upper: float) -> tuple[str, str]:
-    """Return two bounds with two digits, the lower one rounded down and the upper one up.
+def between(lower: float, upper: float, unit: str = "") -> str:
+    """Return two bounds with four digits, as one number where they are the same; the upper one may be unknown.
+
+    >>> between(0.33312, 0.33519, " mm"), between(0.25, 0.25), between(0.25, math.nan)
+    ('0.3331 to 0.3352 mm', '0.25', '≥ 0.25')
+    """
+    if lower == upper or math.isnan(upper):
+        return f"{'≥ ' * (lower != upper)}{lower:.4g}{unit}"
+    low, high = rounded_outwards(lower, upper, 4)
+    return f"{low} to {high}{unit}"
+
+
+def rounded_outwards(lower: float, upper: float, digits: int = 2) -> tuple[str, str]:
+    """Return two bounds with some digits, the lower one rounded down and the upper one up.
 
     >>> rounded_outwards(0.01239, 0.1231), rounded_outwards(0.012, 0.13)
     (('0.012', '0.13'), ('0.012', '0.13'))
     """
-    low, high = -_rounded_up(-lower, 2), _rounded_up(upper, 2)
-    return _shown(low, _magnitude(low) - 1), _shown(high, _magnitude(high) - 1)
+    low, high = -_rounded_up(-lower, digits), _rounded_up(upper, digits)
+    return _shown(low, _magnitude(low) - digits + 1), _shown(high, _magnitude(high) - digits + 1)
 
 
 def count_text(number: float, error: float) -> str:

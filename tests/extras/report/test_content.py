@@ -24,7 +24,7 @@ def cells(tree: xr.DataTree, order: float) -> list[dict[str, str]]:
 
 def test_columns_and_marks(near: xr.DataTree, tree: xr.DataTree) -> None:
     first, second, _ = cells(near, -10.0)
-    assert (first["hausdorff"], first["chamfer"]) == ("0.25", "0.125 ± 0.001")
+    assert (first["hausdorff"], first["chamfer"]) == ("0.2500 to 0.2525", "0.125 ± 0.001")
     assert second["hausdorff"] == second["chamfer"] == ""
     assert "chamfer" not in cells(tree, -10.0)[0]
     above, unresolved, _ = cells(tree, -2.5)
