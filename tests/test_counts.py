@@ -69,8 +69,8 @@ WORK: dict[str, tuple[Callable[[], object], int, int, int, str]] = {
     ),
     "distance to a high accuracy": (
         lambda: sb.distance(sb.shapes.icosphere(4), SPHERE, -10.0, rtol=7e-4),
-        *(2, 23_040, 409_600),
-        "one field, and a coarse one of the frequencies beyond, probed at 32 of them each, and at 8 by its values",
+        *(2, 23_040, 655_360),
+        "one field, and a coarse one of the frequencies beyond, probed at as many of their own as of the common ones",
     ),
     "gradient": (
         lambda: sb.fitting.gradient(COARSE, SPHERE, -4.0, lattice=SMALL_LATTICE),

@@ -107,7 +107,7 @@ def run(
     What would make the run useless, such as too few objects for a league, is logged as a warning first; see `plan`.
 
     Args:
-        study: Study, collection (studies of several objects, carried out one after the other), or the path of the file
+        study: Study, collection (studies of several objects, carried out side by side), or the path of the file
             of either.
         store: Path or URL of a new or existing store, which all workers reach under this name; default
             storage/NAME.zarr. A store in memory:// is computed by threads of this process, and gone when it ends.
@@ -291,6 +291,8 @@ def _planned(study: Study, cluster: Cluster) -> Stages[Plan]:
 def plan_by_itself(study: Study) -> Plan:
     """Plan a study, with digits that do not depend on what else the process computes."""
     with compiled.by_itself():
+        # Workers plan many.
+        compiled.use()
         return make_plan(study)
 
 

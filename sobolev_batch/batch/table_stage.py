@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any, Literal
 
@@ -94,7 +94,28 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> Stages[NormEstima
 
     for tasks in (of_spectra, of_pairs):
         yield Wave(cluster, tasks, take, projected_bytes)
-    results = Results.from_spectra(reducer, meshes, plan.reference)
+    distances: list[NormEstimate] = []
+    arguments = workspace, workspace.store.documents, reducer, meshes, digest, replaced
+    last = Task(write_results, arguments, projected_bytes, stage="tables")
+    yield Wave(cluster, [last], lambda _, outcome: distances.append(result_of(outcome)), projected_bytes)
+    workspace.store.reread()
+    return distances[0]
+
+
+def write_results(
+    workspace: Workspace,
+    documents: Mapping[str, Any],
+    reducer: Reducer,
+    meshes: xr.Dataset,
+    digest: str,
+    replaced: Sequence[str],
+) -> NormEstimate:
+    """Write the tables that follow from stored spectra, on a worker; return the distances to the reference.
+
+    A store travels without what it knows of metadata, hence the documents. Done again, it writes the same.
+    """
+    workspace.store.documents = dict(documents)
+    results = Results.from_spectra(reducer, meshes, workspace.plan.reference)
     _write_tables(workspace, results, digest, replaced)
     return NormEstimate(*results.to_reference)
 

@@ -94,6 +94,11 @@ class Store:
         store.documents = self.documents
         return store
 
+    def reread(self) -> None:
+        """Read the metadata again, which another process has changed."""
+        self.documents, self._hashes = {}, {}
+        self.attributes()
+
     @property
     def path(self) -> str:
         """Path or URL of the store."""
