@@ -21,6 +21,7 @@ from plyfile import PlyData
 
 import sobolev_batch as sb
 from sobolev_batch.tables import FORMATS
+from tests.geometry.test_deviation import plate
 from tests.support.commands import LATTICE, STUDY, ball, call, command, finished, output, write_inputs
 from tests.support.repository import install
 
@@ -140,8 +141,12 @@ def test_compare_to_an_accuracy_and_on_a_lattice(folder: Path) -> None:
     for yardstick in (r"moved by \S+ %", r"with noise of \S+ %", r"decimated to \d+ triangles"):
         assert len(re.findall(rf"^  3\.off {yardstick}", shown, re.M)) == 2
     near = sb.proximity(*(sb.read_mesh(folder / name) for name in ("1.off", "3.off")))
-    lengths = [f"{near[f'hausdorff{way}']:.4g}" for way in ("_forward", "_backward", "")]
-    assert re.search(rf"^Hausdorff, at least +{' +'.join(lengths)}$", shown, re.M)
+    deviations = re.findall(r"^largest deviation, ([AB] to [AB]|both): +(\S+)(?: to (\S+))?, at \(.*\)$", shown, re.M)
+    for (direction, lower, upper), way in zip(deviations, ("_forward", "_backward", ""), strict=True):
+        assert direction == {"_forward": "A to B", "_backward": "B to A", "": "both"}[way]
+        assert float(lower) == pytest.approx(near[f"hausdorff{way}"], rel=1e-3, abs=1e-9)
+        assert float(upper or lower) == pytest.approx(near[f"hausdorff_upper{way}"], rel=1e-3, abs=1e-9)
+    assert re.search(rf"^mean +{near['mean_forward']:.4g} ", shown, re.M)
     assert re.search(rf"^Chamfer, the sum of both means: {near['chamfer']:.3f}\d* ± \S+ \(s\.e\.\)$", shown, re.M)
     for written, own in (("new/w-a.ply", "1.off"), ("new/w-b.ply", "3.off")):
         assert np.array_equal(sb.read_mesh(folder / written).vertices, sb.read_mesh(folder / own).vertices)
@@ -187,6 +192,28 @@ def test_the_exit_status_of_a_verdict(folder: Path) -> None:
         assert done.stdout.count("\n") == 1
 
 
+def test_a_hole_that_was_closed_is_seen(folder: Path) -> None:
+    for name, hole in (("full.off", False), ("hole.off", True)):
+        sb.write_mesh(plate(hole), folder / name)
+    shown = output("compare", "full.off", "hole.off", "--proximity", "--order=-4", "--unit", "mm", folder=folder)
+    assert re.search(r"^largest deviation, A to B: 2\.99\d* mm, at \(0, 0, 0\)$", shown, re.M)
+    assert re.search(r"^largest deviation, B to A: 0 mm, at ", shown, re.M)
+    for length, unit, status, answer in (
+        ("3.1", (), 0, "within 3.1: largest deviation "),
+        ("0.31cm", ("--unit", "mm"), 0, "within 3.1 mm: largest deviation "),
+        ("2", (), 1, "not within 2: largest deviation 2.99"),
+        ("10%", (), 0, "same surface: "),
+        ("1e-4 %", (), 1, "different surfaces: "),
+    ):
+        done = call("compare", "full.off", "hole.off", "--within", length, *unit, folder=folder)
+        assert (done.returncode, done.stdout.count("\n")) == (status, 1), done.stderr
+        assert done.stdout.startswith(f"full.off: {answer}")
+    found = document("compare", "full.off", "hole.off", "--within", "2", folder=folder, status=1)
+    assert (found["outcome"], found["length"], found["unit"]) == ("not within", 2.0, None)
+    assert 2.9 < found["forward"]["lower"] == found["lower"] <= found["upper"]
+    assert np.linalg.norm(found["place"]) < 1e-9
+
+
 def document(*arguments: str, folder: Path, status: int = 0) -> dict[str, Any]:
     """The JSON document that is all that a command prints."""
     table: dict[str, Any] = json.loads(output(*arguments, "--format", "json", folder=folder, status=status))
@@ -208,6 +235,8 @@ def test_json_has_the_numbers_that_texts_round(folder: Path) -> None:
     assert (found["scale"], found["a"]) == (similarity.scale, "1.off")
     assert found["area_change"] == pytest.approx(first.area / third.area - 1)
     assert found["proximity"]["hausdorff"] == sb.proximity(first, third)["hausdorff"]
+    assert found["deviation"]["backward"]["upper"] == found["proximity"]["hausdorff_upper_backward"]
+    assert len(found["deviation"]["forward"]["place"]) == 3
     verdict = document("compare", "1.off", "3.off", "--below", "0.01", folder=folder, status=1)
     assert verdict["outcome"] == "different"
     assert 0.01 < verdict["lower"] < verdict["distance"] < verdict["upper"]
@@ -258,6 +287,8 @@ def test_an_error_is_no_difference(folder: Path, monkeypatch: pytest.MonkeyPatch
 
 # What is refused in one line, and a part of it that names what was found.
 REFUSED = [
+    ("compare 1.off 3.off --within 0.1mm", "name it, as unit='mm'"),
+    ("compare 1.off 3.off --within -1", "a length is a positive number"),
     ("run no.toml", "no.toml: cannot be read"),
     ("run broken.toml", "[lattice]: m is unknown; did you mean M?"),
     ("run study.toml --store taken", "not empty and holds no store"),
@@ -288,6 +319,9 @@ MISUSED = [
     ("compare 1.off 3.off --rtol 1e-3 --M 64", "--rtol chooses the lattice"),
     ("compare 1.off 3.off --below 0.1 --proximity --rtol 0.1", "leave out --proximity, --rtol"),
     ("compare 1.off 3.off --below 0.1 --order -2,-4", "--below takes one --order"),
+    ("compare 1.off 3.off --below 0.1 --within 1", "leave out one of them"),
+    ("compare 1.off 3.off --within 1 --order -2 --proximity", "leave out --order, --proximity"),
+    ("compare 1.off 3.off --within 1% --unit mm", "leave out --unit"),
 ]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ from sobolev_batch.cli.options import PATH, below_option, json_option, memory_si
 from sobolev_batch.cli.output import echo, echo_result
 from sobolev_batch.cli.program import ERROR_STATUS, EXIT_INPUT, cli
 from sobolev_batch.norms import DEFAULT_ORDER
+from sobolev_batch.parameters import fraction
 from sobolev_batch.plugins import FEATURES, extra
 from sobolev_batch.visible import FILE_UNITS, visible
 
@@ -21,13 +22,16 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from sobolev_batch.arrays import Reals
+    from sobolev_batch.geometry.deviation import Deviations
     from sobolev_batch.geometry.mesh import Mesh
     from sobolev_batch.geometry.surface import Similarity
 
 # Exit statuses of a verdict; like diff, which has 1 for files that differ.
-_STATUSES = {"same": 0, "different": 1, "undecided": 4}
-# Options that a verdict knows; it chooses the accuracy of the distance itself.
-_KNOWN = {"a", "b", "below", "orders", "memory", "no_scaling", "style"}
+_STATUSES = {"same": 0, "within": 0, "different": 1, "not within": 1, "undecided": 4}
+# Options that every verdict knows; those of one on a fraction of the norm, which chooses the accuracy of the distance
+# itself; and those of one on a length.
+_KNOWN = {"a", "b", "below", "within", "style"}
+_KNOWN_OF_FRACTIONS, _KNOWN_OF_LENGTHS = {"orders", "memory", "no_scaling"}, {"unit"}
 
 # A radius beyond it, or below its inverse, is far from the unit of length.
 _FAR_UNIT = 10.0
@@ -37,7 +41,6 @@ _DEFAULT_RTOL = 1e-2
 _NO_MOTION = 1e-9
 # Numbers of `proximity` that are printed in both directions.
 _DISTANCES = {
-    "hausdorff": "Hausdorff, at least",
     "mean": "mean",
     "rms": "RMS",
     "p50": "50 % within",
@@ -68,27 +71,40 @@ class _CompareOptions:
     witness: Path | None
     no_scaling: bool
     below: float | None
+    within: str | None
     style: str
 
     def __post_init__(self) -> None:
-        if self.below is not None:
-            self._check_verdict(self.below)
+        if self.below is not None or self.within is not None:
+            self._check_verdict()
         elif self.has_lattice and self.rtol is not None:
             raise click.UsageError("--rtol chooses the lattice; leave out --xi-max and --M")
 
-    def _check_verdict(self, below: float) -> None:
+    def _check_verdict(self) -> None:
+        if self.below is not None and self.within is not None:
+            raise click.UsageError("--below and --within ask for one verdict each; leave out one of them")
+        option, allowed = "--within" if self.below is None else "--below", self.allowed_fraction
+        known = _KNOWN | (_KNOWN_OF_LENGTHS if allowed is None else _KNOWN_OF_FRACTIONS)
         context = click.get_current_context()
         given = [
             parameter.opts[0]
             for parameter in context.command.params
-            if parameter.name not in _KNOWN and getattr(self, str(parameter.name)) not in (None, False)
+            if parameter.name not in known and getattr(self, str(parameter.name)) not in (None, False)
         ]
         if given:
-            raise click.UsageError(f"--below gives a verdict and no numbers; leave out {', '.join(sorted(given))}")
-        if not 0 < below < 1:
-            raise click.UsageError(f"--below takes a fraction between 0 and 1, or 0 and 100 %, found {below:g}")
+            asked = f"{option} with a length" if allowed is None else option
+            raise click.UsageError(f"{asked} gives a verdict and no numbers; leave out {', '.join(sorted(given))}")
+        if allowed is not None and not 0 < allowed < 1:
+            raise click.UsageError(f"{option} takes a fraction between 0 and 1, or 0 and 100 %, found {allowed:g}")
         if len(self.chosen_orders) > 1:
-            raise click.UsageError("--below takes one --order")
+            raise click.UsageError(f"{option} takes one --order")
+
+    @property
+    def allowed_fraction(self) -> float | None:
+        """The fraction of the norm of B that the distance may have for a verdict; None for one on a length, or none."""
+        if self.within is None:
+            return self.below
+        return fraction(self.within) if self.within.rstrip().endswith("%") else None
 
     @property
     def chosen_orders(self) -> tuple[float, ...]:
@@ -155,6 +171,12 @@ class _CompareOptions:
 )
 @click.option("--no-scaling", is_flag=True, help="Keep the files' unit. Otherwise B is scaled to the unit sphere.")
 @below_option("Tell whether the distance is below FRACTION of the norm of B, such as 1e-3 or 0.1%, by the exit status.")
+@click.option(
+    "--within",
+    metavar="LENGTH",
+    help="Tell by the exit status whether no point of either mesh is farther from the other one than LENGTH, such as "
+    "0.1 in the files' unit, or 0.1mm with --unit. A percentage is that of --below.",
+)
 @json_option
 @click.pass_context
 def compare_command(context: click.Context, /, **options: Any) -> None:
@@ -162,13 +184,17 @@ def compare_command(context: click.Context, /, **options: Any) -> None:
 
     B is the reference. The difference is given in per cent of its norm, with a bound on the error, and with the share
     of the squared distance that a change of area explains. With --below, print one line on whether both are the same
-    surface. The exit status is then 0 if they are, 1 if they are not, 4 if that cannot be told, and 2 after any error.
+    surface, and with --within, on whether they are as near everywhere as a length. The exit status is then 0 if they
+    are, 1 if they are not, 4 if that cannot be told, and 2 after any error.
     """
-    chosen = _CompareOptions(**options)
-    if chosen.below is not None:
+    if options["below"] is not None or options["within"] is not None:
         # The usual status of other errors says that the files differ.
         context.meta[ERROR_STATUS] = EXIT_INPUT
-        context.exit(_judge_files(chosen, chosen.below))
+    chosen = _CompareOptions(**options)
+    if chosen.allowed_fraction is not None:
+        context.exit(_judge_files(chosen, chosen.allowed_fraction))
+    if chosen.within is not None:
+        context.exit(_judge_deviation_of_files(chosen, chosen.within))
     found = _Comparison.of_files(chosen)
     echo_result(chosen.style, "\n".join(map(visible, found.lines)), found.document)
     if chosen.witness is not None:
@@ -189,6 +215,17 @@ def _judge_files(options: _CompareOptions, below: float) -> int:
     return _STATUSES[verdict.outcome]
 
 
+def _judge_deviation_of_files(options: _CompareOptions, within: str) -> int:
+    """Print one line on whether two files are as near everywhere as a length, and return the exit status."""
+    from sobolev_batch.testing.within import judge_deviation
+
+    verdict = judge_deviation(options.a, options.b, within, options.unit)
+    answer = {"a": options.a, "b": options.b, "outcome": verdict.outcome, "length": verdict.length}
+    bounds = asdict(verdict.deviations.both) | asdict(verdict.deviations)
+    echo_result(options.style, visible(f"{options.a.name}: {verdict}"), answer | {"unit": verdict.unit} | bounds)
+    return _STATUSES[verdict.outcome]
+
+
 @dataclass(frozen=True, eq=False)
 class _Comparison:
     """Two meshes of files, and how much they differ.
@@ -198,7 +235,7 @@ class _Comparison:
         second: That of B.
         similarity: From this unit to that of the distances.
         results: What `distance` or `yardsticks` returns.
-        nearness: What `proximity` returns, in the unit of the files; None if not asked for.
+        nearness: What `proximity` returns, in the unit of the files, and the largest deviations; None if not asked for.
         motion: Rigid motion (4, 4) of A, and the distance before; None if not asked for.
         doubt: Question whether both are in one unit and place; None where they look it.
     """
@@ -208,7 +245,7 @@ class _Comparison:
     second: Mesh
     similarity: Similarity
     results: xr.Dataset
-    nearness: dict[str, float] | None
+    nearness: tuple[dict[str, float], Deviations] | None
     motion: tuple[Reals, xr.Dataset] | None
     doubt: str | None
 
@@ -216,7 +253,7 @@ class _Comparison:
     def of_files(cls, options: _CompareOptions) -> _Comparison:
         """Read and compare two files; what may make one doubt the result is printed as a note."""
         from sobolev_batch.geometry.formats.readers import read_mesh
-        from sobolev_batch.geometry.proximity import proximity
+        from sobolev_batch.geometry.proximity import proximity_and_deviations
         from sobolev_batch.geometry.surface import Similarity, placement_doubt
         from sobolev_batch.norms.distances import distance
         from sobolev_batch.norms.yardsticks import yardsticks
@@ -239,7 +276,7 @@ class _Comparison:
         for line in _remarks({options.a.name: first, options.b.name: second}, doubt, radius, options.unit):
             echo(f"note: {line}", err=True)
         # Bad settings are refused before a long computation.
-        nearness = proximity(first, second, threshold=options.threshold) if options.proximity else None
+        nearness = proximity_and_deviations(first, second, threshold=options.threshold) if options.proximity else None
         results = (yardsticks if options.yardsticks else distance)(*pair, orders, **accuracy)
         return cls(options, first, second, similarity, results, nearness, motion, doubt)
 
@@ -254,6 +291,7 @@ class _Comparison:
         from sobolev_batch.norms.columns import parts_as_variables
 
         motion, before = self.motion or (None, None)
+        nearness, deviations = self.nearness or (None, None)
         return {
             "a": self.options.a,
             "b": self.options.b,
@@ -263,7 +301,8 @@ class _Comparison:
             "motion": None if motion is None else motion.tolist(),
             "before": None if before is None else before["relative"].item(),
             "settings": self.results.attrs,
-            "proximity": self.nearness,
+            "proximity": nearness,
+            "deviation": None if deviations is None else asdict(deviations),
             "doubt": self.doubt,
             "defects": {"a": self.first.defects, "b": self.second.defects},
             "unit": self.options.unit,
@@ -289,7 +328,8 @@ class _Comparison:
             f"(scale {self.similarity.scale:.6g}, origin {origin})"
         )
         if self.nearness is not None:
-            yield from _proximity_lines(self.nearness, (self.first, self.second), length)
+            yield from _deviation_lines(self.nearness[1], options.unit)
+            yield from _proximity_lines(self.nearness[0], (self.first, self.second), length)
 
     def write_witness(self, path: Path) -> str:
         """Write or draw where the meshes differ, and return a line about it; see `write_difference`."""
@@ -334,6 +374,14 @@ def _remarks(meshes: Mapping[str, Mesh], doubt: str | None, size: float, unit: s
             f"without scaling, wavelengths above 1 {unit or 'file unit'} weigh alike and shorter ones less, "
             f"and the reference has a radius of {size:.4g}; leave out --no-scaling to weigh them against it"
         )
+
+
+def _deviation_lines(found: Deviations, unit: str | None) -> Iterator[str]:
+    """Yield the largest deviation each way and both, with its place."""
+    from sobolev_batch.testing.within import deviation_text
+
+    for direction, way in (("A to B", found.forward), ("B to A", found.backward), ("both", found.both)):
+        yield f"{f'largest deviation, {direction}:':<26} {deviation_text(way, unit)}"
 
 
 def _proximity_lines(found: Mapping[str, float], meshes: tuple[Mesh, Mesh], unit: str) -> Iterator[str]:

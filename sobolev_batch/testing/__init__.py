@@ -1,4 +1,4 @@
-"""Testing: is this surface the same as that one, to a tolerance?
+"""Testing: is this surface the same as that one, to a tolerance, or as near everywhere as a length?
 
 In: two surfaces and a tolerance. Out: a verdict, an assertion of test suites, and files that show where they differ.
 """

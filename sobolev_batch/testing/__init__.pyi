@@ -2,5 +2,6 @@
 from .verdict import Verdict as Verdict
 from .verdict import assert_same_surface as assert_same_surface
 from .verdict import same_surface as same_surface
+from .within import assert_within as assert_within
 
 __all__: list[str]

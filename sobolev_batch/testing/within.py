@@ -1,0 +1,124 @@
+"""Whether the largest deviation of two meshes is within a length: a verdict, and an assertion of test suites."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from typing import Literal
+
+from sobolev_batch.errors import InputError
+from sobolev_batch.geometry.deviation import Deviation, Deviations, largest_deviation
+from sobolev_batch.geometry.formats.conversion import MeshLike
+from sobolev_batch.tables.text import between
+
+# Units of length that are converted into each other, in metres.
+_METRES = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
+_LENGTH = re.compile(r"\s*(?P<number>(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?)\s*(?P<unit>\S.*?)?\s*")
+# Digits of places: of their largest coordinate, or of the deviation where that is larger.
+_PLACE_DIGITS = 6
+
+
+@dataclass(frozen=True)
+class DeviationVerdict:
+    """Answer to whether the largest deviation of two meshes is within a length; a line as text.
+
+    Attributes:
+        length: The length, in the unit of the meshes.
+        unit: Name of this unit; None where it is not known.
+        deviations: Bounds of the largest deviation, only as close as the answer needs.
+    """
+
+    length: float
+    unit: str | None
+    deviations: Deviations
+
+    @property
+    def outcome(self) -> Literal["within", "not within", "undecided"]:
+        """The answer; it is undecided where the length lies between the bounds, which rounding keeps apart."""
+        is_within = self.deviations.both.is_within(self.length)
+        return "undecided" if is_within is None else "within" if is_within else "not within"
+
+    def __str__(self) -> str:
+        """Return the answer with the bounds and the place."""
+        length = f"{self.length:.6g}{f' {self.unit}' if self.unit else ''}"
+        answer = f"undecided whether within {length}" if self.outcome == "undecided" else f"{self.outcome} {length}"
+        return f"{answer}: largest deviation {deviation_text(self.deviations.both, self.unit)}"
+
+
+def judge_deviation(a: MeshLike, b: MeshLike, length: float | str, unit: str | None = None) -> DeviationVerdict:
+    """Return whether the largest deviation of two meshes is within a length; see `assert_within`."""
+    limit = length_in(length, unit)
+    return DeviationVerdict(limit, unit, largest_deviation(a, b, within=limit))
+
+
+def assert_within(a: MeshLike, b: MeshLike, length: float | str, *, unit: str | None = None) -> Deviations:
+    """Raise an AssertionError unless no point of either mesh is farther from the other mesh than a length.
+
+    Bounds decide, and no sample: a spike or a hole that was closed is found, however small. Which vertices and
+    triangles the meshes have does not matter.
+
+    Args:
+        a: Mesh, the path of a mesh file, or a tuple of vertices (n, 3) and triangles (m, 3).
+        b: The other one, likewise, in the same unit of length.
+        length: Largest deviation that passes: a number in the unit of the meshes, or a text such as "0.1 mm".
+        unit: Name of the unit of the meshes, which a length with a unit needs. um, mm, cm, m and in are converted into
+            each other.
+
+    Returns:
+        Bounds of the largest deviation each way and both, in the unit of the meshes; they are only as close as the
+        answer needs.
+
+    Raises:
+        AssertionError: A point is farther away, or rounding leaves that open. The message is one line, with the bounds
+            and the place.
+        InputError: The length is not positive, or has a unit that cannot be converted; or see `as_mesh`.
+
+    >>> import sobolev_batch as sb
+    >>> fine, coarse = sb.shapes.icosphere(4), sb.shapes.icosphere(3)
+    >>> sb.testing.assert_within(coarse, fine, "1 mm", unit="cm").both.upper <= 0.1
+    True
+    >>> sb.testing.assert_within(coarse, fine, 0.001)
+    Traceback (most recent call last):
+        ...
+    AssertionError: not within 0.001: largest deviation 0.00... to 0.0..., at (...)
+    """
+    __tracebackhide__ = True
+    verdict = judge_deviation(a, b, length, unit)
+    if verdict.outcome != "within":
+        raise AssertionError(str(verdict))
+    return verdict.deviations
+
+
+def length_in(length: float | str, unit: str | None) -> float:
+    """Return a length as a number of a unit, whose name is None where it is not known.
+
+    >>> length_in("1 in", "mm"), length_in(0.5, None), length_in("2 voxels", "voxels")
+    (25.4, 0.5, 2.0)
+    """
+    found = None if isinstance(length, bool) else _LENGTH.fullmatch(str(length))
+    number, own = (float(found["number"]), found["unit"]) if found else (math.nan, None)
+    if not 0 < number < math.inf:
+        raise InputError(f"a length is a positive number, alone or with a unit as in '0.1 mm', found {length!r}")
+    if own is None or own == unit:
+        return number
+    if own not in _METRES:
+        raise InputError(f"{length!r} has the unit {own!r}; known are {', '.join(_METRES)}, and that of the meshes")
+    if unit is None:
+        raise InputError(
+            f"{length!r} has a unit, but that of the meshes is not known: name it, as unit='mm' in Python or --unit "
+            "mm, or give the length as a number in the unit of the meshes"
+        )
+    if unit not in _METRES:
+        raise InputError(f"{length!r} cannot be converted into {unit!r}; give the length as a number of {unit}")
+    return number * (_METRES[own] / _METRES[unit])
+
+
+def deviation_text(deviation: Deviation, unit: str | None) -> str:
+    """Return the bounds of a deviation with their unit, and the place."""
+    # What rounding makes of zero is small against the deviation.
+    largest = max(deviation.upper, *map(abs, deviation.place))
+    decimals = _PLACE_DIGITS - 1 - math.floor(math.log10(largest)) if largest else 0
+    # The sum turns a negative zero into zero.
+    place = ", ".join(f"{round(x, decimals) + 0.0:.{_PLACE_DIGITS}g}" for x in deviation.place)
+    return f"{between(deviation.lower, deviation.upper, f' {unit}' if unit else '')}, at ({place})"

@@ -1,0 +1,88 @@
+"""Whether the largest deviation of two meshes is within a length, in any unit, for tests and as an exit status."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import sobolev_batch as sb
+from sobolev_batch.cli.program import cli
+from sobolev_batch.geometry import deviation
+from sobolev_batch.testing.within import deviation_text, length_in
+from tests.geometry.test_deviation import plate
+
+
+def test_a_hole_that_was_closed_fails_and_names_its_place() -> None:
+    full, hole = plate(hole=False), plate(hole=True)
+    found = sb.testing.assert_within(full, hole, 3.1)
+    assert 0 < found.both.lower < 3 < found.both.upper <= 3.1
+    with pytest.raises(AssertionError, match=r"^not within 2: largest deviation 2\.99\d.*, at \(0, 0, 0\)$"):
+        sb.testing.assert_within(full, hole, 2)
+    # A length that is reached is not exceeded.
+    box = sb.shapes.icosphere(1)
+    sb.testing.assert_within(box, sb.Mesh(box.vertices, box.triangles[::-1]), 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("length", "unit", "passes"),
+    [
+        ("3.2 mm", "mm", True),
+        ("0.29cm", "mm", False),
+        ("0.32 cm", "mm", True),
+        ("1in", "cm", False),
+        ("9 in", "cm", True),
+    ],
+)
+def test_units_are_converted(length: str, unit: str, passes: bool) -> None:
+    meshes = plate(hole=False), plate(hole=True)
+    if passes:
+        sb.testing.assert_within(*meshes, length, unit=unit)
+    else:
+        with pytest.raises(AssertionError, match=rf"^not within \S+ {unit}: .* {unit}, at "):
+            sb.testing.assert_within(*meshes, length, unit=unit)
+
+
+def test_lengths_in_units() -> None:
+    assert length_in("1e-3 m", "um") == pytest.approx(1000)
+    assert length_in(".5", "in") == length_in(np.float64(0.5), "mm") == 0.5
+    assert length_in("2voxels", "voxels") == 2
+
+
+@pytest.mark.parametrize(
+    ("length", "unit", "message"),
+    [
+        ("0.1 mm", None, "name it, as unit='mm'"),
+        ("0.1 mm", "voxels", "cannot be converted into 'voxels'"),
+        ("3 furlong", "mm", "known are um, mm, cm, m, in"),
+        ("1 %", "mm", "has the unit '%'"),
+        *(
+            (wrong, "mm", "a positive number")
+            for wrong in ("0", "-1 mm", "mm", "", "nan", "1e999", 0, -0.1, True, None)
+        ),
+    ],
+)
+def test_other_lengths_are_refused(length: str, unit: str | None, message: str) -> None:
+    with pytest.raises(sb.errors.InputError, match=message):
+        sb.testing.assert_within(plate(hole=False), plate(hole=True), length, unit=unit)
+
+
+def test_an_open_question_fails_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    meshes = plate(hole=False), plate(hole=True)
+    length = 1.001 * sb.largest_deviation(*meshes, gap=1e-4).both.lower
+    monkeypatch.setattr(deviation, "_MOST_PIECES", 0)
+    with pytest.raises(AssertionError, match=r"^undecided whether within \S+: largest deviation \S+ to \S+, at "):
+        sb.testing.assert_within(*meshes, length)
+    files = [str(tmp_path / name) for name in ("a.ply", "b.ply")]
+    for mesh, file in zip(meshes, files, strict=True):
+        sb.write_mesh(mesh, file)
+    done = CliRunner().invoke(cli, ["compare", *files, "--within", repr(length)])
+    assert (done.exit_code, done.stdout.startswith("a.ply: undecided")) == (4, True)
+
+
+@pytest.mark.parametrize("unit", [None, "mm"])
+def test_bounds_are_rounded_outwards_and_places_of_rounding_are_zero(unit: str | None) -> None:
+    found = deviation.Deviation(0.33312, 0.33519, (60.0, -1e-17, 10.25))
+    assert deviation_text(found, unit) == f"0.3331 to 0.3352{' mm' if unit else ''}, at (60, 0, 10.25)"
