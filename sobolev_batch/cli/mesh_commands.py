@@ -14,7 +14,6 @@ from sobolev_batch.cli.options import PATH, below_option, json_option, memory_si
 from sobolev_batch.cli.output import echo, echo_result
 from sobolev_batch.cli.program import ERROR_STATUS, EXIT_INPUT, cli
 from sobolev_batch.norms import DEFAULT_ORDER
-from sobolev_batch.parameters import fraction
 from sobolev_batch.plugins import FEATURES, extra
 from sobolev_batch.visible import FILE_UNITS, visible
 
@@ -102,6 +101,8 @@ class _CompareOptions:
     @property
     def allowed_fraction(self) -> float | None:
         """The fraction of the norm of B that the distance may have for a verdict; None for one on a length, or none."""
+        from sobolev_batch.parameters import fraction
+
         if self.within is None:
             return self.below
         return fraction(self.within) if self.within.rstrip().endswith("%") else None
