@@ -239,7 +239,7 @@ def test_the_page_about_test_suites_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert len(blocks("docs/testing.md", "python")) == 2
+    assert len(blocks("docs/testing.md", "python")) == 3
     results = run_blocks("docs/testing.md")
     assert capsys.readouterr().out.startswith("same surface: relative distance at most 0.0036 at order -2")
     results["test_mesher"]((96, 48))

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -166,7 +167,12 @@ def run(
             return started, watch
 
         known_workers = cache(lambda libraries: prepare_workers(start()[0], libraries))
-        announce = cache(lambda: notify(Progress("cluster", 0, 0, start()[0].dashboard_link)))
+
+        @cache
+        def announce() -> None:
+            # Without bokeh, a cluster of this process has a page that says no more than that.
+            if client is not None or find_spec("bokeh"):
+                notify(Progress("cluster", 0, 0, start()[0].dashboard_link))
 
         def equip(study: Study) -> tuple[Cluster, Watch]:
             started, watch = start()
@@ -258,7 +264,7 @@ def carry_out(
     plan: Plan | None = None
     if study.accuracy is not None and stored_choice(location) is None:
         # Pilots are made and compared, which takes as long as some of the study's tasks.
-        plan = yield from _planned(study, equip(study)[0])
+        plan = yield from _planned(study, replace(equip(study)[0], notify=notify))
     workspace = Workspace.of_study(study, location, lock, plan)
     with Heartbeat(workspace.store, lock).kept() as heartbeat:
         if lacks_nothing(workspace):
@@ -283,8 +289,10 @@ def _planned(study: Study, cluster: Cluster) -> Stages[Plan]:
     """Plan a study on a worker."""
     cluster.workers.require_accuracy(study.accuracy)
     plans: list[Plan] = []
+    advance = cluster.count_steps("lattice", 1)
     task = Task(plan_by_itself, (study,), stage="plan")
     yield Wave(cluster, [task], lambda _, outcome: plans.append(result_of(outcome)))
+    advance("", None)
     return plans[0]
 
 

@@ -25,7 +25,7 @@ StoreLike = str | Path | Location | None
 
 _DEFAULT_FOLDER = Path("storage")
 # Folder beside a store for the meshes that its study makes, and commands that a refusal lists.
-_MADE_MESHES, _MOST_COMMANDS = "made-meshes", 3
+MADE_MESHES, _MOST_COMMANDS = "made-meshes", 3
 
 
 def settled(study: StudyLike, store: StoreLike, *, may_run: bool) -> tuple[AnyStudy, Location]:
@@ -35,7 +35,7 @@ def settled(study: StudyLike, store: StoreLike, *, may_run: bool) -> tuple[AnySt
     """
     study = as_study(study)
     location = Location.parse(_DEFAULT_FOLDER / f"{study.name}.zarr" if store is None else store)
-    return study.with_cache(MeshCache(location.absolute().beside(_MADE_MESHES), may_run)), location
+    return study.with_cache(MeshCache(location.absolute().beside(MADE_MESHES), may_run)), location
 
 
 def ready_to_run(

@@ -21,6 +21,8 @@ from sobolev_batch.visible import visible, visible_lines
 if TYPE_CHECKING:
     from sobolev_batch.batch.cluster.execution import Progress
 
+# Labels of bars, of one length.
+_STAGES = {"lattice": "lattice   ", "fields": "transforms", "reduction": "tables    ", "proximity": "proximity "}
 _CLEAR_LINE = "\r\x1b[K"
 # Time after which a silent command says that it goes on, and that between such lines without a terminal.
 _PATIENCE_SECONDS, _SECONDS_BETWEEN_LINES = 2.0, 30.0
@@ -113,19 +115,22 @@ def progress_reports() -> Iterator[Callable[[Progress], None]]:
 
         def show(progress: Progress) -> None:
             nonlocal bar
-            part = f"{progress.part}: " if progress.part else ""
             if progress.stage == "cluster":
                 echo(progress, err=True)
             elif not sys.stderr.isatty():
                 if progress.record is not None or progress.done == progress.total:
                     echo(progress, err=True)
-            elif progress.done == 0:
-                bars.close()
-                stage = {"fields": "transforms", "reduction": "tables    ", "proximity": "proximity "}[progress.stage]
-                bar = bars.enter_context(progress_bar(progress.total, part + stage))
-            else:
+            elif progress.done:
                 bar.update(1)
-            if progress.done == progress.total:
+            elif progress.part and bar is not None:
+                # Objects go on side by side: one bar has the steps of all that have begun.
+                bar.length += progress.total
+                bar.update(0)
+            else:
+                bars.close()
+                label = "all objects" if progress.part else _STAGES[progress.stage]
+                bar = bars.enter_context(progress_bar(progress.total, label))
+            if progress.done == progress.total and not progress.part:
                 bars.close()
 
         yield show

@@ -143,7 +143,7 @@ def submit_command(
 ) -> None:
     """Hand STUDY over to a cluster and return.
 
-    The cluster computes it without this process. The objects of a study are handed over one after another.
+    The cluster computes it without this process. Each object of a study is handed over by itself.
     """
     from sobolev_batch.batch.cluster.clients import remote_client
     from sobolev_batch.batch.submit import submit
@@ -180,8 +180,9 @@ def plan_command(
 ) -> None:
     """Show what running STUDY would do.
 
-    Nothing is computed. The plan has the lattice and the reasons for it, the tasks and their memory, the bytes to be
-    stored, and the number of surfaces that the store has already.
+    No field is computed, but a lattice for an [accuracy] is chosen, for which a few meshes are made and compared. The
+    plan has the lattice and the reasons for it, the tasks and their memory, the bytes to be stored, and the number of
+    surfaces that the store has already.
     """
     from sobolev_batch.batch.cluster.clients import remote_client
     from sobolev_batch.batch.dry_run import CollectionPlan, plan

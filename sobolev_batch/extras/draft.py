@@ -15,6 +15,7 @@ from itertools import chain, takewhile
 from pathlib import Path, PurePosixPath
 from string import Template
 
+from sobolev_batch.batch.start import MADE_MESHES
 from sobolev_batch.errors import MeshError, StudyError, written
 from sobolev_batch.geometry.formats.by_name import is_mesh_name, mesh_stem
 from sobolev_batch.geometry.formats.readers import expected_size, read_mesh
@@ -150,12 +151,14 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
 def _look_at(folder: Path) -> tuple[dict[PurePosixPath, int], dict[str, str]]:
     """Return the number of triangles of each mesh file that a study can name, and the reason for each other file.
 
-    Paths below the folder are in their natural order. Hidden files, stores, and links to folders are left out. Small
-    files are read as a whole, up to some bytes together.
+    Paths below the folder are in their natural order. Hidden files, stores, the meshes made beside these, and links to
+    folders are left out. Small files are read as a whole, up to some bytes together.
     """
     found: list[str] = []
     for parent, folders, files in os.walk(folder):
-        folders[:] = [name for name in folders if not name.startswith(".") and not name.endswith(".zarr")]
+        folders[:] = [
+            name for name in folders if not name.startswith(".") and not name.endswith((".zarr", MADE_MESHES))
+        ]
         meshes = (Path(parent, name) for name in files if not name.startswith("."))
         found += [path.relative_to(folder).as_posix() for path in meshes if is_mesh_name(path)]
         if len(found) > MOST_MESHES:

@@ -130,13 +130,13 @@ def choose_lattice(
     pilots = choose_pilots(members, similarity, reference.extent, look)
     look.at_all(members, similarity, reference.extent)
     for label, reason in look.set_aside.items():
-        _log.warning("%s has no say in the choice of the lattice: %s", label, reason)
+        _log.warning("the lattice is chosen without %s: %s", label, reason)
     if not pilots:
         examples = [f"{label}: {reason}" for label, reason in look.set_aside.items()]
         raise StudyError(
             "none of the study's surfaces can serve to choose a lattice"
             + (f" ({examples[0]})" if examples else ", since all are too large")
-            + "; see what is wrong with them, or give a [lattice] instead of an [accuracy]"
+            + "; mend what is wrong with them. If they are sound, give a [lattice] instead of an [accuracy]"
         )
     extent = Extent.union([reference.extent, *look.extents.values()])
     widths, reach = _REACH_MARGIN * extent.widths, _REACH_MARGIN * extent.reach

@@ -147,6 +147,7 @@ def test_links_to_files_count_and_those_to_folders_do_not(tmp_path: Path) -> Non
 def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
     write(tmp_path / "in" / "original.ply", 3)
     write(tmp_path / "in" / "old.zarr" / "mesh.ply", 4)
+    write(tmp_path / "in" / "made-meshes" / "3023ee15.ply", 4)
     for name in ("scan_1.ply", "scan_2.ply", "{object}.ply", "Scan_1.ply", "\x1b[31mred.ply"):
         write(tmp_path / "in" / name, 1)
     for name in ("scan_3.ply", "notes.txt"):

@@ -101,12 +101,12 @@ def test_a_period_beyond_a_small_lattice_leads_to_octaves(tmp_path: Path) -> Non
 
 
 def test_a_lattice_that_turns_out_too_small_grows(
-    client: Client, store_path: Path, monkeypatch: pytest.MonkeyPatch
+    threads: Client, store_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     chosen = make_plan(asking()).choice
     small = sb.Lattice(0.6 * chosen.lattice.xi_max, chosen.lattice.M)
     monkeypatch.setattr(search_module, "run_pilot", on_lattice(small))
-    summary = sb.run(asking(), store_path, client)
+    summary = sb.run(asking(), store_path, threads)
     grown = stored_choice(store_path)
     assert grown is not None
     assert "grown" in grown.reasons[-1]
@@ -116,11 +116,11 @@ def test_a_lattice_that_turns_out_too_small_grows(
 
 
 def test_what_falls_short_in_the_end_is_marked(
-    client: Client, store_path: Path, monkeypatch: pytest.MonkeyPatch
+    threads: Client, store_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run_module, "_MOST_ROUNDS", 1)
     monkeypatch.setattr(search_module, "run_pilot", on_lattice(sb.Lattice(1.2, 12)))
-    sb.run(asking(), store_path, client)
+    sb.run(asking(), store_path, threads)
     tree = sb.open_store(store_path)
     assert not variable(tree, "convergence", "within").sel(mesh="ico/1", order=-4.0)
     assert re.search(r"^ico/1 .*[!*]", format_table(tree), re.MULTILINE)

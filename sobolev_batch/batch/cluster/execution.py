@@ -6,7 +6,7 @@ Each step is reported to those who watch.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import count
@@ -23,7 +23,14 @@ from sobolev_batch.store.records import Record
 from sobolev_batch.study.study import Study
 
 Result = TypeVar("Result")
-Stage = Literal["cluster", "fields", "reduction", "proximity"]
+Stage = Literal["cluster", "lattice", "fields", "reduction", "proximity"]
+# What was done in a step of a stage, for people.
+_DONE: Mapping[Stage, str] = {
+    "lattice": "lattices chosen",
+    "fields": "transforms",
+    "reduction": "tables reduced",
+    "proximity": "Hausdorff and Chamfer distances measured",
+}
 
 
 @dataclass(frozen=True)
@@ -31,8 +38,9 @@ class Progress:
     """One step of a run.
 
     Attributes:
-        stage: "cluster" once there is one, "fields" while meshes are transformed, "reduction" while
-            tables are computed, "proximity" while Hausdorff and Chamfer distances are measured.
+        stage: "cluster" once there is one, "lattice" while one is chosen for an accuracy, "fields" while meshes are
+            transformed, "reduction" while tables are computed, "proximity" while Hausdorff and Chamfer distances are
+            measured.
         done, total: Steps of the stage.
         label: Label of the mesh that was finished, or address of the cluster's dashboard; else empty.
         part: Object of a collection that is worked on, and its number, such as "cow, 2 of 8"; else empty.
@@ -52,9 +60,7 @@ class Progress:
         if self.record is not None:
             outcome = self.record.reason or f"{self.record.seconds:.2f} s"
             return f"{part}[{self.done}/{self.total}] {self.label}: {self.record.status}, {outcome}"
-        if self.stage == "proximity":
-            return f"{part}{count} Hausdorff and Chamfer distances measured"
-        return f"{part}{count} {'transforms' if self.stage == 'fields' else 'tables reduced'}"
+        return f"{part}{count} {_DONE[self.stage]}"
 
 
 Notify = Callable[[Progress], None]
