@@ -157,7 +157,7 @@ class _CompareOptions:
     help="Divide each axis of the lattice into M intervals, in place of --rtol. [default: 64 with --xi-max]",
 )
 @click.option("--yardsticks", is_flag=True, help="Print which move, noise and decimation bring B as far from itself.")
-@click.option("--proximity", is_flag=True, help="Also print Hausdorff, mean, RMS and other usual distances.")
+@click.option("--proximity", is_flag=True, help="Also print the largest deviation, mean, RMS and other distances.")
 @click.option(
     "--threshold", type=float, help="Take this length for the F-score of --proximity. [default: 1 % of the radius of B]"
 )
