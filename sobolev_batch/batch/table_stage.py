@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any, Literal
 
@@ -23,7 +23,15 @@ from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.norms.fields import Quality
 from sobolev_batch.sources.names import natural_key
 from sobolev_batch.sources.programs import Cost
-from sobolev_batch.store.layout import DISTANCES, PAIRS_KEYS, QUALITY, hide_tables, table_attributes, write_table
+from sobolev_batch.store.layout import (
+    DISTANCES,
+    PAIRS_KEYS,
+    QUALITY,
+    Metadata,
+    hide_tables,
+    table_attributes,
+    write_table,
+)
 from sobolev_batch.store.records import Facts, Record
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.plan import Row
@@ -94,30 +102,30 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> Stages[NormEstima
 
     for tasks in (of_spectra, of_pairs):
         yield Wave(cluster, tasks, take, projected_bytes)
-    distances: list[NormEstimate] = []
-    arguments = workspace, workspace.store.documents, reducer, meshes, digest, replaced
+    written: list[tuple[NormEstimate, Metadata]] = []
+    arguments = workspace, workspace.store.metadata, reducer, meshes, digest, replaced
     last = Task(write_results, arguments, projected_bytes, stage="tables")
-    yield Wave(cluster, [last], lambda _, outcome: distances.append(result_of(outcome)), projected_bytes)
-    workspace.store.reread()
-    return distances[0]
+    yield Wave(cluster, [last], lambda _, outcome: written.append(result_of(outcome)), projected_bytes)
+    ((distances, workspace.store.metadata),) = written
+    return distances
 
 
 def write_results(
     workspace: Workspace,
-    documents: Mapping[str, Any],
+    metadata: Metadata,
     reducer: Reducer,
     meshes: xr.Dataset,
     digest: str,
     replaced: Sequence[str],
-) -> NormEstimate:
+) -> tuple[NormEstimate, Metadata]:
     """Write the tables that follow from stored spectra, on a worker; return the distances to the reference.
 
-    A store travels without what it knows of metadata, hence the documents. Done again, it writes the same.
+    A store travels without its metadata, which go there and back beside it. Done again, the task writes the same.
     """
-    workspace.store.documents = dict(documents)
+    workspace.store.metadata = metadata
     results = Results.from_spectra(reducer, meshes, workspace.plan.reference)
     _write_tables(workspace, results, digest, replaced)
-    return NormEstimate(*results.to_reference)
+    return NormEstimate(*results.to_reference), workspace.store.metadata
 
 
 def _pairs(workspace: Workspace) -> Pairs | None:

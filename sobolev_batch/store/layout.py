@@ -18,6 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from itertools import accumulate
 from pathlib import Path
+from threading import Lock
 from typing import Any, Self
 
 import numpy as np
@@ -57,6 +58,9 @@ _OF_ROWS = frozenset({FIELD, OCTAVES, RECORD, PAGE})
 _FILL_VALUES: dict[str, Any] = {"U": "", "c": complex(np.nan, np.nan), "f": np.nan}
 # Most of the time of a request is spent waiting.
 _REQUESTS_AT_ONCE = 64
+_of_one_thread = Lock()
+# Documents, and hashes of keys.
+Metadata = tuple[dict[str, Document], dict[str, str]]
 # Tasks write into the chunks of these groups; all others are tables, written, listed and hidden as a whole.
 GROUPS_OF_TASKS = ("fourier", OCTAVES_GROUP, SPECTRA_GROUP, RECORDS)
 
@@ -94,10 +98,14 @@ class Store:
         store.documents = self.documents
         return store
 
-    def reread(self) -> None:
-        """Read the metadata again, which another process has changed."""
-        self.documents, self._hashes = {}, {}
-        self.attributes()
+    @property
+    def metadata(self) -> Metadata:
+        """What is known of the metadata, which a store leaves behind when it travels to another process."""
+        return dict(self.documents), dict(self._hashes)
+
+    @metadata.setter
+    def metadata(self, known: Metadata) -> None:
+        self.documents, self._hashes = known
 
     @property
     def path(self) -> str:
@@ -437,8 +445,8 @@ def dataset_keys(group: str, dataset: xr.Dataset) -> dict[str, bytes]:
         for name, variable in dataset.variables.items()
         if variable.ndim
     }
-    # A missing chunk is a lost one, and never a table of zeros.
-    with zarr.config.set({"array.write_empty_chunks": True}):
+    # A missing chunk is a lost one, and never a table of zeros. The setting is that of all threads.
+    with _of_one_thread, zarr.config.set({"array.write_empty_chunks": True}):
         dataset.to_zarr(MemoryStore(keys), group=group, mode="w", zarr_format=3, consolidated=False, encoding=encoding)
     # xarray writes several at a time, in any order.
     places = {str(name): place for place, name in enumerate(dataset.variables)}

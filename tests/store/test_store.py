@@ -7,11 +7,13 @@ import os
 import shutil
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import xarray as xr
 import zarr
 from distributed import Client
 
@@ -22,7 +24,7 @@ from sobolev_batch.errors import LockError, StoreError
 from sobolev_batch.store import metadata as documents
 from sobolev_batch.store.create import prepare_store
 from sobolev_batch.store.field_arrays import Fields
-from sobolev_batch.store.layout import Store
+from sobolev_batch.store.layout import Store, dataset_keys
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, locked
 from sobolev_batch.store.records import Record, Records
@@ -277,3 +279,10 @@ def test_what_no_record_needs_is_counted_and_then_removed(copy: Path, threads: C
     assert len(run(whole, copy, threads).computed) == 1
     with locked(Location.parse(copy), Lock.of_this_process()), pytest.raises(LockError):
         prune(Location.parse(copy), is_dry=False)
+
+
+def test_tables_of_zeros_are_whole_where_threads_write_several() -> None:
+    zeros = xr.Dataset({f"column{k}": ("mesh", np.zeros(3)) for k in range(8)})
+    with ThreadPoolExecutor(4) as pool:
+        written = list(pool.map(lambda _: dataset_keys("table", zeros), range(24)))
+    assert all({f"table/column{k}/c/0" for k in range(8)} <= keys.keys() for keys in written)
