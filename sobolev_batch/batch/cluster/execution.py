@@ -24,6 +24,8 @@ from sobolev_batch.study.study import Study
 
 Result = TypeVar("Result")
 Stage = Literal["cluster", "lattice", "fields", "reduction", "proximity"]
+# Runs that have begun and not ended: each has a thread for its heartbeat, and its records in memory.
+_MOST_RUNS = 64
 # What was done in a step of a stage, for people.
 _DONE: Mapping[Stage, str] = {
     "lattice": "lattices chosen",
@@ -64,9 +66,6 @@ class Progress:
 
 
 Notify = Callable[[Progress], None]
-
-# Runs that have begun and not ended: each has a thread for its heartbeat, and its records in memory.
-_MOST_RUNS = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,6 +227,8 @@ class _Run(Generic[Result]):
 
     def advance(self, error: BaseException | None = None) -> None:
         """Go on to the next wave, or raise StopIteration with the result. An error is raised where the run waits."""
+        # A run that ends waits for no wave, whose other tasks may still come back.
+        self.wave = None
         self.suspects.clear()
         self.wave = next(self.stages) if error is None else self.stages.throw(error)
         self.tasks, self.has_more = iter(self.wave.tasks), True
@@ -335,12 +336,13 @@ class _Loop(Generic[Result]):
             run.in_flight -= 1
         for (run, wave, task), outcome in zip(ended, outcomes, strict=True):
             if run.wave is not wave:
-                continue  # an outcome before this one ended the wave
+                continue  # An outcome before this one ended the wave.
             if isinstance(outcome, KilledWorker) and task is not self._alone:
                 run.suspects.append(task)
             else:
                 self._give(run, task, _deadly(outcome) if isinstance(outcome, KilledWorker) else outcome)
-        self._alone = None
+        if any(task is self._alone for _, _, task in ended):
+            self._alone = None
         for run in dict.fromkeys(run for run, _, _ in ended):
             self._go_on(run)
 

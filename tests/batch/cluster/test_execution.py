@@ -10,7 +10,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from distributed import Client, Event, Future, KilledWorker, LocalCluster
+from distributed import Client, Event, Future, KilledWorker, LocalCluster, as_completed
 from distributed.utils import key_split
 
 from sobolev_batch import Study, StudyCollection, plan, run, submit
@@ -220,6 +220,21 @@ def test_the_end_of_one_run_is_none_of_the_others(cluster: Cluster) -> None:
         list(side_by_side(((name, stages(name)) for name in runs), is_fatal=lambda error: True))
     # All of them gave up what they had.
     assert set(closed) >= {"bad", "other"}
+
+
+def test_a_run_ends_once_where_many_of_its_tasks_fail(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    def all_at_once(self: as_completed, block: bool = True) -> list[Future]:
+        return [next(self) for _ in range(self.count())] if block else []
+
+    def stages(error: Exception | None) -> Stages[str]:
+        function, argument = (abs, -1) if error is None else (_fail, error)
+        yield Wave(cluster, [Task(function, (argument,)) for _ in range(4)], lambda _, outcome: result_of(outcome))
+        return "done"
+
+    monkeypatch.setattr(as_completed, "next_batch", all_at_once)
+    outcomes = dict(side_by_side([("bad", stages(InputError("no mesh"))), ("good", stages(None))]))
+    assert isinstance(outcomes["bad"], InputError)
+    assert outcomes["good"] == "done"
 
 
 @pytest.mark.all
