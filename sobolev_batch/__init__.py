@@ -25,7 +25,7 @@ The public names by subject:
 - Meshes: `Mesh`, `as_mesh` (of paths, arrays and other libraries' meshes), `read_mesh`, `write_mesh`; `fit` moves the
   vertices of one towards a target.
 - Fields: `fourier_transform` on a `Lattice`; all of the above are methods of `field.sobolev`.
-- Studies: `Study`, `StudyCollection`, `init_study`, `plan`, `run`, `submit`.
+- Studies: `Study`, `init_study`, `plan`, `run`, `submit`.
 - Stores: `open_store`, `status`, `verify`, `unlock`.
 - Results of a store: `table`, `smallest_below`, `matrix`, `evolution` (over time), `league`, `compare_studies`,
   `report`, `write_witness`.

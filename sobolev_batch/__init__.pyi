@@ -33,7 +33,6 @@ from .norms.fields import fourier_transform as fourier_transform
 from .norms.yardsticks import yardsticks as yardsticks
 from .store.unlock import unlock as unlock
 from .study.study import Study as Study
-from .study.study import StudyCollection as StudyCollection
 from .tables.convergence import smallest_below as smallest_below
 from .tables.convergence import table as table
 from .tables.matrix import matrix as matrix

@@ -226,7 +226,7 @@ def test_a_plan_that_looks_at_meshes_reads_none_of_them_twice(tmp_path: Path, co
     study = five_files(tmp_path, lattice=None, accuracy={"rtol": 0.3}, norm={"orders": [-4.0]})
     counts.clear()
     plan = sb.plan(study, "memory://looked-at.zarr")
-    assert (len(plan.labels), plan.doubtful) == (6, {})
+    assert (len(plan.object.labels), plan.object.doubtful) == (6, {})
     assert counts["lists of files"] == 2
     for file in tmp_path.glob("*.ply"):
         assert counts[f"bytes of {file.name}"] // file.stat().st_size == 1, file

@@ -85,7 +85,7 @@ def test_the_study_of_a_page_is_valid(page: str, families: list[str], tmp_path: 
     (text,) = blocks(page, "toml")
     (tmp_path / "study.toml").write_text(text)
     study = sb.Study.from_toml(tmp_path / "study.toml")
-    assert [family.name for family in study.families] == families
+    assert [family.name for family in study.object.families] == families
     if page == "README.md":
         on_lattice = re.sub(
             r"^\[accuracy\].*?\n\n", blocks("docs/studies.md", "toml")[1] + "\n", text, flags=re.M | re.S
@@ -102,16 +102,16 @@ def test_the_studies_of_leagues_are_valid(tmp_path: Path, monkeypatch: pytest.Mo
     by_names, one_object, meshes = blocks("docs/leagues.md", "toml")
     Path("meshes.csv").write_text(blocks("docs/leagues.md", "csv")[0])
     found = [
-        sb.StudyCollection.from_table(tomllib.loads(text))
+        sb.Study.from_table(tomllib.loads(text))
         for text in (by_names, by_names + one_object, by_names.partition("[reference]")[0] + meshes)
     ]
-    assert [list(one.studies) for one in found] == [["cow", "statue"], ["cow"], ["cow"]]
-    assert [[family.name for family in one.studies["cow"].families] for one in found] == [
+    assert [list(one.objects) for one in found] == [["cow", "statue"], ["cow"], ["cow"]]
+    assert [[family.name for family in one.objects["cow"].families] for one in found] == [
         ["quick", "decimated"],
         ["quick", "decimated"],
         ["quick"],
     ]
-    assert dict(found[0].lacking) == {"statue": ("quick",)}
+    assert {name: one.lacking for name, one in found[0].objects.items() if one.lacking} == {"statue": ("quick",)}
 
 
 @pytest.mark.slow
@@ -230,7 +230,7 @@ def test_the_page_about_surfaces_that_move_runs(
 
 def test_the_workflow_of_a_flow_is_a_valid_study() -> None:
     study = sb.Study.from_toml(ROOT / "workflows/flow.toml")
-    levels = [family.source.members(ROOT) for family in study.families]
+    levels = [family.source.members(ROOT) for family in study.object.families]
     assert [len(members) for members in levels] == [14, 14, 14]
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any, overload
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import chain, repeat, starmap
+from time import process_time
+from typing import Any
 
 from distributed import Client
 
@@ -27,7 +28,7 @@ from sobolev_batch.store.records import Record
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.pilots import Look
 from sobolev_batch.study.plan import Plan, Row, make_plan
-from sobolev_batch.study.study import Study, StudyCollection, StudyLike
+from sobolev_batch.study.study import Study, StudyLike
 from sobolev_batch.tables.pairs import PAIR_BYTES, tile_count
 from sobolev_batch.tables.text import beside, duration
 from sobolev_batch.transform.fourier import field_seconds, slowness
@@ -42,18 +43,14 @@ _PROCESS_SECONDS, _CLUSTER_SECONDS = 4.0, 6.0
 _FEWEST_RECORDS = 3
 
 
-def forecast(
-    plan: Plan, stored: Mapping[str, Record], workers: Workers, client: Client | None, planning_seconds: float
-) -> tuple[float, float, list[str]]:
-    """Predict the time of a run on workers, of a client if it does not start them, without the stored fields, by label.
-
-    Return the seconds from the start to the end, if the workers have their cores for themselves; seconds of a
-    processor, of all tasks and processes, planning included where a run plans again; and lines that show both.
-    """
-    missing = [row.label for row in plan.rows if row.label not in stored]
-    if not missing:
-        return 0.0, 0.0, ["nothing is missing"]
+def seconds_of_missing(
+    plan: Plan, stored: Mapping[str, Record], workers: Workers, client: Client | None
+) -> tuple[dict[str, float], str]:
+    """Predict the processor seconds of each surface that is missing, by label; return also what tells the speed."""
     predicted = {row.label: _row_seconds(plan, row) for row in plan.rows}
+    missing = [label for label in predicted if label not in stored]
+    if not missing:
+        return {}, ""
     if len(stored) >= _FEWEST_RECORDS:
         spent = sum(record.seconds for record in stored.values())
         factor = spent / sum(predicted[label] for label in stored)
@@ -62,17 +59,7 @@ def forecast(
         factor, basis = slowness(), "a transform on this machine"
     else:
         factor, basis = worker_slowness(client, workers.members[0].address), "a transform on a worker"
-    times = [factor * predicted[label] for label in missing]
-    processes, start = (0.0, 0.0) if client else (_PROCESS_SECONDS * (1 + len(workers.members)), _CLUSTER_SECONDS)
-    processor_seconds = planning_seconds + processes + sum(times)
-    seconds = planning_seconds + start + max(sum(times) / workers.threads, *times)
-    fields = f"{len(missing)} missing field{'s' * (len(missing) != 1)}"
-    tasks = f"{workers.threads} task{'s' * (workers.threads != 1)} at once"
-    lines = [
-        f"about {duration(seconds, digits=2)} for {fields}, with {tasks}",
-        f"{duration(processor_seconds, digits=2)} of processor time; the speed is that of {basis}",
-    ]
-    return seconds, processor_seconds, lines
+    return {label: factor * predicted[label] for label in missing}, basis
 
 
 def _row_seconds(plan: Plan, row: Row) -> float:
@@ -87,11 +74,10 @@ def _row_seconds(plan: Plan, row: Row) -> float:
 
 
 @dataclass(frozen=True)
-class StudyPlan(Shown):
-    """Forecast of a run of a study; ``print(plan)`` shows what ``sobolev-batch plan`` shows.
+class ObjectPlan:
+    """Forecast of the run of an object.
 
     Attributes:
-        study: Study.
         store: Path or URL of its store.
         labels: Labels of all surfaces, the reference among them.
         reference: Label of the reference.
@@ -105,19 +91,18 @@ class StudyPlan(Shown):
         similarity: Similarity from the meshes' own unit of length to the study's.
         field_bytes: Bytes of one stored field.
         memory_bytes: Projected peak memory of each surface's largest task, by label.
-        seconds: Time that a run will take on the workers, if they have their cores for themselves. It leaves out
-            Hausdorff and Chamfer distances, and distances of very many pairs.
-        processor_seconds: Processor time that a run will take, that of starting processes included.
+        task_seconds: Processor time of the tasks of each surface that is missing, by label. It leaves out Hausdorff and
+            Chamfer distances, and distances of very many pairs.
+        planning_seconds: Processor time of the choice of a lattice, where a run makes it again.
+        lacks_tables: True where no field is missing, and tables, or distances of other kinds, are.
         lines: What is shown: name and text of each line; an empty name goes on with the line before.
-        warnings: What would make a run useless or end it, see `warnings_of`.
 
     >>> import sobolev_batch as sb
-    >>> plan = sb.plan("workflows/icosphere.toml")
-    >>> plan.reference, plan.octaves, plan.dtype
-    ('reference', 0, 'complex128')
+    >>> plan = sb.plan("workflows/icosphere.toml").object
+    >>> plan.reference, plan.octaves, plan.dtype, plan.task_seconds
+    ('reference', 0, 'complex128', {})
     """
 
-    study: Study
     store: str
     labels: tuple[str, ...]
     reference: str
@@ -130,31 +115,105 @@ class StudyPlan(Shown):
     similarity: Similarity
     field_bytes: int
     memory_bytes: dict[str, float]
-    seconds: float
-    processor_seconds: float
+    task_seconds: dict[str, float]
+    planning_seconds: float
+    lacks_tables: bool
     lines: tuple[tuple[str, str], ...] = field(repr=False)
-    warnings: tuple[str, ...] = ()
 
     @property
     def total_bytes(self) -> int:
         """Bytes of all stored fields."""
         return self.field_bytes * len(self.labels)
 
+    @property
+    def shortest_seconds(self) -> float:
+        """Time that its run takes where each surface has a processor for itself."""
+        return self.planning_seconds + max(self.task_seconds.values(), default=0.0)
+
     def to_table(self) -> dict[str, Any]:
-        """Return the numbers for programs, with the name of the study and without what is shown."""
-        numbers = {name: value for name, value in vars(self).items() if name != "lines"}
-        return {**numbers, "study": self.study.name, "total_bytes": self.total_bytes}
+        """Return the numbers for programs, without what is shown."""
+        return {
+            **{name: value for name, value in vars(self).items() if name != "lines"},
+            "total_bytes": self.total_bytes,
+        }
+
+
+@dataclass(frozen=True)
+class StudyPlan(Shown):
+    """Forecast of a run of a study; ``print(plan)`` shows what ``sobolev-batch plan`` shows.
+
+    Attributes:
+        study: Name of the study.
+        store: Path or URL of its store.
+        objects: Plan of each object that can be carried out, by its name; that of an only object may be under "".
+        refused: Reason for each other object, by its name.
+        seconds: Time that a run will take on the workers, if they have their cores for themselves. It leaves out
+            Hausdorff and Chamfer distances, and distances of very many pairs.
+        processor_seconds: Processor time that a run will take, that of starting processes included.
+        time: What is shown of both, line by line.
+        warnings: What would make a run useless or end it, see `warnings_of`.
+
+    >>> import sobolev_batch as sb
+    >>> plan = sb.plan("workflows/icosphere.toml")
+    >>> list(plan.objects), plan.missing, plan.seconds
+    ([''], (), 0.0)
+    """
+
+    study: str
+    store: str
+    objects: Mapping[str, ObjectPlan]
+    refused: Mapping[str, str]
+    seconds: float
+    processor_seconds: float
+    time: tuple[str, ...] = field(repr=False)
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def object(self) -> ObjectPlan:
+        """Plan of the only object; ValueError where there are several, or none."""
+        (only,) = self.objects.values()
+        return only
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Labels of the surfaces whose fields are to be computed; those of named objects begin with the name."""
+        return tuple(
+            "/".join(filter(None, (name, label))) for name, one in self.objects.items() for label in one.task_seconds
+        )
+
+    @property
+    def total_bytes(self) -> int:
+        """Bytes of all stored fields."""
+        return sum(one.total_bytes for one in self.objects.values())
+
+    def to_table(self) -> dict[str, Any]:
+        """Return the numbers for programs, without what is shown."""
+        objects = {name: one.to_table() for name, one in self.objects.items()}
+        numbers = {name: value for name, value in vars(self).items() if name != "time"}
+        return {**numbers, "objects": objects, "missing": self.missing, "total_bytes": self.total_bytes}
 
     def __str__(self) -> str:
-        lines = (*self.lines, *(("warning", text) for text in self.warnings))
-        return "\n".join(beside(f"{name + ':' * bool(name):<14} ", text) for name, text in lines)
+        shown = [
+            ("", one.lines) if not name else (f"{visible(name)}:", one.lines) for name, one in self.objects.items()
+        ]
+        lines = [line for head, rows in shown for line in (*filter(None, [head]), *starmap(_beside, rows))]
+        lines += [beside(f"{visible(name)}: ", reason) for name, reason in self.refused.items()]
+        lines += starmap(_beside, zip(chain(["time"], repeat("")), self.time, strict=False))
+        lines += [_beside("warning", text) for text in self.warnings]
+        if "" not in self.objects:
+            lines.append(f"{len(self.objects)} objects, {format_bytes(self.total_bytes)} of fields")
+        return "\n".join(lines)
+
+
+def _beside(name: str, text: str) -> str:
+    return beside(f"{name + ':' * bool(name):<14} ", text)
 
 
 def _study_lines(plan: Plan) -> Iterator[tuple[str, str]]:
     """Yield what is shown of a plan whatever computes it."""
     study, lattice, similarity, tail = plan.study, plan.lattice, plan.similarity, plan.tail
-    yield "study", study.title
-    families = f"{len(study.families)} famil{'y' if len(study.families) == 1 else 'ies'}"
+    yield "study", study.object.title
+    families = f"{len(study.object.families)} famil{'y' if len(study.object.families) == 1 else 'ies'}"
     yield "surfaces", f"{len(plan.rows)} in {families}, reference {plan.reference}"
     yield "similarity", f"scale {similarity.scale:.9g}, origin {' '.join(f'{x:.9g}' for x in similarity.origin)}"
     spacing = f"spacing {lattice.spacing:g}, half period {lattice.half_period:g}"
@@ -181,7 +240,10 @@ def _study_lines(plan: Plan) -> Iterator[tuple[str, str]]:
     if study.commands:
         yield "", "they run only with --allow-commands (in Python: allow_commands=True)"
     if study.proximity is not None:
-        yield "proximity", f"Hausdorff and Chamfer distances, from {study.proximity.points:,} points on each mesh"
+        yield (
+            "proximity",
+            f"Hausdorff and Chamfer distances, from {study.proximity.points:,} points on each mesh; the time leaves them out",
+        )
 
 
 def _task_lines(
@@ -209,78 +271,16 @@ def _task_lines(
     yield from reasons("doubtful", doubtful)
 
 
-@dataclass(frozen=True)
-class CollectionPlan(Shown):
-    """Forecast of a run of a collection; ``print(plan)`` shows the plan of each object.
-
-    Attributes:
-        objects: Plan of each object that can be carried out, by its name.
-        refused: Reason for each other object, by its name.
-        warnings: What would make a run useless or end it, see `warnings_of`.
-
-    >>> import sobolev_batch as sb
-    >>> plan = sb.result_types.CollectionPlan({}, {"cow": "the reference cannot be made: cow.ply: it is empty"})
-    >>> print(plan)
-    cow: the reference cannot be made: cow.ply: it is empty
-    0 objects: about 0 s, 0B of fields
-    """
-
-    objects: Mapping[str, StudyPlan]
-    refused: Mapping[str, str]
-    warnings: tuple[str, ...] = ()
-
-    @property
-    def seconds(self) -> float:
-        """Time that a run will take; see `StudyPlan.seconds`."""
-        return sum(one.seconds for one in self.objects.values())
-
-    @property
-    def total_bytes(self) -> int:
-        """Bytes of all stored fields."""
-        return sum(one.total_bytes for one in self.objects.values())
-
-    @property
-    def total(self) -> str:
-        """Number of objects, time and bytes, as a line."""
-        return (
-            f"{len(self.objects)} objects: about {duration(self.seconds, digits=2)}, "
-            f"{format_bytes(self.total_bytes)} of fields"
-        )
-
-    def to_table(self) -> dict[str, Any]:
-        """Return the numbers for programs; see `StudyPlan.to_table`."""
-        objects = {name: one.to_table() for name, one in self.objects.items()}
-        return {**vars(self), "objects": objects, "seconds": self.seconds, "total_bytes": self.total_bytes}
-
-    def __str__(self) -> str:
-        lines = [f"{visible(name)}:\n{one}" for name, one in self.objects.items()]
-        lines += [beside(f"{visible(name)}: ", reason) for name, reason in self.refused.items()]
-        lines += [beside("warning: ", text) for text in self.warnings]
-        return "\n".join([*lines, self.total])
-
-
-@overload
-def plan(
-    study: Study, store: StoreLike = None, client: Client | None = None, *, allow_commands: bool = False
-) -> StudyPlan: ...
-@overload
-def plan(
-    study: StudyCollection, store: StoreLike = None, client: Client | None = None, *, allow_commands: bool = False
-) -> CollectionPlan: ...
-@overload
 def plan(
     study: StudyLike, store: StoreLike = None, client: Client | None = None, *, allow_commands: bool = False
-) -> StudyPlan | CollectionPlan: ...
-def plan(
-    study: StudyLike, store: StoreLike = None, client: Client | None = None, *, allow_commands: bool = False
-) -> StudyPlan | CollectionPlan:
+) -> StudyPlan:
     """Return what running a study would do, without computing anything.
 
-    The reference is loaded, and a few other surfaces where the study requests an accuracy. An object of a collection
-    that cannot be carried out stops no other.
+    References are loaded, and a few other surfaces where the study requests an accuracy. An object that cannot be
+    carried out stops no other.
 
     Args:
-        study: Study, collection, or the path of the file of either.
+        study: Study, or the path of its file.
         store: Path or URL of a new or existing store; default storage/NAME.zarr.
         client: Client of the cluster to plan for; default processes on this machine, one per core.
         allow_commands: True if the commands of the study may run here, which make the few surfaces that are loaded.
@@ -294,49 +294,69 @@ def plan(
 
     >>> import sobolev_batch as sb
     >>> found = sb.plan("workflows/icosphere.toml")
-    >>> len(found.labels), len(found.stored), found.lattice
-    (5, 5, Lattice(xi_max=5.0, M=48))
+    >>> len(found.object.labels), found.missing, found.object.lattice
+    (5, (), Lattice(xi_max=5.0, M=48))
     >>> print(found)  # doctest: +ELLIPSIS
     study:         ...
     surfaces:      5 in 1 family, reference reference
     ...
     """
     study, location = settled(study, store, may_run=allow_commands)
-    plans, refused = for_each_object(study, location, lambda _, part, place: _plan(part, place, client))
-    warnings = warnings_of(study, location)
-    return replace(plans[""], warnings=warnings) if "" in plans else CollectionPlan(plans, refused, warnings)
-
-
-def _plan(study: Study, location: Location, client: Client | None) -> StudyPlan:
     if client is not None:
         require_blocking(client)
-    workers = Workers.of_this_machine(available_cores()) if client is None else prepare_workers(client, study.libraries)
+        workers = prepare_workers(client, study.libraries)
+    else:
+        workers = Workers.of_this_machine(available_cores())
     workers.require_accuracy(study.accuracy)
-    earlier_choice, started = stored_choice(location), time.process_time()
+    bases: set[str] = set()
+    plans, refused = for_each_object(study, location, lambda _, one, place: _plan(one, place, workers, client, bases))
+    seconds, processor_seconds, time = _forecast(plans.values(), workers, client is None, bases)
+    warnings = warnings_of(study, location)
+    return StudyPlan(study.name, str(location), plans, refused, seconds, processor_seconds, time, warnings)
+
+
+def _forecast(
+    objects: Collection[ObjectPlan], workers: Workers, starts_processes: bool, bases: Collection[str]
+) -> tuple[float, float, tuple[str, ...]]:
+    """Return the seconds of a run, if workers have their cores for themselves, its processor seconds, and both shown.
+
+    Objects are carried out beside each other.
+    """
+    missing = sum(len(one.task_seconds) for one in objects)
+    if not missing:
+        lacks_tables = any(one.lacks_tables for one in objects)
+        text = "no field is missing, and tables follow from them" if lacks_tables else "nothing is missing"
+        return 0.0, 0.0, (text,)
+    work = sum(one.planning_seconds + sum(one.task_seconds.values()) for one in objects)
+    processes, start = (
+        (_PROCESS_SECONDS * (1 + len(workers.members)), _CLUSTER_SECONDS) if starts_processes else (0.0, 0.0)
+    )
+    alone = sum(one.planning_seconds for one in objects) if len(objects) == 1 else 0.0
+    seconds = start + max(alone + (work - alone) / workers.threads, *(one.shortest_seconds for one in objects))
+    fields = f"{missing} missing field{'s' * (missing != 1)}"
+    tasks = f"{workers.threads} task{'s' * (workers.threads != 1)} at once"
+    lines = (
+        f"about {duration(seconds, digits=2)} for {fields}, with {tasks}",
+        f"{duration(processes + work, digits=2)} of processor time; the speed is that of {' and '.join(sorted(bases))}",
+    )
+    return seconds, processes + work, lines
+
+
+def _plan(study: Study, location: Location, workers: Workers, client: Client | None, bases: set[str]) -> ObjectPlan:
+    earlier_choice, started = stored_choice(location), process_time()
     if study.accuracy is not None and earlier_choice is None and not (study.cache and study.cache.may_run):
         # A few meshes decide on the lattice.
         require_permission(study, allow_commands=False)
     study_plan = make_plan(study, earlier_choice)
-    planning_seconds = 0.0 if study_plan.choice is earlier_choice else time.process_time() - started
+    planning_seconds = 0.0 if study_plan.choice is earlier_choice else process_time() - started
     sizes, refused = size_rows(study_plan, study_plan.rows, workers.with_backend(study.backend))
     workspace = Workspace.found(location, study_plan)
     stored = {} if workspace is None else {workspace.labels[i]: record for i, record in workspace.stored.items()}
-    seconds, processor_seconds, (first, *others) = forecast(study_plan, stored, workers, client, planning_seconds)
-    if workspace is not None and len(stored) == len(study_plan.rows) and not lacks_nothing(workspace):
-        first = "no field is missing, and tables follow from them"
+    seconds, basis = seconds_of_missing(study_plan, stored, workers, client)
+    bases.update(filter(None, [basis]))
     doubtful, count = _doubts_of(study_plan, stored), len(study_plan.rows)
     total_bytes = format_bytes(study_plan.field_bytes * count)
-    lines = [
-        *_study_lines(study_plan),
-        *_task_lines(study_plan, workers, sizes, refused, doubtful),
-        ("storage", f"{format_bytes(study_plan.field_bytes)} per surface, {total_bytes} in all"),
-        ("store", f"{location}, {len(stored)} of {count} already stored"),
-        ("time", first),
-        *(("", line) for line in others),
-        *([("", "Hausdorff and Chamfer distances take more")] if study.proximity is not None else []),
-    ]
-    return StudyPlan(
-        study=study_plan.study,
+    return ObjectPlan(
         store=str(location),
         labels=tuple(row.label for row in study_plan.rows),
         reference=study_plan.reference,
@@ -349,9 +369,15 @@ def _plan(study: Study, location: Location, client: Client | None) -> StudyPlan:
         similarity=study_plan.similarity,
         field_bytes=study_plan.field_bytes,
         memory_bytes={label: task_bytes for label, (*_, task_bytes) in sizes.items()},
-        seconds=seconds,
-        processor_seconds=processor_seconds,
-        lines=tuple(lines),
+        task_seconds=seconds,
+        planning_seconds=planning_seconds,
+        lacks_tables=not seconds and (workspace is None or not lacks_nothing(workspace)),
+        lines=(
+            *_study_lines(study_plan),
+            *_task_lines(study_plan, workers, sizes, refused, doubtful),
+            ("storage", f"{format_bytes(study_plan.field_bytes)} per surface, {total_bytes} in all"),
+            ("store", f"{location}, {len(stored)} of {count} already stored"),
+        ),
     )
 
 

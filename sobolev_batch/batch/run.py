@@ -45,7 +45,7 @@ from sobolev_batch.store.lock import Lock, locked
 from sobolev_batch.store.records import Records
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.plan import Plan, make_plan
-from sobolev_batch.study.study import AnyStudy, Study, StudyCollection, StudyLike
+from sobolev_batch.study.study import Study, StudyLike
 from sobolev_batch.visible import visible
 
 _log = logging.getLogger(__name__)
@@ -108,8 +108,7 @@ def run(
     What would make the run useless, such as too few objects for a league, is logged as a warning first; see `plan`.
 
     Args:
-        study: Study, collection (studies of several objects, carried out side by side), or the path of the file
-            of either.
+        study: Study, whose objects are carried out side by side, or the path of its file.
         store: Path or URL of a new or existing store, which all workers reach under this name; default
             storage/NAME.zarr. A store in memory:// is computed by threads of this process, and gone when it ends.
         client: Client of the cluster to compute on. By default single-threaded processes on this machine are started
@@ -122,8 +121,8 @@ def run(
             all. Tables have the others as missing, until a run without it computes them.
 
     Returns:
-        Meshes that were computed, that were reused, and that failed. A mesh that fails does not raise. In a collection,
-        neither does an object whose study cannot be carried out; labels begin with the name of the object.
+        Meshes that were computed, that were reused, and that failed. A mesh that fails does not raise. Of several
+        objects, neither does one that cannot be carried out; labels begin with the name of the object.
 
     Raises:
         StudyError, MeshError, LatticeError: The study cannot be carried out, or runs commands and may not.
@@ -152,9 +151,9 @@ def run(
     study, location = ready_to_run(study, store, allow_commands=allow_commands, only=only)
     location = location if client is None else location.absolute()
     notify = on_progress or _ignore
-    if isinstance(study, StudyCollection):
+    if "" not in study.objects:
         CollectionStore.prepared(location, study)
-    names = list(study.studies)
+    names = list(study.objects)
     with ExitStack() as stack:
 
         @cache
@@ -162,7 +161,7 @@ def run(
             """Start the cluster of all objects, which is not needed where nothing is missing."""
             own = nullcontext(client) if client is not None else _own_cluster(study, location, workers, memory)
             started = stack.enter_context(own)
-            needs_gpu = any(one.backend == "gpu" for one in study.studies.values())
+            needs_gpu = study.backend == "gpu"
             watch = stack.enter_context(Watch(started, needs_gpu).kept())
             return started, watch
 
@@ -177,7 +176,7 @@ def run(
         def equip(study: Study) -> tuple[Cluster, Watch]:
             started, watch = start()
             announce()
-            return Cluster(started, known_workers(study.libraries), study=study.name, part=study.part), watch
+            return Cluster(started, known_workers(study.libraries), study=study.name, part=study.object.name), watch
 
         def run_object(name: str, study: Study, place: Location) -> Stages[Summary]:
             part = f"{name}, {names.index(name) + 1} of {len(names)}" if name else ""
@@ -198,7 +197,7 @@ def _notify_of(notify: Notify, part: str, progress: Progress) -> None:
 
 
 def _outcome_of_all(
-    study: AnyStudy, location: Location, run_object: Callable[[str, Study, Location], Stages[Summary]]
+    study: Study, location: Location, run_object: Callable[[str, Study, Location], Stages[Summary]]
 ) -> Summary:
     """Run all objects of a study beside each other.
 
@@ -209,10 +208,11 @@ def _outcome_of_all(
     refused: dict[str, str] = {}
 
     def is_fatal(error: Exception) -> bool:
-        return "" in study.studies or isinstance(error, StoreError) or not isinstance(error, InputError)
+        return "" in study.objects or isinstance(error, StoreError) or not isinstance(error, InputError)
 
     runs = (
-        (name, run_object(name, one, location.below(name) if name else location)) for name, one in study.studies.items()
+        (name, run_object(name, study.of_object(name), location.below(name) if name else location))
+        for name in study.objects
     )
     for name, outcome in side_by_side(runs, is_fatal):
         if isinstance(outcome, Exception):
@@ -220,7 +220,7 @@ def _outcome_of_all(
             _log.error("%s: %s", name, outcome)
         else:
             summaries[name] = outcome
-    in_order = {name: summaries[name] for name in study.studies if name in summaries}
+    in_order = {name: summaries[name] for name in study.objects if name in summaries}
     return summaries[""] if "" in summaries else _of_all(location, in_order, refused)
 
 
@@ -229,12 +229,11 @@ def _ignore(progress: Progress) -> None:
 
 
 def _own_cluster(
-    study: AnyStudy, location: Location, workers: int | None, memory: float | str | None
+    study: Study, location: Location, workers: int | None, memory: float | str | None
 ) -> AbstractContextManager[Client]:
     """Return a cluster on this machine, not yet started, after a look at whether the machine has the memory."""
-    for part in study.studies.values():
-        if part.accuracy is not None and part.accuracy.asks_for_memory:
-            require_machine_memory(part.accuracy.allowed_bytes, "[accuracy]: memory")
+    if study.accuracy is not None and study.accuracy.asks_for_memory:
+        require_machine_memory(study.accuracy.allowed_bytes, "[accuracy]: memory")
     if memory is not None:
         # Otherwise a store would be made before the cluster refuses it.
         memory_limit(memory, workers or available_cores())

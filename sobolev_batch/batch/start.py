@@ -15,7 +15,7 @@ from sobolev_batch.sources.names import quoted
 from sobolev_batch.store.location import Location
 from sobolev_batch.study.comparable import comparison_warnings
 from sobolev_batch.study.schema import known_names
-from sobolev_batch.study.study import AnyStudy, StudyLike, as_study
+from sobolev_batch.study.study import Study, StudyLike, as_study
 from sobolev_batch.tables.pairs import PAIR_BYTES
 
 _log = logging.getLogger(__name__)
@@ -28,7 +28,7 @@ _DEFAULT_FOLDER = Path("storage")
 MADE_MESHES, _MOST_COMMANDS = "made-meshes", 3
 
 
-def settled(study: StudyLike, store: StoreLike, *, may_run: bool) -> tuple[AnyStudy, Location]:
+def settled(study: StudyLike, store: StoreLike, *, may_run: bool) -> tuple[Study, Location]:
     """Return a study that keeps the meshes that it makes beside its store, and the place of the store.
 
     Stores there share the meshes. The place is storage/NAME.zarr where none is named.
@@ -40,7 +40,7 @@ def settled(study: StudyLike, store: StoreLike, *, may_run: bool) -> tuple[AnySt
 
 def ready_to_run(
     study: StudyLike, store: StoreLike, *, allow_commands: bool, only: Sequence[str] = ()
-) -> tuple[AnyStudy, Location]:
+) -> tuple[Study, Location]:
     """Return a study that may run, or a part of it, and its place; log what would make the run useless."""
     study, location = settled(as_study(study).with_only(tuple(only)), store, may_run=True)
     require_permission(study, allow_commands)
@@ -54,7 +54,7 @@ def ready_to_run(
     return study, location
 
 
-def require_permission(study: AnyStudy, allow_commands: bool) -> None:
+def require_permission(study: Study, allow_commands: bool) -> None:
     """Refuse a study that runs commands and may not, by a StudyError."""
     if study.commands and not allow_commands:
         raise StudyError(
@@ -63,16 +63,16 @@ def require_permission(study: AnyStudy, allow_commands: bool) -> None:
         )
 
 
-def warnings_of(study: AnyStudy, store: Location) -> tuple[str, ...]:
+def warnings_of(study: Study, store: Location) -> tuple[str, ...]:
     """Return a line for each thing that makes a run fail late, or useless: sizes, too few objects, or no space."""
     return (*comparison_warnings(study), *_space_warnings(study, store))
 
 
-def _require_members(study: AnyStudy, only: Sequence[str]) -> None:
+def _require_members(study: Study, only: Sequence[str]) -> None:
     """Refuse names of families and members that no object of a study has."""
     known: dict[str, None] = {}
     unknown = list(only)
-    for one in study.studies.values() if only else ():
+    for one in study.objects.values() if only else ():
         # The run reports what cannot be listed.
         with suppress(InputError):
             known |= dict.fromkeys([*(family for family, _ in one.members.values()), *one.members])
@@ -81,15 +81,14 @@ def _require_members(study: AnyStudy, only: Sequence[str]) -> None:
         raise StudyError(f"no family or member of the study is {quoted(unknown[0])}; {known_names(unknown[0], known)}")
 
 
-def _space_warnings(study: AnyStudy, store: Location) -> Iterator[str]:
+def _space_warnings(study: Study, store: Location) -> Iterator[str]:
     """Yield the need for space of the distances of all pairs, where a disk does not have it."""
     needed = stored = 0
-    for name, one in study.studies.items() if not store.scheme else ():
+    for name, one in study.objects.items() if study.pairs == "all" and not store.scheme else ():
         # The run reports what cannot be listed.
         with suppress(InputError):
-            if one.pairs == "all":
-                needed += PAIR_BYTES * len(one.orders) * len(one.members) ** 2
-                stored += sum((store.below(name) if name else store).sizes("distances").values())
+            needed += PAIR_BYTES * len(study.orders) * len(one.members) ** 2
+            stored += sum((store.below(name) if name else store).sizes("distances").values())
     if not needed:
         return
     folder = Path(str(store)).absolute()

@@ -23,7 +23,7 @@ from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, acquire, release
 from sobolev_batch.store.workspace import Workspace
-from sobolev_batch.study.study import Study, StudyCollection, StudyLike
+from sobolev_batch.study.study import Study, StudyLike
 
 _log = logging.getLogger(__name__)
 
@@ -90,7 +90,7 @@ def submit(
     require_blocking(client)
     study, location = ready_to_run(study, store, allow_commands=allow_commands, only=only)
     location = location.absolute()
-    if isinstance(study, StudyCollection):
+    if "" not in study.objects:
         CollectionStore.prepared(location, study)
     objects, refused = for_each_object(study, location, lambda _, part, place: _submit(part, place, client))
     if "" in objects:
@@ -112,9 +112,9 @@ def _submit(study: Study, location: Location, client: Client) -> Submission:
         workers.require_accuracy(study.accuracy)
         workspace = Workspace.of_study(study, location, lock)
         Heartbeat(workspace.store, lock, watch).write("submitted")
-        arguments = replace(study, folder=study.folder.absolute()), workspace.store.path, lock.run
+        arguments = _absolute(study), workspace.store.path, lock.run
         # Before all tasks of other studies, from which it takes no thread: it leaves its own at once.
-        key = task_key("drive", study.name, study.part, "")
+        key = task_key("drive", study.name, study.object.name, "")
         future = client.submit(drive, *arguments, key=key, pure=False, priority=1)
         fire_and_forget(future)
         _await_acceptance(client, future)
@@ -122,6 +122,12 @@ def _submit(study: Study, location: Location, client: Client) -> Submission:
         release(location, lock)
         raise
     return Submission(workspace.store.path, len(workspace.rows), len(workspace.pending))
+
+
+def _absolute(study: Study) -> Study:
+    """Return a study for processes that were started in another folder."""
+    objects = {name: replace(one, folder=one.folder.absolute()) for name, one in study.objects.items()}
+    return replace(study, objects=objects)
 
 
 def drive(study: Study, store: str, run: str) -> None:

@@ -200,7 +200,7 @@ def _digest(workspace: Workspace, placed: Sequence[Placed]) -> str:
         "orders": plan.study.orders,
         "pairs": plan.study.pairs,
         "reference": plan.reference,
-        "order_by": {family.name: family.order_by for family in plan.study.families},
+        "order_by": {family.name: family.order_by for family in plan.study.object.families},
     }
     return hashlib.sha256(json.dumps(inputs).encode()).hexdigest()
 
@@ -279,7 +279,7 @@ def _strings(values: Sequence[str]) -> NDArray[np.generic]:
 
 
 def _criterion(study: Study, family: str, rows: Sequence[Row], records: Sequence[Record | None]) -> Criterion:
-    chosen = next((one.order_by for one in study.families if one.name == family), None)
+    chosen = next((one.order_by for one in study.object.families if one.name == family), None)
     if chosen is not None:
         return chosen
     if any(row.member.time is not None for row in rows):

@@ -89,7 +89,7 @@ def run_command(
     """
     from sobolev_batch.batch.cluster.clients import remote_client
     from sobolev_batch.batch.run import run
-    from sobolev_batch.study.study import Study, as_study
+    from sobolev_batch.study.study import as_study
     from sobolev_batch.tables.conclusion import format_verdict
     from sobolev_batch.tables.convergence import format_table, table
     from sobolev_batch.tables.open import open_store
@@ -102,7 +102,7 @@ def run_command(
     connected = remote_client(scheduler, trust_network) if scheduler else nullcontext()
     with progress_reports() as show, connected as client:
         summary = run(parsed, store, client, on_progress=show, **settings)
-    if isinstance(parsed, Study):
+    if "" in parsed.objects:
         tree = open_store(summary.store)
         frame = table(tree)
         echo_lines(format_table(tree, frames={"": frame}))
@@ -118,8 +118,7 @@ def run_command(
         echo(f"{label}: its distance has an error of {100 * error:.2g} %, more than the rtol of the study", err=True)
     if len(summary.imprecise) > _MOST_IMPRECISE:
         echo(f"and {len(summary.imprecise) - _MOST_IMPRECISE} more distances", err=True)
-    accuracies = [one.accuracy for one in ([parsed] if isinstance(parsed, Study) else parsed.studies.values())]
-    is_short = bool(summary.imprecise) and not any(one is not None and one.best_effort for one in accuracies)
+    is_short = bool(summary.imprecise) and not (parsed.accuracy is not None and parsed.accuracy.best_effort)
     if summary.failed or summary.not_compared or is_short:
         context.exit(EXIT_SOME_FAILED)
 
@@ -185,12 +184,12 @@ def plan_command(
     surfaces that the store has already.
     """
     from sobolev_batch.batch.cluster.clients import remote_client
-    from sobolev_batch.batch.dry_run import CollectionPlan, plan
+    from sobolev_batch.batch.dry_run import plan
 
     with remote_client(scheduler, trust_network) if scheduler else nullcontext() as client:
         made = plan(study, store, client, allow_commands=allow_commands)
     echo_result(style, made, made.to_table())
-    if isinstance(made, CollectionPlan) and made.refused:
+    if made.refused:
         context.exit(EXIT_SOME_FAILED)
 
 

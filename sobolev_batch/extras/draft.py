@@ -23,7 +23,7 @@ from sobolev_batch.shown import Shown, reasons
 from sobolev_batch.sources.files import MOST_MESHES
 from sobolev_batch.sources.names import caseless_key, label_problem, name_problem, natural_key, quoted
 from sobolev_batch.study.schema import REFERENCE_LABEL, RESERVED
-from sobolev_batch.study.study import Study, StudyCollection
+from sobolev_batch.study.study import Study
 from sobolev_batch.study.templates import METHOD, OBJECT
 from sobolev_batch.visible import visible
 
@@ -138,11 +138,10 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
         sections, summary = _several_objects(references, families, below)
     name = _json(_free_name(folder.resolve().name, fallback="study"))
     text = _filled("study", name=name, sections="".join(f"\n{section}" for section in sections))
+    study = Study.from_table(tomllib.loads(text), folder=base)
     if is_single:
         # A study that cannot list its meshes is none to write down.
-        len(Study.from_table(tomllib.loads(text), folder=base).members)
-    else:
-        StudyCollection.from_table(tomllib.loads(text), folder=base)
+        len(study.object.members)
     with written(output, "the study", StudyError), output.open("x", encoding="utf-8", newline="\n") as file:
         file.write(text)
     return StudyDraft(output, summary, left_out)

@@ -12,7 +12,7 @@ from sobolev_batch.errors import DamageError, InputError, StoreError
 from sobolev_batch.store.layout import COLLECTION, DIGEST, ROOT, Store, digest_of
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.metadata import SCHEMA_VERSION
-from sobolev_batch.study.study import AnyStudy, Study, StudyCollection
+from sobolev_batch.study.study import Study
 
 Result = TypeVar("Result")
 
@@ -59,14 +59,14 @@ class CollectionStore:
         return cls(location, table["title"], table["name"], tuple(table["objects"]), table["table"])
 
     @classmethod
-    def prepared(cls, location: Location, collection: StudyCollection) -> CollectionStore:
+    def prepared(cls, location: Location, collection: Study) -> CollectionStore:
         """Write down at a location which objects a collection has, and return its store."""
         present = None
         with suppress(DamageError):
             present = cls.read(location)
         if present is None:
             # Where it is damaged, the stores of the objects are still there.
-            location.require_free({ROOT, *collection.studies})
+            location.require_free({ROOT, *collection.objects})
         elif present.name != collection.name:
             raise StoreError(
                 f"{location}: it holds the store of another collection, {present.name!r}, not {collection.name!r}; "
@@ -75,19 +75,19 @@ class CollectionStore:
         entry = {
             "name": collection.name,
             "title": collection.title,
-            "objects": list(collection.studies),
-            "lacking": {name: list(methods) for name, methods in collection.lacking.items()},
+            "objects": list(collection.objects),
+            "lacking": {name: list(one.lacking) for name, one in collection.objects.items() if one.lacking},
             "table": dict(collection.table),
         }
         entry[DIGEST] = digest_of(entry)
         attributes = {"title": collection.title, "schema_version": SCHEMA_VERSION, COLLECTION: entry}
         root = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
         location.write({ROOT: json.dumps(root).encode()})
-        return cls(location, collection.title, collection.name, tuple(collection.studies), collection.table)
+        return cls(location, collection.title, collection.name, tuple(collection.objects), collection.table)
 
 
 def for_each_object(
-    study: AnyStudy, location: Location, act: Callable[[str, Study, Location], Result]
+    study: Study, location: Location, act: Callable[[str, Study, Location], Result]
 ) -> tuple[dict[str, Result], dict[str, str]]:
     """Act on the name, the study and the store of each object; return results, and why others have none, by name.
 
@@ -96,9 +96,9 @@ def for_each_object(
     """
     results: dict[str, Result] = {}
     refused: dict[str, str] = {}
-    for name, one in study.studies.items():
+    for name in study.objects:
         try:
-            results[name] = act(name, one, location.below(name) if name else location)
+            results[name] = act(name, study.of_object(name), location.below(name) if name else location)
         except StoreError:
             raise
         except InputError as error:

@@ -83,7 +83,7 @@ def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
         return store
     attributes, lattice = store.attributes(), _lattice_entry(plan)
     if not store.has_digest():
-        is_same = attributes["study"].items() >= {"name": plan.study.name, **lattice}.items()
+        is_same = attributes["study"].items() >= {"name": plan.name, **lattice}.items()
         altered = DamageError("the metadata at the root are damaged", "they are not what was written")
         return _mended(store, plan, None if is_same else altered)
     _check_same_study(store, plan)
@@ -147,7 +147,7 @@ def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:
 def _create(store: Store, plan: Plan) -> None:
     """Create all arrays, in place of everything that the store holds."""
     # This process may be killed before all of them exist: until then the content is declared invalid.
-    attributes = {"title": plan.study.title, "schema_version": SCHEMA_VERSION, UNFINISHED: True}
+    attributes = {"title": plan.study.object.title, "schema_version": SCHEMA_VERSION, UNFINISHED: True}
     store.location.write({ROOT: json.dumps(_root(attributes)).encode()})
     store.location.remove_partial_files()
     for name in sorted(store.location.names() - {*LOCK_KEYS, ROOT}):
@@ -282,7 +282,7 @@ def _check_same_study(store: Store, plan: Plan) -> None:
     study = store.attributes()["study"]
     # A chosen lattice may be chosen anew; a given one is part of the study.
     may_change = plan.study.accuracy is not None and study.get("choice")
-    comparisons = [("the study", repr(study["name"]), repr(plan.study.name))]
+    comparisons = [("the study", repr(study["name"]), repr(plan.name))]
     if not may_change:
         old_lattice, new_lattice = (
             f"xi_max {lattice['xi_max']:.6g} and M {lattice['M']}"
@@ -332,16 +332,16 @@ def _attributes(plan: Plan, labels: Sequence[str]) -> dict[str, Any]:
     """Return the attributes of the root of the store of a plan with some rows."""
     study, planned = plan.study, {row.label for row in plan.rows}
     return {
-        "title": study.title,
+        "title": study.object.title,
         "schema_version": SCHEMA_VERSION,
         "study": {
-            "name": study.name,
+            "name": plan.name,
             **_lattice_entry(plan),
             "eps": None if study.accuracy else study.transform.eps,
             "choice": plan.choice.to_table() if study.accuracy else None,
             "orders": list(study.orders),
             "reference": plan.reference,
-            "table": dict(study.table),
+            "table": dict(study.object.table),
             "mesh_cache": str(study.cache.folder) if study.cache else None,
         },
         REMOVED: [label for label in labels if label not in planned],

@@ -9,7 +9,7 @@ from contextlib import suppress
 from sobolev_batch.errors import InputError
 from sobolev_batch.sources.registry import ExpectedSize
 from sobolev_batch.study.schema import REFERENCE_LABEL
-from sobolev_batch.study.study import AnyStudy, Members, StudyCollection
+from sobolev_batch.study.study import Members, Study
 
 # Ends of a range of logarithms of sizes.
 Range = tuple[float, float]
@@ -48,21 +48,20 @@ def least_objects(tests: int) -> int:
     return math.floor(math.log2(2 * tests / SIGNIFICANCE)) + 1
 
 
-def comparison_warnings(study: AnyStudy) -> Iterator[str]:
+def comparison_warnings(study: Study) -> Iterator[str]:
     """Yield what makes a comparison of the study's methods useless. Surfaces are listed, and none is made."""
     gaps: dict[str, str] = {}
-    is_collection = isinstance(study, StudyCollection)
-    for name, one in study.studies.items():
+    for name, one in study.objects.items():
         # The run reports what cannot be listed, and such an object is none to compare at.
         with suppress(InputError):
-            gaps[name] = _gap_in_sizes(one.members, alone=not is_collection)
+            gaps[name] = _gap_in_sizes(one.members, alone=not name)
     lacking = {name: gap for name, gap in gaps.items() if gap}
     if lacking:
         first, gap = next(iter(lacking.items()))
-        where = f" for {len(lacking)} of {len(study.studies)} objects, such as {first}" if first else ""
+        where = f" for {len(lacking)} of {len(study.objects)} objects, such as {first}" if first else ""
         yield f"{gap}; methods cannot be ranked at equal triangles{where}; add meshes of sizes that all have"
-    if isinstance(study, StudyCollection):
-        useful = [name for name, gap in gaps.items() if not gap and name not in study.lacking]
+    if "" not in study.objects:
+        useful = [name for name, gap in gaps.items() if not gap and not study.objects[name].lacking]
         yield from _test_warnings(study, len(useful))
 
 
@@ -94,10 +93,10 @@ def _range_of(sizes: Iterable[float]) -> Range:
     return math.log(min(listed)), math.log(max(listed))
 
 
-def _test_warnings(collection: StudyCollection, objects: int) -> Iterator[str]:
+def _test_warnings(study: Study, objects: int) -> Iterator[str]:
     """Yield what makes a league useless whose test can tell no two methods apart."""
-    methods = {family.name for study in collection.studies.values() for family in study.families}
-    pairs, count = math.comb(len(methods), 2), len(collection.studies)
+    methods = {family.name for one in study.objects.values() for family in one.families}
+    pairs, count = math.comb(len(methods), 2), len(study.objects)
     if pairs and objects < (least := least_objects(pairs)):
         shown = f"{count} object{'s' * (count != 1)}"
         shown = shown if objects == count else f"{objects} of {shown} that have all methods at common sizes"

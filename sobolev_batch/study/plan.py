@@ -52,7 +52,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Plan:
-    """Plan of a run: all surfaces in the order of the study, the label of the reference, the lattice of all fields.
+    """Plan of a study of one object: its surfaces in their order, the reference's label, the lattice of all fields.
 
     Area and extent of the reference are in the study's unit of length. It has a sample if an accuracy is requested. The
     look is what was seen of the surfaces that the choice of the lattice made.
@@ -67,6 +67,11 @@ class Plan:
     reference_extent: Extent
     sample: Sample | None = None
     look: Look = field(default_factory=Look)
+
+    @property
+    def name(self) -> str:
+        """What a store remembers: the name of the study, and that of its object where it has one."""
+        return f"{self.study.name} {self.study.object.name}".rstrip()
 
     @property
     def lattice(self) -> Lattice:
@@ -115,18 +120,18 @@ class Plan:
 
 
 def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan:
-    """Plan a study: list its surfaces, choose its similarity and lattice, identify every field.
+    """Plan a study of one object: list its surfaces, choose its similarity and lattice, identify every field.
 
     Only the reference is loaded, and a few pilots for an accuracy. MeshError where the reference cannot be read,
     LatticeError where it does not fit into the period; see also `Study.members` and `choose_lattice`.
     """
-    members = study.members
+    members = study.object.members
     reference = _reference_label(study, members)
     try:
         own = members[reference][1].load()
     except Exception as error:  # its source may raise anything
         raise MeshError(f"the reference cannot be made: {one_line(error)}") from error
-    similarity = study.scaling or Similarity.to_unit_ball(own)
+    similarity = study.object.scaling or Similarity.to_unit_ball(own)
     surface = similarity.apply(own)
     choice, look = _lattice_choice(study, similarity, members, reference, surface, earlier_choice)
     if not kind_of(surface).is_closed_form:
@@ -136,7 +141,7 @@ def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan
             "proximity: Hausdorff and Chamfer distances are measured between meshes, and the reference is not one "
             f"but a {type(surface).__name__}; take a fine mesh of it for the reference, or leave [proximity] out"
         )
-    chosen = {reference, *(study.chosen(study.only) if study.only else members)}
+    chosen = {reference, *(study.object.chosen(study.only) if study.only else members)}
     rows = (
         Row(label, family, member, _fingerprint(label, member), is_chosen=label in chosen)
         for label, (family, member) in members.items()
@@ -170,9 +175,9 @@ def _lattice_choice(
 
 
 def _reference_label(study: Study, members: Members) -> str:
-    if not isinstance(study.reference, FamilyReference):
+    if not isinstance(study.object.reference, FamilyReference):
         return REFERENCE_LABEL
-    family, name = study.reference.family, study.reference.member
+    family, name = study.object.reference.family, study.object.reference.member
     if name is None:
         candidates = [member for family_name, member in members.values() if family_name == family]
         finest = max(candidates, key=lambda member: member.level)

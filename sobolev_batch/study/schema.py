@@ -10,6 +10,7 @@ import os
 import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -281,22 +282,13 @@ class ObjectSection(Section):
     scaling: dict[str, Any] | None = None
 
 
-class StudyDocument(Section):
-    """All sections of a study file, of one object or of several."""
+class SurfaceSections(Section):
+    """The sections of a study file that describe the surfaces of an object."""
 
-    study: _Header
     mesh: dict[Name, Annotated[SerializeAsAny[Source], BeforeValidator(_source)]] = {}
-    lattice: _LatticeSection | None = None
-    accuracy: _AccuracySection | None = None
-    norm: _NormSection = _NormSection()
-    compare: _CompareSection = _CompareSection()
-    transform: _TransformSection = _TransformSection()
     reference: Annotated[FamilyReference | SerializeAsAny[Source] | None, BeforeValidator(_reference)]
     family: list[Family]
     scaling: _ScalingSection = _ScalingSection()
-    proximity: ProximitySection | None = None
-    object: Annotated[list[ObjectSection], Field(min_length=1, max_length=_MOST_OBJECTS)] | None = None
-    objects: dict[Literal["meshes"], Annotated[str | tuple[MeshTable, ...], BeforeValidator(checked_list)]] = {}
 
     @classmethod
     def from_tables(cls, values: Mapping[str, Any]) -> Self:
@@ -309,6 +301,20 @@ class StudyDocument(Section):
             more = len(messages) - _MOST_OFFENDERS
             shown = [*messages[:_MOST_OFFENDERS], *([f"and {more} more"] if more > 0 else [])]
             raise StudyError("; ".join(shown)) from error
+
+
+class StudyDocument(SurfaceSections):
+    """All sections of a study file, of one object or of several."""
+
+    study: _Header
+    lattice: _LatticeSection | None = None
+    accuracy: _AccuracySection | None = None
+    norm: _NormSection = _NormSection()
+    compare: _CompareSection = _CompareSection()
+    transform: _TransformSection = _TransformSection()
+    proximity: ProximitySection | None = None
+    object: Annotated[list[ObjectSection], Field(min_length=1, max_length=_MOST_OBJECTS)] | None = None
+    objects: dict[Literal["meshes"], Annotated[str | tuple[MeshTable, ...], BeforeValidator(checked_list)]] = {}
 
     @model_validator(mode="after")
     def _lattice_or_accuracy(self) -> Self:
@@ -401,6 +407,15 @@ def _refusals(error: ValidationError, values: Mapping[str, Any]) -> list[str]:
         text = " or ".join(dict.fromkeys(demands)).replace(" or be ", " or ")
         messages.append(f"{_named(key, values)} must {text}, found {shown_value(_value_at(values, key))}")
     return messages
+
+
+@contextmanager
+def within(what: str) -> Iterator[None]:
+    """Name in a StudyError what it is about, unless that is empty."""
+    try:
+        yield
+    except StudyError as error:
+        raise StudyError(f"{what}: {error}" if what else str(error)) from error
 
 
 def known_names(name: str, known: Iterable[str]) -> str:

@@ -1,15 +1,14 @@
-"""Studies: of one object, and collections of several, each with its own reference, by the same methods."""
+"""Studies: objects, each with its own reference, and how meshes by the same methods are compared with these."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, Self, TypeVar
+from typing import Any, Literal, Self
 
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.geometry.surface import Similarity
@@ -25,162 +24,54 @@ from sobolev_batch.study.schema import (
     Family,
     FamilyReference,
     ProximitySection,
-    StudyDocument,
+    SurfaceSections,
     known_names,
     plain_tables,
     read_toml,
+    within,
 )
-from sobolev_batch.study.templates import is_collection, tables_of_objects
+from sobolev_batch.study.templates import sections_of_objects
 from sobolev_batch.transform.backends import ComplexDtype
 from sobolev_batch.transform.fourier import TransformSettings
 from sobolev_batch.transform.lattice import Lattice, check_orders
-
-Parsed = TypeVar("Parsed")
 
 # Family and member of each surface, by label.
 Members = Mapping[str, tuple[str, Member]]
 
 
 @dataclass(frozen=True)
-class Study:
-    """A validated study. Make it by `from_toml` or `from_table`.
+class StudyObject:
+    """An object of a study: a reference, and families of meshes to compare with it.
 
     Attributes:
-        name: Word or line that identifies the study; a store remembers it.
+        name: Its name among the objects of the study; empty for the only object of a study that names none.
         title: Free text.
-        lattice: Lattice of all fields; None if an accuracy is requested.
-        octaves: Number of octaves that are sampled beyond a given lattice.
-        accuracy: Accuracy of the distances to the reference; None if the lattice is given.
-        transform: Accuracy, dtype and quadrature of the transforms.
-        dtype: Dtype that was requested, if any.
-        backend: Backend of the transforms; "auto" leaves it to each worker.
-        orders: Sobolev orders s < -1/2.
-        pairs: "reference" for the distances to the reference alone, "all" for those of all pairs of meshes.
-        families: Families of surfaces to compare.
+        families: Families of its surfaces. A method is a family with the same name in several objects.
         reference: Surface that they are compared with.
         scaling: Similarity transform of all surfaces; None takes the reference's bounding sphere to the unit sphere.
-        proximity: How the usual distances of each mesh from the reference are measured; None if they are not requested.
         folder: Folder in which relative paths start.
-        table: The study as it was written.
-        largest_chunk_bytes: Size above which a stored field is split into blocks, one chunk each.
-        cache: Where meshes are kept that take long to make; None if the study makes none, or has no store yet.
-        part: Name of the object, in the study of an object of a collection; else empty.
-        only: Families and members FAMILY/MEMBER that a run computes, or patterns of these; empty for all.
+        table: The object as a study of its own, as it was written.
+        lacking: Methods of the study that have no files for it.
 
     >>> import sobolev_batch as sb
-    >>> study = sb.Study.from_table({
-    ...     "study": {"name": "spheres"},
-    ...     "lattice": {"xi_max": 2.0, "M": 8},
-    ...     "norm": {"orders": [-2.0]},
-    ...     "reference": {"source": "sphere"},
-    ...     "family": [{"name": "ico", "source": "icosphere", "levels": [0, 1]}],
-    ... })
-    >>> study.orders, study.lattice, study.pairs
-    ((-2.0,), Lattice(xi_max=2.0, M=8), 'reference')
+    >>> study = sb.Study.from_toml("workflows/icosphere.toml")
+    >>> list(study.object.members)
+    ['icosphere/1', 'icosphere/2', 'icosphere/3', 'icosphere/4', 'reference']
     """
 
     name: str
     title: str
-    lattice: Lattice | None
-    accuracy: Accuracy | None
-    transform: TransformSettings
-    dtype: ComplexDtype | None
-    backend: Backends
-    orders: tuple[float, ...]
-    pairs: Literal["all", "reference"]
     families: tuple[Family, ...]
     reference: Source | FamilyReference
     scaling: Similarity | None
-    proximity: ProximitySection | None
     folder: Path
     table: Mapping[str, Any]
-    largest_chunk_bytes: int = 256 << 20
-    octaves: int = 0
-    cache: MeshCache | None = None
-    part: str = ""
-    only: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        check_orders(self.orders)
-
-    @cached_property
-    def members(self) -> Members:
-        """Family and member of each surface, by label. They are listed once, and none is made.
-
-        StudyError where a family or the reference cannot be listed, or labels or names of metadata collide.
-        """
-        members: dict[str, tuple[str, Member]] = {}
-        for family in self.families:
-            with _within(f"family {family.name!r}"):
-                listed = family.source.members(self.folder)
-            for member in listed:
-                label = f"{family.name}/{member.name}"
-                if label in members:
-                    raise StudyError(f"two surfaces of the study have the label {label!r}")
-                members[label] = family.name, _with_other_names(member, family.name)
-        if not isinstance(self.reference, FamilyReference):
-            with _within("reference"):
-                members[REFERENCE_LABEL] = REFERENCE_LABEL, single_member(self.reference, self.folder)
-        return members
-
-    @property
-    def studies(self) -> dict[str, Self]:
-        """This study, as the only one of its kind; see `StudyCollection`."""
-        return {"": self}
-
-    def chosen(self, only: Sequence[str]) -> set[str]:
-        """Return the labels of the members that names of families or members, or patterns of these, choose."""
-        return {
-            label
-            for label, (family, _) in self.members.items()
-            if any(name == one or fnmatchcase(name, one) for one in only for name in (family, label))
-        }
-
-    @property
-    def libraries(self) -> tuple[str, ...]:
-        """Distributions that its surfaces need besides those that this package requires."""
-        return tuple(sorted({library for source in self._sources for library in source.libraries}))
-
-    @property
-    def commands(self) -> tuple[str, ...]:
-        """Commands that it runs to make its meshes, as a shell would have them, each once."""
-        return tuple(dict.fromkeys(command for source in self._sources for command in source.commands))
-
-    @property
-    def _sources(self) -> list[Source]:
-        own = [self.reference] if isinstance(self.reference, Source) else []
-        return [*(family.source for family in self.families), *own]
+    lacking: tuple[str, ...] = ()
 
     @classmethod
-    def from_toml(cls, path: str | Path) -> Self:
-        """Read a study file. Relative paths in it start from its folder.
-
-        Args:
-            path: Path of the file. docs/studies.md describes its sections.
-
-        Raises:
-            StudyError: The file cannot be read, is no TOML, or has keys that are unknown, of the wrong type, or out of
-                range. The message lists every offender.
-        """
-        return _parsed_file(path, cls.from_table)
-
-    @classmethod
-    def from_table(cls, table: Mapping[str, Any], *, folder: str | Path = ".") -> Self:
-        """Validate a study given as nested tables, with the keys of the study file.
-
-        Args:
-            table: Sections of the study file. A pandas.DataFrame may take the place of a list of tables, such as for
-                ``meshes`` of the source ``files``.
-            folder: Folder in which relative paths start.
-
-        Raises:
-            StudyError: See `from_toml`.
-        """
-        values = plain_tables(table)
-        document = StudyDocument.from_tables(values)
-        if document.object is not None or document.objects:
-            raise StudyError("[[object]] and [objects] make several studies; read them as a StudyCollection")
-        families, reference = document.family, document.reference
+    def from_sections(cls, name: str, sections: SurfaceSections, table: Mapping[str, Any], folder: Path) -> Self:
+        """Check that the families of an object and its reference fit together; StudyError where they do not."""
+        families, reference = sections.family, sections.reference
         if not families:
             raise StudyError("[[family]] must have at least 1 item, found []")
         if reference is None:
@@ -194,6 +85,151 @@ class Study:
         else:
             sources = [family.source.with_reference(reference) for family in families]
             families = [one.model_copy(update={"source": s}) for one, s in zip(families, sources, strict=True)]
+        header, scaling = table["study"], sections.scaling.settings()
+        title = header.get("title") or header["name"]
+        return cls(name, title, tuple(families), reference, scaling, folder, _as_written(table))
+
+    @cached_property
+    def members(self) -> Members:
+        """Family and member of each surface, by label. They are listed once, and none is made.
+
+        StudyError where a family or the reference cannot be listed, or labels or names of metadata collide.
+        """
+        members: dict[str, tuple[str, Member]] = {}
+        for family in self.families:
+            with within(f"family {family.name!r}"):
+                listed = family.source.members(self.folder)
+            for member in listed:
+                label = f"{family.name}/{member.name}"
+                if label in members:
+                    raise StudyError(f"two surfaces of the study have the label {label!r}")
+                members[label] = family.name, _with_other_names(member, family.name)
+        if not isinstance(self.reference, FamilyReference):
+            with within("reference"):
+                members[REFERENCE_LABEL] = REFERENCE_LABEL, single_member(self.reference, self.folder)
+        return members
+
+    def chosen(self, only: Sequence[str]) -> set[str]:
+        """Return the labels of the members that names of families or members, or patterns of these, choose."""
+        return {
+            label
+            for label, (family, _) in self.members.items()
+            if any(name == one or fnmatchcase(name, one) for one in only for name in (family, label))
+        }
+
+    @property
+    def sources(self) -> list[Source]:
+        """Sources of its families, and that of its reference unless it is a member of one."""
+        own = [self.reference] if isinstance(self.reference, Source) else []
+        return [*(family.source for family in self.families), *own]
+
+    def with_cache(self, cache: MeshCache) -> Self:
+        """Return the object, not listed yet, with the place where its meshes are kept that take long to make."""
+        if not any(source.keeps_meshes for source in self.sources):
+            return replace(self)
+        families = tuple(f.model_copy(update={"source": f.source.with_cache(cache)}) for f in self.families)
+        reference = self.reference.with_cache(cache) if isinstance(self.reference, Source) else self.reference
+        return replace(self, families=families, reference=reference)
+
+
+@dataclass(frozen=True)
+class Study:
+    """A validated study: objects, and how their surfaces are compared. Make it by `from_toml` or `from_table`.
+
+    Attributes:
+        name: Word or line that identifies the study; a store remembers it.
+        title: Free text.
+        lattice: Lattice of all fields; None if an accuracy is requested.
+        accuracy: Accuracy of the distances to the references; None if the lattice is given.
+        transform: Accuracy, dtype and quadrature of the transforms.
+        dtype: Dtype that was requested, if any.
+        backend: Backend of the transforms; "auto" leaves it to each worker.
+        orders: Sobolev orders s < -1/2.
+        pairs: "reference" for the distances to the reference alone, "all" for those of all pairs of an object's meshes.
+        proximity: How the usual distances of each mesh from the reference are measured; None if they are not requested.
+        objects: Its objects by name; the only object of a study that names none is under "".
+        table: The study as it was written.
+        largest_chunk_bytes: Size above which a stored field is split into blocks, one chunk each.
+        octaves: Number of octaves that are sampled beyond a given lattice.
+        cache: Where meshes are kept that take long to make; None if the study makes none, or has no store yet.
+        only: Families and members FAMILY/MEMBER that a run computes, or patterns of these; empty for all.
+
+    >>> import sobolev_batch as sb
+    >>> study = sb.Study.from_table({
+    ...     "study": {"name": "balls"},
+    ...     "lattice": {"xi_max": 3.0, "M": 16},
+    ...     "norm": {"orders": [-2.0]},
+    ...     "object": [
+    ...         {"name": "ball", "reference": {"source": "sphere"}},
+    ...         {"name": "egg", "reference": {"source": "ellipsoid", "axes": [1.0, 0.8, 0.8]}},
+    ...     ],
+    ...     "family": [{"name": "icosphere", "source": "icosphere", "levels": [0, 1]}],
+    ... })
+    >>> study.orders, study.lattice, study.pairs
+    ((-2.0,), Lattice(xi_max=3.0, M=16), 'reference')
+    >>> list(study.objects), list(study.objects["egg"].members)
+    (['ball', 'egg'], ['icosphere/0', 'icosphere/1', 'reference'])
+    """
+
+    name: str
+    title: str
+    lattice: Lattice | None
+    accuracy: Accuracy | None
+    transform: TransformSettings
+    dtype: ComplexDtype | None
+    backend: Backends
+    orders: tuple[float, ...]
+    pairs: Literal["all", "reference"]
+    proximity: ProximitySection | None
+    objects: Mapping[str, StudyObject]
+    table: Mapping[str, Any]
+    largest_chunk_bytes: int = 256 << 20
+    octaves: int = 0
+    cache: MeshCache | None = None
+    only: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_orders(self.orders)
+
+    @classmethod
+    def from_toml(cls, path: str | Path) -> Self:
+        """Read a study file. Relative paths in it start from its folder.
+
+        Args:
+            path: Path of the file. docs/studies.md describes its sections, docs/leagues.md those for several objects.
+
+        Raises:
+            StudyError: The file cannot be read, is no TOML, or has keys that are unknown, of the wrong type, or out of
+                range. The message lists every offender.
+        """
+        path = Path(path)
+        try:
+            return cls.from_table(read_toml(path), folder=path.parent)
+        except InputError as error:
+            raise StudyError(f"{path}: {error}") from error
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any], *, folder: str | Path = ".") -> Self:
+        """Validate a study given as nested tables, with the keys of the study file.
+
+        Args:
+            table: Sections of the study file. A pandas.DataFrame may take the place of a list of tables, such as for
+                ``meshes`` of the source ``files``, or of the objects.
+            folder: Folder in which relative paths start.
+
+        Raises:
+            StudyError: See `from_toml`.
+        """
+        values, folder = plain_tables(table), Path(folder)
+        document, sections = sections_of_objects(values, folder)
+        objects: dict[str, StudyObject] = {}
+        for name, (of_object, as_written) in sections.items():
+            with within(f"object {quoted(name)}" if name else ""):
+                objects[name] = StudyObject.from_sections(name, of_object, as_written, folder)
+        methods = dict.fromkeys(family.name for one in objects.values() for family in one.families)
+        for name, one in objects.items():
+            lacking = tuple(methods.keys() - {family.name for family in one.families})
+            objects[name] = replace(one, lacking=tuple(method for method in methods if method in lacking))
         return cls(
             name=document.study.name,
             title=document.study.title or document.study.name,
@@ -204,35 +240,55 @@ class Study:
             backend=document.transform.backend,
             orders=document.norm.settings(),
             pairs=document.compare.pairs,
-            families=tuple(families),
-            reference=reference,
-            scaling=document.scaling.settings(),
             proximity=document.proximity,
-            folder=Path(folder),
-            octaves=document.lattice.octaves if document.lattice else 0,
+            objects=objects,
             table=_as_written(values),
+            octaves=document.lattice.octaves if document.lattice else 0,
         )
+
+    @property
+    def object(self) -> StudyObject:
+        """Its only object; ValueError where there are several."""
+        (only,) = self.objects.values()
+        return only
+
+    def of_object(self, name: str) -> Self:
+        """Return the study of one of its objects: what a task takes along, and a store is made for."""
+        one = self.objects[name]
+        return replace(self, objects={name: one}, table=one.table)
+
+    @property
+    def libraries(self) -> tuple[str, ...]:
+        """Distributions that its surfaces need besides those that this package requires."""
+        return tuple(sorted({library for source in self._sources for library in source.libraries}))
+
+    @property
+    def commands(self) -> tuple[str, ...]:
+        """Commands that it runs to make its meshes, as a shell would have them, each once."""
+        return tuple(dict.fromkeys(command for source in self._sources for command in source.commands))
+
+    @property
+    def _sources(self) -> Iterator[Source]:
+        return (source for one in self.objects.values() for source in one.sources)
 
     def with_cache(self, cache: MeshCache) -> Self:
         """Return the study, not listed yet, with the place where its meshes are kept that take long to make."""
-        if not any(source.keeps_meshes for source in self._sources):
-            return replace(self)
-        families = tuple(f.model_copy(update={"source": f.source.with_cache(cache)}) for f in self.families)
-        reference = self.reference.with_cache(cache) if isinstance(self.reference, Source) else self.reference
-        return replace(self, families=families, reference=reference, cache=cache)
+        objects = {name: one.with_cache(cache) for name, one in self.objects.items()}
+        makes_some = any(source.keeps_meshes for source in self._sources)
+        return replace(self, objects=objects, cache=cache if makes_some else None)
 
     def with_only(self, only: tuple[str, ...]) -> Self:
         """Return the study for a run of a part; see `only`."""
         return replace(self, only=only)
 
 
-@contextmanager
-def _within(what: str) -> Iterator[None]:
-    """Name in a StudyError what it is about."""
-    try:
-        yield
-    except StudyError as error:
-        raise StudyError(f"{what}: {error}") from error
+# As functions take it.
+StudyLike = Study | str | Path
+
+
+def as_study(study: StudyLike) -> Study:
+    """Return a study, which may be given by the path of its file."""
+    return study if isinstance(study, Study) else Study.from_toml(study)
 
 
 def _with_other_names(member: Member, family: str) -> Member:
@@ -266,95 +322,3 @@ def _require_distinct(families: Sequence[str]) -> None:
         )
     if any(caseless_key(name) == REFERENCE_LABEL for name in families):
         raise StudyError(f"family: no family can be named {REFERENCE_LABEL!r}: it is the label of the reference")
-
-
-@dataclass(frozen=True)
-class StudyCollection:
-    """Studies of several objects by the same methods. Make it by `from_toml` or `from_table`.
-
-    Attributes:
-        name: Name of the collection; a store remembers it.
-        title: Free text.
-        studies: Study of each object, by its name. A method is a family with the same name in all of them.
-        lacking: Methods that have no files for an object, by its name.
-        table: The collection as it was written.
-
-    >>> import sobolev_batch as sb
-    >>> collection = sb.StudyCollection.from_table({
-    ...     "study": {"name": "balls"},
-    ...     "lattice": {"xi_max": 3.0, "M": 16},
-    ...     "norm": {"orders": [-2.0]},
-    ...     "object": [
-    ...         {"name": "ball", "reference": {"source": "sphere"}},
-    ...         {"name": "egg", "reference": {"source": "ellipsoid", "axes": [1.0, 0.8, 0.8]}},
-    ...     ],
-    ...     "family": [{"name": "icosphere", "source": "icosphere", "levels": [0, 1]}],
-    ... })
-    >>> list(collection.studies)
-    ['ball', 'egg']
-    """
-
-    name: str
-    title: str
-    studies: Mapping[str, Study]
-    lacking: Mapping[str, tuple[str, ...]]
-    table: Mapping[str, Any]
-
-    @classmethod
-    def from_toml(cls, path: str | Path) -> Self:
-        """Read a study file with several objects, as `Study.from_toml` does; docs/leagues.md describes its sections."""
-        return _parsed_file(path, cls.from_table)
-
-    @classmethod
-    def from_table(cls, table: Mapping[str, Any], *, folder: str | Path = ".") -> Self:
-        """Validate a collection given as nested tables, as `Study.from_table` does.
-
-        A pandas.DataFrame may take the place of ``meshes`` of objects.
-        """
-        folder, written = Path(folder), plain_tables(table)
-        document, tables = tables_of_objects(written, folder)
-        studies: dict[str, Study] = {}
-        for name, of_object in tables.items():
-            with _within(f"object {quoted(name)}"):
-                studies[name] = replace(Study.from_table(of_object, folder=folder), part=name)
-        own = {name: [family.name for family in study.families] for name, study in studies.items()}
-        methods = dict.fromkeys(method for names in own.values() for method in names)
-        lacking = {name: tuple(method for method in methods if method not in own[name]) for name in own}
-        lacking = {name: missing for name, missing in lacking.items() if missing}
-        title = document.study.title or document.study.name
-        return cls(document.study.name, title, studies, lacking, _as_written(written))
-
-    @property
-    def commands(self) -> tuple[str, ...]:
-        """Commands that its studies run, as a shell would have them, each once."""
-        return tuple(dict.fromkeys(command for study in self.studies.values() for command in study.commands))
-
-    def with_cache(self, cache: MeshCache) -> Self:
-        """Return the collection with the place where its meshes are kept that take long to make."""
-        return replace(self, studies={name: study.with_cache(cache) for name, study in self.studies.items()})
-
-    def with_only(self, only: tuple[str, ...]) -> Self:
-        """Return the collection for a run of a part of each study."""
-        return replace(self, studies={name: study.with_only(only) for name, study in self.studies.items()})
-
-
-AnyStudy = Study | StudyCollection
-# As functions take it.
-StudyLike = AnyStudy | str | Path
-
-
-def as_study(study: StudyLike) -> AnyStudy:
-    """Return a study of one object or of several, which may be given by the path of its file."""
-
-    def parse(table: Mapping[str, Any], folder: Path) -> AnyStudy:
-        return (StudyCollection if is_collection(table) else Study).from_table(table, folder=folder)
-
-    return study if isinstance(study, AnyStudy) else _parsed_file(study, parse)
-
-
-def _parsed_file(path: str | Path, parse: Callable[..., Parsed]) -> Parsed:
-    path = Path(path)
-    try:
-        return parse(read_toml(path), folder=path.parent)
-    except InputError as error:
-        raise StudyError(f"{path}: {error}") from error

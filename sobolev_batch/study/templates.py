@@ -16,7 +16,14 @@ from typing import Any
 from sobolev_batch.errors import StudyError
 from sobolev_batch.sources.files import MeshTable, matching_files, number_as_text, read_mesh_list
 from sobolev_batch.sources.names import caseless_key, duplicate_names, natural_key, quoted
-from sobolev_batch.study.schema import REFERENCE_LABEL, ObjectSection, StudyDocument, with_named_meshes
+from sobolev_batch.study.schema import (
+    REFERENCE_LABEL,
+    ObjectSection,
+    StudyDocument,
+    SurfaceSections,
+    with_named_meshes,
+    within,
+)
 
 OBJECT, METHOD = "{object}", "{method}"
 
@@ -27,17 +34,18 @@ _PATTERNS = {"**/": "(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
 _Listed = Mapping[tuple[str, str], Sequence[Mapping[str, Any]]]
 
 
-def is_collection(table: Mapping[str, Any]) -> bool:
-    """Return True where the table of a study file has several objects."""
-    templates = str([table.get(key) for key in ("mesh", "reference", "family")])
-    return "object" in table or "objects" in table or OBJECT in templates or METHOD in templates
+def sections_of_objects(
+    written: Mapping[str, Any], folder: Path
+) -> tuple[StudyDocument, dict[str, tuple[SurfaceSections, dict[str, Any]]]]:
+    """Return the sections of a study, and for each object its own ones and its study as nested tables, by its name.
 
-
-def tables_of_objects(written: Mapping[str, Any], folder: Path) -> tuple[StudyDocument, dict[str, dict[str, Any]]]:
-    """Return the sections that objects have in common, and the tables of the study of each object, by its name.
-
-    Tables are given as `plain_tables` returns them. StudyError where they are malformed, or name no object.
+    The only object of a study without templates and sections of objects is under "". Tables are given as `plain_tables`
+    returns them. StudyError where they are malformed, or name no object.
     """
+    templates = str([written.get(key) for key in ("mesh", "reference", "family")])
+    if not ("object" in written or "objects" in written or OBJECT in templates or METHOD in templates):
+        document = StudyDocument.from_tables(written)
+        return document, {"": (document, dict(written))}
     # Objects and lists may bring references and families.
     values = {"reference": None, "family": [], **written}
     # A family may be of the mesh that has the name of the object: any will do to check it.
@@ -47,11 +55,14 @@ def tables_of_objects(written: Mapping[str, Any], folder: Path) -> tuple[StudyDo
     listed = _listed_meshes(document.objects.get("meshes", ()), folder)
     objects = _objects(document, values, list(dict.fromkeys(name for name, _ in listed)), folder)
     families = [_families(family, [section.name for section in objects], folder) for family in values["family"]]
-    tables = {}
+    sections = {}
     for section in objects:
         own = [entry for entries in families for entry in entries[section.name]]
-        tables[section.name] = _table_of_object(values, section, listed, own)
-    return document, tables
+        table = _table_of_object(values, section, listed, own)
+        with within(f"object {quoted(section.name)}"):
+            own_sections = {name: table[name] for name in SurfaceSections.model_fields if name in table}
+            sections[section.name] = SurfaceSections.from_tables(own_sections), table
+    return document, sections
 
 
 def _listed_meshes(given: str | Sequence[MeshTable], folder: Path) -> _Listed:
@@ -99,8 +110,8 @@ def _names_in_reference(values: Mapping[str, Any], folder: Path) -> list[str]:
     templates = [path for path in paths if isinstance(path, str) and OBJECT in path] if isinstance(paths, list) else []
     if not templates:
         raise StudyError(
-            "a collection needs its objects: [[object]] sections, a list in [objects], or a [reference] with paths "
-            'such as ["objects/{object}.obj"]'
+            "a study of several objects has to name them: by [[object]] sections, a list in [objects], or a "
+            '[reference] with paths such as ["objects/{object}.obj"]'
         )
     names: set[str] = set()
     for template in templates:

@@ -26,8 +26,8 @@ from tests.support.stores import flip
 from tests.support.studies import GONE, balls, methods_of, small_table
 
 
-def collection(objects: list[dict[str, Any]], name: str = "small") -> sb.StudyCollection:
-    return sb.StudyCollection.from_table(small_table(study={"name": name}, object=objects, family=methods_of()))
+def collection(objects: list[dict[str, Any]], name: str = "small") -> sb.Study:
+    return sb.Study.from_table(small_table(study={"name": name}, object=objects, family=methods_of()))
 
 
 LABELS = ("ico/1", "ico/2", "egg/1", "egg/2", "reference")
@@ -50,7 +50,7 @@ def store(threads: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_each_object_has_a_store_of_its_own(store: Path, threads: Client, tmp_path: Path) -> None:
-    alone = collection(balls(b=1.1)).studies["b"]
+    alone = sb.Study.from_table(collection(balls(b=1.1)).object.table)
     sb.run(alone, tmp_path / "alone.zarr", threads)
     ours, own = (sb.table(path).drop(columns="seconds") for path in (store / "b", tmp_path / "alone.zarr"))
     assert ours.equals(own)

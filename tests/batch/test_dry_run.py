@@ -17,7 +17,7 @@ from distributed import Client
 
 import sobolev_batch as sb
 from sobolev_batch.batch.cluster.workers import Workers
-from sobolev_batch.batch.dry_run import forecast
+from sobolev_batch.batch.dry_run import seconds_of_missing
 from sobolev_batch.batch.start import warnings_of
 from sobolev_batch.geometry.formats.writing import write_mesh
 from sobolev_batch.store.layout import Store, hide_tables
@@ -61,18 +61,14 @@ def test_finer_meshes_and_larger_lattices_take_longer() -> None:
 
 def test_stored_fields_tell_the_speed_of_the_others(plan: Plan) -> None:
     labels = [row.label for row in plan.rows]
-    stored = records(plan, *labels[:3], seconds=10.0)
     workers = Workers.of_this_machine(2)
-    seconds, processor_seconds, (first, second) = forecast(plan, stored, workers, None, planning_seconds=0.0)
-    twice, _, _ = forecast(plan, records(plan, *labels[:3], seconds=20.0), workers, None, planning_seconds=0.0)
-    later, _, _ = forecast(plan, stored, workers, None, planning_seconds=7.0)
-    # Two surfaces of about the same cost as those that took ten seconds, side by side.
-    assert 10 < seconds < 40
-    assert processor_seconds > seconds
-    assert 1.3 < twice / seconds <= 2
-    assert later == pytest.approx(seconds + 7.0)
-    assert first.endswith("for 2 missing fields, with 2 tasks at once")
-    assert second.endswith("of processor time; the speed is that of the 3 fields that are stored")
+    found, basis = seconds_of_missing(plan, records(plan, *labels[:3], seconds=10.0), workers, None)
+    twice, _ = seconds_of_missing(plan, records(plan, *labels[:3], seconds=20.0), workers, None)
+    # Two surfaces of about the same cost as those that took ten seconds.
+    assert list(found) == labels[3:]
+    assert all(2 < seconds < 40 for seconds in found.values())
+    assert {label: seconds / 2 for label, seconds in twice.items()} == pytest.approx(found)
+    assert basis == "the 3 fields that are stored"
 
 
 def test_nothing_is_foretold_where_nothing_is_missing(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -81,8 +77,25 @@ def test_nothing_is_foretold_where_nothing_is_missing(plan: Plan, monkeypatch: p
 
     monkeypatch.setattr("sobolev_batch.batch.dry_run.slowness", measured)
     stored = records(plan, *(row.label for row in plan.rows), seconds=1.0)
-    found = forecast(plan, stored, Workers.of_this_machine(2), None, planning_seconds=3.0)
-    assert found == (0.0, 0.0, ["nothing is missing"])
+    assert seconds_of_missing(plan, stored, Workers.of_this_machine(2), None) == ({}, "")
+
+
+def test_objects_are_foretold_beside_each_other(client: Client, tmp_path: Path) -> None:
+    one, three = (
+        sb.plan(
+            sb.Study.from_table(small_table(object=balls(**dict.fromkeys(names, 1.0)), family=methods_of())),
+            tmp_path / f"{names}.zarr",
+            client,
+        )
+        for names in ("a", "abc")
+    )
+    assert len(three.missing) == 3 * len(one.missing)
+    assert list(three.objects) == ["a", "b", "c"]
+    # On two workers, what three take together takes longer than one, and less than one after the other.
+    work = sum(each.planning_seconds + sum(each.task_seconds.values()) for each in three.objects.values())
+    assert three.seconds == pytest.approx(work / 2)
+    alone = one.object
+    assert one.seconds == pytest.approx(alone.planning_seconds + sum(alone.task_seconds.values()) / 2)
 
 
 @pytest.mark.extras
@@ -152,7 +165,7 @@ def test_what_would_make_a_run_useless_is_told_before_it(
 ) -> None:
     for suffix in ("ply", "off"):
         write_mesh(sb.shapes.icosphere(1), tmp_path / f"80.{suffix}")
-    made = (sb.StudyCollection if "object" in table else sb.Study).from_table(table, folder=tmp_path)
+    made = sb.Study.from_table(table, folder=tmp_path)
     found = warnings_of(made, Location.parse(tmp_path / "s.zarr"))
     assert len(found) == len(expected)
     for line, beginning in zip(found, expected, strict=True):
@@ -191,9 +204,9 @@ def test_a_plan_and_a_status_and_a_run_agree_on_what_is_missing() -> None:
     Records(Store.open(place)).write(0, None)
     (missing,) = sb.status(place).lost_records
     assert (sb.verify(place).complete, sb.status(place).complete) == (4, 4)
-    assert set(sb.plan(study, place).labels) - set(sb.plan(study, place).stored) == {missing}
+    assert sb.plan(study, place).missing == (missing,)
     # Surfaces that the store does not know yet are missing too.
-    assert set(sb.plan(more, place).labels) - set(sb.plan(more, place).stored) == {missing, "ico/4"}
+    assert set(sb.plan(more, place).missing) == {missing, "ico/4"}
     assert set(sb.run(more, place).computed) == {missing, "ico/4"}
     assert (sb.status(place).complete, sb.status(place).lost_records) == (6, ())
 

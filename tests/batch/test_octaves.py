@@ -89,7 +89,7 @@ def test_a_run_reuses_octaves_and_a_new_mesh_gets_the_same_frequencies(store: Pa
     before = sb.open_store(store)["octaves"].to_dataset().load()
     assert before.xi_x.attrs["units"] == "cycles per unit length"
     plan = sb.plan(sb.Study.from_table(asking()), store)
-    assert (plan.octaves, len(plan.stored)) == (before["octave"].values.max(), 4)
+    assert (plan.object.octaves, len(plan.object.stored)) == (before["octave"].values.max(), 4)
     assert f"{before.sizes['sample']:,} samples" in str(plan)
     assert sb.run(sb.Study.from_table(asking()), store, client).computed == ()
     more = asking()

@@ -204,7 +204,7 @@ def test_the_command_returns_and_says_how_to_follow(study_path: Path, tmp_path: 
 
 @pytest.mark.process
 def test_a_collection_is_handed_over_by_object(tmp_path: Path, client: Client) -> None:
-    collection = sb.StudyCollection.from_table(small_table(object=[*balls(ball=1.0), GONE]), folder=tmp_path)
+    collection = sb.Study.from_table(small_table(object=[*balls(ball=1.0), GONE]), folder=tmp_path)
     store, address = tmp_path / "all.zarr", client.scheduler.address
     submission = sb.submit(collection, store, client)
     assert (submission.surfaces, submission.missing) == (5, 5)

@@ -261,7 +261,7 @@ def same_worker(memory: str) -> Iterator[Client]:
 @pytest.mark.timeout(900)
 def test_twenty_million_triangles_on_a_worker_of_six_gigabytes(tmp_path: Path, store_path: Path) -> None:
     cortex = Study.from_toml(ROOT / "workflows" / "cortex.toml")
-    base = loaded(*cortex.reference.members(cortex.folder))  # type: ignore[union-attr]
+    base = loaded(*cortex.object.reference.members(cortex.object.folder))  # type: ignore[union-attr]
     count = write_subdivided(base, PER_EDGE, tmp_path / "huge.ply")
     assert count > 20_000_000
     # Finer, it takes four times the points and as many times as long.

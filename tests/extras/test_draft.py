@@ -12,7 +12,7 @@ import pytest
 
 import sobolev_batch as sb
 from sobolev_batch.sources.files import FileMember
-from sobolev_batch.study.study import as_study
+from sobolev_batch.study.study import StudyObject, as_study
 from tests.support.commands import call
 
 # The reference last in each, since it has the most triangles.
@@ -69,26 +69,24 @@ def write(path: Path, level: int) -> None:
         plain.unlink()
 
 
-def files_of(study: sb.Study) -> dict[str, dict[str, str]]:
+def files_of(one: StudyObject) -> dict[str, dict[str, str]]:
     """Return the path of each member of each family, below the folder of the meshes; empty if it is no file."""
-    folder = (study.folder / "meshes").absolute()
+    folder = (one.folder / "meshes").absolute()
     return {
         family.name: {
             member.name: member.path.relative_to(folder).as_posix() if isinstance(member, FileMember) else ""
-            for member in family.source.members(study.folder)
+            for member in family.source.members(one.folder)
         }
-        for family in study.families
+        for family in one.families
     }
 
 
-def drafted(folder: Path, *paths: str) -> tuple[Sequence[str], Mapping[str, sb.Study]]:
-    """Return the summary and the studies of a draft for several objects."""
+def drafted(folder: Path, *paths: str) -> tuple[Sequence[str], Mapping[str, StudyObject]]:
+    """Return the summary and the objects of a draft for several objects."""
     for path in paths:
         write(folder / "meshes" / path, 1)
     draft = sb.init_study(folder / "meshes", folder / "study.toml")
-    collection = as_study(draft.path)
-    assert isinstance(collection, sb.StudyCollection)
-    return draft.summary, collection.studies
+    return draft.summary, as_study(draft.path).objects
 
 
 @pytest.mark.parametrize("layout", ONE_OBJECT)
@@ -100,10 +98,10 @@ def test_reference_and_families(tmp_path: Path, layout: str) -> None:
     study = sb.Study.from_toml(draft.path)
     assert not draft.left_out
     assert draft.summary[0] == f"reference meshes/{reference}, 1,280 triangles"
-    (found,) = study.reference.members(tmp_path)  # type: ignore[union-attr]
+    (found,) = study.object.reference.members(tmp_path)  # type: ignore[union-attr]
     assert isinstance(found, FileMember)
     assert found.path == (tmp_path / "meshes" / reference).absolute()
-    assert {name: set(members) for name, members in files_of(study).items()} == {
+    assert {name: set(members) for name, members in files_of(study.object).items()} == {
         name: set(members) for name, members in families.items()
     }
 
@@ -165,7 +163,7 @@ def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
     more = sb.Study.from_toml(tmp_path / "more.toml")
     assert more.proximity is not None
     assert more.proximity.metrics == ("hausdorff", "chamfer")
-    assert [family.name for family in more.families] == ["meshes", "quadric decimation"]
+    assert [family.name for family in more.object.families] == ["meshes", "quadric decimation"]
 
 
 def test_folders_without_meshes_are_refused(tmp_path: Path) -> None:

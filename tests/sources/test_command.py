@@ -271,7 +271,7 @@ def test_methods_without_a_size_in_common_have_a_plot_by_cost(tmp_path: Path) ->
     coarse = {"name": "coarse", "source": "icosphere", "levels": [0]}
     table = small_table(object=balls(a=1.0, b=1.1), family=[half, coarse])
     place = "memory://by-cost.zarr"
-    sb.run(sb.StudyCollection.from_table(table), place)
+    sb.run(sb.Study.from_table(table), place)
     call("plot", place, "--output", tmp_path / "half", "--family", "half")
     assert {path.name for path in (tmp_path / "half").iterdir()} == {"league.png", "league-by-cost.png"}
     done = call("plot", place, "--output", tmp_path)

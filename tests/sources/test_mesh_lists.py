@@ -88,7 +88,7 @@ def test_a_frame_loses_nothing() -> None:
     paths = [Path("a.ply"), Path("b.ply")]
     frame = pd.DataFrame({"path": paths, "time": times, "tiny": tiny, "day": [day, pd.NaT], "name": [1234567, 8]})
     study = sb.Study.from_table(small_table(family=[{"name": "f", "source": "files", "meshes": frame}]))
-    found = study.families[0].source.members(Path())
+    found = study.object.families[0].source.members(Path())
     assert [member.name for member in found] == ["1234567", "8"]
     assert [member.time for member in found] == times
     assert [dict(member.metadata)["tiny"] for member in found] == tiny

@@ -38,21 +38,21 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def methods(collection: sb.StudyCollection) -> dict[str, list[str]]:
-    return {name: [family.name for family in study.families] for name, study in collection.studies.items()}
+def methods(collection: sb.Study) -> dict[str, list[str]]:
+    return {name: [family.name for family in study.families] for name, study in collection.objects.items()}
 
 
-def files(collection: sb.StudyCollection, folder: Path, name: str, method: str) -> list[str]:
-    (family,) = (family for family in collection.studies[name].families if family.name == method)
+def files(collection: sb.Study, folder: Path, name: str, method: str) -> list[str]:
+    (family,) = (family for family in collection.objects[name].families if family.name == method)
     return [member.name for member in family.source.members(folder)]
 
 
 def test_files_give_objects_and_methods(folder: Path) -> None:
-    found = sb.StudyCollection.from_table(table(), folder=folder)
-    assert list(found.studies) == ["bee9", "bee10", "cow", "cow_2"]
+    found = sb.Study.from_table(table(), folder=folder)
+    assert list(found.objects) == ["bee9", "bee10", "cow", "cow_2"]
     assert methods(found)["cow_2"] == ["even", "quick"]
     assert methods(found)["bee10"] == ["quick"]
-    assert found.lacking == {"bee10": ("even",)}
+    assert {name: one.lacking for name, one in found.objects.items() if one.lacking} == {"bee10": ("even",)}
     # One object's name begins with that of another: a file is of the longest name that fits.
     assert files(found, folder, "cow", "quick") == ["cow_100", "cow_200"]
     assert files(found, folder, "cow_2", "quick") == ["cow_2_100"]
@@ -71,7 +71,7 @@ def test_a_file_is_of_the_object_with_the_longest_name_that_fits(
     family = [{"name": "{method}", "source": "files", "paths": [template.replace("80", "*")]}]
     objects = [{"name": name} for name in names]
     references = {"source": "files", "paths": ["{object}.off"]}
-    found = sb.StudyCollection.from_table(table(object=objects, family=family, reference=references), folder=tmp_path)
+    found = sb.Study.from_table(table(object=objects, family=family, reference=references), folder=tmp_path)
     assert methods(found) == {name: ["quick"] for name in names}
     assert {name: files(found, tmp_path, name, "quick") for name in names} == {
         name: [Path(path).stem] for name, path in paths.items()
@@ -83,25 +83,22 @@ def test_files_of_longer_names_alone_are_no_files(folder: Path) -> None:
     (folder / "out/quick/cow_200.ply").unlink()
     family = [{"name": "quick", "source": "files", "paths": ["out/quick/{object}_*.ply"]}, *ICO]
     objects = [{"name": "cow"}, {"name": "cow_2"}]
-    found = sb.StudyCollection.from_table(table(object=objects, family=family), folder=folder)
-    assert found.lacking == {"cow": ("quick",)}
+    found = sb.Study.from_table(table(object=objects, family=family), folder=folder)
+    assert {name: one.lacking for name, one in found.objects.items() if one.lacking} == {"cow": ("quick",)}
     with pytest.raises(sb.errors.StudyError, match="object 'cow': no family has a file of it"):
-        sb.StudyCollection.from_table(table(object=objects, family=family[:1]), folder=folder)
+        sb.Study.from_table(table(object=objects, family=family[:1]), folder=folder)
     with pytest.raises(sb.errors.StudyError, match="family 'quick': no file that it names is of an object"):
-        sb.StudyCollection.from_table(table(object=[{"name": "horse"}], family=family), folder=folder)
+        sb.Study.from_table(table(object=[{"name": "horse"}], family=family), folder=folder)
 
 
 def test_objects_can_be_listed_with_references_and_scalings_of_their_own(folder: Path) -> None:
     ball = {"name": "ball", "reference": {"source": "sphere"}, "scaling": {"mode": "none"}}
-    with pytest.raises(sb.errors.StudyError, match="read them as a StudyCollection"):
-        sb.Study.from_table(table(object=[{"name": "cow"}, ball], family=ICO), folder=folder)
-    found = sb.StudyCollection.from_table(table(object=[{"name": "cow"}, ball], family=ICO), folder=folder)
-    studies = [(study.name, study.scaling) for study in found.studies.values()]
-    assert studies == [("small cow", None), ("small ball", sb.shapes.Similarity())]
+    found = sb.Study.from_table(table(object=[{"name": "cow"}, ball], family=ICO), folder=folder)
+    assert {name: one.scaling for name, one in found.objects.items()} == {"cow": None, "ball": sb.shapes.Similarity()}
 
 
 def test_named_meshes_give_objects_too(folder: Path) -> None:
-    found = sb.StudyCollection.from_table(
+    found = sb.Study.from_table(
         table(
             mesh={"original": {"source": "files", "paths": ["objects/{object}.ply"]}},
             reference={"mesh": "original"},
@@ -110,7 +107,7 @@ def test_named_meshes_give_objects_too(folder: Path) -> None:
         folder=folder,
     )
     assert methods(found) == {name: ["d"] for name in ("bee9", "bee10", "cow", "cow_2")}
-    (member,) = found.studies["cow"].reference.members(folder)  # type: ignore[union-attr]
+    (member,) = found.objects["cow"].reference.members(folder)  # type: ignore[union-attr]
     assert member.name == "cow"
 
 
@@ -122,12 +119,12 @@ def test_a_list_gives_objects_methods_references_and_metadata(folder: Path) -> N
         "bee,reference,../objects/bee9.ply,\nbee,quick,../out/quick/bee9_100.ply,0.25\n"
     )
     listed = small_table(objects={"meshes": "lists/meshes.csv"}, reference=None, family=None)
-    found = sb.StudyCollection.from_table(listed, folder=folder)
+    found = sb.Study.from_table(listed, folder=folder)
     assert methods(found) == {"cow": ["quick"], "bee": ["quick"]}
-    (member,) = found.studies["bee"].families[0].source.members(folder)
+    (member,) = found.objects["bee"].families[0].source.members(folder)
     assert member.metadata == (("method_seconds", 0.25),)
     frame = pd.DataFrame({"object": ["cow"], "method": ["quick"], "path": ["out/quick/cow_100.ply"]})
-    found = sb.StudyCollection.from_table(table(objects={"meshes": frame}, family=[]), folder=folder)
+    found = sb.Study.from_table(table(objects={"meshes": frame}, family=[]), folder=folder)
     assert methods(found) == {"cow": ["quick"]}
 
 
@@ -158,18 +155,28 @@ def listed(name: str) -> dict[str, str]:
         ({"objects": {"mesh": "a.csv"}}, r"\[objects\]: mesh must be called 'meshes'"),
         ({"family": 3}, "family must be a list, found 3"),
         ({"study": {}}, r"\[study\]: name is missing"),
-        ({"reference": {"source": "sphere"}}, "a collection needs its objects"),
+        ({"reference": {"source": "sphere"}}, "a study of several objects has to name them"),
     ],
 )
 def test_refusals_name_the_place(folder: Path, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(sb.errors.StudyError, match=message):
-        sb.StudyCollection.from_table(table(**changes), folder=folder)
+        sb.Study.from_table(table(**changes), folder=folder)
 
 
 def test_a_study_file_is_read_as_what_it_is(folder: Path) -> None:
-    for made, kind in ((table(), sb.StudyCollection), (small_table(), sb.Study)):
+    for made, names in ((table(), ["bee9", "bee10", "cow", "cow_2"]), (small_table(), [""])):
         (folder / "study.toml").write_text(tomli_w.dumps(made))
-        assert isinstance(as_study(folder / "study.toml"), kind)
+        assert list(as_study(folder / "study.toml").objects) == names
+
+
+def test_the_study_of_an_object_is_one_of_its_own(folder: Path) -> None:
+    whole = sb.Study.from_table(table(), folder=folder)
+    alone = whole.of_object("cow")
+    again = sb.Study.from_table(alone.table, folder=folder)
+    assert list(alone.object.members) == list(again.object.members)
+    assert (alone.orders, again.orders, again.name) == (whole.orders, whole.orders, "small cow")
+    with pytest.raises(ValueError, match="too many values"):
+        _ = whole.object
 
 
 @pytest.mark.parametrize(
@@ -185,10 +192,8 @@ def test_a_study_file_is_read_as_what_it_is(folder: Path) -> None:
 def test_placeholders_take_as_much_as_they_can(tmp_path: Path, template: str, path: str, name: str) -> None:
     (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / path).write_text("")
-    found = sb.StudyCollection.from_table(
-        table(reference={"source": "files", "paths": [template]}, family=ICO), folder=tmp_path
-    )
-    assert list(found.studies) == [name]
+    found = sb.Study.from_table(table(reference={"source": "files", "paths": [template]}, family=ICO), folder=tmp_path)
+    assert list(found.objects) == [name]
 
 
 def test_a_family_may_be_of_the_mesh_with_the_name_of_the_object() -> None:
@@ -198,8 +203,8 @@ def test_a_family_may_be_of_the_mesh_with_the_name_of_the_object() -> None:
         "object": [{"name": "ball", "reference": "ball"}, {"name": "egg", "reference": "egg"}],
         "family": [{"name": "moved", "source": "moved", "mesh": "{object}", "distances": [0.1]}],
     }
-    studies = sb.StudyCollection.from_table(table).studies
+    studies = sb.Study.from_table(table).objects
     assert {name: study.table["family"][0]["mesh"] for name, study in studies.items()} == {"ball": "ball", "egg": "egg"}
     table["family"][0]["mesh"] = "{object}s"
     with pytest.raises(sb.errors.StudyError, match="no mesh is named 'balls'; did you mean ball"):
-        sb.StudyCollection.from_table(table)
+        sb.Study.from_table(table)

@@ -115,8 +115,8 @@ def test_large_lattices_are_cut_into_chunks_and_small_ones_refused() -> None:
 def test_two_surfaces_of_one_label_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """A source of another package may not keep its promise."""
     study = Study.from_table(small_table())
-    source = study.families[0].source
-    members = source.members(study.folder)
+    source = study.object.families[0].source
+    members = source.members(study.object.folder)
     monkeypatch.setattr(type(source), "members", lambda self, folder: [*members, members[0]])
     with pytest.raises(StudyError, match="two surfaces of the study have the label 'ico/0'"):
         make_plan(study)

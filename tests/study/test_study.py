@@ -61,9 +61,9 @@ def test_reads_every_key(tmp_path: Path) -> None:
     assert study.orders == (-2.0, -3.5)
     assert study.pairs == "all"
     assert (study.transform.eps, study.transform.dtype, study.transform.quadrature) == (1e-6, "complex64", 5)
-    assert study.scaling == Similarity(0.5)
-    assert [family.name for family in study.families] == ["ico", "thin"]
-    assert study.folder == tmp_path
+    assert study.object.scaling == Similarity(0.5)
+    assert [family.name for family in study.object.families] == ["ico", "thin"]
+    assert study.object.folder == tmp_path
 
 
 def keys_of(model: type[BaseModel]) -> dict[str, Any]:
@@ -103,12 +103,12 @@ def test_its_example_and_the_workflows_are_valid(tmp_path: Path) -> None:
         (tmp_path / "study.toml").write_text(text)
         return Study.from_toml(tmp_path / "study.toml")
 
-    reference = read(study).reference
+    reference = read(study).object.reference
     assert isinstance(reference, FileSource)
     assert reference.paths == ("original.ply",)
     assert read(study).title == "Scans of a statue, decimated"
     assert read(study.replace("[accuracy]\nrtol = 1e-3\n", lattice)).lattice == Lattice(5.0, 64)
-    coarse, fine = read(f"{study}\n{listed}").families[1].source.members(tmp_path)
+    coarse, fine = read(f"{study}\n{listed}").object.families[1].source.members(tmp_path)
     assert (coarse.name, fine.name, dict(fine.metadata)["tool_seconds"]) == ("coarse", "fine", 12.1)
     for name in ("icosphere", "cortex", "cortex-fitted", "torus"):
         assert Study.from_toml(ROOT / "workflows" / f"{name}.toml").name == name
@@ -134,7 +134,7 @@ def test_python_may_give_arrays_paths_and_sizes() -> None:
 @pytest.mark.parametrize("name", ["a", "two words", "Größe", "日本", "..a", "-", "a" * 100, "😀", "5%"])
 def test_names_may_be_of_any_script(name: str) -> None:
     study = Study.from_table({**changed("family.0.name", name), "study": {"name": name}})
-    assert (study.name, study.families[0].name) == (name, name)
+    assert (study.name, study.object.families[0].name) == (name, name)
 
 
 @pytest.mark.slow

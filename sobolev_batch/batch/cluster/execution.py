@@ -96,7 +96,7 @@ def task_key(stage: str, study: str, part: str, label: str) -> tuple[str, str, s
     The dashboard groups tasks by the first of these: all objects (parts) of a study share it.
     """
     # What follows a hyphen may be taken for a number of the task.
-    group = f"{stage} {study.removesuffix(f' {part}')}".strip().replace("-", "_")
+    group = f"{stage} {study}".strip().replace("-", "_")
     return group, "/".join(filter(None, (part, label))), uuid4().hex
 
 
@@ -124,7 +124,7 @@ class Cluster:
     @classmethod
     def prepare(cls, client: Client, study: Study, notify: Notify = lambda progress: None) -> Self:
         """Prepare the workers of a cluster for a study; see `prepare_workers`."""
-        return cls(client, prepare_workers(client, study.libraries), notify, study=study.name, part=study.part)
+        return cls(client, prepare_workers(client, study.libraries), notify, study=study.name, part=study.object.name)
 
     @property
     def most_in_flight(self) -> int:

@@ -53,7 +53,7 @@ class StudyMeshes:
             study = Study.from_table(tree.attrs["study"]["table"], folder=folder)
             if tree.attrs["study"].get("mesh_cache"):
                 study = study.with_cache(MeshCache(Location.parse(tree.attrs["study"]["mesh_cache"])))
-            members = study.members
+            members = study.object.members
         except SobolevBatchError as error:
             raise InputError(f"the study's meshes cannot be listed here: {error}") from error
         similarity = tree.attrs["similarity"]

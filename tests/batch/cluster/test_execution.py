@@ -13,7 +13,7 @@ import pytest
 from distributed import Client, Event, Future, KilledWorker, LocalCluster, as_completed
 from distributed.utils import key_split
 
-from sobolev_batch import Study, StudyCollection, plan, run, submit
+from sobolev_batch import Study, plan, run, submit
 from sobolev_batch.batch.cluster import execution
 from sobolev_batch.batch.cluster.execution import (
     Cluster,
@@ -274,7 +274,7 @@ def test_the_dashboard_names_tasks_by_stage_study_and_mesh(threads: Client, monk
 
     monkeypatch.setattr(threads, "submit", recorded)
     table = small_table(study={"name": "my-scans 2024-06"}, object=balls(cow=1.0, egg=1.1), family=methods_of())
-    run(StudyCollection.from_table(table), "memory://names.zarr", threads)
+    run(Study.from_table(table), "memory://names.zarr", threads)
     field = "field my_scans 2024_06"
     # The name of the one group of all objects and the one of the prefix, which progress bars show, are the same.
     assert {(key[0], key_split(key)) for key in keys if key[0].startswith("field")} == {(field, field)}

@@ -135,7 +135,7 @@ def test_fits_have_the_parameters_of_the_remesher_before_them() -> None:
         "triangles": [9],
     }
     study = sb.Study.from_table(table(mesh={**FIT, "mesh": remeshed}))
-    assert study.members["fitted/9"][1].metadata == (("target_triangles", 9.0),)
+    assert study.object.members["fitted/9"][1].metadata == (("target_triangles", 9.0),)
 
 
 def test_the_reference_is_handed_down_to_nested_sources() -> None:

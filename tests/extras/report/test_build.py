@@ -313,7 +313,7 @@ def collection() -> str:
     study = {"name": "balls", "title": f"Balls {SCRIPT}"}
     made = small_table(study=study, object=[*balls(ball=1.0, large=1.1), GONE], family=methods_of("=egg"))
     place = "memory://balls-report.zarr"
-    assert list(sb.run(sb.StudyCollection.from_table(made), place).failed) == ["gone"]
+    assert list(sb.run(sb.Study.from_table(made), place).failed) == ["gone"]
     return place
 
 
