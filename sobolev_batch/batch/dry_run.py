@@ -242,7 +242,7 @@ def _study_lines(plan: Plan) -> Iterator[tuple[str, str]]:
     if study.proximity is not None:
         yield (
             "proximity",
-            f"Hausdorff and Chamfer distances, from {study.proximity.points:,} points on each mesh; the time leaves them out",
+            f"Hausdorff and Chamfer distances, from {study.proximity.points:,} points on each mesh, beside the time below",
         )
 
 

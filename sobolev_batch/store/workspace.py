@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -111,7 +111,7 @@ class Workspace(Contents):
         workspace, cache = cls.prepared(location.fenced(lock.fence), plan), plan.study.cache
         if workspace.pending and cache is not None and cache.versions_changed():
             # A program of another version makes other meshes: the study is listed again.
-            return cls.of_study(replace(study), location, lock)
+            return cls.of_study(study.not_listed(), location, lock)
         return workspace
 
     @property

@@ -277,6 +277,10 @@ class Study:
         makes_some = any(source.keeps_meshes for source in self._sources)
         return replace(self, objects=objects, cache=cache if makes_some else None)
 
+    def not_listed(self) -> Self:
+        """Return the study with objects whose members are listed anew."""
+        return replace(self, objects={name: replace(one) for name, one in self.objects.items()})
+
     def with_only(self, only: tuple[str, ...]) -> Self:
         """Return the study for a run of a part; see `only`."""
         return replace(self, only=only)
