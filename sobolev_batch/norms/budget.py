@@ -1,4 +1,4 @@
-"""Errors of a norm or distance: truncation, aliasing and discretisation.
+"""Errors of a norm or distance: truncation, aliasing and discretisation, and what surfaces far apart leave out.
 
 Truncation (frequencies beyond the cube) and aliasing (images of the surfaces at the lattice's period)
 follow from the same sums as the number itself; discretisation comes from the probes of the fields.
@@ -7,6 +7,7 @@ docs/numerics.md says how well these estimates hold.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -15,7 +16,7 @@ import numpy as np
 from scipy.special import beta, exprel, gamma, gammaln, kve, zeta
 
 from sobolev_batch.arrays import Reals
-from sobolev_batch.geometry.surface import DIRECTIONS
+from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Surface
 from sobolev_batch.transform.lattice import SobolevWeights
 
 # Both laws were measured on spheres, boxes, sticks and icospheres, near and far: the truncation was
@@ -27,6 +28,10 @@ _TROUGH_PERIODS = 3.0
 # Two outer ranges of |ξ|, in fractions of xi_max. The energy of a difference is extrapolated from them. Where it is
 # measured beyond xi_max, they are octaves as well.
 _WINDOWS, _OCTAVES = ((0.5, 0.75), (0.75, 1.0)), ((0.25, 0.5), (0.5, 1.0))
+# Fraction of the accuracy that the product of two surfaces far apart may take.
+APART_FRACTION = 0.01
+# Edge of the cubes that bound norms from below, in units of length: the kernel hardly falls within one.
+_EDGE = 0.25
 
 _CUBE = np.array(list(product(range(-3, 4), repeat=3)), dtype=np.float64)
 _ODD_ENTRIES = (np.abs(_CUBE) % 2).sum(axis=1)
@@ -215,10 +220,48 @@ def image_weight(spacing: float, order: float, widths: Reals, images: Reals = _P
     distances = np.maximum((offsets - widths).max(axis=1), 0.0)
     # Above order -3/2 the kernel has no finite peak but the same decay: take the nearest order with one.
     nu = max(-order - 1.5, 0.25)
-    # In logarithms, since powers of both signs overflow at low orders; K itself does so at small arguments.
+    logs = _bessel_logs(nu, distances) - gammaln(nu) - (nu - 1) * np.log(2)
+    # Never exactly zero, so that ratios exist.
+    return float(np.sum(np.maximum(np.exp(np.minimum(logs, 0.0)), 1e-280)))
+
+
+def _bessel_logs(nu: float, distances: Reals) -> Reals:
+    """Return the logarithms of b^ν K_ν(b) at b = 2π distance (n,): the powers overflow at low orders, and so does K."""
     # Beyond the upper bound K is zero, and its routine gives up.
     arguments = np.clip(2 * np.pi * distances, 1e-6, 1e6)
     with np.errstate(over="ignore"):
-        logs = nu * np.log(arguments) + np.log(kve(nu, arguments)) - arguments - gammaln(nu) - (nu - 1) * np.log(2)
-    # Never exactly zero, so that ratios exist.
-    return float(np.sum(np.maximum(np.exp(np.minimum(logs, 0.0)), 1e-280)))
+        return np.asarray(nu * np.log(arguments) + np.log(kve(nu, arguments)) - arguments)
+
+
+def product_apart(surfaces: Sequence[Surface], orders: Sequence[float], rtol: float) -> Reals | None:
+    """Return what the inner product of two surfaces does not exceed (orders,), or None if that is not next to nothing.
+
+    The kernel is positive and falls, so that no product exceeds both areas times the kernel at the gap between the
+    boxes. And no squared norm is below that of an even distribution over cubes of the box, area² / cubes times the
+    kernel at their diagonal. So the areas cancel in the ratio, which is to be far below the rtol.
+    """
+    if len(surfaces) == 1:
+        return None
+    a, b = surfaces
+    (low, high), (other_low, other_high) = a.extent.box, b.extent.box
+    gap = float(np.linalg.norm(np.maximum(np.maximum(low - other_high, other_low - high), 0.0)))
+    if gap <= _EDGE:
+        return None
+    cubes = math.sqrt(_cubes(a.extent) * _cubes(b.extent))
+    at_gap, within = np.array([_kernel(order, np.array([gap, math.sqrt(3) * _EDGE])) for order in orders]).T
+    return a.area * b.area * at_gap if np.all(at_gap * cubes <= 2 * APART_FRACTION * rtol * within) else None
+
+
+def _cubes(extent: Extent) -> float:
+    """Return the number of cubes that hold a box."""
+    low, high = extent.box
+    return float(np.prod(np.maximum(np.ceil((high - low) / _EDGE), 1.0)))
+
+
+def _kernel(order: float, distances: Reals) -> Reals:
+    """Return the Matérn kernel of an order at distances > 0 (n,): the inverse transform of (1 + |ξ|²)^order."""
+    power = -order - 1.5
+    factor = -order * math.log(np.pi) - gammaln(-order)
+    logs = math.log(2) + factor - power * math.log(2 * np.pi) + _bessel_logs(power, distances)
+    at_zero = gammaln(power) + factor - power * math.log(np.pi) if power > 0 else math.inf
+    return np.asarray(np.exp(np.minimum(logs, at_zero)))

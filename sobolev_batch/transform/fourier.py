@@ -9,7 +9,7 @@ import logging
 import math
 import time
 from bisect import bisect_left
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product
@@ -145,10 +145,11 @@ class ErrorTarget:
         return ErrorTarget(self.orders, tuple(norm / factor for norm in self.norms))
 
 
-def permits_single(surface: Surface, lattice: FrequencyLattice, target: ErrorTarget) -> bool:
-    """Tell whether single precision meets a target: its rounding is 1e-7 of the area at every frequency."""
-    rounding = _SINGLE_ROUNDING * surface.area * np.sqrt(weight_masses(lattice, target.orders))
-    return bool(np.all(rounding <= _NUFFT_FRACTION * np.array(target.norms)))
+def cheapest_dtype(surfaces: Sequence[Surface], lattice: FrequencyLattice, target: ErrorTarget) -> ComplexDtype:
+    """Return the dtype in which the field of each surface meets a target: single precision loses 1e-7 of the area."""
+    rounding = _SINGLE_ROUNDING * max(surface.area for surface in surfaces)
+    errors = rounding * np.sqrt(weight_masses(lattice, target.orders))
+    return "complex64" if np.all(errors <= _NUFFT_FRACTION * np.array(target.norms)) else "complex128"
 
 
 def choose_settings(

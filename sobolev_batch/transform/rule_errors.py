@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cache, partial
 
 import numpy as np
@@ -15,6 +14,9 @@ from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.transform.coherence import RANGES, coherence, unpaired
 from sobolev_batch.transform.lattice import FrequencyLattice
 from sobolev_batch.transform.rules import FINEST_TOLERANCE, choose_rules, rule_ranges, typical_errors
+
+# Parts of squared errors at some frequencies (n,): of even errors in phase, of odd ones in phase, and the rest.
+_ErrorParts = tuple[Reals, Reals, Reals]
 
 # Fraction of the odd errors that was seen to remain between neighbouring triangles.
 _ODD_REMAINDER = 0.2
@@ -55,8 +57,8 @@ def tolerance_for(mesh: Mesh, highest_frequency: float, eps: float) -> float:
         return _error_parts(classes, highest_frequency, radii, tolerance, shared, _RESONANCE)
 
     def suffices(tolerance: float, found: Reals) -> bool:
-        energies = parts(tolerance).energies(np.maximum(found, mean), np.maximum(found, alike))
-        return bool(energies.max() <= allowed)
+        even, odd, rest = parts(tolerance)
+        return bool((even * np.maximum(found, mean) + odd * np.maximum(found, alike) + rest).max() <= allowed)
 
     tolerance = _loosest(eps, partial(suffices, found=none))
     # Most coarse meshes keep eps even if all errors were in phase.
@@ -96,9 +98,8 @@ def quadrature_error(
 ) -> Reals:
     """Predict the norm of the quadrature's part of a field's error (orders,), from the `size_classes` of a mesh."""
     radii = _radii(lattice)
-    parts = _error_parts(classes, lattice.highest_frequency, radii, tolerance, shared)
-    energies = parts.energies(_mean_coherence(radii, classes), np.zeros(RANGES))
-    return np.asarray(np.sqrt(_radial_integrals(energies, radii, orders)))
+    even, _, rest = _error_parts(classes, lattice.highest_frequency, radii, tolerance, shared)
+    return np.asarray(np.sqrt(_radial_integrals(even * _mean_coherence(radii, classes) + rest, radii, orders)))
 
 
 def _mean_coherence(radii: Reals, classes: Reals) -> Reals:
@@ -106,30 +107,13 @@ def _mean_coherence(radii: Reals, classes: Reals) -> Reals:
     return np.asarray(np.minimum(1.0, 1 / (2 * np.pi * radii**2 * classes[2].sum())))
 
 
-@dataclass(frozen=True, eq=False)
-class _ErrorParts:
-    """Predicted squared errors of a mesh's points at frequencies |ξ| (n,) each.
-
-    Attributes:
-        even: The part of the even errors of triangles, if all were in phase.
-        odd: The same for the odd errors.
-        rest: The part that adds up like random numbers, or in any case.
-    """
-
-    even: Reals
-    odd: Reals
-    rest: Reals
-
-    def energies(self, even: Reals, odd: Reals) -> Reals:
-        """Return the squared errors (n,) where these fractions (n,) of what would be in phase add up."""
-        return np.asarray(self.even * even + self.odd * odd + self.rest)
-
-
 def _error_parts(
     classes: Reals, highest_frequency: float, radii: Reals, tolerance: float, shared: bool, resonance: float = math.inf
 ) -> _ErrorParts:
-    """Predict the squared error of a mesh's points at frequencies |ξ| (n,), from its `size_classes`.
+    """Predict parts of the squared error of a mesh's points at frequencies |ξ| (n,), from its `size_classes`.
 
+    They are those of the even and of the odd errors of triangles, if all were in phase, and that of errors which add up
+    like random numbers, or in any case.
     The even parts of the triangles' errors add up like the surface's transform itself. The odd parts add up like random
     numbers, but for those without an opposite one. Triangles that are larger than a phase may repeat with the
     wavelength: there both parts add up.
@@ -146,7 +130,7 @@ def _error_parts(
     repeats = phases > resonance
     rest = (np.where(repeats, even + odd, 0) @ areas) ** 2
     rest += (even**2 + (_ODD_REMAINDER * odd) ** 2) @ (squares / 4.0**splits)
-    return _ErrorParts((np.where(repeats, 0, even) @ areas) ** 2, (odd @ areas) ** 2, rest)
+    return (np.where(repeats, 0, even) @ areas) ** 2, (odd @ areas) ** 2, rest
 
 
 def _radii(lattice: FrequencyLattice) -> Reals:

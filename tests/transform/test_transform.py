@@ -22,8 +22,8 @@ from sobolev_batch.transform.fourier import (
     ErrorTarget,
     Execution,
     TransformSettings,
+    cheapest_dtype,
     choose_settings,
-    permits_single,
     projected_bytes,
     transform_block,
 )
@@ -200,8 +200,9 @@ def test_probed_fields_keep_their_goal(name: str) -> None:
 
 def test_single_precision_is_for_goals_above_its_rounding() -> None:
     area = Sphere().area
-    assert permits_single(Sphere(), LATTICE, ErrorTarget((-2.0,), (1e-4 * area,)))
-    assert not permits_single(Sphere(), LATTICE, ErrorTarget((-2.0,), (1e-8 * area,)))
+    assert cheapest_dtype([Sphere()], LATTICE, ErrorTarget((-2.0,), (1e-4 * area,))) == "complex64"
+    assert cheapest_dtype([Sphere()], LATTICE, ErrorTarget((-2.0,), (1e-8 * area,))) == "complex128"
+    assert cheapest_dtype([Sphere(), Sphere(100.0)], LATTICE, ErrorTarget((-2.0,), (1e-4 * area,))) == "complex128"
 
 
 @pytest.mark.parametrize("settings", [TransformSettings(dtype="complex64"), TransformSettings(stored="complex64")])

@@ -27,7 +27,7 @@ from sobolev_batch.norms.tail.integrals import OctaveWeights, integral_over, squ
 from sobolev_batch.norms.tail.remainder import mean_sinc, remainder
 from sobolev_batch.norms.tail.sampling import OctaveSampling
 from sobolev_batch.norms.tail.values import octave_values, settings_for
-from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, permits_single
+from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, cheapest_dtype
 from sobolev_batch.transform.lattice import Lattice, SobolevWeights, shell_sums
 
 
@@ -86,8 +86,7 @@ class Frequencies:
 
     def values(self, surface: Surface, target: ErrorTarget, execution: Execution) -> SurfaceValues:
         """Return the values of a surface within an error target; LatticeError where it exceeds the half period."""
-        single = permits_single(surface, self.lattice, target)
-        settings = TransformSettings(dtype="complex64" if single else "complex128")
+        settings = TransformSettings(dtype=cheapest_dtype([surface], self.lattice, target))
         field = field_for(surface, self.lattice, target, settings, Execution(threads=execution.threads))
         octaves = (
             octave_values(surface, octave, self.orders, settings_for(target), execution) for octave in self.octaves

@@ -87,14 +87,12 @@ class Core:
     @classmethod
     def on_lattice(cls, problem: Problem, lattice: Lattice, cutoff: float) -> Self:
         """Compute the fields of a problem on a lattice."""
-        samples = problem.samples(lattice)
-        values = problem.accuracy.scale(ESTIMATE_CAUTION * estimate_from(samples, problem.orders))
+        estimates = estimate_from(problem.samples(lattice), problem.orders)
+        values = problem.accuracy.scale(ESTIMATE_CAUTION * estimates)
         problem.require_above_rounding(values)
         # The octaves' values have errors of their own.
-        target = error_target(values, problem.orders, problem.accuracy, problem.area).tightened(
-            2 * problem.inexact_count
-        )
-        fields = problem.fields(lattice, samples, target, problem.dtype(lattice, target))
+        target = error_target(values, problem.orders, problem.accuracy, problem.area)
+        fields = problem.fields(lattice, target.tightened(2 * problem.inexact_count))
         weights = SobolevWeights(lattice, problem.orders, cutoff)
         return cls(weights, fields, *sums_on(problem, fields, weights))
 

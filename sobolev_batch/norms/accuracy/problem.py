@@ -14,19 +14,16 @@ from sobolev_batch.errors import AccuracyError
 from sobolev_batch.geometry.mesh import Mesh, shared_triangles
 from sobolev_batch.geometry.overlap import SINGLE_ROUNDING, rests_of
 from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Similarity, Surface, centering
-from sobolev_batch.norms.accuracy.apart import APART_FRACTION, product_apart
 from sobolev_batch.norms.accuracy.tolerance import Accuracy, first_lattice, unreachable
-from sobolev_batch.norms.budget import Sums, Support, norm_of_moves, sums_of_shells
+from sobolev_batch.norms.budget import APART_FRACTION, Sums, Support, norm_of_moves, product_apart, sums_of_shells
 from sobolev_batch.norms.estimate import NormEstimate, change_of_root
 from sobolev_batch.norms.fields import USUAL_DEGREE, Field, field_for
 from sobolev_batch.norms.tail.sampling import OctaveSampling
 from sobolev_batch.norms.tail.values import OctaveValues
 from sobolev_batch.transform.backends import ComplexDtype
-from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, permits_single
+from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, cheapest_dtype
 from sobolev_batch.transform.lattice import Lattice, SobolevWeights, shell_sums
 from sobolev_batch.transform.probe import Sample, draws_for, estimate, needs_probe
-
-Samples = tuple[Sample, ...]
 
 # A distance is first estimated from a few frequencies; it is seldom less than this fraction of the estimate.
 ESTIMATE_CAUTION = 0.7
@@ -141,10 +138,10 @@ class Problem:
         return _ROUNDING * self.area
 
     @cached_property
-    def _samples(self) -> dict[Lattice, Samples]:
+    def _samples(self) -> dict[Lattice, tuple[Sample, ...]]:
         return {}
 
-    def samples(self, lattice: Lattice) -> Samples:
+    def samples(self, lattice: Lattice) -> tuple[Sample, ...]:
         """Return samples of all surfaces at the same frequencies; those of a lattice are computed once."""
         if lattice not in self._samples:
             draws = draws_for(self.surfaces, lattice, self.orders, USUAL_DEGREE)
@@ -154,9 +151,8 @@ class Problem:
         return self._samples[lattice]
 
     def dtype(self, lattice: Lattice, target: ErrorTarget) -> ComplexDtype:
-        """Return the cheapest dtype that meets a target."""
-        single = all(permits_single(surface, lattice, target) for surface in self.surfaces)
-        return "complex64" if single else "complex128"
+        """Return the cheapest dtype in which all fields meet a target."""
+        return cheapest_dtype(self.surfaces, lattice, target)
 
     @property
     def rough_values(self) -> Reals:
@@ -169,12 +165,13 @@ class Problem:
         norms = [estimate([sample], self.orders) for sample in self.samples(lattice)]
         return bool(np.all(_STORED_ROUNDING * np.array(norms) <= _STORED_FRACTION * np.array(target.norms)))
 
-    def fields(self, lattice: Lattice, samples: Samples, target: ErrorTarget, dtype: ComplexDtype) -> tuple[Field, ...]:
-        """Return the fields of all surfaces, each with an error within a target."""
-        settings, execution = TransformSettings(dtype=dtype), Execution(threads=self.threads)
+    def fields(self, lattice: Lattice, target: ErrorTarget, dtype: ComplexDtype | None = None) -> tuple[Field, ...]:
+        """Return the fields of all surfaces, each with an error within a target, by default in the cheapest dtype."""
+        settings = TransformSettings(dtype=dtype or self.dtype(lattice, target))
+        execution = Execution(threads=self.threads)
         return tuple(
             field_for(surface, lattice, target, settings, execution, sample=sample)
-            for surface, sample in zip(self.surfaces, samples, strict=True)
+            for surface, sample in zip(self.surfaces, self.samples(lattice), strict=True)
         )
 
     def require_above_rounding(self, values: Reals) -> None:

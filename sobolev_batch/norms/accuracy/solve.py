@@ -19,7 +19,6 @@ from sobolev_batch.norms.accuracy.octaves import solve_in_octaves
 from sobolev_batch.norms.accuracy.problem import (
     ESTIMATE_CAUTION,
     Problem,
-    Samples,
     Solution,
     SurfaceValues,
     error_target,
@@ -220,13 +219,12 @@ def _solve_on_lattices(problem: Problem, lattice: Lattice, is_pilot: bool, *, be
     # Their fields may differ by a little more.
     equal = _near_duplicates(problem, lattice)
     for rounds_left in reversed(range(_ROUNDS)):
-        samples = problem.samples(lattice)
         if values is None:
-            values = ESTIMATE_CAUTION * estimate(samples, problem.orders)
+            values = ESTIMATE_CAUTION * estimate(problem.samples(lattice), problem.orders)
         problem.require_above_rounding(values)
         accuracy = _of_pilot(problem.accuracy) if is_pilot else problem.accuracy
         target = error_target(values, problem.orders, accuracy, problem.area).tightened(problem.inexact_count)
-        solution, sums = _compute(problem, lattice, samples, target, problem.dtype(lattice, target))
+        solution, sums = _compute(problem, lattice, target)
         values = solution.estimate.values
         has_no_digit = equal | (values <= problem.rounding)
         is_met = bool(np.all(problem.accuracy.met(solution.estimate) | has_no_digit))
@@ -317,8 +315,7 @@ def _bound_up_to(problem: Problem, lattice: Lattice, sparse: Lattice, squared_er
     orders, highest_order = np.array(problem.orders), max(_COARSE_ORDER, *problem.orders)
     factors = (1 + lattice.xi_max**2) ** (orders - highest_order)
     target = ErrorTarget((highest_order,), (float(np.sqrt(squared_errors / factors).min()),))
-    target, samples = target.tightened(problem.inexact_count), problem.samples(sparse)
-    fields = problem.fields(sparse, samples, target, problem.dtype(sparse, target))
+    fields = problem.fields(sparse, target.tightened(problem.inexact_count))
     beyond = only_or_difference([field.values for field in fields]).copy()
     beyond[np.ix_(*(np.abs(axis) <= lattice.xi_max for axis in sparse.axes))] = 0
     squares = SobolevWeights(sparse, problem.orders).per_shell @ shell_sums(beyond, None, sparse, sparse.half)
@@ -353,10 +350,9 @@ def run_pilot(problem: Problem) -> tuple[Reals, Lattice, ComplexDtype]:
     """Return rough distances (orders,) of a pair, and lattice and dtype that its accuracy needs, or AccuracyError."""
     lattice, is_pilot = first_lattice(problem.support, problem.orders, problem.accuracy)
     while True:
-        samples = problem.samples(lattice)
-        values = estimate(samples, problem.orders)
+        values = estimate(problem.samples(lattice), problem.orders)
         target = error_target(values, problem.orders, _of_pilot(problem.accuracy), problem.area).tightened(_PAIR)
-        solution, sums = _compute(problem, lattice, samples, target, "complex128")
+        solution, sums = _compute(problem, lattice, target, "complex128")
         values = solution.estimate.values
         problem.require_above_rounding(values)
         lattice, is_pilot = _next_lattice(problem, lattice, sums)
@@ -365,7 +361,7 @@ def run_pilot(problem: Problem) -> tuple[Reals, Lattice, ComplexDtype]:
     target = error_target(values, problem.orders, problem.accuracy, problem.area).tightened(_PAIR)
     for rounds_left in reversed(range(_ROUNDS)):
         dtype = problem.dtype(lattice, target)
-        solution, _ = _compute(problem, lattice, problem.samples(lattice), target, dtype)
+        solution, _ = _compute(problem, lattice, target, dtype)
         solution, larger = _with_hidden_part(problem, solution, permits_octaves(problem.accuracy))
         allowed = problem.accuracy.rtol * problem.accuracy.scale(values)
         if np.all(solution.estimate.truncation <= allowed) or problem.accuracy.best_effort:
@@ -389,10 +385,10 @@ def _next_lattice(problem: Problem, lattice: Lattice, sums: Sums) -> tuple[Latti
 
 
 def _compute(
-    problem: Problem, lattice: Lattice, samples: Samples, target: ErrorTarget, dtype: ComplexDtype
+    problem: Problem, lattice: Lattice, target: ErrorTarget, dtype: ComplexDtype | None = None
 ) -> tuple[Solution, Sums]:
-    """Compute the norm or distance on a lattice, from fields with an error within a target."""
-    fields = problem.fields(lattice, samples, target, dtype)
+    """Compute the norm or distance on a lattice, from fields with an error within a target; see `Problem.fields`."""
+    fields = problem.fields(lattice, target, dtype)
     found, sums = difference_on(problem, lattice, fields)
     return Solution(found, lattice, tuple(map(SurfaceValues, fields))), sums
 

@@ -15,6 +15,7 @@ from sobolev_batch.norms.accuracy.problem import Problem, error_target
 from sobolev_batch.norms.accuracy.solve import difference_on, solve
 from sobolev_batch.norms.accuracy.tolerance import Accuracy, core_lattice, lattice_of
 from sobolev_batch.norms.budget import area_bound, area_bounds
+from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.norms.fields import USUAL_DEGREE, Field, compute_field
 from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, choose_settings, transform_block
 from sobolev_batch.transform.lattice import Lattice, SobolevWeights, shell_sums, shell_volumes
@@ -53,6 +54,12 @@ class Interval:
     def around(cls, value: float, below: float, above: float) -> Self:
         """Return the numbers from ``value - below``, or zero, to ``value + above``."""
         return cls(max(value - below, 0.0), value + above)
+
+    @classmethod
+    def of(cls, found: NormEstimate, caution: float = 1.0) -> Self:
+        """Return the bounds that the only number of an estimate has by its error, widened by a factor."""
+        value, error = float(found.values[0]), caution * float(found.errors[0])
+        return cls.around(value, error, error)
 
     def over(self, divisor: Interval) -> Interval:
         """Return the bounds on a quotient."""
@@ -136,9 +143,8 @@ class _Search:
         for _ in range(_ROUNDS):
             accuracy = replace(self.problem.accuracy, rtol=rtol, floor=self.threshold.lower)
             solution = solve_in_octaves(replace(self.problem, accuracy=accuracy), seed)
-            value, error = float(solution.estimate.values[0]), float(solution.estimate.errors[0])
-            bounds = Interval.around(value, _OCTAVES_CAUTION * error, _OCTAVES_CAUTION * error)
-            rtol = min(rtol / 2, _OF_MARGIN * self._margin(value))
+            bounds = Interval.of(solution.estimate, _OCTAVES_CAUTION)
+            rtol = min(rtol / 2, _OF_MARGIN * self._margin(float(solution.estimate.values[0])))
             if self.is_decided(bounds) or rtol < _LEAST_RTOL_OF_OCTAVES or solution.shortfall is not None:
                 break
         return bounds
@@ -180,11 +186,8 @@ def _of_apart(problem: Problem, seed: int) -> tuple[Interval, Method]:
     """Return bounds on the relative distance of surfaces far apart, which exceeds one, and what they follow from."""
     solution = solve(replace(problem, accuracy=replace(problem.accuracy, rtol=_APART_RTOL)), seed)
     caution = _OCTAVES_CAUTION if any(one.has_tail for one in solution.alone) else 1.0
-    bounds = []
-    for found in (solution.estimate, solution.alone[1].estimate):
-        value, error = float(found.values[0]), caution * float(found.errors[0])
-        bounds.append(Interval.around(value, error, error))
-    return bounds[0].over(bounds[1]), "lattice" if caution == 1.0 else "octaves"
+    distance, norm = (Interval.of(one.estimate, caution) for one in (solution, solution.alone[1]))
+    return distance.over(norm), "lattice" if caution == 1.0 else "octaves"
 
 
 def _rough_norm(problem: Problem) -> Interval:
@@ -204,9 +207,7 @@ def _rough_norm(problem: Problem) -> Interval:
 
 def _exact_norm(problem: Problem) -> Interval:
     """Return close bounds on the norm of a reference."""
-    found = solve(replace(problem, accuracy=replace(problem.accuracy, rtol=_EXACT_NORM_RTOL))).estimate
-    value, error = float(found.values[0]), float(found.errors[0])
-    return Interval.around(value, error, error)
+    return Interval.of(solve(replace(problem, accuracy=replace(problem.accuracy, rtol=_EXACT_NORM_RTOL))).estimate)
 
 
 def _with_beyond(problem: Problem, value: float, lattice: Lattice) -> float:

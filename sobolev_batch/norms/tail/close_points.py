@@ -103,10 +103,8 @@ class Sheets:
 
     def even(self, count: int, rng: np.random.Generator) -> Draw:
         """Draw points evenly by area, one on each of equal parts."""
-        ends = self._levels[0]
-        places = (np.arange(count) + rng.random(count)) / count * ends[-1]
-        chosen = np.minimum(np.searchsorted(ends, places), len(ends) - 1)
-        return self._at(chosen, np.full(count, ends[-1] / count), rng)
+        levels, _ = self._levels
+        return self._drawn(count, levels, np.broadcast_to(levels[-1] / count, levels.shape), rng)
 
     @cached_property
     def centers(self) -> Reals:
@@ -129,15 +127,17 @@ class Sheets:
     def in_proportion(self, densities: Reals, count: int, rng: np.random.Generator) -> Draw:
         """Draw points in proportion to densities (m,), most of them, and evenly by area for the others."""
         areas = np.diff(self._levels[0], prepend=0.0)
-        shares = areas * (_EVEN_SHARE / areas.sum() + (1 - _EVEN_SHARE) * densities / (areas @ densities))
-        levels = np.cumsum(shares)
+        mixed = _EVEN_SHARE / areas.sum() + (1 - _EVEN_SHARE) * densities / (areas @ densities)
+        return self._drawn(count, np.cumsum(areas * mixed), 1 / (count * mixed), rng)
+
+    def _drawn(self, count: int, levels: Reals, weights: Reals, rng: np.random.Generator) -> Draw:
+        """Draw points in triangles, pieces and on spheres, one for each of equal parts of their cumulative shares (m,).
+
+        The weights (m,) are those of a point on each of them.
+        """
+        starts = self._levels[1]
         places = (np.arange(count) + rng.random(count)) / count * levels[-1]
         chosen = np.minimum(np.searchsorted(levels, places), len(levels) - 1)
-        return self._at(chosen, areas[chosen] / (count * shares[chosen]), rng)
-
-    def _at(self, chosen: Indices, weights: Reals, rng: np.random.Generator) -> Draw:
-        """Return random points in some triangles and on spheres."""
-        count, starts = len(chosen), self._levels[1]
         signs = np.repeat([float(sign) for _, sign in (*self.meshes, *self.spheres)], np.diff(starts))[chosen]
         first, second = np.sqrt(rng.random((count, 1))), rng.random((count, 1))
         directions = rng.normal(size=(count, 3))
@@ -152,7 +152,7 @@ class Sheets:
             a, b, c = np.moveaxis(surface.vertices[surface.triangles[chosen[here] - starts[number]]], 1, 0)
             r, t = first[here], second[here]
             points[here] = (1 - r) * a + r * (1 - t) * b + r * t * c
-        return Draw(points, signs, weights)
+        return Draw(points, signs, weights[chosen])
 
 
 def _ordered(mesh: Mesh, spacing: float) -> Mesh:

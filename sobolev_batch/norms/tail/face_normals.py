@@ -87,11 +87,6 @@ class FaceNormals:
         return np.asarray((_SPOT_FRACTION * 2 * np.pi * radii * sizes) ** 2)
 
 
-def without_sign(normals: Reals) -> Reals:
-    """Return of each normal (n, 3) and its opposite the same one."""
-    return np.where((combine(_UPWARDS, normals.T) < 0)[:, None], -normals, normals)
-
-
 def _main_normals(mesh: Mesh) -> tuple[Reals, Reals, Reals]:
     """Return the normals, areas and face sizes of the directions that hold much of a mesh's area."""
     count = len(mesh.triangles)
@@ -99,7 +94,13 @@ def _main_normals(mesh: Mesh) -> tuple[Reals, Reals, Reals]:
     # The corners and temporaries of all triangles of a fine mesh would take gigabytes.
     for start in range(0, count, _BATCH):
         part = slice(start, start + _BATCH)
-        normals[part], areas[part] = _normals_and_areas(mesh, part)
+        a, b, c = mesh.corners(part)
+        crosses = np.cross(b - a, c - a)
+        doubled = np.linalg.norm(crosses, axis=1)
+        areas[part] = doubled / 2
+        # A normal and its opposite are one direction. Triangles without area have none.
+        crosses[combine(_UPWARDS, crosses.T) < 0] *= -1
+        normals[part] = crosses / np.where(doubled > 0, doubled, 1.0)[:, None]
         # A number for each normal, the same for those that count as one direction.
         x, y, z = np.round(normals[part] * _DIRECTION_PARTS).astype(np.int32).T
         keys[part] = (x * _KEYS_PER_AXIS + y) * _KEYS_PER_AXIS + z
@@ -117,11 +118,3 @@ def _main_normals(mesh: Mesh) -> tuple[Reals, Reals, Reals]:
         sizes[number] = np.sqrt(np.ptp(mesh.vertices[used], axis=0).max() * np.sqrt(areas[face].mean()))
     directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), np.finfo(np.float64).tiny)
     return directions, sums[largest], sizes
-
-
-def _normals_and_areas(mesh: Mesh, part: slice) -> tuple[Reals, Reals]:
-    """Return the unit normals (k, 3), without sign, and areas (k,) of some triangles; 0 for those without area."""
-    a, b, c = mesh.corners(part)
-    crosses = np.cross(b - a, c - a)
-    doubled = np.linalg.norm(crosses, axis=1)
-    return without_sign(crosses / np.where(doubled > 0, doubled, 1.0)[:, None]), doubled / 2

@@ -49,12 +49,20 @@ _PANEL, _PANEL_WAVES, _PANEL_NODES, _LAST = 1.2, 1.5, leggauss(4), 22.0
 _BATCH = 20_000
 
 
+def tail_nodes(cutoff: float, order: float) -> Iterator[tuple[float, Reals, Reals]]:
+    """Yield, octave by octave from the step on, where it begins, radii r (k,) and weights of (1 - step(r)) (1+r²)^s."""
+    low = cutoff / 2
+    while True:
+        radii = low * (1.5 + 0.5 * _NODES[0])
+        yield low, radii, 0.5 * low * _NODES[1] * (1 - smooth_step(radii, cutoff)) * (1 + radii**2) ** order
+        low *= 2
+
+
 @lru_cache(maxsize=4096)
 def tail_integral(cutoff: float, order: float) -> float:
     """Return ∫ (1 - step(r)) (1+r²)^s dr over all r, for the smooth step that ends at a cutoff."""
-    radii = cutoff * (0.75 + 0.25 * _NODES[0])
-    on_step = float(0.25 * cutoff * _NODES[1] @ ((1 - smooth_step(radii, cutoff)) * (1 + radii**2) ** order))
-    return on_step + _power_integral(cutoff, order)
+    _, _, on_step = next(tail_nodes(cutoff, order))
+    return float(on_step.sum()) + _power_integral(cutoff, order)
 
 
 def _power_integral(lowest: float, order: float) -> float:
@@ -144,15 +152,15 @@ def _tables(cutoff: float, order: float, fineness: int) -> tuple[float, Reals, R
     (start, end), count = _grid(cutoff, fineness), fineness * _ENTRIES
     reach, total = fineness * reach_of(order) / cutoff, tail_integral(cutoff, order)
     distances = _distances(np.linspace(start, end, count), cutoff)
-    drops, low = np.zeros(count), cutoff / 2
-    while np.any(near := _CYCLES / distances > low):
-        radii, weights = low * (1.5 + 0.5 * _NODES[0]), 0.5 * low * _NODES[1]
-        terms = weights * (1 - smooth_step(radii, cutoff)) * (1 + radii**2) ** order
+    drops = np.zeros(count)
+    for low, radii, terms in tail_nodes(cutoff, order):
+        near = _CYCLES / distances > low
+        if not near.any():
+            break
         cycles = np.outer(distances[near], radii)
         fade = smooth_step(cycles, _CYCLES)
         drops[near] += np.einsum("ij,j->i", 1 - fade + 2 * fade * np.sin(np.pi * cycles) ** 2, terms)
         drops[~near] += terms.sum()
-        low *= 2
     drops, total = (drops + _power_integral(low, order)) / np.pi, total / np.pi
     # Denser tables by cubic Hermite interpolation, so that straight lines between their entries will do.
     slopes, fractions = np.gradient(drops), np.arange(_DENSER) / _DENSER

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from typing import Self
 
 import numpy as np
@@ -35,8 +36,8 @@ from sobolev_batch.norms.tail.potentials import (
     reach_of,
     seconds_of,
     tail_integral,
+    tail_nodes,
 )
-from sobolev_batch.transform.lattice import smooth_step
 
 # Random points of the first estimate: usually, at least, at most, and of a scale. Pairs of a point and a triangle that
 # they may take, and those of points from which nothing is hidden.
@@ -58,8 +59,8 @@ _UNEVEN, _NOTHING = 2.0, 1e-11
 _HELD = 1 << 18
 # Orders between which the mean energy beyond a frequency is interpolated; those below the lowest are bounded by it.
 _USUAL_ORDERS, LOWEST_ORDER = (-0.55, -0.7, -1.0, -1.5, -2.0, -2.5, -3.0), -4.0
-# Nodes for each octave of frequencies, and cycles after which a sinc counts as averaged out.
-_NODES, _SINC_CYCLES = np.polynomial.legendre.leggauss(48), 8.0
+# Cycles after which a sinc counts as averaged out.
+_SINC_CYCLES = 8.0
 
 
 @dataclass(frozen=True)
@@ -227,10 +228,9 @@ class _Seen:
         """
         n, count = len(draw.points), min(_CONTROLS, len(draw.points))
         chosen = np.sort(rng.choice(n, count, replace=False))
-        controls = Draw(draw.points[chosen], draw.own[chosen], draw.weights[chosen])
         finer = _Seen(self.sheets, self.kernels.finer, self.threads)
-        changes = finer.potentials(controls.points)[0] - potentials[chosen]
-        changes *= n * (controls.weights * controls.own)[:, None]
+        changes = finer.potentials(draw.points[chosen])[0] - potentials[chosen]
+        changes *= n * (draw.weights * draw.own)[chosen, None]
         return changes.mean(axis=0), changes.std(axis=0, ddof=1) / np.sqrt(count) * quantile(count - 1)
 
     def affordable(self, rng: np.random.Generator) -> int:
@@ -250,11 +250,7 @@ class _Seen:
 
 def mean_sinc(cutoff: float, order: float, length: float) -> float:
     """Return the mean of sinc(2 r length) beyond a cutoff, weighted by (1 - step(r)) (1+r²)^s: 1 for a short length."""
-    integral, low = 0.0, cutoff / 2
     # Farther out it averages to nothing.
-    while low * length < _SINC_CYCLES:
-        radii, weights = low * (1.5 + 0.5 * _NODES[0]), 0.5 * low * _NODES[1]
-        terms = weights * (1 - smooth_step(radii, cutoff)) * (1 + radii**2) ** order
-        integral += float(terms @ np.sinc(2 * radii * length))
-        low *= 2
+    octaves = takewhile(lambda octave: octave[0] * length < _SINC_CYCLES, tail_nodes(cutoff, order))
+    integral = sum(float(weights @ np.sinc(2 * radii * length)) for _, radii, weights in octaves)
     return integral / tail_integral(cutoff, order)

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from sobolev_batch.arrays import Reals
 from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms.tail.sampling import OctaveSampling
-from sobolev_batch.transform.backends import Backend, ComplexDtype
+from sobolev_batch.transform.backends import Backend
 from sobolev_batch.transform.fourier import (
     ON_CPU,
     ErrorTarget,
     Execution,
     TransformSettings,
+    cheapest_dtype,
     choose_settings,
-    permits_single,
     transform_block,
 )
 from sobolev_batch.transform.kinds import kind_of
@@ -72,8 +72,8 @@ def settings_for(target: ErrorTarget) -> Settings:
     def settings(surface: Surface, lattice: OctaveLattice) -> TransformSettings:
         if kind_of(surface).is_closed_form:
             return TransformSettings()
-        cheapest: ComplexDtype = "complex64" if permits_single(surface, lattice, target) else "complex128"
-        return choose_settings(surface, lattice, target, TransformSettings(dtype=cheapest))
+        cheapest = TransformSettings(dtype=cheapest_dtype([surface], lattice, target))
+        return choose_settings(surface, lattice, target, cheapest)
 
     return settings
 
