@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal, Self, get_args
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 import xarray as xr
@@ -353,19 +353,15 @@ def _panels(count: int, size: Size | None, *, above: float, beside: float) -> tu
 
     The panels of a row fill its width, so that no place remains empty.
     """
-    rows = -(-count // _PANELS_IN_A_ROW)
-    in_rows = [len(row) for row in np.array_split(np.arange(count), rows)]
-    height = above + rows * (beside + min(WIDTH_INCHES / in_rows[0], _HEIGHT_INCHES))
+    rows = np.array_split(np.arange(count), -(-count // _PANELS_IN_A_ROW))
+    height = above + len(rows) * (beside + min(WIDTH_INCHES / len(rows[0]), _HEIGHT_INCHES))
     figure = Figure(figsize=size or (WIDTH_INCHES, height), layout="constrained")
-    columns = math.lcm(*in_rows)
-    grid = figure.add_gridspec(rows, columns)
-    panels = []
-    for i, in_row in enumerate(in_rows):
-        width = columns // in_row
-        panels += [figure.add_subplot(grid[i, k * width : (k + 1) * width]) for k in range(in_row)]
-    for axes in panels:
+    columns = math.lcm(*map(len, rows))
+    mosaic: list[Any] = [np.repeat(row, columns // len(row)).tolist() for row in rows]
+    panels = figure.subplot_mosaic(mosaic)
+    for axes in panels.values():
         axes.set_axis_off()
-    return figure, panels
+    return figure, list(panels.values())
 
 
 def _seen(view: MeshView) -> str:

@@ -79,25 +79,20 @@ class CostLeague(ShownTables):
         members that are on fronts, those on the most first, with their numbers of fronts where there are several
         objects.
         """
-        rows = []
-        for method, meshes in self.meshes.groupby("method", sort=False):
-            by_object = meshes.assign(sure=meshes["front"] & ~meshes["undecided"]).groupby("object", sort=False)
-            found = by_object[["front", "undecided", "sure"]].any()
-            fronts = (
-                meshes[meshes["front"]].groupby("member", sort=False).size().sort_values(ascending=False, kind="stable")
-            )
-            shown = [f"{name} ({n})" if len(self.objects) > 1 else str(name) for name, n in fronts.items()]
-            rest = [f"{len(shown) - _MOST_MEMBERS} more"] if len(shown) > _MOST_MEMBERS else []
-            rows.append(
-                {
-                    "method": method,
-                    "front": int(found["front"].sum()),
-                    "objects": len(found),
-                    "undecided": int((found["undecided"] & ~found["sure"]).sum()),
-                    "best": ", ".join([*shown[:_MOST_MEMBERS], *rest]),
-                }
-            )
-        return pd.DataFrame(rows).sort_values("front", ascending=False, kind="stable", ignore_index=True)
+        meshes = self.meshes.assign(sure=self.meshes["front"] & ~self.meshes["undecided"], objects=True)
+        found = meshes.groupby(["method", "object"], sort=False)[["front", "objects", "undecided", "sure"]].any()
+        found["undecided"] &= ~found.pop("sure")
+        frame = found.groupby("method", sort=False).sum().reset_index()
+        frame["best"] = [self._best(self.meshes[self.meshes["method"] == method]) for method in frame["method"]]
+        return frame.sort_values("front", ascending=False, kind="stable", ignore_index=True)
+
+    def _best(self, meshes: pd.DataFrame) -> str:
+        """Return the members of a method that are on fronts, those on the most first."""
+        fronts = meshes[meshes["front"]].groupby("member", sort=False).size()
+        fronts = fronts.sort_values(ascending=False, kind="stable")
+        shown = [f"{name} ({n})" if len(self.objects) > 1 else str(name) for name, n in fronts.items()]
+        rest = [f"{len(shown) - _MOST_MEMBERS} more"] if len(shown) > _MOST_MEMBERS else []
+        return ", ".join([*shown[:_MOST_MEMBERS], *rest])
 
     @cached_property
     def means(self) -> pd.DataFrame:

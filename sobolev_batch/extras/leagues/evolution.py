@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
@@ -71,21 +70,18 @@ def evolution(
     # Distances to a surface that moves are computed for each time.
     convergence = convergence_at(tree, order) if truth is None else finished_group(tree, "convergence")
     orders = list(dict.fromkeys(convergence["order"].values.tolist() if order is None else check_orders(order)))
-    labels, true_labels = _labels_by_time(tree, truth)
-    complete = set(complete_meshes(tree))
+    meshes, complete = _moving_meshes(tree, truth), set(complete_meshes(tree))
     frames = []
-    for family, by_time in labels.items():
-        for time, label in by_time.items():
-            known = None
-            if truth is None:
-                known = convergence.sel(mesh=label, order=orders)
-            elif {label, true_label := _at(true_labels, time)} <= complete:
-                known = StoreAccessor(tree).distance(orders, label, str(true_label))
-            numbers = {name: np.nan if known is None else known[name].values for name in _NUMBERS}
-            frames.append(pd.DataFrame({"family": family, "time": time, "order": orders, **numbers}))
-    times = sorted({time for by_time in labels.values() for time in by_time})
+    for row in meshes.itertuples(index=False):
+        known = None
+        if truth is None:
+            known = convergence.sel(mesh=row.mesh, order=orders)
+        elif {row.mesh, row.true} <= complete:
+            known = StoreAccessor(tree).distance(orders, row.mesh, row.true)
+        numbers = {name: np.nan if known is None else known[name].values for name in _NUMBERS}
+        frames.append(pd.DataFrame({"family": row.family, "time": row.time, "order": orders, **numbers}))
     table = pd.concat(frames, ignore_index=True).set_index(["family", "time", "order"]).to_xarray()
-    found = table.reindex(family=list(labels), time=times, order=orders)
+    found = table.reindex(family=meshes["family"].unique().tolist(), time=sorted(meshes["time"].unique()), order=orders)
     for name in (*_NUMBERS, "time", "order"):
         found[name].attrs = VARIABLES[name]
     found["family"].attrs = described("family of meshes")
@@ -120,33 +116,29 @@ def format_evolution(
     return rendered(style, frame[["order", "family", "time", *columns]], sections, notes)
 
 
-def _labels_by_time(tree: xr.DataTree, truth: str | None) -> tuple[dict[str, dict[float, str]], dict[float, str]]:
-    """Return the label of each family's mesh at each time, and those of the true surface, if that moves."""
-    labels: dict[str, dict[float, str]] = {}
-    if has_times(tree):
-        meshes = finished_group(tree, "meshes")
-        columns = (meshes[name].values.tolist() for name in ("mesh", "family", "time"))
-        for label, family, time in zip(*columns, strict=True):
-            if not np.isnan(time):
-                labels.setdefault(family, {})[time] = label
-    if not labels:
+def _moving_meshes(tree: xr.DataTree, truth: str | None) -> pd.DataFrame:
+    """Return mesh, family and time of the meshes with times; and true, the mesh of the true surface, if that moves."""
+    group = finished_group(tree, "meshes")
+    columns = {name: group[name].values for name in ("mesh", "family", "time") if has_times(tree)}
+    meshes = pd.DataFrame(columns, columns=["mesh", "family", "time"]).dropna(subset="time")
+    meshes = meshes.drop_duplicates(["family", "time"], keep="last")
+    if meshes.empty:
         raise InputError("no mesh of the store has a time: the sources flow and files can give them times")
-    if truth is not None and truth not in labels:
-        raise InputError(f"no family {quoted(truth)} has times, only {', '.join(labels)}")
-    true_labels = labels.pop(reference_of(tree) if truth is None else truth, {})
-    if not labels:
+    if truth is not None and truth not in set(meshes["family"]):
+        raise InputError(f"no family {quoted(truth)} has times, only {', '.join(meshes['family'].unique())}")
+    is_true = meshes["family"] == (reference_of(tree) if truth is None else truth)
+    true, meshes = meshes[is_true], meshes[~is_true]
+    if meshes.empty:
         raise InputError("no mesh has a time, except those that the others are compared with")
     if truth is None:
-        return labels, {}
-    for name, by_time in labels.items():
-        if not any(_at(true_labels, time) for time in by_time):
-            raise InputError(f"the families {quoted(name)} and {quoted(truth)} have no time in common")
-    return labels, true_labels
-
-
-def _at(labels: Mapping[float, str], time: float) -> str | None:
-    """Return the label at a time, which may have been computed in another way: 0.3 is 0.1 + 0.2."""
-    return next((label for other, label in labels.items() if math.isclose(other, time, rel_tol=1e-9)), None)
+        return meshes
+    # A time may have been computed in another way: 0.3 is 0.1 + 0.2.
+    is_at = np.isclose(meshes["time"].to_numpy()[:, None], true["time"].to_numpy(), rtol=1e-9, atol=0.0)
+    meshes = meshes.assign(true=np.where(is_at.any(axis=1), true["mesh"].to_numpy()[is_at.argmax(axis=1)], ""))
+    for name, rows in meshes.groupby("family", sort=False):
+        if not rows["true"].any():
+            raise InputError(f"the families {quoted(str(name))} and {quoted(truth)} have no time in common")
+    return meshes
 
 
 def _with_growth(found: xr.Dataset, factor: float) -> xr.Dataset:
