@@ -1,8 +1,9 @@
-"""Parameters of the public interface: numbers, fractions and sizes of memory, checked once where they come in."""
+"""Parameters of the public interface: numbers, fractions, lengths and sizes of memory, checked once on their way in."""
 
 from __future__ import annotations
 
 import math
+import re
 from numbers import Integral
 from typing import TypeGuard
 
@@ -11,6 +12,9 @@ from pydantic import ByteSize, TypeAdapter, ValidationError
 from sobolev_batch.errors import InputError
 
 _BYTE_SIZE = TypeAdapter(ByteSize)
+# Units of length that are converted into each other, in metres.
+_METRES = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
+_LENGTH = re.compile(r"\s*(?P<number>(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?)\s*(?P<unit>\S.*?)?\s*")
 
 
 def is_whole_number(value: object) -> TypeGuard[int]:
@@ -61,6 +65,30 @@ def fraction(value: float | str) -> float:
     if isinstance(value, bool) or not 0 < number < math.inf:
         raise InputError(f"a fraction is a positive number such as 0.01, or a text such as '1%', found {value!r}")
     return number
+
+
+def length_in(length: float | str, unit: str | None) -> float:
+    """Return a length as a number of a unit, whose name is None where it is not known.
+
+    >>> length_in("1 in", "mm"), length_in(0.5, None), length_in("2 voxels", "voxels")
+    (25.4, 0.5, 2.0)
+    """
+    found = None if isinstance(length, bool) else _LENGTH.fullmatch(str(length))
+    number, own = (float(found["number"]), found["unit"]) if found else (math.nan, None)
+    if not 0 < number < math.inf:
+        raise InputError(f"a length is a positive number, alone or with a unit as in '0.1 mm', found {length!r}")
+    if own is None or own == unit:
+        return number
+    if own not in _METRES:
+        raise InputError(f"{length!r} has the unit {own!r}; known are {', '.join(_METRES)}, and that of the meshes")
+    if unit is None:
+        raise InputError(
+            f"{length!r} has a unit, but that of the meshes is not known: name it, as unit='mm' in Python or --unit "
+            "mm, or give the length as a number in the unit of the meshes"
+        )
+    if unit not in _METRES:
+        raise InputError(f"{length!r} cannot be converted into {unit!r}; give the length as a number of {unit}")
+    return number * (_METRES[own] / _METRES[unit])
 
 
 def format_bytes(count: float) -> str:

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
 from typing import Literal
 
-from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.deviation import Deviation, Deviations, largest_deviation
 from sobolev_batch.geometry.formats.conversion import MeshLike
+from sobolev_batch.parameters import length_in
 from sobolev_batch.tables.text import between
 
-# Units of length that are converted into each other, in metres.
-_METRES = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
-_LENGTH = re.compile(r"\s*(?P<number>(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?)\s*(?P<unit>\S.*?)?\s*")
 # Digits of places: of their largest coordinate, or of the deviation where that is larger.
 _PLACE_DIGITS = 6
 
@@ -88,30 +84,6 @@ def assert_within(a: MeshLike, b: MeshLike, length: float | str, *, unit: str | 
     if verdict.outcome != "within":
         raise AssertionError(str(verdict))
     return verdict.deviations
-
-
-def length_in(length: float | str, unit: str | None) -> float:
-    """Return a length as a number of a unit, whose name is None where it is not known.
-
-    >>> length_in("1 in", "mm"), length_in(0.5, None), length_in("2 voxels", "voxels")
-    (25.4, 0.5, 2.0)
-    """
-    found = None if isinstance(length, bool) else _LENGTH.fullmatch(str(length))
-    number, own = (float(found["number"]), found["unit"]) if found else (math.nan, None)
-    if not 0 < number < math.inf:
-        raise InputError(f"a length is a positive number, alone or with a unit as in '0.1 mm', found {length!r}")
-    if own is None or own == unit:
-        return number
-    if own not in _METRES:
-        raise InputError(f"{length!r} has the unit {own!r}; known are {', '.join(_METRES)}, and that of the meshes")
-    if unit is None:
-        raise InputError(
-            f"{length!r} has a unit, but that of the meshes is not known: name it, as unit='mm' in Python or --unit "
-            "mm, or give the length as a number in the unit of the meshes"
-        )
-    if unit not in _METRES:
-        raise InputError(f"{length!r} cannot be converted into {unit!r}; give the length as a number of {unit}")
-    return number * (_METRES[own] / _METRES[unit])
 
 
 def deviation_text(deviation: Deviation, unit: str | None) -> str:

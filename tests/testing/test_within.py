@@ -11,7 +11,8 @@ from click.testing import CliRunner
 import sobolev_batch as sb
 from sobolev_batch.cli.program import cli
 from sobolev_batch.geometry import deviation
-from sobolev_batch.testing.within import deviation_text, length_in
+from sobolev_batch.parameters import length_in
+from sobolev_batch.testing.within import deviation_text
 from tests.geometry.test_deviation import plate
 
 

@@ -1,0 +1,229 @@
+"""The search for the coarsest mesh within a tolerance: what to try next is a function of what was tried.
+
+A remesher has a parameter, here the size: a number of triangles, or a length such as the largest deviation that it aims
+at. Distances follow a power of it, nearly, so the search takes secant steps in logarithms, inside the bracket of the
+coarsest mesh that holds and the next coarser one that does not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Self
+
+from sobolev_batch.errors import InputError
+from sobolev_batch.geometry.surface import is_finite_number
+
+# Width of the last bracket, as a fraction of the size, and trials after which a search ends without it. Decimations of
+# seven meshes down to seven limits took 7.1 trials in the mean, and 10 at most.
+PRECISION, MOST_TRIALS = 0.05, 16
+# Exponent of distances in the size before two trials show one, and the range in which a shown one is believed.
+_FIRST_SLOPE, _LEAST_SLOPE, _LARGEST_SLOPE = 1.0, 0.3, 3.0
+# Logarithm of a distance over the limit, in place of a zero; and the largest one that counts at the end of a bracket:
+# beyond it, distances say little about where the limit is met.
+_NONE, _NEAR = -7.0, 0.5
+# How far beside the predicted size to try, as a fraction of the last bracket's width: on the side where the bracket is
+# wider, so that the trial likely ends the search.
+_BESIDE = 0.4
+# Trials after which each one cuts off at least this fraction of the bracket. One spot that decimation spoils early may
+# keep the largest deviation the same for many sizes, which then follows no power.
+_PATIENCE, _LEAST_CUT = 3, 0.45
+# Several trials at a time lie a bracket's last width apart, or this fraction of the way to the predicted size.
+_APART, _SPREAD = 0.9, 0.4
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A mesh that was made and judged, or why there is none.
+
+    Attributes:
+        size: Parameter of the remesher.
+        triangles: Triangles of the mesh; 0 where there is none.
+        estimate: Estimate of its distance, which guides the search; NaN where there is none.
+        lower: Lower bound of the distance.
+        upper: Upper bound of it.
+        is_within: True where the distance is certainly within the limit. An open question counts as not within.
+        seconds: Time of making and judging it.
+        reason: Why there is no mesh, or no distance.
+    """
+
+    size: float
+    triangles: int = 0
+    estimate: float = math.nan
+    lower: float = math.nan
+    upper: float = math.nan
+    is_within: bool = False
+    seconds: float = math.nan
+    reason: str = ""
+
+    @classmethod
+    def from_json(cls, entry: Mapping[str, Any]) -> Self:
+        """Return a trial from what `to_json` returned; TypeError or ValueError where it is none."""
+        values: dict[str, Any] = {name: math.nan if value is None else value for name, value in entry.items()}
+        trial = cls(**values)
+        if not (is_finite_number(trial.size) and trial.size > 0 and type(trial.is_within) is bool):
+            raise ValueError(f"no trial: {entry!r}")
+        return trial
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the trial as JSON has it, with null for NaN."""
+        return {name: None if value != value else value for name, value in asdict(self).items()}
+
+
+@dataclass(frozen=True)
+class Bracket:
+    """What a search knows: the coarsest mesh that holds, and the next coarser one that does not.
+
+    Attributes:
+        best: The mesh of fewest triangles within the limit; None where none is.
+        failed: The next coarser mesh that is not; None where the coarsest is within.
+        is_monotone: False where a mesh finer than the best one is not within the limit: then a coarser one than the
+            best may be within it, which no search by bracketing can tell.
+    """
+
+    best: Trial | None
+    failed: Trial | None
+    is_monotone: bool
+
+
+@dataclass(frozen=True)
+class Search:
+    """A search between two sizes. It has no state: give it the trials so far, in any order.
+
+    Attributes:
+        limit: Largest distance.
+        low: Smallest size to try.
+        high: Largest size to try.
+        is_whole: True where sizes are whole numbers.
+        larger_is_coarser: Whether a larger size makes a coarser mesh; None to find out by the triangles of trials.
+        precision: Width of the last bracket, as a fraction of the size.
+        most_trials: Trials after which it ends in any case.
+
+    >>> search, trials = Search(limit=0.02, low=4, high=10_000, is_whole=True, larger_is_coarser=False), []
+    >>> while sizes := search.next(trials):
+    ...     trials += [Trial(n, int(n), 8 / n, 8 / n, 8 / n, is_within=8 / n <= 0.02) for n in sizes]
+    >>> len(trials), [trial.triangles for trial in (search.bracket(trials).best, search.bracket(trials).failed)]
+    (4, [404, 396])
+    """
+
+    limit: float
+    low: float
+    high: float
+    is_whole: bool = False
+    larger_is_coarser: bool | None = None
+    precision: float = PRECISION
+    most_trials: int = MOST_TRIALS
+
+    def __post_init__(self) -> None:
+        if not all(map(is_finite_number, (self.low, self.high))) or not 0 < self.low <= self.high:
+            raise InputError(f"sizes to search are two positive numbers, the smaller one first, found {self.ends}")
+        if not (is_finite_number(self.precision) and 0 < self.precision < 1):
+            raise InputError(f"precision is a fraction between 0 and 1, such as 0.05, found {self.precision!r}")
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The smallest and the largest size."""
+        return self.low, self.high
+
+    def bracket(self, trials: Sequence[Trial]) -> Bracket:
+        """Return what trials say."""
+        sign = self._sign(trials)
+        # Of equal meshes the one of the coarsest size.
+        within = [one for one in trials if one.is_within]
+        best = min(within, key=lambda one: (one.triangles, -sign * one.size), default=None)
+        others = sorted((one for one in trials if not one.is_within), key=lambda one: sign * one.size)
+        coarser = [one for one in others if best is None or sign * one.size > sign * best.size]
+        return Bracket(best, coarser[0] if coarser else None, len(coarser) == len(others))
+
+    def next(self, trials: Sequence[Trial], count: int = 1) -> tuple[float, ...]:
+        """Return sizes to try now, up to a count of them at a time; none where the search is over."""
+        bracket, sign = self.bracket(trials), self._sign(trials)
+        # Places are logarithms of sizes, from fine to coarse.
+        finest, coarsest = sorted(sign * math.log(size) for size in self.ends)
+        start = finest if bracket.best is None else sign * math.log(bracket.best.size)
+        end = coarsest if bracket.failed is None else sign * math.log(bracket.failed.size)
+        if len(trials) >= self.most_trials or not self._is_open(bracket, start, end):
+            return ()
+        valued = [one for one in trials if math.isfinite(one.estimate)]
+        points = {sign * math.log(one.size): self._excess(one) for one in valued}
+        places = self._places(points, bracket, start, end, count)
+        tried = {one.size for one in trials}
+        sizes = dict.fromkeys(self._size(sign, place, bracket) for place in places)
+        return tuple(size for size in sizes if size not in tried)
+
+    def _sign(self, trials: Sequence[Trial]) -> int:
+        """Return 1 where a larger size is coarser, which is assumed until trials tell, and -1 otherwise."""
+        if self.larger_is_coarser is not None:
+            return 1 if self.larger_is_coarser else -1
+        made = sorted((one.size, one.triangles) for one in trials if one.triangles)
+        return -1 if made and made[0][1] < made[-1][1] else 1
+
+    def _is_open(self, bracket: Bracket, start: float, end: float) -> bool:
+        """Tell whether a bracket between two places is too wide."""
+        if bracket.best is None or bracket.failed is None:
+            return end > start or (bracket.best or bracket.failed) is None
+        is_adjacent = self.is_whole and abs(bracket.best.size - bracket.failed.size) <= 1
+        return end - start > self._width and not is_adjacent
+
+    @property
+    def _width(self) -> float:
+        """Width of the last bracket, in logarithms."""
+        return math.log1p(self.precision)
+
+    def _places(
+        self, points: Mapping[float, float], bracket: Bracket, start: float, end: float, count: int
+    ) -> Sequence[float]:
+        """Return where to try next between the ends of a bracket, from the excess of the distance at some places."""
+        width = self._width
+        if not points:
+            # Where nothing could be made, halves arrive at the finest size.
+            is_last = bracket.failed is not None and end - start < 2 * width
+            return [start] if is_last else [start + (end - start) * k / (count + 1) for k in range(1, count + 1)]
+        # Steps towards an end that was not tried double, and arrive there.
+        least = _BESIDE * width * 2.0 ** len(points)
+        if bracket.best is None:
+            guess = min(_extrapolated(points) - _BESIDE * width, end - least)
+            guess = start if guess < start + width else guess
+        elif bracket.failed is None:
+            guess = max(_extrapolated(points) + _BESIDE * width, start + least)
+            guess = end if guess > end - width else guess
+        else:
+            # Sobolev distances follow a power closely; the first secant step then arrives.
+            guess = _extrapolated(points) if len(points) == 2 else _interpolated(points, start, end)
+            guess += _BESIDE * width * (1 if 2 * guess < start + end else -1)
+            margin = max((_LEAST_CUT if len(points) > _PATIENCE else 0.0) * (end - start), _BESIDE * width / 2)
+            guess = min(max(guess, start + margin), end - margin)
+        apart = max(_APART * width, _SPREAD * min(abs(guess - place) for place in points))
+        beside = (guess + apart * k * side for k in range(1, count) for side in (1, -1))
+        return [guess, *(place for place in beside if start < place < end)][:count]
+
+    def _excess(self, trial: Trial) -> float:
+        """Return the logarithm of a distance over the limit."""
+        return math.log(trial.estimate / self.limit) if trial.estimate > 0 else _NONE
+
+    def _size(self, sign: int, place: float, bracket: Bracket) -> float:
+        """Return the size at a place; a whole one lies strictly between those of the bracket."""
+        size = min(max(math.exp(sign * place), self.low), self.high)
+        if not self.is_whole:
+            return size
+        finer = self.low if sign > 0 else self.high
+        finer = finer if bracket.best is None else bracket.best.size + sign
+        coarser = self.high if sign > 0 else self.low
+        coarser = coarser if bracket.failed is None else bracket.failed.size - sign
+        return float(min(max(round(size), min(finer, coarser)), max(finer, coarser)))
+
+
+def _extrapolated(points: Mapping[float, float]) -> float:
+    """Return the place where the excess would be zero, by the two places that are nearest to it."""
+    (place, excess), *others = sorted(points.items(), key=lambda point: abs(point[1]))
+    slope = (others[0][1] - excess) / (others[0][0] - place) if others else _FIRST_SLOPE
+    return place - excess / min(max(slope, _LEAST_SLOPE), _LARGEST_SLOPE)
+
+
+def _interpolated(points: Mapping[float, float], start: float, end: float) -> float:
+    """Return the place within a bracket where the excess would be zero."""
+    below, above = min(-points.get(start, -_NEAR), _NEAR), min(points.get(end, _NEAR), _NEAR)
+    # An open question may leave either of them without its sign.
+    below, above = max(below, _NEAR / 100), max(above, _NEAR / 100)
+    return start + (end - start) * below / (below + above)

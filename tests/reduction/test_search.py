@@ -1,0 +1,145 @@
+"""The search for the coarsest size within a limit: what it finds, in how few trials, and what it says otherwise."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+import sobolev_batch as sb
+from sobolev_batch.reduction.search import Search, Trial
+
+
+def trials_of(search: Search, distance: Callable[[float], float], count: int = 1) -> list[Trial]:
+    """Search with distances that are exact; a mesh of distance NaN cannot be made. Sizes are triangles, if whole."""
+    trials: list[Trial] = []
+    while sizes := search.next(trials, count):
+        assert len(set(sizes)) == len(sizes) <= count
+        assert not {one.size for one in trials} & set(sizes)
+        assert all(search.low <= size <= search.high for size in sizes)
+        for size in sizes:
+            value = distance(size)
+            triangles = int(size) if search.is_whole else math.ceil(1000 / size)
+            made = {"triangles": triangles} if value == value else {"reason": "no mesh"}
+            trials.append(
+                Trial(size, **made, estimate=value, lower=value, upper=value, is_within=value <= search.limit)
+            )
+    return trials
+
+
+@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("seed", range(30))
+def test_the_fewest_triangles_lie_in_the_bracket(seed: int, count: int) -> None:
+    # Steps down at random sizes: most sizes have the distance of their neighbours. All are tried for comparison.
+    rng = np.random.default_rng(seed)
+    size = int(10 ** rng.uniform(1, 4))
+    steps = np.sort(rng.integers(4, size + 1, 40))
+    values = np.cumsum(rng.exponential(size=41))[::-1] / 10
+    table = values[np.searchsorted(steps, np.arange(size + 1), side="right")]
+    limit = rng.uniform(table[-1], table[4])
+    search = Search(limit, 4, size, is_whole=True, larger_is_coarser=False)
+    trials = trials_of(search, lambda n: float(table[int(n)]), count)
+    found, fewest = search.bracket(trials), next(n for n in range(4, size + 1) if table[n] <= limit)
+    assert found.best is not None
+    assert found.best.upper <= limit
+    if found.failed is None:
+        assert found.best.size == fewest == 4
+    else:
+        assert found.failed.size < fewest <= found.best.size
+        assert found.best.size <= max(1.0501 * found.failed.size, found.failed.size + 1)
+    assert found.is_monotone
+
+
+def test_powers_take_few_trials() -> None:
+    for exponent in (0.7, 1.0, 1.4):
+        for limit in np.geomspace(1e-4, 0.1, 7):
+            search = Search(float(limit), 4, 100_000, is_whole=True, larger_is_coarser=False)
+            assert len(trials_of(search, lambda n, power=exponent: 3.0 * n**-power)) <= 8  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("power", [1, -1])
+@pytest.mark.parametrize("scale", [1.0, 1e-6, 1e6])
+def test_which_end_is_coarse_shows_by_itself(power: int, scale: float) -> None:
+    search = Search(0.05, 0.001 * scale, scale)
+    trials: list[Trial] = []
+    while sizes := search.next(trials):
+        for size in sizes:
+            # Meshes become coarser with the length, or with its inverse.
+            length = (size / scale) ** power * (1 if power > 0 else 0.001)
+            trials.append(Trial(size, math.ceil(100 / length), length, length, length, length <= 0.05))
+    found = search.bracket(trials)
+    assert found.best is not None
+    assert found.failed is not None
+    assert 0.05 / 1.0501 <= found.best.estimate <= 0.05 < found.failed.estimate
+    assert len(trials) <= 10
+
+
+def test_neither_end_is_passed_over() -> None:
+    search = Search(1.0, 4, 5000, is_whole=True, larger_is_coarser=False)
+    coarsest = search.bracket(trials_of(search, lambda n: 1e-9))
+    assert coarsest.best is not None
+    assert (coarsest.best.size, coarsest.failed) == (4, None)
+    finest = search.bracket(trials_of(search, lambda n: 0.0 if n == 5000 else 7.0))
+    assert finest.best is not None
+    assert finest.failed is not None
+    assert finest.best.size == 5000 <= 1.05 * finest.failed.size
+    nothing = trials_of(search, lambda n: 7.0)
+    assert search.bracket(nothing).best is None
+    assert max(one.size for one in nothing) == 5000
+    # There is nothing between the ends.
+    assert trials_of(Search(1.0, 4, 4, is_whole=True, larger_is_coarser=False), lambda n: 7.0)[0].size == 4
+
+
+def test_a_finer_mesh_that_failed_is_told() -> None:
+    search = Search(1.0, 4, 10_000, is_whole=True, larger_is_coarser=False)
+    trials = trials_of(search, lambda n: 500 / n)
+    assert search.bracket(trials).is_monotone
+    spoiled = Trial(5000, 5000, 2.0, 2.0, 2.0)
+    found = search.bracket([*trials, spoiled])
+    assert not found.is_monotone
+    # The coarser mesh holds nevertheless.
+    assert found.best == search.bracket(trials).best
+
+
+def test_a_size_that_cannot_be_made_counts_as_failed() -> None:
+    search = Search(1.0, 4, 10_000, is_whole=True, larger_is_coarser=False)
+    found = search.bracket(trials_of(search, lambda n: math.nan if n < 900 else 500 / n))
+    assert found.best is not None
+    assert found.failed is not None
+    assert found.failed.reason == "no mesh"
+    assert found.failed.size < 900 <= found.best.size <= 1.05 * found.failed.size + 1
+    # Nothing can be made at all: it ends, and has tried the finest.
+    nothing = trials_of(search, lambda n: math.nan)
+    assert max(one.size for one in nothing) == 10_000
+    assert search.bracket(nothing).best is None
+
+
+def test_a_closer_bracket_goes_on_from_the_same_trials() -> None:
+    wide = Search(1.0, 4, 10_000, is_whole=True, larger_is_coarser=False)
+    trials = trials_of(wide, lambda n: 500 / n)
+    narrow = Search(1.0, 4, 10_000, is_whole=True, larger_is_coarser=False, precision=0.001)
+    assert wide.next(trials) == ()
+    assert narrow.next(trials) != ()
+    best = narrow.bracket(trials_of(narrow, lambda n: 500 / n)).best
+    assert best is not None
+    assert best.size == 500
+
+
+def test_trials_are_read_as_they_were_written() -> None:
+    for trial in (Trial(0.1, 12, 0.3, 0.2, 0.4, True, 1.5), Trial(1 / 3, reason="ended with exit status 3")):
+        text = json.dumps(trial.to_json(), allow_nan=False)
+        assert repr(Trial.from_json(json.loads(text))) == repr(trial)
+    for wrong in ({"size": None}, {"size": -1.0}, {"size": 1.0, "is_within": "no"}, {"width": 1.0}):
+        with pytest.raises((TypeError, ValueError)):
+            Trial.from_json(wrong)
+
+
+@pytest.mark.parametrize("ends", [(0, 1), (2, 1), (-1.0, 1.0), (1.0, math.inf), (math.nan, 1.0)])
+def test_ranges_without_logarithms_are_refused(ends: tuple[float, float]) -> None:
+    with pytest.raises(sb.errors.InputError, match="two positive numbers"):
+        Search(1.0, *ends)
+    with pytest.raises(sb.errors.InputError, match="precision"):
+        Search(1.0, 1, 2, precision=1.5)
