@@ -12,31 +12,28 @@ from distributed import Client
 
 from sobolev_batch.batch.cluster.clients import require_blocking
 from sobolev_batch.batch.cluster.workers import Workers, prepare_workers, worker_slowness
-from sobolev_batch.batch.field_stage import Sizes, size_rows
-from sobolev_batch.batch.run import lacks_nothing
+from sobolev_batch.batch.field_stage import Sizes, row_seconds, size_rows
+from sobolev_batch.batch.object_run import lacks_nothing
 from sobolev_batch.batch.start import StoreLike, require_permission, settled, warnings_of
 from sobolev_batch.geometry.surface import Similarity, placement_doubt
 from sobolev_batch.machine import available_cores
 from sobolev_batch.norms.fields import Quality
-from sobolev_batch.norms.tail.values import SurfaceSize
 from sobolev_batch.parameters import format_bytes
 from sobolev_batch.shown import Shown, reasons
-from sobolev_batch.store.collection_store import for_each_object
 from sobolev_batch.store.layout import stored_choice
 from sobolev_batch.store.location import Location
+from sobolev_batch.store.objects import for_each_object
 from sobolev_batch.store.records import Record
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.pilots import Look
-from sobolev_batch.study.plan import Plan, Row, make_plan
+from sobolev_batch.study.plan import Plan, make_plan
 from sobolev_batch.study.study import Study, StudyLike
 from sobolev_batch.tables.pairs import PAIR_BYTES, tile_count
 from sobolev_batch.tables.text import beside, duration
-from sobolev_batch.transform.fourier import field_seconds, slowness
+from sobolev_batch.transform.fourier import slowness
 from sobolev_batch.transform.lattice import Lattice
 from sobolev_batch.visible import visible
 
-# Time to describe and record a surface, and that of each of its triangles.
-_ROW_SECONDS, _TRIANGLE_SECONDS = 0.1, 5e-6
 # Processor time to start a process with all libraries, and the time until a cluster of them has started.
 _PROCESS_SECONDS, _CLUSTER_SECONDS = 4.0, 6.0
 # Stored fields tell the speed if there are as many.
@@ -47,7 +44,7 @@ def seconds_of_missing(
     plan: Plan, stored: Mapping[str, Record], workers: Workers, client: Client | None
 ) -> tuple[dict[str, float], str]:
     """Predict the processor seconds of each surface that is missing, by label; return also what tells the speed."""
-    predicted = {row.label: _row_seconds(plan, row) for row in plan.rows}
+    predicted = {row.label: row_seconds(plan, row) for row in plan.rows}
     missing = [label for label in predicted if label not in stored]
     if not missing:
         return {}, ""
@@ -60,17 +57,6 @@ def seconds_of_missing(
     else:
         factor, basis = worker_slowness(client, workers.members[0].address), "a transform on a worker"
     return {label: factor * predicted[label] for label in missing}, basis
-
-
-def _row_seconds(plan: Plan, row: Row) -> float:
-    """Return the predicted time of a row's tasks, on the machine that constants were measured on."""
-    expected = row.member.expected_size()
-    size = SurfaceSize(expected.triangles, plan.reference_area)
-    # An accuracy takes coarser settings where it can; what they save is little beside octaves.
-    transform = field_seconds(expected.triangles, plan.reference_area, plan.lattice, plan.transform)
-    octaves = () if plan.tail is None else plan.tail.octaves
-    sampling = sum(size.sampling_seconds(octave) for octave in octaves)
-    return _ROW_SECONDS + _TRIANGLE_SECONDS * expected.triangles + expected.seconds + transform + sampling
 
 
 @dataclass(frozen=True)
@@ -242,7 +228,7 @@ def _study_lines(plan: Plan) -> Iterator[tuple[str, str]]:
     if study.proximity is not None:
         yield (
             "proximity",
-            f"Hausdorff and Chamfer distances, from {study.proximity.points:,} points on each mesh, beside the time below",
+            f"Hausdorff and Chamfer distances, from {study.proximity.points:,} points on each mesh, besides",
         )
 
 

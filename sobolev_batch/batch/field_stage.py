@@ -14,12 +14,13 @@ from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, d
 from sobolev_batch.batch.cluster.workers import Workers
 from sobolev_batch.batch.field_tasks import Job, compute_mesh, compute_parts, finish_mesh
 from sobolev_batch.errors import ClusterError
+from sobolev_batch.norms.tail.values import SurfaceSize
 from sobolev_batch.sources.registry import ExpectedSize
 from sobolev_batch.store.lock import utc_now
 from sobolev_batch.store.records import Record, Records
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.plan import Plan, Row
-from sobolev_batch.transform.fourier import TransformSettings, projected_bytes
+from sobolev_batch.transform.fourier import TransformSettings, field_seconds, projected_bytes
 from sobolev_batch.transform.lattice import Block
 
 _log = logging.getLogger(__name__)
@@ -32,6 +33,8 @@ LEAST_TRANSFORM_BYTES = 256e6
 _CHOICE_BYTES = 100.0
 # Of a sample of octaves: its frequency, weight, place and value, and what makes them.
 _SAMPLE_BYTES = 150.0
+# Time to describe and record a surface, and that of each of its triangles.
+_ROW_SECONDS, _TRIANGLE_SECONDS = 0.1, 5e-6
 # Groups of blocks of the lattice. The blocks of a group are computed in one task.
 _Groups = tuple[tuple[Block, ...], ...]
 # The groups of a row, the memory that one transform may take besides mesh and block, and that of a task.
@@ -157,3 +160,14 @@ def size_tasks(
     ends = [len(blocks) * k // count for k in range(count + 1)]
     groups = tuple(tuple(blocks[first:last]) for first, last in pairwise(ends))
     return groups, allowed_bytes, max(loading_bytes, computing_bytes)
+
+
+def row_seconds(plan: Plan, row: Row) -> float:
+    """Return the predicted time of a row's tasks, on the machine that constants were measured on."""
+    expected = row.member.expected_size()
+    size = SurfaceSize(expected.triangles, plan.reference_area)
+    # An accuracy takes coarser settings where it can; what they save is little beside octaves.
+    transform = field_seconds(expected.triangles, plan.reference_area, plan.lattice, plan.transform)
+    octaves = () if plan.tail is None else plan.tail.octaves
+    sampling = sum(size.sampling_seconds(octave) for octave in octaves)
+    return _ROW_SECONDS + _TRIANGLE_SECONDS * expected.triangles + expected.seconds + transform + sampling

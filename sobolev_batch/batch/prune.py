@@ -8,6 +8,7 @@ from contextlib import nullcontext
 from sobolev_batch.store.layout import FIELD, OCTAVES, ROOT, Store
 from sobolev_batch.store.location import PARTIAL_FILE, Location
 from sobolev_batch.store.lock import LOCK_KEYS, Lock, locked
+from sobolev_batch.store.objects import root_of
 from sobolev_batch.store.records import Records
 from sobolev_batch.store.workspace import Contents
 
@@ -25,7 +26,7 @@ def prune(location: Location, *, is_dry: bool = True) -> dict[str, int]:
     that were killed; and tables that are not listed. StoreError where the location has no store of a study, cannot be
     written, is damaged, or a run is going on in it.
     """
-    with nullcontext() if is_dry else locked(location, Lock.of_this_process()):
+    with nullcontext() if is_dry else locked(root_of(location), Lock.of_this_process()):
         store = Store.open(location)
         contents = Contents.of_store(store)
         lost, kept = set(range(len(contents.labels))) - contents.rows.keys(), contents.complete.keys()

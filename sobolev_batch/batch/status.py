@@ -8,20 +8,19 @@ from dataclasses import dataclass
 
 from sobolev_batch.errors import DamageError
 from sobolev_batch.shown import Shown
-from sobolev_batch.store.collection_store import CollectionStore, labelled
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
-from sobolev_batch.store.lock import Lock, age_seconds, utc_now
-from sobolev_batch.store.records import Record, Records, RunRecord
+from sobolev_batch.store.lock import age_seconds
+from sobolev_batch.store.objects import Objects, labelled
+from sobolev_batch.store.records import ObjectRecord, Records, RunRecord
 from sobolev_batch.store.unlock import LOST_AFTER_SECONDS
 from sobolev_batch.store.workspace import Contents
 from sobolev_batch.tables.open import AnyStore, location_of
 from sobolev_batch.tables.text import duration
 from sobolev_batch.visible import visible
 
-# A run that waits for a busy cluster, or plans on another machine, has no heartbeat. It counts as lost after this time.
+# A run that waits for a busy cluster has no heartbeat. It counts as lost after this time.
 _PATIENCE_SECONDS = 600.0
-_PLANNING = "planning"
 # Finished surfaces from which a rate can be told.
 _FEWEST_FOR_RATE = 3
 
@@ -41,7 +40,6 @@ class Status(Shown):
         reduced: True once the store has tables.
         silence_seconds: Seconds since the latest sign of life of a run that goes on, else 0.
         rate: Surfaces that the latest run finishes in a second, as at the last of them; NaN before there are a few.
-        run_store: Path or URL of the store of the run in a collection: that of one object. Otherwise empty.
         lost_records: Labels of surfaces that the tables list, and whose completion records are gone, or others. A run
             that goes on computes them again.
 
@@ -60,76 +58,38 @@ class Status(Shown):
     reduced: bool
     silence_seconds: float
     rate: float = math.nan
-    run_store: str = ""
     lost_records: tuple[str, ...] = ()
 
     @classmethod
     def from_store(cls, store: AnyStore) -> Status:
         """Return the status of a store; see `sobolev_batch.status`."""
-        place = location_of(store)
-        opened = Store.open(place)
-        run, contents = Records(opened).read_run(), Contents.of_store(opened)
+        location = Location.parse(location_of(store))
+        objects = Objects.read(location)
+        if objects is not None:
+            run = objects.records.read_run()
+            tallies = dict(_tallies(objects, is_open=_goes_on(run)))
+            moments = [one.finished for one in tallies.values() for _ in range(one.complete)]
+        elif Store(location).is_unfinished:
+            # Its run plans, or was ended while it did.
+            run, moments, tallies = Records(Store(location)).read_run(), [], {"": ObjectRecord()}
+        else:
+            opened = Store.open(location)
+            run, contents = Records(opened).read_run(), Contents.of_store(opened)
+            tallies = {"": contents.tally()}
+            moments = [record.finished for record in contents.records if record is not None]
+        refused = {name: one.reason for name, one in tallies.items() if one.reason}
         return cls(
-            str(place),
-            len(contents.complete),
-            len(contents.rows),
-            contents.failures,
-            contents.not_compared,
+            str(location_of(store)),
+            sum(one.complete for one in tallies.values()),
+            sum(one.total for one in tallies.values()),
+            refused | labelled({name: one.failed for name, one in tallies.items()}),
+            labelled({name: one.not_compared for name, one in tallies.items()}),
             run,
-            contents.has_tables,
-            age_seconds(run.seen) if run is not None and run.state in ("submitted", "running") else 0.0,
-            math.nan if run is None else _rate(contents.records, run),
-            lost_records=tuple(contents.labels[row] for row in contents.unlike_tables),
+            all(one.reduced for one in tallies.values()),
+            age_seconds(run.seen) if _goes_on(run) and run is not None else 0.0,
+            math.nan if run is None else _rate(moments, run),
+            tuple(labelled({name: dict.fromkeys(one.lost_records) for name, one in tallies.items()})),
         )
-
-    @classmethod
-    def of_collection(cls, collection: CollectionStore) -> Status:
-        """Return the status of the objects of a collection together; labels begin with the name of the object.
-
-        The run is one that goes on, or else one that failed or was lost, or else the latest.
-        """
-        parts: dict[str, Status] = {}
-        damaged: dict[str, str] = {}
-        for name in collection.objects:
-            try:
-                if part := cls._of_object(collection, name):
-                    parts[name] = part
-            except DamageError as error:
-                damaged[name] = str(error)
-        latest = max(parts.values(), key=_urgency, default=None)
-        current = latest if latest and latest.going_on else None
-        waiting = [name for name in collection.objects if name not in parts | damaged]
-        failed = labelled({name: one.failed for name, one in parts.items()}) | damaged
-        if current is None:
-            # Otherwise its turn may come.
-            failed |= dict.fromkeys(waiting, "it has no results; run the study again to see why")
-        return cls(
-            str(collection.location),
-            sum(one.complete for one in parts.values()),
-            sum(one.total for one in parts.values()) + len(waiting) + len(damaged),
-            failed,
-            labelled({name: one.not_compared for name, one in parts.items()}),
-            latest.run if latest else None,
-            not waiting and not damaged and all(one.reduced for one in parts.values()),
-            latest.silence_seconds if latest else 0.0,
-            current.rate if current else math.nan,
-            latest.store if latest else "",
-            tuple(f"{name}/{label}" for name, one in parts.items() for label in one.lost_records),
-        )
-
-    @classmethod
-    def _of_object(cls, collection: CollectionStore, name: str) -> Status | None:
-        """Return the status of an object of a collection; None before a run takes it up."""
-        place = collection.location.below(name)
-        if collection.existing_store(name) is not None:
-            return cls.from_store(place)
-        # Only a run locks a place without a store: it plans, and has no heartbeat yet.
-        lock = Lock.read(place)
-        if lock is None or not lock.run or lock.holder_is_gone:
-            return None
-        seen = utc_now() if lock.holder_is_alive else lock.since
-        run = RunRecord("running", lock.driver, lock.since, seen, _PLANNING)
-        return cls(str(place), 0, 1, {}, {}, run, reduced=False, silence_seconds=age_seconds(seen))
 
     @property
     def waiting(self) -> int:
@@ -172,8 +132,7 @@ class Status(Shown):
         """True if a run began and shows no signs of life any more."""
         if self.run is None or self.run.state not in ("submitted", "running"):
             return False
-        has_heartbeat = self.run.state == "running" and self.run.stage != _PLANNING
-        return self.silence_seconds > (LOST_AFTER_SECONDS if has_heartbeat else _PATIENCE_SECONDS)
+        return self.silence_seconds > (LOST_AFTER_SECONDS if self.run.state == "running" else _PATIENCE_SECONDS)
 
     def __str__(self) -> str:
         return "\n".join(map(visible, self.lines()))
@@ -196,42 +155,53 @@ class Status(Shown):
         is_ahead = self.silence_seconds < -LOST_AFTER_SECONDS
         direction = "ahead of the clock here" if is_ahead else "ago"
         age = f"{duration(round(abs(self.silence_seconds)))} {direction}"
-        store = self.run_store or self.store
         if run.state == "submitted":
             yield f"submitted {age}, no worker has taken it up yet; {start}"
             if self.lost:
-                yield f"if that cluster is gone, submit the study again after: sobolev-batch unlock {store}"
+                yield f"if that cluster is gone, submit the study again after: sobolev-batch unlock {self.store}"
         elif run.state == "running":
-            yield f"running: {run.stage or _PLANNING}; {start}, last sign of life {age}"
+            yield f"running: {run.stage or 'planning'}; {start}, last sign of life {age}"
             if run.error:
                 yield run.error
             if is_ahead:
-                yield f"whether it goes on is unknown; if it is gone: sobolev-batch unlock {store} --force"
+                yield f"whether it goes on is unknown; if it is gone: sobolev-batch unlock {self.store} --force"
             if self.lost:
                 yield "its process is probably gone, or its clock is behind the one here"
                 yield "run or submit the study again, and it continues from the store"
-                yield f"if the store turns out to be locked: sobolev-batch unlock {store}"
+                yield f"if the store turns out to be locked: sobolev-batch unlock {self.store}"
         elif run.state == "failed":
-            object_text = f" of {self.run_store}" if self.run_store else ""
-            yield f"the latest run{object_text} failed: {run.error}; {start}, ended {run.seen}"
+            yield f"the latest run failed: {run.error}; {start}, ended {run.seen}"
         elif self.is_incomplete:
             yield f"ended {run.seen}, incomplete: run the study again; {start}"
         else:
             yield f"done; {start}, ended {run.seen}"
 
 
-def _urgency(status: Status) -> tuple[bool, bool, str]:
-    """Return what orders the objects of a collection: the last one has the run to be shown."""
-    run = status.run
-    if run is None:
-        return False, False, ""
-    return status.going_on, status.lost or run.state == "failed", run.seen
+def _tallies(objects: Objects, *, is_open: bool) -> Iterator[tuple[str, ObjectRecord]]:
+    """Yield what is known of each object: by its record, or by its store where a run has not come to its end."""
+    recorded = objects.recorded()
+    for name in objects.names:
+        record = recorded.get(name)
+        if record is None:
+            try:
+                place = objects.existing_store(name)
+                record = ObjectRecord() if place is None else Contents.of_store(Store.open(place)).tally()
+            except DamageError as error:
+                record = ObjectRecord(reason=str(error))
+            if not record.reason and not is_open and not record.complete:
+                # Otherwise its turn may come.
+                record = ObjectRecord(reason="it has no results; run the study again to see why")
+        yield name, record
 
 
-def _rate(records: Sequence[Record | None], run: RunRecord) -> float:
-    """Return how many surfaces a run finishes in a second, from the later half of those that it has finished."""
+def _goes_on(run: RunRecord | None) -> bool:
+    return run is not None and run.state in ("submitted", "running")
+
+
+def _rate(finished: Sequence[str], run: RunRecord) -> float:
+    """Return how many surfaces a run finishes in a second, from the later half of the moments when it finished one."""
     age = age_seconds(run.started)
-    ages = sorted(age_seconds(record.finished) for record in records if record is not None and record.finished)
+    ages = sorted(age_seconds(moment) for moment in finished if moment)
     latest = [one for one in ages if one <= age]
     latest = latest[: max(_FEWEST_FOR_RATE, len(latest) // 2)]
     if len(latest) < _FEWEST_FOR_RATE or latest[-1] <= latest[0]:
@@ -243,7 +213,7 @@ def status(store: AnyStore) -> Status:
     """Return how far the study of a store is, and what failed and why.
 
     Args:
-        store: Path, URL or opened DataTree of the store, or that of a collection. Its study may be running.
+        store: Path, URL or opened DataTree of the store. Its study may be running.
 
     Raises:
         StoreError: The location has no store of a study, or cannot be reached.
@@ -256,6 +226,4 @@ def status(store: AnyStore) -> Status:
     storage/icosphere.zarr: 5 of 5 complete, 0 failed, 0 to go
     done; by process ...
     """
-    place = location_of(store)
-    collection = CollectionStore.read(Location.parse(place))
-    return Status.from_store(place) if collection is None else Status.of_collection(collection)
+    return Status.from_store(store)

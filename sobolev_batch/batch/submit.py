@@ -7,21 +7,21 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import cache
 
 from distributed import Client, Future, Status, fire_and_forget, get_worker, worker_client
 
 from sobolev_batch.batch.cluster.clients import require_blocking
-from sobolev_batch.batch.cluster.execution import Cluster, side_by_side, task_key
+from sobolev_batch.batch.cluster.execution import Cluster, task_key
 from sobolev_batch.batch.cluster.watch import Heartbeat, Watch
 from sobolev_batch.batch.cluster.workers import prepare_workers, require_store_access
 from sobolev_batch.batch.run import carry_out
 from sobolev_batch.batch.start import StoreLike, ready_to_run
 from sobolev_batch.errors import ClusterError, StoreError
-from sobolev_batch.store.collection_store import CollectionStore, for_each_object
 from sobolev_batch.store.create import require_usable
-from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, acquire, release
+from sobolev_batch.store.objects import Objects, for_each_object
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.study import Study, StudyLike
 
@@ -39,9 +39,8 @@ class Submission:
     Attributes:
         store: Path or URL of the store.
         surfaces: Number of surfaces of the study.
-        missing: Number of surfaces whose fields are to be computed.
-        objects: Submission of each object of a collection, by its name.
-        refused: Reason for each object that cannot be carried out, by its name.
+        missing: Number of surfaces whose fields are to be computed, as far as the store tells.
+        refused: Reason for each object whose surfaces cannot be listed, by its name.
 
     >>> import sobolev_batch as sb
     >>> submission = sb.result_types.Submission("s3://bucket/results.zarr", surfaces=6, missing=4)
@@ -52,7 +51,6 @@ class Submission:
     store: str
     surfaces: int
     missing: int
-    objects: Mapping[str, Submission] = field(default_factory=dict)
     refused: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -67,11 +65,11 @@ def submit(
     """Hand a study over to a cluster and return; it goes on without this process.
 
     One of the workers drives it, in a thread besides those for tasks; should that worker be lost,
-    another one takes over from what is stored. ``sobolev-batch status`` shows the progress. The objects of a
-    collection are handed over one after another; one that cannot be carried out stops no other.
+    another one takes over from what is stored. ``sobolev-batch status`` shows the progress. An object that
+    cannot be carried out stops no other.
 
     Args:
-        study: Study, collection, or the path of the file of either.
+        study: Study, or the path of its file.
         store: Path or URL of a new or existing store, which this process and all workers reach under this name; None
             for storage/NAME.zarr.
         client: Client of the cluster; it may be closed afterwards.
@@ -89,20 +87,8 @@ def submit(
     """
     require_blocking(client)
     study, location = ready_to_run(study, store, allow_commands=allow_commands, only=only)
-    location = location.absolute()
-    if "" not in study.objects:
-        CollectionStore.prepared(location, study)
-    objects, refused = for_each_object(study, location, lambda _, part, place: _submit(part, place, client))
-    if "" in objects:
-        return objects[""]
-    surfaces = sum(submission.surfaces for submission in objects.values())
-    missing = sum(submission.missing for submission in objects.values())
-    return Submission(str(location), surfaces, missing, objects, refused)
-
-
-def _submit(study: Study, location: Location, client: Client) -> Submission:
-    require_usable(location)
-    lock = Lock.of_this_process(outlives_process=True)
+    location, lock = location.absolute(), Lock.of_this_process(outlives_process=True)
+    require_usable(location, of_objects="" not in study.objects)
     acquire(location, lock)
     try:
         with Watch(client).kept() as watch:
@@ -110,18 +96,29 @@ def _submit(study: Study, location: Location, client: Client) -> Submission:
             workers = prepare_workers(client, study.libraries)
         workers.with_backend(study.backend)
         workers.require_accuracy(study.accuracy)
-        workspace = Workspace.of_study(study, location, lock)
-        Heartbeat(workspace.store, lock, watch).write("submitted")
-        arguments = _absolute(study), workspace.store.path, lock.run
+        submission = _prepared(study, lock.of_run(location))
+        Heartbeat(location, lock, watch).write("submitted")
         # Before all tasks of other studies, from which it takes no thread: it leaves its own at once.
-        key = task_key("drive", study.name, study.object.name, "")
-        future = client.submit(drive, *arguments, key=key, pure=False, priority=1)
+        key = task_key("drive", study.name, "", "")
+        future = client.submit(drive, _absolute(study), location.name, lock.run, key=key, pure=False, priority=1)
         fire_and_forget(future)
         _await_acceptance(client, future)
     except BaseException:
         release(location, lock)
         raise
-    return Submission(workspace.store.path, len(workspace.rows), len(workspace.pending))
+    return submission
+
+
+def _prepared(study: Study, location: Location) -> Submission:
+    """Make the store of a study. An only object is planned, so that what is wrong is said; others are listed."""
+    if "" in study.objects:
+        workspace = Workspace.of_study(study, location)
+        return Submission(location.name, len(workspace.rows), len(workspace.pending))
+    recorded = Objects.prepared(location, study).recorded()
+    listed, refused = for_each_object(study, location, lambda _, one, place: one.object.members)
+    complete = sum(recorded[name].complete for name in listed if name in recorded)
+    surfaces = sum(map(len, listed.values()))
+    return Submission(location.name, surfaces, surfaces - complete, refused)
 
 
 def _absolute(study: Study) -> Study:
@@ -141,12 +138,13 @@ def drive(study: Study, store: str, run: str) -> None:
             return
         acquire(location, lock)
         with worker_client() as client, Watch(client, study.backend == "gpu").kept() as watch:
+            known_workers = cache(lambda libraries: prepare_workers(client, libraries))
 
             def equip(study: Study) -> tuple[Cluster, Watch]:
-                return Cluster.prepare(client, study), watch
+                workers = known_workers(study.libraries)
+                return Cluster(client, workers, study=study.name, part=study.object.name), watch
 
-            for _ in side_by_side([("", carry_out(study, location, lock, equip))], is_fatal=lambda error: True):
-                pass
+            carry_out(study, location, lock, equip)
     except Exception as error:
         if get_worker().status != Status.running:
             # Dask has another worker drive, which takes the lock over.
@@ -156,7 +154,7 @@ def drive(study: Study, store: str, run: str) -> None:
         # The run's own heartbeat has written most errors by now, but not that a file of the study is missing
         # on this machine.
         with suppress(StoreError):  # it may be what failed
-            Heartbeat(Store(location), lock).write("failed", f"{error} (on the worker that drove the study)")
+            Heartbeat(location, lock).write("failed", f"{error} (on the worker that drove the study)")
     release(location, lock)
 
 

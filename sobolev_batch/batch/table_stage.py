@@ -16,7 +16,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, result_of
+from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, result_from, result_of
 from sobolev_batch.errors import DamageError
 from sobolev_batch.norms.columns import describe
 from sobolev_batch.norms.estimate import NormEstimate
@@ -102,11 +102,10 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> Stages[NormEstima
 
     for tasks in (of_spectra, of_pairs):
         yield Wave(cluster, tasks, take, projected_bytes)
-    written: list[tuple[NormEstimate, Metadata]] = []
     arguments = workspace, workspace.store.metadata, reducer, meshes, digest, replaced
     last = Task(write_results, arguments, projected_bytes, stage="tables")
-    yield Wave(cluster, [last], lambda _, outcome: written.append(result_of(outcome)), projected_bytes)
-    ((distances, workspace.store.metadata),) = written
+    distances: NormEstimate
+    distances, workspace.store.metadata = yield from result_from(cluster, last)
     return distances
 
 

@@ -7,13 +7,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
-from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, result_of
 from sobolev_batch.errors import DamageError, LockError, StoreError
 from sobolev_batch.machine import available_cores
 from sobolev_batch.shown import Shown
-from sobolev_batch.store.collection_store import CollectionStore, labelled
 from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.store.layout import (
     GROUPS_OF_TASKS,
@@ -28,9 +25,10 @@ from sobolev_batch.store.layout import (
 )
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, acquire, release
+from sobolev_batch.store.objects import Objects, labelled, root_of
 from sobolev_batch.store.records import Record, Records
 from sobolev_batch.store.sealed_chunks import Index, damaged_chunks, withdraw_chunk
-from sobolev_batch.store.workspace import Contents, Workspace
+from sobolev_batch.store.workspace import Contents
 from sobolev_batch.tables.pairs import Pairs
 from sobolev_batch.tables.shells import spectrum_keys, stale_chunks
 from sobolev_batch.visible import visible
@@ -53,8 +51,8 @@ class Verification(Shown):
         tables: Damage of tables and coordinates, by the name of the array.
         withdrawn: True if the records of damaged fields were withdrawn, so that the next run makes them again, as it
             does damaged tables.
-        objects: Verification of each object of a collection, by its name; none for a single study. The total of an
-            object without a store is 0.
+        objects: Verification of each object by its name, where the study names them. The total of an object without a
+            store is 0.
 
     >>> import sobolev_batch as sb
     >>> sb.result_types.Verification("results.zarr", 5, 5, {}, {}, withdrawn=False).is_sound
@@ -95,7 +93,7 @@ def verify(store: str | Path | Location, on_progress: Callable[[int, int], None]
     """Read everything that a store holds, and withdraw what is damaged so that a run computes it again.
 
     Args:
-        store: Path or URL of the store, or that of a collection, whose objects are verified one after the other. If it
+        store: Path or URL of the store, whose objects are verified one after the other, or that of one object. If it
             cannot be written, nothing is withdrawn.
         on_progress: Callback with the number of fields of a store that were read, and the number of all.
 
@@ -108,20 +106,46 @@ def verify(store: str | Path | Location, on_progress: Callable[[int, int], None]
     >>> found.is_sound, found.complete, found.total
     (True, 5, 5)
     """
-    collection = CollectionStore.read(Location.parse(store))
-    if collection is None:
-        return _verify_study(store, on_progress)
+    location = Location.parse(store)
+    root, lock = root_of(location), Lock.of_this_process()
+    objects = Objects.read(location)
+    if objects is None:
+        # Where there is no store, this says so.
+        Store.open(location)
+    try:
+        acquire(root, lock)
+    except LockError:
+        raise
+    except StoreError as error:
+        _log.info("%s: read without the right to write (%s)", location, error)
+        return _verify_all(location, objects, on_progress, may_write=False)
+    try:
+        # It is opened again: the last run may have ended since. Whoever unlocks it may change it.
+        own = replace(location, fence=lock.of_holder(root).fence)
+        return _verify_all(own, None if objects is None else Objects.read(own), on_progress, may_write=True)
+    finally:
+        release(root, lock)
+
+
+def _verify_all(
+    location: Location, objects: Objects | None, on_progress: Callable[[int, int], None] | None, *, may_write: bool
+) -> Verification:
+    """Verify the only object of a store, or all of them."""
+    if objects is None:
+        return _verify(Store.open(location), on_progress, may_write=may_write)
     verified: dict[str, Verification] = {}
-    for name in collection.objects:
-        verified[name] = Verification(str(collection.location.below(name)), 0, 0, {}, {}, withdrawn=False)
+    for name in objects.names:
+        verified[name] = Verification(str(objects.location.below(name)), 0, 0, {}, {}, withdrawn=False)
         try:
-            if place := collection.existing_store(name):
-                verified[name] = _verify_study(place, on_progress)
+            if place := objects.existing_store(name):
+                verified[name] = _verify(Store.open(place), on_progress, may_write=may_write)
         except DamageError as error:
             verified[name] = replace(verified[name], tables={ROOT: error.what}, withdrawn=True)
+        if may_write and not verified[name].is_sound:
+            objects.records.write(objects.rows[name], None)
     damaged = [one for one in verified.values() if not one.is_sound]
     return Verification(
-        str(collection.location),
+        str(objects.location),
         sum(one.complete for one in verified.values()),
         sum(one.total for one in verified.values()),
         labelled({name: one.fields for name, one in verified.items()}),
@@ -129,39 +153,6 @@ def verify(store: str | Path | Location, on_progress: Callable[[int, int], None]
         bool(damaged) and all(one.withdrawn for one in damaged),
         verified,
     )
-
-
-def _verify_study(store: str | Path | Location, on_progress: Callable[[int, int], None] | None) -> Verification:
-    opened = Store.open(store)
-    lock = Lock.of_this_process()
-    try:
-        acquire(opened.location, lock)
-    except LockError:
-        raise
-    except StoreError as error:
-        _log.info("%s: read without the right to write (%s)", opened.path, error)
-        return _verify(opened, on_progress, may_write=False)
-    try:
-        # It is opened again: the last run may have ended since. Whoever unlocks it may change it.
-        return _verify(Store.open(opened.location.fenced(lock.require)), on_progress, may_write=True)
-    finally:
-        release(opened.location, lock)
-
-
-def damaged_rows(cluster: Cluster, workspace: Workspace) -> Stages[list[int]]:
-    """Return the rows whose fields are not what their records say, found by the workers of a cluster."""
-    tasks = (
-        Task(Fields(workspace.store).damage, (i, record), row=i, label=workspace.labels[i], stage="check")
-        for i, record in workspace.complete.items()
-    )
-    damaged: list[int] = []
-
-    def take(task: Task, damage: Any) -> None:
-        if result_of(damage):
-            damaged.append(task.row)
-
-    yield Wave(cluster, tasks, take)
-    return sorted(damaged)
 
 
 def _verify(store: Store, on_progress: Callable[[int, int], None] | None, *, may_write: bool) -> Verification:

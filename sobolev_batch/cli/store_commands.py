@@ -39,10 +39,6 @@ def status_command(context: click.Context, store: Location, follow: bool, style:
         shown = "" if style == "json" else replace_line(current.progress, shown)
         time.sleep(_FOLLOW_SECONDS)
         current = status(store)
-        if current.run_store and not current.going_on:
-            # Between two objects of a collection, no run goes on for a moment.
-            time.sleep(_FOLLOW_SECONDS)
-            current = status(store)
     replace_line("", shown)
     names = ("waiting", "going_on", "lost", "is_incomplete", "seconds_left")
     echo_result(style, current, vars(current) | {name: getattr(current, name) for name in names})
@@ -59,7 +55,7 @@ def status_command(context: click.Context, store: Location, follow: bool, style:
 def verify_command(context: click.Context, store: Location, style: str) -> None:
     """Check all data of STORE against its checksums.
 
-    All objects of a collection are checked. Damaged data are listed and, if STORE can be written, removed; `run`
+    All its objects are checked. Damaged data are listed and, if STORE can be written, removed; `run`
     computes them again. The exit status is 1 if anything is damaged.
     """
     from sobolev_batch.batch.verify import verify
@@ -68,7 +64,7 @@ def verify_command(context: click.Context, store: Location, style: str) -> None:
 
         def show(done: int, total: int) -> None:
             if done == 1:
-                # The next object of a collection adds its own.
+                # The next object adds its own.
                 bar.length = (bar.length or 0) + total
             bar.update(1)
 
@@ -102,11 +98,10 @@ def prune_command(store: Location, yes: bool) -> None:
     """
     from sobolev_batch.batch.prune import prune
     from sobolev_batch.parameters import format_bytes
-    from sobolev_batch.store.collection_store import CollectionStore
+    from sobolev_batch.store.objects import stores_below
 
-    collection = CollectionStore.read(store)
     total = 0
-    for name, place in ({"": store} if collection is None else collection.existing_stores).items():
+    for name, place in stores_below(store).items():
         for kind, size in prune(place, is_dry=not yes).items():
             total += size
             if size:

@@ -142,7 +142,7 @@ def submit_command(
 ) -> None:
     """Hand STUDY over to a cluster and return.
 
-    The cluster computes it without this process. Each object of a study is handed over by itself.
+    The cluster computes it without this process.
     """
     from sobolev_batch.batch.cluster.clients import remote_client
     from sobolev_batch.batch.submit import submit
@@ -150,11 +150,9 @@ def submit_command(
     with remote_client(scheduler, trust_network) as client:
         submission = submit(study, store, client, **settings)
 
-    for name, one in (submission.objects or {"": submission}).items():
-        where = f"{name}: " if name else ""
-        echo(f"{where}{one.missing} of {one.surfaces} surfaces to be computed by the cluster at {scheduler}")
+    echo(f"{submission.missing} of {submission.surfaces} surfaces to be computed by the cluster at {scheduler}")
     for name, reason in submission.refused.items():
-        echo(f"{name}: not submitted: {reason}", err=True)
+        echo(f"{name}: {reason}", err=True)
     echo(f"follow it by: sobolev-batch status --follow {shlex.quote(submission.store)}")
     if submission.refused:
         context.exit(EXIT_SOME_FAILED)
@@ -194,7 +192,7 @@ def plan_command(
 
 
 def _print_league(context: click.Context, place: str) -> None:
-    """Print the league of a collection as `table league` does, or why there is none."""
+    """Print the league of several objects as `table league` does, or why there is none."""
     try:
         command = table_command.get_command(context, "league")
         if command is not None:

@@ -42,13 +42,9 @@ class TableOptions:
 
     @property
     def tree(self) -> xr.DataTree:
-        """The store of one object, opened; a usage error for that of a collection."""
-        from sobolev_batch.store.collection_store import CollectionStore
+        """The store of one object, opened."""
         from sobolev_batch.tables.open import open_store
 
-        collection = CollectionStore.read(self.store)
-        if collection is not None:
-            raise click.UsageError(f"name the store of one object, such as {self.store}/{collection.objects[0]}")
         return open_store(self.store)
 
 

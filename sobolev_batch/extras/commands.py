@@ -234,20 +234,20 @@ def _text(quality: FitQuality, scale: float) -> str:
 def plot_command(context: click.Context, /, size: str | None, **options: Any) -> None:
     """Draw the results of STORE as pictures.
 
-    They show convergence, distances and spectra, and some of the meshes. Those of a collection show its
-    league.
+    They show convergence, distances and spectra, and some of the meshes. Those of several objects show
+    their league.
 
     Meshes are coloured by their witness functions, which show where they differ from the reference. They are rebuilt
     from the study. Pictures need the extra "plot". By default a few are chosen by their distances.
     """
-    from sobolev_batch.store.collection_store import CollectionStore
+    from sobolev_batch.store.objects import Objects
 
     with from_extra("plot", "a plot needs"):
         from sobolev_batch.extras.figures.style import parse_size
     chosen = _PlotOptions(panel=None if size is None else parse_size(size), **options)
     _require_folder(chosen.output)
-    if CollectionStore.read(chosen.store) is not None:
-        chosen.draw_collection()
+    if Objects.read(chosen.store) is not None:
+        chosen.draw_league()
     elif chosen.draw_store() and chosen.meshes:
         context.exit(EXIT_SOME_FAILED)
 
@@ -290,7 +290,7 @@ class _PlotOptions:
             echo(f"{label}: not drawn with its witness function: {reason}", err=True)
         return bool(missing)
 
-    def draw_collection(self) -> None:
+    def draw_league(self) -> None:
         """Draw the leagues of a collection, by size and where costs are known by cost."""
         from sobolev_batch.extras.figures.drawing import COST_LEAGUE, LEAGUE
         from sobolev_batch.extras.figures.style import drawing, write_figures

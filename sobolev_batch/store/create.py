@@ -27,6 +27,7 @@ from sobolev_batch.store.layout import (
     PAGE,
     QUALITY,
     RECORD,
+    RECORDS,
     REMOVED,
     ROOT,
     SPECTRA_GROUP,
@@ -53,7 +54,7 @@ ROWS_PER_PAGE = 100
 _RECORDED_VERSIONS = ("sobolev-batch", "finufft", "numpy", "scipy", "xarray", "zarr")
 
 
-def require_usable(location: Location) -> None:
+def require_usable(location: Location, *, of_objects: bool = False) -> None:
     """Check, without writing, that a store exists or may be created at a location."""
     store = Store(location)
     # Damaged metadata are made again.
@@ -61,7 +62,31 @@ def require_usable(location: Location) -> None:
         if not store.exists():
             location.require_free(besides=LOCK_KEYS)
         elif not store.is_unfinished:
-            store.attributes()
+            store.attributes(of_objects=of_objects)
+
+
+def reserve(location: Location, title: str) -> None:
+    """Begin the store of a study where there is none, so that its run has a record while it is planned."""
+    store = Store(location)
+    with suppress(DamageError):  # It is made again with the tables.
+        if not store.exists():
+            location.write({ROOT: json.dumps(_unfinished(title)).encode()})
+            list_records(store)
+
+
+def give_up(location: Location) -> None:
+    """Remove what was begun of a store, where its study turned out to be impossible."""
+    with suppress(DamageError):
+        if Store(location).is_unfinished and location.names() <= {ROOT, RECORDS, *LOCK_KEYS}:
+            location.remove(RECORDS)
+            location.discard(ROOT)
+
+
+def list_records(store: Store) -> None:
+    """List the group of records, whose own document has the record of a run that may be going on."""
+    store.documents[RECORDS] = {"zarr_format": 3, "node_type": "group", "attributes": {}}
+    if store.location.read(f"{RECORDS}/{ROOT}") is None:
+        store.location.write({f"{RECORDS}/{ROOT}": json.dumps(store.documents[RECORDS]).encode()})
 
 
 def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
@@ -121,7 +146,7 @@ def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:
     last, last_page = (max(store.stored_chunks(name), default=-1) for name in (RECORD, PAGE))
     count = max(1 + last, ROWS_PER_PAGE * (1 + last_page))
     fresh = Store(store.location)
-    fresh.documents = _documents_of(_record_keys(count))
+    fresh.documents = _documents_of(record_keys(count))
     records, damaged = Records(fresh).examine()
     keys = {row.key for row in plan.rows}
     if damage is not None and not any(record is not None and record.key in keys for record in records):
@@ -147,10 +172,11 @@ def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:
 def _create(store: Store, plan: Plan) -> None:
     """Create all arrays, in place of everything that the store holds."""
     # This process may be killed before all of them exist: until then the content is declared invalid.
-    attributes = {"title": plan.study.object.title, "schema_version": SCHEMA_VERSION, UNFINISHED: True}
-    store.location.write({ROOT: json.dumps(_root(attributes)).encode()})
+    store.location.write({ROOT: json.dumps(_unfinished(plan.study.object.title)).encode()})
     store.location.remove_partial_files()
-    for name in sorted(store.location.names() - {*LOCK_KEYS, ROOT}):
+    for name in sorted(store.location.names() - {*LOCK_KEYS, ROOT, RECORDS}):
+        store.location.remove(name)
+    for name in (RECORD, PAGE):
         store.location.remove(name)
     store.documents = {}
     _lay_out(store, plan, [row.label for row in plan.rows], ())
@@ -182,7 +208,7 @@ def _lay_out(store: Store, plan: Plan, labels: Sequence[str], qualities: Sequenc
                 {"quality": ("mesh", padded, {}, chunks)}, coords={**axes, "mesh": mesh, **_weight_columns(plan)}
             ),
         ),
-        **_record_keys(rows),
+        **record_keys(rows),
     }
     if plan.tail is not None:
         keys |= array_keys(
@@ -195,6 +221,7 @@ def _lay_out(store: Store, plan: Plan, labels: Sequence[str], qualities: Sequenc
             description="the sum of weight (1 + |xi|²)^s |octaves|² is the tail of a squared norm to the last octave",
         )
         keys |= dataset_keys(OCTAVES_GROUP, xr.Dataset(coords={**_sample_columns(plan.tail), "mesh": mesh}))
+    list_records(store)
     store.publish(keys | _spectra_keys(plan, mesh))
     store.documents[""] = _root(_attributes(plan, labels))
 
@@ -220,12 +247,13 @@ def _spectra_keys(plan: Plan, mesh: NDArray[Any]) -> dict[str, bytes]:
     return keys
 
 
-def _record_keys(rows: int) -> dict[str, bytes]:
+def record_keys(rows: int) -> dict[str, bytes]:
     """Return the keys of the arrays of records: a chunk for each row, which tasks write, and pages of many rows."""
-    return {
+    keys = {
         **array_keys(RECORD, str, (rows,), (1,), ("mesh",)),
         **array_keys(PAGE, str, (rows,), (ROWS_PER_PAGE,), ("mesh",)),
     }
+    return {key: text for key, text in keys.items() if key != f"{RECORDS}/{ROOT}"}
 
 
 def _weight_columns(plan: Plan) -> dict[str, tuple[str, Reals, dict[str, str]]]:
@@ -258,6 +286,10 @@ def _sample_columns(tail: TailSampling) -> dict[str, tuple[str, NDArray[Any], di
     }
     labels = tail.labels()
     return columns | {name: ("sample", labels[name], {"long_name": meaning}) for name, meaning in meanings.items()}
+
+
+def _unfinished(title: str) -> dict[str, Any]:
+    return _root({"title": title, "schema_version": SCHEMA_VERSION, UNFINISHED: True})
 
 
 def _root(attributes: dict[str, Any]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from itertools import accumulate
@@ -47,9 +47,9 @@ PAGE = "records/page"
 # These groups have radial spectra, see `sobolev_batch.norms.spectrum`, and distances, with arrays of their keys.
 SPECTRA_GROUP, DISTANCES = "spectra", "distances"
 SPECTRA_KEYS, PAIRS_KEYS = f"{SPECTRA_GROUP}/key", f"{DISTANCES}/key"
-# The root has these attributes: the digest of tables and metadata; true while the store is being created; the objects
-# of a collection; the labels of meshes that the study has lost.
-DIGEST, UNFINISHED, COLLECTION, REMOVED = "digest", "unfinished", "collection", "removed"
+# The root has these attributes: the digest of tables and metadata; true while the store is being created; and the
+# labels of meshes that the study has lost. In the attribute "study" are the names of its objects, where it names any.
+DIGEST, UNFINISHED, OBJECTS, REMOVED = "digest", "unfinished", "objects", "removed"
 # Arrays of tables above this size in memory, such as distances of all pairs of many meshes, have several chunks.
 _LARGEST_CHUNK_BYTES = 64 << 20
 # These arrays have chunks for rows, which need not be computed.
@@ -92,12 +92,6 @@ class Store:
         opened.attributes()
         return opened
 
-    def fenced(self, fence: Callable[[Location], None]) -> Self:
-        """Return the same store for a writer that has to stop once another condition fails."""
-        store = type(self)(self.location.fenced(fence))
-        store.documents = self.documents
-        return store
-
     @property
     def metadata(self) -> Metadata:
         """What is known of the metadata, which a store leaves behind when it travels to another process."""
@@ -131,16 +125,11 @@ class Store:
             self.documents[""] = root
         return True
 
-    def attributes(self) -> dict[str, Any]:
-        """Return the attributes of the root: title, study, similarity, versions."""
+    def attributes(self, *, of_objects: bool = False) -> dict[str, Any]:
+        """Return the attributes of the root: title, study, similarity, versions; or those of a root of objects."""
         if not self.exists() or self.documents[""].get("node_type") != "group":
             raise StoreError(f"{self.path}: it holds no store of a study")
         attributes: dict[str, Any] = self.documents[""].get("attributes", {})
-        if COLLECTION in attributes:
-            raise StoreError(
-                f"{self.path}: the store of a collection; each of its objects has its own, {self.path}/NAME; "
-                "sobolev-batch status shows their names"
-            )
         if self.is_unfinished:
             raise StoreError(
                 f"{self.path}: the store is being laid out, or whoever did that was interrupted; run the study again"
@@ -152,6 +141,14 @@ class Store:
             raise StoreError(
                 f"{self.path}: its schema has version {version}, this program reads {SCHEMA_VERSION}; "
                 "run the study again into another store, or read this one with the version that has written it"
+            )
+        has_objects = OBJECTS in attributes["study"]
+        if of_objects and not has_objects:
+            raise StoreError(f"{self.path}: the store of one object, and the study names several; name another store")
+        if has_objects and not of_objects:
+            first = next(iter(attributes["study"][OBJECTS]), "NAME")
+            raise StoreError(
+                f"{self.path}: the store of several objects; name that of one, such as {self.path}/{first}"
             )
         return attributes
 

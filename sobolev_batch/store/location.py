@@ -51,11 +51,12 @@ class Location:
 
     Attributes:
         name: Path, or URL such as s3://bucket/name.zarr, without credentials.
-        fence: Function that raises a `StoreError` unless the location may be written; called before every write.
+        fence: Function that raises a `StoreError` unless the location may be written; called before every write. It
+            holds for all that lies below.
     """
 
     name: str
-    fence: Callable[[Location], None] | None = field(default=None, compare=False, repr=False)
+    fence: Callable[[], None] | None = field(default=None, compare=False, repr=False)
 
     @classmethod
     def parse(cls, store: str | Path | Location) -> Location:
@@ -93,17 +94,20 @@ class Location:
         """Return the same location for processes that were started in another folder."""
         return self if self.scheme else replace(self, name=str(Path(self.name).absolute()))
 
-    def fenced(self, fence: Callable[[Location], None]) -> Location:
+    def fenced(self, fence: Callable[[], None]) -> Location:
         """Return the same location for writers that have to stop once a condition fails."""
         return replace(self, fence=fence)
 
-    def beside(self, name: str) -> Location:
-        """Return the location of a name in the folder of this one."""
-        return Location(f"{self.name.rpartition('/')[0]}/{name}" if self.scheme else str(Path(self.name).parent / name))
-
     def below(self, name: str) -> Location:
         """Return the location of a name below this one."""
-        return Location(f"{self.name}/{name}" if self.scheme else str(Path(self.name) / name))
+        return replace(self, name=f"{self.name}/{name}" if self.scheme else str(Path(self.name) / name))
+
+    @property
+    def parent(self) -> Location:
+        """The location of the folder of this one."""
+        return replace(
+            self, name=self.name.rpartition("/")[0] if self.scheme else str(Path(self.name).absolute().parent)
+        )
 
     def zarr_store(self, largest_bytes: int = 0) -> FolderStore | RemoteStore:
         """Return the store that zarr and xarray take to read and write here."""
@@ -204,7 +208,7 @@ class Location:
         so every exception counts as a failure of the access. The fence has to allow what is written.
         """
         if verb == "written" and self.fence is not None:
-            self.fence(self)
+            self.fence()
         try:
             yield
         except SobolevBatchError:

@@ -19,8 +19,9 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Literal, Self
 from uuid import uuid4
 
 from pydantic import AfterValidator, TypeAdapter, ValidationError
@@ -108,25 +109,23 @@ class Lock:
         current = Lock.read(location)
         return current is not None and current.holder == self.holder
 
-    def fence(self, location: Location) -> None:
-        """Check that its run still has the store; tasks take this along, see `Location.fenced`."""
-        current = Lock.read(location)
-        if current is None or current.run != self.run:
-            raise _lost(location, current)
+    def of_run(self, location: Location) -> Location:
+        """Return a location for tasks: it may be written, with all below, as long as the lock's run has it."""
+        return location.fenced(partial(self._require, location, "run"))
 
-    def require(self, location: Location) -> None:
-        """Check that its holder still has the store: the fence of a process that another one may replace."""
+    def of_holder(self, location: Location) -> Location:
+        """Return a location for the process that has the lock, in whose place another one may come."""
+        return location.fenced(partial(self._require, location, "holder"))
+
+    def _require(self, location: Location, part: Literal["run", "holder"]) -> None:
         current = Lock.read(location)
-        if current is None or current.holder != self.holder:
-            raise _lost(location, current)
+        if current is None or getattr(current, part) != getattr(self, part):
+            others = "the store was unlocked, or its run is over"
+            others = others if current is None else f"{current.driver} has it now"
+            raise LockError(f"{location}: nothing more is written by a run that no longer has the store: {others}")
 
 
 _adapter = TypeAdapter(Lock)
-
-
-def _lost(location: Location, current: Lock | None) -> LockError:
-    others = "the store was unlocked, or its run is over" if current is None else f"{current.driver} has it now"
-    return LockError(f"{location}: nothing more is written by a run that no longer has the store: {others}")
 
 
 @contextmanager

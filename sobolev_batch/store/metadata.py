@@ -15,7 +15,7 @@ from typing import Any, TypeGuard
 from sobolev_batch.errors import StoreError
 
 # The layout that docs/store.md describes has this version.
-SCHEMA_VERSION = 10
+SCHEMA_VERSION = 11
 
 Document = dict[str, Any]
 

@@ -12,7 +12,7 @@ from collections.abc import Collection, Hashable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache
-from typing import Any, ClassVar, Literal, Self, TypeVar, cast
+from typing import Any, ClassVar, Generic, Literal, Self, TypeVar, cast
 
 import numpy as np
 from pydantic import ConfigDict, TypeAdapter, ValidationError
@@ -92,11 +92,33 @@ class ProximityRecord:
         return not self.reason and self.key == key
 
 
-@dataclass(frozen=True)
-class Record:
-    """Completion record of one surface, written after everything else of it.
+class _Line:
+    """A record as one line of JSON, which begins with its row: records of rows may trade places."""
 
-    It is stored as one line of JSON, which begins with its row: records of rows may trade places.
+    def to_json(self, row: int) -> str:
+        """Return the record of a row as one line of JSON."""
+        return json.dumps({_ROW: row, **asdict(cast(Any, self))})
+
+    @classmethod
+    def from_json(cls, text: str, row: int) -> Self | None:
+        """Return the record of a row that a line holds, if any; DamageError where it holds something else."""
+        if text in ("", _WITHDRAWN):
+            return None
+        name = "a completion record"
+        try:
+            table = dict(json.loads(text))
+        except (ValueError, TypeError, RecursionError) as error:
+            raise _damage(name, f"no table: {error}", text) from error
+        stored_row = table.pop(_ROW, None)
+        record = _from_table(cls, table, name)
+        if stored_row != row:
+            raise _damage(name, f"it is that of row {stored_row!r}", text)
+        return record
+
+
+@dataclass(frozen=True)
+class Record(_Line):
+    """Completion record of one surface, written after everything else of it.
 
     Attributes:
         key: Key of the row when the surface was computed: a digest of all that its field depends on.
@@ -130,25 +152,39 @@ class Record:
         """Return whether the field with this key exists already."""
         return self.status == "complete" and bool(key) and self.key == key
 
-    def to_json(self, row: int) -> str:
-        """Return the record of a row as one line of JSON."""
-        return json.dumps({_ROW: row, **asdict(self)})
 
-    @classmethod
-    def from_json(cls, text: str, row: int) -> Self | None:
-        """Return the record of a row that a line holds, if any; DamageError where it holds something else."""
-        if text in ("", _WITHDRAWN):
-            return None
-        name = "a completion record"
-        try:
-            table = dict(json.loads(text))
-        except (ValueError, TypeError, RecursionError) as error:
-            raise _damage(name, f"no table: {error}", text) from error
-        stored_row = table.pop(_ROW, None)
-        record = _from_table(cls, table, name)
-        if stored_row != row:
-            raise _damage(name, f"it is that of row {stored_row!r}", text)
-        return record
+@dataclass(frozen=True)
+class ObjectRecord(_Line):
+    """What is known of an object once its run has ended: the record of a study's store for it.
+
+    Attributes:
+        key: Digest of all that its tables depend on, where nothing of it is missing; else empty.
+        reason: Why it could not be carried out; empty otherwise.
+        complete, total: Number of its surfaces that are computed, and of all.
+        failed: Reason for each surface that could not be computed, by label.
+        not_compared: Reason for each surface without the Hausdorff and Chamfer distances that the study requests.
+        imprecise: Largest relative error of the distances of each mesh that miss the accuracy requested.
+        lost_records: Labels of surfaces that the tables list, and whose completion records are gone, or others.
+        reduced: True if it has tables.
+        finished: Time at which its run ended, in UTC.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
+
+    key: str = ""
+    reason: str = ""
+    complete: int = 0
+    total: int = 1
+    failed: Mapping[str, str] = field(default_factory=dict)
+    not_compared: Mapping[str, str] = field(default_factory=dict)
+    imprecise: Mapping[str, float] = field(default_factory=dict)
+    lost_records: tuple[str, ...] = ()
+    reduced: bool = False
+    finished: Time | Literal[""] = ""
+
+    def completes(self, key: str) -> bool:
+        """Return whether nothing is missing of the object with this key."""
+        return bool(key) and self.key == key
 
 
 @dataclass(frozen=True)
@@ -171,15 +207,26 @@ class RunRecord:
     error: str = ""
 
 
+RecordType = TypeVar("RecordType", Record, ObjectRecord)
+
+
+# A record for each surface, unless others are asked for.
+_SURFACES: Any = Record
+
+
 @dataclass(frozen=True)
-class Records:
-    """The records of a store: those of its rows, alone and in pages, and that of the latest run."""
+class Records(Generic[RecordType]):
+    """The records of a store: those of its rows, alone and in pages, and that of the latest run.
+
+    Rows are surfaces, or the objects of a study at its root.
+    """
 
     store: Store
+    type: type[RecordType] = _SURFACES
 
-    def examine(self) -> tuple[list[Record | None], dict[int, str]]:
+    def examine(self) -> tuple[list[RecordType | None], dict[int, str]]:
         """Return the completion record of each row, None if it has none that can be read, and the damage of those."""
-        records: list[Record | None] = [None] * self.store.document(RECORD)["shape"][0]
+        records: list[RecordType | None] = [None] * self.store.document(RECORD)["shape"][0]
         step, paged = self._pages()
         own = [row for row in self.store.stored_chunks(RECORD) if row < len(records)]
         lines, damage = self._lines(PAGE, range(paged), step) | self._lines(RECORD, own, 1), {}
@@ -187,7 +234,7 @@ class Records:
             try:
                 if isinstance(line, DamageError):
                     raise line
-                records[row] = Record.from_json(line, row)
+                records[row] = self.type.from_json(line, row)
             except DamageError as error:
                 damage[row] = error.what
         return records, damage
@@ -205,7 +252,7 @@ class Records:
         parts = (rows[start : start + step] for start in range(0, len(rows), step))
         return {row: line for part in parts for row, line in self._lines(name, part, step).items()}
 
-    def read(self) -> tuple[Record | None, ...]:
+    def read(self) -> tuple[RecordType | None, ...]:
         """Return the completion record of each row, or None if it has none that can be read."""
         records, damage = self.examine()
         names = self.store.names_of_rows(len(records)) if damage else ()
@@ -214,20 +261,20 @@ class Records:
             _log.warning("%s is damaged and counts as not there: %s", name, what)
         return tuple(records)
 
-    def read_one(self, row: int) -> Record | None:
+    def read_one(self, row: int) -> RecordType | None:
         """Return the completion record of one row, or None if it has none that can be read."""
         with suppress(DamageError):
             line = str(self.store.read(RECORD, row))
             if not line and row < self._pages()[1]:
                 line = str(self.store.read(PAGE, row))
-            return Record.from_json(line, row)
+            return self.type.from_json(line, row)
         return None
 
-    def write(self, row: int, record: Record | None) -> None:
+    def write(self, row: int, record: RecordType | None) -> None:
         """Write the completion record of a row, or withdraw it: one chunk, replaced as a whole."""
         self.store.write(RECORD, row, _WITHDRAWN if record is None else record.to_json(row))
 
-    def collect(self, records: Sequence[Record | None]) -> None:
+    def collect(self, records: Sequence[RecordType | None]) -> None:
         """Collect the records of all rows in pages, each of rows that all have one, and remove their own chunks.
 
         If the process ends in between, a page and the chunks beside it say the same.
@@ -265,11 +312,10 @@ class Records:
 
     def write_run(self, record: RunRecord) -> None:
         """Replace the record of the latest run: an attribute of the group of records, in one key."""
-        document = self.store.document(RECORDS)
         # The store does not remember it: consolidated metadata would tell readers of a run that ended long ago.
-        run = {**asdict(record), DIGEST: digest_of(asdict(record))}
-        changed = {**document, "attributes": {**document.get("attributes", {}), _RUN: run}}
-        self.store.location.write({f"{RECORDS}/{ROOT}": json.dumps(changed).encode()})
+        attributes = {_RUN: {**asdict(record), DIGEST: digest_of(asdict(record))}}
+        group = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
+        self.store.location.write({f"{RECORDS}/{ROOT}": json.dumps(group).encode()})
 
 
 def rows_unlike_tables(

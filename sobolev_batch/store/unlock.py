@@ -10,6 +10,7 @@ from sobolev_batch.errors import LockError, StoreError
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import LOCK_KEYS, Lock, age_seconds
+from sobolev_batch.store.objects import Objects, root_of
 from sobolev_batch.store.records import Records
 
 # A run counts as lost if its record was not renewed for this time.
@@ -22,7 +23,7 @@ def unlock(store: str | Path | Location, *, force: bool = False) -> Lock | None:
     A run that is still going on notices within seconds, and ends.
 
     Args:
-        store: Path or URL of the store.
+        store: Path or URL of the store, or that of one of its objects.
         force: Whether to also remove the lock of a run that was alive a moment ago.
 
     Returns:
@@ -30,8 +31,7 @@ def unlock(store: str | Path | Location, *, force: bool = False) -> Lock | None:
 
     Raises:
         LockError: The run was alive a moment ago.
-        StoreError: There is no store, or it cannot be read or written; or it is that of a collection, whose objects
-            have locks of their own.
+        StoreError: There is no store, or it cannot be read or written.
 
     >>> import sobolev_batch as sb
     >>> sb.unlock("memory://new.zarr")
@@ -39,10 +39,11 @@ def unlock(store: str | Path | Location, *, force: bool = False) -> Lock | None:
         ...
     sobolev_batch.errors.StoreError: memory://new.zarr: it holds no store of a study
     """
-    location = Location.parse(store)
+    location = root_of(Location.parse(store))
     lock = Lock.read(location)
     if lock is None:
-        Store.open(location)
+        if Objects.read(location) is None:
+            Store.open(location)
         return None
     if not force and lock.holder_is_alive:
         raise LockError(f"{location}: {lock.driver} is alive; stop it, or unlock the store all the same by --force")

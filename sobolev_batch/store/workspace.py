@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Self
 
 import numpy as np
@@ -13,8 +14,8 @@ from sobolev_batch.store.create import prepare_store
 from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.store.layout import QUALITY, Store, hide_tables, stored_choice, table_attributes
 from sobolev_batch.store.location import Location
-from sobolev_batch.store.lock import Lock
-from sobolev_batch.store.records import Record, Records, rows_unlike_tables
+from sobolev_batch.store.lock import utc_now
+from sobolev_batch.store.records import ObjectRecord, Record, Records, rows_unlike_tables
 from sobolev_batch.study.plan import Plan, Row, make_plan
 from sobolev_batch.study.study import Study
 
@@ -63,6 +64,19 @@ class Contents:
         measured = {self.labels[i]: record.proximity for i, record in self.complete.items()}
         return {label: f"no proximity: {one.reason}" for label, one in measured.items() if one and one.reason}
 
+    def tally(self, imprecise: Mapping[str, float] = MappingProxyType({})) -> ObjectRecord:
+        """Return what the store has and lacks, as the record of its object."""
+        return ObjectRecord(
+            complete=len(self.complete),
+            total=len(self.rows),
+            failed=self.failures,
+            not_compared=self.not_compared,
+            imprecise=dict(imprecise),
+            lost_records=tuple(self.labels[row] for row in self.unlike_tables),
+            reduced=self.has_tables,
+            finished=utc_now(),
+        )
+
     @property
     def has_tables(self) -> bool:
         """True where readers find tables; those may be of other fields, see `unlike_tables`."""
@@ -105,13 +119,13 @@ class Workspace(Contents):
         return workspace
 
     @classmethod
-    def of_study(cls, study: Study, location: Location, lock: Lock, plan: Plan | None = None) -> Self:
-        """Plan a study, unless it is planned, and prepare its store, which this process has locked."""
-        plan = plan or make_plan(study, stored_choice(location))
-        workspace, cache = cls.prepared(location.fenced(lock.fence), plan), plan.study.cache
+    def of_study(cls, study: Study, location: Location) -> Self:
+        """Plan a study of one object and prepare its store, which this process or its run has locked."""
+        plan = make_plan(study, stored_choice(location))
+        workspace, cache = cls.prepared(location, plan), plan.study.cache
         if workspace.pending and cache is not None and cache.versions_changed():
             # A program of another version makes other meshes: the study is listed again.
-            return cls.of_study(study.not_listed(), location, lock)
+            return cls.of_study(study.not_listed(), location)
         return workspace
 
     @property

@@ -12,14 +12,13 @@ from typing import Any, Self
 
 import numpy as np
 
-from sobolev_batch.arrays import Reals
+from sobolev_batch.arrays import ComplexDtype, Reals
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms.accuracy.tolerance import FINER_LATTICE, Accuracy, good_intervals, lattice_of
 from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.norms.tail.sampling import TailSampling
 from sobolev_batch.study.schema import MOST_OCTAVES
 from sobolev_batch.study.study import Study
-from sobolev_batch.transform.backends import ComplexDtype
 from sobolev_batch.transform.lattice import Lattice
 
 _log = logging.getLogger(__name__)

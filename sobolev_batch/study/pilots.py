@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from sobolev_batch.arrays import Reals
+from sobolev_batch.arrays import ComplexDtype, Reals
 from sobolev_batch.errors import AccuracyError, MeshError, StudyError, one_line
 from sobolev_batch.geometry.surface import Extent, Similarity, Surface
 from sobolev_batch.machine import available_cores
@@ -27,7 +27,6 @@ from sobolev_batch.norms.tail.sampling import OctaveSampling, TailSampling
 from sobolev_batch.sources.registry import Member
 from sobolev_batch.study.lattice_choice import LatticeChoice
 from sobolev_batch.study.study import Members, Study
-from sobolev_batch.transform.backends import ComplexDtype
 from sobolev_batch.transform.lattice import Lattice
 from sobolev_batch.transform.probe import estimate
 

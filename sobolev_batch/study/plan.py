@@ -143,7 +143,7 @@ def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan
         )
     chosen = {reference, *(study.object.chosen(study.only) if study.only else members)}
     rows = (
-        Row(label, family, member, _fingerprint(label, member), is_chosen=label in chosen)
+        Row(label, family, member, fingerprint_of(label, member), is_chosen=label in chosen)
         for label, (family, member) in members.items()
     )
     sample = None
@@ -192,7 +192,8 @@ def _reference_label(study: Study, members: Members) -> str:
     return f"{family}/{name}"
 
 
-def _fingerprint(label: str, member: Member) -> str:
+def fingerprint_of(label: str, member: Member) -> str:
+    """Return the digest of a member, see `Member.fingerprint_digest`; empty where a file of it cannot be read."""
     try:
         return member.fingerprint_digest()
     except Exception as error:  # its source may raise anything, and the task reports it

@@ -31,6 +31,7 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails, PydanticKnownError
 
+from sobolev_batch.arrays import ComplexDtype
 from sobolev_batch.errors import StudyError, refused_by_pydantic
 from sobolev_batch.geometry.formats.parsing import open_regular
 from sobolev_batch.geometry.proximity import DEFAULT_POINTS, METRICS, MOST_POINTS
@@ -42,7 +43,6 @@ from sobolev_batch.sources.command import function_version
 from sobolev_batch.sources.files import MeshTable, checked_list
 from sobolev_batch.sources.names import name_problem, quoted
 from sobolev_batch.sources.registry import Source, at_most, parse_source, source_type_of
-from sobolev_batch.transform.backends import ComplexDtype
 from sobolev_batch.transform.fourier import TransformSettings
 from sobolev_batch.transform.lattice import Lattice, check_orders
 

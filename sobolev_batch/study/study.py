@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Self
 
+from sobolev_batch.arrays import ComplexDtype
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
@@ -31,7 +32,6 @@ from sobolev_batch.study.schema import (
     within,
 )
 from sobolev_batch.study.templates import sections_of_objects
-from sobolev_batch.transform.backends import ComplexDtype
 from sobolev_batch.transform.fourier import TransformSettings
 from sobolev_batch.transform.lattice import Lattice, check_orders
 

@@ -20,7 +20,6 @@ from sobolev_batch.geometry.surface import placement_doubt
 from sobolev_batch.norms.columns import describe
 from sobolev_batch.norms.fields import Quality
 from sobolev_batch.sources.names import quoted
-from sobolev_batch.store.collection_store import CollectionStore
 from sobolev_batch.store.layout import (
     DIGEST,
     OCTAVES_GROUP,
@@ -31,6 +30,7 @@ from sobolev_batch.store.layout import (
     table_attributes,
 )
 from sobolev_batch.store.location import Location
+from sobolev_batch.store.objects import stores_below
 from sobolev_batch.visible import FILE_UNITS
 
 # Names of families, or globs of names; None is all of them.
@@ -221,11 +221,12 @@ def as_tree(store: AnyStore) -> xr.DataTree:
 
 
 def stores_of(store: AnyStore | Mapping[str, AnyStore]) -> Mapping[str, AnyStore]:
-    """Return the stores of the objects of a collection by name, which they may be already; "" names one study."""
+    """Return the stores of objects by name, which they may be already; "" names an only object."""
     if isinstance(store, Mapping) and not isinstance(store, xr.DataTree):
         return store
-    collection = None if isinstance(store, xr.DataTree) else CollectionStore.read(Location.parse(store))
-    return {"": store} if collection is None else {**collection.existing_stores}
+    if isinstance(store, xr.DataTree):
+        return {"": store}
+    return {**stores_below(Location.parse(store))}
 
 
 def source_of(tree: xr.DataTree) -> str | None:

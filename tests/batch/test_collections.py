@@ -1,4 +1,4 @@
-"""Runs of collections: a store for each object, and one that cannot be carried out stops no other."""
+"""Runs of several objects: a group of the store for each, and one that cannot be carried out stops no other."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ import xarray as xr
 from distributed import Client
 
 import sobolev_batch as sb
-from sobolev_batch.store.collection_store import CollectionStore
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, locked
+from sobolev_batch.store.objects import Objects
 from sobolev_batch.store.records import Records
 from sobolev_batch.study.plan import Plan, make_plan
 from tests.support.commands import call
@@ -56,7 +56,7 @@ def test_each_object_has_a_store_of_its_own(store: Path, threads: Client, tmp_pa
     assert ours.equals(own)
     tree = xr.open_datatree(store, engine="zarr", consolidated=False)
     assert tree["a/convergence"]["distance"].sizes == {"mesh": 5, "order": 2}
-    assert tree.attrs["collection"]["objects"] == ["a", "gone", "b"]
+    assert tree.attrs["study"]["objects"] == ["a", "gone", "b"]
 
 
 def test_what_is_damaged_is_named_with_its_object(changeable: Path) -> None:
@@ -82,7 +82,7 @@ def test_objects_that_were_altered_or_traded_are_damage(changeable: Path) -> Non
         root.write_text(damaged)
         with pytest.raises(sb.errors.DamageError):
             sb.table(changeable)
-        CollectionStore.prepared(Location.parse(changeable), collection([*balls(a=1.0), GONE, *balls(b=1.1)]))
+        Objects.prepared(Location.parse(changeable), collection([*balls(a=1.0), GONE, *balls(b=1.1)]))
         pd.testing.assert_frame_equal(sb.table(changeable), before)
     for names in (("a", "other"), ("b", "a"), ("other", "b")):
         (changeable / names[0]).rename(changeable / names[1])
@@ -99,12 +99,14 @@ def test_an_object_that_lost_its_root_is_damage(changeable: Path, threads: Clien
 
 
 def require_named_damage(path: Path, objects: list[str], what: str) -> None:
-    """Check that no reader of a collection passes over objects whose stores cannot be read."""
+    """Check that no reader of all objects passes over those whose stores cannot be read."""
     with pytest.raises(sb.errors.DamageError, match=what):
         sb.table(path)
-    verified, status = sb.verify(path), sb.status(path)
+    verified = sb.verify(path)
     assert [*verified.tables] == [f"{name}/zarr.json" for name in objects]
     assert what in verified.tables[f"{objects[0]}/zarr.json"]
+    # Their records were withdrawn.
+    status = sb.status(path)
     assert {*status.failed} == {*objects, "gone"}
     assert what in status.failed[objects[0]]
 
@@ -119,7 +121,7 @@ def test_tables_of_a_collection_are_those_of_its_objects(store: Path) -> None:
     assert call("table", store, "--format", "csv").stdout.startswith("object,order,mesh")
     refused = call("table", "matrix", store)
     assert refused.returncode == 2
-    assert "name the store of one object, such as" in refused.stderr
+    assert "name that of one, such as" in refused.stderr
 
 
 @pytest.mark.slow
@@ -144,55 +146,50 @@ def test_a_plan_goes_on_past_an_object_that_cannot_be(tmp_path: Path) -> None:
     assert table["total_bytes"] == sum(one["total_bytes"] for one in table["objects"].values())
 
 
-def test_a_collection_goes_on_while_its_next_object_is_planned(changeable: Path) -> None:
-    ended = sb.status(changeable)
-    assert (ended.going_on, list(ended.failed)) == (False, ["gone"])
-    with locked(Location.parse(changeable / "gone"), Lock.of_this_process()):
-        status = sb.status(changeable)
-        assert (status.going_on, status.complete, status.total, status.failed) == (True, 10, 11, {})
-        assert "running: planning; by process " in str(status)
-    # The lock of a process of which nobody knows whether it runs, from long ago.
-    lock = replace(Lock.of_this_process(outlives_process=True), since="2020-01-01T00:00:00Z")
-    with locked(Location.parse(changeable / "gone"), lock):
-        status = sb.status(changeable)
-        assert status.lost
-        assert f"sobolev-batch unlock {changeable / 'gone'}" in str(status)
-    assert not sb.status(changeable).lost
-
-
-def test_runs_lock_the_objects_that_they_plan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[bool] = []
+def test_runs_tell_of_themselves_while_they_plan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[tuple[bool, int, int]] = []
 
     def planned(*arguments: Any) -> Plan:
-        seen.append(sb.status(tmp_path / "s.zarr").going_on)
+        status = sb.status("memory://planned.zarr")
+        seen.append((status.going_on, status.complete, status.waiting))
         return make_plan(*arguments)
 
     monkeypatch.setattr("sobolev_batch.store.workspace.make_plan", planned)
-    sb.run(collection([GONE, {**GONE, "name": "too"}]), tmp_path / "s.zarr")
-    assert seen == [True, True]
-    assert not sb.status(tmp_path / "s.zarr").going_on
+    sb.run(collection([GONE, {**GONE, "name": "too"}]), "memory://planned.zarr", workers=1)
+    assert seen == [(True, 0, 2), (True, 0, 1)]
+    ended = sb.status("memory://planned.zarr")
+    assert (ended.going_on, ended.waiting, {*ended.failed}) == (False, 0, {"gone", "too"})
 
 
-def test_the_run_of_a_collection_is_the_one_that_did_not_end_well(changeable: Path) -> None:
-    first = Store.open(changeable / "a")
-    ended = Records(first).read_run()
+def test_one_lock_keeps_all_objects(changeable: Path) -> None:
+    with locked(Location.parse(changeable), Lock.of_this_process()):
+        for use in (sb.verify, sb.unlock):
+            for place in (changeable, changeable / "b"):
+                with pytest.raises(sb.errors.LockError):
+                    use(place)
+    assert sb.verify(changeable / "b").is_sound
+
+
+def test_the_status_is_that_of_the_run(changeable: Path) -> None:
+    records = Records(Store(changeable))
+    ended = records.read_run()
     assert ended is not None
     ended = replace(ended, started="2020-01-01T00:00:00Z", seen="2020-01-01T00:00:00Z", error="no disk")
-    Records(first).write_run(replace(ended, state="failed"))
+    records.write_run(replace(ended, state="failed"))
     failed = sb.status(changeable)
-    assert (failed.run_store, failed.lost) == (first.path, False)
-    assert f"the latest run of {first.path} failed: no disk" in str(failed)
-    Records(first).write_run(replace(ended, state="running"))
+    assert not failed.lost
+    assert "the latest run failed: no disk" in str(failed)
+    records.write_run(replace(ended, state="running"))
     lost = sb.status(changeable)
-    assert (lost.run_store, lost.lost) == (first.path, True)
-    assert f"unlock {first.path}" in str(lost)
+    assert lost.lost
+    assert f"unlock {changeable}" in str(lost)
 
 
 def test_a_second_run_computes_what_is_new(store: Path, threads: Client) -> None:
     summary = sb.run(collection(balls(a=1.0, b=1.1, c=1.2)), store, threads)
     assert set(summary.computed) == {f"c/{label}" for label in LABELS}
     assert summary.failed == {}
-    with pytest.raises(sb.errors.StoreError, match="it holds the store of another collection, 'small', not 'other'"):
+    with pytest.raises(sb.errors.StoreError, match="it holds the store of another study, 'small', not 'other'"):
         sb.run(collection(balls(a=1.0), "other"), store, threads)
 
 
@@ -205,7 +202,7 @@ def test_a_league_needs_no_more_than_the_store(store: Path) -> None:
     frame = sb.compare_studies(store, store, -3)
     assert frame["ratio"].tolist() == [1.0, 1.0]
     assert set(frame["verdict"]) == {"undecided"}
-    with pytest.raises(sb.errors.StoreError, match="it holds no store of a collection"):
+    with pytest.raises(sb.errors.StoreError, match="it holds the store of one object"):
         sb.league(store / "a")
     with pytest.raises(sb.errors.StoreError, match="nowhere"):
         sb.league({"a": store / "a", "b": store / "nowhere"})
@@ -223,3 +220,35 @@ def test_other_references_and_units_are_told_apart(
     assert len(sb.compare_studies(store_path, store_path, -3)) == 2
     with pytest.raises(sb.errors.InputError, match="different references or units"):
         sb.compare_studies(store_path, store / "a", -3)
+
+
+def test_a_finished_object_costs_no_look_at_its_store(
+    changeable: Path, threads: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study = collection(balls(a=1.0, b=1.1))
+    sb.run(study, changeable, threads)
+    looked: list[str] = []
+    read = Location.read
+
+    def counted(location: Location, key: str, most_bytes: int | None = None) -> bytes | None:
+        looked.append(str(location))
+        return read(location, key, most_bytes)
+
+    monkeypatch.setattr(Location, "read", counted)
+    summary = sb.run(study, changeable)
+    assert set(summary.reused) == {f"{name}/{label}" for name in "ab" for label in LABELS}
+    assert not [place for place in looked if place != str(changeable)]
+    assert sb.status(changeable).complete == 10
+    # What another version of a file or of the study would change is computed again, and what was removed.
+    shutil.rmtree(changeable / "b")
+    assert {label[0] for label in sb.run(study, changeable, threads).computed} == {"b"}
+
+
+def test_objects_come_and_go(changeable: Path, threads: Client) -> None:
+    sb.run(collection(balls(b=1.1)), changeable, threads)
+    assert sb.status(changeable).total == 5
+    back = sb.run(collection(balls(d=1.3, b=1.1, a=1.0)), changeable, threads)
+    assert {label[0] for label in back.computed} == {"d"}
+    assert {label[0] for label in back.reused} == {"a", "b"}
+    with pytest.raises(sb.errors.StoreError, match="the store of several objects; name that of one"):
+        sb.run(sb.Study.from_table(small_table()), changeable, threads)

@@ -17,6 +17,7 @@ from distributed import Client
 from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Mesh, Study, open_store, run
+from sobolev_batch.arrays import ComplexDtype
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers
 from sobolev_batch.batch.field_stage import size_tasks
@@ -31,9 +32,9 @@ from sobolev_batch.store.create import prepare_store
 from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.store.records import Records
 from sobolev_batch.study.plan import Plan, make_plan
-from sobolev_batch.transform.backends import CPU_COSTS, ComplexDtype, NufftSpec, Workload
-from sobolev_batch.transform.fourier import TransformSettings, fastest_spec, projected_bytes
+from sobolev_batch.transform.fourier import TransformSettings, projected_bytes
 from sobolev_batch.transform.lattice import Block, OctaveLattice
+from sobolev_batch.transform.nufft_costs import CPU_COSTS, NufftSpec, Workload, fastest_spec
 from sobolev_batch.transform.rules import gauss_rule
 from tests.support.commands import call, write_toml
 from tests.support.members import loaded

@@ -13,7 +13,8 @@ import trimesh
 from distributed import Client
 
 import sobolev_batch as sb
-from sobolev_batch.batch import run as run_module
+from sobolev_batch.arrays import ComplexDtype
+from sobolev_batch.batch import object_run
 from sobolev_batch.norms.accuracy.problem import Problem
 from sobolev_batch.norms.accuracy.solve import run_pilot
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
@@ -24,7 +25,6 @@ from sobolev_batch.study.lattice_choice import LatticeChoice
 from sobolev_batch.study.pilots import Look, choose_pilots
 from sobolev_batch.study.plan import make_plan
 from sobolev_batch.tables.convergence import format_table
-from sobolev_batch.transform.backends import ComplexDtype
 from tests.support.commands import call
 from tests.support.members import members
 from tests.support.rectangles import Rectangles
@@ -118,7 +118,7 @@ def test_a_lattice_that_turns_out_too_small_grows(
 def test_what_falls_short_in_the_end_is_marked(
     threads: Client, store_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(run_module, "_MOST_ROUNDS", 1)
+    monkeypatch.setattr(object_run, "_MOST_ROUNDS", 1)
     monkeypatch.setattr(search_module, "run_pilot", on_lattice(sb.Lattice(1.2, 12)))
     sb.run(asking(), store_path, threads)
     tree = sb.open_store(store_path)

@@ -9,23 +9,22 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import count
-from typing import Any, Generic, Literal, Self, TypeVar
+from itertools import chain, count
+from typing import Any, Generic, Literal, TypeVar
 from uuid import uuid4
 
 from distributed import CancelledError, Client, Future, as_completed
 from distributed.comm import CommClosedError
 from distributed.scheduler import KilledWorker
 
-from sobolev_batch.batch.cluster.workers import GPU, MEMORY, Workers, prepare_workers
+from sobolev_batch.batch.cluster.workers import GPU, MEMORY, Workers
 from sobolev_batch.errors import ClusterError, StoreError, one_line
 from sobolev_batch.store.records import Record
-from sobolev_batch.study.study import Study
 
 Result = TypeVar("Result")
 Stage = Literal["cluster", "lattice", "fields", "reduction", "proximity"]
-# Runs that have begun and not ended: each has a thread for its heartbeat, and its records in memory.
-_MOST_RUNS = 64
+# Runs that have begun and not ended: each has its records in memory.
+_MOST_RUNS = 1000
 # What was done in a step of a stage, for people.
 _DONE: Mapping[Stage, str] = {
     "lattice": "lattices chosen",
@@ -79,6 +78,7 @@ class Task:
         row: Row of the store that the task works for, for the caller.
         label: Label of the mesh that it works for, for people.
         stage: What it does, for people; default the name of the function.
+        divided: Tasks that do the same one by one. They take its place where a worker died of it, or beside it.
     """
 
     function: Callable[..., Any]
@@ -88,6 +88,7 @@ class Task:
     row: int = -1
     label: str = ""
     stage: str = ""
+    divided: tuple[Task, ...] = ()
 
 
 def task_key(stage: str, study: str, part: str, label: str) -> tuple[str, str, str]:
@@ -105,6 +106,7 @@ class Cluster:
     """A cluster that computes a study.
 
     Attributes:
+        client: Client of the cluster; None where one task does all the work itself, see `in_place`.
         workers: Workers that the cluster had when the study began.
         notify: Callback for each step of progress.
         in_flight: Number of small tasks that the scheduler knows of at a time, at least: enough to keep workers
@@ -113,18 +115,13 @@ class Cluster:
         study, part: Name of the study, and of its object in a collection, for the names of tasks.
     """
 
-    client: Client
+    client: Client | None
     workers: Workers
     notify: Notify = lambda progress: None
     in_flight: int = 2000
     in_flight_per_thread: int = 20
     study: str = ""
     part: str = ""
-
-    @classmethod
-    def prepare(cls, client: Client, study: Study, notify: Notify = lambda progress: None) -> Self:
-        """Prepare the workers of a cluster for a study; see `prepare_workers`."""
-        return cls(client, prepare_workers(client, study.libraries), notify, study=study.name, part=study.object.name)
 
     @property
     def most_in_flight(self) -> int:
@@ -145,6 +142,8 @@ class Cluster:
                 return [submitted(item) for item in argument]
             return self.submit(argument, claims_memory, futures, label) if isinstance(argument, Task) else argument
 
+        if self.client is None:
+            raise ValueError("there is no cluster to submit tasks to")
         if id(task) not in futures:
             resources = {MEMORY: task.projected_bytes} if claims_memory and task.projected_bytes else {}
             if task.needs_gpu:
@@ -192,6 +191,43 @@ def result_of(outcome: Any) -> Any:
     if isinstance(outcome, BaseException):
         raise outcome
     return outcome
+
+
+def result_from(cluster: Cluster, task: Task) -> Stages[Any]:
+    """Wait for one task, which must not fail, and return its result."""
+    found: list[Any] = []
+    yield Wave(cluster, [task], lambda _, outcome: found.append(result_of(outcome)), task.projected_bytes)
+    return found[0]
+
+
+def in_place(stages: Stages[Result]) -> Result:
+    """Carry a run out where this is called, one task after the other, and return its result."""
+    error: Exception | None = None
+    try:
+        while True:
+            wave = next(stages) if error is None else stages.throw(error)
+            error = None
+            try:
+                for task in wave.tasks:
+                    outcome = _outcome_here(task)
+                    wave.take(task, outcome if not isinstance(outcome, StoreError) else result_of(outcome))
+            except Exception as failure:
+                error = failure
+    except StopIteration as end:
+        result: Result = end.value
+        return result
+
+
+def _outcome_here(argument: Any) -> Any:
+    """Return the result of a task, or its exception; other arguments as they are."""
+    if isinstance(argument, list):
+        return [result_of(_outcome_here(one)) for one in argument]
+    if not isinstance(argument, Task):
+        return argument
+    try:
+        return argument.function(*(result_of(_outcome_here(one)) for one in argument.arguments))
+    except Exception as error:
+        return error
 
 
 def side_by_side(
@@ -316,13 +352,14 @@ class _Loop(Generic[Result]):
         wave = run.wave
         if wave is None:
             raise ValueError("the run waits for nothing")
-        if self._completed is None:
+        if self._completed is None and wave.cluster.client is not None:
             self._client = wave.cluster.client
             self._completed = as_completed(loop=self._client.loop)
         future = wave.cluster.submit(task, wave.claims_memory, {}, task.label)
         self._running[future] = run, wave, task
         run.in_flight += 1
-        self._completed.add(future)
+        if self._completed is not None:
+            self._completed.add(future)
 
     def _take_back(self) -> None:
         """Wait for tasks that end, and give their outcomes to their runs."""
@@ -337,7 +374,11 @@ class _Loop(Generic[Result]):
         for (run, wave, task), outcome in zip(ended, outcomes, strict=True):
             if run.wave is not wave:
                 continue  # An outcome before this one ended the wave.
-            if isinstance(outcome, KilledWorker) and task is not self._alone:
+            if isinstance(outcome, KilledWorker) and task.divided:
+                run.tasks, run.has_more = chain(task.divided, run.tasks), True
+                if run not in self._ready:
+                    self._ready.append(run)
+            elif isinstance(outcome, KilledWorker) and task is not self._alone:
                 run.suspects.append(task)
             else:
                 self._give(run, task, _deadly(outcome) if isinstance(outcome, KilledWorker) else outcome)

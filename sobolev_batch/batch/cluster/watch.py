@@ -12,7 +12,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Any, Self
@@ -25,6 +25,7 @@ from distributed.comm import CommClosedError
 from sobolev_batch.batch.cluster.workers import GPU
 from sobolev_batch.errors import ClusterError, LockError, StoreError, one_line
 from sobolev_batch.store.layout import Store
+from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, this_process, utc_now
 from sobolev_batch.store.records import Records, RunRecord, RunState
 from sobolev_batch.store.unlock import LOST_AFTER_SECONDS
@@ -181,12 +182,11 @@ class Heartbeat:
         watch: The watch over its cluster, once there is one.
     """
 
-    def __init__(self, store: Store, lock: Lock, watch: Watch | None = None) -> None:
+    def __init__(self, location: Location, lock: Lock, watch: Watch | None = None) -> None:
         self.stage, self.watch = "", watch
         # Another driver of the same run may take its lock over, as when this one's worker was retired.
-        self._records = Records(store.fenced(lock.require))
+        self._records = Records(Store(lock.of_holder(location)))
         self._lost: LockError | None = None
-        self._writing = threading.Lock()
         self._started = utc_now()
 
     @contextmanager
@@ -208,10 +208,6 @@ class Heartbeat:
             raise
         self.write("done")
 
-    def paused(self) -> AbstractContextManager[object]:
-        """Return a context in which nothing is written."""
-        return self._writing
-
     def advance(self, stage: str) -> None:
         """Take down what the run does now; LockError if it had lost its store at the latest beat."""
         if self._lost is not None:
@@ -225,8 +221,7 @@ class Heartbeat:
 
     def _beat(self) -> bool:
         try:
-            with self._writing:
-                self.write("running", self.watch.obstacle if self.watch else "")
+            self.write("running", self.watch.obstacle if self.watch else "")
         except LockError as error:
             self._lost = error
         except Exception as error:  # The store may answer again at the next beat.

@@ -94,6 +94,11 @@ class Workers:
         """Number of tasks that run at once."""
         return sum(member.threads for member in self.members)
 
+    @property
+    def smallest(self) -> Workers:
+        """The worker with the least memory for a task, with one thread: what any of them can do by itself."""
+        return Workers((WorkerInfo("any worker", 1, self.allowed_bytes_per_task, "cpu", ""),))
+
     @cached_property
     def allowed_bytes_per_task(self) -> float:
         """Memory that every task may take while all threads of every worker are busy."""

@@ -28,8 +28,8 @@ from sobolev_batch.extras.leagues.statistics import (
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.shown import ShownTables
 from sobolev_batch.sources.names import quoted
-from sobolev_batch.store.collection_store import CollectionStore
 from sobolev_batch.store.location import Location
+from sobolev_batch.store.objects import Objects
 from sobolev_batch.study.comparable import SIGNIFICANCE, gap_of, least_objects
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.convergence import table, tables_of
@@ -51,7 +51,7 @@ the level of 5 % for all methods together."""
 
 
 # The store of a collection, or stores of single objects by their names.
-AnyCollection = str | Path | Location | Mapping[str, AnyStore]
+AnyStores = str | Path | Location | Mapping[str, AnyStore]
 # Columns of the ends of an interval.
 _ENDS = ("low", "high")
 # Of the rows that two studies have in common.
@@ -203,7 +203,7 @@ class League(ShownTables):
 
 @overload
 def league(
-    store: AnyCollection,
+    store: AnyStores,
     order: Orders | None = None,
     *,
     by: Literal["size"] = "size",
@@ -214,7 +214,7 @@ def league(
 
 @overload
 def league(
-    store: AnyCollection,
+    store: AnyStores,
     order: Orders | None = None,
     *,
     by: Literal["cost"],
@@ -224,14 +224,14 @@ def league(
 
 
 def league(
-    store: AnyCollection,
+    store: AnyStores,
     order: Orders | None = None,
     *,
     by: Literal["size", "cost"] = "size",
     x: str | None = None,
     methods: Sequence[str] | None = None,
 ) -> tuple[League, ...] | tuple[CostLeague, ...]:
-    """Rank the methods of a collection over its objects, for each order.
+    """Rank the methods of a study over its objects, for each order.
 
     Methods are the families that the objects have in common. On each object, they are compared at equal sizes: at sizes
     evenly spaced over the range that all of them have, with straight lines on logarithmic axes between their meshes.
@@ -239,8 +239,8 @@ def league(
     distance and its cost. docs/leagues.md explains the intervals and the test.
 
     Args:
-        store: Path or URL of the store of a collection; or stores of single objects by the name of the object. By cost,
-            also the store of one object.
+        store: Path or URL of the store of several objects; or stores of single objects by the name of the object. By
+            cost, also the store of one object.
         order: One of the stores' orders, or several; default all.
         by: What methods are compared by, "size" or "cost".
         x: Size or cost of a mesh: "triangles" (the default by size), "vertices", "edge_length", "make_seconds" (the
@@ -269,15 +269,15 @@ def league(
         raise InputError(f'methods are compared by "size" or "cost", found {by!r}')
     if isinstance(store, Mapping):
         stores, objects = store, tuple(store)
-    elif (collection := CollectionStore.read(Location.parse(store))) is not None:
-        stores, objects = collection.existing_stores, collection.objects
+    elif (found := Objects.read(Location.parse(store))) is not None:
+        stores, objects = found.existing_stores, found.names
     elif by == "cost":
         tree = as_tree(store)
         objects = (str(tree.attrs["study"]["name"]),)
         stores = {objects[0]: tree}
     else:
         raise StoreError(
-            f"{store}: it holds no store of a collection; run a study with several objects, or give the stores of "
+            f"{store}: it holds the store of one object; run a study with several objects, or give the stores of "
             "single objects by their names"
         )
     tables = tables_of(stores, order)
@@ -346,9 +346,7 @@ def _curves(frame: pd.DataFrame, x: str, methods: Sequence[str]) -> dict[str, Cu
     return {method: curve for method, curve in curves.items() if curve is not None}
 
 
-def compare_studies(
-    new: AnyCollection | AnyStore, old: AnyCollection | AnyStore, order: Orders | None = None
-) -> pd.DataFrame:
+def compare_studies(new: AnyStores | AnyStore, old: AnyStores | AnyStore, order: Orders | None = None) -> pd.DataFrame:
     """Compare the distances of two studies of the same objects, such as those of two releases of a remesher.
 
     Meshes of the same label are compared, by the ratio of their distances to the same reference. Relative distances

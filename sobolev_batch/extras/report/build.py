@@ -20,9 +20,9 @@ from sobolev_batch.errors import InputError, from_extra, written
 from sobolev_batch.extras.leagues.costs import CostLeague
 from sobolev_batch.extras.leagues.evolution import evolution
 from sobolev_batch.extras.leagues.league import League
-from sobolev_batch.store.collection_store import CollectionStore
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import utc_now
+from sobolev_batch.store.objects import Objects
 from sobolev_batch.tables.convergence import table
 from sobolev_batch.tables.matrix import pairs_of
 from sobolev_batch.tables.open import (
@@ -109,15 +109,15 @@ def make_report(
     store: AnyStore, *, folder: str | Path = ".", witnesses: Sequence[str] = (), up: Axis | None = None
 ) -> Page:
     """Return the report of a store, and what it leaves out; see `report`."""
-    collection = CollectionStore.read(Location.parse(location_of(store)))
-    if collection is None:
+    objects = Objects.read(Location.parse(location_of(store)))
+    if objects is None:
         return _study_page(store, folder, witnesses, up)
     if witnesses:
         raise InputError(
-            f"{collection.location}: meshes are shown in the report of one object, such as "
-            f"{collection.location.below(collection.objects[0])}"
+            f"{objects.location}: meshes are shown in the report of one object, such as "
+            f"{objects.location.below(objects.names[0])}"
         )
-    content = league_content(collection, Status.of_collection(collection))
+    content = league_content(objects, Status.from_store(store))
     charts = league_data(content["leagues"], content["name"], content["orders"])
     families = content["costs"][0].methods if content["costs"] else charts["families"]
     return _filled("league", content, {**charts, "families": list(families), "costs": cost_data(content["costs"])})

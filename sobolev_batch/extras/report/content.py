@@ -33,7 +33,7 @@ from sobolev_batch.extras.leagues.league import (
     pair_lines,
     percent_text,
 )
-from sobolev_batch.store.collection_store import CollectionStore
+from sobolev_batch.store.objects import Objects
 from sobolev_batch.tables.conclusion import MOST_NAMED, VERDICT_COLUMNS, Row, study_verdict
 from sobolev_batch.tables.convergence import page_columns, table, tables_of, unit_notes, with_remarks
 from sobolev_batch.tables.open import finished_group, has_proximity, open_store, placement_doubts
@@ -263,22 +263,22 @@ _LEAGUE_COLUMNS = tuple(sorted(LEAGUE_COLUMNS, key=lambda column: (column.kind !
 _NO_LEAGUE = "Methods cannot be compared over the objects."
 
 
-def league_content(collection: CollectionStore, status: Status) -> dict[str, Any]:
-    """Return what the template of a collection takes, nothing escaped; InputError where no object has tables yet."""
-    tables = tables_of(collection.existing_stores)
+def league_content(objects: Objects, status: Status) -> dict[str, Any]:
+    """Return what the template of a league takes, nothing escaped; InputError where no object has tables yet."""
+    tables = tables_of(objects.existing_stores)
     try:
-        leagues, no_league = leagues_of(tables, collection.objects), ""
+        leagues, no_league = leagues_of(tables, objects.names), ""
     except InputError as error:
         leagues, no_league = (), str(error)
     orders = list(dict.fromkeys(float(s) for frame in tables.values() for s in frame["order"]))
-    one = collection.location.below(collection.objects[0])
+    one = objects.location.below(objects.names[0])
     by_order = {league.order: league for league in leagues}
-    objects = [row for s in orders for row in _object_rows(tables, s, by_order.get(s))]
+    of_objects = [row for s in orders for row in _object_rows(tables, s, by_order.get(s))]
     ranked, pairs = ([row for league in leagues for row in _rows(league, name)] for name in ("table", "pairs"))
     methods = leagues[0].methods if leagues else list(dict.fromkeys(pd.concat(tables.values())["family"]))
-    versions = open_store(collection.location.below(next(iter(tables)))).attrs["versions"]
+    versions = open_store(objects.location.below(next(iter(tables)))).attrs["versions"]
     return {
-        **common_content(collection.title, collection.table, tables, status, status.failed, versions),
+        **common_content(objects.title, objects.table, tables, status, status.failed, versions),
         **cost_content(tables, methods),
         "leagues": leagues,
         "no_league": no_league,
@@ -287,7 +287,7 @@ def league_content(collection: CollectionStore, status: Status) -> dict[str, Any
         "note": LEAGUE_NOTE.format(x=leagues[0].x).replace("\n", " ") if leagues else "",
         "league": PageTable("league", _LEAGUE_COLUMNS, ranked, [*by_order]),
         "pairs": PageTable("pairs", PAIR_COLUMNS, pairs, [*by_order]) if pairs else None,
-        "objects": PageTable("objects", _OBJECT_COLUMNS, objects, orders),
+        "objects": PageTable("objects", _OBJECT_COLUMNS, of_objects, orders),
         "omissions": [
             f"single meshes: each object has a report of its own, such as that of {one}",
             *(f"{name}, from the league{where}: {why}" for name, where, why in left_out(leagues)),

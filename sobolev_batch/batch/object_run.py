@@ -1,0 +1,279 @@
+"""The run of one object: a worker plans it, and does small work at once; larger work becomes tasks of the cluster.
+
+Whoever drives the run computes nothing itself: it hands out tasks, and keeps what they have found.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from sobolev_batch import compiled
+from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, in_place, result_from, result_of
+from sobolev_batch.batch.cluster.workers import Workers
+from sobolev_batch.batch.field_stage import compute_fields, row_seconds, size_rows
+from sobolev_batch.batch.proximity_stage import have_proximities, measure_proximities
+from sobolev_batch.batch.table_stage import TABLES_VERSION, are_tabulated, tabulate_fields
+from sobolev_batch.errors import DamageError, InputError
+from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
+from sobolev_batch.norms.estimate import NormEstimate
+from sobolev_batch.store.field_arrays import Fields
+from sobolev_batch.store.layout import Metadata, stored_choice
+from sobolev_batch.store.location import Location
+from sobolev_batch.store.metadata import SCHEMA_VERSION
+from sobolev_batch.store.records import ObjectRecord, Records
+from sobolev_batch.store.workspace import Workspace
+from sobolev_batch.study.plan import Plan, fingerprint_of
+from sobolev_batch.study.study import Members, Study, StudyObject
+from sobolev_batch.transform.fourier import NUMERICS_VERSION
+
+_log = logging.getLogger(__name__)
+
+# A study whose distances miss the accuracy requested is computed again on a larger lattice, this often in all.
+_MOST_ROUNDS = 3
+# Fields that turn out damaged are computed again; where that goes on, something destroys them.
+_MOST_REPAIRS = 3
+# The worker that plans an object does all its work where that is predicted to take less: a task costs the scheduler and
+# the driver some milliseconds.
+_SMALL_SECONDS = 2.0
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How the run of an object ended.
+
+    Attributes:
+        record: What its store is known to have.
+        computed, reused: Labels of the surfaces whose fields were computed now, and were stored before.
+    """
+
+    record: ObjectRecord
+    computed: tuple[str, ...] = ()
+    reused: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, workspace: Workspace, computed: set[int]) -> Ended:
+        """Return how a run ended that has computed some rows, by what its workspace holds now."""
+        labels, complete = workspace.labels, workspace.complete
+        record = workspace.tally(imprecise=_imprecise(workspace))
+        if record.complete == record.total and not record.not_compared:
+            one, plan = workspace.plan.study.object, workspace.plan
+            key = object_key(one, one.members, {row.label: row.fingerprint for row in plan.rows})
+            record = replace(record, key=key)
+        return cls(
+            record,
+            tuple(labels[i] for i in workspace.rows if i in computed and i in complete),
+            tuple(labels[i] for i in workspace.rows if i not in computed and i in complete),
+        )
+
+
+def ended_before(study: Study, record: ObjectRecord | None) -> Ended | None:
+    """Return how an object ended of which nothing is missing, by its record; None where anything might be."""
+    if record is None or not record.key:
+        return None
+    with suppress(InputError):  # Its run says what cannot be listed.
+        one, members = study.object, study.object.members
+        prints = {label: fingerprint_of(label, member) for label, (_, member) in members.items()}
+        if record.completes(object_key(one, members, prints)):
+            return Ended(record, reused=tuple(members))
+    return None
+
+
+def object_key(one: StudyObject, members: Members, fingerprints: Mapping[str, str]) -> str:
+    """Return a digest of all that the tables of an object depend on; empty where a file of it cannot be read."""
+    if not all(fingerprints.values()):
+        return ""
+    surfaces = [
+        [label, family, member.time, member.metadata, fingerprints[label]]
+        for label, (family, member) in members.items()
+    ]
+    inputs = [SCHEMA_VERSION, NUMERICS_VERSION, TABLES_VERSION, one.table, surfaces]
+    return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
+
+
+def run_object(
+    study: Study, location: Location, equip: Callable[[], Cluster], workspace: Workspace | None = None
+) -> Stages[Ended]:
+    """Run a study of one object in a locked store, and in a workspace that is at hand.
+
+    A cluster is asked for if anything is missing.
+    """
+    computed: set[int] = set()
+    if workspace is not None and lacks_nothing(workspace):
+        # The last run may have been killed before it did.
+        Records(workspace.store).collect(workspace.records)
+        return Ended.of(workspace, computed)
+    cluster = equip()
+    # Asked before anything is computed: a GPU that nobody has would be waited for.
+    workers = cluster.workers.with_backend(study.backend)
+    workers.require_accuracy(study.accuracy)
+    if workspace is None:
+        workspace, computed = yield from _begin(cluster, study, location, workers)
+    if not lacks_nothing(workspace):
+        workspace, more = yield from _compute(cluster, workspace)
+        computed |= more
+    return Ended.of(workspace, computed)
+
+
+def workspace_at_hand(study: Study, location: Location) -> Workspace | None:
+    """Return the workspace of an only object where planning takes no more than reading its reference."""
+    if study.object.name or (study.accuracy is not None and stored_choice(location) is None):
+        return None
+    return Workspace.of_study(study, location)
+
+
+def _begin(cluster: Cluster, study: Study, location: Location, workers: Workers) -> Stages[tuple[Workspace, set[int]]]:
+    """Have a worker plan an object and do its small work; return its workspace, and the rows computed."""
+    advance = cluster.count_steps("lattice", 1)
+    # Should the worker die, another one leaves the work to tasks.
+    careful = Task(begin, (study, location, None), stage="plan")
+    first = Task(begin, (study, location, workers.smallest), stage="object", divided=(careful,))
+    begun: Begun = yield from result_from(cluster, first)
+    advance("", None)
+    workspace = _received(begun.sent)
+    if begun.computed:
+        advance = cluster.count_steps("fields", len(begun.computed))
+        for i in begun.computed:
+            advance(workspace.labels[i], workspace.records[i])
+    return workspace, set(begun.computed)
+
+
+@dataclass(frozen=True)
+class Begun:
+    """What a worker has made of an object: a workspace that travels, and the rows that it computed."""
+
+    sent: tuple[Workspace, Metadata]
+    computed: tuple[int, ...] = ()
+
+
+def begin(study: Study, location: Location, workers: Workers | None) -> Begun:
+    """Plan a study of one object and prepare its store; compute what is missing where that is small.
+
+    Digits do not depend on what else the process computes. Without workers, of which this one has no more memory than
+    any, nothing is computed.
+    """
+    with compiled.by_itself():
+        # Workers plan many.
+        compiled.use()
+        workspace = Workspace.of_study(study, location)
+    computed: set[int] = set()
+    if workers is not None and not lacks_nothing(workspace) and _is_small(workspace, workers):
+        workspace, computed = in_place(_compute(Cluster(None, workers), workspace))
+    return Begun(_sent(workspace), tuple(sorted(computed)))
+
+
+def _is_small(workspace: Workspace, workers: Workers) -> bool:
+    """Tell whether the missing work of an object takes so little time and memory that one task may do all of it."""
+    plan, study = workspace.plan, workspace.plan.study
+    rows = [workspace.rows[i] for i in workspace.pending]
+    # Nobody knows how long a program takes.
+    if study.backend == "gpu" or study.pairs == "all" or any(source.keeps_meshes for source in study.object.sources):
+        return False
+    sizes, refused = size_rows(plan, rows, workers)
+    is_little = all(task_bytes <= workers.allowed_bytes_per_task for *_, task_bytes in sizes.values())
+    return not refused and is_little and sum(row_seconds(plan, row) for row in rows) < _SMALL_SECONDS
+
+
+def _sent(workspace: Workspace) -> tuple[Workspace, Metadata]:
+    """Return a workspace for another process: a store travels without its metadata, which go beside it."""
+    return workspace, workspace.store.metadata
+
+
+def _received(sent: tuple[Workspace, Metadata]) -> Workspace:
+    workspace, workspace.store.metadata = sent[0], sent[1]
+    return workspace
+
+
+def _compute(cluster: Cluster, workspace: Workspace) -> Stages[tuple[Workspace, set[int]]]:
+    """Compute what a workspace lacks, on larger lattices until the accuracy is reached, and measure proximities.
+
+    Return the workspace on the last of them, and the rows that were computed.
+    """
+    rows, study = workspace.pending, workspace.plan.study
+    workspace.withdraw_results_of(rows)
+    computed: set[int] = set()
+    for rounds_left in reversed(range(_MOST_ROUNDS)):
+        repaired, distances = yield from _compute_repairing(cluster, workspace, rows)
+        computed.update(rows, repaired)
+        if not rounds_left or distances is None or study.accuracy is None:
+            break
+        choice = workspace.plan.choice.grown(distances, study.orders, study.accuracy)
+        if choice is None:
+            break
+        arguments = workspace.store.location, workspace.plan.with_choice(choice)
+        workspace = _received((yield from result_from(cluster, Task(lay_out_again, arguments, stage="layout"))))
+        rows = workspace.pending
+    yield from measure_proximities(cluster, workspace)
+    Records(workspace.store).collect(workspace.records)
+    return workspace, computed
+
+
+def lay_out_again(location: Location, plan: Plan) -> tuple[Workspace, Metadata]:
+    """Lay the store of an object out for another plan of it, on a worker."""
+    return _sent(Workspace.prepared(location, plan))
+
+
+def _compute_repairing(
+    cluster: Cluster, workspace: Workspace, rows: Sequence[int]
+) -> Stages[tuple[set[int], NormEstimate | None]]:
+    """Compute fields and tables, and damaged fields again; return their rows, and distances if they are new."""
+    repairs, repaired = 0, set[int]()
+    while True:
+        try:
+            yield from compute_fields(cluster, workspace, rows)
+            return repaired, (yield from tabulate_fields(cluster, workspace))
+        except DamageError as error:
+            if repairs == _MOST_REPAIRS:
+                raise
+            repairs += 1
+            _log.warning("%s", error)
+            # Where one is damaged, others may be.
+            rows = yield from _damaged_rows(cluster, workspace)
+            workspace.withdraw(rows, "its values are not what was stored")
+            repaired.update(rows)
+
+
+def _damaged_rows(cluster: Cluster, workspace: Workspace) -> Stages[list[int]]:
+    """Return the rows whose fields are not what their records say, found by the workers of a cluster."""
+    tasks = (
+        Task(Fields(workspace.store).damage, (i, record), row=i, label=workspace.labels[i], stage="check")
+        for i, record in workspace.complete.items()
+    )
+    damaged: list[int] = []
+
+    def take(task: Task, damage: Any) -> None:
+        if result_of(damage):
+            damaged.append(task.row)
+
+    yield Wave(cluster, tasks, take)
+    return sorted(damaged)
+
+
+def lacks_nothing(workspace: Workspace) -> bool:
+    """Return True where nothing of a plan is missing in its store: fields, tables and distances of other kinds."""
+    return not workspace.pending and are_tabulated(workspace) and have_proximities(workspace)
+
+
+def _imprecise(workspace: Workspace) -> dict[str, float]:
+    """Return the largest relative error of each mesh whose distances miss the accuracy, by its label."""
+    if workspace.plan.study.accuracy is None or not workspace.has_tables:
+        return {}
+    labels = workspace.store.read_strings("convergence/mesh")
+    distances, errors, relative, within = (
+        np.asarray(workspace.store.read(f"convergence/{name}", ...))
+        for name in ("distance", "error", "relative", "within")
+    )
+    # Of what is next to equal to the reference, no computation gives digits.
+    short = ~within.astype(bool) & (relative > NEXT_TO_EQUAL)
+    return {
+        label: float(np.max(errors[i][short[i]] / distances[i][short[i]]))
+        for i, label in enumerate(labels)
+        if short[i].any()
+    }

@@ -1,0 +1,177 @@
+"""The objects of a store: a group each, and at the root what is known of all, so that few keys tell of thousands.
+
+A study that names no object has its only one at the root itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Self, TypeVar
+
+from sobolev_batch.errors import DamageError, InputError, StoreError
+from sobolev_batch.store.create import list_records, record_keys
+from sobolev_batch.store.layout import OBJECTS, PAGE, RECORD, RECORDS, ROOT, Store
+from sobolev_batch.store.location import Location
+from sobolev_batch.store.lock import LOCK_KEYS
+from sobolev_batch.store.metadata import SCHEMA_VERSION
+from sobolev_batch.store.records import ObjectRecord, Records
+from sobolev_batch.study.study import Study
+
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class Objects:
+    """The objects of a study that names them: their groups below a root, and their records there.
+
+    Attributes:
+        root: Store of the records of objects, and of the table of all rows.
+        names: Names of the objects, in the order of the study.
+    """
+
+    root: Store
+    title: str
+    name: str
+    names: tuple[str, ...]
+    table: Mapping[str, Any]
+
+    @property
+    def location(self) -> Location:
+        """Location of the root."""
+        return self.root.location
+
+    @property
+    def records(self) -> Records[ObjectRecord]:
+        """Records of the objects, whose rows are in the order of their names, and that of the latest run."""
+        return Records(self.root, ObjectRecord)
+
+    @cached_property
+    def rows(self) -> dict[str, int]:
+        """Row of each object by its name."""
+        return {name: row for row, name in enumerate(self.names)}
+
+    def recorded(self) -> dict[str, ObjectRecord]:
+        """Return the records of the objects that have one, by name."""
+        return {name: one for name, one in zip(self.names, self.records.read(), strict=True) if one is not None}
+
+    @property
+    def existing_stores(self) -> dict[str, Location]:
+        """Stores of the objects that have one, by name; see `existing_store`."""
+        found = {name: self.existing_store(name) for name in self.names}
+        return {name: place for name, place in found.items() if place is not None}
+
+    def existing_store(self, name: str) -> Location | None:
+        """Return the store of an object, None before its reference was made; DamageError where it is another's."""
+        store = Store(self.location.below(name))
+        if not store.exists() or store.is_unfinished:
+            return None
+        study = store.attributes()["study"]["name"]
+        if study != f"{self.name} {name}":
+            problem = f"it holds the study {study!r}, not that of the object {name!r}"
+            problem += "; put the store of this object back, or remove it"
+            raise DamageError(f"{store.path}: {problem}", problem)
+        return store.location
+
+    @classmethod
+    def read(cls, location: Location) -> Self | None:
+        """Return the objects of a store; None where it is that of an only object, or there is none.
+
+        DamageError where the list of objects was altered.
+        """
+        root = Store(location)
+        with suppress(DamageError):  # An only object may have lost its root, which its readers say.
+            if not root.exists():
+                return None
+        study = root.documents.get("", {}).get("attributes", {}).get("study")
+        if not isinstance(study, dict) or OBJECTS not in study:
+            return None
+        if not root.has_digest():
+            problem = "the list of its objects, or the table of all rows, is not what was written"
+            raise DamageError(f"{location}: {problem}; run the study again", problem)
+        root.attributes(of_objects=True)
+        return cls(
+            root, root.documents[""]["attributes"]["title"], study["name"], tuple(study[OBJECTS]), study["table"]
+        )
+
+    @classmethod
+    def prepared(cls, location: Location, study: Study) -> Self:
+        """Write down at a location which objects a study has; records of those that it had before stay."""
+        present = None
+        with suppress(DamageError):
+            present = cls.read(location)
+        if present is None:
+            # Where it is damaged, the stores of the objects are still there.
+            location.require_free({ROOT, RECORDS, *LOCK_KEYS, *study.objects})
+        elif present.name != study.name:
+            raise StoreError(
+                f"{location}: it holds the store of another study, {present.name!r}, not {study.name!r}; "
+                "name another store, or remove this one"
+            )
+        root = Store(location) if present is None else present.root
+        entry = {
+            "name": study.name,
+            "orders": list(study.orders),
+            OBJECTS: list(study.objects),
+            "lacking": {name: list(one.lacking) for name, one in study.objects.items() if one.lacking},
+            "table": dict(study.table),
+        }
+        attributes = {"title": study.title, "schema_version": SCHEMA_VERSION, "study": entry}
+        root.documents[""] = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
+        made = cls(root, study.title, study.name, tuple(study.objects), study.table)
+        if present is None or present.names != made.names:
+            kept = {} if present is None else present.recorded()
+            for name in (RECORD, PAGE):
+                root.location.remove(name)
+            list_records(root)
+            root.publish(record_keys(len(made.names)))
+            for name, record in kept.items():
+                if name in made.rows:
+                    made.records.write(made.rows[name], record)
+        root.consolidate()
+        return made
+
+
+def stores_below(location: Location) -> dict[str, Location]:
+    """Return the stores of all objects that have one, by name; that of an only object without a name is under ""."""
+    objects = Objects.read(location)
+    return {"": location} if objects is None else objects.existing_stores
+
+
+def root_of(location: Location) -> Location:
+    """Return the root of the store that a location lies in, where the lock is: an object's lies above its own."""
+    name = location.name.rpartition("/")[2]
+    with suppress(StoreError):
+        above = Objects.read(location.parent)
+        if above is not None and name in above.rows:
+            return location.parent
+    return location
+
+
+def for_each_object(
+    study: Study, location: Location, act: Callable[[str, Study, Location], Result]
+) -> tuple[dict[str, Result], dict[str, str]]:
+    """Act on the name, the study and the store of each object; return results, and why others have none, by name.
+
+    Errors of an only object without a name are raised. Of others, a StoreError ends it: the store of the next one would
+    not fare better.
+    """
+    results: dict[str, Result] = {}
+    refused: dict[str, str] = {}
+    for name in study.objects:
+        try:
+            results[name] = act(name, study.of_object(name), location.below(name) if name else location)
+        except StoreError:
+            raise
+        except InputError as error:
+            if not name:
+                raise
+            refused[name] = str(error)
+    return results, refused
+
+
+def labelled(entries: Mapping[str, Mapping[str, Result]]) -> dict[str, Result]:
+    """Return what objects have by label, under labels that begin with the name of the object, where it has one."""
+    return {"/".join(filter(None, (name, label))): one for name, own in entries.items() for label, one in own.items()}
