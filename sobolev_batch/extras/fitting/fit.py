@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Self
 
 import numpy as np
@@ -46,9 +45,6 @@ _LAST_GROWTH = 1.15
 # Steps after each round but the last.
 _STEPS_BETWEEN = 40
 MOST_TRIANGLES = 1_000_000
-
-# Makes the problem of a round from its mesh.
-Make = Callable[[Mesh], FitProblem]
 
 
 @dataclass(frozen=True)
@@ -178,20 +174,17 @@ def fit(
     """
     mesh, target = as_mesh(mesh), as_operand(target)
     settings = FitSettings(order, steps, smoothing, keep_boundary)
-    problem = FitProblem.for_target(mesh, target, lattice, settings, Execution(threads=thread_count(threads)))
-    before = start_quality(problem)
-    return conclude(mesh, before, FitRun(problem, notify).finish())
+    execution = Execution(threads=thread_count(threads))
+    return _measured(mesh, FitProblem.for_target(mesh, target, lattice, settings, execution), (), notify)
 
 
 def fitted_mesh(
     mesh: Mesh, target: Operand, settings: FitSettings, execution: Execution, triangles: int | None = None
 ) -> Mesh:
     """Return the mesh that `fit` finds, or `refine` for a number of triangles, without measures of its distance."""
-    make = partial(FitProblem.for_target, target=target, lattice=None, settings=settings, execution=execution)
-    if triangles is None:
-        run = FitRun(make(mesh)).finish()
-    else:
-        run = _refine(_first_problem(mesh, triangles, make), triangles, make)
+    goals = () if triangles is None else _goals(len(mesh.triangles), triangles)
+    start = mesh if triangles is None else welded(mesh)[0]
+    run = _finished(FitProblem.for_target(start, target, None, settings, execution), goals)
     if run.end is End.INTERRUPTED:
         # A mesh of a study is the whole fit.
         raise KeyboardInterrupt
@@ -288,8 +281,11 @@ def measure_quality(problem: FitProblem, mesh: Mesh) -> FitQuality:
     return replace(quality, hausdorff=near["hausdorff"], chamfer=near["chamfer"])
 
 
-def start_quality(problem: FitProblem) -> FitQuality:
-    """Measure distances of the start, and refuse a field that cannot serve the order."""
+def _measured(given: Mesh, problem: FitProblem, goals: Sequence[int], notify: Notify | None) -> Fit:
+    """Carry a fit out and measure it: return its mesh, or the given one if that is nearer.
+
+    Refuse a field that cannot serve the order.
+    """
     before = measure_quality(problem, problem.start)
     if before.error >= before.distance > 0 and isinstance(problem.target, xr.DataArray):
         raise InputError(
@@ -297,11 +293,7 @@ def start_quality(problem: FitProblem) -> FitQuality:
             f"distance {before.distance:.2g} has an error of {before.error:.2g}, so there is nothing that a fit could "
             "lower; take a more negative order, or a field on a larger lattice"
         )
-    return before
-
-
-def conclude(start: Mesh, before: FitQuality, run: FitRun) -> Fit:
-    """Return a fit with the mesh of its last run, or with the start if that is nearer."""
+    run = _finished(problem, goals, notify)
     problem = run.problem
     mesh, remarks, end = problem.given_mesh(run.mesh), [], run.end
     try:
@@ -311,7 +303,7 @@ def conclude(start: Mesh, before: FitQuality, run: FitRun) -> Fit:
         remarks.append("it was interrupted before the mesh was measured")
     if after.distance - np.nan_to_num(after.error) > before.distance + np.nan_to_num(before.error):
         remarks.append("no nearer mesh was found: this is the start")
-        mesh, after = start, before
+        mesh, after = given, before
     if after.error >= after.distance > 0:
         remarks.append("the distance is not larger than its error: ask for a more negative order")
     if after.hausdorff > _HAUSDORFF_GROWTH * before.hausdorff:
@@ -372,11 +364,9 @@ def refine(
     """
     mesh, target = as_mesh(mesh), as_operand(target)
     settings = FitSettings(order, steps, smoothing, keep_boundary)
-    execution = Execution(threads=thread_count(threads))
-    make = partial(FitProblem.for_target, target=target, lattice=lattice, settings=settings, execution=execution)
-    problem = _first_problem(mesh, triangles, make)
-    before = start_quality(problem)
-    refined = conclude(mesh, before, _refine(problem, triangles, make, notify))
+    execution, goals = Execution(threads=thread_count(threads)), _goals(len(mesh.triangles), triangles)
+    problem = FitProblem.for_target(welded(mesh)[0], target, lattice, settings, execution)
+    refined = _measured(mesh, problem, goals, notify)
     count = len(refined.mesh.triangles)
     if count >= triangles or refined.end == End.INTERRUPTED.value:
         return refined
@@ -384,21 +374,10 @@ def refine(
     return replace(refined, remarks=(*refined.remarks, remark))
 
 
-def _first_problem(mesh: Mesh, goal: int, make: Make) -> FitProblem:
-    """Return the problem of the first round, and refuse a number of triangles that is out of range."""
-    count = len(mesh.triangles)
-    if not is_whole_number(goal) or not 1 <= goal <= MOST_TRIANGLES:
-        raise InputError(f"triangles must be a whole number up to {MOST_TRIANGLES:,}, found {goal!r}")
-    if count >= goal:
-        raise InputError(f"the mesh has {count:,} triangles already: ask for more than that, found {goal:,}")
-    return make(welded(mesh)[0])
-
-
-def _refine(problem: FitProblem, triangles: int, make: Make, notify: Notify | None = None) -> FitRun:
-    """Return the last run, with the steps of all rounds."""
-    settings = problem.settings
+def _finished(problem: FitProblem, goals: Sequence[int], notify: Notify | None = None) -> FitRun:
+    """Return the last run, with the steps of all rounds: one before each split and one after the last."""
+    settings, taken = problem.settings, 0
     between = replace(settings, steps=min(_STEPS_BETWEEN, settings.steps))
-    goals, taken = _goals(len(problem.start.triangles), triangles), 0
     total = between.steps * len(goals) + settings.steps
 
     def count(progress: FitProgress) -> None:
@@ -412,20 +391,20 @@ def _refine(problem: FitProblem, triangles: int, make: Make, notify: Notify | No
         if goal is None or run.end is End.INTERRUPTED:
             break
         try:
-            problem = make(_split(problem.given_mesh(run.mesh), goal, make))
+            problem = problem.remade(_split(problem, problem.given_mesh(run.mesh), goal))
         except KeyboardInterrupt:
             run.end = End.INTERRUPTED
             break
     return run
 
 
-def _split(mesh: Mesh, triangles: int, make: Make) -> Mesh:
-    """Return a fitted mesh with the edges split where that helps most."""
+def _split(problem: FitProblem, mesh: Mesh, triangles: int) -> Mesh:
+    """Return the fitted mesh of a problem with the edges split where that helps most."""
     edges = Edges.from_mesh(mesh)
     everywhere = edges.split(np.ones(len(edges.ends), dtype=bool))
     if triangles >= 4 * len(mesh.triangles):
         return everywhere
-    problem = make(everywhere)
+    problem = problem.remade(everywhere)
     vertices = np.asarray(problem.start.vertices)
     weights = problem.relative_to(vertices, problem.settings.shares)
     _, gradient = problem.objective(vertices, weights)[0](vertices)
@@ -440,12 +419,16 @@ def largest_while_refining(count: int, triangles: int) -> int:
     """Return the most triangles on the way from a count to another: scores come from a mesh of four times as many."""
     # Nothing is known of a file that cannot be read, or of what a program will make.
     count = max(count, 1)
-    *before, last = [count, *_goals(count, triangles)]
+    *before, last = [count, *(_goals(count, triangles) if count < triangles else [])]
     return max([last, *(4 * number for number in before)])
 
 
 def _goals(count: int, triangles: int) -> list[int]:
-    """Return the number of triangles after each split of a mesh with this many triangles."""
+    """Return the number of triangles after each split of a mesh with this many; refuse a goal that is out of range."""
+    if not is_whole_number(triangles) or not 1 <= triangles <= MOST_TRIANGLES:
+        raise InputError(f"triangles must be a whole number up to {MOST_TRIANGLES:,}, found {triangles!r}")
+    if count >= triangles:
+        raise InputError(f"the mesh has {count:,} triangles already: ask for more than that, found {triangles:,}")
     goals = []
     while count < triangles:
         if count * _EVEN_ABOVE <= triangles:

@@ -96,6 +96,7 @@ class FitProblem:
         start: The same mesh, prepared: moved to the centre, in units of length; no two of its vertices coincide.
         place: Vertex of the prepared mesh for each vertex of the given one.
         target: Target, moved with the mesh.
+        given: Target and lattice as they were given.
         values: Transform of the target on the half lattice.
         quality: Quality of this field, from which its errors follow; None if unknown.
     """
@@ -110,6 +111,7 @@ class FitProblem:
     values: Complexes
     quality: Quality | None
     execution: Execution
+    given: tuple[Operand, Lattice | None]
 
     @classmethod
     def for_target(
@@ -117,7 +119,7 @@ class FitProblem:
     ) -> Self:
         """Check mesh and target, and prepare them. The field of a surface is as accurate as the distance needs."""
         require_comparable(mesh, target)
-        start, place = welded(mesh)
+        as_given, (start, place) = (target, lattice), welded(mesh)
         move = Similarity()
         if isinstance(target, xr.DataArray):
             given = field_of(target, common_lattice((target,), lattice), (settings.order,))
@@ -134,7 +136,11 @@ class FitProblem:
             accuracy = ErrorTarget(orders, tuple(np.maximum(_TARGET_FRACTION * distances, rounding).tolist()))
             field = field_for(target, own, accuracy, TransformSettings(), execution)
             values, quality = np.asarray(field.values, dtype=np.complex128), field.quality
-        return cls(mesh, start, place, move, target, settings, own, values, quality, execution)
+        return cls(mesh, start, place, move, target, settings, own, values, quality, execution, as_given)
+
+    def remade(self, mesh: Mesh) -> Self:
+        """Return the problem of another mesh with the same target."""
+        return self.for_target(mesh, *self.given, self.settings, self.execution)
 
     @property
     def free_vertices(self) -> Indices:
