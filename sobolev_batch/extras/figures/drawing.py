@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -53,11 +54,23 @@ from sobolev_batch.tables.open import (
 )
 
 _MOST_NAMED = 3
-# Points of a front.
+# More labels along a front would overlap.
 _MOST_LABELS = 20
 # By horizontal axis: what a mesh lacks that has no place on it, and the slope of second-order convergence.
 _MISSING = {"edge_length": "edges", "triangles": "triangles", "vertices": "vertices", "seconds": "a time"}
 _SLOPES = {"edge_length": 2, "triangles": -1, "vertices": -1}
+# Smaller fractions are not written into their cells.
+_SMALLEST_SHARE = 0.005
+# Points of the largest font of labels and of shares, of the colour bar beside them, and between slanted labels.
+_LABEL_POINTS, _SHARE_POINTS, _BAR_POINTS, _SLANTED_POINTS = 7.5, 7.0, 65.0, 12.0
+# A matrix shows as many meshes at most.
+MOST_MESHES = 300
+# Points of the font of labels beside a matrix; smaller ones are left out.
+_SMALLEST_FONT, _LARGEST_FONT = 4.0, 8.0
+# Width of a character, as a multiple of the size of the font.
+_CHARACTER_WIDTH = 0.6
+# The colours of a matrix end at a percentile if the distances beyond it would take most of the scale.
+_PERCENTILES = (2.0, 98.0)
 
 
 def draw_convergence(selection: Selection, order: float, axes: Axes) -> None:
@@ -188,28 +201,18 @@ def _describe(axes: Axes, league: League | CostLeague, note: str = "") -> None:
     axes.set_ylabel("relative Sobolev distance")
 
 
-LEAGUE = Plot(draw_league, lambda leagues: leagues, 3.6)
-COST_LEAGUE = Plot(draw_cost_league, lambda leagues: leagues, 3.6)
-
-
-# Smaller fractions are not written into their cells.
-_SMALLEST_SHARE = 0.005
-# Points of the largest font of labels and of shares, of the colour bar beside them, and between slanted labels.
-_LABEL_POINTS, _SHARE_POINTS, _BAR_POINTS, _SLANTED_POINTS = 7.5, 7.0, 65.0, 12.0
-
-
 def draw_spectrum(selection: Selection, order: float, axes: Axes) -> None:
     """Draw the fractions of each squared distance to the reference by wavelength, as a heat map."""
     spectra, (width, height) = selection.spectra, inches(axes)
-    shares = spectra.shares[:, spectra.orders.index(order)]
+    shares, bands = spectra["share"].sel(order=order).values, spectra["text"].values.tolist()
     image = axes.imshow(shares, vmin=0, cmap="Blues", aspect="auto")
     bar = axes.figure.colorbar(image, ax=axes, format=PercentFormatter(1.0, 0))
     bar.set_label("fraction of the\nsquared distance", fontsize="small")
-    labels, row_points = [shortened(label) for label in spectra.labels], 72 * 0.8 * height / len(shares)
+    labels, row_points = [shortened(label) for label in spectra["mesh"].values], 72 * 0.8 * height / len(shares)
     label_points = min(_LABEL_POINTS, row_points)
     taken = _BAR_POINTS + _CHARACTER_WIDTH * label_points * max(map(len, labels))
     # The margins of a subplot, 22 % of its width, are room for labels.
-    column_points = max(1.0, (72 * width / 0.78 - taken) / len(spectra.bands))
+    column_points = max(1.0, (72 * width / 0.78 - taken) / len(bands))
     font = min(_SHARE_POINTS, 0.75 * row_points, 0.4 * column_points)
     for i, fractions in enumerate(shares):
         if np.isnan(fractions).all():
@@ -220,26 +223,20 @@ def draw_spectrum(selection: Selection, order: float, axes: Axes) -> None:
                 color = "white" if fraction > 0.6 * np.nanmax(shares) else "black"
                 axes.text(column, i, f"{fraction:.0%}", ha="center", va="center", fontsize=font, color=color)
     step = math.ceil(_SLANTED_POINTS / column_points)
-    axes.set_xticks(
-        range(0, len(spectra.bands), step),
-        spectra.bands[::step],
-        fontsize=_LABEL_POINTS,
-        rotation=40,
-        ha="right",
-        rotation_mode="anchor",
-    )
+    slanted: dict[str, Any] = {"rotation": 40, "ha": "right", "rotation_mode": "anchor"}
+    axes.set_xticks(range(0, len(bands), step), bands[::step], fontsize=_LABEL_POINTS, **slanted)
     axes.set_yticks(range(len(labels)), labels, fontsize=label_points)
     axes.set_xlabel(escaped(f"wavelength in {study_unit(selection.tree)}"))
-    set_title(axes, f"differences by wavelength, order {order:g}", spectra.omission)
+    set_title(axes, f"differences by wavelength, order {order:g}", spectra.attrs["omission"])
     hide_frame(axes)
 
 
 def draw_energy(selection: Selection, _item: object, axes: Axes) -> None:
     """Draw the energy of each difference from the reference by wavelength, as a fraction of its limit."""
     spectra = selection.spectra
-    is_equal = ~(spectra.energies > 0).any(axis=1)
+    is_equal = ~(spectra["energy"] > 0).any("band").values
     equal = f"not drawn: {is_equal.sum()} equal to the reference" if is_equal.any() else ""
-    set_title(axes, "energy of the differences from the reference", spectra.omission, equal)
+    set_title(axes, "energy of the differences from the reference", spectra.attrs["omission"], equal)
     if is_equal.all():
         axes.text(0.5, 0.5, "no mesh differs from the reference", transform=axes.transAxes, ha="center")
         axes.set_axis_off()
@@ -247,26 +244,17 @@ def draw_energy(selection: Selection, _item: object, axes: Axes) -> None:
     family_of, named = families_of(selection.tree), set[str]()
     set_log_scale(axes, "xy")
     axes.axhline(1.0, color="black", linestyle=":", linewidth=1, label="limit")
-    for label, energies, errors in zip(spectra.labels, spectra.energies, spectra.energy_errors, strict=True):
-        family, drawn = family_of[label], energies > 0
-        if drawn.any():
-            # One entry of the legend for each family.
-            name = "_" if family in named else shortened(family)
-            draw_curve(axes, spectra.wavelengths[drawn], energies[drawn], errors[drawn], selection.styles[family], name)
-            named.add(family)
+    for label in spectra["mesh"].values[~is_equal].tolist():
+        family, bands = family_of[label], spectra.sel(mesh=label)
+        bands = bands.isel(band=(bands["energy"] > 0).values)
+        places, values, errors = (bands[column].values for column in ("wavelength", "energy", "energy_error"))
+        # One entry of the legend for each family.
+        name = "_" if family in named else shortened(family)
+        draw_curve(axes, places, values, errors, selection.styles[family], name)
+        named.add(family)
     axes.invert_xaxis()
     axes.set_xlabel(escaped(f"wavelength in {study_unit(selection.tree)}"))
     axes.set_ylabel("energy over its limit")
-
-
-# In matrices.
-MOST_MESHES = 300
-# Points of the font of labels beside a matrix; smaller ones are left out.
-_SMALLEST_FONT, _LARGEST_FONT = 4.0, 8.0
-# Width of a character, as a multiple of the size of the font.
-_CHARACTER_WIDTH = 0.6
-# The colours of a matrix end at a percentile if the distances beyond it would take most of the scale.
-_PERCENTILES = (2.0, 98.0)
 
 
 def has_pairs(selection: Selection) -> bool:
@@ -342,6 +330,8 @@ def _orders_if(has: Callable[[Selection], object]) -> Callable[[Selection], Sequ
     return lambda selection: selection.orders if has(selection) else ()
 
 
+LEAGUE = Plot(draw_league, lambda leagues: leagues, 3.6)
+COST_LEAGUE = Plot(draw_cost_league, lambda leagues: leagues, 3.6)
 # By the names of their files. Each panel shows one order.
 PLOTS: dict[str, Plot] = {
     "convergence": Plot(draw_convergence, lambda selection: selection.orders, 3.6),

@@ -8,9 +8,9 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
-from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.extras.figures.style import Style, style_of
 from sobolev_batch.norms.causes import spectrum
@@ -77,12 +77,12 @@ class Selection:
         return others if reference in complete else []
 
     @cached_property
-    def spectra(self) -> Spectra:
-        """Spectra of the chosen families; InputError where the store has no mesh to compare."""
+    def spectra(self) -> xr.Dataset:
+        """Spectra of the chosen families, see `spectra_of`; InputError where the store has no mesh to compare."""
         if not self.compared:
             raise InputError("the store has no mesh to compare: the reference or all others are not computed")
         with fields_read(self.tree):
-            return Spectra.from_tree(self.tree, self.orders, self.compared)
+            return spectra_of(self.tree, self.orders, self.compared)
 
     @property
     def has_spectra(self) -> bool:
@@ -90,65 +90,37 @@ class Selection:
         return "similarity" in self.tree.attrs and bool(self.compared)
 
 
-@dataclass(frozen=True)
-class Spectra:
-    """Squared distances of some meshes to the reference, by wavelength.
+def spectra_of(tree: xr.DataTree, orders: Sequence[float], meshes: Sequence[str]) -> xr.Dataset:
+    """Return the squared distances of some meshes to the reference by wavelength, evenly through the study.
 
-    Attributes:
-        total: Number of meshes that these were chosen from.
-        shares: Fractions (meshes, orders, bands) of the squared distance, which sum to one over the bands.
-        longest: Longest wavelength (bands,) in the study's unit, decreasing; the first is infinite.
-        shortest: Shortest wavelength (bands,) in the study's unit.
-        energies: Energy ∫_{|ξ|=r} |a^ - b^|² dS of the difference, as a fraction of twice both areas (meshes, bands).
-        energy_errors: Standard error of these, zero for bands of a lattice.
+    `share` (mesh, order, band) of each squared distance; `energy` (mesh, band), ∫_{|ξ|=r} |a^ - b^|² dS of the
+    difference as a fraction of twice both areas, with its standard error `energy_error`, zero for bands of a lattice;
+    `wavelength` (band), that of the middle frequency in the study's unit; and `text` (band), its range. The attribute
+    `omission` is a note on the meshes that were not chosen, empty where all were.
     """
-
-    labels: tuple[str, ...]
-    total: int
-    orders: tuple[float, ...]
-    shares: Reals
-    longest: Reals
-    shortest: Reals
-    energies: Reals
-    energy_errors: Reals
-
-    @classmethod
-    def from_tree(cls, tree: xr.DataTree, orders: Sequence[float], meshes: Sequence[str]) -> Self:
-        """Return the spectra of some of the meshes of an open store, evenly through the study."""
-        reference = reference_of(tree)
-        fields = tree["fourier"].to_dataset()["fourier"]
-        affordable = _MOST_SAMPLES // int(np.prod(fields.shape[1:]))
-        labels = spread(meshes, max(1, min(MOST_SPECTRA, affordable)))
-        if "octaves" in tree:
-            accessor = StoreAccessor(tree)
-            spectra = [accessor.spectrum(orders, label, reference) for label in labels]
-        else:
-            of_reference = fields.sel(mesh=reference).load()
-            spectra = [spectrum(fields.sel(mesh=label), of_reference, orders) for label in labels]
-        shares = np.stack([np.asarray(bands["share"].transpose("order", "band")) for bands in spectra])
-        longest, shortest = (spectra[0][name].to_numpy() for name in ("longest_wavelength", "shortest_wavelength"))
-        areas = finished_group(tree, "meshes")["area"]
-        limits = 2 * (areas.sel(mesh=labels).to_numpy() + areas.sel(mesh=reference).item())
-        energies = np.stack([bands["energy"].to_numpy() for bands in spectra]) / limits[:, None]
-        errors = np.zeros_like(energies)
-        if "octaves" in tree:
-            errors = np.stack([bands["energy_error"].to_numpy() for bands in spectra]) / limits[:, None]
-        return cls(tuple(labels), len(meshes), tuple(orders), shares, longest, shortest, energies, errors)
-
-    @property
-    def omission(self) -> str:
-        """Note on the meshes that were not chosen; empty where all were."""
-        return f"{len(self.labels)} of {self.total} meshes" if len(self.labels) < self.total else ""
-
-    @property
-    def wavelengths(self) -> Reals:
-        """Wavelength at the middle frequency of each band, in the study's unit."""
-        return np.asarray(2 / (1 / self.longest + 1 / self.shortest))
-
-    @property
-    def bands(self) -> tuple[str, ...]:
-        """Each band as text, in the study's unit."""
-        return tuple(
-            f"> {short:.3g}" if np.isinf(long) else f"{long:.3g} – {short:.3g}"
-            for long, short in zip(self.longest, self.shortest, strict=True)
-        )
+    reference, fields = reference_of(tree), tree["fourier"].to_dataset()["fourier"]
+    affordable = _MOST_SAMPLES // int(np.prod(fields.shape[1:]))
+    labels = spread(meshes, max(1, min(MOST_SPECTRA, affordable)))
+    if "octaves" in tree:
+        found = [StoreAccessor(tree).spectrum(orders, label, reference) for label in labels]
+    else:
+        of_reference = fields.sel(mesh=reference).load()
+        found = [spectrum(fields.sel(mesh=label), of_reference, orders) for label in labels]
+        found = [bands.assign(energy_error=xr.zeros_like(bands["energy"])) for bands in found]
+    along = pd.Index(labels, name="mesh")
+    spectra = xr.concat(
+        [bands[["share", "energy", "energy_error"]] for bands in found], along, coords="minimal", compat="override"
+    ).drop_attrs()
+    areas = finished_group(tree, "meshes")["area"].reset_coords(drop=True)
+    limits = 2 * (areas.sel(mesh=labels) + areas.sel(mesh=reference, drop=True))
+    longest, shortest = (spectra[f"{name}_wavelength"].to_numpy() for name in ("longest", "shortest"))
+    texts = [
+        f"> {short:.3g}" if np.isinf(long) else f"{long:.3g} – {short:.3g}"
+        for long, short in zip(longest, shortest, strict=True)
+    ]
+    return spectra.assign(
+        energy=spectra["energy"] / limits,
+        energy_error=spectra["energy_error"] / limits,
+        wavelength=("band", 2 / (1 / longest + 1 / shortest)),
+        text=("band", texts),
+    ).assign_attrs(omission=f"{len(labels)} of {len(meshes)} meshes" if len(labels) < len(meshes) else "")

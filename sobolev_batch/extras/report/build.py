@@ -19,7 +19,7 @@ from sobolev_batch.batch.status import Status
 from sobolev_batch.errors import InputError, from_extra, written
 from sobolev_batch.extras.leagues.costs import CostLeague
 from sobolev_batch.extras.leagues.evolution import evolution
-from sobolev_batch.extras.leagues.league import League
+from sobolev_batch.extras.leagues.league import League, percent_text
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import utc_now
 from sobolev_batch.store.objects import Objects
@@ -40,7 +40,7 @@ from sobolev_batch.tables.open import (
     require_unchanged,
     study_unit,
 )
-from sobolev_batch.tables.text import minus
+from sobolev_batch.tables.text import duration, minus
 from sobolev_batch.visible import visible
 
 with from_extra("report", "a report needs"):
@@ -49,7 +49,7 @@ with from_extra("report", "a report needs"):
     from jinja2.utils import htmlsafe_json_dumps
 
     from sobolev_batch.extras.figures.drawing import MOST_MESHES, clustered_order
-    from sobolev_batch.extras.figures.selection import Selection, Spectra
+    from sobolev_batch.extras.figures.selection import Selection
     from sobolev_batch.extras.figures.views import Axis, MeshView, make_views
     from sobolev_batch.extras.report.content import PageTable, league_content, study_content, utc_text
 
@@ -128,11 +128,12 @@ def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], u
     content = study_content(tree, Status.from_store(store))
     selection = Selection.from_store(tree)
     spectra = selection.spectra if selection.has_spectra else None
+    omission = "" if spectra is None else spectra.attrs["omission"]
     with fields_read(store):
         views, missing = make_views(tree, folder, witnesses, up=up)
     charts = {**chart_data(tree, spectra, views), "costs": cost_data(content["costs"])}
-    content["omissions"] += chart_omissions(tree, charts, spectra, views, missing)
-    page = _filled("study", content, charts, spectra=spectra, views=views, missing=missing)
+    content["omissions"] += chart_omissions(tree, charts, omission, views, missing)
+    page = _filled("study", content, charts, omission=omission, views=views, missing=missing)
     require_unchanged(tree)
     return page
 
@@ -142,15 +143,7 @@ def _filled(template: str, content: dict[str, Any], charts: Json, **values: Any)
     # Two thirds of a page, if the browser were not to unpack it.
     library = plotly.offline.get_plotlyjs()
     scripts = [_page_file("tables.js"), _page_file("charts.js")]
-    environment = jinja2.Environment(
-        loader=jinja2.FunctionLoader(_page_file),
-        autoescape=True,
-        finalize=_shown,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    text = environment.get_template(f"{template}.html.jinja").render(
+    text = page_template(template).render(
         content=content,
         charts=charts,
         data=htmlsafe_json_dumps(_shown_data(charts), allow_nan=False, separators=(",", ":")),
@@ -165,6 +158,20 @@ def _filled(template: str, content: dict[str, Any], charts: Json, **values: Any)
     )
     tables = [table for table in content.values() if isinstance(table, PageTable) and table.omitted]
     return text, (*(f"the table {one.name}: {one.omitted:,} more rows" for one in tables), *content["omissions"])
+
+
+def page_template(name: str) -> jinja2.Template:
+    """Return a template of pages, which escapes and shows whatever is in double braces."""
+    environment = jinja2.Environment(
+        loader=jinja2.FunctionLoader(_page_file),
+        autoescape=True,
+        finalize=_shown,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"duration": duration, "minus": minus, "percent": percent_text}
+    return environment.get_template(f"{name}.html.jinja")
 
 
 def _shown(value: Any) -> Any:
@@ -191,7 +198,7 @@ def _digest(script: str) -> str:
     return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
 
 
-def chart_data(tree: xr.DataTree, spectra: Spectra | None, views: Sequence[MeshView]) -> Json:
+def chart_data(tree: xr.DataTree, spectra: xr.Dataset | None, views: Sequence[MeshView]) -> Json:
     """Return the data of all charts of an open store, with texts not escaped, and null for missing numbers."""
     orders = finished_group(tree, "convergence")["order"].values.tolist()
     return {
@@ -246,7 +253,7 @@ def _line(family: str, places: Any, values: Any, errors: Any, **others: Any) -> 
 
 
 def chart_omissions(
-    tree: xr.DataTree, charts: Json, spectra: Spectra | None, views: Sequence[MeshView], missing: Mapping[str, str]
+    tree: xr.DataTree, charts: Json, omission: str, views: Sequence[MeshView], missing: Mapping[str, str]
 ) -> Iterator[str]:
     """Yield what the charts of an open store leave out, and the reasons for meshes without views, for people."""
     compared = len(set(complete_meshes(tree)) - {reference_of(tree)})
@@ -257,8 +264,8 @@ def chart_omissions(
         yield f"all pairs: only {len(charts['matrix']['labels'])} of {charts['matrix']['total']:,} meshes are shown"
     if charts["evolution"] is None and has_times(tree):
         yield "the chart of distances over time: they are too many"
-    if spectra is not None and spectra.omission:
-        yield f"spectra: only those of {spectra.omission} are shown"
+    if omission:
+        yield f"spectra: only those of {omission} are shown"
     if 0 < len(views) < compared:
         yield f"witness functions: only {len(views)} of {compared:,} meshes are drawn; --mesh chooses them"
     for label, reason in missing.items():
@@ -330,18 +337,20 @@ def _matrix(pairs: xr.Dataset) -> Json:
     }
 
 
-def _spectra(spectra: Spectra) -> Json:
+def _spectra(spectra: xr.Dataset) -> Json:
+    shares = spectra["share"].transpose("order", "mesh", "band").values
     return {
-        "labels": spectra.labels,
-        "bands": spectra.bands,
-        "shares": [[_numbers(row, digits=3) for row in spectra.shares[:, k]] for k in range(len(spectra.orders))],
+        "labels": spectra["mesh"].values.tolist(),
+        "bands": spectra["text"].values.tolist(),
+        "shares": [[_numbers(row, digits=3) for row in of_order] for of_order in shares],
     }
 
 
-def _energy(spectra: Spectra, family_of: Mapping[str, str]) -> list[Json]:
+def _energy(spectra: xr.Dataset, family_of: Mapping[str, str]) -> list[Json]:
+    columns = (spectra[name].values for name in ("mesh", "energy", "energy_error"))
     return [
-        _line(family_of[label], spectra.wavelengths, energies, errors, label=label)
-        for label, energies, errors in zip(spectra.labels, spectra.energies, spectra.energy_errors, strict=True)
+        _line(family_of[label], spectra["wavelength"].values, energies, errors, label=label)
+        for label, energies, errors in zip(*columns, strict=True)
     ]
 
 

@@ -31,18 +31,44 @@ from sobolev_batch.extras.leagues.league import (
     left_out,
     number_text,
     pair_lines,
-    percent_text,
 )
 from sobolev_batch.store.objects import Objects
-from sobolev_batch.tables.conclusion import MOST_NAMED, VERDICT_COLUMNS, Row, study_verdict
+from sobolev_batch.tables.conclusion import VERDICT_COLUMNS, Row, study_verdict
 from sobolev_batch.tables.convergence import page_columns, table, tables_of, unit_notes, with_remarks
 from sobolev_batch.tables.open import finished_group, has_proximity, open_store, placement_doubts
 from sobolev_batch.tables.rendering import Column
-from sobolev_batch.tables.text import duration, minus, percent
+from sobolev_batch.tables.text import minus, percent
 from sobolev_batch.transform.lattice import Lattice
 
 # Rows of all convergence tables together, of the table of meshes, and of reasons; browsers become slow beyond.
 MOST_CONVERGENCE_ROWS, MOST_MESH_ROWS, _MOST_REASONS = 10_000, 5_000, 2_000
+
+_COUNTS = ["vertices", "triangles", "points", "boundary_edges", "nonmanifold_edges"]
+_MESH_COLUMNS = (
+    Column("mesh", "mesh", kind="label"),
+    Column("vertices", "vertices", "{:,.0f}".format),
+    Column("triangles", "triangles", "{:,.0f}".format),
+    Column("seconds", "seconds", "{:.2f}".format),
+    Column("backend", "backend", kind="text"),
+    Column("area", "area", "{:.4g}".format),
+    Column("boundary_edges", "boundary edges", "{:,.0f}".format),
+    Column("nonmanifold_edges", "non-manifold", "{:,.0f}".format),
+    Column("points", "quadrature points", "{:,.0f}".format),
+    Column("worker", "worker", kind="text"),
+    Column("finished", "finished, UTC", kind="text"),
+)
+_OBJECT_COLUMNS = (
+    Column("object", "object", kind="label"),
+    Column("best", "best method", kind="text"),
+    Column("relative", "relative", percent, "relative_error"),
+    Column("next", "next", kind="text"),
+    Column("ratio", "times as far", number_text, is_marked=True),
+    Column("meshes", "meshes", "{:,}".format),
+    Column("missing", "missing", "{:,}".format),
+    Column("above_rtol", "above rtol", "{:,}".format),
+)
+# The relative distance comes first: a narrow screen shows no more without scrolling.
+_LEAGUE_COLUMNS = tuple(sorted(LEAGUE_COLUMNS, key=lambda column: (column.kind != "label", column.name != "relative")))
 
 
 @dataclass(frozen=True)
@@ -101,29 +127,16 @@ def common_content(
     The study is the table of its file, the frames are the rows of `table` of each object, failures have reasons by
     label.
     """
-    # Of the extra, which `make_report` looks for.
     rows = pd.concat(frames.values(), ignore_index=True)
-    meshes = rows[rows["order"] == rows["order"].iloc[0]]
-    orders = [minus(f"{order:g}") for order in rows["order"].drop_duplicates()]
-    triangles, seconds = meshes["triangles"].sum(), float(meshes["seconds"].sum())
     return {
         "title": title,
         "name": study["study"]["name"],
-        "orders": orders,
-        "summary": {
-            **(
-                {"objects": f"{len(frames):,}", "methods": f"{meshes['family'].nunique():,}"}
-                if "object" in study
-                else {}
-            ),
-            "meshes compared": f"{meshes['distance'].notna().sum():,} of {len(meshes):,}",
-            "orders" if len(orders) > 1 else "order": ", ".join(orders) if len(orders) < 5 else f"{len(orders)}",
-            "triangles in all": f"{triangles:,}" if triangles < 1e6 else f"{triangles / 1e6:,.3g} million",
-            "computing time": duration(seconds),
-        },
+        "orders": [minus(f"{order:g}") for order in rows["order"].drop_duplicates()],
+        "objects_in_all": len(frames) if "object" in study else 0,
+        "meshes_in_all": rows[rows["order"] == rows["order"].iloc[0]],
         "failed": reasons_table("failed", "mesh", failed),
         "not_compared": reasons_table("lacking", "mesh", status.not_compared),
-        "run": dict(_run_facts(status)),
+        "status": status,
         "versions": versions,
         "study_text": tomli_w.dumps(_without_nulls(study)),
     }
@@ -136,32 +149,24 @@ def _without_nulls(value: Any) -> Any:
     return [_without_nulls(entry) for entry in value] if isinstance(value, list) else value
 
 
-def _run_facts(status: Status) -> Iterator[tuple[str, str]]:
-    """Yield facts about the latest run, by keyword."""
-    yield "store", status.store
-    yield "surfaces", f"{status.complete} of {status.total} complete, {len(status.failed)} failed"
-    if status.run is not None:
-        yield "state", status.run.state
-        yield "driver", status.run.driver
-        yield "begun", utc_text(status.run.started)
-        yield "ended" if status.run.state in ("done", "failed") else "last sign of life", utc_text(status.run.seen)
-        if status.run.error:
-            yield "error", status.run.error
-
-
 def study_content(tree: xr.DataTree, status: Status) -> dict[str, Any]:
     """Return what the template of an open store takes, nothing escaped; InputError where it has no tables yet."""
     meshes, convergence = finished_group(tree, "meshes"), finished_group(tree, "convergence")
     attributes: Mapping[str, Any] = {str(key): value for key, value in tree.attrs.items()}
     families = tuple(dict.fromkeys(meshes["family"].values.tolist()))
-    frame, failed, study = table(tree), _failures(meshes), attributes["study"]["table"]
+    frame, study = table(tree), attributes["study"]["table"]
+    missing = meshes.sel(mesh=meshes["status"] != "complete")
+    failed = dict(zip(missing["mesh"].values.tolist(), missing["reason"].values.tolist(), strict=True))
+    failed = {label: reason or "not computed" for label, reason in failed.items()}
     sentences, rows, omitted = study_verdict(frame, failed)
     orders = frame["order"].drop_duplicates().tolist()
     return {
         **common_content(attributes["title"], study, {"": frame}, status, failed, attributes["versions"]),
         **cost_content({str(study["study"]["name"]): frame}, families),
         "reference": convergence.attrs["reference"],
-        "settings": dict(_settings(attributes)),
+        "settings": attributes["study"],
+        "lattice": Lattice(**attributes["study"]["lattice"]),
+        "similarity": attributes["similarity"],
         "sentences": sentences,
         "verdict": PageTable("verdict", VERDICT_COLUMNS, rows, orders, is_sortable=False),
         "verdict_omitted": omitted,
@@ -186,22 +191,6 @@ def convergence_table(tree: xr.DataTree, frame: pd.DataFrame, families: Sequence
     )
 
 
-_COUNTS = ["vertices", "triangles", "points", "boundary_edges", "nonmanifold_edges"]
-_MESH_COLUMNS = (
-    Column("mesh", "mesh", kind="label"),
-    Column("vertices", "vertices", "{:,.0f}".format),
-    Column("triangles", "triangles", "{:,.0f}".format),
-    Column("seconds", "seconds", "{:.2f}".format),
-    Column("backend", "backend", kind="text"),
-    Column("area", "area", "{:.4g}".format),
-    Column("boundary_edges", "boundary edges", "{:,.0f}".format),
-    Column("nonmanifold_edges", "non-manifold", "{:,.0f}".format),
-    Column("points", "quadrature points", "{:,.0f}".format),
-    Column("worker", "worker", kind="text"),
-    Column("finished", "finished, UTC", kind="text"),
-)
-
-
 def _meshes_table(meshes: xr.Dataset, families: Sequence[str]) -> PageTable:
     frame = meshes.reset_coords().to_dataframe().reset_index()
     # Surfaces in closed form have no counts.
@@ -211,56 +200,6 @@ def _meshes_table(meshes: xr.Dataset, families: Sequence[str]) -> PageTable:
         finished=frame["finished"].dt.strftime("%Y-%m-%d %H:%M:%S").fillna(""),
     )
     return PageTable("meshes", _MESH_COLUMNS, rows.to_dict(orient="records"), omitted=len(frame) - len(rows))
-
-
-def _failures(meshes: xr.Dataset) -> dict[str, str]:
-    columns = (meshes[name].values.tolist() for name in ("mesh", "status", "reason"))
-    return {
-        label: reason or "not computed" for label, status, reason in zip(*columns, strict=True) if status != "complete"
-    }
-
-
-def _settings(attributes: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    study = attributes["study"]
-    lattice = Lattice(**study["lattice"])
-    yield "reference", study["reference"]
-    for reason in (study.get("choice") or {}).get("reasons", ()):
-        yield "chosen", reason
-    yield (
-        "lattice",
-        f"frequencies up to {lattice.xi_max:.6g} cycles per unit length on each axis, {lattice.M} intervals "
-        f"(spacing {lattice.spacing:.4g}): wavelengths down to {1 / lattice.xi_max:.4g} units",
-    )
-    octaves = study.get("octaves")
-    if octaves is not None:
-        highest = octaves["cutoff"] * 2 ** len(octaves["octaves"])
-        yield (
-            "octaves",
-            f"{len(octaves['octaves'])} beyond the lattice, at random frequencies up to {highest:.4g} cycles per unit "
-            f"length: wavelengths down to {1 / highest:.4g} units",
-        )
-    computed = (study["choice"] or {"transform_dtype": study["dtype"]})["transform_dtype"]
-    dtype = {"complex128": "double", "complex64": "single"}[computed]
-    eps = "" if study["eps"] is None else f", nonuniform FFT accurate to {study['eps']:g}"
-    yield "arithmetic", f"{dtype} precision{eps}"
-    scale, origin = attributes["similarity"]["scale"], attributes["similarity"]["origin"]
-    yield "similarity", f"scale {scale:.6g}, origin {' '.join(f'{x:.6g}' for x in origin)}"
-
-
-_OBJECT_COLUMNS = (
-    Column("object", "object", kind="label"),
-    Column("best", "best method", kind="text"),
-    Column("relative", "relative", percent, "relative_error"),
-    Column("next", "next", kind="text"),
-    Column("ratio", "times as far", number_text, is_marked=True),
-    Column("meshes", "meshes", "{:,}".format),
-    Column("missing", "missing", "{:,}".format),
-    Column("above_rtol", "above rtol", "{:,}".format),
-)
-# The relative distance comes first: a narrow screen shows no more without scrolling.
-_LEAGUE_COLUMNS = tuple(sorted(LEAGUE_COLUMNS, key=lambda column: (column.kind != "label", column.name != "relative")))
-
-_NO_LEAGUE = "Methods cannot be compared over the objects."
 
 
 def league_content(objects: Objects, status: Status) -> dict[str, Any]:
@@ -282,7 +221,6 @@ def league_content(objects: Objects, status: Status) -> dict[str, Any]:
         **cost_content(tables, methods),
         "leagues": leagues,
         "no_league": no_league,
-        "sentences": tuple(map(sentence_of, leagues)) or (_NO_LEAGUE,) * len(orders),
         "differences": tuple(tuple(pair_lines(one)) for one in leagues),
         "note": LEAGUE_NOTE.format(x=leagues[0].x).replace("\n", " ") if leagues else "",
         "league": PageTable("league", _LEAGUE_COLUMNS, ranked, [*by_order]),
@@ -308,25 +246,6 @@ def cost_content(tables: Mapping[str, pd.DataFrame], methods: Sequence[str]) -> 
         "cost_front": PageTable("cost-front", front_columns(DEFAULT_COST), found["front"], orders),
         "cost_note": COST_NOTE.replace("\n", " "),
     }
-
-
-def sentence_of(league: League) -> str:
-    """Return a sentence on which method is nearest at one order."""
-    table, count = league.table, len(league.objects)
-    first, amount = table["method"].iloc[0], percent_text(table["relative"].iloc[0])
-    at_order = minus(f"at order {league.order:g}")
-    over = f"over {count} objects" if count > 1 else f"on {league.objects[0]}"
-    if len(table) == 1:
-        return f"{first} differs from the references by {amount} {over} {at_order}."
-    leaders = table[table["rank"] == 1]["method"].tolist()
-    if len(leaders) == 1:
-        return f"{first} is nearest to the references {over} {at_order}: it differs by {amount}."
-    if count == 1:
-        return f"{first} is nearest {over} {at_order}: it differs by {amount}. One object ranks no methods."
-    names = f"{', '.join(leaders[:-1])} and {leaders[-1]}"
-    if len(leaders) > MOST_NAMED:
-        names = f"{len(leaders)} of {len(table)} methods"
-    return f"The intervals do not separate {names} {over} {at_order}. {first} has the smallest mean, {amount}."
 
 
 def _rows(league: League | CostLeague, name: Literal["table", "pairs", "front"]) -> list[Row]:

@@ -20,7 +20,7 @@ from scipy.spatial.distance import cdist
 
 import sobolev_batch as sb
 from sobolev_batch.extras.figures.drawing import PLOTS, clustered_order, draw_spectrum, write_plots
-from sobolev_batch.extras.figures.selection import Selection, Spectra
+from sobolev_batch.extras.figures.selection import Selection
 from sobolev_batch.extras.figures.style import Plot, drawing, notes_of, parse_size, set_log_scale, style_of
 from tests.support.commands import finished
 from tests.support.trees import distances_of, tree_of
@@ -110,17 +110,19 @@ def test_a_legend_hides_no_data_and_counts_what_it_leaves_out(count: int, size: 
 
 @pytest.mark.parametrize(("size", "step", "has_shares"), [((6.4, 4.0), 1, True), ((3.3, 2.4), 3, False)])
 def test_labels_of_wavelengths_do_not_overlap(size: tuple[float, float], step: int, has_shares: bool) -> None:
-    longest = np.asarray(2.0 ** -np.arange(12), dtype=np.float64)
-    shares, names = np.full((8, 1, 12), 1 / 12), tuple(f"a long name of a family/{i}" for i in range(8))
-    selection = SimpleNamespace(
-        tree=xr.DataTree(), spectra=Spectra(names, 8, (-2.0,), shares, longest, longest / 2, shares[:, 0], shares[:, 0])
+    bands = [f"{2.0**-i:.3g} – {2.0**-i / 2:.3g}" for i in range(12)]
+    spectra = xr.Dataset(
+        {"share": (("mesh", "order", "band"), np.full((8, 1, 12), 1 / 12)), "text": ("band", bands)},
+        coords={"mesh": [f"a long name of a family/{i}" for i in range(8)], "order": [-2.0]},
+        attrs={"omission": ""},
     )
+    selection = SimpleNamespace(tree=xr.DataTree(), spectra=spectra)
     with drawing(size):
         figure = Plot(draw_spectrum, lambda _: (), 3.6).figure(selection, [-2.0], size)
         figure.draw_without_rendering()
     axes = figure.axes[0]
     labels = [label.get_text() for label in axes.get_xticklabels()]
-    assert labels == list(selection.spectra.bands[::step])
+    assert labels == bands[::step]
     assert len(axes.texts) == (96 if has_shares else 0)
     places = axes.transData.transform(np.column_stack([axes.get_xticks(), axes.get_xticks()]))[:, 0]
     apart = np.diff(places).min() * np.sin(np.radians(40)) * 72 / figure.dpi
