@@ -51,7 +51,7 @@ with from_extra("report", "a report needs"):
     from sobolev_batch.extras.figures.drawing import MOST_MESHES, clustered_order
     from sobolev_batch.extras.figures.selection import Selection
     from sobolev_batch.extras.figures.views import Axis, MeshView, make_views
-    from sobolev_batch.extras.report.content import PageTable, league_content, study_content, utc_text
+    from sobolev_batch.extras.report.content import PageTable, league_content, study_content
 
 # Points of all convergence charts together, and numbers of all matrices: 10 bytes each, on a page of up to 15 MB.
 MOST_POINTS, MOST_NUMBERS = 50_000, 400_000
@@ -153,7 +153,7 @@ def _filled(template: str, content: dict[str, Any], charts: Json, **values: Any)
         # Whatever names and reasons contain, the browser runs no other script and fetches nothing.
         policy=f"default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
         f"script-src {' '.join(map(_digest, [library, *scripts]))}; base-uri 'none'; form-action 'none'",
-        written=utc_text(utc_now()),
+        written=utc_now(),
         **values,
     )
     tables = [table for table in content.values() if isinstance(table, PageTable) and table.omitted]
