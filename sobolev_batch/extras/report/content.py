@@ -109,11 +109,6 @@ def reasons_table(name: str, label: str, reasons: Mapping[str, str]) -> PageTabl
     return PageTable(name, columns, rows, is_sortable=False, omitted=omitted) if rows else None
 
 
-def utc_text(time: str) -> str:
-    """Return a time of a record, in UTC, for people."""
-    return time.replace("T", " ").removesuffix("Z")
-
-
 def common_content(
     title: str,
     study: Mapping[str, Any],
