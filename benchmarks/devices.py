@@ -14,10 +14,12 @@ from benchmarks.table import Row, as_seconds, at_most
 from benchmarks.timing import Effort, elapsed_seconds, take_turns
 from benchmarks.transforms import XI_MAX, fresh, settings_of_the_paper
 from sobolev_batch import compiled
-from sobolev_batch.transform.backends import CPU, ComplexDtype, Gpu, NufftSpec, Workload, gpu_backend
+from sobolev_batch.arrays import ComplexDtype
+from sobolev_batch.transform.backends import CPU, Gpu, gpu_backend
 from sobolev_batch.transform.exact import exact_transform, sampled_transform
 from sobolev_batch.transform.fourier import Execution, TransformSettings, transform_block
 from sobolev_batch.transform.nufft import transform_points
+from sobolev_batch.transform.nufft_costs import NufftSpec, Workload
 
 # Level of the icosphere, intervals per axis, seconds to stay below.
 _CASES = ((7, 128, 0.060), (5, 416, 0.150))

@@ -13,9 +13,8 @@ import numpy as np
 
 from benchmarks.timing import take_turns
 from sobolev_batch import Lattice, Mesh
-from sobolev_batch.arrays import Complexes
+from sobolev_batch.arrays import ComplexDtype, Complexes
 from sobolev_batch.shapes import Sphere
-from sobolev_batch.transform.backends import ComplexDtype
 from sobolev_batch.transform.rules import gauss_rule
 
 _RULE = gauss_rule(8)

@@ -13,8 +13,7 @@ from benchmarks.direct import direct_transform, frequencies_of
 from benchmarks.paper import faster_upsampling, relative_distance, whole_transform
 from benchmarks.table import Row, as_seconds, at_least, at_most
 from benchmarks.timing import Effort, take_turns
-from sobolev_batch.arrays import Complexes
-from sobolev_batch.transform.backends import ComplexDtype
+from sobolev_batch.arrays import ComplexDtype, Complexes
 from sobolev_batch.transform.exact import exact_transform
 from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, choose_settings, transform_block
 

@@ -25,14 +25,14 @@ from sobolev_batch.norms.accuracy.solve import DistanceTarget
 from sobolev_batch.norms.fields import Quality, TailQuality, compute_field, field_for
 from sobolev_batch.norms.tail.remainder import Remainder, remainder
 from sobolev_batch.norms.tail.sampling import TailSampling
-from sobolev_batch.norms.tail.values import Settings, octave_values, settings_for
+from sobolev_batch.norms.tail.values import octave_values
 from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.lock import utc_now
 from sobolev_batch.store.records import Facts, Record, Records
 from sobolev_batch.study.plan import Plan, Row
 from sobolev_batch.study.schema import Backends
-from sobolev_batch.transform.fourier import Execution, TransformSettings, choose_settings, transform_block
+from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, choose_settings, transform_block
 from sobolev_batch.transform.kinds import kind_of
 from sobolev_batch.transform.lattice import Block, Lattice
 from sobolev_batch.transform.probe import COMMON, Probe, draws_for, join, probe_block
@@ -105,12 +105,11 @@ class Job:
             return self.transform
         return choose_settings(surface, self.lattice, self.distance_target.error_target(surface), self.transform)
 
-    def octave_settings(self, surface: Surface) -> Settings:
-        """Return a function that gives the settings of a surface's transforms in octaves."""
-        transform = self.transform
+    def octave_settings(self, surface: Surface) -> TransformSettings | ErrorTarget:
+        """Return the settings of a surface's transforms in octaves, or the target that they are to meet."""
         if self.distance_target is None:
-            return lambda surface, lattice: transform
-        return settings_for(self.distance_target.error_target(surface).tightened(_OCTAVES_SHARE))
+            return self.transform
+        return self.distance_target.error_target(surface).tightened(_OCTAVES_SHARE)
 
     def stored_record(self) -> Record | None:
         """Return the completion record of the field if it exists: Dask repeats tasks whose worker was lost."""

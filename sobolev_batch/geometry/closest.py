@@ -8,7 +8,7 @@ import numpy as np
 
 from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.compiled import pays
-from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.geometry.mesh import Mesh, cross, dot
 
 # libigl starts a thread on each core unless this variable says otherwise. Numerical libraries all know the other one,
 # by which a worker has one thread.
@@ -43,8 +43,8 @@ class Triangles:
         self.corners = [np.ascontiguousarray(self._vertices[self._triangles[:, k]].T) for k in range(3)]
         a, b, c = self.corners
         self._sides = [b - a, c - b, a - c]
-        self._normals = cross(self._sides[0], c - a)
-        self.outward = [cross(side, self._normals) for side in self._sides]
+        self._normals = np.stack(cross(self._sides[0], c - a))
+        self.outward = [np.stack(cross(side, self._normals)) for side in self._sides]
         sizes = dot(self._normals, self._normals)
         self._has_area = sizes > 0
         self._inverse_sizes = _inverse(sizes)
@@ -62,7 +62,7 @@ class Triangles:
         A point in the plane of its triangle, and within it, has exactly the distance zero.
         """
         if pays(_PAIR_SECONDS * len(triangles)):
-            from sobolev_batch.compiled.point_triangle import fill_squares
+            from sobolev_batch.compiled.triangles import fill_squares
 
             squares = np.empty(len(triangles))
             fill_squares(points, self._by_triangle, triangles, squares)
@@ -78,17 +78,6 @@ class Triangles:
             is_above &= dot(arms, outward[:, triangles]) <= 0
         heights = dot(arms, self._normals[:, triangles]) ** 2 * self._inverse_sizes[triangles]
         return np.where(is_above, np.minimum(least, heights), least)
-
-
-def dot(first: Reals, second: Reals) -> Reals:
-    """Return the products (n,) of vectors (3, n)."""
-    return np.asarray(first[0] * second[0] + first[1] * second[1] + first[2] * second[2])
-
-
-def cross(first: Reals, second: Reals) -> Reals:
-    """Return the vector products (3, n) of vectors (3, n)."""
-    (ux, uy, uz), (vx, vy, vz) = first, second
-    return np.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx])
 
 
 def _inverse(values: Reals) -> Reals:

@@ -26,9 +26,9 @@ import numpy as np
 
 from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import InputError
-from sobolev_batch.geometry.closest import Triangles, dot
+from sobolev_batch.geometry.closest import Triangles
 from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
-from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.geometry.mesh import Mesh, dot
 from sobolev_batch.geometry.surface import is_finite_number
 
 # Gap between both bounds, as a fraction of the distance.

@@ -18,6 +18,8 @@ from sobolev_batch.errors import MeshError, from_extra
 from sobolev_batch.geometry.surface import LARGEST_LENGTH, Extent, Point
 
 Corners = tuple[Reals, Reals, Reals]
+# Vectors (3, ...), one row an axis.
+Vectors = Reals | tuple[Reals, Reals, Reals]
 # Vectors from the first corner to the second and to the third, (3, k) each: one row an axis.
 _Edges = tuple[Reals, Reals]
 _Scalar = TypeVar("_Scalar", bound=np.generic)
@@ -27,8 +29,6 @@ _ALL = slice(None)
 _BATCH = 1 << 14
 # Processor time on arrays of measuring a triangle.
 _SECONDS = 6e-8
-# Odd numbers without pattern, which spread the bits of coordinates.
-_MIXERS = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 # Twice the rounding error of a cross product, relative to the squared longest edge: a smaller area is not
 # distinguishable from zero in double precision.
 _AREA_RESOLUTION = 8 * np.finfo(np.float64).eps
@@ -329,33 +329,36 @@ class Mesh:
         return Mesh, (self.vertices, self.triangles)
 
 
-def cross_lengths(first: Reals, second: Reals) -> Reals:
-    """Return |u × v| of vectors (3, ...)."""
-    return np.asarray(np.sqrt(_squares(_cross(first, second))))
+def dot(first: Vectors, second: Vectors) -> Reals:
+    """Return the products (...) of vectors (3, ...)."""
+    # Products that are added one by one have the same digits in a compiled loop.
+    return np.asarray(first[0] * second[0] + first[1] * second[1] + first[2] * second[2])
 
 
-def _cross(first: Reals, second: Reals) -> tuple[Reals, Reals, Reals]:
+def cross(first: Vectors, second: Vectors) -> tuple[Reals, Reals, Reals]:
+    """Return the vector products of vectors (3, ...)."""
     (ux, uy, uz), (vx, vy, vz) = first, second
     return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
 
 
-def _squares(vectors: Reals | tuple[Reals, Reals, Reals]) -> Reals:
-    x, y, z = vectors
-    # Products that are added one by one have the same digits in a compiled loop.
-    return np.asarray(x * x + y * y + z * z)
+def cross_lengths(first: Vectors, second: Vectors) -> Reals:
+    """Return |u × v| of vectors (3, ...)."""
+    normals = cross(first, second)
+    return np.asarray(np.sqrt(dot(normals, normals)))
 
 
 def _side_lengths(edges: _Edges) -> Reals:
     first, second = edges
-    return np.stack([np.sqrt(_squares(side)) for side in (first, second - first, second)], axis=1)
+    return np.stack([np.sqrt(dot(side, side)) for side in (first, second - first, second)], axis=1)
 
 
 def _squared_sizes(edges: _Edges) -> Reals:
     """Return the squares of twice the area, of three times the centroid radius, and of the three sides (5, k)."""
     first, second = edges
-    arms = [_squares(arm) for arm in (first + second, first + first - second, second + second - first)]
-    sides = [_squares(side) for side in (first, second - first, second)]
-    return np.stack([_squares(_cross(first, second)), np.maximum.reduce(arms), *sides])
+    normals = cross(first, second)
+    arms = [dot(arm, arm) for arm in (first + second, first + first - second, second + second - first)]
+    sides = [dot(side, side) for side in (first, second - first, second)]
+    return np.stack([dot(normals, normals), np.maximum.reduce(arms), *sides])
 
 
 def _smallest_angles(edges: _Edges) -> Reals:
@@ -486,16 +489,14 @@ def _matched(hashes: NDArray[np.uint64], others: NDArray[np.uint64]) -> NDArray[
 
 def _triangle_hashes(corners: Reals) -> NDArray[np.uint64]:
     """Return the sum of the hashes of the corners of each triangle (m,), which does not depend on their order."""
+    from pandas.util import hash_array
+
     sums = np.empty(len(corners), dtype=np.uint64)
     for start in range(0, len(corners), _BATCH):
         # Zero has two signs.
-        hashes = np.ascontiguousarray(corners[start : start + _BATCH] + 0.0).view(np.uint64)
-        mixed = np.zeros(hashes.shape[:-1], dtype=np.uint64)
-        for axis in range(3):
-            # The steps of SplitMix64 (G. Steele, D. Lea, C. Flood 2014, doi:10.1145/2714064.2660195).
-            mixed = (mixed ^ hashes[..., axis]) * _MIXERS[0]
-            mixed = (mixed ^ (mixed >> np.uint64(30))) * _MIXERS[1]
-            mixed = (mixed ^ (mixed >> np.uint64(27))) * _MIXERS[2]
-            mixed ^= mixed >> np.uint64(31)
-        sums[start : start + _BATCH] = mixed.sum(axis=1)
+        columns = np.ascontiguousarray((corners[start : start + _BATCH] + 0.0).reshape(-1, 3).T).view(np.uint64)
+        mixed = np.zeros(columns.shape[1], dtype=np.uint64)
+        for column in columns:
+            mixed = hash_array(mixed ^ column)
+        sums[start : start + _BATCH] = mixed.reshape(-1, 3).sum(axis=1)
     return sums

@@ -6,10 +6,10 @@ import numpy as np
 
 from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import InputError
-from sobolev_batch.geometry.closest import Triangles, cross, dot
+from sobolev_batch.geometry.closest import Triangles
 from sobolev_batch.geometry.deviation import Deviations, directed_deviation
 from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
-from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.geometry.mesh import Mesh, Vectors, cross, cross_lengths, dot
 from sobolev_batch.geometry.surface import is_finite_number
 from sobolev_batch.parameters import check_seed, is_whole_number
 
@@ -121,7 +121,8 @@ def proximity_and_deviations(
         scale = 2.0 ** np.frexp(distances.max(initial=np.finfo(float).tiny))[1]
         squares = (distances / scale) ** 2
         rms = float(np.sqrt(squares.mean()))
-        angles = _angles(_normals(own, triangles), _normals(meshes[1 - way], closest))
+        across, other = _normals(own, triangles), _normals(meshes[1 - way], closest)
+        angles = np.degrees(np.arctan2(cross_lengths(across, other), np.abs(dot(across, other))))
         error = float(distances.std(ddof=1)) / np.sqrt(points)
         numbers = {
             "hausdorff": deviations[way].lower,
@@ -187,16 +188,10 @@ def _drawn(mesh: Mesh, points: int, rng: np.random.Generator) -> tuple[Reals, In
     return (1 - root) * a + root * (1 - part) * b + root * part * c, triangles
 
 
-def _normals(mesh: Mesh, triangles: Indices) -> Reals:
+def _normals(mesh: Mesh, triangles: Indices) -> Vectors:
     """Return vectors (3, n) across triangles, of a length that no product overflows."""
     a, b, c = (corner.T for corner in mesh.corners(triangles))
     sides = b - a, c - a
     longest = np.maximum(*(np.abs(side).max(axis=0) for side in sides))
     longest[longest == 0] = 1.0
     return cross(sides[0] / longest, sides[1] / longest)
-
-
-def _angles(first: Reals, second: Reals) -> Reals:
-    """Return the angles (n,) between lines along vectors (3, n), in degrees."""
-    across = np.linalg.norm(cross(first, second), axis=0)
-    return np.asarray(np.degrees(np.arctan2(across, np.abs(dot(first, second)))))

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from sobolev_batch.arrays import Reals
+from sobolev_batch.arrays import ComplexDtype, Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms import DEFAULT_ORDER
@@ -24,10 +24,10 @@ from sobolev_batch.norms.columns import (
 )
 from sobolev_batch.norms.fields import OperandLike, field_of, pair_of, read_blocks, shells_of
 from sobolev_batch.parameters import is_whole_number
-from sobolev_batch.transform.backends import ComplexDtype, NufftSpec
 from sobolev_batch.transform.fourier import TransformSettings, require_points_inside, thread_count
 from sobolev_batch.transform.lattice import Block, Lattice, Orders, SobolevWeights, check_orders, shell_volumes
 from sobolev_batch.transform.nufft import evaluate_at
+from sobolev_batch.transform.nufft_costs import NufftSpec
 
 # Shells this close to an edge, relative to it, lie on it.
 _ON_EDGE = 1e-12

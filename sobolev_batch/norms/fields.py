@@ -11,12 +11,12 @@ import numpy as np
 import xarray as xr
 from pydantic import TypeAdapter
 
-from sobolev_batch.arrays import Complexes, Reals
+from sobolev_batch.arrays import ComplexDtype, Complexes, Reals
 from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.geometry.formats.conversion import SurfaceLike, as_surface
 from sobolev_batch.geometry.surface import Extent, Surface
 from sobolev_batch.norms.tail.remainder import Remainder
-from sobolev_batch.transform.backends import ComplexDtype, backend_named
+from sobolev_batch.transform.backends import backend_named
 from sobolev_batch.transform.fourier import (
     FINEST_EPS,
     ON_CPU,

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from sobolev_batch.arrays import Reals
+from sobolev_batch.arrays import ComplexDtype, Reals
 from sobolev_batch.errors import InputError, from_extra, written
 from sobolev_batch.geometry.formats.ply import write_ply
 from sobolev_batch.geometry.mesh import Mesh
@@ -20,7 +20,6 @@ from sobolev_batch.norms.budget import Support
 from sobolev_batch.norms.causes import witness
 from sobolev_batch.norms.fields import fourier_transform
 from sobolev_batch.plugins import FEATURES, extra
-from sobolev_batch.transform.backends import ComplexDtype
 
 _PICTURES = (".png", ".svg", ".pdf")
 _PURPOSE = "a picture of meshes"

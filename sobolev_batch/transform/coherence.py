@@ -11,7 +11,8 @@ import numpy as np
 from sobolev_batch.arrays import Complexes, Indices, Reals
 from sobolev_batch.compiled import pays
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.transform.backends import CPU, NufftSpec, cosine_and_sine
+from sobolev_batch.transform.backends import CPU, cosine_and_sine
+from sobolev_batch.transform.nufft_costs import NufftSpec
 
 # Triangles at a time: their temporaries stay in cache.
 _BATCH = 1 << 13

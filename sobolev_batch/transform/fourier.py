@@ -8,37 +8,31 @@ from __future__ import annotations
 import logging
 import math
 import time
-from bisect import bisect_left
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import product
 from typing import get_args
 
 import numpy as np
 
-from sobolev_batch.arrays import Complexes, Reals
+from sobolev_batch.arrays import ComplexDtype, Complexes, Reals
 from sobolev_batch.errors import InputError, LatticeError, one_line
 from sobolev_batch.geometry.subdivision import icosphere
 from sobolev_batch.geometry.surface import Similarity, Surface
 from sobolev_batch.machine import available_cores
 from sobolev_batch.parameters import is_whole_number
-from sobolev_batch.transform.backends import (
-    CPU,
-    CPU_COSTS,
-    DEFAULT_BATCH,
-    WIDEST_KERNEL,
-    Backend,
-    ComplexDtype,
-    Costs,
-    Gpu,
-    NufftSpec,
-    Shape,
-    Workload,
-)
+from sobolev_batch.transform.backends import CPU, Backend, Gpu
 from sobolev_batch.transform.kinds import SurfaceKind, kind_of
 from sobolev_batch.transform.lattice import Block, FrequencyLattice, Lattice
 from sobolev_batch.transform.nufft import transform_points
+from sobolev_batch.transform.nufft_costs import (
+    CPU_COSTS,
+    DEFAULT_BATCH,
+    Costs,
+    NufftSpec,
+    Workload,
+    fastest_spec,
+)
 from sobolev_batch.transform.rule_errors import weight_masses
 from sobolev_batch.transform.rules import fixed_rule
 
@@ -48,6 +42,27 @@ FINEST_EPS: dict[ComplexDtype, float] = {"complex128": 1e-14, "complex64": 2e-7}
 COARSEST_EPS = 0.1
 # OpenMP crashes with very many.
 _MOST_THREADS = 1024
+# Fraction of a field's error that is left to the NUFFT.
+_NUFFT_FRACTION = 0.4
+# The rms error of a field of many points at one frequency over eps · area: measured 0.003 to 0.006.
+_NUFFT_ERROR = 0.005
+# The same of single precision over the area, however small its eps; measured 1e-7 at most.
+_SINGLE_ROUNDING = 3e-7
+# Samples of a closed form at a time: temporaries of the whole block would take several times its size.
+_SAMPLES = 1 << 18
+# The fraction of a GPU's free memory that a transform plans with, and the number of attempts, each with half of it.
+_DEVICE_FRACTION, _ATTEMPTS = 0.9, 4
+_OUT_OF_MEMORY = "out of memory"
+# Triangles of a mesh differ in size, which their rules follow; those of this sphere stand for them.
+_STAND_IN_LEVEL = 2
+# A sphere, transformed in a fraction of a second, mostly spreading its points.
+_TRIAL_LEVEL, _TRIAL_LATTICE = 5, Lattice(5.0, 64)
+_NANO = 1e-9
+# Raise it whenever the numbers for a given surface and settings change: stored fields of another version are then
+# computed again instead of being compared with new ones.
+NUMERICS_VERSION = 7
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, init=False)
@@ -125,14 +140,6 @@ class Execution:
 ON_CPU = Execution()
 
 
-# Fraction of a field's error that is left to the NUFFT.
-_NUFFT_FRACTION = 0.4
-# The rms error of a field of many points at one frequency over eps · area: measured 0.003 to 0.006.
-_NUFFT_ERROR = 0.005
-# The same of single precision over the area, however small its eps; measured 1e-7 at most.
-_SINGLE_ROUNDING = 3e-7
-
-
 @dataclass(frozen=True)
 class ErrorTarget:
     """Largest permitted norms ||computed - exact||_s of a field's own error, one for each order s."""
@@ -175,21 +182,6 @@ def _nufft_eps(
     spread = _NUFFT_ERROR + 1 / math.sqrt(points)
     eps = float(np.min(_NUFFT_FRACTION * np.array(target.norms) / (area * spread * np.sqrt(masses))))
     return min(max(eps, FINEST_EPS[settings.dtype]), COARSEST_EPS)
-
-
-# Raise it whenever the numbers for a given surface and settings change: stored fields of another version are then
-# computed again instead of being compared with new ones.
-NUMERICS_VERSION = 7
-
-# The smallest batch holds eight node sets of the largest triangle rule.
-_SMALLEST_BATCH = 1 << 12
-# Samples of a closed form at a time: temporaries of the whole block would take several times its size.
-_SAMPLES = 1 << 18
-# The fraction of a GPU's free memory that a transform plans with, and the number of attempts, each with half of it.
-_DEVICE_FRACTION, _ATTEMPTS = 0.9, 4
-_OUT_OF_MEMORY = "out of memory"
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,58 +276,6 @@ def _on_gpu(
     raise InputError(_OUT_OF_MEMORY)
 
 
-def fastest_spec(whole: NufftSpec, workload: Workload, costs: Costs, allowed_bytes: float) -> NufftSpec:
-    """Return the sub-blocks, batches and oversampling that are predicted to be the fastest within the allowed memory.
-
-    That memory is without the result and the mesh. If the whole block fits, nothing is subdivided or prescribed: the
-    values are then those of unlimited memory. InputError, with the smallest memory that works, where nothing fits.
-    """
-
-    def fits(spec: NufftSpec) -> bool:
-        if costs.grid_cells(spec, workload) > costs.largest_grid:
-            return False
-        return costs.projected_bytes(spec, workload) <= allowed_bytes
-
-    if fits(whole):
-        return whole
-    candidates: list[NufftSpec] = []
-    least_bytes = math.inf
-    batches = [whole.batch]
-    while batches[-1] // 2 >= _SMALLEST_BATCH:
-        batches.append(batches[-1] // 2)
-    for batch, sigma in product(batches, costs.oversamplings(whole)):
-        smaller = [
-            replace(whole, shape=shape, oversampling=sigma, batch=batch) for shape in sub_shapes(whole.shape, sigma)
-        ]
-        # Ever smaller sub-blocks take ever less memory: the first that fits is the largest.
-        first = bisect_left(smaller, True, key=fits)
-        if first < len(smaller):
-            candidates.append(smaller[first])
-        else:
-            least_bytes = min(least_bytes, costs.projected_bytes(smaller[-1], workload))
-    if not candidates:
-        raise InputError(
-            f"{allowed_bytes / 1e6:.4g} MB of memory are too little for a block of {' x '.join(map(str, whole.shape))} "
-            f"samples: give at least {math.ceil(least_bytes / 1e5) / 10:.4g} MB besides the result and the mesh"
-        )
-    return min(candidates, key=lambda spec: costs.projected_nanoseconds(spec, whole.shape, workload))
-
-
-def sub_shapes(shape: Shape, sigma: float) -> Iterator[Shape]:
-    """Yield shapes of sub-blocks, from the whole block down to where smaller ones save nothing."""
-    counts = [1, 1, 1]
-    lengths = list(shape)
-    while True:
-        yield lengths[0], lengths[1], lengths[2]
-        axis = max(range(3), key=lengths.__getitem__)
-        if lengths[axis] * sigma <= 2 * WIDEST_KERNEL:
-            return
-        before = lengths[axis]
-        while lengths[axis] == before:
-            counts[axis] += 1
-            lengths[axis] = math.ceil(shape[axis] / counts[axis])
-
-
 def projected_bytes(block: Block, settings: TransformSettings, *, triangles: int = 0) -> int:
     """Return an upper estimate of the peak memory of `transform_block`, with its result and without the mesh.
 
@@ -347,11 +287,8 @@ def projected_bytes(block: Block, settings: TransformSettings, *, triangles: int
 
 def _closed_form(kind: SurfaceKind, lattice: FrequencyLattice, block: Block, dtype: ComplexDtype) -> Complexes:
     values: Complexes = np.empty(block.shape, dtype=dtype)
-    step = max(1, _SAMPLES // math.prod(block.shape[1:]))
-    for first in range(0, block.shape[0], step):
-        count = min(step, block.shape[0] - first)
-        slab = Block((block.start[0] + first, *block.start[1:]), (count, *block.shape[1:]))
-        values[first : first + count] = kind.block_values(lattice, slab)
+    for part in block.split(_SAMPLES):
+        values[part.place_in(block)] = kind.block_values(lattice, part)
     return values
 
 
@@ -373,13 +310,6 @@ def require_points_inside(
             f"M {lattice.M}) holds only |coordinate| < 1/(2h) = {lattice.half_period:.6g}; "
             f"take M >= {intervals}, a smaller xi_max, or scale {pronoun} down"
         )
-
-
-# Triangles of a mesh differ in size, which their rules follow; those of this sphere stand for them.
-_STAND_IN_LEVEL = 2
-# A sphere, transformed in a fraction of a second, mostly spreading its points.
-_TRIAL_LEVEL, _TRIAL_LATTICE = 5, Lattice(5.0, 64)
-_NANO = 1e-9
 
 
 def field_seconds(triangles: int, area: float, lattice: Lattice, settings: TransformSettings) -> float:

@@ -1,4 +1,4 @@
-"""The kinds of surfaces, and what transforms need of each: quadrature points, exact values, and how both are chosen.
+"""The kinds of surfaces, and what transforms need of each: quadrature points and exact values.
 
 A further kind of surface is one more class here.
 """
@@ -9,7 +9,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from itertools import groupby
 from operator import itemgetter
 from typing import Any, Self
@@ -20,136 +20,14 @@ from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.closed_forms import Sphere
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.geometry.smooth import MOST_GAUSS_NODES, MOST_NODES, Counts, Smooth, doubled
-from sobolev_batch.geometry.surface import DIRECTIONS
-from sobolev_batch.transform.backends import CPU, Backend, cosine_and_sine
+from sobolev_batch.geometry.smooth import Counts, Smooth
+from sobolev_batch.transform.backends import CPU, Backend
 from sobolev_batch.transform.exact import exact_transform, sampled_transform
 from sobolev_batch.transform.lattice import Block, FrequencyLattice
 from sobolev_batch.transform.quadrature import RuleUse, WeightedPoints, assign_rules
+from sobolev_batch.transform.resolution import direct_transform, exact_counts, resolution_of
 from sobolev_batch.transform.rule_errors import loosest_tolerance, weight_masses
 from sobolev_batch.transform.spheres import sphere_block, sphere_transform
-
-# Less is rounding: of the transform, and of derivatives that come from an interpolant.
-FINEST_CHANGE = 1e-13
-# Random sums over few nodes may agree to a few percent by chance.
-COARSEST_CHANGE = 1e-4
-# Nodes that the spacing on a surface is measured with, and nodes beyond two for each wavelength.
-_SPACING_NODES, _MARGIN, _EXTRA = 31, 1.1, 12
-# Number of probe directions that are neither axes nor diagonals, and shorter lengths that are probed too.
-_RANDOM_DIRECTIONS, _FRACTIONS = 9, (0.0, 0.3, 0.7)
-# Pairs of a node and a frequency at a time: their temporaries stay in cache.
-_PAIRS = 1 << 18
-# The change that exact values are resolved to, and the nodes that may be spent on them.
-_EXACT_CHANGE, _MOST_EXACT_NODES = 1e-12, 1 << 19
-
-
-@lru_cache(maxsize=16)
-def resolution_of(surface: Smooth, highest_frequency: float, tolerance: float) -> tuple[Counts, float]:
-    """Return the nodes along u and v that the transform of a surface takes up to a frequency, and how far it is off.
-
-    That is the change of the transform when the nodes are doubled along u, plus that along v, over the area: the
-    largest one over the probe frequencies. The tolerance of it is clipped to 1e-13 to 1e-4; frequencies are in cycles
-    per unit length. InputError where more than 4,194,304 nodes would be needed, or 2,048 along a parameter that is not
-    periodic: the parametrisation is not smooth, or the surface is large or thin compared with the wavelength.
-    """
-    tolerance = min(max(tolerance, FINEST_CHANGE), COARSEST_CHANGE)
-    (u, v), change = _refined(surface, highest_frequency, tolerance, MOST_NODES)
-    if change > tolerance:
-        progress = "it would take more to begin with"
-        if math.isfinite(change):
-            progress = f"with {u} x {v} it still changes by {change:.2g} of the area"
-        raise InputError(
-            f"the transform of the parametrised surface up to |xi| = {highest_frequency:.4g} is not settled to "
-            f"{tolerance:.2g} of its area with {MOST_NODES} nodes, the most that are tried ({MOST_GAUSS_NODES} along a "
-            f"parameter that is not periodic); {progress}. Its parametrisation is not smooth (a kink, a corner, an "
-            "unmarked period), or the surface is large or thin beside the shortest wavelength; lower xi_max, or allow "
-            "a larger eps"
-        )
-    return (u, v), change
-
-
-def direct_transform(surface: Smooth, counts: Counts, frequencies: Reals) -> Complexes:
-    """Return the transform Σ w exp(-2πi ξ·x) over the nodes of a rule (P,), summed one by one.
-
-    The frequencies are float64 (P, 3), in cycles per unit length. The values have a few rounding errors of the area.
-    """
-    wave_vectors = -2 * np.pi * np.asarray(frequencies, dtype=np.float64)
-    values = np.zeros(len(wave_vectors), dtype=np.complex128)
-    for points, weights in surface.nodes(counts, max(1, _PAIRS // max(len(wave_vectors), 1))):
-        cosines, sines = cosine_and_sine(wave_vectors @ points)
-        values += cosines @ weights + 1j * (sines @ weights)
-    return values
-
-
-def exact_values(surface: Smooth, frequencies: Reals) -> Complexes:
-    """Return the transform (P,) at frequencies (P, 3), with twice the nodes along each parameter at which it converges.
-
-    On a smooth surface the error is about 1e-14 of the area. If half a million nodes do not suffice, the values are
-    those of twice as many along each parameter, and have the error of these.
-    """
-    if not len(frequencies):
-        return np.zeros(0, dtype=np.complex128)
-    highest = float(np.linalg.norm(frequencies, axis=1).max())
-    return direct_transform(surface, _exact_counts(surface, highest), frequencies)
-
-
-@lru_cache(maxsize=16)
-def _exact_counts(surface: Smooth, highest: float) -> Counts:
-    counts, _ = _refined(surface, highest, _EXACT_CHANGE, _MOST_EXACT_NODES)
-    return doubled(counts)
-
-
-def _refined(surface: Smooth, highest: float, tolerance: float, most: int) -> tuple[Counts, float]:
-    """Double the nodes along each parameter that needs it, until the change is small or the nodes are too many.
-
-    Returns what `resolution_of` does; the change is infinite if even the first nodes are too many.
-    """
-    counts = _first_counts(surface, highest)
-    if _too_many(surface, counts, most):
-        return counts, math.inf
-    frequencies = highest * _unit_frequencies()
-    values = direct_transform(surface, counts, frequencies)
-    while True:
-        twice = doubled(counts)
-        along = (twice[0], counts[1]), (counts[0], twice[1])
-        finer = [direct_transform(surface, more, frequencies) for more in along]
-        changes = [float(np.abs(more - values).max()) / surface.area for more in finer]
-        if sum(changes) <= tolerance:
-            return counts, sum(changes)
-        coarse = [change > tolerance / 2 for change in changes]
-        larger = (twice[0] if coarse[0] else counts[0], twice[1] if coarse[1] else counts[1])
-        if _too_many(surface, larger, most):
-            return counts, sum(changes)
-        counts = larger
-        values = finer[coarse.index(True)] if sum(coarse) == 1 else direct_transform(surface, counts, frequencies)
-
-
-def _too_many(surface: Smooth, counts: Counts, most: int) -> bool:
-    along = zip(surface.intervals, counts, strict=True)
-    return math.prod(counts) > most or any(n > MOST_GAUSS_NODES and not interval.periodic for interval, n in along)
-
-
-def _first_counts(surface: Smooth, highest: float) -> Counts:
-    """Return two nodes for each wavelength where nodes are farthest apart, and some more; odd numbers."""
-    points = np.concatenate([batch for batch, _ in surface.nodes((_SPACING_NODES, _SPACING_NODES))], axis=1)
-    grid = points.reshape(3, _SPACING_NODES, _SPACING_NODES)
-    counts = []
-    for axis in (1, 2):
-        widest = float(np.linalg.norm(np.diff(grid, axis=axis), axis=0).max())
-        # The number may exceed all bounds, and is refused then.
-        count = min(_MARGIN * _SPACING_NODES * widest * 2 * highest, float(MOST_NODES))
-        counts.append(math.ceil(count) + _EXTRA | 1)
-    return counts[0], counts[1]
-
-
-@lru_cache(maxsize=1)
-def _unit_frequencies() -> Reals:
-    """Return probe frequencies (25, 3): of unit length in all directions, and a few shorter ones."""
-    rng = np.random.default_rng(20)
-    random = rng.normal(size=(_RANDOM_DIRECTIONS, 3))
-    random /= np.linalg.norm(random, axis=1, keepdims=True)
-    return np.concatenate([DIRECTIONS, random, *(fraction * random[:1] for fraction in _FRACTIONS)])
-
 
 # Nodes of a parametrised surface that are made at a time: their temporaries take 4 MB.
 _NODES = 1 << 14
@@ -335,7 +213,10 @@ class _Parametrised(SurfaceKind):
         yield WeightedPoints.concatenated(gathered)
 
     def exact_values(self, frequencies: Reals, threads: int = 1, backend: Backend = CPU) -> Complexes:
-        return exact_values(self.surface, frequencies)
+        # With twice the nodes along each parameter at which it converges, the error is about 1e-14 of the area. If half
+        # a million nodes do not suffice, it is that of twice as many along each parameter.
+        highest = float(np.linalg.norm(frequencies, axis=1).max(initial=0.0))
+        return direct_transform(self.surface, exact_counts(self.surface, highest), frequencies)
 
     def loosest_tolerance(self, lattice: FrequencyLattice, orders: Sequence[float], norms: Reals) -> float:
         # The tolerance bounds the error at every single frequency: assume it at all of them.

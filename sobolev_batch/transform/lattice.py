@@ -32,8 +32,14 @@ AXES = ("xi_x", "xi_y", "xi_z")
 _BALL = (6 / math.pi) ** (1 / 3)
 # Layers of an octave's lattice with ξ_z < 0, over which it fades out, and the width of the fading in layers.
 _FADED_LAYERS, _FADING_LAYERS = 3, 1.2
+_LOWEST_ORDER = -100.0
+# The smooth step falls from one to zero between this fraction of the cutoff and the cutoff.
+STEP_START = 0.5
+# At the ends of the fall it is off by erfc(3)/2 = 1e-5, on both sides of the cut: a partition by steps stays one.
+_STEEPNESS = 3.0
 
 Axes = tuple[Reals, Reals, Reals]
+Orders = float | Sequence[float]
 
 
 @dataclass(frozen=True)
@@ -51,6 +57,12 @@ class Block:
     def indices(self, axis: int) -> Indices:
         """Return the indices k along an axis, int64 (shape[axis],)."""
         return np.arange(self.start[axis], self.start[axis] + self.shape[axis], dtype=np.int64)
+
+    def place_in(self, block: Block) -> tuple[slice, slice, slice]:
+        """Return the slices of this block in an array of another one that holds it."""
+        starts = zip(block.start, self.start, self.shape, strict=True)
+        x, y, z = (slice(start - first, start - first + count) for first, start, count in starts)
+        return x, y, z
 
     def split(self, largest_size: int) -> tuple[Block, ...]:
         """Return equal blocks of at most ``largest_size`` samples that make up this one.
@@ -135,9 +147,7 @@ class FrequencyLattice(ABC):
 
     def place(self, block: Block) -> tuple[slice, slice, slice]:
         """Return the slices of a block in an array of the whole lattice."""
-        starts = zip(self.half.start, block.start, block.shape, strict=True)
-        x, y, z = (slice(start - first, start - first + count) for first, start, count in starts)
-        return x, y, z
+        return block.place_in(self.half)
 
 
 @dataclass(frozen=True)
@@ -331,15 +341,6 @@ class OctaveLattice(FrequencyLattice):
         """
         layers = self.half.indices(2) + self.offset[2]
         return np.asarray(1 + erf(layers / _FADING_LAYERS))
-
-
-Orders = float | Sequence[float]
-
-_LOWEST_ORDER = -100.0
-# The smooth step falls from one to zero between this fraction of the cutoff and the cutoff.
-STEP_START = 0.5
-# At the ends of the fall it is off by erfc(3)/2 = 1e-5, on both sides of the cut: a partition by steps stays one.
-_STEEPNESS = 3.0
 
 
 @dataclass(frozen=True)

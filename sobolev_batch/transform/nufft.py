@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from sobolev_batch.arrays import Array, Complexes, Reals
-from sobolev_batch.transform.backends import CPU, Backend, ComplexDtype, NufftSpec, combine, cosine_and_sine
+from sobolev_batch.arrays import Array, ComplexDtype, Complexes, Reals
+from sobolev_batch.transform.backends import CPU, Backend, combine, cosine_and_sine
 from sobolev_batch.transform.lattice import Block, FrequencyLattice, Lattice
+from sobolev_batch.transform.nufft_costs import NufftSpec
 from sobolev_batch.transform.quadrature import WeightedPoints
 
 # Points at a time whose phases stay in the processor's cache: half the time of all at once.
@@ -54,12 +55,10 @@ def transform_points(
             values = plan.execute(
                 _shifted_strengths(points.weights, angles, _first_mode(sub_block, lattice), spec.dtype)
             )
-            if total is None and spec.shape == block.shape:
-                total = values
-            elif total is None:
-                total = np.zeros(block.shape, dtype=spec.dtype, like=values)
-                total[x, y, z] = values[: x.stop - x.start, : y.stop - y.start, : z.stop - z.start]
-            else:
+            if total is None:
+                is_whole = spec.shape == block.shape
+                total = values if is_whole else np.zeros(block.shape, dtype=spec.dtype, like=values)
+            if total is not values:
                 total[x, y, z] += values[: x.stop - x.start, : y.stop - y.start, : z.stop - z.start]
             # Free the memory before the next values and the next batch are made.
             del values

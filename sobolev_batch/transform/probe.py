@@ -127,7 +127,7 @@ def with_own(draws: Draws, count: float, lattice: Lattice, block: Block, values:
     rng = np.random.default_rng([draws.seed, *np.add(block.start, lattice.M)])
     candidates = block.split(_LOOKED_AT)
     part = candidates[rng.integers(len(candidates))]
-    seen = values[tuple(slice(i - j, i - j + n) for i, j, n in zip(part.start, block.start, part.shape, strict=True))]
+    seen = values[part.place_in(block)]
     energies, (shells, weights) = (seen.real**2 + seen.imag**2).ravel(), _shells_and_weights(lattice, part)
     masses = energies * weights
     per_shell = np.bincount(shells, masses, lattice.shell_count).astype(np.float64)

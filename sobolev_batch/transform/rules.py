@@ -9,16 +9,38 @@ from pathlib import Path
 
 import numpy as np
 
-from sobolev_batch.arrays import Complexes, Indices, Reals
+from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import InputError
-from sobolev_batch.transform.exact import second_difference
 
 HIGHEST_DEGREE = 50
 # Below this, rounding hides the error of a rule.
 FINEST_TOLERANCE = 1e-15
 # Sizes 2π|ξ|ρ of triangles (radians) at which the largest and the typical errors of rules are tabulated.
-_SIZES, _SIZES_ON_AVERAGE = np.geomspace(1e-4, 200.0, 160), np.geomspace(1e-3, 200.0, 64)
-_TABULATED = Path(__file__).with_name("rules.npz")
+SIZES, SIZES_ON_AVERAGE = np.geomspace(1e-4, 200.0, 160), np.geomspace(1e-3, 200.0, 64)
+TABULATED = Path(__file__).with_name("rules.npz")
+# Two coordinates of a node, and the weight of all nodes that symmetry makes from it, for rules whose nodes neighbouring
+# triangles share. They solve the equations for the means of the symmetric polynomials, to all digits.
+_SHARING = {
+    1: ((1.0, 0.0, 1.0),),
+    2: ((0.5, 0.5, 1.0),),
+    4: (
+        (1.0, 0.0, 0.0616204060378000892),
+        (0.5, 0.5, 0.185926496604801428),
+        (0.188580484696445039, 0.188580484696445039, 0.752453097357398483),
+    ),
+    5: (
+        (1.0, 0.0, 1 / 30),
+        (0.5, 0.5, 0.213333333333333333),
+        (1 / 3, 1 / 3, 0.253125),
+        (1 / 7, 1 / 7, 0.500208333333333333),
+    ),
+    6: (
+        (1.0, 0.0, 0.0213910779216134461),
+        (0.307745941625991646, 0.0, 0.177416497060831764),
+        (0.118613686396592868, 0.118613686396592868, 0.305653959080855442),
+        (0.425340125989747152, 0.425340125989747152, 0.495538465936699348),
+    ),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,31 +89,6 @@ class TriangleRule:
     def shares(self) -> bool:
         """True if neighbouring triangles share nodes."""
         return self.cost < self.size
-
-
-# Two coordinates of a node, and the weight of all nodes that symmetry makes from it, for rules whose nodes neighbouring
-# triangles share. They solve the equations for the means of the symmetric polynomials, to all digits.
-_SHARING = {
-    1: ((1.0, 0.0, 1.0),),
-    2: ((0.5, 0.5, 1.0),),
-    4: (
-        (1.0, 0.0, 0.0616204060378000892),
-        (0.5, 0.5, 0.185926496604801428),
-        (0.188580484696445039, 0.188580484696445039, 0.752453097357398483),
-    ),
-    5: (
-        (1.0, 0.0, 1 / 30),
-        (0.5, 0.5, 0.213333333333333333),
-        (1 / 3, 1 / 3, 0.253125),
-        (1 / 7, 1 / 7, 0.500208333333333333),
-    ),
-    6: (
-        (1.0, 0.0, 0.0213910779216134461),
-        (0.307745941625991646, 0.0, 0.177416497060831764),
-        (0.118613686396592868, 0.118613686396592868, 0.305653959080855442),
-        (0.425340125989747152, 0.425340125989747152, 0.495538465936699348),
-    ),
-}
 
 
 @cache
@@ -170,8 +167,8 @@ def rule_ranges(tolerance: float, shared: bool = True) -> tuple[tuple[TriangleRu
         if rule.shares and not shared:
             continue
         beyond = np.flatnonzero(row > tolerance)
-        last = beyond[0] - 1 if beyond.size else len(_SIZES) - 1
-        limit = float(_SIZES[last]) if last >= 0 else 0.0
+        last = beyond[0] - 1 if beyond.size else len(SIZES) - 1
+        limit = float(SIZES[last]) if last >= 0 else 0.0
         while rules and rules[-1].cost >= rule.cost and ranges[-1] <= limit:
             rules.pop()
             ranges.pop()
@@ -189,7 +186,7 @@ def typical_errors(rule: TriangleRule, sizes: Reals) -> tuple[Reals, Reals]:
     of the equilateral and the flat triangle.
     """
     stored, row = tabulated(), candidate_rules().index(rule)
-    logs, grid = np.log(np.maximum(sizes, _SIZES_ON_AVERAGE[0])), np.log(_SIZES_ON_AVERAGE)
+    logs, grid = np.log(np.maximum(sizes, SIZES_ON_AVERAGE[0])), np.log(SIZES_ON_AVERAGE)
     even, odd = (np.exp(np.interp(logs, grid, np.log(stored[part][row] + 1e-17))) for part in ("even", "odd"))
     return even, odd
 
@@ -208,47 +205,10 @@ def tabulated() -> dict[str, Reals]:
 
     The "nodes" (n, 3) and "weights" (n,) of all degrees follow each other; "sizes" (50,) has the number of each. The
     errors "largest" (55, 160), "even" and "odd" (55, 64) depend on the rules alone, and measuring takes a second of
-    each process, so the package carries them. `python -m sobolev_batch.transform.rules` measures them anew.
+    each process, so the package carries them. `python -m benchmarks.rule_errors` measures them anew.
     """
-    with np.load(_TABULATED, allow_pickle=False) as stored:  # noqa: TID251
+    with np.load(TABULATED, allow_pickle=False) as stored:  # noqa: TID251
         return {name: stored[name] for name in stored.files}
-
-
-def measure_largest_errors(rule: TriangleRule) -> Reals:
-    """Return the largest relative error of a rule on triangles of each size (160,).
-
-    On a plane wave the error of a rule depends only on the phases at the triangle's three corners. Measured from the
-    centroid they sum to zero, and the largest is at most 2π|ξ|ρ: a hexagon; symmetry leaves one twelfth of it to
-    sample.
-    """
-    fractions = np.linspace(0.5, 1.0, 5)
-    largest = np.repeat(_SIZES, len(fractions))
-    second = -largest * np.tile(fractions, len(_SIZES))
-    errors = np.abs(_rule_errors(rule, np.stack([largest, second, -largest - second])))
-    return np.asarray(errors.reshape(len(_SIZES), -1).max(axis=1))
-
-
-def measure_typical_errors(rule: TriangleRule) -> tuple[Reals, Reals]:
-    """Return the even and the odd part of a rule's error at each size (64,): see `typical_errors`."""
-    sizes = _SIZES_ON_AVERAGE
-    cosines, weights = np.polynomial.legendre.leggauss(4)
-    sines = np.sqrt(1 - ((1 + cosines) / 2) ** 2)
-    angles = (np.arange(4) + 0.5) * np.pi / 24
-    equilateral = np.cos(angles + 2 * np.pi / 3 * np.arange(3)[:, None])
-    flat = np.outer([1.0, -0.5, -0.5], np.cos((np.arange(4) + 0.5) * np.pi / 8))
-    even, odd = [], []
-    for shape in (equilateral, flat):
-        phases = (sizes[:, None, None] * sines[:, None]) * shape[:, None, None, :]
-        difference = _rule_errors(rule, phases.reshape(3, -1)).reshape(len(sizes), len(sines), -1)
-        even.append(np.sqrt(weights / 2 @ np.mean(difference.real**2, axis=2).T))
-        odd.append(np.sqrt(weights / 2 @ np.mean(difference.imag**2, axis=2).T))
-    return np.maximum(*even), np.maximum(*odd)
-
-
-def _rule_errors(rule: TriangleRule, phases: Reals) -> Complexes:
-    """Return the error (n,) of a rule on exp(i phase), relative to the area, from the phases at the corners (3, n)."""
-    exact = 2 * second_difference(phases[1] - phases[0], phases[2] - phases[0])
-    return np.asarray(rule.weights @ np.exp(1j * (rule.barycentric @ phases)) - exact)
 
 
 def choose_rules(sizes: Reals, ranges: Reals) -> tuple[Indices, Indices]:
@@ -260,10 +220,3 @@ def choose_rules(sizes: Reals, ranges: Reals) -> tuple[Indices, Indices]:
         sizes = np.ldexp(sizes, -splits)
     # Rounding of the logarithm may leave a size just beyond the last range.
     return splits, np.minimum(np.searchsorted(ranges, sizes), len(ranges) - 1)
-
-
-if __name__ == "__main__":
-    _largest = [measure_largest_errors(rule) for rule in candidate_rules()]
-    _even, _odd = zip(*(measure_typical_errors(rule) for rule in candidate_rules()), strict=True)
-    _rules = {name: tabulated()[name] for name in ("sizes", "nodes", "weights")}
-    np.savez_compressed(_TABULATED, allow_pickle=False, largest=_largest, even=_even, odd=_odd, **_rules)

@@ -9,9 +9,9 @@ import xarray as xr
 import sobolev_batch as sb
 from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.norms import causes, fields
-from sobolev_batch.transform.backends import NufftSpec
 from sobolev_batch.transform.lattice import Block
 from sobolev_batch.transform.nufft import evaluate_at
+from sobolev_batch.transform.nufft_costs import NufftSpec
 from tests.support.oracles import full_lattice_norm, on_whole_cube
 from tests.support.shapes import CENTRED_BOX as BOX
 

@@ -95,7 +95,7 @@ def test_blocks_of_a_smooth_surface_make_the_same_store(threads: Client, tmp_pat
 def test_a_reference_that_does_not_settle_is_a_failed_row(
     threads: Client, store_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sobolev_batch.transform.kinds.MOST_NODES", 1 << 14)
+    monkeypatch.setattr("sobolev_batch.transform.resolution.MOST_NODES", 1 << 14)
     family = [{"name": "f", "source": "torus", "R": 1.0, "r": 0.4}]
     study = sb.Study.from_table(torus_table(family=family))
     member = SurfaceMember("own", -1, Roof(), {"test": 1})

@@ -22,10 +22,11 @@ from sobolev_batch.errors import BackendError, InputError
 from sobolev_batch.norms.fields import compute_field, field_for
 from sobolev_batch.shapes import Sphere, icosphere
 from sobolev_batch.transform import backends
-from sobolev_batch.transform.backends import CPU, GPU_COSTS, Gpu, backend_named, gpu_backend, try_out
+from sobolev_batch.transform.backends import CPU, Gpu, backend_named, gpu_backend, try_out
 from sobolev_batch.transform.exact import exact_transform, sampled_transform
 from sobolev_batch.transform.fourier import ErrorTarget, Execution, Transformed, TransformSettings, transform_block
 from sobolev_batch.transform.lattice import Block, FrequencyLattice, OctaveLattice
+from sobolev_batch.transform.nufft_costs import GPU_COSTS
 from sobolev_batch.transform.quadrature import assign_rules, merged_edges
 from sobolev_batch.transform.rules import sharing_rule
 from tests.support.fake_device import FUNCTIONS, OPTIONS, UFUNCS, Array, CUDARuntimeError, Device

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.rule_errors import measure_largest_errors, measure_typical_errors
 from sobolev_batch import Lattice, Mesh, fourier_transform
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.surface import Surface
@@ -24,8 +25,6 @@ from sobolev_batch.transform.rules import (
     TriangleRule,
     candidate_rules,
     gauss_rule,
-    measure_largest_errors,
-    measure_typical_errors,
     rule_ranges,
     sharing_rule,
     symmetric_rule,

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 import sobolev_batch as sb
 from sobolev_batch.arrays import Reals
 from sobolev_batch.geometry.smooth import Smooth
-from sobolev_batch.transform import kinds
+from sobolev_batch.transform import kinds, resolution
 from sobolev_batch.transform.backends import CPU
 from sobolev_batch.transform.fourier import Execution, TransformSettings, transform_block
-from sobolev_batch.transform.kinds import direct_transform, exact_values, resolution_of
+from sobolev_batch.transform.kinds import kind_of
+from sobolev_batch.transform.resolution import direct_transform, resolution_of
 from tests.support.fake_device import Device
 from tests.support.oracles import spheroid_value, torus_value
 from tests.support.shapes import HALF_TURN, TURN, Roof, angular_ball, turned_torus
@@ -62,7 +63,7 @@ def test_solids_of_revolution_are_their_bessel_integrals(name: str) -> None:
     surface, exact = INTEGRALS[name]
     points = frequencies()
     expected = np.array([exact(*point) for point in points.tolist()])
-    assert exact_values(surface, points) == pytest.approx(expected, abs=1e-12 * surface.area)
+    assert kind_of(surface).exact_values(points) == pytest.approx(expected, abs=1e-12 * surface.area)
     assert expected[0] == pytest.approx(surface.area, rel=1e-13)
     # On the lattice, through the NUFFT: along x, where the two sides of a tube interfere.
     found = half_values(surface)[[16, 21, 32], 16, 0]
@@ -78,11 +79,11 @@ def test_the_nodes_are_enough_and_not_many_more(surface: Smooth, highest: float)
     assert change <= 1e-9
     points = highest * np.random.default_rng(9).normal(size=(20, 3))
     points *= highest / np.linalg.norm(points, axis=1, keepdims=True)
-    error = np.abs(direct_transform(surface, counts, points) - exact_values(surface, points)).max()
+    error = np.abs(direct_transform(surface, counts, points) - kind_of(surface).exact_values(points)).max()
     assert error <= 1e-9 * surface.area
     fewer = (counts[0] // 3 | 1, counts[1] // 3 | 1)
     if highest > 1:
-        error = np.abs(direct_transform(surface, fewer, points) - exact_values(surface, points)).max()
+        error = np.abs(direct_transform(surface, fewer, points) - kind_of(surface).exact_values(points)).max()
         assert error > 1e-9 * surface.area
 
 
@@ -97,7 +98,7 @@ def test_waves_that_the_first_nodes_cannot_see_are_seen_when_they_are_doubled() 
 
 
 def test_a_kink_is_refused_with_both_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kinds, "MOST_NODES", 1 << 14)
+    monkeypatch.setattr(resolution, "MOST_NODES", 1 << 14)
     surface = Roof()
     with pytest.raises(
         sb.errors.InputError, match=r"not settled to 1e-09 of its area with 16384 nodes.* it still changes by .*kink"

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from sobolev_batch import Lattice, Mesh, fourier_transform, norm
+from sobolev_batch.arrays import ComplexDtype
 from sobolev_batch.errors import InputError, LatticeError
 from sobolev_batch.norms.fields import compute_field, field_for
 from sobolev_batch.shapes import Sphere, icosphere
-from sobolev_batch.transform.backends import ComplexDtype
 from sobolev_batch.transform.exact import exact_transform
 from sobolev_batch.transform.fourier import (
     ErrorTarget,

@@ -15,10 +15,10 @@ from sobolev_batch.arrays import Complexes, Indices, Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import normals
-from sobolev_batch.transform.backends import NufftSpec
 from sobolev_batch.transform.fourier import ON_CPU, Execution, TransformSettings, require_points_inside
 from sobolev_batch.transform.lattice import Lattice
 from sobolev_batch.transform.nufft import transform_points
+from sobolev_batch.transform.nufft_costs import NufftSpec
 from sobolev_batch.transform.quadrature import RuleUse, WeightedPoints, assign_rules
 
 # Fraction of eps that the coefficients which are left out may carry together.

@@ -23,8 +23,9 @@ _OBJ_VERTEX_SIZES = (3, 4, 6, 7)
 # Further numbers per vertex line, by the kind of file, and per face line: a colour or its index.
 _OFF_EXTRAS = {"": 0, "N": 3, "C": 4, "CN": 7}
 _OFF_FACE_EXTRAS = (0, 1, 3, 4)
-# Digits of an index or count: all that fit into 64 bits.
+# Digits of an index or count: all that fit into 64 bits. Other digits than these are digits to Python too.
 _MOST_DIGITS = 18
+_COUNT = re.compile(f"[0-9]{{1,{_MOST_DIGITS}}}")
 # Characters of a line: a polygon of a hundred thousand corners.
 _LONGEST_LINE = 1 << 20
 # Seventeen digits give every double back.
@@ -59,7 +60,7 @@ def parse_off(data: bytes) -> Raw:
     if kind is None:
         raise MeshError("the file does not begin with OFF, COFF, NOFF or CNOFF")
     counts = first[1:] or next(lines, [])
-    if len(counts) not in (2, 3) or not all(map(_is_count, counts)):
+    if len(counts) not in (2, 3) or not all(_COUNT.fullmatch(word) for word in counts):
         raise MeshError("the OFF header does not announce vertices and faces")
     vertex_count, face_count = int(counts[0]), int(counts[1])
     vertices, corners, sizes = array("d"), array("q"), array("q")
@@ -160,11 +161,6 @@ def _joined_lines(data: bytes) -> Iterator[str]:
             parts, length = [], 0
     if parts:
         yield "".join(parts)
-
-
-def _is_count(word: str) -> bool:
-    # Other digits than these are digits to Python too.
-    return word.isascii() and word.isdigit() and len(word) <= _MOST_DIGITS
 
 
 def _parsed_numbers(words: list[str], owner: str) -> list[float]:

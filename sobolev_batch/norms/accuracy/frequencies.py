@@ -26,7 +26,7 @@ from sobolev_batch.norms.fields import field_for
 from sobolev_batch.norms.tail.integrals import OctaveWeights, integral_over, squared_moduli
 from sobolev_batch.norms.tail.remainder import mean_sinc, remainder
 from sobolev_batch.norms.tail.sampling import OctaveSampling
-from sobolev_batch.norms.tail.values import octave_values, settings_for
+from sobolev_batch.norms.tail.values import octave_values
 from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, cheapest_dtype
 from sobolev_batch.transform.lattice import Lattice, SobolevWeights, shell_sums
 
@@ -88,9 +88,7 @@ class Frequencies:
         """Return the values of a surface within an error target; LatticeError where it exceeds the half period."""
         settings = TransformSettings(dtype=cheapest_dtype([surface], self.lattice, target))
         field = field_for(surface, self.lattice, target, settings, Execution(threads=execution.threads))
-        octaves = (
-            octave_values(surface, octave, self.orders, settings_for(target), execution) for octave in self.octaves
-        )
+        octaves = (octave_values(surface, octave, self.orders, target, execution) for octave in self.octaves)
         return SurfaceValues(field, tuple(octaves))
 
     def norms(self, values: Sequence[SurfaceValues], surfaces: Sequence[Surface], signs: Sequence[int]) -> NormEstimate:

@@ -34,7 +34,7 @@ from sobolev_batch.norms.tail.integrals import OctaveSums, OctaveWeights, integr
 from sobolev_batch.norms.tail.potentials import tail_integral
 from sobolev_batch.norms.tail.remainder import MOSTLY, Remainder, remainder
 from sobolev_batch.norms.tail.sampling import Octave, OctaveSampling
-from sobolev_batch.norms.tail.values import POINTS_PER_SQUARE, OctaveValues, SurfaceSize, octave_values, settings_for
+from sobolev_batch.norms.tail.values import POINTS_PER_SQUARE, OctaveValues, SurfaceSize, octave_values
 from sobolev_batch.transform.lattice import Lattice, OctaveLattice, SobolevWeights
 from sobolev_batch.transform.probe import estimate as estimate_from
 
@@ -359,17 +359,11 @@ def _measured(state: State, sampling: OctaveSampling, known: MeasuredOctave | No
     problem = state.problem
     values = problem.accuracy.scale(np.sqrt(state.squares))
     target = error_target(values, problem.orders, problem.accuracy, problem.area)
-    settings = settings_for(target.tightened(2 * problem.inexact_count * np.sqrt(_USUAL_OCTAVES)))
+    target = target.tightened(2 * problem.inexact_count * np.sqrt(_USUAL_OCTAVES))
+    known_values = known.values if known else [None] * len(problem.surfaces)
     of_surfaces = tuple(
-        octave_values(
-            surface,
-            sampling,
-            problem.orders,
-            settings,
-            problem.execution,
-            known=known.values[number] if known else None,
-        )
-        for number, surface in enumerate(problem.surfaces)
+        octave_values(surface, sampling, problem.orders, target, problem.execution, known=values)
+        for surface, values in zip(problem.surfaces, known_values, strict=True)
     )
     squares = squared_moduli(only_or_difference([values.values for values in of_surfaces]))
     return MeasuredOctave(of_surfaces, OctaveWeights(sampling, problem.orders).sums(squares))

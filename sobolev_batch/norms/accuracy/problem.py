@@ -9,7 +9,7 @@ from typing import Any, Self, cast
 
 import numpy as np
 
-from sobolev_batch.arrays import Complexes, Reals
+from sobolev_batch.arrays import ComplexDtype, Complexes, Reals
 from sobolev_batch.errors import AccuracyError
 from sobolev_batch.geometry.mesh import Mesh, shared_triangles
 from sobolev_batch.geometry.overlap import SINGLE_ROUNDING, rests_of
@@ -20,7 +20,6 @@ from sobolev_batch.norms.estimate import NormEstimate, change_of_root
 from sobolev_batch.norms.fields import USUAL_DEGREE, Field, field_for
 from sobolev_batch.norms.tail.sampling import OctaveSampling
 from sobolev_batch.norms.tail.values import OctaveValues
-from sobolev_batch.transform.backends import ComplexDtype
 from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, cheapest_dtype
 from sobolev_batch.transform.lattice import Lattice, SobolevWeights, shell_sums
 from sobolev_batch.transform.probe import Sample, draws_for, estimate, needs_probe

@@ -11,7 +11,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.arrays import Reals
+from sobolev_batch.arrays import ComplexDtype, Reals
 from sobolev_batch.errors import AccuracyError
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Surface
@@ -29,7 +29,6 @@ from sobolev_batch.norms.accuracy.tolerance import (
     LEAST_CLEARANCE,
     Accuracy,
     first_lattice,
-    larger_pilot,
     lattice_of,
     refined,
 )
@@ -38,7 +37,6 @@ from sobolev_batch.norms.estimate import NormEstimate, estimate_norms
 from sobolev_batch.norms.fields import Field
 from sobolev_batch.norms.tail.face_normals import FaceNormals
 from sobolev_batch.norms.tail.remainder import LOWEST_ORDER, remainder
-from sobolev_batch.transform.backends import ComplexDtype
 from sobolev_batch.transform.fourier import ErrorTarget
 from sobolev_batch.transform.kinds import kind_of
 from sobolev_batch.transform.lattice import LARGEST_M, Lattice, SobolevWeights, shell_sums
@@ -69,8 +67,8 @@ _WIDE_M = 160
 _OF_VALUES, _COARSE_ORDER, _SPARSE_CAUTION = 0.1, -2.0, 2.0
 # The least factor by which a lattice grows that shows more.
 _LEAST_GROWTH = 1.1
-# A pilot has to tell how large distances are, not more.
-_PILOT_RTOL = 1e-3
+# A pilot has to tell how large distances are, not more. Before an accuracy is refused, a larger one may look further.
+_PILOT_RTOL, _LARGER_PILOT_M = 1e-3, 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -378,10 +376,10 @@ def _next_lattice(problem: Problem, lattice: Lattice, sums: Sums) -> tuple[Latti
     try:
         return refined(sums, weights, problem.support, problem.accuracy, problem.label), False
     except AccuracyError:
-        larger = larger_pilot(lattice, problem.accuracy)
-        if larger is None:
+        intervals = min(_LARGER_PILOT_M, problem.accuracy.largest_intervals)
+        if intervals <= lattice.M:
             raise
-        return larger, True
+        return Lattice(intervals * lattice.spacing / 2, intervals), True
 
 
 def _compute(

@@ -125,7 +125,9 @@ class _Search:
 
     def _frequency(self, beyond: float) -> float:
         """Return the frequency beyond which no more can lie than a fraction of the threshold."""
-        return _frequency_of(self.problem, beyond * self.threshold.lower)
+        (order,), norm = self.problem.orders, beyond * self.threshold.lower
+        bounds = area_bounds(self.problem.area, order)
+        return float(min((factor / norm**2) ** (1 / power) for factor, power in bounds))
 
     def _on_lattice(self, lattice: Lattice, rtol: float) -> tuple[float, Interval]:
         """Return the part of the distance on a lattice, and bounds on all of it."""
@@ -214,9 +216,3 @@ def _with_beyond(problem: Problem, value: float, lattice: Lattice) -> float:
     """Return a norm on a lattice with all that may lie beyond the lattice."""
     (order,) = problem.orders
     return float(np.sqrt(value**2 + area_bound(problem.area, order, lattice.xi_max)))
-
-
-def _frequency_of(problem: Problem, norm: float) -> float:
-    """Return the frequency beyond which no more than a norm can lie."""
-    (order,) = problem.orders
-    return float(min((factor / norm**2) ** (1 / power) for factor, power in area_bounds(problem.area, order)))

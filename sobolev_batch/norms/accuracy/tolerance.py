@@ -44,8 +44,6 @@ NEXT_TO_EQUAL = 1e-5
 _IMAGE_MARGIN, _TAIL_MARGIN = 30.0, 2.0
 # If those laws ask for more than this, a pilot lattice of this size measures the pair first.
 _PILOT_M = 64
-# Before an accuracy is refused, a larger pilot may look further.
-_LARGER_PILOT_M = 128
 _HIGHEST_FREQUENCY = 1e4
 # Surfaces end this much short of the period.
 LEAST_CLEARANCE = 1.001
@@ -168,12 +166,6 @@ def core_lattice(support: Support, orders: Sequence[float], accuracy: Accuracy) 
     """
     period, most = _first_period(support, orders, accuracy), min(_PILOT_M, accuracy.largest_intervals)
     return lattice_of(_HIGHEST_FREQUENCY, period, most)
-
-
-def larger_pilot(lattice: Lattice, accuracy: Accuracy) -> Lattice | None:
-    """Return a pilot that sees further than one on which an accuracy seemed out of reach, or None."""
-    intervals = min(_LARGER_PILOT_M, accuracy.largest_intervals)
-    return Lattice(intervals * lattice.spacing / 2, intervals) if intervals > lattice.M else None
 
 
 def lattice_of(highest: float, period: float, most: int) -> Lattice:

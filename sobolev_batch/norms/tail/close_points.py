@@ -16,7 +16,7 @@ from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.smooth import Interval, Smooth
 from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms.tail.potentials import centers_and_radii
-from sobolev_batch.transform.kinds import resolution_of
+from sobolev_batch.transform.resolution import resolution_of
 
 # Cells along each parameter that a smooth surface is replaced by: the most, and how many for a node of its transform.
 _MOST_CELLS, _CELLS_PER_NODE, _TRIANGULATION_TOLERANCE = 320, 4, 1e-4
@@ -127,8 +127,9 @@ class Sheets:
     def in_proportion(self, densities: Reals, count: int, rng: np.random.Generator) -> Draw:
         """Draw points in proportion to densities (m,), most of them, and evenly by area for the others."""
         areas = np.diff(self._levels[0], prepend=0.0)
-        mixed = _EVEN_SHARE / areas.sum() + (1 - _EVEN_SHARE) * densities / (areas @ densities)
-        return self._drawn(count, np.cumsum(areas * mixed), 1 / (count * mixed), rng)
+        shares = areas * (_EVEN_SHARE / areas.sum() + (1 - _EVEN_SHARE) * densities / (areas @ densities))
+        weights = np.divide(areas, count * shares, out=np.zeros_like(areas), where=shares > 0)
+        return self._drawn(count, np.cumsum(shares), weights, rng)
 
     def _drawn(self, count: int, levels: Reals, weights: Reals, rng: np.random.Generator) -> Draw:
         """Draw points in triangles, pieces and on spheres, one for each of equal parts of their cumulative shares (m,).

@@ -61,8 +61,9 @@ def tail_nodes(cutoff: float, order: float) -> Iterator[tuple[float, Reals, Real
 @lru_cache(maxsize=4096)
 def tail_integral(cutoff: float, order: float) -> float:
     """Return ∫ (1 - step(r)) (1+r²)^s dr over all r, for the smooth step that ends at a cutoff."""
-    _, _, on_step = next(tail_nodes(cutoff, order))
-    return float(on_step.sum()) + _power_integral(cutoff, order)
+    radii = cutoff * (0.75 + 0.25 * _NODES[0])
+    on_step = float(0.25 * cutoff * _NODES[1] @ ((1 - smooth_step(radii, cutoff)) * (1 + radii**2) ** order))
+    return on_step + _power_integral(cutoff, order)
 
 
 def _power_integral(lowest: float, order: float) -> float:

@@ -125,10 +125,6 @@ class OctaveSampling:
         # Tasks make the samples anew: it is cheaper than sending them.
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
-    def has_draws_of(self, other: OctaveSampling) -> bool:
-        """Tell whether the drawn frequencies are those of another sampling of the octave."""
-        return (self.draws, self.seed, self.uniform_fraction) == (other.draws, other.seed, other.uniform_fraction)
-
     @property
     def frequencies(self) -> Reals:
         """ξ along the axes of the surfaces, float64 (n, 3), in cycles per unit length; drawn ones come last."""
@@ -188,25 +184,10 @@ class OctaveSampling:
             directional += (1 - uniform) * self.normals.density(frequencies / radii[:, None], radii)
         return np.asarray(self.draws * radial * directional / radii**2)
 
-    def to_table(self) -> dict[str, Any]:
-        """Return the sampling as a table, without its octave and the normals."""
-        return {
-            "lattices": [
-                {"M": one.M, "quaternion": list(one.quaternion), "offset": list(one.offset)} for one in self.lattices
-            ],
-            "draws": self.draws,
-            "seed": self.seed,
-            "uniform_fraction": self.uniform_fraction,
-        }
-
-    @classmethod
-    def from_table(cls, octave: Octave, normals: FaceNormals, table: Mapping[str, Any]) -> Self:
-        """Return the sampling of an octave that a table holds."""
-        lattices = tuple(
-            OctaveLattice(octave.lowest, octave.highest, one["M"], tuple(one["quaternion"]), tuple(one["offset"]))
-            for one in table["lattices"]
-        )
-        return cls(octave, lattices, table["draws"], table["seed"], normals, table["uniform_fraction"])
+    @property
+    def drawn_by(self) -> dict[str, Any]:
+        """All that the drawn frequencies follow from, besides the octave and the normals."""
+        return {"draws": self.draws, "seed": self.seed, "uniform_fraction": self.uniform_fraction}
 
 
 def _lattice_samples(lattice: OctaveLattice) -> tuple[Reals, Reals, Indices, Indices]:
@@ -273,10 +254,14 @@ class TailSampling:
     def to_table(self) -> dict[str, Any]:
         """Return the sampling as a table, from which `from_table` makes it again."""
         normals = self.octaves[0].normals
+
+        def of_lattice(lattice: OctaveLattice) -> dict[str, Any]:
+            return {"M": lattice.M, "quaternion": list(lattice.quaternion), "offset": list(lattice.offset)}
+
         return {
             "cutoff": self.cutoff,
             "normals": {name: getattr(normals, name).tolist() for name in ("directions", "shares", "sizes")},
-            "octaves": [sampling.to_table() for sampling in self.octaves],
+            "octaves": [{"lattices": [of_lattice(it) for it in one.lattices], **one.drawn_by} for one in self.octaves],
         }
 
     @classmethod
@@ -284,10 +269,14 @@ class TailSampling:
         """Return the sampling that a table holds."""
         arrays = {name: np.array(values, dtype=np.float64) for name, values in table["normals"].items()}
         normals = FaceNormals(arrays["directions"].reshape(-1, 3), arrays["shares"], arrays["sizes"])
-        samplings = (
-            OctaveSampling.from_table(Octave(table["cutoff"], index), normals, octave)
-            for index, octave in enumerate(table["octaves"], 1)
-        )
+        samplings = []
+        for index, one in enumerate(table["octaves"], 1):
+            octave = Octave(table["cutoff"], index)
+            lattices = tuple(
+                OctaveLattice(octave.lowest, octave.highest, it["M"], tuple(it["quaternion"]), tuple(it["offset"]))
+                for it in one["lattices"]
+            )
+            samplings.append(OctaveSampling(octave, normals=normals, **{**one, "lattices": lattices}))
         return cls(table["cutoff"], tuple(samplings))
 
     @property

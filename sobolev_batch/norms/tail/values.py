@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -26,9 +26,6 @@ from sobolev_batch.transform.fourier import (
 from sobolev_batch.transform.kinds import kind_of
 from sobolev_batch.transform.lattice import OctaveLattice
 from sobolev_batch.transform.probe import norms_of_checks
-
-# Settings of the transform of a surface on a lattice.
-Settings = Callable[[Surface, OctaveLattice], TransformSettings]
 
 # Samples at which values on a lattice are checked: for small meshes, for huge ones, and in between as many as make this
 # number of pairs of a triangle (or point) and a frequency.
@@ -66,32 +63,21 @@ class OctaveValues:
         return norms_of_checks(self.radii, self.squares, orders)
 
 
-def settings_for(target: ErrorTarget) -> Settings:
-    """Return a function that gives the cheapest settings for a target."""
-
-    def settings(surface: Surface, lattice: OctaveLattice) -> TransformSettings:
-        if kind_of(surface).is_closed_form:
-            return TransformSettings()
-        cheapest = TransformSettings(dtype=cheapest_dtype([surface], lattice, target))
-        return choose_settings(surface, lattice, target, cheapest)
-
-    return settings
-
-
 def octave_values(
     surface: Surface,
     sampling: OctaveSampling,
     orders: Sequence[float],
-    settings: Settings,
+    settings: TransformSettings | ErrorTarget,
     execution: Execution = ON_CPU,
     *,
     known: OctaveValues | None = None,
 ) -> OctaveValues:
     """Return the transform of a surface at the samples of an octave.
 
-    Values on lattices come from nonuniform FFTs by these settings, and their errors are measured for some orders. Those
-    at drawn frequencies, and on lattices where large triangles would take many points, are exact. Known values, on the
-    first lattices and maybe at the same drawn frequencies, are not computed again.
+    Values on lattices come from nonuniform FFTs, by these settings or by the cheapest ones for a target, and their
+    errors are measured for some orders. Those at drawn frequencies, and on lattices where large triangles would take
+    many points, are exact. Known values, on the first lattices and maybe at the same drawn frequencies, are not
+    computed again.
     """
     values: list[NDArray[np.complexfloating]] = []
     finished = 0 if known is None else len(known.sampling.lattices)
@@ -99,7 +85,7 @@ def octave_values(
         if known is not None and number < finished:
             values.append(known.values[known.sampling.sample_sets[number].samples])
             continue
-        if known is not None and sample_set.is_drawn and sampling.has_draws_of(known.sampling):
+        if known is not None and sample_set.is_drawn and sampling.drawn_by == known.sampling.drawn_by:
             values.append(known.values[known.sampling.sample_sets[-1].samples])
             continue
         lattice = None if sample_set.is_drawn else sampling.lattices[number]
@@ -107,10 +93,18 @@ def octave_values(
             frequencies = sampling.frequencies[sample_set.samples]
             values.append(kind_of(surface).sampled_values(frequencies, execution.threads, execution.backend))
         else:
-            block = transform_block(surface, lattice, lattice.half, settings(surface, lattice), execution).values
+            chosen = settings if isinstance(settings, TransformSettings) else _cheapest(surface, lattice, settings)
+            block = transform_block(surface, lattice, lattice.half, chosen, execution).values
             values.append(block.ravel()[sample_set.places])
     joined = np.concatenate(values)
     return OctaveValues(sampling, joined, *_compared(surface, sampling, joined, orders, execution.backend))
+
+
+def _cheapest(surface: Surface, lattice: OctaveLattice, target: ErrorTarget) -> TransformSettings:
+    if kind_of(surface).is_closed_form:
+        return TransformSettings()
+    dtype = cheapest_dtype([surface], lattice, target)
+    return choose_settings(surface, lattice, target, TransformSettings(dtype=dtype))
 
 
 def _compared(
@@ -176,7 +170,7 @@ class SurfaceSize:
         lattices, draws = sampling.lattices, sampling.draws
         if known is not None:
             lattices = lattices[len(known.lattices) :]
-            draws = 0 if sampling.has_draws_of(known) else draws
+            draws = 0 if sampling.drawn_by == known.drawn_by else draws
         return sum(map(self.lattice_seconds, lattices)) + draws * self.draw_seconds
 
     def _nufft_seconds(self, lattice: OctaveLattice) -> float:

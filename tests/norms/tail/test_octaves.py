@@ -14,7 +14,7 @@ from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms.tail.face_normals import FaceNormals
 from sobolev_batch.norms.tail.integrals import OctaveSums, OctaveWeights, integral_over, squared_moduli
 from sobolev_batch.norms.tail.sampling import Octave, OctaveSampling, TailSampling
-from sobolev_batch.norms.tail.values import OctaveValues, octave_values, settings_for
+from sobolev_batch.norms.tail.values import OctaveValues, octave_values
 from sobolev_batch.shapes import Sphere, Torus, icosphere
 from sobolev_batch.transform.exact import exact_transform
 from sobolev_batch.transform.fourier import ErrorTarget
@@ -36,7 +36,7 @@ def sampling_of(surface: Surface, seed: int, intervals: int = 16, draws: int = 2
 
 
 def values_of(surface: Surface, sampling: OctaveSampling, known: OctaveValues | None = None) -> OctaveValues:
-    return octave_values(surface, sampling, ORDERS, settings_for(TARGET), known=known)
+    return octave_values(surface, sampling, ORDERS, TARGET, known=known)
 
 
 def sums_of(surface: Surface, sampling: OctaveSampling) -> OctaveSums:
