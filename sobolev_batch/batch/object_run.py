@@ -20,18 +20,18 @@ from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, i
 from sobolev_batch.batch.cluster.workers import Workers
 from sobolev_batch.batch.field_stage import compute_fields, row_seconds, size_rows
 from sobolev_batch.batch.proximity_stage import have_proximities, measure_proximities
-from sobolev_batch.batch.table_stage import TABLES_VERSION, are_tabulated, tabulate_fields
+from sobolev_batch.batch.table_stage import TABLES_VERSION, Tabulated, are_tabulated, tabulate_fields
 from sobolev_batch.errors import DamageError, InputError
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
-from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.store.layout import Metadata, stored_choice
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.metadata import SCHEMA_VERSION
-from sobolev_batch.store.records import ObjectRecord, Records
+from sobolev_batch.store.records import ObjectRecord, Record, Records
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.plan import Plan, fingerprint_of
 from sobolev_batch.study.study import Members, Study, StudyObject
+from sobolev_batch.tables.all_objects import Tables, tables_in, tables_of_object
 from sobolev_batch.transform.fourier import NUMERICS_VERSION
 
 _log = logging.getLogger(__name__)
@@ -43,6 +43,8 @@ _MOST_REPAIRS = 3
 # The worker that plans an object does all its work where that is predicted to take less: a task costs the scheduler and
 # the driver some milliseconds.
 _SMALL_SECONDS = 2.0
+# A workspace that travels, with the metadata of its store.
+Sent = tuple[Workspace, Metadata]
 
 
 @dataclass(frozen=True)
@@ -52,15 +54,17 @@ class Ended:
     Attributes:
         record: What its store is known to have.
         computed, reused: Labels of the surfaces whose fields were computed now, and were stored before.
+        tables: Rows of the object in the tables of all; None where they have not changed.
     """
 
     record: ObjectRecord
     computed: tuple[str, ...] = ()
     reused: tuple[str, ...] = ()
+    tables: Tables | None = None
 
     @classmethod
-    def of(cls, workspace: Workspace, computed: set[int]) -> Ended:
-        """Return how a run ended that has computed some rows, by what its workspace holds now."""
+    def of(cls, workspace: Workspace, computed: set[int], tables: Tables | None = None) -> Ended:
+        """Return how a run ended that has computed some rows, by what its workspace holds now, and new tables."""
         labels, complete = workspace.labels, workspace.complete
         record = workspace.tally(imprecise=_imprecise(workspace))
         if record.complete == record.total and not record.not_compared:
@@ -71,6 +75,7 @@ class Ended:
             record,
             tuple(labels[i] for i in workspace.rows if i in computed and i in complete),
             tuple(labels[i] for i in workspace.rows if i not in computed and i in complete),
+            _rows_of_all(workspace, tables),
         )
 
 
@@ -105,21 +110,20 @@ def run_object(
 
     A cluster is asked for if anything is missing.
     """
-    computed: set[int] = set()
     if workspace is not None and lacks_nothing(workspace):
         # The last run may have been killed before it did.
         Records(workspace.store).collect(workspace.records)
-        return Ended.of(workspace, computed)
+        return Ended.of(workspace, set())
     cluster = equip()
     # Asked before anything is computed: a GPU that nobody has would be waited for.
     workers = cluster.workers.with_backend(study.backend)
     workers.require_accuracy(study.accuracy)
     if workspace is None:
-        workspace, computed = yield from _begin(cluster, study, location, workers)
-    if not lacks_nothing(workspace):
-        workspace, more = yield from _compute(cluster, workspace)
-        computed |= more
-    return Ended.of(workspace, computed)
+        begun = yield from _begin(cluster, study, location, workers)
+        if isinstance(begun, Ended):
+            return begun
+        workspace = begun
+    return (yield from _compute(cluster, workspace))
 
 
 def workspace_at_hand(study: Study, location: Location) -> Workspace | None:
@@ -129,31 +133,32 @@ def workspace_at_hand(study: Study, location: Location) -> Workspace | None:
     return Workspace.of_study(study, location)
 
 
-def _begin(cluster: Cluster, study: Study, location: Location, workers: Workers) -> Stages[tuple[Workspace, set[int]]]:
-    """Have a worker plan an object and do its small work; return its workspace, and the rows computed."""
+def _begin(cluster: Cluster, study: Study, location: Location, workers: Workers) -> Stages[Ended | Workspace]:
+    """Have a worker plan an object and do its small work; return how that ended, or the workspace for what is left."""
     advance = cluster.count_steps("lattice", 1)
     # Should the worker die, another one leaves the work to tasks.
     careful = Task(begin, (study, location, None), stage="plan")
     first = Task(begin, (study, location, workers.smallest), stage="object", divided=(careful,))
-    begun: Begun = yield from result_from(cluster, first)
+    begun: Begun | Sent = yield from result_from(cluster, first)
     advance("", None)
-    workspace = _received(begun.sent)
-    if begun.computed:
-        advance = cluster.count_steps("fields", len(begun.computed))
-        for i in begun.computed:
-            advance(workspace.labels[i], workspace.records[i])
-    return workspace, set(begun.computed)
+    if not isinstance(begun, Begun):
+        return _received(begun)
+    if begun.records:
+        advance = cluster.count_steps("fields", len(begun.records))
+        for label, record in begun.records:
+            advance(label, record)
+    return begun.ended
 
 
 @dataclass(frozen=True)
 class Begun:
-    """What a worker has made of an object: a workspace that travels, and the rows that it computed."""
+    """How the run of an object ended that a worker did by itself, and the record of each surface that it computed."""
 
-    sent: tuple[Workspace, Metadata]
-    computed: tuple[int, ...] = ()
+    ended: Ended
+    records: tuple[tuple[str, Record], ...]
 
 
-def begin(study: Study, location: Location, workers: Workers | None) -> Begun:
+def begin(study: Study, location: Location, workers: Workers | None) -> Begun | Sent:
     """Plan a study of one object and prepare its store; compute what is missing where that is small.
 
     Digits do not depend on what else the process computes. Without workers, of which this one has no more memory than
@@ -163,10 +168,14 @@ def begin(study: Study, location: Location, workers: Workers | None) -> Begun:
         # Workers plan many.
         compiled.use()
         workspace = Workspace.of_study(study, location)
-    computed: set[int] = set()
-    if workers is not None and not lacks_nothing(workspace) and _is_small(workspace, workers):
-        workspace, computed = in_place(_compute(Cluster(None, workers), workspace))
-    return Begun(_sent(workspace), tuple(sorted(computed)))
+    if lacks_nothing(workspace):
+        Records(workspace.store).collect(workspace.records)
+        return Begun(Ended.of(workspace, set()), ())
+    if workers is None or not _is_small(workspace, workers):
+        return _sent(workspace)
+    ended = in_place(_compute(Cluster(None, workers), workspace))
+    records = dict(zip(workspace.labels, Records(workspace.store).read(), strict=True))
+    return Begun(ended, tuple((label, one) for label in ended.computed if (one := records[label]) is not None))
 
 
 def _is_small(workspace: Workspace, workers: Workers) -> bool:
@@ -181,30 +190,27 @@ def _is_small(workspace: Workspace, workers: Workers) -> bool:
     return not refused and is_little and sum(row_seconds(plan, row) for row in rows) < _SMALL_SECONDS
 
 
-def _sent(workspace: Workspace) -> tuple[Workspace, Metadata]:
+def _sent(workspace: Workspace) -> Sent:
     """Return a workspace for another process: a store travels without its metadata, which go beside it."""
     return workspace, workspace.store.metadata
 
 
-def _received(sent: tuple[Workspace, Metadata]) -> Workspace:
+def _received(sent: Sent) -> Workspace:
     workspace, workspace.store.metadata = sent[0], sent[1]
     return workspace
 
 
-def _compute(cluster: Cluster, workspace: Workspace) -> Stages[tuple[Workspace, set[int]]]:
-    """Compute what a workspace lacks, on larger lattices until the accuracy is reached, and measure proximities.
-
-    Return the workspace on the last of them, and the rows that were computed.
-    """
+def _compute(cluster: Cluster, workspace: Workspace) -> Stages[Ended]:
+    """Compute what a workspace lacks, on larger lattices until the accuracy is reached, and measure proximities."""
     rows, study = workspace.pending, workspace.plan.study
     workspace.withdraw_results_of(rows)
     computed: set[int] = set()
     for rounds_left in reversed(range(_MOST_ROUNDS)):
-        repaired, distances = yield from _compute_repairing(cluster, workspace, rows)
+        repaired, tabulated = yield from _compute_repairing(cluster, workspace, rows)
         computed.update(rows, repaired)
-        if not rounds_left or distances is None or study.accuracy is None:
+        if not rounds_left or tabulated is None or study.accuracy is None:
             break
-        choice = workspace.plan.choice.grown(distances, study.orders, study.accuracy)
+        choice = workspace.plan.choice.grown(tabulated.distances, study.orders, study.accuracy)
         if choice is None:
             break
         arguments = workspace.store.location, workspace.plan.with_choice(choice)
@@ -212,18 +218,18 @@ def _compute(cluster: Cluster, workspace: Workspace) -> Stages[tuple[Workspace, 
         rows = workspace.pending
     yield from measure_proximities(cluster, workspace)
     Records(workspace.store).collect(workspace.records)
-    return workspace, computed
+    return Ended.of(workspace, computed, None if tabulated is None else tabulated.tables)
 
 
-def lay_out_again(location: Location, plan: Plan) -> tuple[Workspace, Metadata]:
+def lay_out_again(location: Location, plan: Plan) -> Sent:
     """Lay the store of an object out for another plan of it, on a worker."""
     return _sent(Workspace.prepared(location, plan))
 
 
 def _compute_repairing(
     cluster: Cluster, workspace: Workspace, rows: Sequence[int]
-) -> Stages[tuple[set[int], NormEstimate | None]]:
-    """Compute fields and tables, and damaged fields again; return their rows, and distances if they are new."""
+) -> Stages[tuple[set[int], Tabulated | None]]:
+    """Compute fields and tables, and damaged fields again; return their rows, and the tables if they are new."""
     repairs, repaired = 0, set[int]()
     while True:
         try:
@@ -259,6 +265,16 @@ def _damaged_rows(cluster: Cluster, workspace: Workspace) -> Stages[list[int]]:
 def lacks_nothing(workspace: Workspace) -> bool:
     """Return True where nothing of a plan is missing in its store: fields, tables and distances of other kinds."""
     return not workspace.pending and are_tabulated(workspace) and have_proximities(workspace)
+
+
+def _rows_of_all(workspace: Workspace, tables: Tables | None) -> Tables | None:
+    """Return the rows of an object in the tables of all objects; None for an only one, whose tables are at the root."""
+    study = workspace.plan.study
+    if not study.object.name:
+        return None
+    if tables is None or study.proximity is not None:
+        tables = tables_in(workspace.store)
+    return tables_of_object(study.object.name, tables, 1 / workspace.plan.similarity.scale)
 
 
 def _imprecise(workspace: Workspace) -> dict[str, float]:

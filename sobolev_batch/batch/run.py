@@ -27,6 +27,7 @@ from sobolev_batch.store.objects import Objects, labelled
 from sobolev_batch.store.records import ObjectRecord
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.study import Study, StudyLike
+from sobolev_batch.tables.all_objects import write_all
 from sobolev_batch.visible import visible
 
 _log = logging.getLogger(__name__)
@@ -191,13 +192,14 @@ def carry_out(
 
         recorded = {} if objects is None else objects.recorded()
         present = place.names() if recorded else frozenset()
+        tabulated = frozenset() if objects is None else objects.tabulated()
         ended: dict[str, Ended] = {}
 
         def runs() -> Iterator[tuple[str, Stages[Ended]]]:
             for name in study.objects:
                 one = study.of_object(name)
                 before = ended_before(one, recorded.get(name))
-                if before is not None and name in present:
+                if before is not None and name in present & tabulated:
                     ended[name] = before
                 else:
                     yield name, run_object(one, place.below(name) if name else place, partial(equipped, one), at_hand)
@@ -215,6 +217,7 @@ def carry_out(
                 objects.records.write(objects.rows[name], outcome.record)
         if objects is not None:
             objects.records.collect([ended[name].record for name in study.objects])
+            _tabulate(objects, ended, tabulated)
     return _summary(location, {name: ended[name] for name in study.objects})
 
 
@@ -233,6 +236,14 @@ def _own_cluster(
         memory_limit(memory, workers or available_cores())
     # In threads, where no other process would see the store.
     return thread_client(workers) if location.is_in_memory else local_client(workers, memory)
+
+
+def _tabulate(objects: Objects, ended: Mapping[str, Ended], present: frozenset[str]) -> None:
+    """Write the tables of all objects at the root, where rows of any have changed, came or went."""
+    changed = [one.tables for one in ended.values() if one.tables is not None]
+    kept = {name for name, one in ended.items() if one.tables is None and name in present}
+    if changed or present != kept:
+        write_all(objects.root, objects.names, changed, kept)
 
 
 def _summary(location: Location, ended: Mapping[str, Ended]) -> Summary:

@@ -35,7 +35,7 @@ def settled(study: StudyLike, store: StoreLike, *, may_run: bool) -> tuple[Study
     """
     study = as_study(study)
     location = Location.parse(_DEFAULT_FOLDER / f"{study.name}.zarr" if store is None else store)
-    return study.with_cache(MeshCache(location.absolute().parent.below(MADE_MESHES), may_run)), location
+    return study.with_cache(MeshCache(location.absolute().beside(MADE_MESHES), may_run)), location
 
 
 def ready_to_run(

@@ -9,7 +9,7 @@ import hashlib
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import Any, Literal
 
 import numpy as np
@@ -36,6 +36,7 @@ from sobolev_batch.store.records import Facts, Record
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.plan import Row
 from sobolev_batch.study.study import Study
+from sobolev_batch.tables.all_objects import Tables
 from sobolev_batch.tables.pairs import Pairs, fill_tile
 from sobolev_batch.tables.reducer import Reducer
 from sobolev_batch.tables.results import COORDINATES, SOME_COORDINATES, Results, coordinates_of
@@ -58,8 +59,16 @@ _SMALLEST_STEP = 1.2
 _MOST_OF_ONE_SIZE = 10
 
 
-def tabulate_fields(cluster: Cluster, workspace: Workspace) -> Stages[NormEstimate | None]:
-    """Write the tables, and return the distances to the reference, or None where the tables were there."""
+@dataclass(frozen=True)
+class Tabulated:
+    """What new tables hold: distances to the reference, and the tables that the root of a study repeats."""
+
+    distances: NormEstimate
+    tables: Tables
+
+
+def tabulate_fields(cluster: Cluster, workspace: Workspace) -> Stages[Tabulated | None]:
+    """Write the tables, and return what they hold, or None where the tables were there."""
     placed = table_order(workspace)
     digest = _digest(workspace, placed)
     if are_tabulated(workspace, digest):
@@ -104,9 +113,9 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> Stages[NormEstima
         yield Wave(cluster, tasks, take, projected_bytes)
     arguments = workspace, workspace.store.metadata, reducer, meshes, digest, replaced
     last = Task(write_results, arguments, projected_bytes, stage="tables")
-    distances: NormEstimate
-    distances, workspace.store.metadata = yield from result_from(cluster, last)
-    return distances
+    tabulated: Tabulated
+    tabulated, workspace.store.metadata = yield from result_from(cluster, last)
+    return tabulated
 
 
 def write_results(
@@ -116,15 +125,17 @@ def write_results(
     meshes: xr.Dataset,
     digest: str,
     replaced: Sequence[str],
-) -> tuple[NormEstimate, Metadata]:
-    """Write the tables that follow from stored spectra, on a worker; return the distances to the reference.
+) -> tuple[Tabulated, Metadata]:
+    """Write the tables that follow from stored spectra, on a worker.
 
     A store travels without its metadata, which go there and back beside it. Done again, the task writes the same.
     """
     workspace.store.metadata = metadata
     results = Results.from_spectra(reducer, meshes, workspace.plan.reference)
-    _write_tables(workspace, results, digest, replaced)
-    return NormEstimate(*results.to_reference), workspace.store.metadata
+    convergence = results.convergence_table(workspace.plan.study.accuracy).assign_attrs(digest=digest)
+    _write_tables(workspace, results, convergence, replaced)
+    tables = {"meshes": results.meshes, "convergence": convergence}
+    return Tabulated(NormEstimate(*results.to_reference), tables), workspace.store.metadata
 
 
 def _pairs(workspace: Workspace) -> Pairs | None:
@@ -144,7 +155,7 @@ def _spectrum_keys(workspace: Workspace) -> dict[int, str]:
     return spectrum_keys(_record_keys(workspace), workspace.reference)
 
 
-def _write_tables(workspace: Workspace, results: Results, digest: str, replaced: Sequence[str]) -> None:
+def _write_tables(workspace: Workspace, results: Results, convergence: xr.Dataset, replaced: Sequence[str]) -> None:
     store = workspace.store
     replaced = [*replaced, *(hide_tables(store) if _pairs(workspace) is None else ())]
     store.write(QUALITY, ..., np.array(_qualities(workspace), dtype=object))
@@ -155,7 +166,6 @@ def _write_tables(workspace: Workspace, results: Results, digest: str, replaced:
             store.location.remove(DISTANCES)
         write_table(store, DISTANCES, results.distances_table())
     # Written last: its digest says that all tables belong to the fields that are stored.
-    convergence = results.convergence_table(workspace.plan.study.accuracy).assign_attrs(digest=digest)
     write_table(store, "convergence", convergence)
     for name in set(replaced) - store.documents.keys():
         store.location.remove(name)

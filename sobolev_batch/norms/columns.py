@@ -31,6 +31,9 @@ def described(long_name: str, units: str = "", **others: str) -> dict[str, str]:
 VARIABLES: Mapping[str, Mapping[str, str]] = {
     "mesh": described("label of the mesh"),
     "other": described("label of the other mesh"),
+    "object": described("name of the object"),
+    "reference": described("label of the reference of the object"),
+    "unit_length": described("unit of length in which the object was computed, in that of the files"),
     "order": described("Sobolev order s", NUMBER),
     "time": described("time of the mesh", description="in the unit of the study's times"),
     "fourier": described("Fourier transform of the area measure", convention="∫ exp(-2πi ξ·x) dμ(x)"),

@@ -247,11 +247,11 @@ def _spectra_keys(plan: Plan, mesh: NDArray[Any]) -> dict[str, bytes]:
     return keys
 
 
-def record_keys(rows: int) -> dict[str, bytes]:
+def record_keys(rows: int, dimension: str = "mesh") -> dict[str, bytes]:
     """Return the keys of the arrays of records: a chunk for each row, which tasks write, and pages of many rows."""
     keys = {
-        **array_keys(RECORD, str, (rows,), (1,), ("mesh",)),
-        **array_keys(PAGE, str, (rows,), (ROWS_PER_PAGE,), ("mesh",)),
+        **array_keys(RECORD, str, (rows,), (1,), (dimension,)),
+        **array_keys(PAGE, str, (rows,), (ROWS_PER_PAGE,), (dimension,)),
     }
     return {key: text for key, text in keys.items() if key != f"{RECORDS}/{ROOT}"}
 

@@ -50,6 +50,8 @@ SPECTRA_KEYS, PAIRS_KEYS = f"{SPECTRA_GROUP}/key", f"{DISTANCES}/key"
 # The root has these attributes: the digest of tables and metadata; true while the store is being created; and the
 # labels of meshes that the study has lost. In the attribute "study" are the names of its objects, where it names any.
 DIGEST, UNFINISHED, OBJECTS, REMOVED = "digest", "unfinished", "objects", "removed"
+# Tables whose rows the root of several objects repeats.
+TABLES_OF_ALL = ("meshes", "convergence", "proximity")
 # Arrays of tables above this size in memory, such as distances of all pairs of many meshes, have several chunks.
 _LARGEST_CHUNK_BYTES = 64 << 20
 # These arrays have chunks for rows, which need not be computed.
@@ -125,8 +127,11 @@ class Store:
             self.documents[""] = root
         return True
 
-    def attributes(self, *, of_objects: bool = False) -> dict[str, Any]:
-        """Return the attributes of the root: title, study, similarity, versions; or those of a root of objects."""
+    def attributes(self, *, of_objects: bool | None = False) -> dict[str, Any]:
+        """Return the attributes of the root: title, study, similarity, versions; or those of a root of objects.
+
+        StoreError where it is the other one of the two, unless None allows both.
+        """
         if not self.exists() or self.documents[""].get("node_type") != "group":
             raise StoreError(f"{self.path}: it holds no store of a study")
         attributes: dict[str, Any] = self.documents[""].get("attributes", {})
@@ -145,7 +150,7 @@ class Store:
         has_objects = OBJECTS in attributes["study"]
         if of_objects and not has_objects:
             raise StoreError(f"{self.path}: the store of one object, and the study names several; name another store")
-        if has_objects and not of_objects:
+        if has_objects and of_objects is False:
             first = next(iter(attributes["study"][OBJECTS]), "NAME")
             raise StoreError(
                 f"{self.path}: the store of several objects; name that of one, such as {self.path}/{first}"

@@ -102,12 +102,12 @@ class Location:
         """Return the location of a name below this one."""
         return replace(self, name=f"{self.name}/{name}" if self.scheme else str(Path(self.name) / name))
 
-    @property
-    def parent(self) -> Location:
-        """The location of the folder of this one."""
-        return replace(
-            self, name=self.name.rpartition("/")[0] if self.scheme else str(Path(self.name).absolute().parent)
-        )
+    def beside(self, name: str) -> Location:
+        """Return the location of a name in the folder of this one; the empty name is the folder itself."""
+        if not self.scheme:
+            return replace(self, name=str(Path(self.name).absolute().parent / name))
+        folder = self.name.rpartition("/")[0]
+        return replace(self, name=f"{folder}/{name}" if name or folder.endswith("/") else folder)
 
     def zarr_store(self, largest_bytes: int = 0) -> FolderStore | RemoteStore:
         """Return the store that zarr and xarray take to read and write here."""

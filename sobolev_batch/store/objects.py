@@ -13,7 +13,7 @@ from typing import Any, Self, TypeVar
 
 from sobolev_batch.errors import DamageError, InputError, StoreError
 from sobolev_batch.store.create import list_records, record_keys
-from sobolev_batch.store.layout import OBJECTS, PAGE, RECORD, RECORDS, ROOT, Store
+from sobolev_batch.store.layout import OBJECTS, PAGE, RECORD, RECORDS, ROOT, TABLES_OF_ALL, Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import LOCK_KEYS
 from sobolev_batch.store.metadata import SCHEMA_VERSION
@@ -56,6 +56,11 @@ class Objects:
     def recorded(self) -> dict[str, ObjectRecord]:
         """Return the records of the objects that have one, by name."""
         return {name: one for name, one in zip(self.names, self.records.read(), strict=True) if one is not None}
+
+    def tabulated(self) -> frozenset[str]:
+        """Return the names of the objects that have rows in the tables at the root."""
+        rows = self.root.read_strings("meshes/object") if "meshes" in self.root.documents else ()
+        return frozenset(rows)
 
     @property
     def existing_stores(self) -> dict[str, Location]:
@@ -104,7 +109,7 @@ class Objects:
             present = cls.read(location)
         if present is None:
             # Where it is damaged, the stores of the objects are still there.
-            location.require_free({ROOT, RECORDS, *LOCK_KEYS, *study.objects})
+            location.require_free({ROOT, RECORDS, *LOCK_KEYS, *TABLES_OF_ALL, *study.objects})
         elif present.name != study.name:
             raise StoreError(
                 f"{location}: it holds the store of another study, {present.name!r}, not {study.name!r}; "
@@ -126,7 +131,7 @@ class Objects:
             for name in (RECORD, PAGE):
                 root.location.remove(name)
             list_records(root)
-            root.publish(record_keys(len(made.names)))
+            root.publish(record_keys(len(made.names), "object"))
             for name, record in kept.items():
                 if name in made.rows:
                     made.records.write(made.rows[name], record)
@@ -144,9 +149,10 @@ def root_of(location: Location) -> Location:
     """Return the root of the store that a location lies in, where the lock is: an object's lies above its own."""
     name = location.name.rpartition("/")[2]
     with suppress(StoreError):
-        above = Objects.read(location.parent)
-        if above is not None and name in above.rows:
-            return location.parent
+        above = location.beside("")
+        objects = Objects.read(above)
+        if objects is not None and name in objects.rows:
+            return above
     return location
 
 

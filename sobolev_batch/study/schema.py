@@ -77,6 +77,8 @@ _WORDS = {
 REFERENCE_LABEL = "reference"
 # Characters of globs and templates, which the names of objects and methods cannot have.
 RESERVED = "*?[]{}/\\"
+# Groups that lie beside those of objects.
+_GROUPS = ("records", "meshes", "convergence", "proximity")
 
 
 def _line_of_text(longest: int, forbidden: str = "") -> AfterValidator:
@@ -95,6 +97,8 @@ def _line_of_text(longest: int, forbidden: str = "") -> AfterValidator:
 
 
 def _object_name(name: str) -> str:
+    if name.lower() in _GROUPS:
+        raise ValueError(f"a group of the store is named {name.lower()}; name the object {name}_1, for example")
     if set(RESERVED) & set(name) or name.startswith((".", "__")) or name.endswith(".json"):
         raise ValueError(
             f"the name of an object is that of a folder in the store: it holds none of {' '.join(RESERVED)}, does not "

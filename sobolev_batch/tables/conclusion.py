@@ -12,6 +12,7 @@ import xarray as xr
 
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.convergence import nearest, smallest_of, table
+from sobolev_batch.tables.open import require_one_object
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.text import count, minus, percent, spread
 
@@ -179,6 +180,7 @@ def format_verdict(
     frame: pd.DataFrame | None = None,
 ) -> str:
     """Return the verdict on the study of an open store as text, or its rows for programs; its `table` may be given."""
+    require_one_object(tree)
     frame = table(tree, orders) if frame is None else frame
     reasons = frame[frame["status"] != "complete"].drop_duplicates("mesh").set_index("mesh")["reason"]
     _, rows, omitted = study_verdict(frame, reasons.to_dict())

@@ -23,10 +23,13 @@ from sobolev_batch.tables.open import (
     AnyStore,
     as_tree,
     finished_group,
+    has_objects,
     has_proximity,
     is_sequence,
     metadata_of,
     placement_doubts,
+    reference_of,
+    require_one_object,
     sizes_of,
     stores_of,
     study_unit,
@@ -54,6 +57,8 @@ _NUMBERS = (
 )
 # Of meshes that a program or function made.
 _MADE = tuple(item.name for item in fields(Cost))
+# What the rows of all objects have besides.
+_OF_ALL = ("object", "reference", "unit_length")
 # Integers, or missing where a mesh failed.
 _COUNTS = ("triangles", "vertices")
 _NOTE = """\
@@ -120,8 +125,8 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
     """Return the convergence table of a store in long form: one row for each mesh and order.
 
     Args:
-        store: Path, URL or opened DataTree of the store. From the store of a collection, the rows of all objects that
-            have tables follow each other, and the first column, object, names theirs.
+        store: Path, URL or opened DataTree of the store. The rows of several objects follow each other, and the first
+            column, object, names theirs.
         order: One order s < -1/2, or several; default all of the store. Others than those are computed from the stored
             fields, which takes about as long as reading them.
         x: Size of a mesh, a column of the table, in which rates are observed: "edge_length", "triangles", "vertices"
@@ -162,18 +167,56 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
     >>> frame.set_index("mesh")["rate"].round(1).to_dict()
     {'icosphere/0': nan, 'icosphere/1': 2.0, 'icosphere/2': 2.0, 'icosphere/3': 2.0}
     """
-    stores = stores_of(store)
-    if "" not in stores:
-        return _joined(tables_of(stores, order, x=x))
-    tree = as_tree(store)
-    convergence, meshes = convergence_at(tree, order), finished_group(tree, "meshes")
+    return _joined(tables_of(store, order, x=x))
+
+
+def tables_of(
+    store: AnyStore | Mapping[str, AnyStore], order: Orders | None = None, *, x: str = EDGE_LENGTH
+) -> dict[str, pd.DataFrame]:
+    """Return the rows of `table` of each object that has any, by its name, "" for an only one; InputError if none has.
+
+    The root of a store has the rows of all its objects at the orders of the study; others are computed from the stores
+    of the objects.
+    """
+    if not isinstance(store, Mapping) or isinstance(store, xr.DataTree):
+        tree = as_tree(store)
+        if not has_objects(tree):
+            return {"": _table(tree, order, x)}
+        stored = finished_group(tree, "convergence", load=False)["order"].values if _has_rows(tree) else np.empty(0)
+        if stored.size and (order is None or np.isin(order, stored).all()):
+            return _divided(_rows(tree, order), x)
+    trees = {name: as_tree(place) for name, place in stores_of(store).items()}
+    finished = {name: tree for name, tree in trees.items() if _has_rows(tree)}
+    if not finished:
+        raise InputError("there are no tables yet: run the study to its end")
+    return {name: _table(tree, order, x) for name, tree in finished.items()}
+
+
+def _has_rows(tree: xr.DataTree) -> bool:
+    return "convergence" in tree.children
+
+
+def _table(tree: xr.DataTree, order: Orders | None, x: str) -> pd.DataFrame:
+    """Return the rows of one object, see `table`."""
+    frame = _rows(tree, order)
+    frame.attrs["reference"] = reference_of(tree)
+    frame.attrs["unit_length"] = unit_of(tree)[1]
+    return frame if x == EDGE_LENGTH else _with_rates(frame, x)
+
+
+def _rows(tree: xr.DataTree, order: Orders | None) -> pd.DataFrame:
+    """Return the rows of all meshes but references, of an object or, with its name and unit, of all objects."""
+    meshes, of_all = finished_group(tree, "meshes"), has_objects(tree)
+    convergence = convergence_at(tree, order)
     labels = convergence["mesh"].values
-    others = labels != convergence.attrs["reference"]
+    others = labels != (convergence["reference"].values if of_all else reference_of(tree))
     about = [key for key in (*_ABOUT, *_MADE, *metadata_of(tree)) if key in meshes]
     columns = {"mesh": labels[others], **{key: meshes[key].values[others] for key in about}}
+    if of_all:
+        columns = {**{key: meshes[key].values[others] for key in _OF_ALL}, **columns}
     nearness = {}
     if has_proximity(tree):
-        proximity = finished_group(tree, "proximity").sel(mesh=labels[others])
+        proximity = finished_group(tree, "proximity").reindex(mesh=labels[others])
         asked = [f"{name}{way}" for name in _metrics_of(tree) for way in ("", "_forward", "_backward")]
         nearness = {name: proximity[name].values for name in asked if name in proximity}
         if "hausdorff" in nearness:
@@ -181,7 +224,8 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
             nearness.setdefault("hausdorff_upper", np.full(others.sum(), np.nan))
         nearness |= {name: meshes[name].values[others] for name in asked if name in OF_ONE_MESH}
         if "volume" in nearness:
-            nearness["volume"] = nearness["volume"] * unit_of(tree)[1] ** 3
+            unit_length = meshes["unit_length"].values[others] if of_all else unit_of(tree)[1]
+            nearness["volume"] = nearness["volume"] * unit_length**3
     frames = []
     for s in dict.fromkeys(convergence["order"].values.tolist()):
         row = parts_as_variables(convergence.sel(order=s))
@@ -189,28 +233,34 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
         numbers = {key: row[key].values[others] for key in _NUMBERS if key in row}
         frames.append(pd.DataFrame({"order": s, **columns, **numbers, **nearness}))
     frame = pd.concat(frames, ignore_index=True).astype(dict.fromkeys(_COUNTS, "Int64"))
-    kept = ("reference", "rtol", "computed")
-    frame.attrs = {key: convergence.attrs[key] for key in kept if key in convergence.attrs}
-    frame.attrs["unit_length"] = unit_of(tree)[1]
+    frame.attrs = {key: convergence.attrs[key] for key in ("rtol", "computed") if key in convergence.attrs}
     if known := metadata_of(tree):
         frame.attrs["metadata"] = known
-    return frame if x == EDGE_LENGTH else _with_rates(frame, x)
+    return frame
+
+
+def _divided(rows: pd.DataFrame, x: str) -> dict[str, pd.DataFrame]:
+    """Return the rows of each object by its name, without what others alone have."""
+    frames = {}
+    for name, of_object in rows.groupby("object", sort=False):
+        begin = len(f"{name}/")
+        frame = of_object.drop(columns=list(_OF_ALL)).reset_index(drop=True)
+        frame["mesh"] = frame["mesh"].str[begin:].astype(rows["mesh"].dtype)
+        reference, unit_length = (of_object[key].iloc[0] for key in ("reference", "unit_length"))
+        own = [key for key in rows.attrs.get("metadata", ()) if not frame[key].isin(["", np.nan]).all()]
+        frame = frame.drop(columns=[key for key in rows.attrs.get("metadata", ()) if key not in own])
+        frame.attrs = {**rows.attrs, "reference": reference[begin:], "unit_length": float(unit_length)}
+        if "metadata" in frame.attrs:
+            frame.attrs["metadata"] = own
+        frames[str(name)] = frame if x == EDGE_LENGTH else _with_rates(frame, x)
+    return frames
 
 
 def _joined(frames: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-    """Return the rows of several objects after each other, named in the first column."""
+    """Return the rows of several objects after each other, named in the first column; those of an only one alone."""
+    if "" in frames:
+        return frames[""]
     return pd.concat(frames, names=["object", "row"]).reset_index(level="object").reset_index(drop=True)
-
-
-def tables_of(
-    stores: Mapping[str, AnyStore], order: Orders | None = None, *, x: str = EDGE_LENGTH
-) -> dict[str, pd.DataFrame]:
-    """Return the rows of `table` of each object that has any, by its name; InputError if none has."""
-    trees = {name: as_tree(place) for name, place in stores.items()}
-    finished = {name: tree for name, tree in trees.items() if "convergence" in tree.children}
-    if not finished:
-        raise InputError("there are no tables yet: run the study to its end")
-    return {name: table(tree, order, x=x) for name, tree in finished.items()}
 
 
 def format_table(
@@ -225,11 +275,12 @@ def format_table(
 
     What `tables_of` returns for them may be given.
     """
-    trees = {name: as_tree(place) for name, place in stores_of(store).items()}
-    frames = tables_of(trees, orders, x=x) if frames is None else frames
-    rows = frames[""] if "" in frames else _joined(frames)
+    frames = tables_of(store, orders, x=x) if frames is None else frames
+    stores = stores_of(store)
+    trees = {name: as_tree(stores[name]) for name in frames}
+    rows = _joined(frames)
     sections = (part for name, frame in frames.items() for part in _sections(name, trees[name], frame, x))
-    return rendered(style, rows, sections, _notes([trees[name] for name in frames], list(frames.values()), x))
+    return rendered(style, rows, sections, _notes([*trees.values()], list(frames.values()), x))
 
 
 def _sections(name: str, tree: xr.DataTree, frame: pd.DataFrame, x: str) -> Iterator[Section]:
@@ -363,7 +414,9 @@ def smallest_below(store: AnyStore, relative: float | str, order: Orders | None 
     [['icosphere', 'icosphere/2', 320]]
     """
     most = fraction(relative)
-    frame = table(as_tree(store), order)
+    tree = as_tree(store)
+    require_one_object(tree)
+    frame = table(tree, order)
     if not (frame["triangles"] > 0).any():
         raise InputError("the smallest mesh has the fewest triangles, and no surface of the store is known to have any")
     smallest = smallest_of(frame, most)

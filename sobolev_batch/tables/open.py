@@ -22,7 +22,10 @@ from sobolev_batch.norms.fields import Quality
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.store.layout import (
     DIGEST,
+    FIELD,
+    OBJECTS,
     OCTAVES_GROUP,
+    RECORD,
     RECORDS,
     SPECTRA_GROUP,
     JoinedStore,
@@ -70,8 +73,9 @@ def open_store(store: str | Path | Location | Sequence[str | Path | Location]) -
 
     Groups: fourier (the fields), spectra, meshes, norms, distances, convergence, records; where the study requests it
     also octaves and proximity. docs/store.md lists their variables with dimensions and units. All stay on disk until
-    you ask for values of them. Fields and spectra are Dask arrays, unless the store is in memory; fields have the
-    accessor `field.sobolev`.
+    you ask for values of them. The root of several objects has meshes, convergence and proximity of all of them, with
+    the coordinate `object`. Fields and spectra are Dask arrays, unless the store is in memory; fields
+    have the accessor `field.sobolev`.
 
     Several stores open as one, without copies of their fields. They need the same lattice, similarity and reference.
     Their meshes follow each other, with the name of their `study` as a coordinate, which begins labels and families if
@@ -96,9 +100,11 @@ def open_store(store: str | Path | Location | Sequence[str | Path | Location]) -
         return _joined([open_store(place) for place in store])
     # Else values that are read once the process has gone to another folder would be missing ones.
     location = Location.parse(store).absolute()
-    opened = Store.open(location)
+    opened = Store(location)
+    has_objects = OBJECTS in opened.attributes(of_objects=None)["study"]
     # Left to itself, xarray looks for older formats, which nobody has checked, and lists keys again.
-    keys: Any = opened.checked_keys(has_tables=table_attributes(opened, "convergence") is not None)
+    has_tables = table_attributes(opened, "convergence") is not None
+    keys: Any = opened.checked_keys(RECORD if has_objects else FIELD, has_tables=has_tables)
     with opened.location.access("read"):
         try:
             tree = xr.open_datatree(keys, engine="zarr", consolidated=True, zarr_format=3)
@@ -224,9 +230,9 @@ def stores_of(store: AnyStore | Mapping[str, AnyStore]) -> Mapping[str, AnyStore
     """Return the stores of objects by name, which they may be already; "" names an only object."""
     if isinstance(store, Mapping) and not isinstance(store, xr.DataTree):
         return store
-    if isinstance(store, xr.DataTree):
+    if isinstance(store, xr.DataTree) and not has_objects(store):
         return {"": store}
-    return {**stores_below(Location.parse(store))}
+    return {**stores_below(Location.parse(location_of(store)))}
 
 
 def source_of(tree: xr.DataTree) -> str | None:
@@ -288,11 +294,24 @@ def fields_read(store: AnyStore) -> Iterator[None]:
 
 
 def finished_group(tree: xr.DataTree, name: str, *, load: bool = True) -> xr.Dataset:
-    """Return a table of an open store, in memory unless it may stay on disk; InputError if it has no tables yet."""
+    """Return a table of an open store, in memory unless it may stay on disk; InputError if it has no such tables."""
     if name not in tree.children:
+        require_one_object(tree)
         raise InputError("the store has no tables yet: run the study to its end")
     dataset = tree[name].to_dataset()
     return dataset.load() if load else dataset
+
+
+def has_objects(tree: xr.DataTree) -> bool:
+    """Return True for the root of several objects."""
+    return OBJECTS in tree.attrs.get("study", {})
+
+
+def require_one_object(tree: xr.DataTree) -> None:
+    """Refuse the root of several objects, by an InputError that names the store of one."""
+    if has_objects(tree):
+        one = f"{source_of(tree)}/{next(iter(tree.attrs['study'][OBJECTS]), 'NAME')}"
+        raise InputError(f"{source_of(tree)}: the store of several objects; name that of one, such as {one}")
 
 
 def has_proximity(tree: xr.DataTree) -> bool:
@@ -301,7 +320,8 @@ def has_proximity(tree: xr.DataTree) -> bool:
 
 
 def reference_of(tree: xr.DataTree) -> str:
-    """Return the label of the study's reference."""
+    """Return the label of the reference of an object's study."""
+    require_one_object(tree)
     return str(finished_group(tree, "convergence", load=False).attrs["reference"])
 
 

@@ -267,10 +267,11 @@ def league(
     """
     if by not in ("size", "cost"):
         raise InputError(f'methods are compared by "size" or "cost", found {by!r}')
+    stores: AnyStores = store
     if isinstance(store, Mapping):
-        stores, objects = store, tuple(store)
+        objects = tuple(store)
     elif (found := Objects.read(Location.parse(store))) is not None:
-        stores, objects = found.existing_stores, found.names
+        objects = found.names
     elif by == "cost":
         tree = as_tree(store)
         objects = (str(tree.attrs["study"]["name"]),)

@@ -199,7 +199,7 @@ def _meshes_table(meshes: xr.Dataset, families: Sequence[str]) -> PageTable:
 
 def league_content(objects: Objects, status: Status) -> dict[str, Any]:
     """Return what the template of a league takes, nothing escaped; InputError where no object has tables yet."""
-    tables = tables_of(objects.existing_stores)
+    tables = tables_of(objects.location)
     try:
         leagues, no_league = leagues_of(tables, objects.names), ""
     except InputError as error:

@@ -1,0 +1,103 @@
+"""The tables of all objects of a study after each other, as the root of its store has them.
+
+Thousands of objects are queried there without opening thousands of groups. Labels begin with the name of the object.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from sobolev_batch.norms.columns import describe
+from sobolev_batch.store.layout import RECORD, TABLES_OF_ALL, Store, hide_tables, table_names, write_table
+
+# A table for each of these groups that an object has.
+Tables = Mapping[str, xr.Dataset]
+
+
+def tables_in(store: Store) -> dict[str, xr.Dataset]:
+    """Return the tables of a store, of an object or of all, in memory; none before they were made."""
+    keys: Any = store.checked_keys(RECORD, has_tables=True)
+    names = [name for name in TABLES_OF_ALL if name in store.documents and "convergence" in store.documents]
+    return {
+        name: xr.open_dataset(keys, group=name, engine="zarr", consolidated=True, zarr_format=3).load()
+        for name in names
+    }
+
+
+def tables_of_object(name: str, tables: Tables, unit_length: float) -> dict[str, xr.Dataset]:
+    """Return the tables of an object as rows of all, with its name and its reference, and its unit as a coordinate.
+
+    That is the study's unit in terms of the unit of length of the files: another for each object.
+    """
+    if not tables:
+        return {}
+    reference = f"{name}/{tables['convergence'].attrs['reference']}"
+    found = {}
+    for group, table in tables.items():
+        count = table.sizes["mesh"]
+        columns = {
+            "mesh": np.array([f"{name}/{label}" for label in table["mesh"].values], dtype=object),
+            "object": np.full(count, name, dtype=object),
+            "reference": np.full(count, reference, dtype=object),
+            "unit_length": np.full(count, unit_length),
+        }
+        attributes = {key: value for key, value in table.attrs.items() if key not in ("reference", "digest")}
+        named = table.assign_coords({key: ("mesh", values) for key, values in columns.items()})
+        found[group] = named.assign_attrs(attributes)
+        found[group].attrs = attributes
+    return found
+
+
+def write_all(root: Store, names: Sequence[str], changed: Iterable[Tables], kept: Collection[str]) -> None:
+    """Write the tables of all objects in the order of their names: those that changed, and those kept of before."""
+    before = {group: table.sel(mesh=table["object"].isin(list(kept))) for group, table in tables_in(root).items()}
+    parts = [before, *changed]
+    rank = {name: place for place, name in enumerate(names)}
+    tables = {}
+    for group in TABLES_OF_ALL:
+        of_group = [part[group] for part in parts if group in part and part[group].sizes["mesh"]]
+        if of_group:
+            table = _concatenated(of_group)
+            order = np.argsort([rank[name] for name in table["object"].values.tolist()], kind="stable")
+            tables[group] = table.isel(mesh=order)
+    replaced = hide_tables(root) if table_names(root) else []
+    for group, table in tables.items():
+        write_table(root, group, table)
+    for name in set(replaced) - root.documents.keys():
+        root.location.remove(name)
+    root.consolidate()
+
+
+def _concatenated(tables: Sequence[xr.Dataset]) -> xr.Dataset:
+    """Return tables after each other, with NaN or empty texts where only others have a column.
+
+    xarray's own function takes milliseconds for each column of each table.
+    """
+    known = {name: variable for table in reversed(tables) for name, variable in table.variables.items()}
+    columns: dict[Any, tuple[tuple[Any, ...], NDArray[Any]]] = {}
+    for name, model in known.items():
+        if "mesh" in model.dims:
+            found = [
+                table.variables[name].values if name in table.variables else _missing(model, table.sizes["mesh"])
+                for table in tables
+            ]
+            columns[name] = model.dims, np.concatenate(found)
+        else:
+            columns[name] = model.dims, model.values
+    coordinates = {name for table in tables for name in table.coords}
+    attributes = dict(tables[0].attrs)
+    if "metadata" in attributes:
+        attributes["metadata"] = list(dict.fromkeys(name for table in tables for name in table.attrs["metadata"]))
+    return describe(xr.Dataset(columns, attrs=attributes).set_coords(list(coordinates)))
+
+
+def _missing(model: xr.Variable, count: int) -> NDArray[Any]:
+    shape = (count, *model.shape[1:])
+    if model.dtype.kind in "OTU":
+        return np.full(shape, "", dtype=object)
+    return np.full(shape, np.datetime64("NaT") if model.dtype.kind == "M" else np.nan)
