@@ -14,8 +14,8 @@ from .extras import plot as plot
 from .extras.draft import init_study as init_study
 from .extras.figures.remade import write_witness as write_witness
 from .extras.fitting.fit import fit as fit
+from .extras.leagues.changes import compare_studies as compare_studies
 from .extras.leagues.evolution import evolution as evolution
-from .extras.leagues.league import compare_studies as compare_studies
 from .extras.leagues.league import league as league
 from .extras.report.build import report as report
 from .geometry.deviation import largest_deviation as largest_deviation

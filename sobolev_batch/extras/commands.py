@@ -434,8 +434,9 @@ def league_command(
     With --by cost, STORE may also be that of one object. With --against, compare each method with itself in an earlier
     study instead.
     """
+    from sobolev_batch.extras.leagues.changes import compare_studies, format_changes
     from sobolev_batch.extras.leagues.costs import format_cost_leagues
-    from sobolev_batch.extras.leagues.league import compare_studies, format_changes, format_league, league
+    from sobolev_batch.extras.leagues.league import format_league, league
 
     if against is not None:
         text = format_changes(compare_studies(table.store, against, table.orders), table.style)

@@ -1,4 +1,4 @@
-"""A league: the methods of a collection, ranked over all objects; a study against an earlier one; both as text."""
+"""A league: the methods of a study, ranked over all objects, and as text."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from typing import Literal, overload
 
 import numpy as np
 import pandas as pd
-import xarray as xr
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError, StoreError
@@ -32,8 +31,8 @@ from sobolev_batch.store.location import Location
 from sobolev_batch.store.objects import Objects
 from sobolev_batch.study.comparable import SIGNIFICANCE, gap_of, least_objects
 from sobolev_batch.tables import Format
-from sobolev_batch.tables.convergence import table, tables_of
-from sobolev_batch.tables.open import EDGE_LENGTH, AnyStore, as_tree, finished_group, reference_of, stores_of
+from sobolev_batch.tables.convergence import tables_of
+from sobolev_batch.tables.open import EDGE_LENGTH, AnyStore, as_tree
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.text import wrapped
 from sobolev_batch.transform.lattice import Orders
@@ -44,18 +43,11 @@ leave out what the objects themselves differ by, and hold the errors of the dist
 such as 1-3 says which places the intervals allow. Rates are orders of convergence in the edge
 length. Two methods differ where the permutation test of pairs says so, at the level of 5 %
 for all pairs together."""
-_CHANGES_NOTE = """\
-A ratio below 1 says that the new study is nearer to the references. It is the geometric mean
-over the {units}, with its 95 % interval. The verdict is that of the permutation test of pairs, at
-the level of 5 % for all methods together."""
 
-
-# The store of a collection, or stores of single objects by their names.
+# The store of several objects, or stores of single objects by their names.
 AnyStores = str | Path | Location | Mapping[str, AnyStore]
 # Columns of the ends of an interval.
-_ENDS = ("low", "high")
-# Of the rows that two studies have in common.
-_KEYS = ["order", "mesh"]
+ENDS = ("low", "high")
 
 
 def number_text(value: float, unit: str = "") -> str:
@@ -68,7 +60,7 @@ def percent_text(value: float) -> str:
     return number_text(100 * value, " %")
 
 
-def _interval(shown: Callable[[float], str]) -> Callable[[float, float], str]:
+def interval_text(shown: Callable[[float], str]) -> Callable[[float, float], str]:
     """Return the format of intervals, with ? for an end that nothing bounds."""
     return lambda low, high: f"{shown(low)} to {shown(high)}"
 
@@ -77,27 +69,18 @@ LEAGUE_COLUMNS = (
     Column("method", "method", kind="label"),
     Column("rank", "rank", lambda first, last: f"{first}" if first == last else f"{first}-{last}", "last_rank"),
     Column("relative", "relative", percent_text),
-    Column("low", "95 % interval", _interval(percent_text), "high"),
+    Column("low", "95 % interval", interval_text(percent_text), "high"),
     Column("rate", "rate", number_text),
-    Column("rate_low", "95 % interval", _interval(number_text), "rate_high"),
+    Column("rate_low", "95 % interval", interval_text(number_text), "rate_high"),
     Column("objects", "objects"),
 )
 PAIR_COLUMNS = (
     Column("method", "method", kind="label"),
     Column("other", "other", kind="text"),
     Column("ratio", "ratio", number_text),
-    Column("low", "95 % interval", _interval(number_text), "high"),
+    Column("low", "95 % interval", interval_text(number_text), "high"),
     Column("p", "p", "{:.2g}".format),
     Column("nearer", "nearer", kind="text"),
-)
-_CHANGE_COLUMNS = (
-    Column("method", "method"),
-    Column("verdict", "verdict"),
-    Column("ratio", "new/old", number_text),
-    Column("low", "95 % interval", _interval(number_text), "high"),
-    Column("p", "p", "{:.2g}".format),
-    Column("meshes", "meshes"),
-    Column("worst_ratio", "largest new/old", lambda ratio, mesh: f"{number_text(ratio)}, {mesh}", "worst"),
 )
 
 
@@ -166,7 +149,7 @@ class League(ShownTables):
         spreads = within_objects(self.values) if count > 1 else np.full(len(self.methods), np.nan)
         slopes = [of_method[np.isfinite(of_method[:, 0])] for of_method in self.slopes.swapaxes(0, 1)]
         frame = pd.DataFrame({"method": self.methods, "objects": count})
-        frame[["relative", *_ENDS]] = np.exp(list(map(interval, self.values.T, self.errors.T, spreads)))
+        frame[["relative", *ENDS]] = np.exp(list(map(interval, self.values.T, self.errors.T, spreads)))
         frame[["rate", "rate_low", "rate_high"]] = [interval(*known.T) for known in slopes]
         frame = frame.sort_values("relative", kind="stable", ignore_index=True)
         low, high = frame["low"].to_numpy(), frame["high"].to_numpy()
@@ -189,7 +172,7 @@ class League(ShownTables):
             errors = self.errors[:, i] + self.errors[:, j]
             ratio = np.exp(interval(differences, errors))
             rows.append([self.methods[i], self.methods[j], *ratio, sign_flip_test(differences, errors)])
-        frame = pd.DataFrame(rows, columns=["method", "other", "ratio", *_ENDS, "p"])
+        frame = pd.DataFrame(rows, columns=["method", "other", "ratio", *ENDS, "p"])
         frame["p"] = adjusted(frame["p"].to_numpy(dtype=np.float64))
         nearer = np.where(frame["ratio"] < 1, frame["method"], frame["other"])
         frame["nearer"] = np.where(frame["p"] < SIGNIFICANCE, nearer, "")
@@ -347,100 +330,6 @@ def _curves(frame: pd.DataFrame, x: str, methods: Sequence[str]) -> dict[str, Cu
     return {method: curve for method, curve in curves.items() if curve is not None}
 
 
-def compare_studies(new: AnyStores | AnyStore, old: AnyStores | AnyStore, order: Orders | None = None) -> pd.DataFrame:
-    """Compare the distances of two studies of the same objects, such as those of two releases of a remesher.
-
-    Meshes of the same label are compared, by the ratio of their distances to the same reference. Relative distances
-    below 1e-5 count as 1e-5, since they tell of rounding.
-
-    Args:
-        new: Store of the new study: of a collection, or of one object; or stores of single objects by their names.
-        old: Store of the old study, likewise.
-        order: One of the stores' orders, or several; default all that both have.
-
-    Returns:
-        A row for each order and method (family): order, method; objects and meshes, their numbers; ratio, the geometric
-        mean of the ratios of new to old distances, with the ends low and high of its interval over the objects, or over
-        the meshes of a single object; p, the p-value of the paired permutation test, adjusted for the number of methods
-        (Holm); verdict, "nearer" or "farther" by this test at the level of 5 %, else "undecided"; worst, the mesh whose
-        distance grew most, and worst_ratio, by how much.
-
-    Raises:
-        InputError: The studies have no mesh in common, or an object has another reference or unit of length.
-        StoreError: A location has no store.
-
-    >>> import sobolev_batch as sb
-    >>> same = sb.compare_studies("storage/icosphere.zarr", "storage/icosphere.zarr", -10)
-    >>> same[["method", "meshes", "ratio", "verdict"]].to_dict("records")
-    [{'method': 'icosphere', 'meshes': 4, 'ratio': 1.0, 'verdict': 'undecided'}]
-    """
-    news, olds = stores_of(new), stores_of(old)
-    common = [name for name in news if name in olds]
-    if not common:
-        raise InputError(
-            f"the studies have no object in common: the new one has {', '.join(news)}, the old one {', '.join(olds)}"
-        )
-    frames = [_joined(name, news[name], olds[name], order) for name in common]
-    joined = pd.concat(frames, ignore_index=True)
-    if joined.empty:
-        raise InputError("the studies have no mesh in common that both have computed at the same order")
-    rows = [
-        {"order": s, "method": method, **_change(meshes)}
-        for (s, method), meshes in joined.groupby(["order", "family"], sort=False)
-    ]
-    result = pd.DataFrame(rows)
-    for _, of_order in result.groupby("order", sort=False):
-        result.loc[of_order.index, "p"] = adjusted(of_order["p"].to_numpy())
-    words = np.where(result["ratio"] < 1, "nearer", "farther")
-    result.insert(8, "verdict", np.where(result["p"] < SIGNIFICANCE, words, "undecided"))
-    return result
-
-
-def _joined(name: str, new: AnyStore, old: AnyStore, order: Orders | None) -> pd.DataFrame:
-    """Return the meshes that two stores of an object have in common, with the logarithms of their ratios."""
-    trees = as_tree(new), as_tree(old)
-    if trees[0].attrs["similarity"] != trees[1].attrs["similarity"] or len({_identity(tree) for tree in trees}) > 1:
-        raise InputError(
-            f"{name or 'the studies'}: they have different references or units of length, so their distances cannot be "
-            "compared; give both the same [reference] and [scaling]"
-        )
-    first, second = (_distances(table(tree, order)) for tree in trees)
-    both = first.merge(second, on=_KEYS, suffixes=("", "_old"))
-    ratios = np.log(both["relative"] / both["relative_old"])
-    errors = both["share"] + both["share_old"]
-    return both.assign(object=name, log_ratio=ratios, log_error=errors)
-
-
-def _identity(tree: xr.DataTree) -> str:
-    """Return what tells the reference from others: the digest of its mesh, or the keys of a surface in closed form."""
-    digest = str(finished_group(tree, "meshes")["digest"].sel(mesh=reference_of(tree)).item())
-    return digest or repr(sorted(tree.attrs["study"]["table"]["reference"].items()))
-
-
-def _distances(frame: pd.DataFrame) -> pd.DataFrame:
-    known = frame[frame["relative"].notna()]
-    relative = np.maximum(known["relative"], NEXT_TO_EQUAL)
-    with np.errstate(divide="ignore"):
-        share = -np.log1p(-np.minimum(known["relative_error"] / relative, 1.0))
-    return known[[*_KEYS, "family"]].assign(relative=relative, share=share)
-
-
-def _change(meshes: pd.DataFrame) -> dict[str, object]:
-    """Return the change of one method at one order."""
-    by_object = meshes.groupby("object", sort=False)[["log_ratio", "log_error"]].mean()
-    units = by_object if len(by_object) > 1 else meshes
-    ratios, errors = units["log_ratio"].to_numpy(), units["log_error"].to_numpy()
-    worst = meshes.loc[meshes["log_ratio"].idxmax()]
-    return {
-        "objects": len(by_object),
-        "meshes": len(meshes),
-        **dict(zip(("ratio", *_ENDS), np.exp(interval(ratios, errors)), strict=True)),
-        "p": sign_flip_test(ratios, errors),
-        "worst": f"{worst['object']}/{worst['mesh']}".lstrip("/"),
-        "worst_ratio": float(np.exp(worst["log_ratio"])),
-    }
-
-
 def format_league(leagues: Sequence[League], style: Format = "text") -> str:
     """Return leagues as text; see `league`."""
     frame = pd.concat([one.table.assign(order=one.order) for one in leagues], ignore_index=True)
@@ -459,20 +348,6 @@ def left_out(leagues: Sequence[League]) -> Iterator[tuple[str, str, str]]:
     for (name, reason), at in orders.items():
         where = "" if len(at) == len(leagues) else f" at order {', '.join(f'{s:g}' for s in at)}"
         yield name, where, reason
-
-
-def format_changes(changes: pd.DataFrame, style: Format = "text") -> str:
-    """Return the result of `compare_studies` as text."""
-    sections = [
-        Section(f"New study against the old one at order {order:g}", [(_CHANGE_COLUMNS, rows)])
-        for order, rows in changes.groupby("order", sort=False)
-    ]
-    units = "objects" if (changes["objects"] > 1).all() else "meshes"
-    notes = wrapped(_CHANGES_NOTE.format(units=units))
-    least = least_objects(changes["method"].nunique())
-    if (changes[units] < least).any():
-        notes.append(f"With fewer than {least} {units}, the test decides nothing; look at the intervals.")
-    return rendered(style, changes, sections, notes)
 
 
 def pair_lines(league: League) -> list[str]:

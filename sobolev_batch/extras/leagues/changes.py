@@ -1,0 +1,143 @@
+"""A study against an earlier one of the same objects, and as text: which methods came nearer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from sobolev_batch.errors import InputError
+from sobolev_batch.extras.leagues.league import ENDS, AnyStores, interval_text, number_text
+from sobolev_batch.extras.leagues.statistics import adjusted, interval, sign_flip_test
+from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
+from sobolev_batch.study.comparable import SIGNIFICANCE, least_objects
+from sobolev_batch.tables import Format
+from sobolev_batch.tables.convergence import table
+from sobolev_batch.tables.open import AnyStore, as_tree, finished_group, reference_of, stores_of
+from sobolev_batch.tables.rendering import Column, Section, rendered
+from sobolev_batch.tables.text import wrapped
+from sobolev_batch.transform.lattice import Orders
+
+_NOTE = """\
+A ratio below 1 says that the new study is nearer to the references. It is the geometric mean
+over the {units}, with its 95 % interval. The verdict is that of the permutation test of pairs, at
+the level of 5 % for all methods together."""
+# These tell the rows that two studies have in common.
+_KEYS = ["order", "mesh"]
+_COLUMNS = (
+    Column("method", "method"),
+    Column("verdict", "verdict"),
+    Column("ratio", "new/old", number_text),
+    Column("low", "95 % interval", interval_text(number_text), "high"),
+    Column("p", "p", "{:.2g}".format),
+    Column("meshes", "meshes"),
+    Column("worst_ratio", "largest new/old", lambda ratio, mesh: f"{number_text(ratio)}, {mesh}", "worst"),
+)
+
+
+def compare_studies(new: AnyStores | AnyStore, old: AnyStores | AnyStore, order: Orders | None = None) -> pd.DataFrame:
+    """Compare the distances of two studies of the same objects, such as those of two releases of a remesher.
+
+    Meshes of the same label are compared, by the ratio of their distances to the same reference. Relative distances
+    below 1e-5 count as 1e-5, since they tell of rounding.
+
+    Args:
+        new: Store of the new study: of a collection, or of one object; or stores of single objects by their names.
+        old: Store of the old study, likewise.
+        order: One of the stores' orders, or several; default all that both have.
+
+    Returns:
+        A row for each order and method (family): order, method; objects and meshes, their numbers; ratio, the geometric
+        mean of the ratios of new to old distances, with the ends low and high of its interval over the objects, or over
+        the meshes of a single object; p, the p-value of the paired permutation test, adjusted for the number of methods
+        (Holm); verdict, "nearer" or "farther" by this test at the level of 5 %, else "undecided"; worst, the mesh whose
+        distance grew most, and worst_ratio, by how much.
+
+    Raises:
+        InputError: The studies have no mesh in common, or an object has another reference or unit of length.
+        StoreError: A location has no store.
+
+    >>> import sobolev_batch as sb
+    >>> same = sb.compare_studies("storage/icosphere.zarr", "storage/icosphere.zarr", -10)
+    >>> same[["method", "meshes", "ratio", "verdict"]].to_dict("records")
+    [{'method': 'icosphere', 'meshes': 4, 'ratio': 1.0, 'verdict': 'undecided'}]
+    """
+    news, olds = stores_of(new), stores_of(old)
+    common = [name for name in news if name in olds]
+    if not common:
+        raise InputError(
+            f"the studies have no object in common: the new one has {', '.join(news)}, the old one {', '.join(olds)}"
+        )
+    frames = [_joined(name, news[name], olds[name], order) for name in common]
+    joined = pd.concat(frames, ignore_index=True)
+    if joined.empty:
+        raise InputError("the studies have no mesh in common that both have computed at the same order")
+    rows = [
+        {"order": s, "method": method, **_change(meshes)}
+        for (s, method), meshes in joined.groupby(["order", "family"], sort=False)
+    ]
+    result = pd.DataFrame(rows)
+    for _, of_order in result.groupby("order", sort=False):
+        result.loc[of_order.index, "p"] = adjusted(of_order["p"].to_numpy())
+    words = np.where(result["ratio"] < 1, "nearer", "farther")
+    result.insert(8, "verdict", np.where(result["p"] < SIGNIFICANCE, words, "undecided"))
+    return result
+
+
+def _joined(name: str, new: AnyStore, old: AnyStore, order: Orders | None) -> pd.DataFrame:
+    """Return the meshes that two stores of an object have in common, with the logarithms of their ratios."""
+    trees = as_tree(new), as_tree(old)
+    if trees[0].attrs["similarity"] != trees[1].attrs["similarity"] or len({_identity(tree) for tree in trees}) > 1:
+        raise InputError(
+            f"{name or 'the studies'}: they have different references or units of length, so their distances cannot be "
+            "compared; give both the same [reference] and [scaling]"
+        )
+    first, second = (_distances(table(tree, order)) for tree in trees)
+    both = first.merge(second, on=_KEYS, suffixes=("", "_old"))
+    ratios = np.log(both["relative"] / both["relative_old"])
+    errors = both["share"] + both["share_old"]
+    return both.assign(object=name, log_ratio=ratios, log_error=errors)
+
+
+def _identity(tree: xr.DataTree) -> str:
+    """Return what tells the reference from others: the digest of its mesh, or the keys of a surface in closed form."""
+    digest = str(finished_group(tree, "meshes")["digest"].sel(mesh=reference_of(tree)).item())
+    return digest or repr(sorted(tree.attrs["study"]["table"]["reference"].items()))
+
+
+def _distances(frame: pd.DataFrame) -> pd.DataFrame:
+    known = frame[frame["relative"].notna()]
+    relative = np.maximum(known["relative"], NEXT_TO_EQUAL)
+    with np.errstate(divide="ignore"):
+        share = -np.log1p(-np.minimum(known["relative_error"] / relative, 1.0))
+    return known[[*_KEYS, "family"]].assign(relative=relative, share=share)
+
+
+def _change(meshes: pd.DataFrame) -> dict[str, object]:
+    """Return the change of one method at one order."""
+    by_object = meshes.groupby("object", sort=False)[["log_ratio", "log_error"]].mean()
+    units = by_object if len(by_object) > 1 else meshes
+    ratios, errors = units["log_ratio"].to_numpy(), units["log_error"].to_numpy()
+    worst = meshes.loc[meshes["log_ratio"].idxmax()]
+    return {
+        "objects": len(by_object),
+        "meshes": len(meshes),
+        **dict(zip(("ratio", *ENDS), np.exp(interval(ratios, errors)), strict=True)),
+        "p": sign_flip_test(ratios, errors),
+        "worst": f"{worst['object']}/{worst['mesh']}".lstrip("/"),
+        "worst_ratio": float(np.exp(worst["log_ratio"])),
+    }
+
+
+def format_changes(changes: pd.DataFrame, style: Format = "text") -> str:
+    """Return the result of `compare_studies` as text."""
+    sections = [
+        Section(f"New study against the old one at order {order:g}", [(_COLUMNS, rows)])
+        for order, rows in changes.groupby("order", sort=False)
+    ]
+    units = "objects" if (changes["objects"] > 1).all() else "meshes"
+    notes = wrapped(_NOTE.format(units=units))
+    least = least_objects(changes["method"].nunique())
+    if (changes[units] < least).any():
+        notes.append(f"With fewer than {least} {units}, the test decides nothing; look at the intervals.")
+    return rendered(style, changes, sections, notes)
