@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from sobolev_batch.geometry.surface import Similarity
     from sobolev_batch.store.location import Location
 
-# In radii of the target; distances have about as many digits.
+# A fit may lose this fraction of the radius of its target to rounding; distances have about as many digits.
 _MOST_ROUNDING = 1e-6
 
 _folder_option = click.option(

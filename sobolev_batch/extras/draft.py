@@ -31,7 +31,7 @@ from sobolev_batch.visible import visible
 _MOST_BYTES = 32 << 20
 # Words in the names of references, and of folders that hold references.
 _REFERENCE = re.compile(r"(?<![^\W\d_])(original|reference|ref|target|ground[\W_]*truth|gt)(?![^\W\d_])", re.IGNORECASE)
-# Only in the names of folders that hold the files themselves: objects/cow/ is the folder of one object.
+# These count only in the names of folders that hold the files themselves: objects/cow/ is the folder of one object.
 _REFERENCES = re.compile(r"(originals|references|targets|objects)", re.IGNORECASE)
 # The size of a mesh at the end of its name: cow_500, cow-1k7, cow 20.5.
 _SIZE = re.compile(r"\d+(?:[.,]\d+)?(?:[kKmM]\d*)?$")

@@ -56,7 +56,7 @@ from sobolev_batch.tables.open import (
 _MOST_NAMED = 3
 # More labels along a front would overlap.
 _MOST_LABELS = 20
-# By horizontal axis: what a mesh lacks that has no place on it, and the slope of second-order convergence.
+# Each horizontal axis has what a mesh lacks that has no place on it, and the slope of second-order convergence.
 _MISSING = {"edge_length": "edges", "triangles": "triangles", "vertices": "vertices", "seconds": "a time"}
 _SLOPES = {"edge_length": 2, "triangles": -1, "vertices": -1}
 # Smaller fractions are not written into their cells.
@@ -332,7 +332,7 @@ def _orders_if(has: Callable[[Selection], object]) -> Callable[[Selection], Sequ
 
 LEAGUE = Plot(draw_league, lambda leagues: leagues, 3.6)
 COST_LEAGUE = Plot(draw_cost_league, lambda leagues: leagues, 3.6)
-# By the names of their files. Each panel shows one order.
+# The plots have the names of their files. Each panel shows one order.
 PLOTS: dict[str, Plot] = {
     "convergence": Plot(draw_convergence, lambda selection: selection.orders, 3.6),
     "over-time": Plot(draw_evolution, _orders_if(moving_families), 3.6),

@@ -235,7 +235,7 @@ def _vtp(found: VertexWitness) -> bytes:
         surface.point_data["distance"] = found.distances
     surface.point_data.active_scalars_name = names[0]
     surface.field_data["notes"] = found.notes
-    # In memory: VTK does not report a full disk.
+    # VTK writes into memory, since it does not report a full disk.
     writer = vtkXMLPolyDataWriter()
     writer.SetInputData(surface)
     writer.SetDataModeToBinary()

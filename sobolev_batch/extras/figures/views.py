@@ -52,7 +52,7 @@ from sobolev_batch.tables.open import (
 from sobolev_batch.testing.difference import witness_at_vertices
 
 Triangles = NDArray[np.int32]
-# Of a surface and of what it is compared with.
+# The field of a surface, and that of what it is compared with.
 Fields = tuple[xr.DataArray, xr.DataArray]
 
 Axis = Literal["x", "y", "z"]
@@ -74,9 +74,9 @@ _ONE_WAY, _SHOWN, _STEEPEST = 0.5, 0.4, 0.9
 # base below it covers this fraction of the bounding box, and more than the factor times what that of the z axis covers.
 _BASE, _BROAD, _BROADER = 0.03, 0.1, 2.0
 
-# Of a plot: its height, orders of one mesh, panels in a row, and meshes beside each other.
+# A plot has this height, and at most so many orders of one mesh, panels in a row, and meshes beside each other.
 _HEIGHT_INCHES, MOST_ORDERS, _PANELS_IN_A_ROW, _MOST_COMPARED = 5.0, 6, 3, 9
-# Of a store, unless meshes are named.
+# So many meshes of a store are shown unless some are named.
 _MOST_EXTREMES = 4
 _ENOUGH_TRIANGLES = 6_000
 # Larger meshes take minutes to be made again.

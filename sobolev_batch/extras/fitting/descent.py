@@ -48,7 +48,7 @@ class End(Enum):
     INTERRUPTED = "it was interrupted"
 
 
-# By the status of scipy's L-BFGS-B; any other is that of a failed line search.
+# These are statuses of scipy's L-BFGS-B; any other is that of a failed line search.
 _END_OF_STATUS = {0: End.CONVERGED, 1: End.STEPS}
 
 

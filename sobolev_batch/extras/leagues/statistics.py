@@ -20,7 +20,7 @@ from sobolev_batch.tables.open import sizes_of
 _SIZES = 5
 # Meshes whose sizes differ by a smaller factor tell no rate.
 _SMALLEST_RANGE = 1.1
-# Of a logarithm; the bar of a larger error would leave no room for the distances.
+# The bar of a logarithm with a larger error would leave no room for the distances.
 _LARGEST_ERROR = 3.0
 CONFIDENCE = 0.95
 # All changes of sign are tried for as many objects, and as many random ones for more.
@@ -72,7 +72,7 @@ class Curve:
         Beyond the ends the distance is that of the last mesh: a line through two of about one size could lead anywhere.
         """
         own, index, counts = np.unique(self.sizes, return_inverse=True, return_counts=True)
-        # Of meshes of one size, the geometric mean.
+        # Meshes of one size count with their geometric mean.
         values, errors = (np.bincount(index, numbers) / counts for numbers in (self.values, self.errors))
         left = np.clip(np.searchsorted(own, sizes, side="right") - 1, 0, len(own) - 1)
         right = np.minimum(left + 1, len(own) - 1)
