@@ -99,7 +99,7 @@ def test_a_reference_that_does_not_settle_is_a_failed_row(
     family = [{"name": "f", "source": "torus", "R": 1.0, "r": 0.4}]
     study = sb.Study.from_table(torus_table(family=family))
     member = SurfaceMember("own", -1, Roof(), {"test": 1})
-    object.__setattr__(study, "reference", SimpleNamespace(members=lambda folder: (member,)))
+    object.__setattr__(study.object, "reference", SimpleNamespace(members=lambda folder: (member,)))
     summary = sb.run(study, store_path, threads)
     assert set(summary.failed) == {"reference"}
     assert "not settled to 1e-09 of its area with 16384 nodes" in summary.failed["reference"]
