@@ -27,6 +27,7 @@ The public names by subject:
 - Fields: `fourier_transform` on a `Lattice`; all of the above are methods of `field.sobolev`.
 - Studies: `Study`, `init_study`, `plan`, `run`, `submit`.
 - Stores: `open_store`, `status`, `verify`, `unlock`.
+- Meshes within a tolerance: `reduce`.
 - Results of a store: `table`, `smallest_below`, `matrix`, `evolution` (over time), `league`, `compare_studies`,
   `report`, `write_witness`.
 - Modules: `plot` (on Matplotlib axes), `shapes` (spheres and surfaces of your own), `fitting` (refinement and

@@ -5,6 +5,7 @@ from . import shapes as shapes
 from . import sources as sources
 from . import testing as testing
 from .batch.dry_run import plan as plan
+from .batch.reduce import reduce as reduce
 from .batch.run import run as run
 from .batch.status import status as status
 from .batch.submit import submit as submit

@@ -1,6 +1,7 @@
 # The classes of what functions return: each is imported from its module when it is first asked for.
 from .batch.dry_run import ObjectPlan as ObjectPlan
 from .batch.dry_run import StudyPlan as StudyPlan
+from .batch.reduce import Reduction as Reduction
 from .batch.run import Summary as Summary
 from .batch.status import Status as Status
 from .batch.submit import Submission as Submission

@@ -5,9 +5,10 @@ A question that is clear is answered early: bounds are only as close as it needs
 
 from __future__ import annotations
 
+import math
 import time
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Self
 
 from sobolev_batch.errors import InputError, one_line
 from sobolev_batch.geometry.deviation import largest_deviation
@@ -21,76 +22,52 @@ from sobolev_batch.reduction.search import Trial
 from sobolev_batch.sources.registry import Member, load_mesh
 from sobolev_batch.transform.lattice import single_order
 
-# The accuracy of a verdict follows from its limit; only the memory of this one counts.
+# The accuracy of a distance follows from its limit; only the memory of this one counts.
 _ANY_ACCURACY = Accuracy(1e-2)
 # Each trial computes in one thread, and random frequencies are the same for all.
 _THREADS, _SEED = 1, 0
+# A limit that is met up to this fraction is met.
+_EQUAL = 1e-9
 
 
 @dataclass(frozen=True)
-class Limit(ABC):
+class Limit:
     """Largest distance of a mesh from the one that it was made of.
 
     Attributes:
-        value: The distance, in the unit of the meshes or as a fraction of a norm.
+        value: Largest deviation, of each point of either mesh from the closest one of the other, in the unit of the
+            meshes. With an order, largest Sobolev distance over the norm of the original, in the unit in which its
+            bounding sphere has the radius 1.
+        order: Order s < -1/2 of the Sobolev distance; None for the deviation.
     """
 
     value: float
+    order: float | None = None
 
-    @abstractmethod
+    @classmethod
+    def parse(cls, within: float | str, order: float | None = None, unit: str | None = None) -> Self:
+        """Return the limit that is meant: a length, or with a per cent sign or an order a fraction of the norm.
+
+        >>> Limit.parse("0.1 mm", unit="m"), Limit.parse("1%")
+        (Limit(value=0.0001, order=None), Limit(value=0.01, order=-2.0))
+        """
+        if order is None and not str(within).rstrip().endswith("%"):
+            return cls(length_in(within, unit))
+        limit = cls(fraction(within), single_order(DEFAULT_ORDER if order is None else order))
+        if limit.value >= 1:
+            raise InputError(f"a Sobolev distance is a fraction of the norm below 1, such as 1%, found {within!r}")
+        return limit
+
     def bounds(self, mesh: Mesh, reference: Mesh) -> tuple[float, float, float]:
         """Return an estimate of the distance of a mesh from a reference, a lower and an upper bound."""
-
-    def is_met(self, upper: float) -> bool:
-        """Tell whether a distance of at most an upper bound is within the limit, up to rounding of the limit."""
-        return upper <= self.value * (1 + 1e-9)
-
-
-@dataclass(frozen=True)
-class DeviationLimit(Limit):
-    """Largest deviation, from each point of either mesh to the closest one of the other, in the unit of the meshes."""
-
-    def bounds(self, mesh: Mesh, reference: Mesh) -> tuple[float, float, float]:
-        """Return bounds that tell whether the deviation is within the limit."""
-        found = largest_deviation(mesh, reference, within=self.value).both
-        # The largest distance of a vertex, where the upper bound is hardly below the limit.
-        return found.lower, found.lower, found.upper
-
-
-@dataclass(frozen=True)
-class DistanceLimit(Limit):
-    """Largest Sobolev distance over the norm of the reference, in the unit in which its bounding sphere has radius 1.
-
-    Attributes:
-        order: Order s < -1/2 of the norm.
-    """
-
-    order: float = DEFAULT_ORDER
-
-    def __post_init__(self) -> None:
-        single_order(self.order)
-        if self.value >= 1:
-            raise InputError(
-                f"a Sobolev distance is a fraction of the norm below 1, such as '1%', found {self.value:g}"
-            )
-
-    def bounds(self, mesh: Mesh, reference: Mesh) -> tuple[float, float, float]:
-        """Return bounds that tell whether the distance is within the limit, where it is not next to it."""
+        if self.order is None:
+            deviation = largest_deviation(mesh, reference, within=self.value).both
+            # The lower bound is the largest distance of a vertex at least; the upper one is hardly below the limit.
+            return deviation.lower, deviation.lower, deviation.upper
         to_unit = Similarity.to_unit_ball(reference)
         pair = to_unit.apply(mesh), to_unit.apply(reference)
         found, _ = relative_distance(*pair, self.order, self.value, _ANY_ACCURACY, _THREADS, _SEED)
         return (found.lower + found.upper) / 2, found.lower, found.upper
-
-
-def as_limit(within: float | str, order: float | None = None, unit: str | None = None) -> Limit:
-    """Return the limit that is meant: a length, or a fraction of the norm where there is an order or a per cent sign.
-
-    >>> as_limit("0.1 mm", unit="m"), as_limit("1%")
-    (DeviationLimit(value=0.0001), DistanceLimit(value=0.01, order=-2.0))
-    """
-    if order is None and not str(within).rstrip().endswith("%"):
-        return DeviationLimit(length_in(within, unit))
-    return DistanceLimit(fraction(within), DEFAULT_ORDER if order is None else order)
 
 
 def tried(original: Member, member: Member | None, limit: Limit, size: float) -> tuple[Trial, Mesh | None]:
@@ -100,12 +77,12 @@ def tried(original: Member, member: Member | None, limit: Limit, size: float) ->
     that failed; what is wrong with the original is raised as a MeshError.
     """
     reference, started = load_mesh(original), time.perf_counter()
-    mesh, reason, found = None, "", (float("nan"),) * 3
+    mesh, reason, bounds = None, "", (math.inf,) * 3
     try:
         mesh = reference if member is None else load_mesh(member)
-        found = limit.bounds(mesh, reference)
+        bounds = limit.bounds(mesh, reference)
     except InputError as error:
         reason = one_line(error)
-    is_within, count = not reason and limit.is_met(found[2]), 0 if mesh is None else len(mesh.triangles)
-    trial = Trial(float(size), count, *found, is_within, time.perf_counter() - started, reason)
+    is_within, triangles = bounds[2] <= limit.value * (1 + _EQUAL), 0 if mesh is None else len(mesh.triangles)
+    trial = Trial(float(size), triangles, *bounds, is_within, time.perf_counter() - started, reason)
     return trial, mesh if is_within else None

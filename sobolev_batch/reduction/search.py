@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Self
+from dataclasses import dataclass
+from itertools import combinations
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.surface import is_finite_number
 
 # Width of the last bracket, as a fraction of the size, and trials after which a search ends without it. Decimations of
 # seven meshes down to seven limits took 7.1 trials in the mean, and 10 at most.
-PRECISION, MOST_TRIALS = 0.05, 16
+PRECISION, _MOST_TRIALS = 0.05, 16
 # Exponent of distances in the size before two trials show one, and the range in which a shown one is believed.
 _FIRST_SLOPE, _LEAST_SLOPE, _LARGEST_SLOPE = 1.0, 0.3, 3.0
 # Logarithm of a distance over the limit, in place of a zero; and the largest one that counts at the end of a bracket:
@@ -35,12 +35,12 @@ _APART, _SPREAD = 0.9, 0.4
 
 @dataclass(frozen=True)
 class Trial:
-    """A mesh that was made and judged, or why there is none.
+    """A mesh that was made and judged; what cannot be made is infinitely far away.
 
     Attributes:
         size: Parameter of the remesher.
         triangles: Triangles of the mesh; 0 where there is none.
-        estimate: Estimate of its distance, which guides the search; NaN where there is none.
+        estimate: Estimate of its distance, which guides the search.
         lower: Lower bound of the distance.
         upper: Upper bound of it.
         is_within: True where the distance is certainly within the limit. An open question counts as not within.
@@ -50,25 +50,12 @@ class Trial:
 
     size: float
     triangles: int = 0
-    estimate: float = math.nan
-    lower: float = math.nan
-    upper: float = math.nan
+    estimate: float = math.inf
+    lower: float = math.inf
+    upper: float = math.inf
     is_within: bool = False
-    seconds: float = math.nan
+    seconds: float = 0.0
     reason: str = ""
-
-    @classmethod
-    def from_json(cls, entry: Mapping[str, Any]) -> Self:
-        """Return a trial from what `to_json` returned; TypeError or ValueError where it is none."""
-        values: dict[str, Any] = {name: math.nan if value is None else value for name, value in entry.items()}
-        trial = cls(**values)
-        if not (is_finite_number(trial.size) and trial.size > 0 and type(trial.is_within) is bool):
-            raise ValueError(f"no trial: {entry!r}")
-        return trial
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the trial as JSON has it, with null for NaN."""
-        return {name: None if value != value else value for name, value in asdict(self).items()}
 
 
 @dataclass(frozen=True)
@@ -78,8 +65,8 @@ class Bracket:
     Attributes:
         best: The mesh of fewest triangles within the limit; None where none is.
         failed: The next coarser mesh that is not; None where the coarsest is within.
-        is_monotone: False where a mesh finer than the best one is not within the limit: then a coarser one than the
-            best may be within it, which no search by bracketing can tell.
+        is_monotone: False where a finer mesh is certainly farther away than a coarser one. Then a mesh that is coarser
+            than the one that failed may hold, which no search by bracketing can tell.
     """
 
     best: Trial | None
@@ -98,13 +85,13 @@ class Search:
         is_whole: True where sizes are whole numbers.
         larger_is_coarser: Whether a larger size makes a coarser mesh; None to find out by the triangles of trials.
         precision: Width of the last bracket, as a fraction of the size.
-        most_trials: Trials after which it ends in any case.
 
     >>> search, trials = Search(limit=0.02, low=4, high=10_000, is_whole=True, larger_is_coarser=False), []
     >>> while sizes := search.next(trials):
     ...     trials += [Trial(n, int(n), 8 / n, 8 / n, 8 / n, is_within=8 / n <= 0.02) for n in sizes]
-    >>> len(trials), [trial.triangles for trial in (search.bracket(trials).best, search.bracket(trials).failed)]
-    (4, [404, 396])
+    >>> found = search.bracket(trials)
+    >>> found.failed.triangles < 400 <= found.best.triangles < 1.05 * found.failed.triangles
+    True
     """
 
     limit: float
@@ -113,18 +100,13 @@ class Search:
     is_whole: bool = False
     larger_is_coarser: bool | None = None
     precision: float = PRECISION
-    most_trials: int = MOST_TRIALS
 
     def __post_init__(self) -> None:
-        if not all(map(is_finite_number, (self.low, self.high))) or not 0 < self.low <= self.high:
-            raise InputError(f"sizes to search are two positive numbers, the smaller one first, found {self.ends}")
+        ends = self.low, self.high
+        if not all(map(is_finite_number, ends)) or not 0 < self.low <= self.high:
+            raise InputError(f"sizes to search are two positive numbers, the smaller one first, found {ends}")
         if not (is_finite_number(self.precision) and 0 < self.precision < 1):
             raise InputError(f"precision is a fraction between 0 and 1, such as 0.05, found {self.precision!r}")
-
-    @property
-    def ends(self) -> tuple[float, float]:
-        """The smallest and the largest size."""
-        return self.low, self.high
 
     def bracket(self, trials: Sequence[Trial]) -> Bracket:
         """Return what trials say."""
@@ -133,20 +115,24 @@ class Search:
         within = [one for one in trials if one.is_within]
         best = min(within, key=lambda one: (one.triangles, -sign * one.size), default=None)
         others = sorted((one for one in trials if not one.is_within), key=lambda one: sign * one.size)
-        coarser = [one for one in others if best is None or sign * one.size > sign * best.size]
-        return Bracket(best, coarser[0] if coarser else None, len(coarser) == len(others))
+        coarser = (one for one in others if best is None or sign * one.size > sign * best.size)
+        made = sorted((one for one in trials if one.triangles), key=lambda one: sign * one.size)
+        return Bracket(best, next(coarser, None), all(a.lower <= b.upper for a, b in combinations(made, 2)))
 
     def next(self, trials: Sequence[Trial], count: int = 1) -> tuple[float, ...]:
         """Return sizes to try now, up to a count of them at a time; none where the search is over."""
         bracket, sign = self.bracket(trials), self._sign(trials)
         # Places are logarithms of sizes, from fine to coarse.
-        finest, coarsest = sorted(sign * math.log(size) for size in self.ends)
+        finest, coarsest = sorted(sign * math.log(size) for size in (self.low, self.high))
         start = finest if bracket.best is None else sign * math.log(bracket.best.size)
         end = coarsest if bracket.failed is None else sign * math.log(bracket.failed.size)
-        if len(trials) >= self.most_trials or not self._is_open(bracket, start, end):
+        if len(trials) >= _MOST_TRIALS or not self._is_open(bracket, start, end):
             return ()
         valued = [one for one in trials if math.isfinite(one.estimate)]
-        points = {sign * math.log(one.size): self._excess(one) for one in valued}
+        points = {
+            sign * math.log(one.size): math.log(one.estimate / self.limit) if one.estimate > 0 else _NONE
+            for one in valued
+        }
         places = self._places(points, bracket, start, end, count)
         tried = {one.size for one in trials}
         sizes = dict.fromkeys(self._size(sign, place, bracket) for place in places)
@@ -162,20 +148,15 @@ class Search:
     def _is_open(self, bracket: Bracket, start: float, end: float) -> bool:
         """Tell whether a bracket between two places is too wide."""
         if bracket.best is None or bracket.failed is None:
-            return end > start or (bracket.best or bracket.failed) is None
+            return end > start or bracket.best == bracket.failed
         is_adjacent = self.is_whole and abs(bracket.best.size - bracket.failed.size) <= 1
-        return end - start > self._width and not is_adjacent
-
-    @property
-    def _width(self) -> float:
-        """Width of the last bracket, in logarithms."""
-        return math.log1p(self.precision)
+        return end - start > math.log1p(self.precision) and not is_adjacent
 
     def _places(
         self, points: Mapping[float, float], bracket: Bracket, start: float, end: float, count: int
     ) -> Sequence[float]:
         """Return where to try next between the ends of a bracket, from the excess of the distance at some places."""
-        width = self._width
+        width = math.log1p(self.precision)
         if not points:
             # Where nothing could be made, halves arrive at the finest size.
             is_last = bracket.failed is not None and end - start < 2 * width
@@ -197,10 +178,6 @@ class Search:
         apart = max(_APART * width, _SPREAD * min(abs(guess - place) for place in points))
         beside = (guess + apart * k * side for k in range(1, count) for side in (1, -1))
         return [guess, *(place for place in beside if start < place < end)][:count]
-
-    def _excess(self, trial: Trial) -> float:
-        """Return the logarithm of a distance over the limit."""
-        return math.log(trial.estimate / self.limit) if trial.estimate > 0 else _NONE
 
     def _size(self, sign: int, place: float, bracket: Bracket) -> float:
         """Return the size at a place; a whole one lies strictly between those of the bracket."""

@@ -77,10 +77,12 @@ class DecimateSource(NestedSource):
     """Simplifications of one mesh by quadric edge collapse.
 
     M. Garland, P. S. Heckbert, "Surface simplification using quadric error metrics" (1997),
-    doi:10.1145/258734.258849; by the library fast-simplification.
+    doi:10.1145/258734.258849; by the library fast-simplification. The library has thresholds that are lengths, so what
+    it makes depends on the unit. With a ``radius``, meshes are scaled for it until their bounding sphere has this one.
     """
 
     triangles: Several[Annotated[int, Field(ge=4, le=_MOST_TRIANGLES)]]
+    radius: Annotated[float, Field(gt=0, allow_inf_nan=False, strict=False)] | None = None
 
     kind: ClassVar[str] = "decimate"
     library: ClassVar[str] = "fast-simplification"
@@ -95,8 +97,8 @@ class DecimateSource(NestedSource):
                 str(count),
                 rank,
                 _reduced,
-                {"triangles": count},
-                (type(self).reduce, count),
+                {"triangles": count} | ({} if self.radius is None else {"radius": self.radius}),
+                (type(self).reduce, count, self.radius),
                 originals={self.kind: original},
                 libraries=(self.library,),
                 triangles=count,
@@ -106,12 +108,16 @@ class DecimateSource(NestedSource):
         )
 
 
-def _reduced(mesh: Mesh, reduce: Callable[[Mesh, int], Mesh], triangles: int) -> Mesh:
+def _reduced(mesh: Mesh, reduce: Callable[[Mesh, int], Mesh], triangles: int, radius: float | None) -> Mesh:
     if triangles >= len(mesh.triangles):
         raise MeshError(
             f"the mesh has {len(mesh.triangles)} triangles and cannot be reduced to {triangles}: choose fewer"
         )
-    return reduce(mesh, triangles)
+    if radius is None:
+        return reduce(mesh, triangles)
+    center, own = mesh.bounding_sphere
+    found = reduce(Mesh((mesh.vertices - center) * (radius / own), mesh.triangles), triangles)
+    return Mesh(found.vertices * (own / radius) + center, found.triangles)
 
 
 class RemeshSource(DecimateSource):

@@ -126,6 +126,22 @@ def test_decimated_meshes_have_the_counts_asked_for() -> None:
     assert np.count_nonzero(gaps > 1e-12) <= 1
 
 
+def test_decimation_at_a_radius_does_not_depend_on_the_unit(tmp_path: Path) -> None:
+    found = []
+    for unit in (1.0, 2.0**-10):
+        vertices = unit * (icosphere(3).vertices * [1.0, 0.8, 0.6] + [5.0, 0.0, 0.0])
+        sb.write_mesh(Mesh(vertices, icosphere(3).triangles), tmp_path / f"{unit}.ply")
+        files = {"source": "files", "paths": [str(tmp_path / f"{unit}.ply")]}
+        (member,) = members({"source": "decimate", "mesh": files, "triangles": [200], "radius": 100})
+        found.append(loaded(member).vertices / unit)
+    np.testing.assert_allclose(found[0], found[1], rtol=0, atol=1e-12)
+    # Without it, fingerprints are as they were.
+    (without,), (at_radius,) = (
+        members({"source": "decimate", "mesh": BALL, "triangles": [80], **more}) for more in ({}, {"radius": 100})
+    )
+    assert at_radius.fingerprint() == {**without.fingerprint(), "radius": 100.0}
+
+
 def test_remeshed_surfaces_are_even_and_have_about_the_counts_asked_for() -> None:
     found = members({"source": "remesh", "mesh": BALL, "triangles": [320, 80, 80]})
     assert listed(found) == [("80", 0), ("320", 1)]

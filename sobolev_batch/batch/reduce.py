@@ -1,0 +1,399 @@
+"""Meshes reduced as far as a tolerance permits, many at a time: each trial is a task, and its outcome is recorded."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
+from pathlib import Path, PurePath
+from typing import Any
+
+import pandas as pd
+from distributed import Client
+from pydantic import TypeAdapter, ValidationError
+
+from sobolev_batch.batch.cluster.clients import local_client, require_blocking
+from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, result_of, side_by_side
+from sobolev_batch.batch.cluster.workers import prepare_workers
+from sobolev_batch.errors import InputError, MeshError, SobolevBatchError, StoreError, one_line
+from sobolev_batch.geometry.formats.by_name import WRITERS, mesh_format
+from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
+from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.machine import available_cores
+from sobolev_batch.reduction.limit import Limit, tried
+from sobolev_batch.reduction.remesher import Method, Range, Remesher
+from sobolev_batch.reduction.search import PRECISION, Bracket, Search, Trial
+from sobolev_batch.sources.files import FileMember, matching_files, names_of_files
+from sobolev_batch.sources.names import duplicate_names
+from sobolev_batch.sources.registry import Member, SurfaceMember, load_mesh
+from sobolev_batch.store.location import Location
+from sobolev_batch.tables import Format
+from sobolev_batch.tables.rendering import Column, Section, rendered
+from sobolev_batch.tables.text import between, count, duration
+
+# Raise it whenever a mesh of one size is judged in another way: trials of another version are made again.
+_VERSION = 1
+# Measured peak of a trial: for each triangle of the original, and of the libraries.
+_TRIAL_BYTES, _LEAST_BYTES = 1400, 3e8
+# Sizes of one mesh that are tried at a time, where workers are idle: more save hardly any time.
+_MOST_AT_ONCE = 4
+# A search over fewer triangles takes less time than processes take to start.
+_SMALL = 100_000
+_NOTHING_KNOWN = Bracket(None, None, is_monotone=True)
+# What a row has of the best mesh, and of the next smaller one that failed.
+_OF_TRIALS = ("triangles", "size", "lower", "upper")
+
+
+@dataclass(frozen=True)
+class Reduction:
+    """The fewest triangles of one mesh within a tolerance.
+
+    Attributes:
+        name: Name of the mesh.
+        limit: The tolerance: its ``value``, and its ``order`` if it is a Sobolev distance.
+        original_triangles: Number of triangles of the mesh; 0 if it cannot be read.
+        trials: What was tried, in this order.
+        bracket: The ``best`` mesh, of the fewest triangles within the tolerance, and the next coarser one that
+            ``failed``. ``is_monotone`` is false where a finer mesh was farther away than a coarser one: then a smaller
+            one than ``best`` may hold.
+        reason: Why there is no mesh; empty where there is one.
+        path: Where the mesh was written; empty without an output.
+        mesh: The mesh, where there is no output.
+
+    >>> import sobolev_batch as sb
+    >>> found = sb.reduce(sb.shapes.icosphere(3), within=0.05)["mesh"]
+    >>> found.bracket.best.upper <= 0.05 < found.bracket.failed.upper, found.mesh.defects
+    (True, ())
+    """
+
+    name: str
+    limit: Limit
+    original_triangles: int = 0
+    trials: tuple[Trial, ...] = ()
+    bracket: Bracket = _NOTHING_KNOWN
+    reason: str = ""
+    path: str = ""
+    mesh: Mesh | None = field(default=None, repr=False, compare=False)
+
+    def __str__(self) -> str:
+        """Return the result in a line."""
+        best = self.bracket.best
+        if best is None:
+            return f"{self.name}: {self.reason}"
+        return f"{self.name}: {best.triangles:,} of {self.original_triangles:,} triangles, {len(self.trials)} trials"
+
+    def to_row(self) -> dict[str, Any]:
+        """Return the row of a table; bounds are lengths in the unit of the meshes, or fractions of the norm."""
+        best, failed = self.bracket.best, self.bracket.failed
+        return {
+            "object": self.name,
+            "original_triangles": self.original_triangles,
+            **{name: getattr(best, name, None) for name in _OF_TRIALS},
+            **{f"failed_{name}": getattr(failed, name, None) for name in _OF_TRIALS},
+            "trials": len(self.trials),
+            "seconds": sum(one.seconds for one in self.trials),
+            "is_monotone": self.bracket.is_monotone,
+            "note": self.reason or ("" if self.bracket.is_monotone else "not monotone: a finer mesh was farther away"),
+            "path": self.path,
+        }
+
+
+def format_reductions(found: Mapping[str, Reduction], style: Format = "text", unit: str | None = None) -> str:
+    """Return a row for each mesh, as text, Markdown or LaTeX for people, or as CSV or JSON for programs."""
+    limit = next(iter(found.values())).limit
+    factor, sign = (1, f" {unit}" if unit else "") if limit.order is None else (100, " %")
+    columns = [
+        Column("object", "object", kind="label"),
+        Column("original_triangles", "original", count),
+        Column("triangles", "triangles", count),
+        Column(
+            "lower",
+            "deviation" if limit.order is None else "distance",
+            lambda lower, upper: between(factor * lower, factor * upper, sign),
+            error="upper",
+        ),
+        Column("failed_triangles", "next that failed", count),
+        Column("trials", "trials"),
+        Column("seconds", "time", duration),
+        *([Column("note", "note", kind="text")] if any(one.to_row()["note"] for one in found.values()) else []),
+    ]
+    frame = pd.DataFrame([one.to_row() for one in found.values()])
+    frame = frame.astype({"triangles": "Int64", "failed_triangles": "Int64"})
+    order = "" if limit.order is None else f" at order {limit.order:g}"
+    caption = f"fewest triangles within {factor * limit.value:.6g}{sign}{order}"
+    return rendered(style, frame, [Section(caption, [(columns, frame)])], [])
+
+
+@dataclass(frozen=True)
+class _Record:
+    """What is known of a job, as a JSON file that is replaced as a whole after each trial.
+
+    Attributes:
+        digest: Digest of the job; another one has other trials.
+        triangles: Triangles of the original.
+        mesh_digest: Digest of the file of the best mesh.
+    """
+
+    digest: str
+    triangles: int
+    mesh_digest: str = ""
+    trials: tuple[Trial, ...] = ()
+
+
+_RECORDS = TypeAdapter(_Record)
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """A mesh to reduce, and how.
+
+    Attributes:
+        mesh_key: Name of the file of the reduced mesh.
+        folder: Where results are kept; None to keep them in memory.
+    """
+
+    name: str
+    original: Member
+    mesh_key: str
+    limit: Limit
+    remesher: Remesher
+    precision: float
+    folder: Location | None
+
+    def read(self, key: str) -> bytes:
+        """Return the contents of a file; empty where there is none."""
+        return b"" if self.folder is None else self.folder.read(key) or b""
+
+    def write(self, record: _Record, mesh: bytes | None = None) -> None:
+        """Write the record, after the mesh that it counts on."""
+        if self.folder is not None:
+            if mesh is not None:
+                self.folder.write({self.mesh_key: mesh})
+            self.folder.write({f"{self.name}.json": _RECORDS.dump_json(record, indent=1, exclude_defaults=True)})
+
+    def recorded(self) -> _Record | None:
+        """Return the record; None where there is none of the same original, remesher and tolerance."""
+        with suppress(ValidationError):
+            record = _RECORDS.validate_json(self.read(f"{self.name}.json"), strict=True)
+            return record if record.digest == self.digest else None
+        return None
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of all that trials depend on; MeshError where the original cannot be read."""
+        about = [_VERSION, self.remesher.fingerprint(self.original), repr(self.limit)]
+        return _digest(json.dumps(about, sort_keys=True).encode())
+
+    def search(self, triangles: int) -> Search:
+        """Return the search for the mesh, which has some triangles."""
+        return self.remesher.search(self.limit.value, triangles, self.precision)
+
+    def task(self, size: float, triangles: int) -> Task:
+        """Return the trial of a size."""
+        member = self.remesher.member(self.original, size, triangles)
+        needed = _projected_bytes(self.original) + _TRIAL_BYTES * triangles
+        label = f"{self.name}/{size:g}"
+        return Task(tried, (self.original, member, self.limit, size), needed, label=label, stage="trial")
+
+
+def reduce(
+    meshes: MeshLike | Sequence[str | Path] | Mapping[str, MeshLike],
+    within: float | str,
+    *,
+    order: float | None = None,
+    unit: str | None = None,
+    method: Method = "decimate",
+    search: Range | None = None,
+    precision: float = PRECISION,
+    output: str | Path | None = None,
+    client: Client | None = None,
+    workers: int | None = None,
+    on_progress: Callable[[Reduction], None] | None = None,
+) -> dict[str, Reduction]:
+    """Find the fewest triangles with which each mesh is still within a tolerance of itself.
+
+    Bounds decide, and no sample. A mesh that is not certainly within the tolerance counts as one that is not. What was
+    tried is recorded in the output, so that the same call goes on where it was ended.
+
+    Args:
+        meshes: A mesh, the path of a file or a glob, a list of these paths, or meshes by name. Files are in one unit.
+        within: The tolerance: a length for the largest deviation, as a number in the unit of the files or a text such
+            as "0.1 mm"; or a text such as "1%" for the Sobolev distance over the norm of the original.
+        order: Order s < -1/2 of this distance; default -2.
+        unit: Name of the unit of the files, which a length with a unit needs.
+        method: Name of a source that makes meshes of a number of triangles ("decimate", "remesh"); a command with
+            {input}, {output} and a parameter, which thereby is permitted to run; a function of a mesh and a parameter;
+            or the table of a family without its mesh.
+        search: Name of the parameter, and between which two values to search; whole numbers for one that takes no
+            others. Which end is coarse shows by itself. Default: triangles, from 4 to those of the mesh.
+        precision: Width of the last bracket, from the mesh that holds to the next coarser one that failed, as a
+            fraction of the parameter.
+        output: Folder or URL for the reduced meshes, under their own names, and for records; default none.
+        client: Client of the cluster to compute on. By default, processes on this machine are started where there
+            are several meshes, or a large one; a script must then guard its main part by
+            ``if __name__ == "__main__"``.
+        workers: Number of these processes; default one for each core. With one, this process computes.
+        on_progress: Called with the result of each mesh.
+
+    Returns:
+        What was found for each mesh, by the name of its file, or "mesh". One that cannot be read, or of which nothing
+        is within the tolerance, has a reason, and does not raise.
+
+    Raises:
+        InputError: A parameter is wrong, or the output would replace a mesh.
+        StoreError: The output cannot be written.
+        ClusterError: The scheduler was lost.
+
+    >>> import sobolev_batch as sb
+    >>> found = sb.reduce(sb.shapes.icosphere(3), within="2%", order=-4)["mesh"]
+    >>> found.bracket.best.triangles < 1280, found.bracket.best.upper <= 0.02 < found.bracket.failed.upper
+    (True, True)
+    """
+    if client is not None:
+        require_blocking(client)
+    limit, remesher = Limit.parse(within, order, unit), Remesher.parse(method, search)
+    folder = None if output is None else Location.parse(output).absolute()
+    jobs = [
+        _Job(name, original, f"{name}{suffix}", limit, remesher, precision, folder)
+        for name, (original, suffix) in _originals(meshes, folder).items()
+    ]
+    # Refuses a precision, and ends of the range.
+    jobs[0].search(1)
+    found: dict[str, Reduction] = {}
+    for name, outcome in _outcomes(jobs, client, workers):
+        found[name] = outcome if isinstance(outcome, Reduction) else Reduction(name, limit, reason=one_line(outcome))
+        if on_progress is not None:
+            on_progress(found[name])
+    return {job.name: found[job.name] for job in jobs}
+
+
+def _outcomes(
+    jobs: Sequence[_Job], client: Client | None, workers: int | None
+) -> Iterator[tuple[str, Reduction | Exception]]:
+    """Carry out jobs and yield what came of each; see `reduce`."""
+    processes = available_cores() if workers is None else workers
+    if client is None and (processes == 1 or (workers is None and len(jobs) == 1 and _is_small(jobs[0].original))):
+        for job in jobs:
+            try:
+                yield job.name, _in_this_process(_searched(job, lambda: None, lambda: 1))
+            except SobolevBatchError as error:
+                if _ends_all(error):
+                    raise
+                yield job.name, error
+        return
+    open_jobs = {job.name for job in jobs}
+    with ExitStack() as stack:
+
+        @cache
+        def cluster() -> Cluster:
+            """Start the cluster, which is not needed where everything is recorded."""
+            started = client or stack.enter_context(local_client(min(processes, _MOST_AT_ONCE * len(jobs))))
+            libraries = jobs[0].remesher.source(jobs[0].remesher.a_size).libraries
+            return Cluster(started, prepare_workers(started, libraries), study="reduce")
+
+        def at_once() -> int:
+            return max(1, min(_MOST_AT_ONCE, cluster().workers.threads // len(open_jobs)))
+
+        for name, outcome in side_by_side(((job.name, _searched(job, cluster, at_once)) for job in jobs), _ends_all):
+            open_jobs.discard(name)
+            yield name, outcome
+
+
+def _ends_all(error: Exception) -> bool:
+    """Tell whether an error is more than that of one mesh."""
+    return isinstance(error, StoreError) or not isinstance(error, SobolevBatchError)
+
+
+def _is_small(original: Member) -> bool:
+    """Tell whether a search takes no processes of its own."""
+    with suppress(MeshError):
+        return original.expected_size().triangles < _SMALL
+    return True
+
+
+def _in_this_process(search: Stages[Reduction]) -> Reduction:
+    while True:
+        try:
+            wave = next(search)
+        except StopIteration as end:
+            return end.value  # type: ignore[no-any-return]
+        for task in wave.tasks:
+            wave.take(task, task.function(*task.arguments))
+
+
+def _searched(job: _Job, cluster: Callable[[], Any], at_once: Callable[[], int]) -> Stages[Reduction]:
+    """Search for the fewest triangles of a mesh, on a cluster or, where that is None, in this process."""
+    known, mesh = job.recorded(), None
+    if known is None:
+        counts: list[int] = []
+        task = Task(_triangle_count, (job.original,), _projected_bytes(job.original), label=job.name, stage="read")
+        yield Wave(cluster(), [task], lambda _, outcome: counts.append(result_of(outcome)), task.projected_bytes)
+        known = _Record(job.digest, counts[0])
+    record = known
+    search = job.search(record.triangles)
+
+    def take(_: Task, outcome: Any) -> None:
+        nonlocal record, mesh
+        trial, made = result_of(outcome)
+        record = replace(record, trials=(*record.trials, trial))
+        data = None
+        if made is not None and search.bracket(record.trials).best == trial:
+            mesh, data = made, WRITERS[PurePath(job.mesh_key).suffix](made)
+            record = replace(record, mesh_digest=_digest(data))
+        job.write(record, data)
+
+    while True:
+        best = search.bracket(record.trials).best
+        sizes = search.next(record.trials) and search.next(record.trials, at_once())
+        if not sizes and best is not None and mesh is None and _digest(job.read(job.mesh_key)) != record.mesh_digest:
+            # It was removed or changed since, and is made again.
+            sizes, record = (best.size,), replace(record, trials=tuple(one for one in record.trials if one != best))
+        if not sizes:
+            break
+        tasks = [job.task(size, record.triangles) for size in sizes]
+        yield Wave(cluster(), tasks, take, tasks[0].projected_bytes)
+    bracket, path, reason = search.bracket(record.trials), "", ""
+    if bracket.best is None:
+        nearest = min(record.trials, key=lambda one: one.upper)
+        reason = nearest.reason or f"nothing is within the tolerance; nearest are {nearest.triangles:,} triangles"
+    elif job.folder is not None:
+        path, mesh = str(job.folder.below(job.mesh_key)), None
+    return Reduction(job.name, job.limit, record.triangles, record.trials, bracket, reason, path, mesh)
+
+
+def _projected_bytes(original: Member) -> float:
+    return _LEAST_BYTES + original.expected_size().projected_bytes
+
+
+def _triangle_count(original: Member) -> int:
+    return len(load_mesh(original).triangles)
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def _originals(meshes: Any, folder: Location | None) -> dict[str, tuple[Member, str]]:
+    """Return the meshes to reduce by their names, each with the suffix of the file to write into a folder."""
+    if isinstance(meshes, str | os.PathLike):
+        meshes = [meshes]
+    if not isinstance(meshes, list | tuple) or not all(isinstance(one, str | os.PathLike) for one in meshes):
+        by_name = meshes if isinstance(meshes, Mapping) else {"mesh": meshes}
+        made = {str(name): as_mesh(mesh) for name, mesh in by_name.items()}
+        return {name: (SurfaceMember(name, -1, mesh, {"mesh": mesh.digest}), ".ply") for name, mesh in made.items()}
+    paths = list(dict.fromkeys(path for one in meshes for path in matching_files(Path(), os.fspath(one))))
+    # Names of files that lie in different folders are whole paths.
+    names = ["_".join(part for part in PurePath(name).parts if part != "/") for name in names_of_files(paths)]
+    if not names or duplicate_names(names):
+        raise InputError(f"meshes to reduce need names of their own, found {', '.join(names) or 'no mesh'}")
+    found: dict[str, tuple[Member, str]] = {}
+    for name, path in zip(names, paths, strict=True):
+        suffix = mesh_format(path) if mesh_format(path) in WRITERS else ".ply"
+        if folder is not None and not folder.scheme and path.resolve() == Path(folder.name, name + suffix).resolve():
+            raise InputError(f"{path}: the reduced mesh would replace it; name another folder for these")
+        found[name] = FileMember(name, -1, path.absolute()), suffix
+    return found

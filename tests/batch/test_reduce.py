@@ -1,0 +1,327 @@
+"""The fewest triangles within a tolerance: what is found holds, and a search goes on wherever it was ended."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from distributed import Client
+
+import sobolev_batch as sb
+from sobolev_batch.batch import reduce as module
+from sobolev_batch.batch.reduce import Reduction, format_reductions
+from sobolev_batch.reduction import limit as limits
+from tests.geometry.test_deviation import distance_from_triangles, grid
+from tests.support.commands import call, started
+
+# A remesher that makes rings of this many edges, and none of a thirteenth.
+RINGS = "python {folder}/rings.py {input} {output} {edge}"
+SCRIPT = """
+import math, sys
+import sobolev_batch as sb
+count = max(3, round(2 * math.pi / float(sys.argv[3])))
+if count == 13:
+    sys.exit("thirteen edges are refused")
+angles = [2 * math.pi * k / count for k in range(count)]
+ring = [[math.cos(a), math.sin(a), 0.0] for a in angles]
+sb.write_mesh(sb.Mesh([[0.0, 0, 0], *ring], [[0, 1 + k, 1 + (k + 1) % count] for k in range(count)]), sys.argv[2])
+"""
+
+
+def disc(mesh: sb.Mesh, edge: float) -> sb.Mesh:
+    """A flat disc within the unit circle, of edges of a length, whatever the mesh."""
+    count = max(3, round(2 * np.pi / edge))
+    if count == 13:
+        raise ValueError("thirteen edges are refused")
+    angles = 2 * np.pi * np.arange(count) / count
+    ring = np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+    spokes = [[0, 1 + k, 1 + (k + 1) % count] for k in range(count)]
+    return sb.Mesh(np.concatenate([np.zeros((1, 3)), ring]), spokes)
+
+
+def lumpy(level: int = 3, scale: float = 1.0) -> sb.Mesh:
+    """A lumpy ellipsoid."""
+    ball = sb.shapes.icosphere(level)
+    x, y, z = ball.vertices.T
+    radii = 1 + 0.1 * np.sin(5 * x) * np.cos(4 * y + 1) + 0.05 * np.sin(7 * z)
+    return sb.Mesh(scale * radii[:, None] * ball.vertices * [1.0, 0.8, 0.6], ball.triangles)
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("scans") / "scan.ply"
+    sb.write_mesh(lumpy(), path)
+    return path
+
+
+def found_by(*arguments: Any, **options: Any) -> Reduction:
+    """The result for one mesh, in this process."""
+    (found,) = sb.reduce(*arguments, workers=1, **options).values()
+    return found
+
+
+def sizes(found: Reduction) -> list[float]:
+    return [one.size for one in found.trials]
+
+
+def rows(found: Reduction) -> list[int]:
+    """Triangles of the mesh, and of the next smaller one that failed."""
+    row = found.to_row()
+    return [row["triangles"], row["failed_triangles"]]
+
+
+def farthest(mesh: sb.Mesh, other: sb.Mesh) -> float:
+    """The largest distance of points on a grid, either way, by all triangles."""
+    pairs = ((mesh, other), (other, mesh))
+    return max(float(distance_from_triangles(grid(a, 3), b).max()) for a, b in pairs)
+
+
+def test_the_mesh_holds_and_the_next_smaller_one_does_not(tmp_path: Path) -> None:
+    from fast_simplification import simplify
+
+    original = lumpy(2)
+    sb.write_mesh(original, tmp_path / "scan.ply")
+    found = found_by(tmp_path / "scan.ply", within=0.1, output=tmp_path / "reduced")
+    best, failed = found.bracket.best, found.bracket.failed
+    assert best is not None
+    assert failed is not None
+    assert (found.original_triangles, found.path) == (320, str(tmp_path / "reduced" / "scan.ply"))
+    reduced = sb.read_mesh(found.path)
+    assert len(reduced.triangles) == best.triangles < 320 / 2
+    # By brute force, which shares no code with the bounds.
+    assert best.lower * (1 - 1e-9) <= farthest(reduced, original) <= best.upper <= 0.1
+    scale = 100 / original.bounding_sphere[1]
+    vertices = (original.vertices - original.bounding_sphere[0]) * scale
+    made = simplify(vertices, original.triangles.astype(np.int32), target_count=int(failed.size))
+    smaller = sb.Mesh(made[0] / scale + original.bounding_sphere[0], made[1])
+    assert len(smaller.triangles) == failed.triangles < best.triangles <= 1.05 * failed.triangles + 1
+    assert farthest(smaller, original) > 0.1
+    assert len(found.trials) <= 8
+
+
+@pytest.mark.slow
+def test_a_fraction_of_the_norm_does_not_depend_on_the_unit(tmp_path: Path) -> None:
+    found = sb.reduce({"mm": lumpy(), "m": lumpy(scale=1e-3)}, "2%", order=-4, workers=1)
+    for one in found.values():
+        best, failed = one.bracket.best, one.bracket.failed
+        assert best is not None
+        assert failed is not None
+        assert best.upper <= 0.02 < failed.upper
+        assert best.size <= 1.05 * failed.size + 1
+    assert rows(found["mm"]) == pytest.approx(rows(found["m"]), rel=0.06)
+    mesh = found["mm"].mesh
+    assert mesh is not None
+    assert sb.testing.same_surface(mesh, lumpy(), tolerance=0.02, order=-4).outcome == "same"
+
+
+def test_lengths_are_converted_into_the_unit_of_the_files() -> None:
+    in_mm = found_by(lumpy(scale=30.0), "0.1cm", unit="mm")
+    in_m = found_by(lumpy(scale=0.03), "1 mm", unit="m")
+    assert rows(in_mm) == pytest.approx(rows(in_m), rel=0.06) == rows(found_by(lumpy(scale=30.0), 1.0))
+    with pytest.raises(sb.errors.InputError, match="name it, as unit='mm'"):
+        found_by(lumpy(), "0.1 mm")
+
+
+class EndedError(Exception):
+    """What ends a search in the middle."""
+
+
+@pytest.fixture
+def tried(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Sizes that are tried, in this order; a negative number at its beginning ends the trial before so many more."""
+    done: list[float] = []
+
+    def counted(mesh: Any, member: Any, limit: Any, size: float) -> Any:
+        if done and done[0] < 0:
+            done[0] += 1
+            if done[0] == 0:
+                raise EndedError
+        done.append(size)
+        return limits.tried(mesh, member, limit, size)
+
+    monkeypatch.setattr(module, "tried", counted)
+    return done
+
+
+def test_a_search_goes_on_where_it_was_ended(scan: Path, tmp_path: Path, tried: list[float]) -> None:
+    whole = found_by(scan, within=0.05, output=tmp_path / "whole")
+    assert sizes(whole) == tried
+    count = len(tried)
+    for ended in range(1, count + 1):
+        tried[:] = [-ended]
+        with pytest.raises(EndedError):
+            found_by(scan, within=0.05, output=tmp_path / str(ended))
+        tried[0] = 0
+        found = found_by(scan, within=0.05, output=tmp_path / str(ended))
+        # No size is tried twice, and the result is the same to the byte.
+        assert tried[1:] == sizes(whole) == sizes(found)
+        assert found.bracket.best is not None
+        assert (tmp_path / str(ended) / "scan.ply").read_bytes() == Path(whole.path).read_bytes()
+    tried.clear()
+    assert found_by(scan, within=0.05, output=tmp_path / "whole") == whole
+    assert tried == []
+
+
+def test_what_changed_since_is_tried_again(scan: Path, tmp_path: Path, tried: list[float]) -> None:
+    mesh = tmp_path / "part.ply"
+    shutil.copy(scan, mesh)
+    output = tmp_path / "reduced"
+    found = found_by(mesh, within=0.1, output=output)
+    assert found.bracket.best is not None
+    written = (output / "part.ply").read_bytes()
+    # The file of the result alone is made again.
+    (output / "part.ply").unlink()
+    tried.clear()
+    again = found_by(mesh, within=0.1, output=output)
+    assert tried == [found.bracket.best.size]
+    assert (output / "part.ply").read_bytes() == written
+    assert again.bracket.failed == found.bracket.failed
+    # Another tolerance, another remesher, another mesh: all of it.
+    for change in ({"within": 0.2}, {"within": 0.2, "method": disc, "search": {"edge": (0.5, 1.0)}}):
+        tried.clear()
+        assert found_by(mesh, **change, output=output).trials
+        assert len(tried) > 1
+    sb.write_mesh(lumpy(2), mesh)
+    assert found_by(mesh, within=0.1, output=output).original_triangles == 320
+    # A damaged record is none.
+    record = output / "part.json"
+    for damage in (b"", b"{", record.read_bytes().replace(b'"size"', b'"sise"')):
+        record.write_bytes(damage)
+        tried.clear()
+        assert found_by(mesh, within=0.1, output=output).bracket.best is not None
+        assert len(tried) > 1
+
+
+def test_a_tolerance_that_nothing_meets_and_one_that_four_triangles_meet() -> None:
+    nothing = found_by(lumpy(2), within=1e-30)
+    assert nothing.bracket.best is None
+    assert nothing.bracket.failed is not None
+    assert (nothing.bracket.failed.size, nothing.mesh) == (320, None)
+    assert "nothing is within the tolerance" in nothing.reason
+    # The mesh itself is within a larger one, and is not remeshed.
+    itself = found_by(lumpy(2), within=1e-9)
+    assert itself.mesh is not None
+    assert itself.mesh.digest == lumpy(2).digest
+    least = found_by(lumpy(2), within=5.0)
+    assert least.bracket.best is not None
+    assert (least.bracket.best.size, least.bracket.failed, len(least.trials)) == (4, None, 2)
+    # The library stops at eight.
+    assert 4 <= least.bracket.best.triangles <= 8
+
+
+def test_a_remesher_that_fails_at_a_size() -> None:
+    # A ring of n edges is 1 - cos(π/n) within the circle; that of 13 would be the fewest within 0.03.
+    original = disc(lumpy(1), 2 * np.pi / 1000)
+    found = found_by(original, within=1 - np.cos(np.pi / 12.5), method=disc, search={"edge": (0.02, 1.5)})
+    best, failed = found.bracket.best, found.bracket.failed
+    assert best is not None
+    assert failed is not None
+    assert (best.triangles, failed.triangles) == (14, 0)
+    assert "thirteen edges are refused" in failed.reason
+    # One that fails at each size says why.
+    wrong = found_by(original, within=0.1, method=lambda mesh, edge: edge / 0, search={"edge": (0.1, 1.0)})
+    assert "ZeroDivisionError" in wrong.reason
+
+
+def test_results_that_are_not_monotone_are_told() -> None:
+    def uneven(mesh: sb.Mesh, edge: float) -> sb.Mesh:
+        return disc(mesh, 2.0 if 0.2 < edge < 0.9 else edge)
+
+    original = disc(lumpy(1), 2 * np.pi / 1000)
+    found = found_by(original, within=0.1, method=uneven, search={"edge": (0.02, 1.5)})
+    assert not found.bracket.is_monotone
+    best = found.bracket.best
+    assert best is not None
+    assert best.upper <= 0.1
+    assert "not monotone" in format_reductions({"disc": found})
+
+
+def test_several_meshes_on_a_cluster(client: Client, scan: Path, tmp_path: Path) -> None:
+    (tmp_path / "more").mkdir()
+    sb.write_mesh(lumpy(2), tmp_path / "more" / "other.obj")
+    (tmp_path / "more" / "broken.stl").write_bytes(b"solid")
+    seen: list[str] = []
+
+    def reduced() -> dict[str, Reduction]:
+        files = [scan, tmp_path / "more" / "*.*"]
+        tell: Callable[[Reduction], None] = lambda one: seen.append(one.name)  # noqa: E731
+        return sb.reduce(files, 0.1, output=tmp_path / "reduced", client=client, on_progress=tell)
+
+    found = reduced()
+    assert sorted(seen) == sorted(found) == ["broken", "other", "scan"]
+    assert found["broken"].reason
+    assert found["broken"].bracket.best is None
+    for name in ("scan", "other"):
+        best, failed = found[name].bracket.best, found[name].bracket.failed
+        assert best is not None
+        assert failed is not None
+        assert best.upper <= 0.1 < failed.upper
+        assert best.size <= 1.05 * failed.size + 1
+        assert len(sb.read_mesh(found[name].path).triangles) == best.triangles
+    assert sorted(path.name for path in (tmp_path / "reduced").iterdir()) == [
+        *("other.json", "other.obj", "scan.json", "scan.ply")
+    ]
+    assert reduced() == found
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"within": "110%"}, "below 1"),
+        ({"within": 0.0}, "a positive number"),
+        ({"within": "1%", "order": 0.0}, "order"),
+        ({"within": 1, "method": "nothing"}, "no source is named 'nothing'"),
+        ({"within": 1, "method": "x {input} {output} {hausd}"}, "{hausd}"),
+        ({"within": 1, "method": "x {input} {hausd}", "search": {"hausd": (0.1, 1.0)}}, "no {output}"),
+        ({"within": 1, "search": {"triangles": (9, 4)}}, "the smaller one first"),
+        ({"within": 1, "search": {"a": (1, 2), "b": (1, 2)}}, "one parameter is searched"),
+        ({"within": 1, "precision": 0}, "precision"),
+    ],
+)
+def test_wrong_parameters_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(sb.errors.InputError, match=message):
+        found_by(lumpy(1), **options)
+
+
+def test_no_original_is_replaced(scan: Path) -> None:
+    before = scan.read_bytes()
+    with pytest.raises(sb.errors.InputError, match="would replace it"):
+        found_by(scan, within=0.1, output=scan.parent)
+    assert scan.read_bytes() == before
+
+
+@pytest.mark.process
+def test_the_command_goes_on_after_it_was_killed(tmp_path: Path) -> None:
+    (tmp_path / "rings.py").write_text(SCRIPT)
+    sb.write_mesh(disc(lumpy(1), 2 * np.pi / 500), tmp_path / "flat.ply")
+    (tmp_path / "broken.ply").write_text("ply")
+    files = [str(tmp_path / name) for name in ("flat.ply", "broken.ply")]
+    method = ["--with", RINGS.replace("{folder}", str(tmp_path)), "--search", "edge=0.05:1.5", "--workers", "1"]
+    words = ["reduce", *files, "--within", "0.3mm", "--unit", "cm", *method, "--output", str(tmp_path / "reduced")]
+    record = tmp_path / "reduced" / "flat.json"
+    with started(*words) as process:
+        while not (record.exists() and len(json.loads(record.read_bytes())["trials"]) >= 2):
+            assert process.poll() is None, process.communicate()
+        os.kill(process.pid, 9)
+    before = json.loads(record.read_bytes())["trials"]
+    done = call(*words, "--format", "json")
+    assert done.returncode == 3
+    assert json.loads(record.read_bytes())["trials"][: len(before)] == before
+    broken, flat = sorted(json.loads(done.stdout), key=lambda row: str(row["object"]))
+    assert (flat["object"], flat["original_triangles"], flat["note"]) == ("flat", 500, "")
+    # 1 - cos(π/n) is at most 0.03 from n = 13 on, which the remesher refuses.
+    assert (flat["triangles"], flat["failed_triangles"]) == (14, 0)
+    assert flat["upper"] <= 0.03
+    assert (broken["triangles"], broken["trials"]) == (None, 0)
+    assert "broken.ply" in broken["note"]
+    shown = call(*words)
+    assert shown.returncode == 3
+    assert "fewest triangles within 0.03 cm" in shown.stdout
+    assert "flat: 14 of 500 triangles" in shown.stderr
+    assert call("reduce", *files, "--within", "1", "--output", "x", "--search", "edge").returncode == 2
