@@ -26,6 +26,7 @@ from sobolev_batch.errors import ClusterError
 from sobolev_batch.norms.accuracy.solve import DistanceTarget
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
 from sobolev_batch.norms.tail.sampling import Octave
+from sobolev_batch.norms.tail.values import settings_on
 from sobolev_batch.shapes import Similarity, icosphere
 from sobolev_batch.sources.registry import ExpectedSize
 from sobolev_batch.store.create import prepare_store
@@ -72,7 +73,7 @@ def test_octaves_have_the_precision_that_their_own_accuracy_needs(store_path: Pa
             target = DistanceTarget((-2.0,), Accuracy(0.1), None, (distance,))
             both = replace(job, transform=TransformSettings(dtype=precision), distance_target=target)
             mesh = job.load()
-            assert both.octave_settings(mesh)(mesh, lattice).dtype == expected
+            assert settings_on(lattice, mesh, both.octave_settings(mesh)).dtype == expected
 
 
 def test_what_a_mesh_and_its_reference_cover_is_nothing_beyond_the_octaves(tmp_path: Path) -> None:

@@ -93,18 +93,23 @@ def octave_values(
             frequencies = sampling.frequencies[sample_set.samples]
             values.append(kind_of(surface).sampled_values(frequencies, execution.threads, execution.backend))
         else:
-            chosen = settings if isinstance(settings, TransformSettings) else _cheapest(surface, lattice, settings)
+            chosen = settings_on(lattice, surface, settings)
             block = transform_block(surface, lattice, lattice.half, chosen, execution).values
             values.append(block.ravel()[sample_set.places])
     joined = np.concatenate(values)
     return OctaveValues(sampling, joined, *_compared(surface, sampling, joined, orders, execution.backend))
 
 
-def _cheapest(surface: Surface, lattice: OctaveLattice, target: ErrorTarget) -> TransformSettings:
+def settings_on(
+    lattice: OctaveLattice, surface: Surface, settings: TransformSettings | ErrorTarget
+) -> TransformSettings:
+    """Return settings as they are, or the cheapest ones with which a surface meets a target on a lattice."""
+    if isinstance(settings, TransformSettings):
+        return settings
     if kind_of(surface).is_closed_form:
         return TransformSettings()
-    dtype = cheapest_dtype([surface], lattice, target)
-    return choose_settings(surface, lattice, target, TransformSettings(dtype=dtype))
+    cheapest = TransformSettings(dtype=cheapest_dtype([surface], lattice, settings))
+    return choose_settings(surface, lattice, settings, cheapest)
 
 
 def _compared(
