@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, describe_failure
 from sobolev_batch.batch.cluster.workers import Workers
-from sobolev_batch.batch.field_tasks import Job, compute_mesh, compute_parts, finish_mesh
+from sobolev_batch.batch.field_tasks import Job, compute_group, compute_mesh, compute_parts, finish_mesh
 from sobolev_batch.errors import ClusterError
 from sobolev_batch.norms.tail.values import SurfaceSize
 from sobolev_batch.sources.registry import ExpectedSize
@@ -33,8 +33,10 @@ LEAST_TRANSFORM_BYTES = 256e6
 _CHOICE_BYTES = 100.0
 # Of a sample of octaves: its frequency, weight, place and value, and what makes them.
 _SAMPLE_BYTES = 150.0
+# Surfaces predicted to take less are computed several in a task, which is predicted to take no more than the other.
+_SMALL_SECONDS, _GROUP_SECONDS = 0.05, 0.3
 # Time to describe and record a surface, and that of each of its triangles.
-_ROW_SECONDS, _TRIANGLE_SECONDS = 0.1, 5e-6
+_ROW_SECONDS, _TRIANGLE_SECONDS = 0.015, 5e-6
 # Groups of blocks of the lattice. The blocks of a group are computed in one task.
 _Groups = tuple[tuple[Block, ...], ...]
 # The groups of a row, the memory that one transform may take besides mesh and block, and that of a task.
@@ -73,14 +75,56 @@ def compute_fields(cluster: Cluster, workspace: Workspace, pending: Sequence[int
                 yield _field_task(Job.for_row(plan, row, store, i, allowed_bytes, reference), groups, task_bytes)
 
     projected_bytes = max((task_bytes for *_, task_bytes in sizes.values()), default=0.0)
+    seconds = {rows[i].label: row_seconds(plan, rows[i]) for i in pending if is_predictable(rows[i])}
+    most = max(1, len(sizes) // (2 * workers.threads))
 
     def take_outcome(task: Task, outcome: Any) -> None:
-        if isinstance(outcome, Record):
+        if isinstance(outcome, dict):
+            for one in task.divided:
+                take_outcome(one, outcome[one.row])
+        elif task.divided:
+            for one in task.divided:
+                take_outcome(one, outcome)
+        elif isinstance(outcome, Record):
             take(task.row, outcome)
         else:
             give_up(task.row, describe_failure(outcome))
 
-    yield Wave(cluster, tasks(), take_outcome, projected_bytes)
+    yield Wave(cluster, _in_groups(tasks(), seconds, most), take_outcome, projected_bytes)
+
+
+def is_predictable(row: Row) -> bool:
+    """Tell whether the size of a surface is known before it is made: nobody knows how long a program takes."""
+    return math.isfinite(row.member.expected_size().factor)
+
+
+def _in_groups(tasks: Iterator[Task], seconds: Mapping[str, float], most: int) -> Iterator[Task]:
+    """Yield tasks of fields, with up to so many of small meshes in one: each costs the scheduler some milliseconds."""
+    group: list[Task] = []
+    for task in tasks:
+        predicted = seconds.get(task.label, math.inf) if task.function is compute_mesh else math.inf
+        if predicted > _SMALL_SECONDS:
+            yield task
+            continue
+        group.append(task)
+        if len(group) >= most or sum(seconds[one.label] for one in group) > _GROUP_SECONDS:
+            yield _grouped(group)
+            group = []
+    if group:
+        yield _grouped(group)
+
+
+def _grouped(tasks: Sequence[Task]) -> Task:
+    """Return one task that does several of small meshes, which take its place where a worker dies of it."""
+    first, *others = tasks
+    if not others:
+        return first
+    jobs, (_, blocks) = [task.arguments[0] for task in tasks], first.arguments
+    label = f"{first.label} and {len(others)} more"
+    largest = max(task.projected_bytes for task in tasks)
+    return Task(
+        compute_group, (jobs, blocks), largest, first.needs_gpu, first.row, label, stage="field", divided=tuple(tasks)
+    )
 
 
 def _field_task(job: Job, groups: _Groups, projected_bytes: float) -> Task:

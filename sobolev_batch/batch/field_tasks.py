@@ -113,7 +113,7 @@ class Job:
 
     def stored_record(self) -> Record | None:
         """Return the completion record of the field if it exists: Dask repeats tasks whose worker was lost."""
-        record = Records(self.store).read_one(self.index)
+        record = Records(self.store).read_one(self.index, of_this_run=True)
         return record if record is not None and record.completes(self.row.key) else None
 
     def failure_reason(self, error: Exception) -> str:
@@ -149,6 +149,19 @@ def compute_mesh(job: Job, blocks: Sequence[Block]) -> Record:
     """
     stored = compute_parts(job, blocks, octaves=job.tail is not None)
     return stored if isinstance(stored, Record) else _finished(job, stored)
+
+
+def compute_group(jobs: Sequence[Job], blocks: Sequence[Block]) -> dict[int, Record | Exception]:
+    """Do `compute_mesh` for several small meshes; return the record of each, or its exception, by its row."""
+    outcomes: dict[int, Record | Exception] = {}
+    for job in jobs:
+        try:
+            outcomes[job.index] = compute_mesh(job, blocks)
+        except StoreError:
+            raise
+        except Exception as error:
+            outcomes[job.index] = error
+    return outcomes
 
 
 def compute_parts(job: Job, blocks: Sequence[Block] = (), octaves: bool = False) -> list[StoredBlocks] | Record:

@@ -18,7 +18,7 @@ import numpy as np
 from sobolev_batch import compiled
 from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, in_place, result_from, result_of
 from sobolev_batch.batch.cluster.workers import Workers
-from sobolev_batch.batch.field_stage import compute_fields, row_seconds, size_rows
+from sobolev_batch.batch.field_stage import compute_fields, is_predictable, row_seconds, size_rows
 from sobolev_batch.batch.proximity_stage import have_proximities, measure_proximities
 from sobolev_batch.batch.table_stage import TABLES_VERSION, Tabulated, are_tabulated, tabulate_fields
 from sobolev_batch.errors import DamageError, InputError
@@ -182,8 +182,7 @@ def _is_small(workspace: Workspace, workers: Workers) -> bool:
     """Tell whether the missing work of an object takes so little time and memory that one task may do all of it."""
     plan, study = workspace.plan, workspace.plan.study
     rows = [workspace.rows[i] for i in workspace.pending]
-    # Nobody knows how long a program takes.
-    if study.backend == "gpu" or study.pairs == "all" or any(source.keeps_meshes for source in study.object.sources):
+    if study.backend == "gpu" or study.pairs == "all" or not all(map(is_predictable, rows)):
         return False
     sizes, refused = size_rows(plan, rows, workers)
     is_little = all(task_bytes <= workers.allowed_bytes_per_task for *_, task_bytes in sizes.values())

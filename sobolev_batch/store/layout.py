@@ -323,7 +323,9 @@ class Store:
             keys |= dict.fromkeys(self.chunk_keys(name), largest_chunk_bytes(self.documents[name]))
         unknown = {key: keys[key] for key in sorted(keys.keys() - self._hashes.keys())}
         with ThreadPoolExecutor(_REQUESTS_AT_ONCE) as pool:
-            contents = pool.map(self.location.read, unknown, unknown.values())
+            # A thread takes longer to start than a file to be read.
+            each = pool.map if self.location.scheme else map
+            contents = each(self.location.read, unknown, unknown.values())
             for key, content in zip(unknown, contents, strict=True):
                 self._hashes[key] = hashlib.sha256(content or b"").hexdigest()
         return digest_of([root, {key: self._hashes[key] for key in keys}])

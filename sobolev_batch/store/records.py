@@ -261,11 +261,14 @@ class Records(Generic[RecordType]):
             _log.warning("%s is damaged and counts as not there: %s", name, what)
         return tuple(records)
 
-    def read_one(self, row: int) -> RecordType | None:
-        """Return the completion record of one row, or None if it has none that can be read."""
+    def read_one(self, row: int, *, of_this_run: bool = False) -> RecordType | None:
+        """Return the completion record of one row, or None if it has none that can be read.
+
+        Those of the run that is going on are in no page yet.
+        """
         with suppress(DamageError):
             line = str(self.store.read(RECORD, row))
-            if not line and row < self._pages()[1]:
+            if not line and not of_this_run and row < self._pages()[1]:
                 line = str(self.store.read(PAGE, row))
             return self.type.from_json(line, row)
         return None

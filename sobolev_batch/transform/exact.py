@@ -382,8 +382,10 @@ def sampled_transform(mesh: Mesh, frequencies: Reals, threads: int = 1, backend:
         parts = np.array_split(others, threads if backend is CPU else 1)
         total = np.zeros(len(others), dtype=np.complex128)
         with ThreadPoolExecutor(len(parts)) as pool:
+            # A thread takes longer to start than few sums.
+            each = pool.map if len(parts) > 1 else map
             for _, batch in mesh.batches(_SAMPLED_PAIRS[backend.name]):
-                total += np.concatenate(list(pool.map(partial(_plain_sums, _faces(batch, backend), backend), parts)))
+                total += np.concatenate(list(each(partial(_plain_sums, _faces(batch, backend), backend), parts)))
         return total
 
     values[~fine] = compute_on(_faster(backend, mesh, others), sums) if len(others) else 0

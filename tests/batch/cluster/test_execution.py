@@ -13,7 +13,7 @@ import pytest
 from distributed import Client, Event, Future, KilledWorker, LocalCluster, as_completed
 from distributed.utils import key_split
 
-from sobolev_batch import Study, plan, run, submit
+from sobolev_batch import Study, plan, run, shapes, submit
 from sobolev_batch.batch.cluster import execution
 from sobolev_batch.batch.cluster.execution import (
     Cluster,
@@ -22,6 +22,7 @@ from sobolev_batch.batch.cluster.execution import (
     Task,
     Wave,
     describe_failure,
+    in_place,
     result_of,
     side_by_side,
 )
@@ -29,6 +30,7 @@ from sobolev_batch.batch.cluster.watch import Watch
 from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers, prepare_workers
 from sobolev_batch.batch.status import Status
 from sobolev_batch.errors import ClusterError, DamageError, InputError, StoreError
+from sobolev_batch.geometry.formats.writing import write_mesh
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.records import Records
 from tests.support.processes import tcp_cluster
@@ -150,6 +152,40 @@ def test_tasks_whose_workers_died_are_tried_alone(cluster: Cluster, monkeypatch:
     assert tried[4:] == [(1, 2), (3, 3)]
     assert (outcomes[1], outcomes[2], outcomes[4]) == (1, 2, 4)
     assert "at last with nothing else beside them" in str(outcomes[3])
+
+
+def test_a_group_whose_worker_died_is_divided(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    worker: Any = SimpleNamespace(address="tcp://127.0.0.1:1")
+    fetched, outcomes = execution._outcomes, list[tuple[int, Any]]()
+
+    def died(client: Client, futures: Sequence[Future]) -> list[Any]:
+        return [KilledWorker("group", worker, 1) if isinstance(one, int) else one for one in fetched(client, futures)]
+
+    def stages() -> Stages[str]:
+        pieces = tuple(Task(str, (row,), row=row) for row in (1, 2))
+        yield Wave(cluster, [Task(abs, (-12,), divided=pieces)], lambda task, found: outcomes.append((task.row, found)))
+        return "after"
+
+    monkeypatch.setattr(execution, "_outcomes", died)
+    assert list(side_by_side([("", stages())])) == [("", "after")]
+    assert sorted(outcomes) == [(1, "1"), (2, "2")]
+
+
+def test_a_run_in_place_is_the_same(cluster: Cluster) -> None:
+    seen: list[Any] = []
+
+    def stages() -> Stages[str]:
+        tasks = [Task(abs, (-1,)), Task(sum, ([Task(abs, (-2,)), 3],)), Task(_fail, (ValueError("bad mesh"),))]
+        yield Wave(cluster, tasks, lambda task, outcome: seen.append(outcome))
+        try:
+            yield Wave(cluster, [Task(_fail, (StoreError("disk full"),)), Task(abs, (-9,))], ignore)
+        except StoreError as error:
+            return str(error)
+        return ""
+
+    assert in_place(stages()) == "disk full"
+    assert seen[:2] == [1, 5]
+    assert str(seen[2]) == "bad mesh"
 
 
 def _fail(error: Exception) -> None:
@@ -280,14 +316,16 @@ def test_the_dashboard_names_tasks_by_stage_study_and_mesh(threads: Client, monk
     assert {(key[0], key_split(key)) for key in keys if key[0].startswith("field")} == {(field, field)}
     assert all(key_split(key).endswith(" my_scans 2024_06") for key in keys)
     meshes = ["ico/1", "ico/2", "egg/1", "egg/2", "reference"]
-    shown = sorted(label for group, label, _ in keys if group == field)
-    assert shown == sorted(f"{name}/{mesh}" for name in ("cow", "egg") for mesh in meshes)
+    shown = [label.partition(" and ") for group, label, _ in keys if group == field]
+    # Small meshes share tasks, which the first of them names.
+    assert {first for first, *_ in shown} < {f"{name}/{mesh}" for name in ("cow", "egg") for mesh in meshes}
+    assert sum(1 + int(more.split()[0] if more else 0) for *_, more in shown) == 2 * len(meshes)
     assert len(set(keys)) == len(keys)
 
     def transforms(dask_scheduler: Any) -> int:
         return int(dask_scheduler.task_prefixes[field].state_counts["memory"])
 
-    assert threads.run_on_scheduler(transforms) == 10
+    assert threads.run_on_scheduler(transforms) == len(shown)
 
 
 def test_an_asynchronous_client_is_refused_before_anything_is_made() -> None:
@@ -312,3 +350,22 @@ def test_a_run_prints_its_progress(capsys: pytest.CaptureFixture[str]) -> None:
 def test_a_failure_of_the_storage_is_not_blamed_on_a_scheduler_that_answers(threads: Client) -> None:
     with pytest.raises(OSError, match="no room"), Watch(threads).kept():
         raise OSError("no room")
+
+
+def test_small_meshes_travel_in_groups(threads: Client, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    keys: list[str] = []
+    hand_over = threads.submit
+
+    def recorded(*arguments: Any, key: tuple[str, str, str], **options: Any) -> Future:
+        keys.append(key[0])
+        return hand_over(*arguments, key=key, **options)
+
+    monkeypatch.setattr(threads, "submit", recorded)
+    for k in range(40):
+        write_mesh(shapes.icosphere(0), tmp_path / f"{k}.off")
+    (tmp_path / "7.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 nan 0\n3 0 1 2\n")
+    table = small_table(family=[{"name": "f", "source": "files", "paths": ["*.off"]}], compare=None)
+    summary = run(Study.from_table(table, folder=tmp_path), "memory://groups.zarr", threads)
+    # Each has its record, and one bad mesh stops no other.
+    assert (len(summary.computed), list(summary.failed)) == (40, ["f/7"])
+    assert sum(key.startswith("field") for key in keys) <= 6
