@@ -36,7 +36,7 @@ def _range(context: click.Context, param: click.Parameter, value: str | None) ->
     "--within",
     required=True,
     metavar="TOLERANCE",
-    help="Keep the largest deviation within a length, such as 0.1 or 0.1mm, or the distance within a fraction, as 1%.",
+    help="Keep the largest deviation within a length, such as 0.1mm, or the distance within 1% of the norm.",
 )
 @click.option("--order", type=float, help=f"Measure this fraction at an order below -1/2. [default: {DEFAULT_ORDER:g}]")
 @click.option("--unit", metavar="NAME", help="Name the unit of length of the files, such as mm.")
@@ -45,7 +45,7 @@ def _range(context: click.Context, param: click.Parameter, value: str | None) ->
     default="decimate",
     show_default=True,
     metavar="METHOD",
-    help="Take this source (decimate, remesh) or command, such as 'mmgs_O3 -in {input} -out {output} -hausd {hausd}'.",
+    help="Take 'mmgs_O3 -in {input} -out {output} -hausd {hausd}' or another command, or the source remesh.",
 )
 @click.option(
     "--search",
