@@ -52,7 +52,7 @@ Metric = Literal["hausdorff", "mean", "rms", "percentiles", "chamfer", "fscore",
 
 # Deeper tables are mistakes.
 _DEEPEST = 20
-_MOST_ORDERS, _MOST_OBJECTS = 100, 1000
+_MOST_ORDERS, _MOST_OBJECTS = 100, 100_000
 MOST_OCTAVES = 24
 # Larger study files are mistakes.
 _LARGEST_FILE_BYTES = 4 << 20

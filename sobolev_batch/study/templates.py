@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from glob import has_magic
 from itertools import islice
 from pathlib import Path
@@ -172,15 +172,17 @@ def _families(family: Mapping[str, Any], names: Sequence[str], folder: Path) -> 
 
 def _files(template: str, names: Sequence[str], folder: Path) -> Iterator[tuple[str, str, str]]:
     """Yield object, method and path of the files that match a template; the longest names that fit count."""
-    texts = {name: template.replace(OBJECT, name) for name in sorted(names, key=len, reverse=True)}
     if not has_magic(_glob(template.replace(OBJECT, ""))):
         # The files need not exist yet.
-        yield from ((name, "", text) for name, text in texts.items())
+        yield from ((name, "", template.replace(OBJECT, name)) for name in names)
         return
-    patterns = {name: re.compile(_pattern(text)).fullmatch for name, text in texts.items()}
+    known, lengths = set(names), sorted({len(name) for name in names}, reverse=True)
+    pattern_of = cache(lambda name: re.compile(_pattern(template.replace(OBJECT, name))).fullmatch)
     for path in map(partial(_text, folder), matching_files(folder, _glob(template))):
-        candidates = (name for name in patterns if name in path or OBJECT not in template)
-        found = ((name, match) for name in candidates if (match := patterns[name](path)) is not None)
+        # Thousands of names are not tried one by one.
+        parts = (path[i : i + length] for length in lengths for i in range(len(path) - length + 1))
+        candidates = names if OBJECT not in template else (part for part in parts if part in known)
+        found = ((name, match) for name in candidates if (match := pattern_of(name)(path)) is not None)
         for name, match in found if OBJECT not in template else islice(found, 1):
             yield name, match.groupdict().get("method", ""), path
 
