@@ -78,7 +78,7 @@ def table_command() -> None:
 def convergence_command(table: TableOptions, x: str) -> None:
     """Print distances to the reference, with rates.
 
-    A collection has the tables of all its objects.
+    The rows of several objects follow each other.
     """
     from sobolev_batch.tables.convergence import format_table
 

@@ -291,7 +291,7 @@ class _PlotOptions:
         return bool(missing)
 
     def draw_league(self) -> None:
-        """Draw the leagues of a collection, by size and where costs are known by cost."""
+        """Draw the leagues of several objects, by size and where costs are known by cost."""
         from sobolev_batch.extras.figures.drawing import COST_LEAGUE, LEAGUE
         from sobolev_batch.extras.figures.style import drawing, write_figures
         from sobolev_batch.extras.leagues.league import league
@@ -381,8 +381,8 @@ def witness_command(
 def report_command(store: Location, output: Path, folder: Path, up: Axis | None, meshes: tuple[str, ...]) -> None:
     """Write the results of STORE as one HTML page.
 
-    The page needs no other files and makes no requests. What it leaves out is listed. The page of a collection has its
-    league; each object has a store, and a report, of its own.
+    The page needs no other files and makes no requests. What it leaves out is listed. The page of several objects
+    has their league; STORE/OBJECT is the store of each, which has a page of its own.
     """
     from sobolev_batch.extras.report.build import make_report, write_page
 

@@ -18,11 +18,11 @@ _GROUPS = ("meshes", "norms", "distances", "convergence", "proximity")
 
 
 def export(store: AnyStore, path: Path, style: ExportFormat, order: Orders | None = None) -> None:
-    """Write the tables of a store, or of all objects of a collection, to a file.
+    """Write the tables of a store, of one object or of several, to a file.
 
     Parquet and CSV have the rows of `table`. NetCDF has the groups of the store but fields, spectra and records, below
-    groups of their objects in a collection; attributes that are tables or lists are JSON. InputError where a library
-    is not installed, StoreError where the file cannot be written.
+    groups of their objects where there are several; attributes that are tables or lists are JSON. InputError where a
+    library is not installed, StoreError where the file cannot be written.
     """
     with written(path, "the file"):
         if style == "csv":

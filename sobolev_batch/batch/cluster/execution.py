@@ -44,7 +44,7 @@ class Progress:
             measured.
         done, total: Steps of the stage.
         label: Label of the mesh that was finished, or address of the cluster's dashboard; else empty.
-        part: Object of a collection that is worked on, and its number, such as "cow, 2 of 8"; else empty.
+        part: Object that is worked on and its number, such as "cow, 2 of 8"; empty where the study names no object.
     """
 
     stage: Stage
@@ -112,7 +112,7 @@ class Cluster:
         in_flight: Number of small tasks that the scheduler knows of at a time, at least: enough to keep workers
             busy, while each costs the scheduler memory.
         in_flight_per_thread: The same for each thread of the workers.
-        study, part: Name of the study, and of its object in a collection, for the names of tasks.
+        study, part: Name of the study, and of its object where it names any, for the names of tasks.
     """
 
     client: Client | None

@@ -42,7 +42,7 @@ def compare_studies(new: AnyStores | AnyStore, old: AnyStores | AnyStore, order:
     below 1e-5 count as 1e-5, since they tell of rounding.
 
     Args:
-        new: Store of the new study: of a collection, or of one object; or stores of single objects by their names.
+        new: Store of the new study, of several objects or of one; or stores of single objects by their names.
         old: Store of the old study, likewise.
         order: One of the stores' orders, or several; default all that both have.
 

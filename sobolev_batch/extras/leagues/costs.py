@@ -39,7 +39,7 @@ METHOD_COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class CostLeague(ShownTables):
-    """The meshes of a study or collection by distance and cost, at one order. Make it by `league` with ``by="cost"``.
+    """The meshes of a study by distance and cost, at one order. Make it by `league` with ``by="cost"``.
 
     Attributes:
         order: Sobolev order s.

@@ -86,7 +86,7 @@ PAIR_COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class League(ShownTables):
-    """The methods of a collection, compared over its objects at one order. Make it by `league`.
+    """The methods of a study, compared over its objects at one order. Make it by `league`.
 
     Attributes:
         order: Sobolev order s.

@@ -71,11 +71,11 @@ def report(
 ) -> Path:
     """Write the report of a store as one HTML page, with tables, plots and meshes, that makes no requests.
 
-    The page of a collection has the league of its methods, and the best method for each object. Needs the extra
-    "report".
+    The page of several objects has the league of their methods, and the best method for each object. Needs the
+    extra "report".
 
     Args:
-        store: Path, URL or opened DataTree of the store, or path or URL of that of a collection.
+        store: Path, URL or opened DataTree of the store, or path or URL of that of several objects.
         path: File to write.
         folder: Folder where relative paths in the study start; the study makes some meshes again, to be shown.
         witnesses: Labels of those meshes, in the store of one object, or patterns such as "scans/*"; by default a few
@@ -87,7 +87,7 @@ def report(
 
     Raises:
         InputError: A library of the extra is not installed, the store has no tables yet, a label is unknown, or meshes
-            of a collection are named.
+            are named in the store of several objects.
         StoreError: The location has no store of a study, or the page cannot be written.
         DamageError: A field is damaged.
 
@@ -216,7 +216,7 @@ def chart_data(tree: xr.DataTree, spectra: xr.Dataset | None, views: Sequence[Me
 
 
 def league_data(leagues: Sequence[League], name: str, orders: Sequence[str]) -> Json:
-    """Return the data of the charts of a collection, which may have no league; see `chart_data`."""
+    """Return the data of the charts of several objects, which may have no league; see `chart_data`."""
     return {
         "name": name,
         "orders": list(orders),

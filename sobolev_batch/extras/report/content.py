@@ -1,4 +1,4 @@
-"""Texts and tables of a report: of a study, with its verdict, and of a collection, with its league."""
+"""Texts and tables of a report: of one object, with its verdict, and of several, with their league."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def common_content(
     failed: Mapping[str, str],
     versions: Mapping[str, str],
 ) -> dict[str, Any]:
-    """Return what the pages of a study and of a collection both show.
+    """Return what the pages of one object and of several both show.
 
     The study is the table of its file, the frames are the rows of `table` of each object, failures have reasons by
     label.

@@ -1,4 +1,4 @@
-"""Reports of a small study with a failed mesh and hostile names, and of a collection, in a real browser."""
+"""Reports of a small study with a failed mesh and hostile names, and of several objects, in a real browser."""
 
 from __future__ import annotations
 
@@ -307,7 +307,7 @@ def test_what_is_missing_or_damaged_is_said(store: str, tmp_path: Path, monkeypa
 
 
 @pytest.fixture(scope="module")
-def collection() -> str:
+def objects() -> str:
     """Two spheres by two methods, and an object that has lost its reference."""
     study = {"name": "balls", "title": f"Balls {SCRIPT}"}
     made = small_table(study=study, object=[*balls(ball=1.0, large=1.1), GONE], family=methods_of("=egg"))
@@ -316,13 +316,13 @@ def collection() -> str:
     return place
 
 
-def test_the_page_of_a_collection_opens_with_the_league(collection: str, tmp_path: Path) -> None:
+def test_the_page_of_several_objects_opens_with_the_league(objects: str, tmp_path: Path) -> None:
     path = tmp_path / "report.html"
-    done = CliRunner().invoke(cli, ["report", collection, "--output", str(path)])
+    done = CliRunner().invoke(cli, ["report", objects, "--output", str(path)])
     assert done.stdout.strip() == str(path)
     left_out = "left out: single meshes: each object has a report of its own, such as that of "
-    assert f"{left_out}{collection}/ball" in done.stderr
-    (league, _) = sb.league(collection)
+    assert f"{left_out}{objects}/ball" in done.stderr
+    (league, _) = sb.league(objects)
     methods = league.table["method"].tolist()
     with browser(tmp_path / "profile") as reader:
         reader.open_report(path)
@@ -354,21 +354,21 @@ def test_a_study_with_costs_has_its_league_by_cost(store: str, monkeypatch: pyte
 
 
 @pytest.mark.slow
-def test_a_collection_without_league_says_why(collection: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_objects_without_league_say_why(objects: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise InputError("no object has all of the methods <a>")
 
     monkeypatch.setattr(content, "leagues_of", refuse)
-    text = make_report(collection)[0]
+    text = make_report(objects)[0]
     assert "<strong>There is no league.</strong> no object has all of the methods &lt;a&gt;" in text
     assert "left out: methods cannot be compared" in text
     assert 'id="table-objects"' in text
     assert text.count("Methods cannot be compared over the objects.") == 1
 
 
-def test_meshes_of_a_collection_are_shown_by_the_report_of_an_object(collection: str) -> None:
-    with pytest.raises(InputError, match=f"in the report of one object, such as {collection}/ball"):
-        make_report(collection, witnesses=["ico/1"])
+def test_meshes_of_several_objects_are_shown_by_the_report_of_an_object(objects: str) -> None:
+    with pytest.raises(InputError, match=f"in the report of one object, such as {objects}/ball"):
+        make_report(objects, witnesses=["ico/1"])
 
 
 SEPARATED = "a is nearest to the references over 8 objects at order −2: it differs by 0.5 %."

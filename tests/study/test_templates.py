@@ -38,12 +38,12 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def methods(collection: sb.Study) -> dict[str, list[str]]:
-    return {name: [family.name for family in study.families] for name, study in collection.objects.items()}
+def methods(study: sb.Study) -> dict[str, list[str]]:
+    return {name: [family.name for family in one.families] for name, one in study.objects.items()}
 
 
-def files(collection: sb.Study, folder: Path, name: str, method: str) -> list[str]:
-    (family,) = (family for family in collection.objects[name].families if family.name == method)
+def files(study: sb.Study, folder: Path, name: str, method: str) -> list[str]:
+    (family,) = (family for family in study.objects[name].families if family.name == method)
     return [member.name for member in family.source.members(folder)]
 
 

@@ -27,7 +27,7 @@ from tests.support.stores import flip
 from tests.support.studies import GONE, balls, methods_of, small_table
 
 
-def collection(objects: list[dict[str, Any]], name: str = "small") -> sb.Study:
+def study_of(objects: list[dict[str, Any]], name: str = "small") -> sb.Study:
     return sb.Study.from_table(small_table(study={"name": name}, object=objects, family=methods_of()))
 
 
@@ -41,9 +41,9 @@ def changeable(store: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def store(threads: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The store of a collection of which one object has lost its reference."""
-    path = tmp_path_factory.mktemp("collection") / "balls.zarr"
-    summary = sb.run(collection([*balls(a=1.0), GONE, *balls(b=1.1)]), path, threads)
+    """The store of three objects, of which one has lost its reference."""
+    path = tmp_path_factory.mktemp("objects") / "balls.zarr"
+    summary = sb.run(study_of([*balls(a=1.0), GONE, *balls(b=1.1)]), path, threads)
     assert set(summary.computed) == {f"{name}/{label}" for name in "ab" for label in LABELS}
     assert list(summary.failed) == ["gone"]
     assert "the reference cannot be made: nowhere.ply" in summary.failed["gone"].replace(str(Path.cwd()) + "/", "")
@@ -51,7 +51,7 @@ def store(threads: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_each_object_has_a_store_of_its_own(store: Path, threads: Client, tmp_path: Path) -> None:
-    alone = sb.Study.from_table(collection(balls(b=1.1)).object.table)
+    alone = sb.Study.from_table(study_of(balls(b=1.1)).object.table)
     sb.run(alone, tmp_path / "alone.zarr", threads)
     ours, own = (sb.table(path).drop(columns="seconds") for path in (store / "b", tmp_path / "alone.zarr"))
     assert ours.equals(own)
@@ -83,7 +83,7 @@ def test_objects_that_were_altered_or_traded_are_damage(changeable: Path) -> Non
         root.write_text(damaged)
         with pytest.raises(sb.errors.DamageError):
             sb.status(changeable)
-        Objects.prepared(Location.parse(changeable), collection([*balls(a=1.0), GONE, *balls(b=1.1)]))
+        Objects.prepared(Location.parse(changeable), study_of([*balls(a=1.0), GONE, *balls(b=1.1)]))
         pd.testing.assert_frame_equal(sb.table(changeable), before)
     for names in (("a", "other"), ("b", "a"), ("other", "b")):
         (changeable / names[0]).rename(changeable / names[1])
@@ -96,7 +96,7 @@ def test_an_object_that_lost_its_root_is_damage(changeable: Path, threads: Clien
     pd.testing.assert_frame_equal(sb.table(changeable), before)
     require_named_damage(changeable, ["b"], "zarr.json, the metadata at the root, is gone")
     (changeable / "zarr.json").write_text("")
-    assert sb.run(collection([*balls(a=1.0), GONE, *balls(b=1.1)]), changeable, threads).computed == ()
+    assert sb.run(study_of([*balls(a=1.0), GONE, *balls(b=1.1)]), changeable, threads).computed == ()
     pd.testing.assert_frame_equal(sb.table(changeable), before)
 
 
@@ -113,7 +113,7 @@ def require_named_damage(path: Path, objects: list[str], what: str) -> None:
     assert what in status.failed[objects[0]]
 
 
-def test_tables_of_a_collection_are_those_of_its_objects(store: Path) -> None:
+def test_tables_of_a_study_are_those_of_its_objects(store: Path) -> None:
     joined = sb.table(store, -3)
     assert joined.columns[0] == "object"
     for name, of_object in joined.groupby("object"):
@@ -129,7 +129,7 @@ def test_tables_of_a_collection_are_those_of_its_objects(store: Path) -> None:
 @pytest.mark.slow
 def test_a_plan_goes_on_past_an_object_that_cannot_be(tmp_path: Path) -> None:
     path = tmp_path / "study.toml"
-    made = collection([*balls(a=1.0), GONE, *balls(b=1.1)])
+    made = study_of([*balls(a=1.0), GONE, *balls(b=1.1)])
     plan = sb.plan(made, tmp_path / "s.zarr")
     assert list(plan.objects) == ["a", "b"]
     assert plan.objects["b"].store == str(tmp_path / "s.zarr" / "b")
@@ -157,7 +157,7 @@ def test_runs_tell_of_themselves_while_they_plan(tmp_path: Path, monkeypatch: py
         return make_plan(*arguments)
 
     monkeypatch.setattr("sobolev_batch.store.workspace.make_plan", planned)
-    sb.run(collection([GONE, {**GONE, "name": "too"}]), "memory://planned.zarr", workers=1)
+    sb.run(study_of([GONE, {**GONE, "name": "too"}]), "memory://planned.zarr", workers=1)
     assert [one[:2] for one in seen] == [(True, 0), (True, 0)]
     ended = sb.status("memory://planned.zarr")
     assert (ended.going_on, ended.waiting, {*ended.failed}) == (False, 0, {"gone", "too"})
@@ -188,11 +188,11 @@ def test_the_status_is_that_of_the_run(changeable: Path) -> None:
 
 
 def test_a_second_run_computes_what_is_new(store: Path, threads: Client) -> None:
-    summary = sb.run(collection(balls(a=1.0, b=1.1, c=1.2)), store, threads)
+    summary = sb.run(study_of(balls(a=1.0, b=1.1, c=1.2)), store, threads)
     assert set(summary.computed) == {f"c/{label}" for label in LABELS}
     assert summary.failed == {}
     with pytest.raises(sb.errors.StoreError, match="it holds the store of another study, 'small', not 'other'"):
-        sb.run(collection(balls(a=1.0), "other"), store, threads)
+        sb.run(study_of(balls(a=1.0), "other"), store, threads)
 
 
 @pytest.mark.extras
@@ -227,7 +227,7 @@ def test_other_references_and_units_are_told_apart(
 def test_a_finished_object_costs_no_look_at_its_store(
     changeable: Path, threads: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    study = collection(balls(a=1.0, b=1.1))
+    study = study_of(balls(a=1.0, b=1.1))
     sb.run(study, changeable, threads)
     looked: list[str] = []
     read = Location.read
@@ -247,9 +247,9 @@ def test_a_finished_object_costs_no_look_at_its_store(
 
 
 def test_objects_come_and_go(changeable: Path, threads: Client) -> None:
-    sb.run(collection(balls(b=1.1)), changeable, threads)
+    sb.run(study_of(balls(b=1.1)), changeable, threads)
     assert sb.status(changeable).total == 5
-    back = sb.run(collection(balls(d=1.3, b=1.1, a=1.0)), changeable, threads)
+    back = sb.run(study_of(balls(d=1.3, b=1.1, a=1.0)), changeable, threads)
     assert {label[0] for label in back.computed} == {"d"}
     assert {label[0] for label in back.reused} == {"a", "b"}
     with pytest.raises(sb.errors.StoreError, match="the store of several objects; name that of one"):
@@ -269,11 +269,11 @@ def test_the_root_has_the_rows_of_all_objects(changeable: Path, threads: Client)
             for variable in ("distance", "error_part", "triangles", "family"):
                 np.testing.assert_array_equal(found[variable].values, own[variable].values)
 
-    sb.run(collection(balls(a=1.0, b=1.1)), changeable, threads)
+    sb.run(study_of(balls(a=1.0, b=1.1)), changeable, threads)
     rows("a", "b")
-    sb.run(collection(balls(b=1.1, d=1.2)), changeable, threads)
+    sb.run(study_of(balls(b=1.1, d=1.2)), changeable, threads)
     rows("b", "d")
-    changed = collection(balls(b=1.1, d=1.3, a=1.0))
+    changed = study_of(balls(b=1.1, d=1.3, a=1.0))
     assert {label[0] for label in sb.run(changed, changeable, threads).computed} == {"d"}
     rows("b", "d", "a")
     assert sb.verify(changeable).is_sound
@@ -282,7 +282,7 @@ def test_the_root_has_the_rows_of_all_objects(changeable: Path, threads: Client)
 def test_a_run_that_was_killed_before_the_tables_of_all_goes_on(
     changeable: Path, threads: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    study = collection(balls(a=1.0, e=1.4, b=1.1))
+    study = study_of(balls(a=1.0, e=1.4, b=1.1))
 
     def killed(*arguments: Any) -> None:
         raise KeyboardInterrupt
