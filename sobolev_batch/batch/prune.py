@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from contextlib import nullcontext
 
-from sobolev_batch.store.layout import FIELD, OCTAVES, ROOT, Store
+from sobolev_batch.store.encoding import ROOT
+from sobolev_batch.store.layout import FIELD, OCTAVES, Store
 from sobolev_batch.store.location import PARTIAL_FILE, Location
 from sobolev_batch.store.lock import LOCK_KEYS, Lock, locked
 from sobolev_batch.store.objects import root_of

@@ -264,6 +264,8 @@ def _meshes_table(workspace: Workspace, placed: Sequence[Placed]) -> xr.Dataset:
         columns["time"] = np.array([np.nan if time is None else time for time in times])
     variables = {name: ("mesh", values) for name, values in {**columns, **metadata}.items()}
     table = xr.Dataset(variables, attrs={"metadata": list(metadata)})
+    # Else xarray counts from the first of them, and no two tables have the same metadata.
+    table["finished"].encoding = {"units": "seconds since 1970-01-01", "dtype": "int64"}
     # Texts have no missing value, which `where` needs of variables that are no coordinates.
     texts = [name for name, values in columns.items() if values.dtype == object]
     return describe(table.set_coords([*texts, *COORDINATES, *sorted(SOME_COORDINATES & columns.keys()), *metadata]))

@@ -11,6 +11,7 @@ from pathlib import Path
 from sobolev_batch.errors import DamageError, LockError, StoreError
 from sobolev_batch.machine import available_cores
 from sobolev_batch.shown import Shown
+from sobolev_batch.store.encoding import ROOT
 from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.store.layout import (
     GROUPS_OF_TASKS,
@@ -18,7 +19,6 @@ from sobolev_batch.store.layout import (
     PAIRS_KEYS,
     QUALITY,
     RECORDS,
-    ROOT,
     SPECTRA_KEYS,
     Store,
     table_names,

@@ -20,6 +20,7 @@ from sobolev_batch.errors import DamageError, StoreError
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms.spectrum import RadialAxis
 from sobolev_batch.norms.tail.sampling import TailSampling
+from sobolev_batch.store.encoding import ROOT, array_keys, dataset_keys
 from sobolev_batch.store.layout import (
     FIELD,
     OCTAVES,
@@ -29,13 +30,10 @@ from sobolev_batch.store.layout import (
     RECORD,
     RECORDS,
     REMOVED,
-    ROOT,
     SPECTRA_GROUP,
     SPECTRA_KEYS,
     UNFINISHED,
     Store,
-    array_keys,
-    dataset_keys,
     hide_tables,
 )
 from sobolev_batch.store.location import Location

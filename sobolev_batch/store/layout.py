@@ -18,24 +18,21 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from itertools import accumulate
 from pathlib import Path
-from threading import Lock
 from typing import Any, Self
 
 import numpy as np
 import xarray as xr
 import zarr
-from zarr.abc.buffer import Buffer
 from zarr.abc.store import Store as ZarrStore
-from zarr.codecs import Crc32cCodec
-from zarr.storage import MemoryStore, StorePath
+from zarr.storage import StorePath
 
 from sobolev_batch.errors import DamageError, StoreError
 from sobolev_batch.store.checked import CheckedStore, largest_chunk_bytes
+from sobolev_batch.store.encoding import LARGEST_CHUNK_BYTES, ROOT, dataset_keys
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.metadata import MOST_BYTES, SCHEMA_VERSION, Document, check_documents, chunk_shape
 from sobolev_batch.study.lattice_choice import LatticeChoice
 
-ROOT = "zarr.json"
 FIELD = "fourier/fourier"
 LABELS = "fourier/mesh"
 QUALITY = "fourier/quality"
@@ -52,15 +49,10 @@ SPECTRA_KEYS, PAIRS_KEYS = f"{SPECTRA_GROUP}/key", f"{DISTANCES}/key"
 DIGEST, UNFINISHED, OBJECTS, REMOVED = "digest", "unfinished", "objects", "removed"
 # Tables whose rows the root of several objects repeats.
 TABLES_OF_ALL = ("meshes", "convergence", "proximity")
-# Arrays of tables above this size in memory, such as distances of all pairs of many meshes, have several chunks.
-_LARGEST_CHUNK_BYTES = 64 << 20
 # These arrays have chunks for rows, which need not be computed.
 _OF_ROWS = frozenset({FIELD, OCTAVES, RECORD, PAGE})
-# Missing values depend on the kind of a dtype: that of strings, of complex and of real numbers.
-_FILL_VALUES: dict[str, Any] = {"U": "", "c": complex(np.nan, np.nan), "f": np.nan}
 # Most of the time of a request is spent waiting.
 _REQUESTS_AT_ONCE = 64
-_of_one_thread = Lock()
 # Documents, and hashes of keys.
 Metadata = tuple[dict[str, Document], dict[str, str]]
 # Tasks write into the chunks of these groups; all others are tables, written, listed and hidden as a whole.
@@ -408,61 +400,8 @@ def hide_tables(store: Store) -> list[str]:
 
 def write_table(store: Store, group: str, dataset: xr.Dataset) -> None:
     """Write a group. Readers find it after `Store.consolidate`."""
-    large = [name for name, values in dataset.items() if values.nbytes > _LARGEST_CHUNK_BYTES]
+    large = [name for name, values in dataset.items() if values.nbytes > LARGEST_CHUNK_BYTES]
     store.publish(dataset_keys(group, dataset.drop_vars(large)))
     # They are written one after the other, since keys are copies.
     for name in large:
         store.publish(dataset_keys(group, dataset[[name]].drop_vars(list(dataset.coords), errors="ignore")))
-
-
-def array_keys(
-    name: str,
-    dtype: Any,
-    shape: tuple[int, ...],
-    chunks: tuple[int, ...],
-    dimensions: tuple[str, ...],
-    **attributes: Any,
-) -> dict[str, bytes]:
-    """Return the keys of an array without chunks, with checksums. It reads as NaN, or as empty strings."""
-    keys: dict[str, Buffer] = {}
-    zarr.create_group(MemoryStore(keys), zarr_format=3).create_array(
-        name,
-        shape=shape,
-        dtype=dtype,
-        chunks=chunks,
-        compressors=(Crc32cCodec(),),
-        fill_value=_FILL_VALUES[np.dtype(dtype).kind],
-        dimension_names=dimensions,
-        attributes=attributes,
-    )
-    return _bytes_of(keys)
-
-
-def dataset_keys(group: str, dataset: xr.Dataset) -> dict[str, bytes]:
-    """Return the keys of a group with the arrays of a dataset, with checksums, one chunk each unless they are large."""
-    keys: dict[str, Buffer] = {}
-    encoding = {
-        str(name): {
-            "compressors": (Crc32cCodec(),),
-            "chunks": variable.encoding.get("chunks", (_steps(variable), *variable.shape[1:])),
-        }
-        for name, variable in dataset.variables.items()
-        if variable.ndim
-    }
-    # A missing chunk is a lost one, and never a table of zeros. The setting is that of all threads.
-    with _of_one_thread, zarr.config.set({"array.write_empty_chunks": True}):
-        dataset.to_zarr(MemoryStore(keys), group=group, mode="w", zarr_format=3, consolidated=False, encoding=encoding)
-    # xarray writes several at a time, in any order.
-    places = {str(name): place for place, name in enumerate(dataset.variables)}
-    written = _bytes_of(keys)
-    return {key: written[key] for key in sorted(written, key=lambda key: places.get(key.split("/")[1], -1))}
-
-
-def _steps(variable: xr.Variable) -> int:
-    """Return the length of a chunk along the first axis."""
-    return max(1, min(variable.shape[0], _LARGEST_CHUNK_BYTES * variable.shape[0] // max(1, variable.nbytes)))
-
-
-def _bytes_of(keys: dict[str, Buffer]) -> dict[str, bytes]:
-    # The root is made by `Store.consolidate`.
-    return {key: value.to_bytes() for key, value in keys.items() if key != ROOT}

@@ -13,7 +13,8 @@ from typing import Any, Self, TypeVar
 
 from sobolev_batch.errors import DamageError, InputError, StoreError
 from sobolev_batch.store.create import list_records, record_keys
-from sobolev_batch.store.layout import OBJECTS, PAGE, RECORD, RECORDS, ROOT, TABLES_OF_ALL, Store
+from sobolev_batch.store.encoding import ROOT
+from sobolev_batch.store.layout import OBJECTS, PAGE, RECORD, RECORDS, TABLES_OF_ALL, Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import LOCK_KEYS
 from sobolev_batch.store.metadata import SCHEMA_VERSION

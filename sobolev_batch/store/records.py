@@ -20,7 +20,8 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from sobolev_batch.errors import DamageError
 from sobolev_batch.sources.programs import Cost
 from sobolev_batch.store.checked import CHANGED, largest_chunk_bytes
-from sobolev_batch.store.layout import DIGEST, PAGE, RECORD, RECORDS, ROOT, Store, digest_of, table_attributes
+from sobolev_batch.store.encoding import ROOT
+from sobolev_batch.store.layout import DIGEST, PAGE, RECORD, RECORDS, Store, digest_of, table_attributes
 from sobolev_batch.store.lock import Time
 from sobolev_batch.store.metadata import chunk_shape
 

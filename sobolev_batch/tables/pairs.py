@@ -18,7 +18,8 @@ from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import DamageError
 from sobolev_batch.norms.columns import VARIABLES, describe
 from sobolev_batch.norms.estimate import PARTS, NormEstimate
-from sobolev_batch.store.layout import DISTANCES, PAIRS_KEYS, Store, array_keys, dataset_keys
+from sobolev_batch.store.encoding import array_keys, dataset_keys
+from sobolev_batch.store.layout import DISTANCES, PAIRS_KEYS, Store
 from sobolev_batch.store.metadata import chunk_shape
 from sobolev_batch.store.sealed_chunks import key_in, key_of, missing_chunks, seal
 from sobolev_batch.tables.reducer import Reducer

@@ -17,6 +17,8 @@ import pytest
 import xarray as xr
 import zarr
 from distributed import Client
+from zarr.codecs import Crc32cCodec
+from zarr.storage import MemoryStore
 
 from sobolev_batch import Study, open_store, run, verify
 from sobolev_batch.batch.prune import prune
@@ -24,8 +26,9 @@ from sobolev_batch.batch.status import Status
 from sobolev_batch.errors import LockError, StoreError
 from sobolev_batch.store import metadata as documents
 from sobolev_batch.store.create import prepare_store
+from sobolev_batch.store.encoding import dataset_keys
 from sobolev_batch.store.field_arrays import Fields
-from sobolev_batch.store.layout import Store, dataset_keys
+from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, locked
 from sobolev_batch.store.records import Record, Records
@@ -299,3 +302,40 @@ def test_one_thread_at_a_time_changes_what_zarr_does_with_zeros(monkeypatch: pyt
     with ThreadPoolExecutor(4) as pool:
         tables = list(pool.map(lambda _: dataset_keys("table", zeros), range(8)))
     assert all("table/column/c/0" in keys for keys in tables)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_keys_of_a_known_form_are_those_that_xarray_writes(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    random = np.random.default_rng(seed)
+
+    def dataset(count: int) -> xr.Dataset:
+        texts = np.array(["", "é𝄞", "a" * 300] * count, dtype=object)[:count]
+        times = np.datetime64("2026-11-26T20:00:00") + random.integers(0, 10**6, count).astype("timedelta64[s]")
+        times[0] = np.datetime64("NaT")
+        columns = {
+            "distance": (("mesh", "order"), random.normal(size=(count, 2)), {"units": "1", "long_name": "distance"}),
+            "level": ("mesh", random.integers(-5, 5, count)),
+            "single": ("mesh", random.normal(size=count).astype(np.float32)),
+            "resolved": ("mesh", random.random(count) > 0.5),
+            "field": (("order", "mesh"), random.normal(size=(2, count)) + 1j),
+            "family": ("mesh", texts),
+            "finished": ("mesh", times, {}, {"units": "seconds since 1970-01-01", "dtype": "int64"}),
+        }
+        made = xr.Dataset(
+            columns, coords={"order": [-2.0, -1.0], "mesh": texts}, attrs={"rtol": random.random(), "names": ["a"]}
+        )
+        return made.set_coords("level")
+
+    for count in (5, 5, 7, 5, 7):
+        own, keys = dataset(count), dict[str, Any]()
+        with zarr.config.set({"array.write_empty_chunks": True}):
+            encoding = {
+                name: {**one.encoding, "compressors": (Crc32cCodec(),), "chunks": one.shape}
+                for name, one in own.variables.items()
+            }
+            own.to_zarr(MemoryStore(keys), group="g", mode="w", zarr_format=3, consolidated=False, encoding=encoding)
+        expected = {key: content.to_bytes() for key, content in keys.items() if key != "zarr.json"}
+        assert dataset_keys("g", own) == expected
+    with monkeypatch.context() as patch:
+        patch.delattr(xr.Dataset, "to_zarr")
+        assert dataset_keys("g", own) == expected

@@ -10,7 +10,7 @@ import xarray as xr
 from distributed import Client
 
 from sobolev_batch import Study, open_store, run, verify
-from sobolev_batch.store import layout
+from sobolev_batch.store import encoding, layout
 from sobolev_batch.tables.results import observed_rates
 from tests.support.stores import assert_same_results
 from tests.support.studies import small_table
@@ -21,7 +21,8 @@ NAN = np.nan
 def test_tables_in_many_chunks_are_those_in_one(
     monkeypatch: pytest.MonkeyPatch, store_path: Path, finished_store: Path, threads: Client
 ) -> None:
-    monkeypatch.setattr(layout, "_LARGEST_CHUNK_BYTES", 16)
+    monkeypatch.setattr(encoding, "LARGEST_CHUNK_BYTES", 16)
+    monkeypatch.setattr(layout, "LARGEST_CHUNK_BYTES", 16)
     run(Study.from_table(small_table()), store_path, threads)
     assert len(list((store_path / "convergence/distance/c").rglob("*"))) > 5
     assert verify(store_path).is_sound
