@@ -18,6 +18,7 @@ import numpy as np
 import xarray as xr
 import zarr
 from numcodecs.vlen import VLenUTF8
+from numpy.typing import NDArray
 from zarr.abc.buffer import Buffer
 from zarr.codecs import Crc32cCodec
 from zarr.storage import MemoryStore
@@ -81,7 +82,7 @@ def dataset_keys(group: str, dataset: xr.Dataset) -> dict[str, bytes]:
     keys = {f"{group}/{ROOT}": json.dumps(of_group, indent=2).encode()}
     for name, one in encoded.items():
         keys[f"{group}/{name}/{ROOT}"] = documents[f"{group}/{name}/{ROOT}"]
-        keys["/".join([group, name, "c", *["0"] * one.ndim])] = _chunk_of(one)
+        keys["/".join([group, name, "c", *["0"] * one.ndim])] = chunk_of(one.values)
     return keys
 
 
@@ -98,11 +99,15 @@ def _is_one_chunk(variable: xr.Variable) -> bool:
     return bool(variable.ndim and variable.size) and tuple(chunks) == variable.shape
 
 
-def _chunk_of(variable: xr.Variable) -> bytes:
-    """Return the bytes of an array of one chunk, as the codecs of its document encode it, with their checksum."""
-    values = np.ascontiguousarray(variable.values)
+def chunk_of(values: NDArray[Any]) -> bytes:
+    """Return the bytes of a chunk of texts or numbers, as the codecs of its array encode it, with their checksum."""
+    values = np.ascontiguousarray(values)
     is_text = values.dtype.kind in "OTU"
-    data = bytes(_strings.encode(values.astype(object).ravel())) if is_text else values.tobytes()
+    data = (
+        bytes(_strings.encode(values.astype(object).ravel()))
+        if is_text
+        else values.astype(values.dtype.newbyteorder("<"), copy=False).tobytes()
+    )
     return data + int(google_crc32c.value(data)).to_bytes(4, "little")
 
 

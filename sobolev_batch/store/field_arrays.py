@@ -16,6 +16,7 @@ from zarr.buffer.cpu import NDBuffer
 from sobolev_batch.errors import DamageError
 from sobolev_batch.store.checked import checksum_of
 from sobolev_batch.store.layout import FIELD, OCTAVES, Store
+from sobolev_batch.store.metadata import chunk_shape
 from sobolev_batch.store.records import Record
 from sobolev_batch.transform.lattice import AXES, Block, Lattice
 
@@ -50,10 +51,17 @@ class Fields:
 
     def write(self, row: int, place: Place, values: NDArray[Any]) -> int:
         """Write a row's values at a place, made of whole chunks, and return their checksum for `read`."""
-        array = self.store.array(_array_at(place))
-        values = np.ascontiguousarray(values, dtype=array.dtype)
-        with self.store.location.access("written"):
-            array.set_basic_selection((row, *place), values)
+        name = _array_at(place)
+        document = self.store.document(name)
+        step = chunk_shape(document)[1:]
+        values = np.ascontiguousarray(values, dtype=document["data_type"])
+        if list(values.shape) == step:
+            index = [row, *(axis.start // length for axis, length in zip(place, step, strict=True))]
+            self.store.write_chunk(name, index, values)
+        else:
+            array = self.store.array(name)
+            with self.store.location.access("written"):
+                array.set_basic_selection((row, *place), values)
         return checksum_of(values)
 
     def read(self, rows: Sequence[int], place: Place, checksums: Sequence[int] | None = None) -> NDArray[Any]:

@@ -23,12 +23,13 @@ from typing import Any, Self
 import numpy as np
 import xarray as xr
 import zarr
+from numpy.typing import NDArray
 from zarr.abc.store import Store as ZarrStore
 from zarr.storage import StorePath
 
 from sobolev_batch.errors import DamageError, StoreError
 from sobolev_batch.store.checked import CheckedStore, largest_chunk_bytes
-from sobolev_batch.store.encoding import LARGEST_CHUNK_BYTES, ROOT, dataset_keys
+from sobolev_batch.store.encoding import LARGEST_CHUNK_BYTES, ROOT, chunk_of, dataset_keys
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.metadata import MOST_BYTES, SCHEMA_VERSION, Document, check_documents, chunk_shape
 from sobolev_batch.study.lattice_choice import LatticeChoice
@@ -263,6 +264,11 @@ class Store:
         self._forget(name)
         with self.location.access("written"):
             array[selection] = values
+
+    def write_chunk(self, name: str, index: Sequence[int], values: NDArray[Any]) -> None:
+        """Write one whole chunk of an array."""
+        self._forget(name)
+        self.location.write({"/".join([name, "c", *map(str, index)]): chunk_of(values)})
 
     def publish(self, keys: Mapping[str, bytes]) -> None:
         """Write keys of new nodes. Readers find the nodes after `consolidate`."""

@@ -276,7 +276,8 @@ class Records(Generic[RecordType]):
 
     def write(self, row: int, record: RecordType | None) -> None:
         """Write the completion record of a row, or withdraw it: one chunk, replaced as a whole."""
-        self.store.write(RECORD, row, _WITHDRAWN if record is None else record.to_json(row))
+        line = _WITHDRAWN if record is None else record.to_json(row)
+        self.store.write_chunk(RECORD, [row], np.array([line], dtype=object))
 
     def collect(self, records: Sequence[RecordType | None]) -> None:
         """Collect the records of all rows in pages, each of rows that all have one, and remove their own chunks.
