@@ -13,7 +13,7 @@ from benchmarks.fitting import fits
 from benchmarks.low_orders import low_orders
 from benchmarks.memory import peaks
 from benchmarks.reconstruction import reconstructions
-from benchmarks.scale import tiny_meshes
+from benchmarks.scale import many_objects, tiny_meshes, waiting_workers
 from benchmarks.studies import all_pairs, study_overhead
 from benchmarks.table import Row, format_table
 from benchmarks.timing import Effort, machine_facts
@@ -36,6 +36,8 @@ _ITEMS: dict[str, Callable[[Effort], Iterator[Row]]] = {
     "13": verdicts,
     "growth": growth,
     "scale": tiny_meshes,
+    "objects": many_objects,
+    "waiting": waiting_workers,
 }
 # Reconstructions take as long as everything else together.
 _BY_NAME = ("12",)

@@ -1,10 +1,12 @@
-"""What the scheduler and the store add to each of very many meshes: a study of tiny ones."""
+"""What the driver, the scheduler and the store add to each of very many meshes and objects."""
 
 from __future__ import annotations
 
 import resource
+import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -70,6 +72,102 @@ def tiny_meshes(effort: Effort) -> Iterator[Row]:
     yield Row("scale", "distances of all meshes to the reference at a new order", f"{every:.3g} s")
     yield Row("scale", "distance of two meshes at a new order", f"{pair:.3g} s")
     yield Row("scale", "peak memory of driver, client and scheduler in one process", f"{peak_bytes / 1e6:.3g} MB")
+
+
+def many_objects(effort: Effort) -> Iterator[Row]:
+    """Processor time and memory of a study of many objects with four meshes and a reference each, on own workers."""
+    count = 1000 if effort.large else 100 if not effort.quick else 4
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        _write_objects(folder, count)
+        store = folder / "many.zarr"
+        for lattice in ({"lattice": {"xi_max": 3.0, "M": 24}}, {"accuracy": {"rtol": 5e-2}}):
+            is_given = "lattice" in lattice
+            what = f"{count} objects x 5 meshes, {'lattice given' if is_given else 'rtol 5e-2'}, {_WORKERS} workers"
+            study = sb.Study.from_table({**_OBJECTS, **lattice}, folder=folder)
+            before, driver, started = _children_seconds(), time.process_time(), time.perf_counter()
+            sb.run(study, store, workers=_WORKERS)
+            driver, wall = time.process_time() - driver, time.perf_counter() - started
+            each = f"{1e3 * driver / (5 * count):.3g} ms a mesh"
+            yield Row("objects", f"{what}: driver and scheduler", f"{driver:.3g} CPU s, {each}")
+            workers = _children_seconds() - before
+            yield Row(
+                "objects", f"{what}: workers", f"{workers:.3g} CPU s, {1e3 * workers / (5 * count):.3g} ms a mesh"
+            )
+            yield Row("objects", f"{what}: wall time", f"{wall:.3g} s")
+            again = _processor_seconds(partial(sb.run, study, store))
+            yield Row("objects", f"{what}: a run that finds everything there", f"{again:.3g} CPU s")
+            yield Row("objects", f"{what}: status", f"{_processor_seconds(lambda: Status.from_store(store)):.3g} CPU s")
+            read = _processor_seconds(lambda: sb.table(store))
+            yield Row("objects", f"{what}: table of all rows", f"{read:.3g} CPU s")
+            shutil.rmtree(store)
+        peak_bytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+        yield Row("objects", "peak memory of driver, client and scheduler in one process", f"{peak_bytes / 1e6:.3g} MB")
+
+
+def waiting_workers(effort: Effort) -> Iterator[Row]:
+    """Wall time of objects whose meshes only wait, beside that of one: a worker is idle where no object has work."""
+    seconds, most = (15, 8) if not effort.quick else (1, 2)
+    times = {}
+    for count in (1, most):
+        study: dict[str, Any] = {
+            "study": {"name": "waiting"},
+            "accuracy": {"rtol": 5e-2},
+            "norm": {"orders": [-2.0]},
+            "object": [
+                {"name": f"egg{k}", "reference": {"source": "ellipsoid", "axes": [1.0, 0.7 + 0.01 * k, 0.6]}}
+                for k in range(count)
+            ],
+            "family": [
+                {
+                    "name": word,
+                    "source": "command",
+                    "mesh": {"source": "icosphere", "levels": [2]},
+                    "command": ["sh", "-c", f"sleep {seconds}; cp {{input}} {{output}}", word, "{object}"],
+                }
+                for word in ("one", "two")
+            ],
+        }
+        with TemporaryDirectory() as name:
+            started = time.perf_counter()
+            sb.run(
+                sb.Study.from_table(study), Path(name) / "waiting.zarr", workers=8, memory="1GB", allow_commands=True
+            )
+            times[count] = time.perf_counter() - started
+    what = f"{most} objects x 2 commands that wait {seconds} s, 8 workers: wall time over that of one object"
+    yield Row("objects", what, f"{times[most] / times[1]:.3g} ({times[1]:.3g} and {times[most]:.3g} s)")
+
+
+_OBJECTS: dict[str, Any] = {
+    "study": {"name": "many"},
+    "norm": {"orders": [-2.0, -4.0]},
+    "reference": {"source": "files", "paths": ["{object}/reference.ply"]},
+    "family": [{"name": "noisy", "source": "files", "paths": ["{object}/noisy*.ply"]}],
+}
+
+
+def _write_objects(folder: Path, count: int) -> None:
+    """Write ellipsoids of 1,280 triangles, and for each four noisy meshes of 320 and 1,280 triangles."""
+    rng = np.random.default_rng(0)
+    for number in range(count):
+        (folder / f"{number:05}").mkdir()
+        axes = 1 + 0.3 * rng.random(3)
+        for name, level, noise in (("reference", 3, 0.0), *((f"noisy{k}", 2 + k // 2, 0.003) for k in range(4))):
+            sphere = sb.shapes.icosphere(level)
+            radii = 1 + noise * rng.normal(size=(len(sphere.vertices), 1))
+            sb.write_mesh(sb.Mesh(sphere.vertices * axes * radii, sphere.triangles), folder / f"{number:05}/{name}.ply")
+
+
+def _children_seconds() -> float:
+    """Return the processor time of processes that this one has started, and that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def _processor_seconds(act: Callable[[], object]) -> float:
+    started = time.process_time()
+    act()
+    return time.process_time() - started
 
 
 _STUDY: dict[str, Any] = {

@@ -17,9 +17,10 @@ import dask
 import numpy as np
 import psutil
 import pytest
+import tomli_w
 from distributed import Client, wait
 
-from sobolev_batch import Mesh, Study, open_store, run, verify, write_mesh
+from sobolev_batch import Mesh, Study, open_store, run, status, table, verify, write_mesh
 from sobolev_batch.batch.cluster import watch
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.watch import Silence, Watch
@@ -36,7 +37,7 @@ from tests.support.commands import TOML, call, command, finished, read_until, st
 from tests.support.processes import PATIENCE_SECONDS, tcp_cluster, wait_until
 from tests.support.shapes import TETRAHEDRON_TRIANGLES, TETRAHEDRON_VERTICES
 from tests.support.stores import assert_same_results, contents
-from tests.support.studies import variable
+from tests.support.studies import small_table, variable
 
 
 @pytest.mark.parametrize(
@@ -98,6 +99,56 @@ def test_the_next_run_computes_what_has_no_record(
     assert again.stderr.count("complete, ") == 5 - complete
     assert f"{5 - complete} computed, {complete} reused" in again.stdout
     assert_same_results(store_path, finished_store)
+
+
+@pytest.fixture(scope="module")
+def several(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A study of two objects that goes through all stages, and its store after an undisturbed run."""
+    folder = tmp_path_factory.mktemp("several")
+    eggs = {
+        name: {"source": "ellipsoid", "axes": [1.0, axis, 0.8], "levels": [3]}
+        for name, axis in (("a", 0.9), ("b", 0.7))
+    }
+    table = small_table(
+        lattice=None,
+        accuracy={"rtol": 0.3},
+        norm={"orders": [-2.0]},
+        proximity={"points": 500},
+        object=eggs,
+        family=[{"name": "ico", "source": "icosphere", "levels": [1, 2]}],
+        reference=None,
+    )
+    (folder / "study.toml").write_text(
+        tomli_w.dumps({key: value for key, value in table.items() if key != "reference"})
+    )
+    run(Study.from_toml(folder / "study.toml"), folder / "undisturbed.zarr", workers=1)
+    return folder / "study.toml", folder / "undisturbed.zarr"
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "lattices chosen",
+        *(pytest.param(line, marks=pytest.mark.all) for line in ("b, 2 of 2: [1/3]", "tables reduced", "measured")),
+    ],
+)
+def test_objects_go_on_wherever_their_driver_was_killed(
+    line: str, several: tuple[Path, Path], store_path: Path, threads: Client
+) -> None:
+    study, undisturbed = several
+    with started("run", study, "--store", store_path, "--workers", "1") as driver:
+        read_until(driver, line)
+        os.kill(driver.pid, signal.SIGKILL)
+        driver.wait()
+        assert driver.stdout is not None
+        driver.stdout.read()
+    assert status(store_path).run is not None
+    again = run(Study.from_toml(study), store_path, threads)
+    assert (len(again.computed) + len(again.reused), again.failed) == (6, {})
+    for name in "ab":
+        assert_same_results(store_path / name, undisturbed / name)
+    assert verify(store_path).is_sound
+    assert table(store_path)["object"].unique().tolist() == ["a", "b"]
 
 
 KILLS = 20
