@@ -6,8 +6,8 @@ READY := .venv/.ready
 
 .PHONY: study icosphere league test test-fast test-all durations coverage soak mutants check bench gpu docs pictures audit format clean
 
-study: $(READY)  ## run the real study (a cortical surface) and print its table
-	$(BIN)/sobolev-batch run workflows/cortex.toml
+study: $(READY)  ## run the study of the README (ten surfaces of a brain) and print its league
+	$(BIN)/sobolev-batch run workflows/brain.toml
 
 icosphere: $(READY)  ## run the paper's study
 	$(BIN)/sobolev-batch run workflows/icosphere.toml

@@ -129,8 +129,8 @@ def _draw_quickstart(_: Path, path: Path) -> None:
     mpl.use("agg")
     import matplotlib.pyplot as plt
 
-    place = _store("workflows/cortex.toml")
-    exec(quickstart().replace("storage/cortex.zarr", str(place)), {})
+    place = _store("workflows/brain.toml")
+    exec(quickstart().replace("storage/brain.zarr", str(place)), {})
     plt.gcf().savefig(path, dpi=120, bbox_inches="tight")
 
 
@@ -258,9 +258,10 @@ _FIGURES = "sobolev_batch.extras.figures."
 _PLOT = ("benchmarks.pictures:_draw_plot", f"{_FIGURES}style:Plot", f"{_FIGURES}style:draw_curve")
 _WITNESS = ("benchmarks.pictures:_draw_witnesses", f"{_FIGURES}views:write_witness_plots")
 _FITTED, _CORTEX, _FLOW = "workflows/cortex-fitted.toml", "workflows/cortex.toml", "workflows/flow.toml"
+_BRAIN = "workflows/brain.toml"
 _ROW = ("benchmarks.reconstruction:draw_row", "benchmarks.reconstruction:reconstructed")
 PICTURES = {
-    "quickstart": Picture(_draw_quickstart, ("benchmarks.pictures:_draw_quickstart",), ("README.md", _CORTEX)),
+    "quickstart": Picture(_draw_quickstart, ("benchmarks.pictures:_draw_quickstart",), ("README.md", _BRAIN)),
     "cortex-convergence": Picture(
         partial(_draw_plot, "convergence", _FITTED, (-1.5, -4.0)),
         (*_PLOT, f"{_FIGURES}drawing:draw_convergence"),

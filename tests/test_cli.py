@@ -244,7 +244,8 @@ def test_json_has_the_numbers_that_texts_round(folder: Path) -> None:
 
 def test_json_of_studies_and_stores(folder: Path) -> None:
     plan = document("plan", "study.toml", folder=folder)
-    assert (plan["study"], plan["stored"], plan["lattice"]) == ("cli", plan["labels"], {"xi_max": 3.0, "M": 16})
+    one = plan["objects"][""]
+    assert (plan["study"], one["stored"], one["lattice"]) == ("cli", one["labels"], {"xi_max": 3.0, "M": 16})
     status = document("status", STORE, folder=folder)
     assert (status["complete"], status["run"]["state"], status["seconds_left"]) == (3, "done", None)
     checked = document("verify", STORE, folder=folder)

@@ -20,6 +20,7 @@ import sobolev_batch as sb
 from sobolev_batch.cli import cli
 from tests.support.commands import call
 from tests.support.repository import ROOT, blocks, run_blocks, run_icospheres
+from tests.support.studies import balls, methods_of, small_table
 
 MOST_BYTES_OF_A_PICTURE = 100_000
 
@@ -30,15 +31,13 @@ def test_the_examples_of_the_readme_and_of_stores_run(
 ) -> None:
     run_icospheres(tmp_path, client)
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "storage" / "cortex.zarr").symlink_to(tmp_path / "storage" / "icosphere.zarr")
-    order = "order=-2"
-    (example,) = blocks("README.md", "python")
-    assert example.count(order) == 1
-    found: dict[str, Any] = {}
-    exec(compile(example.replace(order, "order=-5"), "README.md", "exec"), found)
-    assert re.search(r"array\(\[0\.0\d+", capsys.readouterr().out)
-    assert len(found["convergence"]["relative"]) == 5
-    run_blocks("docs/store.md")
+    made = small_table(norm=None, compare=None, object=balls(small=0.9, ball=1.0), family=methods_of())
+    sb.run(sb.Study.from_table(made), "storage/brain.zarr", client)
+    found = run_blocks("README.md")
+    assert re.search(r"array\(\[0\.[1-9]\d+", capsys.readouterr().out)
+    assert len(found["meshes"]["relative"]) == 8
+    found = run_blocks("docs/store.md")
+    assert found["distance"] > 0
 
 
 @pytest.mark.all
@@ -76,7 +75,6 @@ def test_the_table_of_weights() -> None:
 @pytest.mark.parametrize(
     ("page", "families"),
     [
-        ("README.md", ["mine"]),
         ("docs/fitting.md", ["fitted"]),
         ("docs/remeshers.md", ["mmg"]),
     ],
@@ -86,12 +84,38 @@ def test_the_study_of_a_page_is_valid(page: str, families: list[str], tmp_path: 
     (tmp_path / "study.toml").write_text(text)
     study = sb.Study.from_toml(tmp_path / "study.toml")
     assert [family.name for family in study.object.families] == families
-    if page == "README.md":
-        on_lattice = re.sub(
-            r"^\[accuracy\].*?\n\n", blocks("docs/studies.md", "toml")[1] + "\n", text, flags=re.M | re.S
-        )
-        (tmp_path / "study.toml").write_text(on_lattice)
-        assert sb.Study.from_toml(tmp_path / "study.toml").lattice == sb.Lattice(5.0, 64)
+
+
+def test_a_lattice_takes_the_place_of_the_accuracy() -> None:
+    with_accuracy, lattice, *_ = blocks("docs/studies.md", "toml")
+    on_lattice = re.sub(r"^\[accuracy\].*?\n\n", lattice + "\n", with_accuracy, flags=re.M | re.S)
+    assert sb.Study.from_table(tomllib.loads(on_lattice)).lattice == sb.Lattice(5.0, 64)
+
+
+def study_of_the_readme() -> dict[str, Any]:
+    """The study that the README begins with, and the family that it appends."""
+    study, family = map(tomllib.loads, blocks("README.md", "toml"))
+    assert study == tomllib.loads((ROOT / "workflows/brain.toml").read_text(encoding="utf-8"))
+    return {**study, "family": [*study["family"], *family["family"]]}
+
+
+def test_the_study_of_the_readme_is_that_of_its_file() -> None:
+    study = sb.Study.from_table(study_of_the_readme(), folder=ROOT / "workflows")
+    assert len(study.objects) == 10
+    for one in study.objects.values():
+        assert [family.name for family in one.families] == ["decimated", "remeshed", "mine"]
+        assert len(one.members) == 10
+
+
+@pytest.mark.all
+def test_the_study_of_the_readme_runs(client: Client, tmp_path: Path) -> None:
+    table = study_of_the_readme()
+    table["object"] = [one for one in table["object"] if one["name"].startswith(("infl", "sphere"))]
+    for family in table["family"]:
+        family["triangles"] = [500]
+    study = sb.Study.from_table(table, folder=ROOT / "workflows")
+    summary = sb.run(study, tmp_path / "brain.zarr", client, allow_commands=True)
+    assert (len(summary.computed), summary.failed) == (4 * 4, {})
 
 
 def test_the_studies_of_leagues_are_valid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

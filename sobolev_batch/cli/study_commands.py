@@ -82,8 +82,8 @@ def run_command(
 ) -> None:
     """Compute what is missing of STUDY and print its tables.
 
-    Ctrl-C and SIGTERM end it. The same command continues from the store. A study with several objects gets a store for
-    each of them, and its league is printed.
+    Ctrl-C and SIGTERM end it. The same command continues from the store. For several objects it
+    prints their league; an object that cannot be carried out stops no other.
 
     The exit status is 3 if a mesh failed, or if a distance is less accurate than the study requires.
     """
