@@ -136,21 +136,25 @@ def run(
             own = nullcontext(client) if client is not None else _own_cluster(study, location, workers, memory)
             started = stack.enter_context(own)
             watch = stack.enter_context(Watch(started, study.backend == "gpu").kept())
-            if client is not None:
-                require_store_access(started, location, lock)
+            return started, watch
+
+        @cache
+        def announce() -> None:
             # Without bokeh, a cluster of this process has a page that says no more than that.
             if client is not None or find_spec("bokeh"):
-                notify(Progress("cluster", 0, 0, started.dashboard_link))
-            return started, watch
+                notify(Progress("cluster", 0, 0, start()[0].dashboard_link))
 
         known_workers = cache(lambda libraries: prepare_workers(start()[0], libraries))
 
         def equip(study: Study) -> tuple[Cluster, Watch]:
             started, watch = start()
+            announce()
             workers = known_workers(study.libraries)
             return Cluster(started, workers, study=study.name, part=study.object.name), watch
 
         with locked(location, lock):
+            if client is not None:
+                require_store_access(start()[0], location, lock)
             try:
                 return carry_out(study, location, lock, equip, notify)
             except SobolevBatchError:
@@ -175,7 +179,8 @@ def carry_out(
     at_hand: Workspace | None = None
     if "" in study.objects:
         at_hand = workspace_at_hand(study, place)
-        reserve(place, study.title)
+        if at_hand is None:
+            reserve(place, study.title)
     else:
         objects = Objects.prepared(place, study)
     with Heartbeat(location, lock).kept() as heartbeat:

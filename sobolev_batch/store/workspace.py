@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Self
 
 import numpy as np
@@ -64,15 +63,18 @@ class Contents:
         measured = {self.labels[i]: record.proximity for i, record in self.complete.items()}
         return {label: f"no proximity: {one.reason}" for label, one in measured.items() if one and one.reason}
 
-    def tally(self, imprecise: Mapping[str, float] = MappingProxyType({})) -> ObjectRecord:
-        """Return what the store has and lacks, as the record of its object."""
+    def tally(self, imprecise: Mapping[str, float] | None = None) -> ObjectRecord:
+        """Return what the store has and lacks, as the record of its object.
+
+        A run that has just written the tables knows which distances are imprecise, and that no record was lost since.
+        """
         return ObjectRecord(
             complete=len(self.complete),
             total=len(self.rows),
             failed=self.failures,
             not_compared=self.not_compared,
-            imprecise=dict(imprecise),
-            lost_records=tuple(self.labels[row] for row in self.unlike_tables),
+            imprecise=imprecise or {},
+            lost_records=tuple(self.labels[row] for row in self.unlike_tables) if imprecise is None else (),
             reduced=self.has_tables,
             finished=utc_now(),
         )

@@ -105,10 +105,10 @@ def test_the_next_run_computes_what_has_no_record(
 def several(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A study of two objects that goes through all stages, and its store after an undisturbed run."""
     folder = tmp_path_factory.mktemp("several")
-    eggs = {
-        name: {"source": "ellipsoid", "axes": [1.0, axis, 0.8], "levels": [3]}
+    eggs = [
+        {"name": name, "reference": {"source": "ellipsoid", "axes": [1.0, axis, 0.8], "levels": [3]}}
         for name, axis in (("a", 0.9), ("b", 0.7))
-    }
+    ]
     table = small_table(
         lattice=None,
         accuracy={"rtol": 0.3},
