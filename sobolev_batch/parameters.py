@@ -83,8 +83,8 @@ def length_in(length: float | str, unit: str | None) -> float:
         raise InputError(f"{length!r} has the unit {own!r}; known are {', '.join(_METRES)}, and that of the meshes")
     if unit is None:
         raise InputError(
-            f"{length!r} has a unit, but that of the meshes is not known: name it, as unit='mm' in Python or --unit "
-            "mm, or give the length as a number in the unit of the meshes"
+            f"{length!r} has a unit, but that of the meshes is not known: name it, as unit='mm' in Python, --unit mm, "
+            "or length_unit in a study file, or give the length as a number in the unit of the meshes"
         )
     if unit not in _METRES:
         raise InputError(f"{length!r} cannot be converted into {unit!r}; give the length as a number of {unit}")

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path, PurePath
 from typing import Any
 
 import pandas as pd
 from distributed import Client
-from pydantic import TypeAdapter, ValidationError
 
 from sobolev_batch.batch.cluster.clients import local_client, require_blocking
-from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, result_of, side_by_side
+from sobolev_batch.batch.cluster.execution import (
+    Cluster,
+    Stages,
+    Task,
+    Wave,
+    in_place,
+    result_from,
+    result_of,
+    side_by_side,
+)
 from sobolev_batch.batch.cluster.workers import prepare_workers
 from sobolev_batch.errors import InputError, MeshError, SobolevBatchError, StoreError, one_line
 from sobolev_batch.geometry.formats.by_name import WRITERS, mesh_format
@@ -25,9 +31,11 @@ from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.machine import available_cores
 from sobolev_batch.reduction.limit import Limit, tried
+from sobolev_batch.reduction.recorded import RecordedSearch
 from sobolev_batch.reduction.remesher import Method, Range, Remesher
-from sobolev_batch.reduction.search import PRECISION, Bracket, Search, Trial
+from sobolev_batch.reduction.search import PRECISION, Bracket, Trial
 from sobolev_batch.sources.files import FileMember, matching_files, names_of_files
+from sobolev_batch.sources.mesh_cache import InMemory
 from sobolev_batch.sources.names import duplicate_names
 from sobolev_batch.sources.registry import Member, SurfaceMember, load_mesh
 from sobolev_batch.store.location import Location
@@ -35,10 +43,6 @@ from sobolev_batch.tables import Format
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.text import between, count, duration
 
-# Raise it whenever a mesh of one size is judged in another way: trials of another version are made again.
-_VERSION = 1
-# Measured peak of a trial: for each triangle of the original, and of the libraries.
-_TRIAL_BYTES, _LEAST_BYTES = 1400, 3e8
 # Sizes of one mesh that are tried at a time, where workers are idle: more save hardly any time.
 _MOST_AT_ONCE = 4
 # A search over fewer triangles takes less time than processes take to start.
@@ -128,78 +132,6 @@ def format_reductions(found: Mapping[str, Reduction], style: Format = "text", un
     return rendered(style, frame, [Section(caption, [(columns, frame)])], [])
 
 
-@dataclass(frozen=True)
-class _Record:
-    """What is known of a job, as a JSON file that is replaced as a whole after each trial.
-
-    Attributes:
-        digest: Digest of the job; another one has other trials.
-        triangles: Triangles of the original.
-        mesh_digest: Digest of the file of the best mesh.
-    """
-
-    digest: str
-    triangles: int
-    mesh_digest: str = ""
-    trials: tuple[Trial, ...] = ()
-
-
-_RECORDS = TypeAdapter(_Record)
-
-
-@dataclass(frozen=True, eq=False)
-class _Job:
-    """A mesh to reduce, and how.
-
-    Attributes:
-        mesh_key: Name of the file of the reduced mesh.
-        folder: Where results are kept; None to keep them in memory.
-    """
-
-    name: str
-    original: Member
-    mesh_key: str
-    limit: Limit
-    remesher: Remesher
-    precision: float
-    folder: Location | None
-
-    def read(self, key: str) -> bytes:
-        """Return the contents of a file; empty where there is none."""
-        return b"" if self.folder is None else self.folder.read(key) or b""
-
-    def write(self, record: _Record, mesh: bytes | None = None) -> None:
-        """Write the record, after the mesh that it counts on."""
-        if self.folder is not None:
-            if mesh is not None:
-                self.folder.write({self.mesh_key: mesh})
-            self.folder.write({f"{self.name}.json": _RECORDS.dump_json(record, indent=1, exclude_defaults=True)})
-
-    def recorded(self) -> _Record | None:
-        """Return the record; None where there is none of the same original, remesher and tolerance."""
-        with suppress(ValidationError):
-            record = _RECORDS.validate_json(self.read(f"{self.name}.json"), strict=True)
-            return record if record.digest == self.digest else None
-        return None
-
-    @cached_property
-    def digest(self) -> str:
-        """SHA-256 of all that trials depend on; MeshError where the original cannot be read."""
-        about = [_VERSION, self.remesher.fingerprint(self.original), repr(self.limit)]
-        return _digest(json.dumps(about, sort_keys=True).encode())
-
-    def search(self, triangles: int) -> Search:
-        """Return the search for the mesh, which has some triangles."""
-        return self.remesher.search(self.limit.value, triangles, self.precision)
-
-    def task(self, size: float, triangles: int) -> Task:
-        """Return the trial of a size."""
-        member = self.remesher.member(self.original, size, triangles)
-        needed = _projected_bytes(self.original) + _TRIAL_BYTES * triangles
-        label = f"{self.name}/{size:g}"
-        return Task(tried, (self.original, member, self.limit, size), needed, label=label, stage="trial")
-
-
 def reduce(
     meshes: MeshLike | Sequence[str | Path] | Mapping[str, MeshLike],
     within: float | str,
@@ -256,50 +188,51 @@ def reduce(
     if client is not None:
         require_blocking(client)
     limit, remesher = Limit.parse(within, order, unit), Remesher.parse(method, search)
+    # Refuses a precision.
+    remesher.search(limit.value, 1, precision)
     folder = None if output is None else Location.parse(output).absolute()
-    jobs = [
-        _Job(name, original, f"{name}{suffix}", limit, remesher, precision, folder)
-        for name, (original, suffix) in _originals(meshes, folder).items()
+    searches = [
+        RecordedSearch(one, one, limit, remesher, folder or InMemory(), name, f"{name}{suffix}", precision)
+        for name, (one, suffix) in _originals(meshes, folder).items()
     ]
-    # Refuses a precision, and ends of the range.
-    jobs[0].search(1)
     found: dict[str, Reduction] = {}
-    for name, outcome in _outcomes(jobs, client, workers):
+    for name, outcome in _outcomes(searches, client, workers):
         found[name] = outcome if isinstance(outcome, Reduction) else Reduction(name, limit, reason=one_line(outcome))
         if on_progress is not None:
             on_progress(found[name])
-    return {job.name: found[job.name] for job in jobs}
+    return {search.name: found[search.name] for search in searches}
 
 
 def _outcomes(
-    jobs: Sequence[_Job], client: Client | None, workers: int | None
+    searches: Sequence[RecordedSearch], client: Client | None, workers: int | None
 ) -> Iterator[tuple[str, Reduction | Exception]]:
-    """Carry out jobs and yield what came of each; see `reduce`."""
+    """Carry out searches and yield what came of each; see `reduce`."""
     processes = available_cores() if workers is None else workers
-    if client is None and (processes == 1 or (workers is None and len(jobs) == 1 and _is_small(jobs[0].original))):
-        for job in jobs:
+    if client is None and (processes == 1 or (workers is None and len(searches) == 1 and _is_small(searches[0]))):
+        for search in searches:
             try:
-                yield job.name, _in_this_process(_searched(job, lambda: None, lambda: 1))
+                yield search.name, in_place(_searched(search, lambda: None, lambda: 1))
             except SobolevBatchError as error:
                 if _ends_all(error):
                     raise
-                yield job.name, error
+                yield search.name, error
         return
-    open_jobs = {job.name for job in jobs}
+    left = {search.name for search in searches}
     with ExitStack() as stack:
 
         @cache
         def cluster() -> Cluster:
             """Start the cluster, which is not needed where everything is recorded."""
-            started = client or stack.enter_context(local_client(min(processes, _MOST_AT_ONCE * len(jobs))))
-            libraries = jobs[0].remesher.source(jobs[0].remesher.a_size).libraries
+            started = client or stack.enter_context(local_client(min(processes, _MOST_AT_ONCE * len(searches))))
+            libraries = searches[0].remesher.a_source.libraries
             return Cluster(started, prepare_workers(started, libraries), study="reduce")
 
         def at_once() -> int:
-            return max(1, min(_MOST_AT_ONCE, cluster().workers.threads // len(open_jobs)))
+            return max(1, min(_MOST_AT_ONCE, cluster().workers.threads // len(left)))
 
-        for name, outcome in side_by_side(((job.name, _searched(job, cluster, at_once)) for job in jobs), _ends_all):
-            open_jobs.discard(name)
+        runs = ((search.name, _searched(search, cluster, at_once)) for search in searches)
+        for name, outcome in side_by_side(runs, _ends_all):
+            left.discard(name)
             yield name, outcome
 
 
@@ -308,73 +241,42 @@ def _ends_all(error: Exception) -> bool:
     return isinstance(error, StoreError) or not isinstance(error, SobolevBatchError)
 
 
-def _is_small(original: Member) -> bool:
+def _is_small(search: RecordedSearch) -> bool:
     """Tell whether a search takes no processes of its own."""
     with suppress(MeshError):
-        return original.expected_size().triangles < _SMALL
+        return search.original.expected_size().triangles < _SMALL
     return True
 
 
-def _in_this_process(search: Stages[Reduction]) -> Reduction:
-    while True:
-        try:
-            wave = next(search)
-        except StopIteration as end:
-            return end.value  # type: ignore[no-any-return]
-        for task in wave.tasks:
-            wave.take(task, task.function(*task.arguments))
-
-
-def _searched(job: _Job, cluster: Callable[[], Any], at_once: Callable[[], int]) -> Stages[Reduction]:
+def _searched(search: RecordedSearch, cluster: Callable[[], Any], at_once: Callable[[], int]) -> Stages[Reduction]:
     """Search for the fewest triangles of a mesh, on a cluster or, where that is None, in this process."""
-    known, mesh = job.recorded(), None
+    known = search.recorded()
     if known is None:
-        counts: list[int] = []
-        task = Task(_triangle_count, (job.original,), _projected_bytes(job.original), label=job.name, stage="read")
-        yield Wave(cluster(), [task], lambda _, outcome: counts.append(result_of(outcome)), task.projected_bytes)
-        known = _Record(job.digest, counts[0])
+        read = Task(_triangle_count, (search.original,), search.projected_bytes(0), label=search.name, stage="read")
+        known = search.begun((yield from result_from(cluster(), read)))
     record = known
-    search = job.search(record.triangles)
 
     def take(_: Task, outcome: Any) -> None:
-        nonlocal record, mesh
-        trial, made = result_of(outcome)
-        record = replace(record, trials=(*record.trials, trial))
-        data = None
-        if made is not None and search.bracket(record.trials).best == trial:
-            mesh, data = made, WRITERS[PurePath(job.mesh_key).suffix](made)
-            record = replace(record, mesh_digest=_digest(data))
-        job.write(record, data)
+        nonlocal record
+        record = search.taken(record, result_of(outcome))
 
-    while True:
-        best = search.bracket(record.trials).best
-        sizes = search.next(record.trials) and search.next(record.trials, at_once())
-        if not sizes and best is not None and mesh is None and _digest(job.read(job.mesh_key)) != record.mesh_digest:
-            # It was removed or changed since, and is made again.
-            sizes, record = (best.size,), replace(record, trials=tuple(one for one in record.trials if one != best))
-        if not sizes:
-            break
-        tasks = [job.task(size, record.triangles) for size in sizes]
-        yield Wave(cluster(), tasks, take, tasks[0].projected_bytes)
-    bracket, path, reason = search.bracket(record.trials), "", ""
-    if bracket.best is None:
-        nearest = min(record.trials, key=lambda one: one.upper)
-        reason = nearest.reason or f"nothing is within the tolerance; nearest are {nearest.triangles:,} triangles"
-    elif job.folder is not None:
-        path, mesh = str(job.folder.below(job.mesh_key)), None
-    return Reduction(job.name, job.limit, record.triangles, record.trials, bracket, reason, path, mesh)
-
-
-def _projected_bytes(original: Member) -> float:
-    return _LEAST_BYTES + original.expected_size().projected_bytes
+    needed = search.projected_bytes(record.triangles)
+    while search.next(record):
+        tasks = [
+            Task(tried, search.trial(record, size), needed, label=f"{search.name}/{size:g}", stage="trial")
+            for size in search.next(record, at_once())
+        ]
+        yield Wave(cluster(), tasks, take, needed)
+    reason, folder = search.reason(record), search.folder
+    path = str(folder.below(search.mesh_key)) if isinstance(folder, Location) and not reason else ""
+    mesh = None if reason or path else search.mesh(record)
+    return Reduction(
+        search.name, search.limit, record.triangles, record.trials, search.bracket(record), reason, path, mesh
+    )
 
 
 def _triangle_count(original: Member) -> int:
     return len(load_mesh(original).triangles)
-
-
-def _digest(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()
 
 
 def _originals(meshes: Any, folder: Location | None) -> dict[str, tuple[Member, str]]:

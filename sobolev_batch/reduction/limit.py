@@ -45,7 +45,13 @@ class Limit:
     order: float | None = None
 
     @classmethod
-    def parse(cls, within: float | str, order: float | None = None, unit: str | None = None) -> Self:
+    def parse(
+        cls,
+        within: float | str,
+        order: float | None = None,
+        unit: str | None = None,
+        default_order: float = DEFAULT_ORDER,
+    ) -> Self:
         """Return the limit that is meant: a length, or with a per cent sign or an order a fraction of the norm.
 
         >>> Limit.parse("0.1 mm", unit="m"), Limit.parse("1%")
@@ -53,7 +59,7 @@ class Limit:
         """
         if order is None and not str(within).rstrip().endswith("%"):
             return cls(length_in(within, unit))
-        limit = cls(fraction(within), single_order(DEFAULT_ORDER if order is None else order))
+        limit = cls(fraction(within), single_order(default_order if order is None else order))
         if limit.value >= 1:
             raise InputError(f"a Sobolev distance is a fraction of the norm below 1, such as 1%, found {within!r}")
         return limit
@@ -70,16 +76,16 @@ class Limit:
         return (found.lower + found.upper) / 2, found.lower, found.upper
 
 
-def tried(original: Member, member: Member | None, limit: Limit, size: float) -> tuple[Trial, Mesh | None]:
-    """Make a mesh and judge it against its original; None stands for the original itself.
+def tried(reference_member: Member, member: Member, limit: Limit, size: float) -> tuple[Trial, Mesh | None]:
+    """Make a mesh and judge it against a reference.
 
     Return the trial, and the mesh where it is within the limit. What goes wrong with the mesh is the reason of a trial
-    that failed; what is wrong with the original is raised as a MeshError.
+    that failed; what is wrong with the reference is raised as a MeshError.
     """
-    reference, started = load_mesh(original), time.perf_counter()
+    reference, started = load_mesh(reference_member), time.perf_counter()
     mesh, reason, bounds = None, "", (math.inf,) * 3
     try:
-        mesh = reference if member is None else load_mesh(member)
+        mesh = load_mesh(member)
         bounds = limit.bounds(mesh, reference)
     except InputError as error:
         reason = one_line(error)

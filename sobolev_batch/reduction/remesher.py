@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -13,7 +14,8 @@ from pydantic import ValidationError
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.reduction.search import PRECISION, Search
-from sobolev_batch.sources.mesh_cache import MeshCache
+from sobolev_batch.sources.command import RemeshedMember
+from sobolev_batch.sources.mesh_cache import InMemory, MeshCache
 from sobolev_batch.sources.programs import PLACEHOLDER
 from sobolev_batch.sources.registry import Member, Source, parse_source, single_member
 
@@ -41,18 +43,6 @@ class GivenSource(Source):
         return (self.member,)
 
 
-@dataclass(frozen=True)
-class _Nowhere:
-    """A place where nothing is kept: who searches takes the meshes."""
-
-    def read(self, key: str) -> bytes | None:
-        """Return None."""
-        return None
-
-    def write(self, documents: Mapping[str, bytes]) -> None:
-        """Forget the documents."""
-
-
 @dataclass(frozen=True, eq=False)
 class Remesher:
     """A family of meshes of one other mesh, with a parameter that makes them coarse or fine.
@@ -62,37 +52,45 @@ class Remesher:
         parameter: Name of the parameter.
         ends: Smallest and largest value to try, whole numbers for a parameter that takes those alone; None for numbers
             of triangles, up to that of the mesh itself, which is then not remeshed.
-        cache: Permits commands to run, and knows their versions.
+        cache: Permits commands to run, and knows their versions. Meshes of trials are not kept.
+        folder: Folder in which relative paths start.
     """
 
     table: Mapping[str, Any]
     parameter: str = _TRIANGLES
     ends: tuple[float, float] | None = None
-    cache: MeshCache = field(default_factory=lambda: MeshCache(_Nowhere(), may_run=True))
+    cache: MeshCache = field(default_factory=lambda: MeshCache(InMemory(), may_run=True))
+    folder: Path = field(default_factory=Path.cwd)
 
     @classmethod
     def parse(cls, method: Method, search: Range | None = None) -> Self:
         """Return the remesher that is meant; InputError where none is."""
-        table: Mapping[str, Any] = {"source": method} | ({"radius": _RADIUS} if method == "decimate" else {})
+        table: Mapping[str, Any] = {"source": method}
         if isinstance(method, Mapping):
             table = method
         elif callable(method):
             table = {"source": "function", "function": method}
         elif PLACEHOLDER.search(method):
             table = {"source": "command", "command": shlex.split(method)}
-        if search is None:
-            remesher = cls(table)
-        elif len(search) == 1:
-            ((name, (low, high)),) = search.items()
-            remesher = cls(table, name, (low, high))
-        else:
+        if table.get("source") == "decimate":
+            table = {"radius": _RADIUS, **table}
+        if search is not None and len(search) != 1:
             raise InputError(f"one parameter is searched, found {len(search)}; give the others fixed values")
-        remesher.source(remesher.a_size)
+        remesher = cls(table, *(next(iter(search.items())) if search else ()))
+        if remesher.parameter in table:
+            raise InputError(f"{remesher.parameter} is searched, so it has no value of its own; take it out")
+        # Both refuse what is wrong with the parameter or its ends.
+        remesher.a_source  # noqa: B018
+        remesher.search(1.0, _FEWEST)
         return remesher
 
     @property
-    def a_size(self) -> float:
-        """A size to be tried for any mesh."""
+    def a_source(self) -> Source:
+        """The source of a mesh of one size: what it needs, all need."""
+        return self.source(self._a_size)
+
+    @property
+    def _a_size(self) -> float:
         return _FEWEST if self.ends is None else self.ends[0]
 
     @property
@@ -112,19 +110,23 @@ class Remesher:
         try:
             source = parse_source({**self.table, self.parameter: [value], "mesh": _ANY_MESH})
         except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            place = "".join(f"{part}: " for part in first["loc"])
-            raise StudyError(f"{place}{first['msg'].removeprefix('Value error, ')}") from error
+            parts = [(*one["loc"], one["msg"].removeprefix("Value error, ")) for one in error.errors()]
+            raise StudyError("; ".join(": ".join(map(str, part)) for part in parts)) from error
         return source.with_cache(self.cache)
 
-    def member(self, original: Member, size: float, triangles: int | None = None) -> Member | None:
-        """Return the mesh of one size that is made of another one; None for that one itself, by its triangles."""
-        if triangles is not None and self.parameter == _TRIANGLES and size >= triangles:
-            return None
+    def member(self, original: Member, size: float, triangles: float = math.inf) -> Member:
+        """Return the mesh of one size that is made of another one, or that one itself where it has no more triangles.
+
+        Its triangles are infinitely many by default.
+        """
+        if self.parameter == _TRIANGLES and size >= triangles:
+            return original
         source = self.source(size).model_copy(update={"mesh": GivenSource(member=original)})
-        return single_member(source, Path.cwd())
+        member = single_member(source, self.folder)
+        if isinstance(member, RemeshedMember):
+            return replace(member, cache=MeshCache(InMemory(), self.cache.may_run))
+        return member
 
     def fingerprint(self, original: Member) -> list[Any]:
         """Return what all meshes that are made of another one depend on; MeshError where that cannot be read."""
-        member = self.member(original, self.a_size)
-        return [self.parameter, self.ends, None if member is None else member.fingerprint()]
+        return [self.parameter, self.ends, self.member(original, self._a_size).fingerprint()]

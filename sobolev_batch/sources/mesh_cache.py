@@ -25,6 +25,18 @@ class Folder(Protocol):
         """Write files by their keys, each as a whole."""
 
 
+class InMemory(dict[str, bytes]):
+    """A place for files that ends with the process."""
+
+    def read(self, key: str) -> bytes | None:
+        """Return the bytes of a file, or None if it does not exist."""
+        return self.get(key)
+
+    def write(self, documents: Mapping[str, bytes]) -> None:
+        """Write files by their keys."""
+        self.update(documents)
+
+
 @dataclass(frozen=True)
 class MeshCache:
     """A folder of meshes that programs or functions made, and whether these may run.

@@ -39,6 +39,7 @@ from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
 from sobolev_batch.parameters import byte_count
+from sobolev_batch.reduction.searched import SearchedSource
 from sobolev_batch.sources.command import function_version
 from sobolev_batch.sources.files import MeshTable, checked_list
 from sobolev_batch.sources.names import name_problem, quoted
@@ -58,8 +59,8 @@ MOST_OCTAVES = 24
 _LARGEST_FILE_BYTES = 4 << 20
 # Most refusals of one study; longer keys are not compared with others.
 _MOST_OFFENDERS, _LONGEST_KEY = 10, 40
-# Sections that are lists, and keys of a family that are none of its source.
-_REPEATED, _KEYS_OF_FAMILY = ("family", "object"), ("name", "order_by")
+# Sections that are lists; keys of a family that are none of its source, and those with which its meshes are searched.
+_REPEATED, _KEYS_OF_FAMILY, _KEYS_OF_SEARCH = ("family", "object"), ("name", "order_by"), ("within", "order", "search")
 # The place of a value in nested tables and lists.
 _Key = tuple[int | str, ...]
 # What a value must be in the words of TOML, by the type of pydantic's error or the first word of it.
@@ -250,17 +251,30 @@ def _source(table: object, info: ValidationInfo) -> Source:
         return parse_source(table)
 
 
+def _source_of_family(table: object, info: ValidationInfo) -> Source:
+    """Return what the table of a family describes, which may be a search with its source."""
+    # Sources may have an order of their own, and commands a parameter named search.
+    if not isinstance(table, dict) or not ("within" in table or isinstance(table.get("search"), dict)):
+        return _source(table, info)
+    own = {key: table[key] for key in _KEYS_OF_SEARCH if key in table}
+    with refused_by_pydantic():
+        others = with_named_meshes({key: table[key] for key in table if key not in own}, info.context or {})
+        mesh = parse_source(others.pop("mesh")) if "mesh" in others else None
+    return SearchedSource.model_validate({"table": others, "mesh": mesh, **own})
+
+
 class Family(Section):
     """A named source of surfaces.
 
     Attributes:
-        source: Source of its surfaces. In a study file its keys are beside the others.
+        source: Source of its surfaces, or the search for meshes within tolerances. In a study file its keys are beside
+            the others.
         order_by: What orders its meshes in tables, if the study says so: their triangles, or the natural order of their
             names, in which they are no sequence from coarse to fine and have no rates.
     """
 
     name: Name
-    source: Annotated[SerializeAsAny[Source], BeforeValidator(_source)]
+    source: Annotated[SerializeAsAny[Source], BeforeValidator(_source_of_family)]
     order_by: Literal["triangles", "names"] | None = None
 
     @model_validator(mode="before")
@@ -484,7 +498,7 @@ def _known_keys(values: Mapping[str, Any], key: _Key) -> Iterable[str]:
         return next(models_in(StudyDocument.model_fields[str(key[0])].annotation)).model_fields
     if key == ("reference",) and table["source"] == "family":
         return (*FamilyReference.model_fields, "source")
-    own = _KEYS_OF_FAMILY if key[0] == "family" and len(key) == len(("family", 0)) else ()
+    own = (*_KEYS_OF_FAMILY, *_KEYS_OF_SEARCH) if key[0] == "family" and len(key) == len(("family", 0)) else ()
     return (*source_type_of(table["source"]).model_fields, "source", *own)
 
 

@@ -13,8 +13,10 @@ from typing import Any, Literal, Self
 from sobolev_batch.arrays import ComplexDtype
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.geometry.surface import Similarity
+from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
 from sobolev_batch.norms.columns import TAKEN_NAMES
+from sobolev_batch.reduction.searched import SearchedSource
 from sobolev_batch.sources.command import function_name
 from sobolev_batch.sources.mesh_cache import MeshCache
 from sobolev_batch.sources.names import caseless_key, duplicate_names, quoted
@@ -86,6 +88,12 @@ class StudyObject:
             sources = [family.source.with_reference(reference) for family in families]
             families = [one.model_copy(update={"source": s}) for one, s in zip(families, sources, strict=True)]
         header, scaling = table["study"], sections.scaling.settings()
+        orders = table.get("norm", {}).get("orders") or [DEFAULT_ORDER]
+        for number, family in enumerate(families):
+            if isinstance(family.source, SearchedSource):
+                with within(f"family {family.name!r}"):
+                    source = family.source.in_study(header.get("length_unit"), orders[0])
+                families[number] = family.model_copy(update={"source": source})
         title = header.get("title") or header["name"]
         return cls(name, title, tuple(families), reference, scaling, folder, _as_written(table))
 

@@ -1,0 +1,145 @@
+"""The search for the fewest triangles of one mesh, recorded after each trial, so that it goes on where it was ended."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import PurePath
+
+from pydantic import TypeAdapter, ValidationError
+
+from sobolev_batch.errors import MeshError
+from sobolev_batch.geometry.formats.by_name import WRITERS
+from sobolev_batch.geometry.formats.ply import parse_ply
+from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.reduction.limit import Limit
+from sobolev_batch.reduction.remesher import Remesher
+from sobolev_batch.reduction.search import PRECISION, Bracket, Search, Trial
+from sobolev_batch.sources.mesh_cache import Folder
+from sobolev_batch.sources.registry import Member
+
+# Raise it whenever a mesh of one size is judged in another way: trials of another version are made again.
+_VERSION = 2
+# Measured peak of a trial: for each triangle of the original, and of the libraries.
+_TRIAL_BYTES, _LEAST_BYTES = 1400, 3e8
+
+
+@dataclass(frozen=True)
+class SearchRecord:
+    """What is known of a search, as a JSON file that is replaced as a whole after each trial.
+
+    Attributes:
+        digest: Digest of the search; another one has other trials.
+        triangles: Triangles of the original.
+        mesh_digest: Digest of the file of the best mesh.
+    """
+
+    digest: str
+    triangles: int
+    mesh_digest: str = ""
+    trials: tuple[Trial, ...] = ()
+
+
+_RECORDS = TypeAdapter(SearchRecord)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedSearch:
+    """A mesh to reduce, how, and where what is known of it is kept.
+
+    Attributes:
+        original: Mesh that is remeshed.
+        reference: Mesh from which those found may be as far away as the limit says.
+        folder: Place of the record and of the best mesh.
+        name: Name of the record without its suffix; by default the digest of the search.
+        mesh_key: Name of the file of the mesh; by default that of the record with the suffix .ply.
+    """
+
+    original: Member
+    reference: Member
+    limit: Limit
+    remesher: Remesher
+    folder: Folder
+    name: str = ""
+    mesh_key: str = ""
+    precision: float = PRECISION
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of all that trials depend on; MeshError where a file of it cannot be read."""
+        about = [self.remesher.fingerprint(self.original), self.reference.fingerprint(), repr(self.limit)]
+        return _digest(json.dumps([_VERSION, *about], sort_keys=True).encode())
+
+    def projected_bytes(self, triangles: int) -> float:
+        """Return the memory that a trial takes with an original of some triangles; without any, that to read it."""
+        return _LEAST_BYTES + self.original.expected_size().projected_bytes + _TRIAL_BYTES * triangles
+
+    def recorded(self) -> SearchRecord | None:
+        """Return the record; None where there is none of the same search, or where nothing could be made so far."""
+        digest = self.digest
+        with suppress(ValidationError):
+            data = self.folder.read(f"{self.name or digest}.json") or b""
+            record = _RECORDS.validate_json(data, strict=True)
+            # A program that was missing may be there now.
+            return record if record.digest == digest and any(one.triangles for one in record.trials) else None
+        return None
+
+    def begun(self, triangles: int) -> SearchRecord:
+        """Return the record of a search that begins, for an original of some triangles."""
+        return SearchRecord(self.digest, triangles)
+
+    def bracket(self, record: SearchRecord) -> Bracket:
+        """Return what the trials say."""
+        return self._search(record).bracket(record.trials)
+
+    def next(self, record: SearchRecord, count: int = 1) -> tuple[float, ...]:
+        """Return sizes to try now, up to a count of them; that of the best mesh where its file is gone or another."""
+        sizes, best = self._search(record).next(record.trials, count), self.bracket(record).best
+        if not sizes and best is not None and _digest(self._read_mesh(record)) != record.mesh_digest:
+            return (best.size,)
+        return sizes
+
+    def trial(self, record: SearchRecord, size: float) -> tuple[Member, Member, Limit, float]:
+        """Return the arguments of `tried` for a size."""
+        return self.reference, self.remesher.member(self.original, size, record.triangles), self.limit, size
+
+    def taken(self, record: SearchRecord, outcome: tuple[Trial, Mesh | None]) -> SearchRecord:
+        """Record the outcome of a trial, after the mesh if it is the best one, and return the record."""
+        if self.digest != record.digest:
+            raise MeshError("a file of it was changed while it was searched; try again")
+        trial, mesh = outcome
+        trials = (*(one for one in record.trials if one.size != trial.size), trial)
+        record = replace(record, trials=trials)
+        if mesh is not None and self.bracket(record).best == trial:
+            data = WRITERS[PurePath(self._key_of_mesh(record)).suffix](mesh)
+            self.folder.write({self._key_of_mesh(record): data})
+            record = replace(record, mesh_digest=_digest(data))
+        self.folder.write({f"{self.name or record.digest}.json": _RECORDS.dump_json(record, exclude_defaults=True)})
+        return record
+
+    def reason(self, record: SearchRecord) -> str:
+        """Return why nothing was found; empty where something was."""
+        if self.bracket(record).best is not None:
+            return ""
+        nearest = min(record.trials, key=lambda one: one.upper)
+        found = f"{nearest.triangles:,} triangles, at most {nearest.upper:.4g} away"
+        return nearest.reason or f"nothing is within the tolerance of {self.limit.value:.4g}; nearest are {found}"
+
+    def mesh(self, record: SearchRecord) -> Mesh:
+        """Return the best mesh, which is kept as a PLY file."""
+        return Mesh(*parse_ply(self._read_mesh(record)))
+
+    def _search(self, record: SearchRecord) -> Search:
+        return self.remesher.search(self.limit.value, record.triangles, self.precision)
+
+    def _key_of_mesh(self, record: SearchRecord) -> str:
+        return self.mesh_key or f"{record.digest}.ply"
+
+    def _read_mesh(self, record: SearchRecord) -> bytes:
+        return self.folder.read(self._key_of_mesh(record)) or b""
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()

@@ -1,0 +1,207 @@
+"""Families of meshes within tolerances: what a study stores holds, and a search goes on wherever it was ended."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tomli_w
+from distributed import Client
+
+import sobolev_batch as sb
+from sobolev_batch.reduction import limit as limits
+from sobolev_batch.reduction import searched
+from sobolev_batch.sources.mesh_cache import MeshCache
+from sobolev_batch.sources.registry import Member, load_mesh
+from sobolev_batch.store.location import Location
+from tests.batch.test_reduce import EndedError, disc, farthest, found_by, lumpy
+from tests.support.commands import call
+
+DECIMATED: dict[str, Any] = {"name": "decimated", "source": "decimate", "within": "1 mm"}
+# A remesher of Python alone, which makes discs of this many edges.
+RINGS = """
+import math, sys
+count = max(3, round(2 * math.pi / float(sys.argv[2])))
+angles = [2 * math.pi * k / count for k in range(count)]
+with open(sys.argv[1], "w") as file:
+    print(f"OFF\\n{count + 1} {count} 0\\n0 0 0", file=file)
+    for angle in angles:
+        print(math.cos(angle), math.sin(angle), 0.0, file=file)
+    for k in range(count):
+        print(3, 0, 1 + k, 1 + (k + 1) % count, file=file)
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with two scans, in centimetres."""
+    (tmp_path / "scans").mkdir()
+    sb.write_mesh(lumpy(2), tmp_path / "scans" / "a.ply")
+    sb.write_mesh(lumpy(2, 2.0), tmp_path / "scans" / "b.ply")
+    return tmp_path
+
+
+def table(*families: dict[str, Any], name: str = "{object}", **sections: Any) -> dict[str, Any]:
+    """A study of all scans, or of the one of a name."""
+    return {
+        "study": {"name": "scans", "length_unit": "cm"},
+        "lattice": {"xi_max": 3.0, "M": 16},
+        "norm": {"orders": [-4.0]},
+        "reference": {"source": "files", "paths": [f"scans/{name}.ply"]},
+        "family": list(families),
+        **sections,
+    }
+
+
+def member(folder: Path, family: dict[str, Any], *, may_run: bool = True, **sections: Any) -> Member:
+    """The first mesh of a family of the study of one scan."""
+    study = sb.Study.from_table(table(family, name="a", **sections), folder=folder)
+    cache = MeshCache(Location(str(folder / "made-meshes")), may_run)
+    return next(iter(study.with_cache(cache).object.members.values()))[1]
+
+
+def test_meshes_of_two_objects_hold_and_are_those_of_reduce(client: Client, folder: Path) -> None:
+    within = ["1 mm", 0.05]
+    study = sb.Study.from_table(table({**DECIMATED, "within": within}), folder=folder)
+    assert list(study.objects["a"].members) == ["decimated/1mm", "decimated/0.05", "reference"]
+    store = folder / "scans.zarr"
+    sb.plan(study, store)
+    assert not (folder / "made-meshes").exists()
+    assert not sb.run(study, store, client=client).failed
+    rows = sb.table(store).set_index(["object", "mesh"])
+    for name in ("a", "b"):
+        original = sb.read_mesh(folder / "scans" / f"{name}.ply")
+        for tolerance, label in zip((0.1, 0.05), study.objects[name].members, strict=False):
+            row = rows.loc[name, label]
+            found = found_by(folder / "scans" / f"{name}.ply", within=tolerance)
+            assert found.bracket.best is not None
+            assert row["triangles"] == found.bracket.best.triangles < 320
+            assert row["target_tolerance"] == pytest.approx(tolerance)
+            assert row["make_seconds"] > 0
+            cache = MeshCache(Location(str(folder / "made-meshes")))
+            kept = load_mesh(study.with_cache(cache).objects[name].members[label][1])
+            assert found.mesh is None or kept.digest == found.mesh.digest
+            assert farthest(kept, original) <= tolerance
+    before = {path.name: path.stat().st_mtime_ns for path in (folder / "made-meshes").iterdir()}
+    again = sb.run(sb.Study.from_table(table({**DECIMATED, "within": within}), folder=folder), store, client=client)
+    assert again.computed == ()
+    assert {path.name: path.stat().st_mtime_ns for path in (folder / "made-meshes").iterdir()} == before
+
+
+def test_a_search_goes_on_where_it_was_ended(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[float] = []
+
+    def counted(reference: Any, one: Any, limit: Any, size: float) -> Any:
+        if len(tried) == ended:
+            raise EndedError
+        tried.append(size)
+        return limits.tried(reference, one, limit, size)
+
+    monkeypatch.setattr(searched, "tried", counted)
+    # None at first.
+    ended = -1
+    whole = load_mesh(member(folder, DECIMATED))
+    sizes = list(tried)
+    assert len(sizes) > 2
+    assert load_mesh(member(folder, DECIMATED)).digest == whole.digest
+    assert tried == sizes
+    with pytest.raises(sb.errors.MeshError, match=r"no search may run here"):
+        load_mesh(member(folder, {**DECIMATED, "within": "2 mm"}, may_run=False))
+    assert load_mesh(member(folder, DECIMATED, may_run=False)).digest == whole.digest
+    for ended in range(1, len(sizes)):
+        tried.clear()
+        for path in (folder / "made-meshes").iterdir():
+            path.unlink()
+        with pytest.raises(EndedError):
+            load_mesh(member(folder, DECIMATED))
+        ended = -1
+        assert load_mesh(member(folder, DECIMATED)).digest == whole.digest
+        # No size is tried twice.
+        assert tried == sizes
+    # The mesh alone is made again, from its last size.
+    (kept,) = (folder / "made-meshes").glob("*.ply")
+    kept.write_bytes(b"")
+    tried.clear()
+    assert load_mesh(member(folder, DECIMATED)).digest == whole.digest
+    assert len(tried) == 1
+
+
+def test_another_mesh_is_judged_against_the_reference(folder: Path) -> None:
+    start = {"source": "moved", "mesh": "scan", "distances": [0.03]}
+    sections: dict[str, Any] = {"mesh": {"scan": {"source": "files", "paths": ["scans/a.ply"]}}}
+    moved = load_mesh(member(folder, {**DECIMATED, "mesh": start}, **sections))
+    assert farthest(moved, lumpy(2)) <= 0.1
+    assert len(load_mesh(member(folder, DECIMATED)).triangles) < len(moved.triangles) < 320
+    # Already the mesh to start from is too far away.
+    start["distances"] = [0.2]
+    with pytest.raises(sb.errors.MeshError, match=r"nothing is within the tolerance of 0\.1; nearest are"):
+        member(folder, {**DECIMATED, "mesh": start}, **sections).load()
+
+
+def test_a_fraction_is_that_of_the_first_order(folder: Path) -> None:
+    own = {**DECIMATED, "within": ["10 %"]}
+    one, other = member(folder, own), member(folder, {**own, "order": -8})
+    assert one.metadata == (("target_tolerance", 0.1),)
+    assert sb.testing.same_surface(load_mesh(one), lumpy(2), tolerance=0.1, order=-4.0).outcome == "same"
+    assert len(load_mesh(other).triangles) < len(load_mesh(one).triangles) < 320
+
+
+@pytest.mark.process
+def test_a_command_is_searched_where_it_may_run(folder: Path) -> None:
+    (folder / "rings.py").write_text(RINGS)
+    sb.write_mesh(disc(lumpy(1), 2 * np.pi / 500), folder / "scans" / "a.ply")
+    rings = {
+        "name": "rings",
+        "source": "command",
+        "command": ["python", "{folder}/rings.py", "{output}", "{edge}"],
+        "output": ".off",
+        "within": "0.3 mm",
+        "search": {"edge": [0.05, 1.5]},
+    }
+    study = table(rings, name="a", scaling={"mode": "none"})
+    (folder / "study.toml").write_text(tomli_w.dumps(study))
+    words = "run", str(folder / "study.toml"), "--store", str(folder / "scans.zarr"), "--workers", "1"
+    refused = call(*words)
+    assert (refused.returncode, "--allow-commands" in refused.stderr) == (2, True)
+    done = call(*words, "--allow-commands")
+    assert done.returncode == 0, done.stderr
+    # 1 - cos(π/n) is at most 0.03 from n = 13 on.
+    assert sb.table(folder / "scans.zarr")["triangles"].tolist() == [13]
+    # Of the meshes of trials, only that one is kept.
+    assert len(list((folder / "made-meshes").glob("*.ply"))) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"within": []}, "within must have at least 1 item"),
+        ({"within": "1 furlong"}, "furlong"),
+        ({"within": -1.0}, "a length is a positive number"),
+        ({"within": "110 %"}, "below 1"),
+        ({"within": "1 mm", "order": -2.0}, "a fraction is a positive number"),
+        ({"triangles": [100]}, "triangles is searched"),
+        ({"search": {"levels": [1, 2]}}, "levels"),
+        ({"search": {"triangles": [9, 4]}}, "the smaller one first"),
+        ({"search": {"a": [1, 2], "b": [1, 2]}}, "one parameter is searched"),
+        ({"search": {"triangles": [4]}}, "search"),
+        ({"source": "command", "command": ["x", "{input}", "{output}"]}, "triangles"),
+        ({"source": "command", "command": ["x", "{output}", "{h}"], "search": {"g": [0.1, 1.0]}}, "{h}"),
+        ({"radios": 1.0}, "radios"),
+        ({"mesh": "nobody"}, "no mesh is named 'nobody'"),
+        ({"within": None, "triangles": [9], "search": {"triangles": [4, 9]}}, "within is missing"),
+    ],
+)
+def test_wrong_families_are_refused(change: dict[str, Any], message: str, folder: Path) -> None:
+    family = {key: value for key, value in {**DECIMATED, **change}.items() if value is not None}
+    with pytest.raises(sb.errors.StudyError, match=rf"decimated.*{message}"):
+        sb.Study.from_table(table(family, name="a"), folder=folder)
+
+
+def test_lengths_need_a_unit_and_a_reference_of_its_own(folder: Path) -> None:
+    study = table(DECIMATED, name="a")
+    with pytest.raises(sb.errors.StudyError, match="length_unit"):
+        sb.Study.from_table({**study, "study": {"name": "scans"}}, folder=folder)
+    with pytest.raises(sb.errors.StudyError, match=r"decimated.*a source of its own"):
+        sb.Study.from_table({**study, "reference": {"source": "family", "family": "decimated"}}, folder=folder)
