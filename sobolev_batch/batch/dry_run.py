@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain, repeat, starmap
 from time import process_time
 from typing import Any
@@ -13,7 +13,7 @@ from distributed import Client
 from sobolev_batch.batch.cluster.clients import require_blocking
 from sobolev_batch.batch.cluster.workers import Workers, prepare_workers, worker_slowness
 from sobolev_batch.batch.field_stage import Sizes, row_seconds, size_rows
-from sobolev_batch.batch.object_run import lacks_nothing
+from sobolev_batch.batch.object_run import ended_before, lacks_nothing
 from sobolev_batch.batch.start import StoreLike, require_permission, settled, warnings_of
 from sobolev_batch.geometry.surface import Similarity, placement_doubt
 from sobolev_batch.machine import available_cores
@@ -22,7 +22,7 @@ from sobolev_batch.parameters import format_bytes
 from sobolev_batch.shown import Shown, reasons
 from sobolev_batch.store.layout import stored_choice
 from sobolev_batch.store.location import Location
-from sobolev_batch.store.objects import for_each_object
+from sobolev_batch.store.objects import Objects, for_each_object
 from sobolev_batch.store.records import Record
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.pilots import Look
@@ -36,6 +36,8 @@ from sobolev_batch.visible import visible
 
 # Processor time to start a process with all libraries, and the time until a cluster of them has started.
 _PROCESS_SECONDS, _CLUSTER_SECONDS = 4.0, 6.0
+# Objects that a plan looks at: the choice of a lattice takes seconds.
+_MOST_OBJECTS = 16
 # Stored fields tell the speed if there are as many.
 _FEWEST_RECORDS = 3
 
@@ -131,7 +133,10 @@ class StudyPlan(Shown):
     Attributes:
         study: Name of the study.
         store: Path or URL of its store.
-        objects: Plan of each object that can be carried out, by its name; that of an only object may be under "".
+        count: Number of its objects.
+        share: How many unfinished objects each of those stands for that were looked at: 1 unless there are many.
+        objects: Plan of each object that was looked at and can be carried out, by its name; that of an only object may
+            be under "".
         refused: Reason for each other object, by its name.
         seconds: Time that a run will take on the workers, if they have their cores for themselves. It leaves out
             Hausdorff and Chamfer distances, and distances of very many pairs.
@@ -147,6 +152,8 @@ class StudyPlan(Shown):
 
     study: str
     store: str
+    count: int
+    share: float
     objects: Mapping[str, ObjectPlan]
     refused: Mapping[str, str]
     seconds: float
@@ -162,15 +169,16 @@ class StudyPlan(Shown):
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Labels of the surfaces whose fields are to be computed; those of named objects begin with the name."""
+        """Labels of the surfaces of these objects whose fields are to be computed, below the names of the objects."""
         return tuple(
             "/".join(filter(None, (name, label))) for name, one in self.objects.items() for label in one.task_seconds
         )
 
     @property
     def total_bytes(self) -> int:
-        """Bytes of all stored fields."""
-        return sum(one.total_bytes for one in self.objects.values())
+        """Bytes of all stored fields, as far as objects that were looked at tell."""
+        looked_at, possible = len(self.objects), self.count - self.share * len(self.refused)
+        return round(sum(one.total_bytes for one in self.objects.values()) * possible / max(1, looked_at))
 
     def to_table(self) -> dict[str, Any]:
         """Return the numbers for programs, without what is shown."""
@@ -187,7 +195,8 @@ class StudyPlan(Shown):
         lines += starmap(_beside, zip(chain(["time"], repeat("")), self.time, strict=False))
         lines += [_beside("warning", text) for text in self.warnings]
         if "" not in self.objects:
-            lines.append(f"{len(self.objects)} objects, {format_bytes(self.total_bytes)} of fields")
+            looked = f", of which {len(self.objects) + len(self.refused)} were looked at" if self.share > 1 else ""
+            lines.append(f"{self.count:,} objects{looked}; {format_bytes(self.total_bytes)} of fields")
         return "\n".join(lines)
 
 
@@ -263,7 +272,7 @@ def plan(
     """Return what running a study would do, without computing anything.
 
     References are loaded, and a few other surfaces where the study requests an accuracy. An object that cannot be
-    carried out stops no other.
+    carried out stops no other. Of many objects, 16 unfinished ones are looked at, and others count as their mean.
 
     Args:
         study: Study, or the path of its file.
@@ -295,31 +304,47 @@ def plan(
         workers = Workers.of_this_machine(available_cores())
     workers.require_accuracy(study.accuracy)
     bases: set[str] = set()
-    plans, refused = for_each_object(study, location, lambda _, one, place: _plan(one, place, workers, client, bases))
-    seconds, processor_seconds, time = _forecast(plans.values(), workers, client is None, bases)
-    warnings = warnings_of(study, location)
-    return StudyPlan(study.name, str(location), plans, refused, seconds, processor_seconds, time, warnings)
+    names, share = _looked_at(study, location)
+    part = replace(study, objects={name: study.objects[name] for name in names})
+    plans, refused = for_each_object(part, location, lambda _, one, place: _plan(one, place, workers, client, bases))
+    seconds, processor_seconds, time = _forecast(plans.values(), share, workers, client is None, bases)
+    warnings, count = warnings_of(study, location), len(study.objects)
+    return StudyPlan(
+        study.name, str(location), count, share, plans, refused, seconds, processor_seconds, time, warnings
+    )
+
+
+def _looked_at(study: Study, location: Location) -> tuple[list[str], float]:
+    """Return the names of the objects to plan, and how many unfinished ones each of them stands for."""
+    names = list(study.objects)
+    if len(names) <= _MOST_OBJECTS:
+        return names, 1.0
+    objects = Objects.read(location)
+    recorded = {} if objects is None else objects.recorded()
+    left = [name for name in names if ended_before(study.of_object(name), recorded.get(name)) is None]
+    chosen = [left[k * len(left) // _MOST_OBJECTS] for k in range(_MOST_OBJECTS)] if len(left) > _MOST_OBJECTS else left
+    return chosen, len(left) / max(1, len(chosen))
 
 
 def _forecast(
-    objects: Collection[ObjectPlan], workers: Workers, starts_processes: bool, bases: Collection[str]
+    objects: Collection[ObjectPlan], share: float, workers: Workers, starts_processes: bool, bases: Collection[str]
 ) -> tuple[float, float, tuple[str, ...]]:
     """Return the seconds of a run, if workers have their cores for themselves, its processor seconds, and both shown.
 
-    Objects are carried out beside each other.
+    Objects are carried out beside each other, and each stands for some.
     """
-    missing = sum(len(one.task_seconds) for one in objects)
+    missing = round(share * sum(len(one.task_seconds) for one in objects))
     if not missing:
         lacks_tables = any(one.lacks_tables for one in objects)
         text = "no field is missing, and tables follow from them" if lacks_tables else "nothing is missing"
         return 0.0, 0.0, (text,)
-    work = sum(one.planning_seconds + sum(one.task_seconds.values()) for one in objects)
+    work = share * sum(one.planning_seconds + sum(one.task_seconds.values()) for one in objects)
     processes, start = (
         (_PROCESS_SECONDS * (1 + len(workers.members)), _CLUSTER_SECONDS) if starts_processes else (0.0, 0.0)
     )
-    alone = sum(one.planning_seconds for one in objects) if len(objects) == 1 else 0.0
+    alone = sum(one.planning_seconds for one in objects) if len(objects) == share == 1 else 0.0
     seconds = start + max(alone + (work - alone) / workers.threads, *(one.shortest_seconds for one in objects))
-    fields = f"{missing} missing field{'s' * (missing != 1)}"
+    fields = f"{missing:,} missing field{'s' * (missing != 1)}"
     tasks = f"{workers.threads} task{'s' * (workers.threads != 1)} at once"
     lines = (
         f"about {duration(seconds, digits=2)} for {fields}, with {tasks}",

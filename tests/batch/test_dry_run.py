@@ -115,6 +115,24 @@ def test_workers_of_a_cluster_are_tried(client: Client, plan: Plan) -> None:
     assert "1 tiles, 2.4KB on disk" in str(found)
 
 
+def test_of_many_objects_some_are_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    looked: list[str] = []
+
+    def planned(study: sb.Study, *arguments: Any) -> Plan:
+        looked.append(study.object.name)
+        return make_plan(study, *arguments)
+
+    monkeypatch.setattr("sobolev_batch.batch.dry_run.make_plan", planned)
+    names = [f"ball{k:02}" for k in range(40)]
+    study = sb.Study.from_table(small_table(object=balls(**dict.fromkeys(names, 1.0)), family=methods_of()))
+    found = sb.plan(study, tmp_path / "many.zarr")
+    assert looked == list(found.objects) == [names[k * 40 // 16] for k in range(16)]
+    assert (found.count, found.share) == (40, 2.5)
+    assert found.total_bytes == 40 * found.objects["ball00"].total_bytes
+    assert "for 200 missing fields" in str(found)
+    assert str(found).splitlines()[-1].startswith("40 objects, of which 16 were looked at")
+
+
 def made_of(**families: Mapping[str, Any] | list[int]) -> list[dict[str, Any]]:
     """Return families by name: icospheres of some levels, or sources."""
     return [
