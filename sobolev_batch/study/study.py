@@ -58,7 +58,7 @@ class StudyObject:
     >>> import sobolev_batch as sb
     >>> study = sb.Study.from_toml("workflows/icosphere.toml")
     >>> list(study.object.members)
-    ['icosphere/1', 'icosphere/2', 'icosphere/3', 'icosphere/4', 'reference']
+    ['icosphere/0', 'icosphere/1', 'icosphere/2', 'icosphere/3', 'reference']
     """
 
     name: str
