@@ -7,6 +7,7 @@ import logging
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -376,8 +377,13 @@ def _attributes(plan: Plan, labels: Sequence[str]) -> dict[str, Any]:
         },
         REMOVED: [label for label in labels if label not in planned],
         "similarity": _similarity_entry(plan.similarity),
-        "versions": {name: version(name) for name in _RECORDED_VERSIONS},
+        "versions": dict(_versions()),
     }
+
+
+@cache
+def _versions() -> tuple[tuple[str, str], ...]:
+    return tuple((name, version(name)) for name in _RECORDED_VERSIONS)
 
 
 def _lattice_entry(plan: Plan) -> dict[str, Any]:
