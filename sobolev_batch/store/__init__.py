@@ -1,4 +1,5 @@
 """Store: where bytes lie and who may write them, and the zarr hierarchy of a study with its fields, records and tables.
 
-In: a location, and a plan to create the hierarchy from. Out: arrays that any xarray reads.
+In: a location, and a plan to create the hierarchy from. Out: arrays that any xarray reads, at a root for all
+objects, and in a group for each.
 """

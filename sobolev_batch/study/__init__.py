@@ -1,4 +1,5 @@
 """Study: a validated study file, and the plan that follows from it.
 
-In: TOML or a table. Out: a frozen `Study`, its lattice, and a `Plan` with one row for each surface.
+In: TOML or a table. Out: a frozen `Study` of objects, and for each its lattice, and a `Plan` with one row for each
+surface.
 """
