@@ -179,12 +179,12 @@ class Status(Shown):
 
 def _tallies(objects: Objects, *, is_open: bool) -> Iterator[tuple[str, ObjectRecord]]:
     """Yield what is known of each object: by its record, or by its store where a run has not come to its end."""
-    recorded = objects.recorded()
+    recorded, present = objects.recorded(), objects.location.names()
     for name in objects.names:
         record = recorded.get(name)
         if record is None:
             try:
-                place = objects.existing_store(name)
+                place = objects.existing_store(name) if name in present else None
                 record = ObjectRecord() if place is None else Contents.of_store(Store.open(place)).tally()
             except DamageError as error:
                 record = ObjectRecord(reason=str(error))

@@ -23,8 +23,9 @@ from sobolev_batch.store.records import Record
 
 Result = TypeVar("Result")
 Stage = Literal["cluster", "lattice", "fields", "reduction", "proximity"]
-# Runs that have begun and not ended: each has its records in memory.
-_MOST_RUNS = 1000
+# Runs that have begun and not ended: at least so many, and so many for each thread of the workers, whose first task may
+# be their only one. Each has its plan and its records in memory.
+_FEWEST_RUNS, _RUNS_PER_THREAD = 64, 4
 # What was done in a step of a stage, for people.
 _DONE: Mapping[Stage, str] = {
     "lattice": "lattices chosen",
@@ -276,6 +277,7 @@ class _Loop(Generic[Result]):
     def __init__(self, waiting: Iterator[tuple[str, Stages[Result]]], is_fatal: Callable[[Exception], bool]) -> None:
         self._waiting, self._is_fatal = waiting, is_fatal
         self._begun: list[_Run[Result]] = []
+        self._most_runs = _FEWEST_RUNS
         # Those with tasks to hand out, which they do in turn.
         self._ready = deque[_Run[Result]]()
         self._running: dict[Future, tuple[_Run[Result], Wave, Task]] = {}
@@ -338,7 +340,7 @@ class _Loop(Generic[Result]):
 
     def _begin(self) -> bool:
         """Begin the next run; False where none is waiting, or enough have begun."""
-        if len(self._begun) >= _MOST_RUNS:
+        if len(self._begun) >= self._most_runs:
             return False
         name, stages = next(self._waiting, ("", None))
         if stages is None:
@@ -355,6 +357,7 @@ class _Loop(Generic[Result]):
         if self._completed is None and wave.cluster.client is not None:
             self._client = wave.cluster.client
             self._completed = as_completed(loop=self._client.loop)
+            self._most_runs = max(_FEWEST_RUNS, _RUNS_PER_THREAD * wave.cluster.workers.threads)
         future = wave.cluster.submit(task, wave.claims_memory, {}, task.label)
         self._running[future] = run, wave, task
         run.in_flight += 1
