@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path, PurePath
 from typing import Any
 
 import pandas as pd
 from distributed import Client
+from pydantic import ValidationError
 
 from sobolev_batch.batch.cluster.clients import local_client, require_blocking
 from sobolev_batch.batch.cluster.execution import (
@@ -35,9 +36,9 @@ from sobolev_batch.reduction.recorded import RecordedSearch
 from sobolev_batch.reduction.remesher import Method, Range, Remesher
 from sobolev_batch.reduction.search import PRECISION, Bracket, Trial
 from sobolev_batch.sources.files import FileMember, matching_files, names_of_files
-from sobolev_batch.sources.mesh_cache import InMemory
+from sobolev_batch.sources.mesh_cache import InMemory, MeshCache
 from sobolev_batch.sources.names import duplicate_names
-from sobolev_batch.sources.registry import Member, SurfaceMember, load_mesh
+from sobolev_batch.sources.registry import Member, SurfaceMember
 from sobolev_batch.store.location import Location
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.rendering import Column, Section, rendered
@@ -187,8 +188,8 @@ def reduce(
     """
     if client is not None:
         require_blocking(client)
-    limit, remesher = Limit.parse(within, order, unit), Remesher.parse(method, search)
-    # Refuses a precision.
+    limit, remesher = Limit.parse(within, order, unit), _permitted(method, search)
+    # It refuses a wrong precision.
     remesher.search(limit.value, 1, precision)
     folder = None if output is None else Location.parse(output).absolute()
     searches = [
@@ -201,6 +202,16 @@ def reduce(
         if on_progress is not None:
             on_progress(found[name])
     return {search.name: found[search.name] for search in searches}
+
+
+def _permitted(method: Method, search: Range | None) -> Remesher:
+    """Return a remesher that may run; InputError where none is meant."""
+    try:
+        remesher = Remesher.parse(method, search)
+    except ValidationError as error:
+        parts = [(*one["loc"], one["msg"].removeprefix("Value error, ")) for one in error.errors()]
+        raise InputError("; ".join(": ".join(map(str, part)) for part in parts)) from error
+    return replace(remesher, source=remesher.source.with_cache(MeshCache(InMemory(), may_run=True)))
 
 
 def _outcomes(
@@ -224,8 +235,7 @@ def _outcomes(
         def cluster() -> Cluster:
             """Start the cluster, which is not needed where everything is recorded."""
             started = client or stack.enter_context(local_client(min(processes, _MOST_AT_ONCE * len(searches))))
-            libraries = searches[0].remesher.a_source.libraries
-            return Cluster(started, prepare_workers(started, libraries), study="reduce")
+            return Cluster(started, prepare_workers(started, searches[0].remesher.source.libraries), study="reduce")
 
         def at_once() -> int:
             return max(1, min(_MOST_AT_ONCE, cluster().workers.threads // len(left)))
@@ -252,8 +262,8 @@ def _searched(search: RecordedSearch, cluster: Callable[[], Any], at_once: Calla
     """Search for the fewest triangles of a mesh, on a cluster or, where that is None, in this process."""
     known = search.recorded()
     if known is None:
-        read = Task(_triangle_count, (search.original,), search.projected_bytes(0), label=search.name, stage="read")
-        known = search.begun((yield from result_from(cluster(), read)))
+        read = Task(search.begun, (), search.projected_bytes(0), label=search.name, stage="read")
+        known = yield from result_from(cluster(), read)
     record = known
 
     def take(_: Task, outcome: Any) -> None:
@@ -273,10 +283,6 @@ def _searched(search: RecordedSearch, cluster: Callable[[], Any], at_once: Calla
     return Reduction(
         search.name, search.limit, record.triangles, record.trials, search.bracket(record), reason, path, mesh
     )
-
-
-def _triangle_count(original: Member) -> int:
-    return len(load_mesh(original).triangles)
 
 
 def _originals(meshes: Any, folder: Location | None) -> dict[str, tuple[Member, str]]:

@@ -11,7 +11,7 @@ import sys
 import click
 
 # Importing these modules adds their commands to the group.
-from sobolev_batch.cli import mesh_commands, reduce_command, store_commands, study_commands, table_commands  # noqa: F401
+from sobolev_batch.cli import mesh_commands, store_commands, study_commands, table_commands  # noqa: F401
 from sobolev_batch.cli.interruption import Deadline
 from sobolev_batch.cli.output import show_usage_error
 from sobolev_batch.cli.program import cli

@@ -1,4 +1,4 @@
-"""Commands that take a study: run, submit, plan."""
+"""Commands that may compute on a cluster: run, submit, plan, which take a study, and reduce."""
 
 from __future__ import annotations
 
@@ -10,14 +10,17 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sobolev_batch.cli.options import PATH, Callback, json_option, location, memory_size
+from sobolev_batch.cli.options import PATH, Callback, format_option, json_option, location, memory_size
 from sobolev_batch.cli.output import echo, echo_lines, echo_result, progress_reports
 from sobolev_batch.cli.program import EXIT_SOME_FAILED, cli
 from sobolev_batch.cli.table_commands import table_command
 from sobolev_batch.errors import InputError
+from sobolev_batch.norms import DEFAULT_ORDER
 
 if TYPE_CHECKING:
+    from sobolev_batch.batch.reduce import Reduction
     from sobolev_batch.store.location import Location
+    from sobolev_batch.tables import Format
 
 # Lines about distances that are less accurate than requested.
 _MOST_IMPRECISE = 10
@@ -43,6 +46,12 @@ def _scheduler_option(*, required: bool = False) -> Callable[[Callback], Callbac
     return click.option("--scheduler", metavar="ADDRESS", required=required, help=text)
 
 
+_workers_option = click.option(
+    "--workers",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Start N processes on this machine. [default: one per core]",
+)
 _only_option = click.option(
     "--only",
     multiple=True,
@@ -56,12 +65,7 @@ _only_option = click.option(
 @_store_option
 @_scheduler_option()
 @_trust_option
-@click.option(
-    "--workers",
-    type=click.IntRange(min=1),
-    metavar="N",
-    help="Start N processes on this machine. [default: one per core]",
-)
+@_workers_option
 @click.option(
     *("--worker-memory", "memory"),
     type=memory_size,
@@ -188,6 +192,81 @@ def plan_command(
         made = plan(study, store, client, allow_commands=allow_commands)
     echo_result(style, made, made.to_table())
     if made.refused:
+        context.exit(EXIT_SOME_FAILED)
+
+
+def _range(context: click.Context, param: click.Parameter, value: str | None) -> dict[str, tuple[float, float]] | None:
+    """Return the parameter that is searched with its ends, from NAME=LOW:HIGH."""
+    if value is None:
+        return None
+    name, _, ends = value.partition("=")
+    try:
+        low, high = ((float if set(end) & set(".eE") else int)(end) for end in ends.split(":"))
+    except ValueError as error:
+        raise click.BadParameter(f"{value!r} is no range such as hausd=0.001:1.0 or triangles=100:5000") from error
+    return {name: (low, high)}
+
+
+@cli.command("reduce", remark="; the same command goes on from its last trial")
+@click.argument("files", nargs=-1, required=True, type=PATH)
+@click.option(
+    "--within",
+    required=True,
+    metavar="TOLERANCE",
+    help="Keep the largest deviation within a length, such as 0.1mm, or the distance within 1% of the norm.",
+)
+@click.option("--order", type=float, help=f"Measure this fraction at an order below -1/2. [default: {DEFAULT_ORDER:g}]")
+@click.option("--unit", metavar="NAME", help="Name the unit of length of the files, such as mm.")
+@click.option(
+    *("--with", "method"),
+    default="decimate",
+    show_default=True,
+    metavar="METHOD",
+    help="Take 'mmgs_O3 -in {input} -out {output} -hausd {hausd}' or another command, or the source remesh.",
+)
+@click.option(
+    "--search",
+    callback=_range,
+    metavar="NAME=LOW:HIGH",
+    help="Search a parameter between two values; whole numbers try those alone. [default: triangles]",
+)
+@click.option("--output", required=True, metavar="FOLDER|URL", help="Write meshes and records of trials there.")
+@_workers_option
+@_scheduler_option()
+@_trust_option
+@format_option
+@click.pass_context
+def reduce_command(
+    context: click.Context,
+    /,
+    files: tuple[Path, ...],
+    style: Format,
+    scheduler: str | None,
+    trust_network: bool,
+    **settings: Any,
+) -> None:
+    """Find the fewest triangles of each mesh within a tolerance.
+
+    Each mesh is made with more or fewer triangles and compared with its file, until the coarsest one within the
+    tolerance is known. Bounds decide. The same command goes on where it was ended. A command in METHOD runs here, or
+    on the workers.
+
+    The exit status is 3 if nothing within the tolerance was found for some.
+    """
+    from sobolev_batch.batch.cluster.clients import remote_client
+    from sobolev_batch.batch.reduce import format_reductions, reduce
+
+    if scheduler and settings["workers"]:
+        raise click.UsageError("--workers is for processes on this machine; a scheduler has its own")
+
+    def tell(one: Reduction) -> None:
+        if len(files) > 1:
+            echo(one, err=True)
+
+    with remote_client(scheduler, trust_network) if scheduler else nullcontext() as client:
+        found = reduce(files, client=client, on_progress=tell, **settings)
+    echo_lines(format_reductions(found, style, settings["unit"]))
+    if any(one.reason for one in found.values()):
         context.exit(EXIT_SOME_FAILED)
 
 

@@ -45,13 +45,7 @@ class Limit:
     order: float | None = None
 
     @classmethod
-    def parse(
-        cls,
-        within: float | str,
-        order: float | None = None,
-        unit: str | None = None,
-        default_order: float = DEFAULT_ORDER,
-    ) -> Self:
+    def parse(cls, within: float | str, order: float | None = None, unit: str | None = None) -> Self:
         """Return the limit that is meant: a length, or with a per cent sign or an order a fraction of the norm.
 
         >>> Limit.parse("0.1 mm", unit="m"), Limit.parse("1%")
@@ -59,7 +53,7 @@ class Limit:
         """
         if order is None and not str(within).rstrip().endswith("%"):
             return cls(length_in(within, unit))
-        limit = cls(fraction(within), single_order(default_order if order is None else order))
+        limit = cls(fraction(within), single_order(DEFAULT_ORDER if order is None else order))
         if limit.value >= 1:
             raise InputError(f"a Sobolev distance is a fraction of the norm below 1, such as 1%, found {within!r}")
         return limit

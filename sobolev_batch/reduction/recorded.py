@@ -18,7 +18,7 @@ from sobolev_batch.reduction.limit import Limit
 from sobolev_batch.reduction.remesher import Remesher
 from sobolev_batch.reduction.search import PRECISION, Bracket, Search, Trial
 from sobolev_batch.sources.mesh_cache import Folder
-from sobolev_batch.sources.registry import Member
+from sobolev_batch.sources.registry import Member, load_mesh
 
 # Raise it whenever a mesh of one size is judged in another way: trials of another version are made again.
 _VERSION = 2
@@ -86,9 +86,9 @@ class RecordedSearch:
             return record if record.digest == digest and any(one.triangles for one in record.trials) else None
         return None
 
-    def begun(self, triangles: int) -> SearchRecord:
-        """Return the record of a search that begins, for an original of some triangles."""
-        return SearchRecord(self.digest, triangles)
+    def begun(self) -> SearchRecord:
+        """Return the record of a search that begins; MeshError where the original cannot be read."""
+        return SearchRecord(self.digest, len(load_mesh(self.original).triangles))
 
     def bracket(self, record: SearchRecord) -> Bracket:
         """Return what the trials say."""

@@ -9,15 +9,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
-from pydantic import ValidationError
-
-from sobolev_batch.errors import InputError, StudyError
+from sobolev_batch.errors import InputError
 from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.reduction.search import PRECISION, Search
 from sobolev_batch.sources.command import RemeshedMember
 from sobolev_batch.sources.mesh_cache import InMemory, MeshCache
 from sobolev_batch.sources.programs import PLACEHOLDER
-from sobolev_batch.sources.registry import Member, Source, parse_source, single_member
+from sobolev_batch.sources.registry import Member, Source, parse_source, single_member, source_type_of
 
 # What a remesher is asked for by default, and the fewest triangles of a closed mesh.
 _TRIANGLES, _FEWEST = "triangles", 4
@@ -31,6 +29,13 @@ _ANY_MESH = {"source": "icosphere", "levels": [0]}
 # that is searched with its ends.
 Method = str | Callable[..., Any] | Mapping[str, Any]
 Range = Mapping[str, tuple[float, float]]
+
+
+def searched_parameter(search: Range | None) -> tuple[str, tuple[float, float] | None]:
+    """Return the parameter that is searched, and its ends; by default triangles, whose ends depend on the mesh."""
+    if search is not None and len(search) != 1:
+        raise InputError(f"one parameter is searched, found {len(search)}; give the others fixed values")
+    return next(iter(search.items())) if search else (_TRIANGLES, None)
 
 
 class GivenSource(Source):
@@ -48,23 +53,21 @@ class Remesher:
     """A family of meshes of one other mesh, with a parameter that makes them coarse or fine.
 
     Attributes:
-        table: Table of the family, without its mesh and the parameter.
+        source: Source of such meshes, of any other mesh and for any values of the parameter.
         parameter: Name of the parameter.
         ends: Smallest and largest value to try, whole numbers for a parameter that takes those alone; None for numbers
             of triangles, up to that of the mesh itself, which is then not remeshed.
-        cache: Permits commands to run, and knows their versions. Meshes of trials are not kept.
         folder: Folder in which relative paths start.
     """
 
-    table: Mapping[str, Any]
+    source: Source
     parameter: str = _TRIANGLES
     ends: tuple[float, float] | None = None
-    cache: MeshCache = field(default_factory=lambda: MeshCache(InMemory(), may_run=True))
     folder: Path = field(default_factory=Path.cwd)
 
     @classmethod
     def parse(cls, method: Method, search: Range | None = None) -> Self:
-        """Return the remesher that is meant; InputError where none is."""
+        """Return the remesher that is meant; InputError or pydantic's ValidationError where none is."""
         table: Mapping[str, Any] = {"source": method}
         if isinstance(method, Mapping):
             table = method
@@ -74,24 +77,17 @@ class Remesher:
             table = {"source": "command", "command": shlex.split(method)}
         if table.get("source") == "decimate":
             table = {"radius": _RADIUS, **table}
-        if search is not None and len(search) != 1:
-            raise InputError(f"one parameter is searched, found {len(search)}; give the others fixed values")
-        remesher = cls(table, *(next(iter(search.items())) if search else ()))
-        if remesher.parameter in table:
-            raise InputError(f"{remesher.parameter} is searched, so it has no value of its own; take it out")
-        # Both refuse what is wrong with the parameter or its ends.
-        remesher.a_source  # noqa: B018
+        parameter, ends = searched_parameter(search)
+        kind = source_type_of(table.get("source"))
+        if parameter in table:
+            raise InputError(f"{parameter} is searched, so it has no value of its own; take it out")
+        if parameter not in kind.model_fields and kind.model_config.get("extra") != "allow":
+            raise InputError(f"the source {table['source']} has no parameter {parameter} that could be searched")
+        values = [*dict.fromkeys(ends or [_FEWEST])]
+        remesher = cls(parse_source({**table, parameter: values, "mesh": _ANY_MESH}), parameter, ends)
+        # It refuses wrong ends.
         remesher.search(1.0, _FEWEST)
         return remesher
-
-    @property
-    def a_source(self) -> Source:
-        """The source of a mesh of one size: what it needs, all need."""
-        return self.source(self._a_size)
-
-    @property
-    def _a_size(self) -> float:
-        return _FEWEST if self.ends is None else self.ends[0]
 
     @property
     def is_whole(self) -> bool:
@@ -104,16 +100,6 @@ class Remesher:
         coarser = False if self.parameter == _TRIANGLES else None
         return Search(limit, low, high, self.is_whole, coarser, precision)
 
-    def source(self, size: float) -> Source:
-        """Return the source of the mesh of one size; StudyError where its table is malformed."""
-        value = int(size) if self.is_whole else size
-        try:
-            source = parse_source({**self.table, self.parameter: [value], "mesh": _ANY_MESH})
-        except ValidationError as error:
-            parts = [(*one["loc"], one["msg"].removeprefix("Value error, ")) for one in error.errors()]
-            raise StudyError("; ".join(": ".join(map(str, part)) for part in parts)) from error
-        return source.with_cache(self.cache)
-
     def member(self, original: Member, size: float, triangles: float = math.inf) -> Member:
         """Return the mesh of one size that is made of another one, or that one itself where it has no more triangles.
 
@@ -121,12 +107,14 @@ class Remesher:
         """
         if self.parameter == _TRIANGLES and size >= triangles:
             return original
-        source = self.source(size).model_copy(update={"mesh": GivenSource(member=original)})
+        values = (int(size) if self.is_whole else size,)
+        source = self.source.model_copy(update={self.parameter: values, "mesh": GivenSource(member=original)})
         member = single_member(source, self.folder)
-        if isinstance(member, RemeshedMember):
-            return replace(member, cache=MeshCache(InMemory(), self.cache.may_run))
-        return member
+        # Whoever searches may run it, and keeps the best mesh alone.
+        kept = MeshCache(InMemory(), may_run=True)
+        return replace(member, cache=kept) if isinstance(member, RemeshedMember) else member
 
     def fingerprint(self, original: Member) -> list[Any]:
         """Return what all meshes that are made of another one depend on; MeshError where that cannot be read."""
-        return [self.parameter, self.ends, self.member(original, self._a_size).fingerprint()]
+        one = self.member(original, _FEWEST if self.ends is None else self.ends[0])
+        return [self.parameter, self.ends, one.fingerprint()]

@@ -184,10 +184,8 @@ class Search:
         size = min(max(math.exp(sign * place), self.low), self.high)
         if not self.is_whole:
             return size
-        finer = self.low if sign > 0 else self.high
-        finer = finer if bracket.best is None else bracket.best.size + sign
-        coarser = self.high if sign > 0 else self.low
-        coarser = coarser if bracket.failed is None else bracket.failed.size - sign
+        finer = -sign * math.inf if bracket.best is None else bracket.best.size + sign
+        coarser = sign * math.inf if bracket.failed is None else bracket.failed.size - sign
         return float(min(max(round(size), min(finer, coarser)), max(finer, coarser)))
 
 

@@ -8,18 +8,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import BeforeValidator, Field, PrivateAttr, SerializeAsAny, model_validator
+from pydantic import BeforeValidator, Field, PrivateAttr, SerializeAsAny, ValidationInfo
 
 from sobolev_batch.errors import InputError, MeshError, StudyError, refused_by_pydantic
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.reduction.limit import Limit, tried
 from sobolev_batch.reduction.recorded import RecordedSearch
-from sobolev_batch.reduction.remesher import Remesher
+from sobolev_batch.reduction.remesher import Remesher, searched_parameter
 from sobolev_batch.sources.files import number_as_text
 from sobolev_batch.sources.mesh_cache import InMemory, MeshCache
 from sobolev_batch.sources.programs import Cost
-from sobolev_batch.sources.registry import ExpectedSize, Fingerprint, Member, Several, Source, load_mesh, single_member
+from sobolev_batch.sources.registry import ExpectedSize, Fingerprint, Member, Several, Source, single_member
 
 # One or several tolerances, as a study file gives them; and the parameter that is searched, with its ends.
 Tolerances = Annotated[
@@ -28,48 +28,33 @@ Tolerances = Annotated[
 Searched = dict[str, Annotated[tuple[int | float, int | float], Field(strict=False)]]
 
 
+def _template(table: Any, info: ValidationInfo) -> Source:
+    with refused_by_pydantic():
+        return Remesher.parse(table, info.data.get("search")).source
+
+
 class SearchedSource(Source):
     """Meshes of one other mesh, of as few triangles as each of several tolerances permits.
 
     Attributes:
-        table: Table of the source that makes them, without its mesh and the parameter that is searched.
-        mesh: Mesh to start from; None for the reference.
         within: Largest distances from the reference, as `Limit.parse` takes them with the order.
         search: Name of the parameter, and between which two values to search; None for triangles.
+        template: Source that makes them, from its table without its mesh and the parameter that is searched.
+        mesh: Mesh to start from; None for the reference.
         reference: Reference of the study.
         unit: Unit of the files, where it is known.
         default_order: Order of fractions for which none is given.
     """
 
-    table: dict[str, Any]
-    mesh: SerializeAsAny[Source] | None = None
     within: Tolerances
     order: float | None = None
     search: Searched | None = None
+    template: Annotated[SerializeAsAny[Source], BeforeValidator(_template)]
+    mesh: SerializeAsAny[Source] | None = None
     reference: SerializeAsAny[Source] | None = None
     unit: str | None = None
     default_order: float = DEFAULT_ORDER
     _cache: MeshCache = PrivateAttr(default_factory=lambda: MeshCache(InMemory()))
-
-    @model_validator(mode="after")
-    def _check_remesher(self) -> Self:
-        with refused_by_pydantic():
-            self.remesher(Path())
-        return self
-
-    def remesher(self, folder: Path) -> Remesher:
-        """Return the remesher for a study in a folder."""
-        return replace(Remesher.parse(self.table, self.search), cache=self._cache, folder=folder.absolute())
-
-    @property
-    def libraries(self) -> tuple[str, ...]:
-        """Distributions that remesher and meshes need."""
-        return *self.remesher(Path()).a_source.libraries, *super().libraries
-
-    @property
-    def commands(self) -> tuple[str, ...]:
-        """Commands that making the meshes runs."""
-        return *self.remesher(Path()).a_source.commands, *super().commands
 
     @property
     def keeps_meshes(self) -> bool:
@@ -93,29 +78,30 @@ class SearchedSource(Source):
             source.limits()
         except InputError as error:
             raise StudyError(f"within: {error}") from error
-        if source.reference is None:
-            raise StudyError("within: the reference is a member of a family; give it a source of its own, or a mesh")
         return source
 
     def limits(self) -> dict[str, Limit]:
         """Return the tolerances by their names; InputError where they are none."""
         texts = [number_as_text(one) if isinstance(one, float) else one for one in self.within]
-        limits = [Limit.parse(text, self.order, self.unit, self.default_order) for text in texts]
+        orders = [self.default_order if text.endswith("%") and self.order is None else self.order for text in texts]
+        limits = [Limit.parse(text, order, self.unit) for text, order in zip(texts, orders, strict=True)]
         return {text.replace(" ", ""): limit for text, limit in zip(texts, limits, strict=True)}
 
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member for each tolerance, in their order."""
         if self.reference is None:
-            raise StudyError("meshes within a tolerance need a reference")
+            raise StudyError("within: the reference is a member of a family; give it a source of its own, or a mesh")
         reference = single_member(self.reference, folder)
         original = reference if self.mesh is None else single_member(self.mesh, folder)
-        remesher = self.remesher(folder)
+        parameter, ends = searched_parameter(self.search)
+        remesher = Remesher(self.template, parameter, ends, folder.absolute())
         return tuple(
             SearchedMember(
                 name,
                 -1,
                 metadata=(("target_tolerance", limit.value),),
                 search=RecordedSearch(original, reference, limit, remesher, self._cache.folder),
+                may_run=self._cache.may_run,
             )
             for name, limit in self.limits().items()
         )
@@ -123,18 +109,17 @@ class SearchedSource(Source):
 
 @dataclass(frozen=True)
 class SearchedMember(Member):
-    """The mesh of fewest triangles that a search finds, unless it was found before."""
+    """The mesh of fewest triangles that a search finds, unless it was found before, or may not run."""
 
     search: RecordedSearch
+    may_run: bool
 
     def load(self) -> Mesh:
         """Return the mesh that is kept, or go on with the search; MeshError where it finds none, or may not run."""
-        search, cache = self.search, self.search.remesher.cache
-        record = search.recorded()
-        if not cache.may_run and (record is None or search.next(record)):
-            raise MeshError(f"no search may run here, and its mesh is not kept in {cache.folder}; run the study")
-        if record is None:
-            record = search.begun(len(load_mesh(search.original).triangles))
+        search, record = self.search, self.search.recorded()
+        if not self.may_run and (record is None or search.next(record)):
+            raise MeshError(f"no search may run here, and its mesh is not kept in {search.folder}; run the study")
+        record = record or search.begun()
         while sizes := search.next(record):
             record = search.taken(record, tried(*search.trial(record, sizes[0])))
         if reason := search.reason(record):

@@ -28,13 +28,7 @@ class Folder(Protocol):
 class InMemory(dict[str, bytes]):
     """A place for files that ends with the process."""
 
-    def read(self, key: str) -> bytes | None:
-        """Return the bytes of a file, or None if it does not exist."""
-        return self.get(key)
-
-    def write(self, documents: Mapping[str, bytes]) -> None:
-        """Write files by their keys."""
-        self.update(documents)
+    read, write = dict.get, dict.update
 
 
 @dataclass(frozen=True)

@@ -260,7 +260,7 @@ def _source_of_family(table: object, info: ValidationInfo) -> Source:
     with refused_by_pydantic():
         others = with_named_meshes({key: table[key] for key in table if key not in own}, info.context or {})
         mesh = parse_source(others.pop("mesh")) if "mesh" in others else None
-    return SearchedSource.model_validate({"table": others, "mesh": mesh, **own})
+    return SearchedSource.model_validate({"template": others, "mesh": mesh, **own})
 
 
 class Family(Section):
