@@ -110,11 +110,11 @@ class RecordedSearch:
         if self.digest != record.digest:
             raise MeshError("a file of it was changed while it was searched; try again")
         trial, mesh = outcome
-        trials = (*(one for one in record.trials if one.size != trial.size), trial)
-        record = replace(record, trials=trials)
+        record = replace(record, trials=(*(one for one in record.trials if one.size != trial.size), trial))
         if mesh is not None and self.bracket(record).best == trial:
-            data = WRITERS[PurePath(self._key_of_mesh(record)).suffix](mesh)
-            self.folder.write({self._key_of_mesh(record): data})
+            key = self._key_of_mesh(record)
+            data = WRITERS[PurePath(key).suffix](mesh)
+            self.folder.write({key: data})
             record = replace(record, mesh_digest=_digest(data))
         self.folder.write({f"{self.name or record.digest}.json": _RECORDS.dump_json(record, exclude_defaults=True)})
         return record

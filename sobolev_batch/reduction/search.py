@@ -198,7 +198,7 @@ def _extrapolated(points: Mapping[float, float]) -> float:
 
 def _interpolated(points: Mapping[float, float], start: float, end: float) -> float:
     """Return the place within a bracket where the excess would be zero."""
-    below, above = min(-points.get(start, -_NEAR), _NEAR), min(points.get(end, _NEAR), _NEAR)
     # An open question may leave either of them without its sign.
-    below, above = max(below, _NEAR / 100), max(above, _NEAR / 100)
+    excesses = -points.get(start, -_NEAR), points.get(end, _NEAR)
+    below, above = (min(max(excess, _NEAR / 100), _NEAR) for excess in excesses)
     return start + (end - start) * below / (below + above)

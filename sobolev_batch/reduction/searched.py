@@ -82,7 +82,7 @@ class SearchedSource(Source):
 
     def limits(self) -> dict[str, Limit]:
         """Return the tolerances by their names; InputError where they are none."""
-        texts = [number_as_text(one) if isinstance(one, float) else one for one in self.within]
+        texts = [number_as_text(one) if isinstance(one, float) else one.strip() for one in self.within]
         orders = [self.default_order if text.endswith("%") and self.order is None else self.order for text in texts]
         limits = [Limit.parse(text, order, self.unit) for text, order in zip(texts, orders, strict=True)]
         return {text.replace(" ", ""): limit for text, limit in zip(texts, limits, strict=True)}
