@@ -31,7 +31,7 @@ from sobolev_batch.store.records import ObjectRecord, Record, Records
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.plan import Plan, fingerprint_of
 from sobolev_batch.study.study import Members, Study, StudyObject
-from sobolev_batch.tables.all_objects import Tables, tables_in, tables_of_object
+from sobolev_batch.tables.all_objects import Tables, packed_tables, tables_in
 from sobolev_batch.transform.fourier import NUMERICS_VERSION
 
 _log = logging.getLogger(__name__)
@@ -54,13 +54,13 @@ class Ended:
     Attributes:
         record: What its store is known to have.
         computed, reused: Labels of the surfaces whose fields were computed now, and were stored before.
-        tables: Rows of the object in the tables of all; None where they have not changed.
+        tables: Rows of the object in the tables of all, see `packed_tables`; None where they have not changed.
     """
 
     record: ObjectRecord
     computed: tuple[str, ...] = ()
     reused: tuple[str, ...] = ()
-    tables: Tables | None = None
+    tables: bytes | None = None
 
     @classmethod
     def of(cls, workspace: Workspace, computed: set[int], tables: Tables | None = None) -> Ended:
@@ -266,14 +266,14 @@ def lacks_nothing(workspace: Workspace) -> bool:
     return not workspace.pending and are_tabulated(workspace) and have_proximities(workspace)
 
 
-def _rows_of_all(workspace: Workspace, tables: Tables | None) -> Tables | None:
+def _rows_of_all(workspace: Workspace, tables: Tables | None) -> bytes | None:
     """Return the rows of an object in the tables of all objects; None for an only one, whose tables are at the root."""
     study = workspace.plan.study
     if not study.object.name:
         return None
     if tables is None or study.proximity is not None:
         tables = tables_in(workspace.store)
-    return tables_of_object(study.object.name, tables, 1 / workspace.plan.similarity.scale)
+    return packed_tables(study.object.name, tables, 1 / workspace.plan.similarity.scale) if tables else None
 
 
 def _imprecise(workspace: Workspace) -> dict[str, float]:

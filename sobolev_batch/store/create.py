@@ -39,14 +39,15 @@ from sobolev_batch.store.layout import (
 )
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import LOCK_KEYS
-from sobolev_batch.store.metadata import SCHEMA_VERSION
+from sobolev_batch.store.metadata import SCHEMA_VERSION, chunk_shape
 from sobolev_batch.store.records import Record, Records
 from sobolev_batch.study.plan import Plan
 from sobolev_batch.transform.lattice import AXES, smooth_step
 
 _log = logging.getLogger(__name__)
 
-# Of a chunk of spectra: its rows are one task, and small ones would be many keys. Qualities have as many rows.
+# Bytes and rows of a chunk of spectra: its rows are one task, and small ones would be many keys. A chunk is written as
+# a whole, so a small store has short ones. Qualities have as many rows.
 _SPECTRA_BYTES, _MOST_SPECTRA = 2 << 20, 512
 # Records that lie together once a run has ended.
 ROWS_PER_PAGE = 100
@@ -221,14 +222,18 @@ def _lay_out(store: Store, plan: Plan, labels: Sequence[str], qualities: Sequenc
         )
         keys |= dataset_keys(OCTAVES_GROUP, xr.Dataset(coords={**_sample_columns(plan.tail), "mesh": mesh}))
     list_records(store)
-    store.publish(keys | _spectra_keys(plan, mesh))
+    spectra, before = _spectra_keys(plan, mesh), store.documents.get(SPECTRA_KEYS)
+    if before is not None and chunk_shape(before) != chunk_shape(_documents_of(spectra)[SPECTRA_KEYS]):
+        # They are summed up from the fields again.
+        store.location.remove(SPECTRA_GROUP)
+    store.publish(keys | spectra)
     store.documents[""] = _root(_attributes(plan, labels))
 
 
 def _spectra_keys(plan: Plan, mesh: NDArray[Any]) -> dict[str, bytes]:
     """Return the keys of the radial spectra of all rows, without their chunks."""
     axis, rows = RadialAxis(plan.lattice, plan.tail), len(mesh)
-    step = min(max(1, _SPECTRA_BYTES // (8 * len(axis))), _MOST_SPECTRA)
+    step = min(max(1, _SPECTRA_BYTES // (8 * len(axis))), _MOST_SPECTRA, 1 << (rows - 1).bit_length())
     columns = {
         "radius": ("shell", axis.radii, {"units": "cycles per unit length"}),
         "weight": ("shell", axis.weights, {"long_name": "factor of an entry in the squared value"}),

@@ -78,7 +78,10 @@ def dataset_keys(group: str, dataset: xr.Dataset) -> dict[str, bytes]:
         _documents[form] = {key: content for key, content in keys.items() if key.endswith(f"/{ROOT}")}
         return keys
     documents = _documents[form]
-    of_group = {**json.loads(documents[f"{group}/{ROOT}"]), "attributes": dict(dataset.attrs)}
+    of_group = json.loads(documents[f"{group}/{ROOT}"])
+    # xarray names those coordinates there that no other variable has.
+    lonely = {key: names for key, names in of_group["attributes"].items() if key == "coordinates"}
+    of_group["attributes"] = {**dataset.attrs, **lonely}
     keys = {f"{group}/{ROOT}": json.dumps(of_group, indent=2).encode()}
     for name, one in encoded.items():
         keys[f"{group}/{name}/{ROOT}"] = documents[f"{group}/{name}/{ROOT}"]

@@ -5,7 +5,10 @@ Thousands of objects are queried there without opening thousands of groups. Labe
 
 from __future__ import annotations
 
+import pickle
+import zlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -17,6 +20,8 @@ from sobolev_batch.store.layout import RECORD, TABLES_OF_ALL, Store, hide_tables
 
 # A table for each of these groups that an object has.
 Tables = Mapping[str, xr.Dataset]
+# Tables of objects that are in memory at a time, as datasets: as bytes they take a twentieth.
+_MOST_AT_ONCE = 1000
 
 
 def tables_in(store: Store) -> dict[str, xr.Dataset]:
@@ -29,13 +34,12 @@ def tables_in(store: Store) -> dict[str, xr.Dataset]:
     }
 
 
-def tables_of_object(name: str, tables: Tables, unit_length: float) -> dict[str, xr.Dataset]:
+def packed_tables(name: str, tables: Tables, unit_length: float) -> bytes:
     """Return the tables of an object as rows of all, with its name and its reference, and its unit as a coordinate.
 
-    That is the study's unit in terms of the unit of length of the files: another for each object.
+    That is the study's unit in terms of the unit of length of the files: another for each object. The bytes are for
+    `write_all`; the driver of a run holds thousands.
     """
-    if not tables:
-        return {}
     reference = f"{name}/{tables['convergence'].attrs['reference']}"
     found = {}
     for group, table in tables.items():
@@ -47,30 +51,39 @@ def tables_of_object(name: str, tables: Tables, unit_length: float) -> dict[str,
             "unit_length": np.full(count, unit_length),
         }
         attributes = {key: value for key, value in table.attrs.items() if key not in ("reference", "digest")}
-        named = table.assign_coords({key: ("mesh", values) for key, values in columns.items()})
-        found[group] = named.assign_attrs(attributes)
+        found[group] = table.assign_coords({key: ("mesh", values) for key, values in columns.items()})
         found[group].attrs = attributes
-    return found
+    return zlib.compress(pickle.dumps(found))
 
 
-def write_all(root: Store, names: Sequence[str], changed: Iterable[Tables], kept: Collection[str]) -> None:
-    """Write the tables of all objects in the order of their names: those that changed, and those kept of before."""
+def write_all(root: Store, names: Sequence[str], changed: Iterable[bytes], kept: Collection[str]) -> None:
+    """Write the tables of all objects in the order of their names: those that changed, and those kept of before.
+
+    Only bytes that `packed_tables` has returned in a run may be given.
+    """
     before = {group: table.sel(mesh=table["object"].isin(list(kept))) for group, table in tables_in(root).items()}
-    parts = [before, *changed]
+    parts, waiting = [before], iter(changed)
+    while batch := [pickle.loads(zlib.decompress(one)) for one in islice(waiting, _MOST_AT_ONCE)]:  # noqa: S301
+        parts.append(_joined(batch))
     rank = {name: place for place, name in enumerate(names)}
     tables = {}
-    for group in TABLES_OF_ALL:
-        of_group = [part[group] for part in parts if group in part and part[group].sizes["mesh"]]
-        if of_group:
-            table = _concatenated(of_group)
-            order = np.argsort([rank[name] for name in table["object"].values.tolist()], kind="stable")
-            tables[group] = table.isel(mesh=order)
+    for group, table in _joined(parts).items():
+        order = np.argsort([rank[name] for name in table["object"].values.tolist()], kind="stable")
+        tables[group] = table.isel(mesh=order)
     replaced = hide_tables(root) if table_names(root) else []
     for group, table in tables.items():
         write_table(root, group, table)
     for name in set(replaced) - root.documents.keys():
         root.location.remove(name)
     root.consolidate()
+
+
+def _joined(parts: Sequence[Tables]) -> dict[str, xr.Dataset]:
+    """Return the tables of several parts as one each."""
+    of_groups = {
+        group: [part[group] for part in parts if group in part and part[group].sizes["mesh"]] for group in TABLES_OF_ALL
+    }
+    return {group: _concatenated(tables) for group, tables in of_groups.items() if tables}
 
 
 def _concatenated(tables: Sequence[xr.Dataset]) -> xr.Dataset:

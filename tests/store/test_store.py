@@ -321,10 +321,11 @@ def test_keys_of_a_known_form_are_those_that_xarray_writes(seed: int, monkeypatc
             "family": ("mesh", texts),
             "finished": ("mesh", times, {}, {"units": "seconds since 1970-01-01", "dtype": "int64"}),
         }
+        columns |= {"sample": ("sample", [1.0, 2.0, 3.0]), "weight": ("sample", random.normal(size=3))}
         made = xr.Dataset(
             columns, coords={"order": [-2.0, -1.0], "mesh": texts}, attrs={"rtol": random.random(), "names": ["a"]}
         )
-        return made.set_coords("level")
+        return made.set_coords(["level", "weight"])
 
     for count in (5, 5, 7, 5, 7):
         own, keys = dataset(count), dict[str, Any]()

@@ -22,7 +22,7 @@ from sobolev_batch.sources.names import file_stem
 from sobolev_batch.sources.registry import Member
 from sobolev_batch.store.location import Location
 from sobolev_batch.study.study import Study
-from sobolev_batch.tables.open import AnyStore, as_tree, fields_read, finished_group, reference_of
+from sobolev_batch.tables.open import AnyStore, as_tree, fields_read, finished_group, reference_of, require_one_object
 from sobolev_batch.testing.difference import VertexWitness, order_text, witness_at_vertices
 from sobolev_batch.transform.lattice import Orders, check_orders
 
@@ -48,6 +48,7 @@ class StudyMeshes:
     @classmethod
     def from_tree(cls, tree: xr.DataTree, folder: str | Path) -> Self:
         """List the meshes of an open store, with relative paths in a folder; InputError where that fails."""
+        require_one_object(tree)
         table = finished_group(tree, "meshes")
         try:
             study = Study.from_table(tree.attrs["study"]["table"], folder=folder)
