@@ -6,10 +6,10 @@ from collections import Counter
 from contextlib import nullcontext
 
 from sobolev_batch.store.encoding import ROOT
-from sobolev_batch.store.layout import FIELD, OCTAVES, Store
+from sobolev_batch.store.layout import FIELD, OCTAVES, RECORDS, TABLES_OF_ALL, Store
 from sobolev_batch.store.location import PARTIAL_FILE, Location
 from sobolev_batch.store.lock import LOCK_KEYS, Lock, locked
-from sobolev_batch.store.objects import root_of
+from sobolev_batch.store.objects import Objects, root_of
 from sobolev_batch.store.records import Records
 from sobolev_batch.store.workspace import Contents
 
@@ -18,6 +18,22 @@ _LOST, _KILLED, _UNLISTED = (
     "leftovers of runs that were killed",
     "tables that the store does not list",
 )
+
+
+def prune_lost_objects(location: Location, *, is_dry: bool = True) -> int:
+    """Remove the groups of objects that the study of a store has lost, and return their bytes; see `prune`."""
+    objects, total = Objects.read(location), 0
+    if objects is None:
+        return 0
+    with nullcontext() if is_dry else locked(location, Lock.of_this_process()):
+        own = {*objects.names, *TABLES_OF_ALL, RECORDS, ROOT, *LOCK_KEYS}
+        for name in sorted(location.names() - own):
+            # Whatever else lies there is not ours.
+            if Store(location.below(name)).exists():
+                total += sum(location.below(name).sizes("").values())
+                if not is_dry:
+                    location.remove(name)
+    return total
 
 
 def prune(location: Location, *, is_dry: bool = True) -> dict[str, int]:

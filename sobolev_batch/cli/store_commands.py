@@ -94,13 +94,15 @@ def prune_command(store: Location, yes: bool) -> None:
     """Remove what STORE keeps and no record needs.
 
     These are fields of meshes that are no longer in the study, leftovers of killed runs, and tables that are not
-    listed. Meshes that commands made are kept: other stores may use them.
+    listed, and objects that are no longer in the study. Meshes that commands made are kept: other stores may use them.
     """
-    from sobolev_batch.batch.prune import prune
+    from sobolev_batch.batch.prune import prune, prune_lost_objects
     from sobolev_batch.parameters import format_bytes
     from sobolev_batch.store.objects import stores_below
 
-    total = 0
+    total = prune_lost_objects(store, is_dry=not yes)
+    if total:
+        echo(f"objects that are no longer in the study: {format_bytes(total)}")
     for name, place in stores_below(store).items():
         for kind, size in prune(place, is_dry=not yes).items():
             total += size

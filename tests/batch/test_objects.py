@@ -252,6 +252,13 @@ def test_objects_come_and_go(changeable: Path, threads: Client) -> None:
     back = sb.run(study_of(balls(d=1.3, b=1.1, a=1.0)), changeable, threads)
     assert {label[0] for label in back.computed} == {"d"}
     assert {label[0] for label in back.reused} == {"a", "b"}
+    assert sb.run(study_of(balls(b=1.1)), changeable, threads).computed == ()
+    (changeable / "notes").mkdir()
+    done = call("prune", changeable, "--yes")
+    assert done.stdout.startswith("objects that are no longer in the study: ")
+    assert not {"a", "d"} & {path.name for path in changeable.iterdir()}
+    assert (changeable / "notes").is_dir()
+    assert sb.verify(changeable).is_sound
     with pytest.raises(sb.errors.StoreError, match="the store of several objects; name that of one"):
         sb.run(sb.Study.from_table(small_table()), changeable, threads)
 
