@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from importlib.util import find_spec
@@ -17,7 +17,7 @@ from sobolev_batch.batch.cluster.watch import Heartbeat, Watch
 from sobolev_batch.batch.cluster.workers import prepare_workers, require_store_access
 from sobolev_batch.batch.object_run import Ended, ended_before, run_object, workspace_at_hand
 from sobolev_batch.batch.start import StoreLike, ready_to_run
-from sobolev_batch.errors import DamageError, SobolevBatchError, StoreError
+from sobolev_batch.errors import DamageError, InputError, SobolevBatchError, StoreError
 from sobolev_batch.machine import available_cores, require_machine_memory
 from sobolev_batch.shown import Shown, reasons
 from sobolev_batch.store.create import give_up, require_usable, reserve
@@ -93,8 +93,9 @@ def run(
         memory: Memory of each of them, in bytes or as a text such as "4GB"; by default equal parts of the machine's.
         on_progress: Callback for each step, such as `print`; it is called in this thread.
         allow_commands: True if the study may run its commands on the workers and here: you trust its file.
-        only: Families or members FAMILY/MEMBER to compute, or patterns such as "mmg/0.0*", with the reference; default
-            all. Tables have the others as missing, until a run without it computes them.
+        only: Objects, families or members to compute, such as "cow", "mmg" or "cow/mmg/0.1", or patterns such as
+            "mmg/0.0*", with the reference; default all. Tables have the others as missing, until a run without it
+            computes them.
 
     Returns:
         Meshes that were computed, that were reused, and that failed. A mesh that fails does not raise. Of several
@@ -203,6 +204,8 @@ def carry_out(
         def runs() -> Iterator[tuple[str, Stages[Ended]]]:
             for name in study.objects:
                 one = study.of_object(name)
+                if _is_left_out(one):
+                    continue
                 before = ended_before(one, recorded.get(name))
                 if before is not None and name in present & tabulated:
                     ended[name] = before
@@ -221,9 +224,10 @@ def carry_out(
             if objects is not None:
                 objects.records.write(objects.rows[name], outcome.record)
         if objects is not None:
-            objects.records.collect([ended[name].record for name in study.objects])
-            _tabulate(objects, ended, tabulated)
-    return _summary(location, {name: ended[name] for name in study.objects})
+            known = {**recorded, **{name: one.record for name, one in ended.items()}}
+            objects.records.collect([known.get(name) for name in study.objects])
+            _tabulate(objects, ended, tabulated & study.objects.keys())
+    return _summary(location, {name: ended[name] for name in study.objects if name in ended})
 
 
 def _ignore(progress: Progress) -> None:
@@ -243,12 +247,22 @@ def _own_cluster(
     return thread_client(workers) if location.is_in_memory else local_client(workers, memory)
 
 
-def _tabulate(objects: Objects, ended: Mapping[str, Ended], present: frozenset[str]) -> None:
+def _is_left_out(study: Study) -> bool:
+    """Tell whether a run of a part of a study takes nothing of an object."""
+    # Its run says what cannot be listed.
+    with suppress(InputError):
+        return bool(study.object.name and study.only) and not study.object.chosen(study.only)
+    return False
+
+
+def _tabulate(objects: Objects, ended: Mapping[str, Ended], present: Set[str]) -> None:
     """Write the tables of all objects at the root, where rows of any have changed, came or went."""
-    changed = [one.tables for one in ended.values() if one.tables is not None]
-    kept = {name for name, one in ended.items() if one.tables is None and name in present}
-    if changed or present != kept:
-        write_all(objects.root, objects.names, changed, kept)
+    changed = {name: one.tables for name, one in ended.items() if one.tables is not None}
+    # Objects that the run left out keep theirs; those that it found to be impossible lose them.
+    refused = {name for name, one in ended.items() if one.record.reason}
+    kept = present - changed.keys() - refused
+    if changed or kept != objects.tabulated():
+        write_all(objects.root, objects.names, changed.values(), kept)
 
 
 def _summary(location: Location, ended: Mapping[str, Ended]) -> Summary:

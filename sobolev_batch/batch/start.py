@@ -69,16 +69,20 @@ def warnings_of(study: Study, store: Location) -> tuple[str, ...]:
 
 
 def _require_members(study: Study, only: Sequence[str]) -> None:
-    """Refuse names of families and members that no object of a study has."""
+    """Refuse names of objects, families and members that a study does not have."""
     known: dict[str, None] = {}
     unknown = list(only)
     for one in study.objects.values() if only else ():
         # The run reports what cannot be listed.
         with suppress(InputError):
-            known |= dict.fromkeys([*(family for family, _ in one.members.values()), *one.members])
+            known |= dict.fromkeys(
+                [*filter(None, [one.name]), *(family for family, _ in one.members.values()), *one.members]
+            )
             unknown = [name for name in unknown if not one.chosen([name])]
     if unknown:
-        raise StudyError(f"no family or member of the study is {quoted(unknown[0])}; {known_names(unknown[0], known)}")
+        raise StudyError(
+            f"no object, family or member of the study is {quoted(unknown[0])}; {known_names(unknown[0], known)}"
+        )
 
 
 def _space_warnings(study: Study, store: Location) -> Iterator[str]:

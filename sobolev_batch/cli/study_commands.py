@@ -55,8 +55,9 @@ _workers_option = click.option(
 _only_option = click.option(
     "--only",
     multiple=True,
-    metavar="FAMILY[/MEMBER]",
-    help="Compute this part with the reference; patterns such as 'mmg/0.0*' work. The option may be repeated.",
+    metavar="PART",
+    help="Compute this part with the reference: OBJECT, FAMILY, FAMILY/MEMBER, or the latter two after OBJECT/; "
+    "patterns such as 'mmg/0.0*' work. The option may be repeated.",
 )
 
 

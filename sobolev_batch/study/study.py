@@ -118,11 +118,20 @@ class StudyObject:
         return members
 
     def chosen(self, only: Sequence[str]) -> set[str]:
-        """Return the labels of the members that names of families or members, or patterns of these, choose."""
+        """Return the labels of the members that names of families or members, or patterns of these, choose.
+
+        A name may begin with that of the object, or be no more than that.
+        """
+
+        def names_of(label: str, family: str) -> Iterator[str]:
+            yield from (family, label)
+            if self.name:
+                yield from (self.name, f"{self.name}/{family}", f"{self.name}/{label}")
+
         return {
             label
             for label, (family, _) in self.members.items()
-            if any(name == one or fnmatchcase(name, one) for one in only for name in (family, label))
+            if any(name == one or fnmatchcase(name, one) for one in only for name in names_of(label, family))
         }
 
     @property

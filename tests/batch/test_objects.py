@@ -289,7 +289,7 @@ def test_the_root_has_the_rows_of_all_objects(changeable: Path, threads: Client)
 def test_a_run_that_was_killed_before_the_tables_of_all_goes_on(
     changeable: Path, threads: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    study = study_of(balls(a=1.0, e=1.4, b=1.1))
+    study = study_of(balls(a=1.0, e=1.25, b=1.1))
 
     def killed(*arguments: Any) -> None:
         raise KeyboardInterrupt
@@ -300,3 +300,23 @@ def test_a_run_that_was_killed_before_the_tables_of_all_goes_on(
             sb.run(study, changeable, threads)
     assert sb.run(study, changeable, threads).computed == ()
     assert sb.table(changeable)["object"].unique().tolist() == ["a", "e", "b"]
+
+
+def test_a_run_of_a_part_takes_objects_families_or_members(changeable: Path, threads: Client) -> None:
+    sb.run(study_of(balls(a=1.0, b=1.1)), changeable, threads)
+    before = sb.table(changeable).set_index(["object", "order", "mesh"])["distance"]
+    study = study_of(balls(a=1.0, b=1.1, p=1.25, q=1.3))
+    for only, computed in (
+        (["p/ico"], {"p/ico/1", "p/ico/2", "p/reference"}),
+        (["p"], {"p/egg/1", "p/egg/2"}),
+        (["q/egg/1"], {"q/egg/1", "q/reference"}),
+    ):
+        assert set(sb.run(study, changeable, threads, only=only).computed) == computed
+    # What a run leaves out stays as it was.
+    rows = sb.table(changeable).set_index(["object", "order", "mesh"])
+    assert list(rows.index.unique("object")) == ["a", "b", "p", "q"]
+    pd.testing.assert_series_equal(rows["distance"].loc[before.index], before)
+    assert rows.loc["q", "status"].value_counts().to_dict() == {"missing": 6, "complete": 2}
+    assert set(sb.run(study, changeable, threads).computed) == {"q/ico/1", "q/ico/2", "q/egg/2"}
+    with pytest.raises(sb.errors.StudyError, match="no object, family or member of the study is 'r'"):
+        sb.run(study, changeable, threads, only=["r"])
