@@ -32,7 +32,15 @@ GROUPS = {
     "Learn": ("docs/tutorial", "docs/walkthroughs", "docs/gallery", "workflows/README"),
     "Reference": (
         *("docs/studies", "docs/remeshers", "docs/leagues", "docs/commands", "docs/formats", "docs/surfaces"),
-        *("docs/store", "docs/queries", "docs/testing", "docs/tolerance", "docs/fitting", "docs/moving", "docs/reconstruction"),
+        *(
+            "docs/store",
+            "docs/queries",
+            "docs/testing",
+            "docs/tolerance",
+            "docs/fitting",
+            "docs/moving",
+            "docs/reconstruction",
+        ),
     ),
     "Operate": ("docs/clusters", "docs/scale", "docs/reliability"),
     "Project": ("docs/numerics", "docs/design", "benchmarks/RESULTS", "docs/stability", "CHANGELOG"),
