@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 
+from sobolev_batch.errors import StoreError
 from sobolev_batch.store.encoding import ROOT
 from sobolev_batch.store.layout import FIELD, OCTAVES, RECORDS, TABLES_OF_ALL, Store
 from sobolev_batch.store.location import PARTIAL_FILE, Location
@@ -28,9 +29,12 @@ def prune_lost_objects(location: Location, *, is_dry: bool = True) -> int:
     with nullcontext() if is_dry else locked(location, Lock.of_this_process()):
         own = {*objects.names, *TABLES_OF_ALL, RECORDS, ROOT, *LOCK_KEYS}
         for name in sorted(location.names() - own):
-            # Whatever else lies there is not ours.
-            if Store(location.below(name)).exists():
-                total += sum(location.below(name).sizes("").values())
+            # Whatever else lies there is not ours, and another store least of all.
+            place = None
+            with suppress(StoreError):
+                place = objects.existing_store(name)
+            if place is not None:
+                total += sum(place.sizes("").values())
                 if not is_dry:
                     location.remove(name)
     return total

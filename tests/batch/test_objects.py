@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 import tomli_w
 import xarray as xr
+import zarr
 from distributed import Client
 
 import sobolev_batch as sb
@@ -254,10 +255,12 @@ def test_objects_come_and_go(changeable: Path, threads: Client) -> None:
     assert {label[0] for label in back.reused} == {"a", "b"}
     assert sb.run(study_of(balls(b=1.1)), changeable, threads).computed == ()
     (changeable / "notes").mkdir()
+    zarr.create_group(changeable / "foreign")
+    shutil.copytree(changeable / "b", changeable / "copy of b")
     done = call("prune", changeable, "--yes")
     assert done.stdout.startswith("objects that are no longer in the study: ")
     assert not {"a", "d"} & {path.name for path in changeable.iterdir()}
-    assert (changeable / "notes").is_dir()
+    assert all((changeable / name).is_dir() for name in ("notes", "foreign", "copy of b"))
     assert sb.verify(changeable).is_sound
     with pytest.raises(sb.errors.StoreError, match="the store of several objects; name that of one"):
         sb.run(sb.Study.from_table(small_table()), changeable, threads)
