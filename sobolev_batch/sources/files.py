@@ -35,6 +35,7 @@ from sobolev_batch.sources.names import (
     label_problem,
     name_problem,
     natural_key,
+    node_problem,
     numbers_in,
     quoted,
 )
@@ -139,7 +140,7 @@ def _checked_table(table: Mapping[str, Any]) -> MeshTable:
             raise ValueError(f"{quoted(path)} has the time {quoted(time)}; a time is a number")
         checked["time"] = float(time)
     for key, value in known.items():
-        problem = name_problem(key, 100, "/\\") if isinstance(key, str) else "it is no text"
+        problem = node_problem(key)
         if problem is not None:
             raise ValueError(f"{quoted(key)} cannot name metadata: {problem}")
         if isinstance(value, Real) and is_finite_number(value):

@@ -12,6 +12,8 @@ from collections.abc import Iterable
 
 # A file's stem has up to 255 bytes; a path in its place may be longer.
 _LONGEST_LABEL = 1000
+# Of a file system's names; and characters of what becomes a name in a store.
+_MOST_BYTES, _LONGEST_NODE = 255, 100
 # Short enough for every file system, with a number before it and a suffix after it.
 _LONGEST_STEM = 60
 _NUMBER = re.compile(r"\d+(?:\.\d+)?(?:[eE][+-]?\d+)?")
@@ -53,6 +55,20 @@ def name_problem(text: str, longest: int, forbidden: str = "") -> str | None:
 def label_problem(name: str) -> str | None:
     """Describe why a name of a member cannot be a label; None where it can."""
     return name_problem(name, _LONGEST_LABEL, "\\")
+
+
+def node_problem(name: object) -> str | None:
+    """Describe why a value cannot name an array or a group of a store, which is a folder there; None where it can."""
+    if not isinstance(name, str):
+        return "it is no text"
+    problem = name_problem(name, _LONGEST_NODE, "/\\")
+    if problem is None and name.startswith((".", "__")):
+        return f"it begins with {name[0] if name[0] == '.' else '__'}"
+    if problem is None and name.casefold().endswith(".json"):
+        return "it ends with .json, as keys of stores do"
+    if problem is None and len(name.encode()) > _MOST_BYTES:
+        return f"it has {len(name.encode())} bytes, {_MOST_BYTES} are allowed"
+    return problem
 
 
 def caseless_key(name: str) -> str:

@@ -6,6 +6,7 @@ is damaged.
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import socket
@@ -22,10 +23,11 @@ from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import LocalStore, WrapperStore
 
 from sobolev_batch.errors import DamageError, StoreError
-from sobolev_batch.store.metadata import chunk_shape
+from sobolev_batch.store.metadata import Document, chunk_shape, consolidated
 
 CHANGED = "it is not what was written"
 CHECKSUM_BYTES = 4
+_ROOT = "zarr.json"
 # The codec of texts writes their number, and the length of each, in as many bytes.
 _COUNT_BYTES = 4
 # Records have checksums of all blocks of a field, and are the longest texts.
@@ -47,7 +49,7 @@ class CheckedStore(WrapperStore[ZarrStore]):
     """
 
     def __init__(
-        self, store: ZarrStore, name: str, documents: Mapping[str, Mapping[str, Any]], in_progress: Collection[str]
+        self, store: ZarrStore, name: str, documents: Mapping[str, Document], in_progress: Collection[str]
     ) -> None:
         super().__init__(store)
         self._name, self._documents, self._in_progress = name, documents, in_progress
@@ -57,15 +59,21 @@ class CheckedStore(WrapperStore[ZarrStore]):
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
         """Return the bytes of a key."""
-        array = key.partition("/c/")[0].removesuffix("/c")
-        document = self._documents.get(array) if array != key else None
+        if key == _ROOT and "" in self._documents:
+            # What is not used is not there.
+            return prototype.buffer.from_bytes(json.dumps(consolidated(self._documents)).encode())
+        group, _, place = key.partition("/")
+        name, _, place = place.partition("/")
+        array = f"{group}/{name}"
+        # Any of them may be named c.
+        document = self._documents.get(array) if place.split("/")[0] == "c" else None
         if byte_range is not None or document is None:
             return await super().get(key, prototype, byte_range)
         problem = await self._problem_of_size(key, document)
         content = None if problem else await super().get(key, prototype)
         if content is not None:
             problem = problem_of_chunk(content.as_numpy_array(), document)
-        elif not problem and document["data_type"] != "string" and not await self._store.exists("zarr.json"):
+        elif not problem and document["data_type"] != "string" and not await self._store.exists(_ROOT):
             # All its numbers would read as missing ones.
             raise StoreError(
                 f"{self._name}: it is not there for process {os.getpid()} of {socket.gethostname()}; a worker of your "
@@ -74,7 +82,7 @@ class CheckedStore(WrapperStore[ZarrStore]):
         elif array not in self._in_progress:
             problem = problem or "it is missing"
         if problem:
-            place = key.removeprefix(f"{array}/c").removeprefix("/")
+            place = place.removeprefix("c").removeprefix("/")
             raise DamageError(
                 f"{self._name}: chunk {place or '0'} of {array} is damaged ({problem}), or a run has just replaced it; "
                 "sobolev-batch verify names what is damaged, and run makes it again",

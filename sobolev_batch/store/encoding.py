@@ -65,8 +65,14 @@ def array_keys(
 def dataset_keys(group: str, dataset: xr.Dataset) -> dict[str, bytes]:
     """Return the keys of a group with the arrays of a dataset, with checksums, one chunk each unless they are large.
 
-    They are those that xarray writes.
+    They are those that xarray writes, but for coordinates with blanks in their names, see `with_coordinates`.
     """
+    # The attribute that lists coordinates has blanks between them.
+    dataset = dataset.reset_coords([name for name in dataset.coords if " " in str(name)])
+    for variable in dataset.variables.values():
+        if variable.dtype == bool:
+            # Older versions of xarray store them as integers otherwise.
+            variable.encoding = {**variable.encoding, "dtype": "bool"}
     encoded = {str(name): xr.conventions.encode_cf_variable(one) for name, one in dataset.variables.items()}
     if not all(map(_is_one_chunk, dataset.variables.values())):
         return _written(group, dataset)
@@ -87,6 +93,11 @@ def dataset_keys(group: str, dataset: xr.Dataset) -> dict[str, bytes]:
         keys[f"{group}/{name}/{ROOT}"] = documents[f"{group}/{name}/{ROOT}"]
         keys["/".join([group, name, "c", *["0"] * one.ndim])] = chunk_of(one.values)
     return keys
+
+
+def with_coordinates(dataset: xr.Dataset) -> xr.Dataset:
+    """Return a table of a store in which those are coordinates again that xarray cannot list, for their blanks."""
+    return dataset.set_coords([name for name in dataset.data_vars if " " in str(name)])
 
 
 def _form_of(dataset: xr.Dataset, encoded: Mapping[str, xr.Variable]) -> tuple[Any, ...]:

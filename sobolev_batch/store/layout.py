@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -31,8 +32,10 @@ from sobolev_batch.errors import DamageError, StoreError
 from sobolev_batch.store.checked import CheckedStore, largest_chunk_bytes
 from sobolev_batch.store.encoding import LARGEST_CHUNK_BYTES, ROOT, chunk_of, dataset_keys
 from sobolev_batch.store.location import Location
-from sobolev_batch.store.metadata import MOST_BYTES, SCHEMA_VERSION, Document, check_documents, chunk_shape
+from sobolev_batch.store.metadata import MOST_BYTES, SCHEMA_VERSION, Document, chunk_shape, consolidated, problems_of
 from sobolev_batch.study.lattice_choice import LatticeChoice
+
+_log = logging.getLogger(__name__)
 
 FIELD = "fourier/fourier"
 LABELS = "fourier/mesh"
@@ -68,6 +71,7 @@ class Store:
 
     Attributes:
         documents: Metadata documents by the path of their node. That of the root, under "", lacks the others.
+        lacks_tables: True once tables were found that another program has written: they are not listed.
     """
 
     def __init__(self, store: str | Path | Location) -> None:
@@ -75,10 +79,11 @@ class Store:
         self.documents: dict[str, Document] = {}
         # These are the SHA-256 of keys below the digest, where this process knows them.
         self._hashes: dict[str, str] = {}
+        self.lacks_tables = False
 
     def __getstate__(self) -> dict[str, Any]:
         carried = {name: self.documents[name] for name in self._arrays_in_progress if name in self.documents}
-        return {"location": self.location, "documents": carried, "_hashes": {}}
+        return {"location": self.location, "documents": carried, "_hashes": {}, "lacks_tables": self.lacks_tables}
 
     @classmethod
     def open(cls, store: str | Path | Location) -> Self:
@@ -205,7 +210,19 @@ class Store:
             document = dict(json.loads(text))
         except (ValueError, TypeError, RecursionError) as error:
             raise self.damage(key, str(error)) from error
-        check_documents(self.path, {name: document})
+        problems = list(problems_of({name: document}))
+        for node, problem in problems:
+            if name or not _is_of_tables(node):
+                raise StoreError(f"{self.path}: the store is not used: {problem}; this program did not write that")
+        if problems:
+            # A run makes them from the fields.
+            self.lacks_tables = True
+            _log.warning(
+                "%s: its tables are not used: %s; this program did not write that, and run makes them again",
+                *(self.path, problems[0][1]),
+            )
+            nodes = document["consolidated_metadata"]["metadata"]
+            document["consolidated_metadata"]["metadata"] = {n: d for n, d in nodes.items() if not _is_of_tables(n)}
         return document
 
     def keyed_arrays(self) -> list[str]:
@@ -307,11 +324,7 @@ class Store:
     def _root(self) -> Document:
         """Return the document at the root with those of all nodes, as zarr consolidates them, without the digest."""
         attributes = {name: value for name, value in self.documents[""]["attributes"].items() if name != DIGEST}
-        # Readers list the variables of a group in this order: the number and its error first.
-        names = sorted(filter(None, self.documents), key=lambda name: name.split("/")[0])
-        nodes = {name: self.documents[name] for name in names}
-        consolidated = {"kind": "inline", "must_understand": False, "metadata": nodes}
-        return {**self.documents[""], "attributes": attributes, "consolidated_metadata": consolidated}
+        return {**consolidated(self.documents), "attributes": attributes}
 
     def _digest(self, root: Document) -> str:
         """Return the SHA-256 of a root and of all keys of the tables, coordinates and metadata that it lists."""
@@ -387,7 +400,11 @@ def digest_of(table: Any) -> str:
 
 def table_names(store: Store) -> list[str]:
     """Return the names of the groups and arrays of tables that are listed."""
-    return [name for name in store.documents if name and name.split("/")[0] not in GROUPS_OF_TASKS]
+    return list(filter(_is_of_tables, store.documents))
+
+
+def _is_of_tables(node: str) -> bool:
+    return bool(node) and node.split("/")[0] not in GROUPS_OF_TASKS
 
 
 def table_attributes(store: Store, group: str) -> dict[str, Any] | None:

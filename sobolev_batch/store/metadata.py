@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, TypeGuard
 
-from sobolev_batch.errors import StoreError
+from sobolev_batch.sources.names import node_problem
 
 # The layout that docs/store.md describes has this version.
 SCHEMA_VERSION = 11
@@ -22,7 +22,6 @@ Document = dict[str, Any]
 # No document is larger. That of the root repeats all others, with about 1 kB for each.
 MOST_BYTES = 64_000_000
 
-_NODE = re.compile(r"[A-Za-z0-9_]+(/[A-Za-z0-9_]+)?")  # a group, or an array in one
 _GROUP_KEYS = {"attributes", "consolidated_metadata", "node_type", "zarr_format"}
 _ARRAY_KEYS = {
     *("attributes", "chunk_grid", "chunk_key_encoding", "codecs", "data_type", "dimension_names", "fill_value"),
@@ -45,20 +44,29 @@ def chunk_shape(document: Mapping[str, Any]) -> list[int]:
     return shape
 
 
-def check_documents(store: str, documents: Mapping[str, Any]) -> None:
-    """Check metadata documents of a store, by the paths of their nodes; the root's path is empty."""
+def consolidated(documents: Mapping[str, Document]) -> Document:
+    """Return the document at the root with those of all nodes, as zarr consolidates them."""
+    # Readers list the variables of a group in this order: the number and its error first.
+    names = sorted(filter(None, documents), key=lambda name: name.split("/")[0])
+    nodes = {name: documents[name] for name in names}
+    return {**documents[""], "consolidated_metadata": {"kind": "inline", "must_understand": False, "metadata": nodes}}
+
+
+def problems_of(documents: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield the paths of nodes, empty for the root, whose metadata documents are not used, and why."""
     for name, document in documents.items():
         problem = _problem(name, document)
         if problem:
-            raise StoreError(f"{store}: the store is not used: {problem}; this program did not write that")
+            yield name, problem
         # zarr repeats in each group what the root has.
-        if document.get("consolidated_metadata"):
+        elif document.get("consolidated_metadata"):
             nodes, prefix = document["consolidated_metadata"]["metadata"], f"{name}/" if name else ""
-            check_documents(store, {f"{prefix}{path}": node for path, node in nodes.items()})
+            yield from problems_of({f"{prefix}{path}": node for path, node in nodes.items()})
 
 
 def _problem(name: str, document: Any) -> str:
-    if name and not _NODE.fullmatch(name):
+    parts = name.split("/")  # a group, or an array in one
+    if name and (len(parts) > 2 or any(map(node_problem, parts))):
         return f"a node is named {_shown(name)}"
     node = name or "the root"
     if not isinstance(document, dict):

@@ -12,6 +12,7 @@ from functools import cached_property
 from typing import Any, Self, TypeVar
 
 from sobolev_batch.errors import DamageError, InputError, StoreError
+from sobolev_batch.sources.names import node_problem, quoted
 from sobolev_batch.store.create import list_records, record_keys
 from sobolev_batch.store.encoding import ROOT
 from sobolev_batch.store.layout import OBJECTS, PAGE, RECORD, RECORDS, TABLES_OF_ALL, Store
@@ -94,10 +95,13 @@ class Objects:
         study = root.documents.get("", {}).get("attributes", {}).get("study")
         if not isinstance(study, dict) or OBJECTS not in study:
             return None
-        if not root.has_digest():
+        if not root.lacks_tables and not root.has_digest():
             problem = "the list of its objects, or the table of all rows, is not what was written"
             raise DamageError(f"{location}: {problem}; run the study again", problem)
         root.attributes(of_objects=True)
+        for name in study[OBJECTS]:
+            if unfit := node_problem(name):
+                raise StoreError(f"{location}: the store is not used: an object has the name {quoted(name)}: {unfit}")
         return cls(
             root, root.documents[""]["attributes"]["title"], study["name"], tuple(study[OBJECTS]), study["table"]
         )

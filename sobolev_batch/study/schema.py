@@ -42,7 +42,7 @@ from sobolev_batch.parameters import byte_count
 from sobolev_batch.reduction.searched import SearchedSource
 from sobolev_batch.sources.command import function_version
 from sobolev_batch.sources.files import MeshTable, checked_list
-from sobolev_batch.sources.names import name_problem, quoted
+from sobolev_batch.sources.names import name_problem, node_problem, quoted
 from sobolev_batch.sources.registry import Source, at_most, parse_source, source_type_of
 from sobolev_batch.transform.fourier import TransformSettings
 from sobolev_batch.transform.lattice import Lattice, check_orders
@@ -97,10 +97,16 @@ def _line_of_text(longest: int, forbidden: str = "") -> AfterValidator:
     return AfterValidator(check)
 
 
+def _study_name(name: str) -> str:
+    if name in (".", ".."):
+        raise ValueError("a folder has this name in every other one; choose a word")
+    return name
+
+
 def _object_name(name: str) -> str:
     if name.lower() in _GROUPS:
         raise ValueError(f"a group of the store is named {name.lower()}; name the object {name}_1, for example")
-    if set(RESERVED) & set(name) or name.startswith((".", "__")) or name.endswith(".json"):
+    if set(RESERVED) & set(name) or node_problem(name) is not None:
         raise ValueError(
             f"the name of an object is that of a folder in the store: it holds none of {' '.join(RESERVED)}, does not "
             "begin with . or __, and does not end with .json"
@@ -130,7 +136,7 @@ class Section(BaseModel):
 
 
 class _Header(Section):
-    name: Name
+    name: Annotated[Name, AfterValidator(_study_name)]
     title: Annotated[str, _line_of_text(1000)] | None = None
     length_unit: Annotated[str, _line_of_text(20)] | None = None
 

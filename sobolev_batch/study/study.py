@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
+from numbers import Real
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -19,7 +21,7 @@ from sobolev_batch.norms.columns import TAKEN_NAMES
 from sobolev_batch.reduction.searched import SearchedSource
 from sobolev_batch.sources.command import function_name
 from sobolev_batch.sources.mesh_cache import MeshCache
-from sobolev_batch.sources.names import caseless_key, duplicate_names, quoted
+from sobolev_batch.sources.names import caseless_key, duplicate_names, node_problem, quoted
 from sobolev_batch.sources.registry import Member, Source, single_member
 from sobolev_batch.study.schema import (
     REFERENCE_LABEL,
@@ -36,6 +38,9 @@ from sobolev_batch.study.schema import (
 from sobolev_batch.study.templates import sections_of_objects
 from sobolev_batch.transform.fourier import TransformSettings
 from sobolev_batch.transform.lattice import Lattice, check_orders
+
+# Halves of characters, which no file can hold.
+_HALVES = re.compile("[\ud800-\udfff]")
 
 # Family and member of each surface, by label.
 Members = Mapping[str, tuple[str, Member]]
@@ -106,15 +111,20 @@ class StudyObject:
         members: dict[str, tuple[str, Member]] = {}
         for family in self.families:
             with within(f"family {family.name!r}"):
-                listed = family.source.members(self.folder)
+                listed = [_with_other_names(one, family.name) for one in family.source.members(self.folder)]
             for member in listed:
                 label = f"{family.name}/{member.name}"
                 if label in members:
                     raise StudyError(f"two surfaces of the study have the label {label!r}")
-                members[label] = family.name, _with_other_names(member, family.name)
+                members[label] = family.name, member
         if not isinstance(self.reference, FamilyReference):
             with within("reference"):
                 members[REFERENCE_LABEL] = REFERENCE_LABEL, single_member(self.reference, self.folder)
+        columns = dict.fromkeys(name for _, member in members.values() for name, _ in member.metadata)
+        if same := duplicate_names(columns):
+            raise StudyError(
+                f"metadata: the names {' and '.join(map(quoted, same[0]))} differ in case alone; rename one"
+            )
         return members
 
     def chosen(self, only: Sequence[str]) -> set[str]:
@@ -313,17 +323,24 @@ def as_study(study: StudyLike) -> Study:
 
 
 def _with_other_names(member: Member, family: str) -> Member:
-    """Return a member whose metadata have no name that tables use themselves; StudyError where they have one."""
+    """Return a member whose metadata tables can hold, beside what they have themselves; StudyError otherwise."""
     if member.names_wishes:
-        named = ((f"target_{name}" if name in TAKEN_NAMES else name, value) for name, value in member.metadata)
-        return replace(member, metadata=tuple(named))
-    taken = next((name for name, _ in member.metadata if name in TAKEN_NAMES), None)
-    if taken is not None:
-        raise StudyError(
-            f"family {family!r}: the metadata of {quoted(member.name)} have the name {taken!r}, which tables use "
-            f"themselves; rename it, for example to {family}_{taken}"
-        )
+        named = ((f"target_{name}" if _is_taken(name) else name, value) for name, value in member.metadata)
+        member = replace(member, metadata=tuple(named))
+    for name, value in member.metadata:
+        problem = node_problem(name)
+        if problem is None and _is_taken(name):
+            problem = f"tables use that themselves; rename it, for example to {family}_{name}"
+        if problem is not None:
+            raise StudyError(f"the metadata of {quoted(member.name)} have the name {quoted(name)}: {problem}")
+        if not isinstance(value, Real) and (not isinstance(value, str) or _HALVES.search(value)):
+            raise StudyError(f"{name} of {quoted(member.name)} must be a number or a text, found {quoted(value)}")
     return member
+
+
+def _is_taken(name: str) -> bool:
+    """Tell whether tables use a name themselves, or another one that some file systems take for the same."""
+    return caseless_key(name) in TAKEN_NAMES
 
 
 def _as_written(values: Mapping[str, Any]) -> dict[str, Any]:

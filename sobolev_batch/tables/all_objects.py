@@ -16,6 +16,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sobolev_batch.norms.columns import describe
+from sobolev_batch.store.encoding import with_coordinates
 from sobolev_batch.store.layout import RECORD, TABLES_OF_ALL, Store, hide_tables, table_names, write_table
 
 # A table for each of these groups that an object has.
@@ -29,7 +30,9 @@ def tables_in(store: Store) -> dict[str, xr.Dataset]:
     keys: Any = store.checked_keys(RECORD, has_tables=True)
     names = [name for name in TABLES_OF_ALL if name in store.documents and "convergence" in store.documents]
     return {
-        name: xr.open_dataset(keys, group=name, engine="zarr", consolidated=True, zarr_format=3).load()
+        name: with_coordinates(
+            xr.open_dataset(keys, group=name, engine="zarr", consolidated=True, zarr_format=3).load()
+        )
         for name in names
     }
 

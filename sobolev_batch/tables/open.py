@@ -20,6 +20,7 @@ from sobolev_batch.geometry.surface import placement_doubt
 from sobolev_batch.norms.columns import describe
 from sobolev_batch.norms.fields import Quality
 from sobolev_batch.sources.names import quoted
+from sobolev_batch.store.encoding import with_coordinates
 from sobolev_batch.store.layout import (
     DIGEST,
     FIELD,
@@ -108,6 +109,8 @@ def open_store(store: str | Path | Location | Sequence[str | Path | Location]) -
     with opened.location.access("read"):
         try:
             tree = xr.open_datatree(keys, engine="zarr", consolidated=True, zarr_format=3)
+            for group in tree.children:
+                tree[group].dataset = with_coordinates(tree[group].to_dataset())
             # The processes of a Dask client do not see the memory of this one.
             for group in () if opened.location.is_in_memory else _LARGE.intersection(tree.children):
                 lazy = xr.open_dataset(keys, group=group, engine="zarr", consolidated=True, zarr_format=3, chunks={})

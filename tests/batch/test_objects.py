@@ -91,6 +91,23 @@ def test_objects_that_were_altered_or_traded_are_damage(changeable: Path) -> Non
     require_named_damage(changeable, ["a", "b"], "not that of the object 'a'")
 
 
+def test_tables_of_all_that_another_program_wrote_are_made_again(changeable: Path, threads: Client) -> None:
+    before, root = sb.table(changeable), changeable / "zarr.json"
+    # As some versions of xarray store booleans.
+    root.write_text(root.read_text().replace('"data_type": "bool"', '"data_type": "int8"'))
+    assert sb.status(changeable).complete == 10
+    assert call("verify", changeable).returncode in (0, 1)
+    for command in ("prune", "unlock"):
+        assert call(command, changeable).returncode == 0
+    assert sb.run(study_of([*balls(a=1.0), GONE, *balls(b=1.1)]), changeable, threads).computed == ()
+    pd.testing.assert_frame_equal(sb.table(changeable), before)
+    root.write_text(
+        root.read_text().replace('"data_type": "bool"', '"data_type": "int8"').replace('["a", ', '["../a", ')
+    )
+    with pytest.raises(sb.errors.StoreError, match=r"an object has the name '\.\./a': it holds '/'"):
+        sb.status(changeable)
+
+
 def test_an_object_that_lost_its_root_is_damage(changeable: Path, threads: Client) -> None:
     before = sb.table(changeable)
     (changeable / "b/zarr.json").unlink()

@@ -9,10 +9,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+import xarray as xr
+from distributed import Client
 
 import sobolev_batch as sb
+from sobolev_batch.batch.prune import prune
 from sobolev_batch.errors import StudyError
 from sobolev_batch.sources.files import FileMember, FileSource, read_mesh_list
+from sobolev_batch.store.location import Location
 from sobolev_batch.tables.convergence import format_table
 from tests.support.studies import small_table
 
@@ -119,6 +123,53 @@ def test_metadata_become_coordinates_and_sizes_of_rates(tmp_path: Path) -> None:
         sb.table("memory://mesh-lists.zarr", x="tool")
 
 
+NAMES = ["tool seconds", "weight [kg]", "50%", "größe", "c", "a*b", "x?y#z", "<b>'&", "coordinates", "index"]
+
+
+@pytest.mark.slow
+def test_every_name_of_metadata_that_a_run_takes_is_read_by_all(tmp_path: Path, threads: Client) -> None:
+    sb.write_mesh(sb.shapes.icosphere(1), tmp_path / "a.ply")
+    meshes = [{"path": "a.ply", **dict.fromkeys(NAMES, 1.5), "in words": "a b"}]
+    table = small_table(object=[{"name": "q%"}, {"name": "ü b"}], family=[_listed(meshes)])
+    store = tmp_path / "x.zarr"
+    sb.run(sb.Study.from_table(table, folder=tmp_path), store, threads)
+    for place in (store, store / "q%"):
+        assert sb.status(place).complete
+        assert sb.verify(place).is_sound
+        rows, frame = sb.open_store(place)["convergence"].to_dataset(), sb.table(place)
+        for name in NAMES:
+            assert (rows.coords[name].dims, 1.5 in rows[name].values) == (("mesh",), True)
+            assert 1.5 in frame[name].tolist()
+        assert "a b" in rows.coords["in words"].values
+    assert not any(prune(Location.parse(store / "q%")).values())
+    assert "tool seconds" in xr.open_dataset(store, group="convergence", engine="zarr").variables
+
+
+@pytest.mark.parametrize(
+    ("metadata", "message"),
+    [
+        ({".x": 1}, "it begins with ."),
+        ({"__x": 1}, "it begins with __"),
+        ({"zarr.json": 1}, "it ends with .json"),
+        ({"😀" * 80: 1}, "it has 320 bytes, 255 are allowed"),
+        ({"Family": 1}, "tables use that themselves"),
+        ({"tool": 1, "Tool": 2}, "differ in case alone"),
+    ],
+)
+def test_names_that_a_store_cannot_hold_are_refused_first(
+    metadata: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    sb.write_mesh(sb.shapes.icosphere(1), tmp_path / "a.ply")
+    table = small_table(family=[_listed([{"path": "a.ply", **metadata}])])
+    with pytest.raises(StudyError, match=re.escape(message)):
+        sb.run(sb.Study.from_table(table, folder=tmp_path), tmp_path / "x.zarr", workers=1)
+    assert not (tmp_path / "x.zarr").exists()
+
+
+def _listed(meshes: list[dict[str, Any]]) -> dict[str, Any]:
+    return {"name": "f", "source": "files", "meshes": meshes}
+
+
 def test_metadata_cannot_take_the_name_of_a_variable_of_tables(finished_store: Path, tmp_path: Path) -> None:
     tree = sb.open_store(finished_store)
     groups = [tree[name].to_dataset() for name in ("meshes", "norms", "distances", "convergence")]
@@ -129,5 +180,5 @@ def test_metadata_cannot_take_the_name_of_a_variable_of_tables(finished_store: P
         study = sb.Study.from_table(
             small_table(family=[{"name": "f", "source": "files", "meshes": meshes}]), folder=tmp_path
         )
-        with pytest.raises(StudyError, match=f"have the name '{name}', which tables use"):
+        with pytest.raises(StudyError, match=f"have the name '{name}': tables use that"):
             sb.plan(study, "memory://nowhere.zarr")

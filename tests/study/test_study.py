@@ -231,6 +231,7 @@ REFUSED: list[tuple[Any, str]] = [
     *((small_table(**changes), part) for changes, part in CHANGES),
     *((changed(key, name), r"it holds the invisible character U\+|begins or ends with")
       for name in HIDDEN for key in ("study.name", "family.0.name", "study.title")),
+    (changed("study.name", ".."), "a folder has this name in every other one"),
     *((changed("study", {"name": "a", key: 1}), " is unknown; ") for key in KEYS),
     *((table, "a study is a mapping of sections, such as .*, found ") for table in (None, "study.toml", ["study"], 3)),
 ]  # fmt: skip
