@@ -20,7 +20,7 @@ from sobolev_batch.store.lock import utc_now
 from sobolev_batch.store.records import Record, Records
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.plan import Plan, Row
-from sobolev_batch.transform.fourier import TransformSettings, field_seconds, projected_bytes
+from sobolev_batch.transform.fourier import NUMERICS_VERSION, TransformSettings, field_seconds, projected_bytes
 from sobolev_batch.transform.lattice import Block
 
 _log = logging.getLogger(__name__)
@@ -85,6 +85,11 @@ def compute_fields(cluster: Cluster, workspace: Workspace, pending: Sequence[int
         elif task.divided:
             for one in task.divided:
                 take_outcome(one, outcome)
+        elif isinstance(outcome, Record) and outcome.numerics != NUMERICS_VERSION:
+            give_up(
+                task.row,
+                f"{outcome.worker} computed it by numerics of version {outcome.numerics}, not {NUMERICS_VERSION}",
+            )
         elif isinstance(outcome, Record):
             take(task.row, outcome)
         else:

@@ -32,7 +32,14 @@ from sobolev_batch.store.lock import utc_now
 from sobolev_batch.store.records import Facts, Record, Records
 from sobolev_batch.study.plan import Plan, Row
 from sobolev_batch.study.schema import Backends
-from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, choose_settings, transform_block
+from sobolev_batch.transform.fourier import (
+    NUMERICS_VERSION,
+    ErrorTarget,
+    Execution,
+    TransformSettings,
+    choose_settings,
+    transform_block,
+)
 from sobolev_batch.transform.kinds import kind_of
 from sobolev_batch.transform.lattice import Block, Lattice
 from sobolev_batch.transform.probe import COMMON, Probe, draws_for, join, probe_block
@@ -52,6 +59,7 @@ class Job:
         distance_target: Accuracy that the field is computed for, if the study has one.
         allowed_bytes: Memory that one transform may take besides its mesh and its block.
         reference: Row of the reference, which a surface in octaves is compared with; None where it is too large.
+        numerics: Version of the numerics that the key of the row has.
     """
 
     store: Store
@@ -66,6 +74,13 @@ class Job:
     distance_target: DistanceTarget | None = None
     allowed_bytes: float | None = None
     reference: Row | None = None
+    numerics: int = NUMERICS_VERSION
+
+    @property
+    def key(self) -> str:
+        """Key of the record of this field: that of the row, where this process computes as the study was planned."""
+        is_same = self.numerics == NUMERICS_VERSION
+        return self.row.key if is_same else f"{self.row.key} by numerics {NUMERICS_VERSION}"
 
     @classmethod
     def for_row(
@@ -114,7 +129,7 @@ class Job:
     def stored_record(self) -> Record | None:
         """Return the completion record of the field if it exists: Dask repeats tasks whose worker was lost."""
         record = Records(self.store).read_one(self.index, of_this_run=True)
-        return record if record is not None and record.completes(self.row.key) else None
+        return record if record is not None and record.completes(self.key) else None
 
     def failure_reason(self, error: Exception) -> str:
         """Return why the mesh failed, in one line, and log the traceback where its input is not to blame."""
@@ -258,7 +273,8 @@ def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block]) -> Stored
 def _finished(job: Job, stored: Sequence[StoredBlocks]) -> Record:
     backends = dict.fromkeys(backend for blocks in stored for backend in blocks.backends)
     record = Record(
-        key=job.row.key,
+        key=job.key,
+        numerics=NUMERICS_VERSION,
         status="complete",
         seconds=sum(blocks.seconds for blocks in stored),
         worker=_worker_address(),

@@ -25,6 +25,7 @@ from sobolev_batch.sources.names import natural_key
 from sobolev_batch.sources.programs import Cost
 from sobolev_batch.store.layout import (
     DISTANCES,
+    NUMERICS,
     PAIRS_KEYS,
     QUALITY,
     Metadata,
@@ -47,7 +48,7 @@ from sobolev_batch.tables.shells import (
 )
 
 # Raise it whenever tables hold something that those of older versions lack: they are then made again.
-TABLES_VERSION = 11
+TABLES_VERSION = 12
 
 Criterion = Literal["level", "triangles", "names", "time"]
 # A row, its place in its family, and what orders that.
@@ -132,7 +133,9 @@ def write_results(
     """
     workspace.store.metadata = metadata
     results = Results.from_spectra(reducer, meshes, workspace.plan.reference)
-    convergence = results.convergence_table(workspace.plan.study.accuracy).assign_attrs(digest=digest)
+    numerics = sorted({record.numerics for record in workspace.complete.values()})
+    convergence = results.convergence_table(workspace.plan.study.accuracy)
+    convergence.attrs |= {"digest": digest, NUMERICS: numerics}
     _write_tables(workspace, results, convergence, replaced)
     tables = {"meshes": results.meshes, "convergence": convergence}
     return Tabulated(NormEstimate(*results.to_reference), tables), workspace.store.metadata
@@ -256,6 +259,7 @@ def _meshes_table(workspace: Workspace, placed: Sequence[Placed]) -> xr.Dataset:
     # numpy's times are in UTC, and know no zone.
     times_of_end = [record.finished.removesuffix("Z") or "NaT" for record in filled]
     columns["finished"] = np.array(times_of_end, dtype="datetime64[s]")
+    columns[NUMERICS] = np.array([record.numerics for record in filled], dtype=np.int64)
     for name in ("worker", "backend", "key"):
         columns[name] = _strings([getattr(record, name) for record in filled])
     columns["mesh"], metadata = _strings([row.label for row in rows]), _metadata(rows)

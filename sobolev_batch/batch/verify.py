@@ -16,6 +16,7 @@ from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.store.layout import (
     GROUPS_OF_TASKS,
     LABELS,
+    NUMERICS,
     PAIRS_KEYS,
     QUALITY,
     RECORDS,
@@ -177,6 +178,10 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, *, may
         if not tables:
             chunks = dict.fromkeys(_stale(store), "it is not that of the stored fields") | chunks
     complete = contents.complete
+    planned = store.attributes()["versions"].get(NUMERICS)
+    for row, record in complete.items():
+        if planned is not None and record.numerics != planned:
+            damaged[row] = f"it was computed by numerics of version {record.numerics}, and the study by {planned}"
     whole = Fields(store).complete_rows() if complete else set()
 
     def damage_of(row: int) -> str:

@@ -98,6 +98,7 @@ VARIABLES: Mapping[str, Mapping[str, str]] = {
     "points": described("number of quadrature points", NUMBER),
     "worker": described("address of the worker"),
     "backend": described("backend of the NUFFT"),
+    "numerics": described("version of the numerics that computed the field", NUMBER),
     "finished": described("time of the end, in UTC"),
     "seconds": described("time spent in tasks", "s"),
     "make_seconds": described("time that making the mesh took", "s"),

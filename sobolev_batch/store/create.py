@@ -24,6 +24,7 @@ from sobolev_batch.norms.tail.sampling import TailSampling
 from sobolev_batch.store.encoding import ROOT, array_keys, dataset_keys
 from sobolev_batch.store.layout import (
     FIELD,
+    NUMERICS,
     OCTAVES,
     OCTAVES_GROUP,
     PAGE,
@@ -42,6 +43,7 @@ from sobolev_batch.store.lock import LOCK_KEYS
 from sobolev_batch.store.metadata import SCHEMA_VERSION, chunk_shape
 from sobolev_batch.store.records import Record, Records
 from sobolev_batch.study.plan import Plan
+from sobolev_batch.transform.fourier import NUMERICS_VERSION
 from sobolev_batch.transform.lattice import AXES, smooth_step
 
 _log = logging.getLogger(__name__)
@@ -382,7 +384,7 @@ def _attributes(plan: Plan, labels: Sequence[str]) -> dict[str, Any]:
         },
         REMOVED: [label for label in labels if label not in planned],
         "similarity": _similarity_entry(plan.similarity),
-        "versions": dict(_versions()),
+        "versions": {**dict(_versions()), NUMERICS: NUMERICS_VERSION},
     }
 
 

@@ -50,6 +50,8 @@ SPECTRA_GROUP, DISTANCES = "spectra", "distances"
 SPECTRA_KEYS, PAIRS_KEYS = f"{SPECTRA_GROUP}/key", f"{DISTANCES}/key"
 # The root has these attributes: the digest of tables and metadata; true while the store is being created; and the
 # labels of meshes that the study has lost. In the attribute "study" are the names of its objects, where it names any.
+# Among its versions, and those of the tables, is that of the numerics by which fields were computed.
+NUMERICS = "numerics"
 DIGEST, UNFINISHED, OBJECTS, REMOVED = "digest", "unfinished", "objects", "removed"
 # Tables whose rows the root of several objects repeats.
 TABLES_OF_ALL = ("meshes", "convergence", "proximity")

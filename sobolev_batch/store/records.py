@@ -24,6 +24,7 @@ from sobolev_batch.store.encoding import ROOT
 from sobolev_batch.store.layout import DIGEST, PAGE, RECORD, RECORDS, Store, digest_of, table_attributes
 from sobolev_batch.store.lock import Time
 from sobolev_batch.store.metadata import chunk_shape
+from sobolev_batch.transform.fourier import NUMERICS_VERSION
 
 _log = logging.getLogger(__name__)
 
@@ -132,6 +133,7 @@ class Record(_Line):
         finished: Time at which it was finished, in UTC.
         proximity: Hausdorff and Chamfer distances from the reference, where the study requests them.
         cost: What making the surface took, where that is known.
+        numerics: Version of the numerics of the worker that computed it.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
@@ -148,6 +150,7 @@ class Record(_Line):
     finished: Time | Literal[""] = ""
     proximity: ProximityRecord | None = None
     cost: Cost | None = None
+    numerics: int = NUMERICS_VERSION
 
     def completes(self, key: str) -> bool:
         """Return whether the field with this key exists already."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.norms.columns import describe
 from sobolev_batch.store.encoding import with_coordinates
-from sobolev_batch.store.layout import RECORD, TABLES_OF_ALL, Store, hide_tables, table_names, write_table
+from sobolev_batch.store.layout import NUMERICS, RECORD, TABLES_OF_ALL, Store, hide_tables, table_names, write_table
 
 # A table for each of these groups that an object has.
 Tables = Mapping[str, xr.Dataset]
@@ -107,8 +107,8 @@ def _concatenated(tables: Sequence[xr.Dataset]) -> xr.Dataset:
             columns[name] = model.dims, model.values
     coordinates = {name for table in tables for name in table.coords}
     attributes = dict(tables[0].attrs)
-    if "metadata" in attributes:
-        attributes["metadata"] = list(dict.fromkeys(name for table in tables for name in table.attrs["metadata"]))
+    for name in {"metadata", NUMERICS} & attributes.keys():
+        attributes[name] = list(dict.fromkeys(one for table in tables for one in table.attrs.get(name, ())))
     return describe(xr.Dataset(columns, attrs=attributes).set_coords(list(coordinates)))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -24,6 +25,7 @@ from sobolev_batch.store.encoding import with_coordinates
 from sobolev_batch.store.layout import (
     DIGEST,
     FIELD,
+    NUMERICS,
     OBJECTS,
     OCTAVES_GROUP,
     RECORD,
@@ -36,6 +38,8 @@ from sobolev_batch.store.layout import (
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.objects import stores_below
 from sobolev_batch.visible import FILE_UNITS
+
+_log = logging.getLogger(__name__)
 
 # Names of families, or globs of names; None is all of them.
 Families = str | Sequence[str] | None
@@ -121,6 +125,12 @@ def open_store(store: str | Path | Location | Sequence[str | Path | Location]) -
             raise DamageError(
                 f"{opened.path}: the store is damaged ({problem}); run the study again", problem
             ) from error
+    numerics = (table_attributes(opened, "convergence") or {}).get(NUMERICS, ())
+    if len(numerics) > 1:
+        _log.warning(
+            "%s: its fields were computed by numerics of versions %s, as the column numerics of /meshes says; run the "
+            "study again, which computes those of others anew", *(location, " and ".join(map(str, numerics))),
+        )  # fmt: skip
     tree.encoding = {**tree.encoding, _SOURCE: str(location), _STATE: tree.attrs.pop(DIGEST, None)}
     return tree
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import trimesh
 from distributed import Client
 
 import sobolev_batch as sb
-from sobolev_batch.batch import table_stage
+from sobolev_batch.batch import field_tasks, table_stage
 from sobolev_batch.batch.cluster.clients import remote_client
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.status import Status
@@ -135,6 +136,32 @@ def test_tables_of_an_older_version_are_made_anew(
         steps: list[Progress] = []
         assert sb.run(study, store_path, client, on_progress=steps.append).computed == ()
         assert bool(steps) == ("reduction" in {step.stage for step in steps}) == reduced
+
+
+def test_what_another_version_computed_is_never_taken_for_ours_and_is_named(
+    copy: Path, store_path: Path, threads: Client, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    study, other = sb.Study.from_table(small_table()), store_path.with_name("other.zarr")
+    with monkeypatch.context() as patch:
+        # As on a worker of a later version.
+        patch.setattr(field_tasks, "NUMERICS_VERSION", -1)
+        failed = sb.run(study, other, threads).failed
+    assert len(failed) == 5
+    assert "computed it by numerics of version -1, not" in failed["ico/2"]
+    assert len(sb.run(study, other, threads).computed) == 5
+    # In a store where it was taken all the same:
+    row, records = Store.open(copy).labels().index("ico/2"), Records(Store.open(copy))
+    record = records.read()[row]
+    assert record is not None
+    records.write(row, replace(record, numerics=-1))
+    monkeypatch.setattr(table_stage, "TABLES_VERSION", -1)
+    assert sb.run(study, copy, threads).computed == ()
+    versions = variable(sb.open_store(copy), "meshes", "numerics")
+    assert versions["mesh"].values[versions == -1].tolist() == ["ico/2"]
+    assert "were computed by numerics of versions -1 and" in caplog.text
+    assert sb.verify(copy).fields.keys() == {"ico/2"}
+    assert sb.run(study, copy, threads).computed == ("ico/2",)
+    assert sb.verify(copy).is_sound
 
 
 def test_a_bad_mesh_is_recorded_and_stops_nothing(client: Client, tmp_path: Path, store_path: Path) -> None:

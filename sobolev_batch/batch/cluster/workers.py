@@ -22,6 +22,7 @@ from typing import Any
 
 from distributed import Client, Worker, WorkerPlugin, get_worker
 from distributed.core import Status
+from distributed.versions import get_versions
 
 from sobolev_batch.errors import BackendError, ClusterError, InputError, StoreError
 from sobolev_batch.machine import machine_memory
@@ -46,6 +47,8 @@ GPU = "sobolev-batch-gpu"
 _ALLOWED_FRACTION, _IDLE_BYTES = 0.85, 300e6
 _MOST_NAMED = 4
 _NAME = "sobolev-batch"
+# Plugin and topic of workers that have other versions.
+_KEPT_OUT = "sobolev-batch-kept-out"
 _SETUP_SECONDS = 0.05
 
 _VISIBLE = "CUDA_VISIBLE_DEVICES"
@@ -202,9 +205,39 @@ class BackendPlugin(WorkerPlugin):  # type: ignore[misc]  # distributed has no t
                 release_gpu(device)
 
 
+class VersionPlugin(WorkerPlugin):  # type: ignore[misc]  # distributed has no types
+    """Plugin that keeps a worker out that joins later with other versions than those of the study.
+
+    A worker sets its plugins up before it hears of any task. One without this package fails to, and ends.
+    """
+
+    def __init__(self, required: Sequence[str], ours: Mapping[str, str]) -> None:
+        self.required, self.ours = tuple(required), dict(ours)
+
+    async def setup(self, worker: Worker) -> None:
+        """Compare the versions; where they differ, say so, take no task, and leave."""
+        found = _packages(get_versions([*self.required[1:], *_OF_EXTRAS])) | _checkout()
+        differing = _differing(found, self.ours, self.required)
+        if not differing:
+            return
+        listed = ", ".join(f"{name} {version or 'is missing'}" for name, version in differing.items())
+        expected = ", ".join(f"{name} {self.ours[name]}" for name in differing)
+        reason = (
+            f"the worker {worker.address} is kept out, since results would mix what other versions compute: it has "
+            f"{listed}; the study that began on its cluster has {expected}. Install the same, or start the scheduler "
+            "again for another study"
+        )
+        _log.error(reason)
+        worker.log_event(_KEPT_OUT, reason)
+        # From now on it neither begins a task nor is given one.
+        worker.status = Status.closing_gracefully
+        worker.loop.add_callback(worker.scheduler.retire_workers, workers=[worker.address], close_workers=True)
+
+
 def prepare_workers(client: Client, libraries: Iterable[str] = ()) -> Workers:
-    """Install the plugin on the workers of a cluster, also on those that join later, and return what they offer."""
-    require_same_versions(client, libraries)
+    """Install the plugins on the workers of a cluster, also on those that join later, and return what they offer."""
+    client.subscribe_topic(_KEPT_OUT, lambda event: _log.warning("%s", event[1]))
+    client.register_plugin(VersionPlugin(*require_same_versions(client, libraries)), name=_KEPT_OUT)
     client.register_plugin(BackendPlugin(), name=_NAME)
     answers = client.run(_describe, on_error="return")
     # A worker that is just leaving, or joining, does not count.
@@ -240,8 +273,8 @@ async def _slowness(dask_worker: Worker) -> float:
     return await asyncio.to_thread(slowness, dask_worker.plugins[_NAME].backend)
 
 
-def require_same_versions(client: Client, libraries: Iterable[str] = ()) -> None:
-    """Check that the scheduler and all workers have installed what this process has."""
+def require_same_versions(client: Client, libraries: Iterable[str] = ()) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Check that the scheduler and all workers have installed what this process has; return the names and versions."""
     required = ("python", *_OF_DASK, *_OF_NUMBERS, *libraries)
     # Dask answers this itself: code of ours would not run where the package is missing.
     answers = client.get_versions(packages=[*required[1:], *_OF_EXTRAS])
@@ -249,18 +282,16 @@ def require_same_versions(client: Client, libraries: Iterable[str] = ()) -> None
     checkouts = client.run(_checkout, on_error="return")
     ours = _packages(answers["client"]) | _checkout()
     scheduler = _packages(answers["scheduler"])
-    processes = {f"scheduler {client.scheduler.address}": {name: scheduler[name] for name in _OF_DASK}}
+    processes = {f"scheduler {client.scheduler.address}": _differing(scheduler, ours, _OF_DASK)}
     for address, answer in answers["workers"].items():
         if answer:  # a worker that is just leaving answers nothing
-            found, checkout = _packages(answer), checkouts.get(address)
-            names = (*required, *(name for name in _OF_EXTRAS if ours[name] and found[name]))
-            theirs = {name: found[name] for name in names}
-            processes[f"worker {address}"] = theirs | (checkout if isinstance(checkout, dict) else {})
+            checkout = checkouts.get(address)
+            found = _packages(answer) | (checkout if isinstance(checkout, dict) else _checkout())
+            processes[f"worker {address}"] = _differing(found, ours, (*required, *_checkout()))
     differing = defaultdict(list)
     for process in sorted(processes):
         for name, version in processes[process].items():
-            if version != ours[name]:
-                differing[name, version].append(process)
+            differing[name, version].append(process)
     if differing:
         differences = (
             f"{name} {version or 'is missing'} at the {who[0]}{f' and {len(who) - 1} more' if who[1:] else ''}, "
@@ -271,6 +302,13 @@ def require_same_versions(client: Client, libraries: Iterable[str] = ()) -> None
             f"versions differ, and results would mix what they compute: {'; '.join(differences)}. "
             "Install the same ones everywhere and start those processes again"
         )
+    return (*required, *_checkout()), ours
+
+
+def _differing(found: Mapping[str, str], ours: Mapping[str, str], required: Iterable[str]) -> dict[str, str]:
+    """Return what a process has in another version than this one, or lacks; extras count where both have them."""
+    names = (*required, *(name for name in _OF_EXTRAS if ours[name] and found.get(name)))
+    return {name: found[name] for name in names if found[name] != ours[name]}
 
 
 def _packages(answer: Mapping[str, Mapping[str, str | None]]) -> dict[str, str]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from dask import config
-from distributed import Client
+from distributed import Client, get_worker
 
 from sobolev_batch import Study, open_store, run, write_mesh
 from sobolev_batch.batch.cluster import clients, workers
@@ -22,7 +22,7 @@ from sobolev_batch.shapes import icosphere
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.records import Records
 from tests.support import gate
-from tests.support.processes import PATIENCE_SECONDS, WORKER, dask, tcp_cluster
+from tests.support.processes import PATIENCE_SECONDS, WORKER, dask, tcp_cluster, wait_until
 from tests.support.repository import install
 from tests.support.stores import assert_same_results
 from tests.support.studies import small_table
@@ -88,6 +88,33 @@ def test_local_workers_have_the_memory_that_is_given_and_late_ones_are_equipped_
 def test_a_memory_that_no_worker_can_live_in(memory: str) -> None:
     with pytest.raises(InputError, match=r"memory (of a worker )?must be .*found "):
         local_client(1, memory).__enter__()
+
+
+LATER = """
+from sobolev_batch.batch.cluster import workers
+
+# Dask may load this twice.
+workers.NUMERICS_VERSION = 99
+"""
+
+
+@pytest.mark.process
+def test_a_worker_of_another_version_that_joins_is_kept_out_and_the_driver_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "later.py").write_text(LATER)
+    with tcp_cluster([]) as (address, _), Client(address) as client:
+        (first,) = prepare_workers(client).members
+        tasks = [client.submit(_where, i, pure=False) for i in range(200)]
+        joiner = dask("worker", address, *WORKER, "--preload", str(tmp_path / "later.py"))
+        assert "is kept out" in joiner.communicate(timeout=PATIENCE_SECONDS)[1]
+        assert set(client.gather(tasks)) == {first.address}
+        wait_until(lambda: "it has numerics of sobolev-batch 99; the study" in caplog.text)
+        assert list(client.scheduler_info(n_workers=-1)["workers"]) == [first.address]
+
+
+def _where(number: int) -> str:
+    return str(get_worker().address)
 
 
 def _die_once(marker: Path) -> str:
