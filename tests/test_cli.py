@@ -23,6 +23,7 @@ import sobolev_batch as sb
 from sobolev_batch.tables import FORMATS
 from tests.geometry.test_deviation import plate
 from tests.support.commands import LATTICE, STUDY, ball, call, command, finished, output, write_inputs
+from tests.support.processes import with_certificates
 from tests.support.repository import install
 
 pytestmark = pytest.mark.process
@@ -350,7 +351,8 @@ def test_failed_meshes_give_status_3_and_are_shown_as_missing(folder: Path, clie
     study = STUDY.replace('"cli"', '"partly"') + '\n[[family]]\nname = "f"\nsource = "files"\npaths = ["nan.off"]\n'
     (folder / "partly.toml").write_text(study)
     assert client.scheduler is not None
-    done = call("run", "partly.toml", "--scheduler", client.scheduler.address, folder=folder)
+    with with_certificates(client):
+        done = call("run", "partly.toml", "--scheduler", client.scheduler.address, folder=folder)
     assert done.returncode == 3
     assert re.search(r"^f/nan( +missing){6}$", done.stdout, re.M)
     assert "1 of 3 vertices have NaN" in done.stdout

@@ -22,7 +22,7 @@ from sobolev_batch.store import workspace
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.records import Record, Records
 from tests.support.commands import call, command, finished
-from tests.support.processes import tcp_cluster, wait_until
+from tests.support.processes import tcp_cluster, wait_until, with_certificates
 from tests.support.recipes import write_study
 from tests.support.studies import GONE, SMALL_LATTICE, balls, small_table, variable
 
@@ -81,7 +81,7 @@ def test_mesh_facts_are_recorded(finished_store: Path) -> None:
     assert row["digest"].item() == mesh.digest
     assert row["edge_length_max"].item() == pytest.approx(mesh.edge_lengths.max())
     assert (row["status"].item(), row["backend"].item()) == ("complete", "finufft")
-    assert row["worker"].item().startswith("tcp://127.0.0.1:")
+    assert row["worker"].item().startswith("tls://127.0.0.1:")
     assert meshes["level"].values.tolist() == [0, 1, 2, 3, -1]
 
 
@@ -220,7 +220,8 @@ def test_the_client_is_killed_and_the_tables_come(study_path: Path, store_path: 
 def test_the_command_returns_and_says_how_to_follow(study_path: Path, tmp_path: Path, client: Client) -> None:
     store, address = tmp_path / "with space.zarr", client.scheduler.address
     for missing, status, options in ((2, 3, ["--only", "ico/[0]"]), (4, 0, []), (0, 0, [])):
-        submitted = call("submit", study_path, "--scheduler", address, "--store", store, *options)
+        with with_certificates(client):
+            submitted = call("submit", study_path, "--scheduler", address, "--store", store, *options)
         assert submitted.returncode == 0, submitted.stderr
         assert submitted.stdout.splitlines() == [
             f"{missing} of 6 surfaces to be computed by the cluster at {address}",
@@ -240,7 +241,8 @@ def test_a_study_of_several_objects_is_handed_over_as_a_whole(tmp_path: Path, cl
     assert "gone: the reference cannot be made" in followed.stdout
     assert sb.status(store).complete == 5
     (tmp_path / "study.toml").write_text(tomli_w.dumps(study.table))
-    submitted = call("submit", tmp_path / "study.toml", "--scheduler", address, "--store", store)
+    with with_certificates(client):
+        submitted = call("submit", tmp_path / "study.toml", "--scheduler", address, "--store", store)
     assert submitted.returncode == 0, submitted.stderr
     assert submitted.stdout.splitlines() == [
         f"5 of 10 surfaces to be computed by the cluster at {address}",

@@ -261,7 +261,7 @@ def test_workers_that_do_not_reach_the_store_are_found_at_once(server: Server, u
         patch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{free_port()}")
         with local_client(1) as client:
             patch.undo()
-            with pytest.raises(StoreError, match=r"worker tcp://\S+ cannot use the store: s3://.*Could not connect"):
+            with pytest.raises(StoreError, match=r"worker tls://\S+ cannot use the store: s3://.*Could not connect"):
                 run(Study.from_table(small_table()), url, client)
     assert server.keys(key_of(url)) == []
 
@@ -283,7 +283,7 @@ def test_a_store_in_memory_is_computed_by_threads(study: Study, finished_store: 
 
 def test_a_store_in_memory_is_refused_where_workers_are_other_processes(client: Client, study: Study) -> None:
     steps: list[Progress] = []
-    with pytest.raises(StoreError, match=r"in the memory of one process, and the worker tcp://\S+ is another one"):
+    with pytest.raises(StoreError, match=r"in the memory of one process, and the worker tls://\S+ is another one"):
         run(study, "memory://d/results.zarr", client, on_progress=steps.append)
     assert steps == []
     assert not fsspec.filesystem("memory").exists("/d")

@@ -8,10 +8,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from typing import TypeVar
 
 import psutil
+from dask import config as dask_config
 from distributed import Client
 
 T = TypeVar("T")
@@ -70,6 +71,17 @@ def listening(*pids: int) -> set[tuple[str, int]]:
 def scheduler_address(scheduler: subprocess.Popen[str]) -> str:
     assert scheduler.stderr is not None
     return next(match[0] for line in scheduler.stderr if (match := re.search(r"(?:tcp|tls)://127\.0\.0\.1:\d+", line)))
+
+
+def with_certificates(client: Client) -> AbstractContextManager[None]:
+    """Let commands of this process reach the cluster of a client that has certificates."""
+    security = client.security
+    files = {"ca-file": security.tls_ca_file, "client.cert": security.tls_client_cert}
+    files["client.key"] = security.tls_client_key
+    of_client: AbstractContextManager[None] = dask_config.set(
+        {f"distributed.comm.tls.{name}": content for name, content in files.items()}
+    )
+    return of_client
 
 
 @contextmanager

@@ -42,7 +42,8 @@ _LOST_WORKER_SECONDS = 10**7
 def local_client(workers: int | None = None, memory: float | str | None = None) -> Iterator[Client]:
     """Give a client of a new cluster of single-threaded worker processes, reachable from this machine only.
 
-    By default there is one for each core, and they share the memory equally; InputError where there is too little.
+    Its scheduler and workers demand certificates made for it, since other users reach loopback too. By default there is
+    a worker for each core, and they share the memory equally; InputError where there is too little.
     """
     count = workers or available_cores()
     # Dask's own default knows no limit of an inner control group.
@@ -70,6 +71,7 @@ def local_client(workers: int | None = None, memory: float | str | None = None) 
             processes=True,
             host="127.0.0.1",
             dashboard_address="127.0.0.1:0",
+            security=Security.temporary(),
         ) as cluster,
         Client(cluster) as client,
         _ending_at_once(cluster),

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import socket
+import ssl
 from pathlib import Path
 from typing import Any
 
 import pytest
-from distributed import Client, LocalCluster
+from distributed import Client, LocalCluster, Security
 
 from sobolev_batch import Study, run
 from sobolev_batch.batch.cluster.clients import remote_client, require_private
@@ -55,6 +56,21 @@ def test_a_worker_that_others_could_reach_counts_too() -> None:
             remote_client(address).__enter__()
         with remote_client(address, trust_network=True) as client:
             assert client.submit(abs, -1).result() == 1
+
+
+def test_whoever_lacks_the_certificates_of_a_local_cluster_is_refused(client: Client) -> None:
+    workers = client.scheduler_info(n_workers=-1)["workers"]
+    addresses = {client.scheduler.address, *workers, *(worker["nanny"] for worker in workers.values())}
+    assert len(addresses) == 5
+    without, other = ssl.create_default_context(), Security.temporary().get_connection_args("client")["ssl_context"]
+    for context in (without, other):
+        context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    for address in addresses:
+        assert address.startswith("tls://127.0.0.1:")
+        place = "127.0.0.1", int(address.rpartition(":")[2])
+        for context in (without, other):
+            with pytest.raises(ssl.SSLError), socket.create_connection(place) as bare, context.wrap_socket(bare) as own:
+                own.recv(1)
 
 
 @pytest.mark.parametrize(

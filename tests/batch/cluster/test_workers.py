@@ -72,7 +72,7 @@ def test_local_workers_have_equal_parts_of_the_machine(count: int, monkeypatch: 
 
 @pytest.mark.all
 def test_local_workers_have_the_memory_that_is_given_and_late_ones_are_equipped_too() -> None:
-    with local_client(1, "3GB") as client, Client(client.scheduler.address, set_as_default=False) as second:
+    with local_client(1, "3GB") as client, Client(client.cluster, set_as_default=False) as second:
         first = prepare_workers(client)
         assert [member.allowed_bytes for member in first.members] == [pytest.approx(0.85 * 3e9 - 300e6)]
         # This client registers nothing and waits for nothing of its own accord.
@@ -136,10 +136,10 @@ def test_a_task_that_claims_memory_goes_on_when_its_only_worker_was_restarted(tm
 @pytest.mark.parametrize(
     ("process", "package", "version", "message"),
     [
-        ("workers", "sobolev-batch", "9.9", r"sobolev-batch 9\.9 at the worker tcp://\S+ and 1 more, \S+ here"),
-        ("workers", "sobolev-batch", None, r"sobolev-batch is missing at the worker tcp://"),
-        ("workers", "python", "3.9.1.final.0", r"python 3\.9 at the worker tcp://.*, 3\.\d+ here"),
-        ("scheduler", "dask", "1.0", r"dask 1\.0 at the scheduler tcp://"),
+        ("workers", "sobolev-batch", "9.9", r"sobolev-batch 9\.9 at the worker tls://\S+ and 1 more, \S+ here"),
+        ("workers", "sobolev-batch", None, r"sobolev-batch is missing at the worker tls://"),
+        ("workers", "python", "3.9.1.final.0", r"python 3\.9 at the worker tls://.*, 3\.\d+ here"),
+        ("scheduler", "dask", "1.0", r"dask 1\.0 at the scheduler tls://"),
     ],
 )
 def test_differences_are_reported_before_anything_is_computed(
