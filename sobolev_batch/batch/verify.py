@@ -178,7 +178,7 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, *, may
         if not tables:
             chunks = dict.fromkeys(_stale(store), "it is not that of the stored fields") | chunks
     complete = contents.complete
-    planned = store.attributes()["versions"].get(NUMERICS)
+    planned = store.attributes().get("versions", {}).get(NUMERICS)
     for row, record in complete.items():
         if planned is not None and record.numerics != planned:
             damaged[row] = f"it was computed by numerics of version {record.numerics}, and the study by {planned}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cached_property
@@ -13,6 +14,7 @@ from typing import Self
 
 import xarray as xr
 
+from sobolev_batch.batch.start import MADE_MESHES
 from sobolev_batch.errors import InputError, SobolevBatchError, from_extra, written
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.proximity import vertex_distances
@@ -21,8 +23,17 @@ from sobolev_batch.sources.mesh_cache import MeshCache
 from sobolev_batch.sources.names import file_stem
 from sobolev_batch.sources.registry import Member
 from sobolev_batch.store.location import Location
+from sobolev_batch.store.objects import root_of
 from sobolev_batch.study.study import Study
-from sobolev_batch.tables.open import AnyStore, as_tree, fields_read, finished_group, reference_of, require_one_object
+from sobolev_batch.tables.open import (
+    AnyStore,
+    as_tree,
+    fields_read,
+    finished_group,
+    location_of,
+    reference_of,
+    require_one_object,
+)
 from sobolev_batch.testing.difference import VertexWitness, order_text, witness_at_vertices
 from sobolev_batch.transform.lattice import Orders, check_orders
 
@@ -52,8 +63,10 @@ class StudyMeshes:
         table = finished_group(tree, "meshes")
         try:
             study = Study.from_table(tree.attrs["study"]["table"], folder=folder)
-            if tree.attrs["study"].get("mesh_cache"):
-                study = study.with_cache(MeshCache(Location.parse(tree.attrs["study"]["mesh_cache"])))
+            # The place that the store itself names may be anybody's.
+            with suppress(InputError):
+                place = root_of(Location.parse(location_of(tree)))
+                study = study.with_cache(MeshCache(place.absolute().beside(MADE_MESHES)))
             members = study.object.members
         except SobolevBatchError as error:
             raise InputError(f"the study's meshes cannot be listed here: {error}") from error

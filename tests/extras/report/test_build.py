@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
+import socket
 import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 import pytest
 from click.testing import CliRunner
+from distributed import Client
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
@@ -391,3 +396,52 @@ def test_a_sentence_says_which_method_is_nearest(factors: dict[str, float], obje
     (league,) = leagues_of(tables, list(tables))
     macros: Any = build.page_template("macros").module
     assert macros.nearest_method(league) == sentence
+
+
+class _Live(HTMLParser):
+    """What a page may do beside showing its text: scripts, handlers, and addresses of other places."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found, self.scripts = list[str](), 0
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.scripts += tag == "script"
+        places = [f"{tag} {name}={value}" for name, value in attrs if name in ("src", "href", "action", "srcdoc")]
+        self.found += [place for place in places if not re.search(r"=(#|data:(image/|,$))", place)]
+        self.found += [f"{tag} {name}" for name, _ in attrs if name.startswith("on")]
+        self.found += [tag] if tag in ("iframe", "object", "embed", "base", "form", "meta-refresh") else []
+
+
+@pytest.mark.slow
+def test_a_forged_store_makes_nothing_live_and_opens_no_place_that_it_names(tmp_path: Path, threads: Client) -> None:
+    run(Study.from_table(small_table(compare=None)), tmp_path / "sound.zarr", threads)
+    forged = Store(shutil.copytree(tmp_path / "sound.zarr", tmp_path / "forged.zarr"))
+    study, versions = (forged.attributes()[name] for name in ("study", "versions"))
+    nasty = f"a\x1b[31m\u202eb\x00{SCRIPT}{IMAGE}javascript:alert(1)"
+    # Its meshes have the labels of those in the store.
+    made = {"name": "ico", "source": "command", "command": ["cp", "{input}", "{output}", "{n}"], "n": [0, 1, 2, 3]}
+    family = [{**made, "mesh": {"source": "icosphere", "levels": [1]}}]
+    header = {**study["table"]["study"], "title": nasty, "length_unit": nasty}
+    live = [_Live(), _Live()]
+    live[0].feed(make_report(tmp_path / "sound.zarr")[0])
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(0)
+        place = f"http://127.0.0.1:{server.getsockname()[1]}/steal"
+        for cache, table in (
+            (f"simplecache::{place}", {**study["table"], "study": header}),
+            (place, {**study["table"], "family": family}),
+        ):
+            attributes = {"title": nasty, "study": {**study, "name": nasty, "mesh_cache": cache, "table": table}}
+            forged.documents[""]["attributes"] |= {**attributes, "versions": dict.fromkeys(versions, nasty)}
+            forged.consolidate()
+            html, _ = make_report(forged.location)
+            live[1].feed(html)
+            assert live[1].found == live[0].found == []
+            assert not re.search("[\x00-\x08\x0b-\x1f\u202a-\u202e\u2066-\u2069]", html)
+        assert live[1].scripts == 2 * live[0].scripts > 0
+        write = tmp_path / "witness.ply"
+        with pytest.raises(InputError):
+            sb.write_witness(forged.location.name, "ico/2", write)
+        with pytest.raises(BlockingIOError):
+            server.accept()
