@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import re
 import sys
@@ -345,6 +346,22 @@ def test_a_process_ends_in_the_same_way(folder: Path) -> None:
     assert (done.returncode, done.stdout) == (2, "")
     assert re.match(r"^error: .*it holds no store of a study.*\n$", done.stderr)
     assert "Traceback" in command("--debug", "status", "nothing.zarr", folder=folder).stderr
+
+
+def test_what_dask_says_of_its_own_code_is_left_out(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def lose(store: object) -> None:
+        try:
+            raise RuntimeError("deep inside")
+        except RuntimeError:
+            logging.getLogger("distributed.utils").exception("")
+            logging.getLogger("distributed.nanny").exception("Worker died")
+        raise sb.errors.ClusterError("the scheduler was lost")
+
+    # As in a process whose log was set up before Dask's.
+    monkeypatch.setattr(logging.getLogger("distributed"), "propagate", True)
+    monkeypatch.setattr("sobolev_batch.batch.status.status", lose)
+    done = call("status", "x.zarr", folder=folder)
+    assert (done.returncode, done.stderr) == (1, "error: Worker died\nerror: the scheduler was lost\n")
 
 
 def test_failed_meshes_give_status_3_and_are_shown_as_missing(folder: Path, client: Client) -> None:

@@ -164,4 +164,8 @@ def _with_kind(record: logging.LogRecord) -> bool:
 
 def _is_shown(record: logging.LogRecord) -> bool:
     """Return whether a message is for users: those of the cluster at its start and end would only hide the table."""
-    return record.levelno >= logging.ERROR or not record.name.startswith("distributed")
+    if not record.name.startswith("distributed"):
+        return True
+    # They show Dask's own code, and the error that follows says what happened.
+    record.exc_info = record.exc_text = None
+    return record.levelno >= logging.ERROR and bool(record.getMessage())

@@ -24,7 +24,6 @@ from sobolev_batch.study.pilots import Look, choose_lattice
 from sobolev_batch.study.schema import REFERENCE_LABEL, FamilyReference
 from sobolev_batch.study.study import Members, Study
 from sobolev_batch.transform.fourier import NUMERICS_VERSION, TransformSettings, require_inside
-from sobolev_batch.transform.kinds import kind_of
 from sobolev_batch.transform.lattice import Block, Lattice
 from sobolev_batch.transform.probe import Sample, draws_for
 
@@ -134,8 +133,7 @@ def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan
     similarity = study.object.scaling or Similarity.to_unit_ball(own)
     surface = similarity.apply(own)
     choice, look = _lattice_choice(study, similarity, members, reference, surface, earlier_choice)
-    if not kind_of(surface).is_closed_form:
-        require_inside(surface, choice.lattice)
+    require_inside(surface, choice.lattice)
     if study.proximity is not None and not isinstance(surface, Mesh):
         raise StudyError(
             "proximity: Hausdorff and Chamfer distances are measured between meshes, and the reference is not one "

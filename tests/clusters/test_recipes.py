@@ -102,6 +102,20 @@ def test_lifetimes_end_before_the_walltime(system: str) -> None:
 
 
 @pytest.mark.all
+def test_objects_and_commands_on_local_jobs_with_the_exit_status_of_run(tmp_path: Path) -> None:
+    write_study(tmp_path)
+    text = (tmp_path / "study.toml").read_text().replace('[reference]\nsource = "sphere"', "")
+    made = '[[family]]\nname = "made"\nsource = "command"\nmesh = { source = "icosphere", levels = [1] }\n'
+    balls = "".join(f'[[object]]\nname = "{name}"\nreference = {{ source = "sphere" }}\n' for name in "ab")
+    made += 'command = ["false", "{input}", "{output}"]\n'
+    (tmp_path / "study.toml").write_text(text + made + balls)
+    options = ["--system", "local", "--allow-commands", "--store", "results.zarr"]
+    completed = jobqueue(tmp_path, *options)
+    assert completed.returncode == 3, completed.stderr
+    assert "12 computed, 0 reused, 2 failed" in completed.stdout
+
+
+@pytest.mark.all
 def test_a_study_on_local_jobs(tmp_path: Path) -> None:
     write_study(tmp_path)
     completed = jobqueue(tmp_path, "--system", "local", "--jobs", "1", "--adaptive", "--store", "results.zarr")

@@ -106,6 +106,8 @@ def test_a_missing_mesh_is_left_to_its_task_and_a_missing_reference_is_not(tmp_p
 def test_large_lattices_are_cut_into_chunks_and_small_ones_refused() -> None:
     with pytest.raises(LatticeError, match="take M >= "):
         plan_of(lattice={"xi_max": 5.0, "M": 16}, reference={"source": "icosphere", "levels": [2]})
+    with pytest.raises(LatticeError, match=r"the surface reaches to \|coordinate\| = 5, .* holds only"):
+        plan_of(reference={"source": "sphere", "radius": 5.0}, scaling={"mode": "none"})
     plan = plan_of(lattice={"xi_max": 20.0, "M": 512})
     sizes = [block.size for block in plan.blocks]
     assert (len(sizes), sum(sizes), plan.field_bytes) == (5, 513 * 513 * 257, 513 * 513 * 257 * 16)

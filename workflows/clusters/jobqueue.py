@@ -1,7 +1,7 @@
 """Run a study on workers that are jobs of SLURM or PBS.
 
     export DASK_CONFIG=$HOME/jobqueue.yaml
-    python jobqueue.py STUDY --system slurm --jobs 4
+    python jobqueue.py STUDY --system slurm --jobs 4 [further options of `sobolev-batch run`, such as --store STORE]
 
 The scheduler is part of this process, on the node where you start it. See docs/clusters.md.
 """
@@ -12,7 +12,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -25,17 +25,15 @@ from dask_jobqueue.local import LocalCluster
 from distributed import Adaptive, Client, Security
 from distributed.core import Status
 
-from sobolev_batch import Study, open_store, run
-from sobolev_batch.batch.cluster.execution import Progress
+from sobolev_batch import Study
+from sobolev_batch.cli import cli
 from sobolev_batch.errors import SobolevBatchError
-from sobolev_batch.tables.convergence import format_table
 
 # dask_jobqueue ends the process on Ctrl-C with the exit status of success.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 CLUSTERS: dict[str, type[JobQueueCluster]] = {"slurm": SLURMCluster, "pbs": PBSCluster, "local": LocalCluster}
 INTERVAL_SECONDS = 30.0  # between two checks of the jobs
-SOME_FAILED = 3  # as the exit status of sobolev-batch
 
 
 class ReplacingAdaptive(Adaptive):  # type: ignore[misc]  # distributed has no types
@@ -162,40 +160,41 @@ def jobs_of(system: str, jobs: int, adaptive: bool = False) -> Iterator[JobQueue
             yield cluster
 
 
-def show(progress: Progress) -> None:
-    """Print a line for each mesh on standard error."""
-    if progress.record is not None:
-        outcome = progress.record.reason or f"{progress.record.seconds:.2f} s"
-        line = f"[{progress.done}/{progress.total}] {progress.label}: {progress.record.status}, {outcome}"
-        click.echo(line, err=True)
+def run_on(cluster: JobQueueCluster, arguments: Sequence[str]) -> int:
+    """Do `sobolev-batch run` on a cluster, and return its exit status."""
+    security = cluster.security
+    files = {"ca-file": security.tls_ca_file, "client.cert": security.tls_client_cert}
+    files["client.key"] = security.tls_client_key
+    with dask.config.set({f"distributed.comm.tls.{name}": path for name, path in files.items()}):
+        command = ["run", *arguments, "--scheduler", cluster.scheduler_address]
+        return int(cli.main(command, prog_name="sobolev-batch", standalone_mode=False) or 0)
 
 
-@click.command()
+@click.command(context_settings={"ignore_unknown_options": True})
 @click.argument("study", type=click.Path(path_type=Path))
+@click.argument("options", nargs=-1, type=click.UNPROCESSED)
 @click.option("--system", type=click.Choice(list(CLUSTERS)), required=True)
 @click.option("--jobs", type=click.IntRange(min=1), default=1, show_default=True, help="Number of jobs at a time.")
 @click.option("--adaptive", is_flag=True, help="Run fewer jobs while there is little work.")
-@click.option("--store", help="Path or URL for the results. [default: storage/NAME.zarr]")
 @click.option("--print-script", is_flag=True, help="Show the script of a job and end.")
-def main(study: Path, system: str, jobs: int, adaptive: bool, store: str | None, print_script: bool) -> None:
-    """Run STUDY on jobs of a batch system and print its table."""
+def main(study: Path, options: tuple[str, ...], system: str, jobs: int, adaptive: bool, print_script: bool) -> None:
+    """Run STUDY on jobs of a batch system.
+
+    OPTIONS are those of `sobolev-batch run`, such as --store STORE or --allow-commands, whose exit status this has.
+    """
     check_settings(system, print_script)
     if print_script:
         click.echo(job_script(system))
         return
     try:
-        parsed = Study.from_toml(study)
-        store = store or f"storage/{parsed.name}.zarr"
+        Study.from_toml(study)  # before any job is submitted
         with jobs_of(system, jobs, adaptive) as cluster, Client(cluster) as client:
             click.echo("jobs are submitted; the study begins when the first one runs", err=True)
             client.wait_for_workers(1)
-            summary = run(parsed, store, client, on_progress=show)
-        click.echo(format_table(open_store(store)))
+            status = run_on(cluster, [str(study), *options])
     except (SobolevBatchError, RuntimeError) as error:  # the batch system and Dask raise the latter
         raise click.ClickException(str(error).strip()) from error
-    for label, reason in summary.failed.items():
-        click.echo(f"{label}: {reason}", err=True)
-    sys.exit(SOME_FAILED if summary.failed else 0)
+    sys.exit(status)
 
 
 if __name__ == "__main__":
