@@ -25,14 +25,16 @@ from sobolev_batch.geometry.mesh import Mesh
 
 # A header ends within this many bytes: room for a thousand lines, and quick to look through.
 HEADER_BYTES = 1 << 16
-# All lines end as the first one does. Behind a lone carriage return, a line feed may be the first byte of the data.
-_HEADER = re.compile(rb"ply[ \t]*(\r\n|\r|\n)(.*?)(?<=[\r\n])end_header[ \t]*\1", re.DOTALL)
+# The last line ends as the first one does, where it can: behind a lone carriage return, a line feed may be data.
+_HEADER = re.compile(rb"(?s)(?:\xef\xbb\xbf)?ply[ \t]*(\r\n|\r|\n)(.*?)(?<=[\r\n])end_header[ \t]*(?:\1|\r\n|\n|\r)")
+# What some programs write behind binary data.
+_LAST_LINE = (b"", b"\n", b"\r\n")
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 # The codes that NumPy and the module struct have for the types.
 _CODES = {"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d"}
 _CODES |= {"int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I"}
-_CODES |= {"float32": "f", "float64": "d"}
-_TEXT, _FRACTIONS = "=d", "fd"
+_CODES |= {"int64": "q", "uint64": "Q", "float16": "e", "float32": "f", "float64": "d"}
+_TEXT, _FRACTIONS = "=d", "efd"
 _CORNERS = ("vertex_indices", "vertex_index")
 _WANTED = {"vertex": ("x", "y", "z"), "face": _CORNERS, "tristrips": _CORNERS}
 # Digits of a count: all that fit into 64 bits.
@@ -100,7 +102,7 @@ def parse_ply(data: bytes) -> Raw:
         rows.append(np.broadcast_to(len(element.properties) + sum(sizes.values()), element.count))
     if is_text:
         _require_aligned(np.frombuffer(lines, np.uintc), rows)
-    if place < len(body):
+    if body[place : place + 3].tobytes() not in _LAST_LINE:
         more = f"{(len(body) - place) // 8} numbers" if is_text else f"{len(body) - place} bytes"
         raise MeshError(f"the PLY header announces {counts}, but {more} more follow")
     axes = [values for values, sizes in columns.get("vertex", {}).values() if sizes is None]
@@ -160,7 +162,8 @@ def _parsed_header(data: bytes) -> tuple[dict[str, _Element], int, bool]:
         raise MeshError(f"no PLY header begins the file and ends within its first {HEADER_BYTES} bytes")
     elements: dict[str, _Element] = {}
     order = ""
-    for line in header[2].decode("ascii", errors="replace").splitlines():
+    # Some programs write X for x.
+    for line in re.sub(rb"\s[XYZ]\s", lambda axis: axis[0].lower(), header[2]).decode("ascii", "replace").splitlines():
         match line.split():
             case [] | ["comment" | "obj_info", *_]:
                 continue
@@ -174,7 +177,7 @@ def _parsed_header(data: bytes) -> tuple[dict[str, _Element], int, bool]:
                 match [_CODES.get(word, word) for word in words]:
                     case [code] if code in _CODES.values():
                         declared, length = code, ""
-                    case ["list", length, code] if {code, length} <= {*_CODES.values()} and length not in _FRACTIONS:
+                    case ["list", length, code] if {code, length} <= {*_CODES.values()}:
                         declared = code
                     case _:
                         raise MeshError(f"the PLY header declares {name[:40]!r} by {line[:80]!r}, of no type of PLY")
