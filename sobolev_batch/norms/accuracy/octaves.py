@@ -59,8 +59,9 @@ _FEWEST_FLAT_DRAWS = 20_000
 _UNIFORM_BESIDE_LATTICE, _UNIFORM_ALONE = 0.1, 0.5
 # Deviation of |field|² over its mean among draws, on curved surfaces and on flat faces.
 _CURVED_DEVIATION, _FLAT_DEVIATION = 1.3, 3.0
-# Between octaves the energy grows at most like |ξ|² as long as surfaces are closer than the wavelength.
-_GROWTH = 4.0
+# Between octaves the energy grows at most like |ξ|² as long as surfaces are closer than the wavelength. It grows ever
+# less: by more than this fraction of what it last grew by.
+_GROWTH, _OF_GROWTH = 4.0, 0.7
 # Predicted seconds that the first samples of an octave may take if drawn, and all of the samples together.
 _OCTAVE_SECONDS, _MOST_SECONDS = 20.0, 200.0
 # Random points of a remainder at most, how many more than needed are taken, and how many more to check it again.
@@ -151,7 +152,7 @@ class State:
         """Return what a small lattice shows, and what lies beyond it."""
         lattice = core_lattice(problem.support, problem.orders, problem.accuracy)
         core = Core.on_lattice(problem, lattice, lattice.xi_max)
-        beyond = _beyond(problem, lattice.xi_max, seed)
+        beyond = Remainder.unknown(lattice.xi_max) if for_others else _beyond(problem, lattice.xi_max, seed)
         return cls(problem, seed, core, (), (beyond,), for_others, beyond.seconds(beyond.points))
 
     @property
@@ -185,14 +186,16 @@ class State:
         period has less of it farther out, and points that nothing is hidden from see that.
         """
         orders, beyond = self.problem.orders, self.remainders[-1]
-        if beyond.points >= beyond.covering:
-            return np.zeros(len(orders))
+        return np.zeros(len(orders)) if beyond.points >= beyond.covering else self.expected - sum(beyond.at(orders))
+
+    @property
+    def expected(self) -> Reals:
+        """What lies beyond all octaves if the energy of the last one does not grow (orders,)."""
         least = self.core.energy
         if self.octaves:
             least = self.octaves[-1].sums.energy - _QUANTILE * self.octaves[-1].sums.energy_deviation
-        return np.asarray(least * np.array([tail_integral(beyond.cutoff, order) for order in orders])) - sum(
-            beyond.at(orders)
-        )
+        cutoff = self.remainders[-1].cutoff
+        return np.array([least * tail_integral(cutoff, order) for order in self.problem.orders])
 
     @cached_property
     def squares(self) -> Reals:
@@ -203,9 +206,12 @@ class State:
     @cached_property
     def permitted(self) -> Reals:
         """Largest permitted error of the squares by the tail (orders,)."""
+        return self._permitted_of(self.squares)
+
+    def _permitted_of(self, squares: Reals) -> Reals:
         accuracy = self.problem.accuracy
         parts = accuracy.truncation_parts(self.problem.orders)
-        return np.asarray(2 * parts * np.maximum(self.squares, accuracy.floor**2))
+        return np.asarray(2 * parts * np.maximum(squares, accuracy.floor**2))
 
     @property
     def permitted_variances(self) -> Reals:
@@ -214,7 +220,13 @@ class State:
 
     @property
     def excess(self) -> float:
-        """Error of the remainder over the permitted one, at the worst order."""
+        """Error of the remainder over the permitted one, at the worst order; most likely more where it is not known."""
+        if not self.remainders[-1].is_known:
+            energies = [self.core.energy, *(octave.sums.energy for octave in self.octaves)]
+            growth = energies[-1] / energies[-2] if self.octaves and energies[-2] > 0 else 1.0
+            expected = self.expected * np.clip(_OF_GROWTH * growth, 1.0, _GROWTH)
+            permitted = _REMAINDER_FRACTION * self._permitted_of(self.squares + expected)
+            return float(np.max(_OF_OTHERS * expected / permitted))
         values, errors = self.remainders[-1].at(self.problem.orders)
         if self.for_others:
             errors = np.maximum(errors, _OF_OTHERS * np.abs(values))
@@ -249,10 +261,10 @@ class State:
         """Predict the time of the samples of an octave, without those that are known."""
         return sum(size.sampling_seconds(sampling, known) for size in self.sizes)
 
-    def redrawn(self, number: int, points: int) -> State:
+    def redrawn(self, number: int, points: int | None = None) -> State:
         """Return the state after a step that estimates one remainder from new points."""
         problem, known = self.problem, list(self.remainders)
-        cutoff, seconds, seed = known[number].cutoff, known[number].seconds(points), self.seed + self.steps + 1
+        cutoff, seconds, seed = known[number].cutoff, known[number].seconds(points or 0), self.seed + self.steps + 1
         known[number] = _beyond(problem, cutoff, seed, points)
         return self.advanced(seconds, remainders=tuple(known))
 
@@ -297,10 +309,13 @@ def solution_of(state: State) -> Solution:
 
 
 def farther_out(state: State) -> State | None:
-    """Return a state whose remainder is known better, by more points or one more octave; None if it is known well."""
+    """Return a state whose remainder is known better, by more points or one more octave; None if it is known well.
+
+    For others, what lies beyond is first looked at where the energy of the last octave permits that it is enough.
+    """
     problem, beyond = state.problem, state.remainders[-1]
     if state.excess <= 1 or state.seconds >= _MOST_SECONDS:
-        return None
+        return _looked_at(state)
     octave = Octave(state.cutoff, len(state.octaves) + 1)
     can_go_on = len(state.octaves) < _MOST_OCTAVES and octave.highest <= _resolvable_frequency(problem)
     points = int(_MORE_POINTS * beyond.points * state.excess**2)
@@ -312,10 +327,15 @@ def farther_out(state: State) -> State | None:
     if not state.for_others and points <= _MOST_POINTS and beyond.seconds(points) < min(seconds, _MOST_SECONDS):
         return state.redrawn(len(state.octaves), points)
     if sampling is None:
-        return None
+        return _looked_at(state)
     measured = _measured(state, sampling)
-    outer = _beyond(problem, octave.highest, state.seed)
+    outer = Remainder.unknown(octave.highest) if state.for_others else _beyond(problem, octave.highest, state.seed)
     return state.advanced(seconds, octaves=(*state.octaves, measured), remainders=(*state.remainders, outer))
+
+
+def _looked_at(state: State) -> State | None:
+    """Return a state whose remainder is known; None if it is."""
+    return None if state.remainders[-1].is_known else state.redrawn(len(state.octaves))
 
 
 def refined(state: State) -> State | None:

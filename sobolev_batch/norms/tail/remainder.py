@@ -92,6 +92,16 @@ class Remainder:
         """Return a part whose mean energy lies between bounds."""
         return cls(cutoff, (-1.0,), ((lowest + highest) / 2,), (abs(highest - lowest) / 2,))
 
+    @classmethod
+    def unknown(cls, cutoff: float) -> Self:
+        """Return a part that nobody has looked at."""
+        return cls(cutoff, (-1.0,), (0.0,), (np.inf,))
+
+    @property
+    def is_known(self) -> bool:
+        """True if errors are finite."""
+        return bool(np.all(np.isfinite(self.errors)))
+
     def at(self, orders: Sequence[float]) -> tuple[Reals, Reals]:
         """Return the part of the squared norm (orders,), and how far off it may be; energies are interpolated."""
         values, errors = np.zeros(len(orders)), np.zeros(len(orders))

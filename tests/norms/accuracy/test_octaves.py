@@ -15,6 +15,8 @@ from sobolev_batch.errors import AccuracyError, InputError
 from sobolev_batch.norms.accuracy import octaves
 from sobolev_batch.norms.tail.remainder import Remainder, remainder
 from sobolev_batch.shapes import icosphere
+from sobolev_batch.study.plan import make_plan
+from sobolev_batch.study.study import Study
 from tests.support.rectangles import Rectangles
 
 Pair = tuple[Rectangles, Rectangles]
@@ -176,3 +178,23 @@ def test_other_points_confirm_a_disagreement_or_show_that_it_was_chance(
         with pytest.raises(AccuracyError, match="out of reach"):
             distance(a.mesh(), b.mesh(), -1.0, rtol=0.02)
     assert len(seeds) == len(set(seeds)) == 2
+
+
+def test_pilots_look_beyond_their_octaves_only_where_these_may_be_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked_at: list[float] = []
+
+    def counted(surfaces: Any, signs: Any, cutoff: float, *others: Any, **options: Any) -> Remainder:
+        looked_at.append(cutoff)
+        return remainder(surfaces, signs, cutoff, *others, **options)
+
+    monkeypatch.setattr(octaves, "remainder", counted)
+    study: dict[str, Any] = {
+        "study": {"name": "spheres"},
+        "accuracy": {"rtol": 0.02},
+        "norm": {"orders": [-1.0]},
+        "reference": {"source": "icosphere", "levels": [3]},
+        "family": [{"name": "levels", "source": "icosphere", "levels": [2]}],
+    }
+    chosen = make_plan(Study.from_table(study)).choice.tail
+    assert chosen is not None and looked_at[-1] == chosen.highest_frequency
+    assert len(looked_at) <= len(chosen.octaves) / 2
