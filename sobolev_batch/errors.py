@@ -1,5 +1,6 @@
 """Exceptions of the package: one tree, with plain messages, safe to pickle between processes."""
 
+import errno
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
@@ -7,7 +8,7 @@ from sobolev_batch.visible import visible
 
 __all__ = [
     *("AccuracyError", "BackendError", "ClusterError", "DamageError", "InputError", "LatticeError", "LockError"),
-    *("MeshError", "OrderError", "SobolevBatchError", "StoreError", "StudyError"),
+    *("MemoryLimitError", "MeshError", "OrderError", "SobolevBatchError", "SpaceError", "StoreError", "StudyError"),
 ]
 
 # Characters of another library's message that are worth keeping.
@@ -38,6 +39,10 @@ class LatticeError(InputError):
     """A lattice is malformed, or a surface does not fit into its period."""
 
 
+class MemoryLimitError(InputError):
+    """A transform is allowed too little memory."""
+
+
 class OrderError(InputError):
     """The norm of a surface measure is infinite for a Sobolev order."""
 
@@ -62,6 +67,10 @@ class StudyError(InputError):
 
 class StoreError(InputError):
     """A store cannot be read or written, or belongs to another study."""
+
+
+class SpaceError(StoreError):
+    """A disk is full, or a quota is used up; the same command goes on once there is room."""
 
 
 class LockError(StoreError):
@@ -113,12 +122,18 @@ def refused_by_pydantic() -> Iterator[None]:
         raise ValueError(str(error)) from error
 
 
+def is_for_want_of_space(error: BaseException) -> bool:
+    """Tell whether something could not be written since a disk is full, or a quota is used up."""
+    return getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
+
+
 @contextmanager
 def written(place: object, what: str, kind: type[InputError] = StoreError) -> Iterator[None]:
     """Turn a failure to write a file into an error that says what cannot be written, where, and why."""
     try:
         yield
     except OSError as error:
+        kind = SpaceError if is_for_want_of_space(error) else kind
         raise kind(f"{place}: {what} cannot be written there: {error.strerror or error}") from error
 
 

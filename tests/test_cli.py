@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import os
@@ -362,6 +363,16 @@ def test_what_dask_says_of_its_own_code_is_left_out(folder: Path, monkeypatch: p
     monkeypatch.setattr("sobolev_batch.batch.status.status", lose)
     done = call("status", "x.zarr", folder=folder)
     assert (done.returncode, done.stderr) == (1, "error: Worker died\nerror: the scheduler was lost\n")
+
+
+def test_a_full_disk_has_a_status_of_its_own(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*arguments: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("sobolev_batch.store.location.FolderStore.put", fail)
+    done = call("run", "study.toml", "--store", "full.zarr", folder=folder)
+    assert done.returncode == 5
+    assert re.match(r"error: full\.zarr: the store cannot be written: No space left on device; make room", done.stderr)
 
 
 def test_failed_meshes_give_status_3_and_are_shown_as_missing(folder: Path, client: Client) -> None:

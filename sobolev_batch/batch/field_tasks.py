@@ -16,8 +16,8 @@ import numpy as np
 from distributed import get_worker
 
 from sobolev_batch import compiled
-from sobolev_batch.batch.cluster.workers import worker_backend
-from sobolev_batch.errors import InputError, LatticeError, MeshError, StoreError, one_line
+from sobolev_batch.batch.cluster.workers import worker_backend, worker_limit
+from sobolev_batch.errors import InputError, LatticeError, MemoryLimitError, MeshError, StoreError, one_line
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Similarity, Surface
 from sobolev_batch.norms.accuracy.problem import without_common_parts
@@ -26,6 +26,7 @@ from sobolev_batch.norms.fields import Quality, TailQuality, compute_field, fiel
 from sobolev_batch.norms.tail.remainder import Remainder, remainder
 from sobolev_batch.norms.tail.sampling import TailSampling
 from sobolev_batch.norms.tail.values import octave_values
+from sobolev_batch.parameters import format_bytes
 from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.lock import utc_now
@@ -138,6 +139,13 @@ class Job:
             reason = (
                 f"{reason}; it was chosen for surfaces that reach less far. Is this one in the same unit of length? "
                 "If it is, name another store, for which the lattice is chosen anew"
+            )
+        if isinstance(error, MemoryLimitError):
+            limit = worker_limit()
+            told = f" of {format_bytes(limit)}" if limit else ""
+            reason = (
+                f"{reason}. That is what the limit{told} of its worker leaves; raise that limit by --worker-memory of "
+                "run, or by --memory-limit of dask worker"
             )
         if not isinstance(error, InputError):
             _log.error("%s failed for a reason that is not its mesh's", self.row.label, exc_info=error)

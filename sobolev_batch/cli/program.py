@@ -16,11 +16,11 @@ import click
 
 from sobolev_batch.cli.interruption import SECONDS_TO_END, Deadline
 from sobolev_batch.cli.output import echo, echo_lines, patience
-from sobolev_batch.errors import InputError, SobolevBatchError, one_line
+from sobolev_batch.errors import InputError, SobolevBatchError, SpaceError, one_line
 from sobolev_batch.plugins import COMMANDS, extra, is_extra, registered
 
 # Exit statuses; `end_process` has those after SIGINT and SIGTERM.
-EXIT_OTHER, EXIT_INPUT, EXIT_SOME_FAILED = 1, 2, 3
+EXIT_OTHER, EXIT_INPUT, EXIT_SOME_FAILED, EXIT_NO_SPACE = 1, 2, 3, 5
 # Key of the context's `meta` with the status of errors other than wrong input, where a command has one of its own.
 ERROR_STATUS = "sobolev_batch.error_status"
 
@@ -108,14 +108,14 @@ class _Program(NamedCommands):
         except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError):
             raise
         except Exception as error:
-            status = ctx.meta.get(ERROR_STATUS, EXIT_OTHER)
+            status = EXIT_NO_SPACE if isinstance(error, SpaceError) else ctx.meta.get(ERROR_STATUS, EXIT_OTHER)
             if ctx.params["debug"]:
                 echo_lines(traceback.format_exc().removesuffix("\n"), err=True)
                 ctx.exit(status)
             is_ours = isinstance(error, SobolevBatchError)
             message = str(error) if is_ours else f"{type(error).__name__}: {one_line(error)} (--debug shows where)"
             echo(f"error: {message}", err=True)
-            ctx.exit(EXIT_INPUT if isinstance(error, InputError) else status)
+            ctx.exit(EXIT_INPUT if isinstance(error, InputError) and status != EXIT_NO_SPACE else status)
 
 
 @click.group(cls=_Program, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -128,8 +128,8 @@ def cli(context: click.Context, debug: bool) -> None:
     A study file names families of meshes and a reference. `run` stores the Fourier transform of every
     mesh and prints its distance from the reference.
 
-    The exit status is 0 if all is done, 2 if the input is wrong, 3 if some meshes failed or are missing, 1 after
-    another error, 130 after Ctrl-C and 143 after SIGTERM. `compare --below` has its own.
+    The exit status is 0 if all is done, 2 if the input is wrong, 3 if some meshes failed or are missing, 5 if a disk
+    is full, 1 after another error, 130 after Ctrl-C and 143 after SIGTERM. `compare --below` has its own.
     """
     _set_up_logging(debug)
     command = cli.get_command(context, str(context.invoked_subcommand))

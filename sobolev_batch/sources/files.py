@@ -127,9 +127,7 @@ def _checked_table(table: Mapping[str, Any]) -> MeshTable:
     path, name, time = known.pop("path", None), known.pop("name", None), known.pop("time", None)
     if not isinstance(path, str):
         raise ValueError(f"each mesh needs a path, as in {_EXAMPLE}; found {quoted(dict(table))}")
-    if "\0" in path:
-        raise ValueError(f"no file can have the name {quoted(path)}, which holds the character NUL")
-    checked: MeshTable = {"path": path}
+    checked: MeshTable = {"path": _checked_path(path)}
     if name is not None:
         checked["name"] = number_as_text(name) if is_finite_number(name) else name
         problem = label_problem(checked["name"]) if isinstance(checked["name"], str) else "it is no text"
@@ -150,6 +148,14 @@ def _checked_table(table: Mapping[str, Any]) -> MeshTable:
         else:
             raise ValueError(f"{key} of {quoted(path)} must be a number or a line of text, found {quoted(value)}")
     return checked
+
+
+def _checked_path(path: str) -> str:
+    if "\0" in path:
+        raise ValueError(f"no file can have the name {quoted(path)}, which holds the character NUL")
+    if "://" in path:
+        raise ValueError(f"{quoted(path)} is a URL, and meshes are read from files; fetch it, and give its path")
+    return path
 
 
 def _is_nothing(value: object) -> bool:
@@ -174,7 +180,9 @@ class FileSource(Source):
 
     paths: (
         Annotated[
-            tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=1, strict=False), at_most(MOST_MESHES)
+            tuple[Annotated[str, Field(min_length=1)], ...],
+            Field(min_length=1, strict=False),
+            at_most(MOST_MESHES),
         ]
         | None
     ) = None
@@ -271,8 +279,10 @@ def matching_files(folder: Path, path: str) -> list[Path]:
 
     Hidden files match only where a part of the glob begins with a dot; ``**`` follows no links to folders.
     """
-    if "\0" in path:
-        raise StudyError(f"paths: no file can have the name {quoted(path)}, which holds the character NUL")
+    try:
+        _checked_path(path)
+    except ValueError as error:
+        raise StudyError(f"paths: {error}") from error
     # A file may have wildcard characters in its name; an existing one is meant.
     if not has_magic(path) or os.path.isfile(folder / path):
         return [folder / path]

@@ -10,7 +10,6 @@ the store. So no link below its folder is followed: checksums would reveal a wro
 from __future__ import annotations
 
 import asyncio
-import errno
 import os
 import re
 import stat
@@ -30,7 +29,7 @@ from zarr.core.common import AccessModeLiteral
 from zarr.core.sync import sync
 from zarr.storage import FsspecStore, LocalStore
 
-from sobolev_batch.errors import DamageError, SobolevBatchError, StoreError
+from sobolev_batch.errors import DamageError, SobolevBatchError, SpaceError, StoreError, is_for_want_of_space
 
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)(://|::)(.*)", re.DOTALL)
 _FOLDER_SCHEMES = ("file", "local")
@@ -228,12 +227,12 @@ class Location:
             text = " ".join((getattr(error, "strerror", None) or str(error) or type(error).__name__).split())
             if not self.scheme and getattr(error, "filename", None):
                 text += f": {getattr(error, 'filename', None)}"
-            if getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT):
-                text += "; make room there"
+            is_full = is_for_want_of_space(error)
+            text += "; make room there" if is_full else ""
             if self.scheme:
                 # The address of a server may contain a password.
                 text = self._explain(error, re.sub(r"//[^/\s]*@", "//", text))
-            raise StoreError(f"{self}: the store cannot be {verb}: {text}") from error
+            raise (SpaceError if is_full else StoreError)(f"{self}: the store cannot be {verb}: {text}") from error
 
     def _explain(self, error: Exception, text: str) -> str:
         """Return the reason of a failure of object storage, and its remedy."""

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.fft import next_fast_len
 
 from sobolev_batch.arrays import ComplexDtype
-from sobolev_batch.errors import InputError
+from sobolev_batch.errors import MemoryLimitError
 
 Shape = tuple[int, int, int]
 
@@ -223,7 +223,7 @@ def fastest_spec(whole: NufftSpec, workload: Workload, costs: Costs, allowed_byt
         else:
             least_bytes = min(least_bytes, costs.projected_bytes(smaller[-1], workload))
     if not candidates:
-        raise InputError(
+        raise MemoryLimitError(
             f"{allowed_bytes / 1e6:.4g} MB of memory are too little for a block of {' x '.join(map(str, whole.shape))} "
             f"samples: give at least {math.ceil(least_bytes / 1e5) / 10:.4g} MB besides the result and the mesh"
         )

@@ -53,6 +53,8 @@ def job_of(plan: Plan, store_path: Path, label: str = "ico/5", allowed_bytes: fl
 def test_a_mesh_is_one_task_whatever_the_memory_allows(store_path: Path) -> None:
     plan = make_plan(Study.from_table(FINE))
     whole = compute_mesh(job_of(plan, store_path), plan.blocks)
+    reason = compute_mesh(job_of(plan, store_path.with_name("other.zarr"), allowed_bytes=1.0), plan.blocks).reason
+    assert "is what the limit of its worker leaves; raise that limit by --worker-memory" in reason
     # So little that points are added up in batches.
     job = replace(job_of(plan, store_path, allowed_bytes=1.25e7), index=1)
     record = compute_mesh(job, plan.blocks)

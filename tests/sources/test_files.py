@@ -136,6 +136,7 @@ TWINS = "differ only in case or in the encoding of accents; rename one$"
         (["a.off"], "a**", "the glob 'a\\*\\*' is none: Invalid pattern"),
         *(([f"{one}.off", f"{other}.off"], "*.off", TWINS) for one, other in (("A", "a"), ("STRASSE", "straße"))),
         (["caf\u00e9.off", "cafe\u0301.off"], "*.off", TWINS),
+        ([], "s3://bucket/*.ply", "'s3://bucket/\\*.ply' is a URL, and meshes are read from files"),
         ([], "a\0b.off", "NUL"),
         ([], "a\0*.off", "NUL"),
         ([], "x" * 5000 + ".off", "1000 are allowed"),

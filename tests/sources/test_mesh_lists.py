@@ -56,6 +56,7 @@ def test_tables_of_a_study_keep_their_order(tmp_path: Path) -> None:
         ([{"path": "a.ply", "name": " x"}], "which is no label: it begins or ends with a blank"),
         ([{"path": "a.ply", "time": "soon"}], "has the time 'soon'; a time is a number"),
         ([{"path": "a.ply", "colour": [1, 2]}], "colour of 'a.ply' must be a number or a line of text"),
+        ([{"path": "http://host/a.ply"}], "'http://host/a.ply' is a URL, and meshes are read from files"),
         ([{"path": "a.ply", "a/b": 1}], "'a/b' cannot name metadata: it holds '/'"),
         ([], "must be the path of a CSV file"),
         (["a.ply"], "must be the path of a CSV file"),

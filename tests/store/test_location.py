@@ -15,7 +15,7 @@ from zarr.core.sync import sync
 
 from sobolev_batch import Study, run
 from sobolev_batch.batch.status import Status
-from sobolev_batch.errors import StoreError
+from sobolev_batch.errors import SpaceError, StoreError
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location, path_in
 from tests.support.studies import small_table
@@ -96,6 +96,7 @@ def test_documents_of_a_folder_and_of_a_url(place: str, tmp_path: Path) -> None:
         (TimeoutError(), "nothing answers there within"),
         (FileNotFoundError("b"), r"there is no bucket 'bucket' \(b\)"),
         (OSError(errno.ENOSPC, "No space left"), "No space left; make room there$"),
+        (OSError(errno.EDQUOT, "Quota"), "Quota; make room there$"),
         (ZeroDivisionError("of a driver"), "of a driver"),
     ],
 )
@@ -103,6 +104,7 @@ def test_reasons_in_one_line(error: Exception, reason: str) -> None:
     message = rf"^s3://bucket/a: the store cannot be read: {reason}"
     with pytest.raises(StoreError, match=message) as caught, Location.parse("s3://bucket/a").access("read"):
         raise error
+    assert isinstance(caught.value, SpaceError) == ("make room" in reason)
     assert "\n" not in str(caught.value)
     # Of a folder, what is no failure of the disk is a defect of ours.
     if not isinstance(error, OSError):

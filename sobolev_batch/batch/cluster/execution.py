@@ -18,7 +18,7 @@ from distributed.comm import CommClosedError
 from distributed.scheduler import KilledWorker
 
 from sobolev_batch.batch.cluster.workers import GPU, MEMORY, Workers
-from sobolev_batch.errors import ClusterError, StoreError, one_line
+from sobolev_batch.errors import ClusterError, SpaceError, StoreError, one_line
 from sobolev_batch.store.records import Record
 
 Result = TypeVar("Result")
@@ -395,8 +395,8 @@ class _Loop(Generic[Result]):
         if run.wave is None:
             raise ValueError("the run waits for nothing")
         try:
-            if type(outcome) is StoreError:
-                raise StoreError(f"{outcome}; then the same command goes on from what is stored") from outcome
+            if type(outcome) in (StoreError, SpaceError):
+                raise type(outcome)(f"{outcome}; then the same command goes on from what is stored") from outcome
             if isinstance(outcome, StoreError):
                 raise outcome
             run.wave.take(task, outcome)

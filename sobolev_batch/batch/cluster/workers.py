@@ -236,6 +236,7 @@ class VersionPlugin(WorkerPlugin):  # type: ignore[misc]  # distributed has no t
 
 def prepare_workers(client: Client, libraries: Iterable[str] = ()) -> Workers:
     """Install the plugins on the workers of a cluster, also on those that join later, and return what they offer."""
+    await_a_worker(client)
     client.subscribe_topic(_KEPT_OUT, lambda event: _log.warning("%s", event[1]))
     client.register_plugin(VersionPlugin(*require_same_versions(client, libraries)), name=_KEPT_OUT)
     client.register_plugin(BackendPlugin(), name=_NAME)
@@ -245,6 +246,13 @@ def prepare_workers(client: Client, libraries: Iterable[str] = ()) -> Workers:
     if not members:
         raise ClusterError("the cluster has no workers; start some with: dask worker ADDRESS")
     return Workers(members)
+
+
+def await_a_worker(client: Client) -> None:
+    """Wait until a cluster has a worker, which an adaptive one starts for a task that waits."""
+    if not client.scheduler_info(n_workers=-1)["workers"]:
+        _log.warning("the cluster at %s has no worker yet; waiting for one to start", client.scheduler.address)
+        client.submit(abs, 0, pure=False).result()
 
 
 def worker_slowness(client: Client, address: str) -> float:
@@ -261,6 +269,14 @@ def worker_backend(choice: str) -> Backend:
     except ValueError:  # called outside a cluster
         return CPU
     return plugins[_NAME].backend if _NAME in plugins else CPU
+
+
+def worker_limit() -> int:
+    """Return the limit of the memory of the worker that runs this task, in bytes; 0 without one."""
+    try:
+        return int(get_worker().memory_manager.memory_limit or 0)
+    except ValueError:  # called outside a cluster
+        return 0
 
 
 async def _describe(dask_worker: Worker) -> WorkerInfo | None:
@@ -393,6 +409,7 @@ def require_store_access(client: Client, location: Location, lock: Lock) -> None
     Raises:
         StoreError: A worker does not see it; the message names the worker.
     """
+    await_a_worker(client)
     for worker, problem in client.run(_problem, location, lock, on_error="return").items():
         if isinstance(problem, BaseException):
             # A worker that has just gone says nothing about the store; tasks will tell.

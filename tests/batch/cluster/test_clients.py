@@ -29,6 +29,14 @@ def test_a_scheduler_without_workers() -> None:
         remote_client(cluster.scheduler_address).__enter__()
 
 
+def test_a_cluster_that_adapts_from_no_worker_at_all(study: Study) -> None:
+    options = {"processes": False, "protocol": "inproc://", "threads_per_worker": 1}
+    pages = {"dashboard_address": "127.0.0.1:0", "worker_dashboard_address": "127.0.0.1:0"}
+    with LocalCluster(n_workers=0, **options, **pages) as cluster, Client(cluster) as client:
+        cluster.adapt(minimum=0, maximum=1, interval="20ms")
+        assert len(run(study, "memory://adapted.zarr", client).computed) == 5
+
+
 @pytest.mark.all
 def test_a_scheduler_that_others_could_reach_is_for_those_who_say_so(tmp_path: Path) -> None:
     """0.0.0.0 leads to loopback, and is not known to: what listens here nobody else reaches."""
