@@ -45,6 +45,7 @@ class Mesh:
     Args:
         vertices: Coordinates, real (n, 3), finite, in the user's unit of length.
         triangles: Indices into ``vertices``, integer (m, 3), m > 0.
+        notes: What was found where the mesh was read, and may make one doubt it, a sentence each.
 
     Raises:
         MeshError: Coordinates are not finite; indices are negative, out of range or not integers; there are no
@@ -58,12 +59,14 @@ class Mesh:
 
     vertices: Reals
     triangles: Indices
+    notes: tuple[str, ...] = ()
 
-    def __init__(self, vertices: ArrayLike, triangles: ArrayLike) -> None:
+    def __init__(self, vertices: ArrayLike, triangles: ArrayLike, notes: tuple[str, ...] = ()) -> None:
         checked_vertices = _checked_vertices(vertices)
         checked_triangles = _checked_triangles(triangles, len(checked_vertices))
         object.__setattr__(self, "vertices", checked_vertices)
         object.__setattr__(self, "triangles", checked_triangles)
+        object.__setattr__(self, "notes", tuple(notes))
         self._require_sizes()
 
     def _require_sizes(self) -> None:
@@ -81,11 +84,12 @@ class Mesh:
             )
 
     @classmethod
-    def from_checked(cls, vertices: Reals, triangles: Indices) -> Mesh:
+    def from_checked(cls, vertices: Reals, triangles: Indices, notes: tuple[str, ...] = ()) -> Mesh:
         """Return a mesh of arrays that were checked before, without a copy; they become read-only."""
         mesh = object.__new__(cls)
         object.__setattr__(mesh, "vertices", _frozen(vertices))
         object.__setattr__(mesh, "triangles", _frozen(triangles))
+        object.__setattr__(mesh, "notes", notes)
         return mesh
 
     def corners(self, selection: slice | Indices = _ALL) -> Corners:
@@ -136,7 +140,7 @@ class Mesh:
         """Return the mesh after x -> scale * (x - origin)."""
         vertices = self.vertices - np.asarray(origin)
         vertices *= scale
-        moved = Mesh.from_checked(vertices, self.triangles)
+        moved = Mesh.from_checked(vertices, self.triangles, self.notes)
         moved._require_sizes()
         return moved
 
@@ -325,8 +329,8 @@ class Mesh:
     def __repr__(self) -> str:
         return f"Mesh({len(self.vertices)} vertices, {len(self.triangles)} triangles)"
 
-    def __reduce__(self) -> tuple[type[Mesh], tuple[Reals, Indices]]:
-        return Mesh, (self.vertices, self.triangles)
+    def __reduce__(self) -> tuple[type[Mesh], tuple[Reals, Indices, tuple[str, ...]]]:
+        return Mesh, (self.vertices, self.triangles, self.notes)
 
 
 def dot(first: Vectors, second: Vectors) -> Reals:

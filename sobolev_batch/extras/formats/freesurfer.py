@@ -57,7 +57,7 @@ def parse_freesurfer(data: bytes) -> Raw:
         raise MeshError(f"the file has {len(data) - end} bytes behind its {triangles} triangles")
     coordinates = np.frombuffer(data, ">f4", 3 * vertices, start)
     corners = np.frombuffer(data, ">i4", 3 * triangles, start + coordinates.nbytes)
-    return coordinates.reshape(-1, 3), corners.reshape(-1, 3)
+    return Raw(coordinates.reshape(-1, 3), corners.reshape(-1, 3))
 
 
 FORMATS = (Format(("freesurfer",), parse_freesurfer, 18, 80, is_name=is_freesurfer_name),)

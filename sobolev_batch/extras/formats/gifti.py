@@ -59,7 +59,7 @@ def parse_gifti(data: bytes) -> Raw:
         raise MeshError(
             f"a GIFTI surface has one point set and one triangle array, found {len(points)} and {len(faces)}"
         )
-    return points[0], faces[0]
+    return Raw(points[0], faces[0])
 
 
 def _decoded(text: str, attributes: Mapping[str, str], number: int, most_bytes: int) -> NDArray[Any]:

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from sobolev_batch.arrays import Indices
 from sobolev_batch.errors import MeshError, from_extra
 from sobolev_batch.geometry.formats.by_name import Format
-from sobolev_batch.geometry.formats.parsing import Raw, triangle_fans, xml_events
+from sobolev_batch.geometry.formats.parsing import Raw, xml_events
+from sobolev_batch.geometry.formats.polygons import cut_polygons
 
 # VTK's numbers for types of cells: vertices and lines, then those with area, triangles, polygons and quadrilaterals.
 _WITHOUT_AREA, _VTK_TRIANGLE, _POLYGON, _QUAD = (1, 2, 3, 4), 5, 7, 9
@@ -56,8 +57,8 @@ def parse_vtk(data: bytes, suffix: str) -> Raw:
             "the file has ghost cells, which belong to other parts of a surface; remove them: in PyVista by "
             "mesh.remove_ghost_cells()"
         )
-    triangles = _vtk_triangles(kinds, _vtk_values(cells.GetConnectivityArray()), _vtk_values(cells.GetOffsetsArray()))
-    return _vtk_values(dataset.GetPoints().GetData()), triangles
+    faces = _faces(kinds, _vtk_values(cells.GetConnectivityArray()), _vtk_values(cells.GetOffsetsArray()))
+    return cut_polygons(_vtk_values(dataset.GetPoints().GetData()), *faces)
 
 
 def _check_xml(data: bytes) -> None:
@@ -108,8 +109,8 @@ def _vtk_values(array: Any) -> NDArray[Any]:
     return values.astype(np.int64) if values.dtype.kind in "iu" else values
 
 
-def _vtk_triangles(kinds: Indices, corners: Indices, offsets: Indices) -> Indices:
-    """Return the triangles (m, 3) of cells of some types, from the corners of all and the places where each begins."""
+def _faces(kinds: Indices, corners: Indices, offsets: Indices) -> tuple[Indices, Indices]:
+    """Return the corners of cells with area, and their numbers, from those of all and the places where each begins."""
     sizes = np.diff(offsets)
     if len(sizes) != len(kinds) or (sizes < 0).any() or sizes.sum() != len(corners):
         raise MeshError(f"the offsets of its {len(kinds)} cells do not run from 0 up to their {len(corners)} corners")
@@ -122,7 +123,7 @@ def _vtk_triangles(kinds: Indices, corners: Indices, offsets: Indices) -> Indice
             "take the surface and cut it into triangles first: in PyVista by "
             "grid.extract_surface().triangulate(), then save it as .vtp"
         )
-    return triangle_fans(corners[np.repeat(has_area, sizes)], sizes[has_area])
+    return corners[np.repeat(has_area, sizes)], sizes[has_area]
 
 
 FORMATS = (

@@ -1,4 +1,4 @@
-"""What parsers share: the bytes of regular files, unpacked but bounded; XML in small parts; polygons as triangles."""
+"""What parsers share: the bytes of regular files, unpacked but bounded; XML in small parts; strips as triangles."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from io import BufferedReader
 from pathlib import Path, PurePath
-from typing import IO, Any, cast
+from typing import IO, Any, NamedTuple, cast
 from xml.parsers import expat
 
 import numpy as np
@@ -22,8 +22,15 @@ from sobolev_batch.errors import MeshError
 from sobolev_batch.machine import machine_memory
 from sobolev_batch.parameters import format_bytes
 
-# What a parser makes of a file: vertices (n, 3) and triangles (m, 3).
-Raw = tuple[NDArray[Any], NDArray[Any]]
+
+class Raw(NamedTuple):
+    """What a parser makes of a file: vertices (n, 3), triangles (m, 3), and notes on what it found, in sentences."""
+
+    vertices: NDArray[Any]
+    triangles: NDArray[Any]
+    notes: tuple[str, ...] = ()
+
+
 # How the bytes of an open file are read, of which so many are wanted.
 Read = Callable[[BufferedReader, int], bytes]
 
@@ -167,26 +174,6 @@ def _unpacked_bounded(packed: bytes, factor: float) -> bytes:
     return data.getvalue()
 
 
-def triangle_fans(corners: Indices, sizes: Indices) -> Indices:
-    """Cut each polygon into the fan of triangles around its first corner, exact for convex ones, int64 (m, 3).
-
-    The corners are vertex indices of all polygons, one after the other, the sizes their numbers. Triangles of a polygon
-    lie next to each other.
-    """
-    if not len(sizes):
-        raise MeshError("the file has no faces")
-    short = np.flatnonzero(sizes < 3)
-    if short.size:
-        raise MeshError(f"face {short[0] + 1} has {sizes[short[0]]} vertices, expected three or more")
-    if (sizes == 3).all():
-        return corners.reshape(-1, 3)
-    # The place of the first corner of each triangle's polygon, and the rank of the triangle in it.
-    ends = np.cumsum(sizes - 2)
-    first = np.repeat(np.cumsum(sizes) - sizes, sizes - 2)
-    rank = np.arange(ends[-1]) - np.repeat(ends - (sizes - 2), sizes - 2)
-    return np.stack([corners[first], corners[first + rank + 1], corners[first + rank + 2]], axis=1)
-
-
 def triangle_strips(corners: Indices, sizes: Indices) -> Indices:
     """Cut strips into triangles (m, 3), every second one turned round, so that all face the same side.
 
@@ -207,10 +194,10 @@ def triangle_strips(corners: Indices, sizes: Indices) -> Indices:
     return np.stack([corners[places + odd], corners[places + 1 - odd], corners[places + 2]], axis=1)
 
 
-def merge_coincident(vertices: NDArray[np.floating], triangles: Indices) -> tuple[NDArray[np.floating], Indices]:
+def merge_coincident(vertices: NDArray[np.floating], triangles: Indices) -> Raw:
     """Merge vertices with exactly the same coordinates, for formats that repeat them."""
     if not np.isfinite(vertices).all():
         # The mesh refuses them and names the entries.
-        return vertices, triangles
+        return Raw(vertices, triangles)
     merged, indices = np.unique(vertices, axis=0, return_inverse=True)
-    return merged, indices.reshape(-1)[triangles]
+    return Raw(merged, indices.reshape(-1)[triangles])

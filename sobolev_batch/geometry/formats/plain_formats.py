@@ -14,7 +14,8 @@ import numpy as np
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import MeshError
-from sobolev_batch.geometry.formats.parsing import Raw, merge_coincident, triangle_fans
+from sobolev_batch.geometry.formats.parsing import Raw, merge_coincident
+from sobolev_batch.geometry.formats.polygons import cut_polygons
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import normals
 
@@ -49,7 +50,7 @@ def parse_obj(data: bytes) -> Raw:
         elif words[0] == "f":
             corners.extend(_obj_corner(word, len(vertices) // 3, len(sizes) + 1) for word in words[1:])
             sizes.append(len(words) - 1)
-    return np.array(vertices).reshape(-1, 3), triangle_fans(np.array(corners), np.array(sizes))
+    return cut_polygons(np.array(vertices).reshape(-1, 3), np.array(corners), np.array(sizes))
 
 
 def parse_off(data: bytes) -> Raw:
@@ -82,7 +83,7 @@ def parse_off(data: bytes) -> Raw:
             f"the OFF header announces {vertex_count + face_count} lines, {vertex_count} for vertices and "
             f"{face_count} for faces, found {found}"
         )
-    return np.array(vertices).reshape(-1, 3), triangle_fans(np.array(corners), np.array(sizes))
+    return cut_polygons(np.array(vertices).reshape(-1, 3), np.array(corners), np.array(sizes))
 
 
 def parse_stl(data: bytes) -> Raw:

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Indices
 from sobolev_batch.errors import MeshError
-from sobolev_batch.geometry.formats.parsing import Raw, triangle_fans, triangle_strips
+from sobolev_batch.geometry.formats.parsing import Raw, triangle_strips
+from sobolev_batch.geometry.formats.polygons import cut_polygons
 from sobolev_batch.geometry.mesh import Mesh
 
 # A header ends within this many bytes: room for a thousand lines, and quick to look through.
@@ -108,11 +109,13 @@ def parse_ply(data: bytes) -> Raw:
     axes = [values for values, sizes in columns.get("vertex", {}).values() if sizes is None]
     if len(axes) < 3:
         raise MeshError("the PLY header declares no vertices with the numbers x, y and z")
-    cuts = {"face": triangle_fans, "tristrips": triangle_strips}
-    found = [cut(*_corners(name, columns[name])) for name, cut in cuts.items() if counts.get(name)]
+    vertices = np.stack(axes, axis=1)
+    found = [cut_polygons(vertices, *_corners("face", columns["face"]))] if counts.get("face") else []
+    if counts.get("tristrips"):
+        found.append(Raw(vertices, triangle_strips(*_corners("tristrips", columns["tristrips"]))))
     if not found:
         raise MeshError("the file has no faces")
-    return np.stack(axes, axis=1), np.concatenate(found) if found[1:] else found[0]
+    return found[0]._replace(triangles=np.concatenate([one.triangles for one in found])) if found[1:] else found[0]
 
 
 def announced_size(header: bytes, length: int) -> tuple[int, float]:

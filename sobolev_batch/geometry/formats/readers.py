@@ -12,6 +12,7 @@ import numpy as np
 from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.formats.by_name import BY_SUFFIX, mesh_format
 from sobolev_batch.geometry.formats.parsing import (
+    Raw,
     Read,
     checked_length,
     is_gzipped,
@@ -32,8 +33,8 @@ def read_mesh(path: str | Path) -> Mesh:
     """Read a mesh from a PLY, OBJ, STL, OFF, glTF, GLB, GIFTI, VTK or FreeSurfer file, gzipped or not.
 
     The format follows from the name: FreeSurfer's are such as lh.pial, VTK's end in .vtk, .vtp or .vtu. Coordinates
-    keep the precision of the file. Polygons are cut into fans of triangles, which is exact for convex ones. STL and
-    glTF repeat vertices, so those that coincide exactly are merged; vertices of other formats stay as they are.
+    keep the precision of the file. Polygons are cut into triangles, where they bend least. STL and glTF repeat
+    vertices, so those that coincide exactly are merged; vertices of other formats stay as they are.
 
     Args:
         path: Path of the file.
@@ -72,10 +73,10 @@ def read_mesh_by(path: Path, read: Read) -> Mesh:
         # Numbers that overflow become infinite, which the mesh refuses.
         with np.errstate(all="ignore"):
             # Only the parser holds the bytes, so that it can free them early.
-            vertices, triangles = form.parse(data.pop())
-            for array in (vertices, triangles):
+            raw = Raw(*form.parse(data.pop()))
+            for array in (raw.vertices, raw.triangles):
                 array.setflags(write=False)
-            return Mesh(vertices, triangles)
+            return Mesh(*raw)
     except MeshError as error:
         raise MeshError(f"{path}: {_shortened(error)}") from error
     except MemoryError as error:

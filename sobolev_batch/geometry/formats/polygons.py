@@ -1,0 +1,207 @@
+"""Polygons cut into triangles, by rules that depend neither on the corner that a file lists first nor on its order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import mapbox_earcut
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.arrays import Indices, Reals
+from sobolev_batch.errors import MeshError
+from sobolev_batch.geometry.formats.parsing import Raw
+from sobolev_batch.geometry.mesh import cross, cross_lengths, dot
+
+# Quadrilaterals that are cut at a time: their corners and temporaries stay in cache.
+_BATCH = 1 << 13
+# Cosines that differ by less are equal: those of bends below a ten thousandth, which single precision may have made.
+_EQUAL_COSINES = 1e-9
+# Cosine in place of that beside a triangle without area: the other diagonal is better, even if it bends the face.
+_NO_COSINE = -0.5
+# Weights of the axes in the height of a vertex: no usual edge is at right angles to them, so that none lies level.
+_AXES = (1.0, 0.618, 0.414)
+# Faces that are bent by less, as a fraction of the size of the mesh, are flat: single precision rounds as much.
+_FLAT = 1e-6
+# The largest turn to the wrong side, and error of the sum of all turns, of a convex polygon, in radians.
+_WRONG_TURN, _WRONG_SUM = 1e-9, 1e-3
+# Areas of a face that differ by less, as a fraction, are equal, and those below a fraction of the squared size of the
+# mesh are rounding.
+_EQUAL_AREAS, _NO_AREA = 1e-6, 1e-12
+
+
+@dataclass
+class _Found:
+    """What the faces of a file have that leaves their area open; heights and areas in units of length."""
+
+    size: float
+    bent: int = 0
+    height: float = 0.0
+    difference: float = 0.0
+    crossed: int = 0
+    crossed_area: float = 0.0
+    bent_area: float = 0.0
+
+    def add(self, heights: Reals, areas: Reals, differences: Reals, is_crossed: NDArray[np.bool_]) -> None:
+        """Count faces by their heights, their areas, and how those differ between the ways to cut them."""
+        has_area = areas > _NO_AREA * self.size**2
+        is_crossed = has_area & is_crossed
+        is_bent = has_area & ~is_crossed & (heights > _FLAT * self.size)
+        self.bent += int(np.count_nonzero(is_bent))
+        self.height = max(self.height, float(heights.max(initial=0.0, where=is_bent)))
+        self.difference += float(differences.sum(where=is_bent))
+        self.crossed += int(np.count_nonzero(is_crossed))
+        self.crossed_area += float(areas.sum(where=is_crossed))
+        self.bent_area += float(areas.sum(where=is_bent))
+
+    def notes(self, faces: int) -> tuple[str, ...]:
+        """Return what was found, in words."""
+        found = []
+        if self.bent:
+            found.append(
+                f"{self.bent:,} of {faces:,} faces are not flat: the other way to cut them moves them by up to "
+                f"{self.height:.2g} and changes their area of {self.bent_area:.3g} by {self.difference:.2g}"
+            )
+        if self.crossed:
+            found.append(
+                f"{self.crossed:,} of {faces:,} faces cross themselves or fold over, so that nothing tells their area; "
+                f"{self.crossed_area:.3g} is counted"
+            )
+        return tuple(found)
+
+
+def cut_polygons(vertices: NDArray[Any], corners: Indices, sizes: Indices) -> Raw:
+    """Cut polygons into triangles (m, 3), those of each next to each other, and note what leaves their area open.
+
+    A quadrilateral is cut along the diagonal at which it bends less, and of two equal ones from its lowest corner. A
+    polygon of more corners is cut from its lowest corner if it is convex, and else by its ears, seen along its normal;
+    holes may be joined to its outline by bridges. The vertices are (n, 3). The corners are vertex indices of all
+    polygons, one after the other, the sizes their numbers.
+    """
+    if not len(sizes):
+        raise MeshError("the file has no faces")
+    short = np.flatnonzero(sizes < 3)
+    if short.size:
+        raise MeshError(f"face {short[0] + 1} has {sizes[short[0]]} vertices, expected three or more")
+    if (sizes == 3).all():
+        return Raw(vertices, corners.reshape(-1, 3))
+    if corners.min() < 0 or corners.max() >= len(vertices):
+        face = int(np.searchsorted(np.cumsum(sizes), np.argmax((corners < 0) | (corners >= len(vertices))), "right"))
+        raise MeshError(f"face {face + 1} has an index outside 0..{len(vertices) - 1}")
+    axes = [np.ascontiguousarray(axis, np.float64) for axis in vertices.T]
+    # Vertices that no face uses may be no numbers.
+    found = _Found(float(np.linalg.norm(np.fmax.reduce(vertices, axis=0) - np.fmin.reduce(vertices, axis=0))))
+    if (sizes == 4).all():
+        return Raw(vertices, _cut_quads(axes, corners.reshape(-1, 4), found), found.notes(len(sizes)))
+    starts = np.cumsum(sizes) - sizes
+    parts, owners = [], []
+    for faces in (np.flatnonzero(sizes == 3), np.flatnonzero(sizes == 4), np.flatnonzero(sizes > 4)):
+        if not faces.size:
+            continue
+        size = int(sizes[faces[0]])
+        if size > 4:
+            triangles, own = _cut_others(axes, corners[np.repeat(sizes > 4, sizes)], sizes[faces], found)
+        else:
+            triangles, own = corners[starts[faces, None] + np.arange(size)], np.arange(len(faces)).repeat(size - 2)
+            triangles = triangles if size == 3 else _cut_quads(axes, triangles, found)
+        parts.append(triangles)
+        owners.append(faces[own])
+    order = np.argsort(np.concatenate(owners), kind="stable")
+    return Raw(vertices, np.concatenate(parts)[order], found.notes(len(sizes)))
+
+
+def _cut_quads(axes: list[Reals], quads: Indices, found: _Found) -> Indices:
+    """Return the triangles (2 k, 3) of quadrilaterals (k, 4)."""
+    cut = quads.take([0, 1, 2, 0, 2, 3], axis=1)
+    for start in range(0, len(quads), _BATCH):
+        batch = quads[start : start + _BATCH]
+        edges = _edges(axes, batch)
+        first, second = cross(edges[0], edges[1]), cross(edges[1], edges[2])
+        product = dot(first, second)
+        is_flat = product * np.abs(product) > (1 - 2 * _EQUAL_COSINES) * dot(first, first) * dot(second, second)
+        rest = np.flatnonzero(~is_flat)
+        if rest.size:
+            turned = start + rest[_is_turned(axes, batch[rest], found)]
+            cut[turned] = quads[turned].take([1, 2, 3, 1, 3, 0], axis=1)
+    return cut.reshape(-1, 3)
+
+
+def _edges(axes: list[Reals], quads: Indices) -> list[tuple[Reals, Reals, Reals]]:
+    """Return the vectors from the first corner of each quadrilateral to the others, by their coordinates."""
+    (a, *others), (x, y, z) = np.ascontiguousarray(quads.T), axes
+    first = x.take(a), y.take(a), z.take(a)
+    return [(x.take(one) - first[0], y.take(one) - first[1], z.take(one) - first[2]) for one in others]
+
+
+def _is_turned(axes: list[Reals], quads: Indices, found: _Found) -> NDArray[np.bool_]:
+    """Tell which quadrilaterals (k, 4) are better cut from their second corner, and count those that are not flat."""
+    b, c, d = (np.array(edge) for edge in _edges(axes, quads))
+    # Twice the areas, with the normals, of the triangles abc, acd, bcd and abd.
+    first, second, fourth = (np.array(cross(*pair)) for pair in ((b, c), (c, d), (b, d)))
+    whole = first + second
+    lengths = np.sqrt([dot(normal, normal) for normal in (first, second, whole - fourth, fourth, whole)])
+    products = lengths[0] * lengths[1], lengths[2] * lengths[3]
+    # Beside a triangle without area nothing bends, but the other diagonal is better if it does not fold the face.
+    cosines = [
+        np.divide(dot(one, other), product, out=np.full(len(quads), _NO_COSINE), where=product > 0)
+        for one, other, product in zip((first, whole - fourth), (second, fourth), products, strict=True)
+    ]
+    heights = [sum(weight * axis[corner] for weight, axis in zip(_AXES, axes, strict=True)) for corner in quads.T]
+    is_lower = np.minimum(heights[1], heights[3]) < np.minimum(heights[0], heights[2])
+    gain = cosines[1] - cosines[0]
+    turned: NDArray[np.bool_] = np.where(np.abs(gain) < _EQUAL_COSINES, is_lower, gain > 0)
+    areas = lengths[0] + lengths[1], lengths[2] + lengths[3]
+    offsets = np.divide(np.abs(dot(whole, b)), lengths[4], out=np.zeros(len(quads)), where=lengths[4] > 0)
+    area, difference = np.where(turned, areas[1], areas[0]) / 2, np.abs(areas[1] - areas[0]) / 2
+    found.add(offsets, area, difference, np.maximum(*cosines) < _NO_COSINE)
+    return turned
+
+
+def _cut_others(axes: list[Reals], corners: Indices, sizes: Indices, found: _Found) -> tuple[Indices, Indices]:
+    """Return the triangles (k, 3) of polygons of more than four corners, and the polygon of each triangle (k,)."""
+    starts, polygon = np.cumsum(sizes) - sizes, np.repeat(np.arange(len(sizes)), sizes)
+    heights = np.nan_to_num(sum(weight * axis[corners] for weight, axis in zip(_AXES, axes, strict=True)))
+    lowest = np.flatnonzero(heights == np.minimum.reduceat(heights, starts)[polygon])
+    lowest = lowest[np.searchsorted(polygon[lowest], np.arange(len(sizes)))]
+    begins, rank = starts[polygon], np.arange(len(corners)) - starts[polygon]
+    corners = corners[begins + (rank + (lowest - starts)[polygon]) % sizes[polygon]]
+    following = begins + (rank + 1) % sizes[polygon]
+    # From a point nearby: far from the origin, the parts cancel.
+    points = np.array([axis[corners] - axis[corners[begins]] for axis in axes])
+    # Newell's normals, of twice the area that the outline encloses along them.
+    normals = np.add.reduceat(np.array(cross(points, points[:, following])), starts, axis=1)
+    # Without the axis that is nearest to its normal, a polygon is as convex as along it.
+    dropped = np.abs(normals).argmax(axis=0)
+    twice = normals[dropped, np.arange(len(sizes))]
+    plane = np.array([points[(dropped[polygon] + shift) % 3, np.arange(len(corners))] for shift in (1, 2)])
+    sides = plane[:, following] - plane
+    nexts = sides[:, following]
+    turns = np.arctan2((sides[0] * nexts[1] - sides[1] * nexts[0]) * np.sign(twice)[polygon], (sides * nexts).sum(0))
+    is_simple = np.minimum.reduceat(turns, starts) > -_WRONG_TURN
+    is_simple &= np.abs(np.add.reduceat(turns, starts) - 2 * np.pi) < _WRONG_SUM
+    # Coordinates that are no numbers are refused later.
+    is_simple |= ~np.isfinite(np.add.reduceat(np.abs(points).sum(axis=0), starts))
+    owners = np.repeat(np.arange(len(sizes)), sizes - 2)
+    ranks = np.arange(len(owners)) - (np.cumsum(sizes - 2) - (sizes - 2))[owners]
+    fans = starts[owners, None] + np.stack([np.zeros_like(ranks), ranks + 1, ranks + 2], axis=1)
+    parts, of_parts = [fans[is_simple[owners]]], [owners[is_simple[owners]]]
+    is_crossed = np.zeros(len(sizes), bool)
+    for one in np.flatnonzero(~is_simple):
+        own = slice(starts[one], starts[one] + sizes[one])
+        ears = mapbox_earcut.triangulate_float64(plane[:, own].T.copy(), np.array(sizes[one : one + 1], np.uint32))
+        # All ears face the same side. Without any the outline encloses nothing.
+        ears = ears.reshape(-1, 3)[:, :: 1 if twice[one] > 0 else -1].astype(np.int64) + starts[one]
+        parts.append(ears if len(ears) else fans[owners == one])
+        of_parts.append(np.full(len(parts[-1]), one))
+        a, b, c = (plane[:, corner] for corner in parts[-1].T)
+        total = np.abs((b - a)[0] * (c - a)[1] - (b - a)[1] * (c - a)[0]).sum()
+        is_crossed[one] = abs(total - abs(twice[one])) > _EQUAL_AREAS * total
+    triangles, owners = np.concatenate(parts), np.concatenate(of_parts)
+    lengths = np.sqrt(dot(normals, normals))
+    offsets = dot(points, normals[:, polygon] / np.where(lengths > 0, lengths, 1.0)[polygon])
+    a, b, c = (points[:, corner] for corner in triangles.T)
+    areas = np.bincount(owners, cross_lengths(b - a, c - a), len(sizes)) / 2
+    heights = np.maximum.reduceat(offsets, starts) - np.minimum.reduceat(offsets, starts)
+    found.add(heights, areas, np.abs(areas - lengths / 2), is_crossed)
+    return corners[triangles], owners
