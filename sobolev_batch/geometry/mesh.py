@@ -11,6 +11,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.compiled import pays
@@ -158,13 +160,21 @@ class Mesh:
 
     @cached_property
     def counts(self) -> dict[str, int]:
-        """Counts of what is unusual about the mesh. All of it is legitimate in a surface measure, none is repaired.
+        """Counts of how triangles are connected, and of what is unusual. Nothing of that is repaired.
 
         The keys are "zero_area_triangles", to double precision; "duplicate_triangles", which repeat the three vertices
         of an earlier one in any orientation; "boundary_edges" of exactly one triangle; "nonmanifold_edges" of more
-        than two; and "inconsistent_edges" of exactly two that face opposite sides there.
+        than two; "inconsistent_edges" of exactly two that face opposite sides there; "components" that share no vertex;
+        and "euler_characteristic", the number of vertices in use less that of edges plus that of triangles. Closed
+        surfaces have two for each component, less two for each handle.
+
+        >>> import sobolev_batch as sb
+        >>> counts = sb.shapes.Torus(1.0, 0.3).mesh(12, 8).counts
+        >>> counts["components"], counts["euler_characteristic"]
+        (1, 0)
         """
-        boundary, nonmanifold, inconsistent = _unusual_edges(self.triangles, len(self.vertices))
+        unused = len(self.vertices) - len(self.used_vertices)
+        edges, components, boundary, nonmanifold, inconsistent = _edges_of(self.triangles, len(self.vertices))
         zero_area = sum(int(np.count_nonzero(self.areas[batch] <= limit)) for batch, limit in self._zero_areas())
         return {
             "zero_area_triangles": zero_area,
@@ -172,6 +182,8 @@ class Mesh:
             "boundary_edges": boundary,
             "nonmanifold_edges": nonmanifold,
             "inconsistent_edges": inconsistent,
+            "components": components - unused,
+            "euler_characteristic": len(self.used_vertices) - edges + len(self.triangles),
         }
 
     @property
@@ -441,8 +453,11 @@ def _frozen(array: NDArray[_Scalar]) -> NDArray[_Scalar]:
     return array
 
 
-def _unusual_edges(triangles: Indices, vertex_count: int) -> tuple[int, int, int]:
-    """Return the numbers of edges of exactly one triangle, of more than two, and of two that run along it alike."""
+def _edges_of(triangles: Indices, vertex_count: int) -> tuple[int, int, int, int, int]:
+    """Return the number of edges, and into how many parts they connect all vertices.
+
+    Return also the numbers of edges of exactly one triangle, of more than two, and of two that run along it alike.
+    """
     keys = np.empty(3 * len(triangles), dtype=np.int64)
     for start in range(0, len(triangles), _BATCH):
         ends = np.ascontiguousarray(triangles[start : start + _BATCH].T)
@@ -458,14 +473,18 @@ def _unusual_edges(triangles: Indices, vertex_count: int) -> tuple[int, int, int
     keys.sort()
     keys = keys[np.searchsorted(keys, 0) :]
     if not keys.size:
-        return 0, 0, 0
+        return 0, vertex_count, 0, 0, 0
     is_alike = (keys[1:] == keys[:-1]) & (keys[1:] % 3 < 2)
     keys //= 3
     repeats = np.concatenate([[False], keys[1:] == keys[:-1], [False, False]])
     first, second, third = ~repeats[:-2], repeats[1:-1], repeats[2:]
     inconsistent = first[:-1] & (second & ~third)[:-1] & is_alike
     boundary, nonmanifold = first & ~second, first & second & third
-    return int(np.count_nonzero(boundary)), int(np.count_nonzero(nonmanifold)), int(np.count_nonzero(inconsistent))
+    pairs = np.divmod(keys[first], vertex_count)
+    links = coo_array((np.ones(len(pairs[0]), dtype=np.int8), pairs), shape=(vertex_count, vertex_count))
+    components, _ = connected_components(links, directed=False)
+    numbers = [int(np.count_nonzero(edges)) for edges in (boundary, nonmanifold, inconsistent)]
+    return len(pairs[0]), int(components), numbers[0], numbers[1], numbers[2]
 
 
 def _duplicate_triangles(triangles: Indices) -> int:

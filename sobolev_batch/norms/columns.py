@@ -89,6 +89,8 @@ VARIABLES: Mapping[str, Mapping[str, str]] = {
     "nonmanifold_edges": described("number of edges of more than two triangles", NUMBER),
     "inconsistent_edges": described("number of edges whose two triangles face opposite sides", NUMBER),
     "volume": described("enclosed volume", VOLUME, description="negative for a mesh that is inside out"),
+    "components": described("number of parts that share no vertex", NUMBER),
+    "euler_characteristic": described("number of vertices less that of edges plus that of triangles", NUMBER),
     "smallest_angle": described("smallest angle of the triangles", ANGLE),
     "aspect_ratio": described("largest aspect ratio of the triangles; 1 is equilateral", NUMBER),
     "duplicate_triangles": described("number of triangles that repeat another", NUMBER),

@@ -15,7 +15,7 @@ from typing import Any, TypeGuard
 from sobolev_batch.sources.names import node_problem
 
 # The layout that docs/store.md describes has this version.
-SCHEMA_VERSION = 11
+SCHEMA_VERSION = 12
 
 Document = dict[str, Any]
 

@@ -48,8 +48,8 @@ class Facts:
         vertices, triangles: Counts; zero for a surface that is no mesh.
         area: Total area in the study's unit of length, squared.
         edge_length_mean, edge_length_max: Lengths of triangle sides, in the study's unit; NaN without triangles.
-        zero_area_triangles, duplicate_triangles, boundary_edges, nonmanifold_edges, inconsistent_edges: See
-            `Mesh.counts`.
+        zero_area_triangles, duplicate_triangles, boundary_edges, nonmanifold_edges, inconsistent_edges, components,
+        euler_characteristic: See `Mesh.counts`.
         volume: Enclosed volume, see `Mesh.volume`.
         smallest_angle: Smallest angle of all triangles, in degrees.
         aspect_ratio: Largest aspect ratio of all triangles, see `Mesh.aspect_ratios`.
@@ -67,6 +67,8 @@ class Facts:
     boundary_edges: int = 0
     nonmanifold_edges: int = 0
     inconsistent_edges: int = 0
+    components: int = 0
+    euler_characteristic: int = 0
     volume: float = float("nan")
     smallest_angle: float = float("nan")
     aspect_ratio: float = float("nan")

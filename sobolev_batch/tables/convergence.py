@@ -41,7 +41,18 @@ from sobolev_batch.tables.store_accessor import convergence_at, order_note
 from sobolev_batch.tables.text import between, count, percent, with_error, wrapped
 from sobolev_batch.transform.lattice import Orders
 
-_ABOUT = ("family", "name", "level", "rank", "ordered_by", "status", "reason", "triangles", "vertices", "seconds")
+# What a remesher may break.
+CONNECTION_COLUMNS = (
+    Column("components", "components", "{:,.0f}".format),
+    Column("euler_characteristic", "Euler", "{:,.0f}".format),
+    Column("boundary_edges", "open edges", "{:,.0f}".format),
+    Column("nonmanifold_edges", "non-manifold", "{:,.0f}".format),
+    Column("inconsistent_edges", "flipped", "{:,.0f}".format),
+    Column("zero_area_triangles", "degenerate", "{:,.0f}".format),
+)
+# Integers, or missing where a mesh failed.
+_COUNTS = ("triangles", "vertices", *(column.name for column in CONNECTION_COLUMNS))
+_ABOUT = ("family", "name", "level", "rank", "ordered_by", "status", "reason", *_COUNTS, "seconds")
 _NUMBERS = (
     "edge_length",
     "distance",
@@ -59,8 +70,6 @@ _NUMBERS = (
 _MADE = tuple(item.name for item in fields(Cost))
 # What the rows of all objects have besides.
 _OF_ALL = ("object", "reference", "unit_length")
-# Integers, or missing where a mesh failed.
-_COUNTS = ("triangles", "vertices")
 _NOTE = """\
 Relative distances are fractions of the reference's norm. Errors are meant as bounds,
 the sums of truncation (frequencies beyond the highest one), aliasing (spacing of the
@@ -138,7 +147,8 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
         - order, mesh, family, name, level; rank, the place in the family from coarse to fine, and ordered_by, what
           decides on it (level, triangles, names or time);
         - status, reason, triangles, vertices, seconds (of computing), edge_length (mean), and the metadata that the
-          study gives its meshes; make_seconds, make_cpu_seconds, make_peak_bytes and exit_status of what made them,
+          study gives its meshes; what a remesher may break, by the names of `Mesh.counts`: components,
+          euler_characteristic, boundary_edges, nonmanifold_edges, inconsistent_edges and zero_area_triangles; make_seconds, make_cpu_seconds, make_peak_bytes and exit_status of what made them,
           where the study does;
         - distance (to the reference), error and its parts truncation, aliasing, discretisation and statistical;
           relative and relative_error (over the norm of the reference);
@@ -166,6 +176,8 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
     'reference'
     >>> frame.set_index("mesh")["rate"].round(1).to_dict()
     {'icosphere/0': nan, 'icosphere/1': 2.0, 'icosphere/2': 2.0, 'icosphere/3': 2.0}
+    >>> frame[["components", "euler_characteristic"]].value_counts().to_dict()
+    {(1, 2): 4}
     """
     return _joined(tables_of(store, order, x=x))
 
@@ -232,7 +244,7 @@ def _rows(tree: xr.DataTree, order: Orders | None) -> pd.DataFrame:
         # Tables of older versions lack some.
         numbers = {key: row[key].values[others] for key in _NUMBERS if key in row}
         frames.append(pd.DataFrame({"order": s, **columns, **numbers, **nearness}))
-    frame = pd.concat(frames, ignore_index=True).astype(dict.fromkeys(_COUNTS, "Int64"))
+    frame = pd.concat(frames, ignore_index=True).astype({name: "Int64" for name in _COUNTS if name in about})
     frame.attrs = {key: convergence.attrs[key] for key in ("rtol", "computed") if key in convergence.attrs}
     if known := metadata_of(tree):
         frame.attrs["metadata"] = known
@@ -297,6 +309,10 @@ def _sections(name: str, tree: xr.DataTree, frame: pd.DataFrame, x: str) -> Iter
         once = marked[marked["order"] == marked["order"].iloc[0]]
         others = (_MESH, *_metric_columns(tree)), once
         yield Section("Other distances, the same at all orders", [others])
+    connection = [column for column in CONNECTION_COLUMNS if column.name in frame]
+    if frame[[column.name for column in connection]].nunique().gt(1).any():
+        once = marked[marked["order"] == marked["order"].iloc[0]]
+        yield Section("How triangles are connected", [((_MESH, *connection), once)])
     if "computed" in frame.attrs:
         yield Section(sentences=order_note(tree, frame.attrs["computed"]))
     doubts = [f"{mesh}: {doubt}" for mesh, doubt in placement_doubts(tree).items()]

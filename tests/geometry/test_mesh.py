@@ -87,19 +87,23 @@ def test_a_total_area_of_zero_is_refused(vertices: Any) -> None:
     ("extra_vertices", "triangles", "counts"),
     [
         ([], TETRAHEDRON_TRIANGLES, mesh_counts(0, 0, 0, 0)),
-        ([], TETRAHEDRON_TRIANGLES[:3], mesh_counts(0, 0, 3, 0)),
+        ([], TETRAHEDRON_TRIANGLES[:3], mesh_counts(0, 0, 3, 0, euler=1)),
         # A fourth vertex on the edge 0-1: a triangle of no area that is open along two new edges.
         ([[0.5, 0, 0]], [*TETRAHEDRON_TRIANGLES, [0, 1, 4]], mesh_counts(1, 0, 2, 1)),
         # The first face again, in the same and in the other orientation.
-        ([], [*TETRAHEDRON_TRIANGLES, [0, 2, 1]], mesh_counts(0, 1, 0, 3)),
-        ([], [*TETRAHEDRON_TRIANGLES, [1, 2, 0], [0, 1, 2]], mesh_counts(0, 2, 0, 3)),
+        ([], [*TETRAHEDRON_TRIANGLES, [0, 2, 1]], mesh_counts(0, 1, 0, 3, euler=3)),
+        ([], [*TETRAHEDRON_TRIANGLES, [1, 2, 0], [0, 1, 2]], mesh_counts(0, 2, 0, 3, euler=4)),
         # A fin on the edge 0-1.
         ([[0, 0, -1]], [*TETRAHEDRON_TRIANGLES, [0, 1, 4]], mesh_counts(0, 0, 2, 1)),
-        ([[5, 5, 5], [6, 5, 5], [5, 6, 5]], [*TETRAHEDRON_TRIANGLES, [4, 5, 6]], mesh_counts(0, 0, 3, 0)),
+        (
+            [[5, 5, 5], [6, 5, 5], [5, 6, 5]],
+            [*TETRAHEDRON_TRIANGLES, [4, 5, 6]],
+            mesh_counts(0, 0, 3, 0, components=2, euler=3),
+        ),
         ([[100, 100, 100]], TETRAHEDRON_TRIANGLES, mesh_counts(0, 0, 0, 0)),
         # The edges of [0, 0, 1] are 0-1 alone: none goes from a vertex to itself.
         ([], [[0, 1, 2], [0, 0, 1]], mesh_counts(1, 0, 2, 0)),
-        ([], [*TETRAHEDRON_TRIANGLES, [0, 0, 1]], mesh_counts(1, 0, 0, 1)),
+        ([], [*TETRAHEDRON_TRIANGLES, [0, 0, 1]], mesh_counts(1, 0, 0, 1, euler=3)),
         ([], [*TETRAHEDRON_TRIANGLES[:3], [0, 2, 3]], mesh_counts(0, 0, 0, 0, 3)),
     ],
     ids=[

@@ -26,11 +26,24 @@ AWKWARD_VERTICES: Reals = BOX_VERTICES / 3 + 1 / 7
 
 
 def mesh_counts(
-    zero_area: int, duplicate: int, boundary: int, nonmanifold: int, inconsistent: int = 0
+    zero_area: int,
+    duplicate: int,
+    boundary: int,
+    nonmanifold: int,
+    inconsistent: int = 0,
+    components: int = 1,
+    euler: int = 2,
 ) -> dict[str, int]:
-    """Return counts as `Mesh.counts` gives them."""
-    names = ("zero_area_triangles", "duplicate_triangles", "boundary_edges", "nonmanifold_edges", "inconsistent_edges")
-    return dict(zip(names, (zero_area, duplicate, boundary, nonmanifold, inconsistent), strict=True))
+    """Return counts as `Mesh.counts` gives them, by default of one part with the Euler characteristic of a sphere."""
+    return {
+        "zero_area_triangles": zero_area,
+        "duplicate_triangles": duplicate,
+        "boundary_edges": boundary,
+        "nonmanifold_edges": nonmanifold,
+        "inconsistent_edges": inconsistent,
+        "components": components,
+        "euler_characteristic": euler,
+    }
 
 
 CLOSED = mesh_counts(0, 0, 0, 0)

@@ -126,6 +126,24 @@ def test_proximities_have_columns_of_their_own(tree: xr.DataTree, near: xr.DataT
     assert (first["hausdorff"], first["chamfer"], second["hausdorff"]) == (0.25, 0.125, None)
 
 
+def test_tables_tell_what_a_remesher_broke(tree: xr.DataTree) -> None:
+    names = "components", "euler_characteristic", "boundary_edges", "nonmanifold_edges", "inconsistent_edges"
+    sound, holed = (1, 2, 0, 0, 0, 0), (2, 3, 1200, 0, 5, 1)
+
+    def text(second: tuple[int, ...]) -> str:
+        numbers = dict(zip((*names, "zero_area_triangles"), zip(sound, second, [np.nan] * 6, sound), strict=False))
+        made: xr.DataTree = tree.copy()
+        made["meshes"] = xr.DataTree(
+            tree["meshes"].to_dataset().assign({k: ("mesh", [*v]) for k, v in numbers.items()})
+        )
+        assert table(made, -10).set_index("mesh").loc["f_1/1", [*names]].tolist() == [*second[:5]]
+        return format_table(made)
+
+    assert "How triangles" not in text(sound)
+    lines = [line.split() for line in text(holed).split("How triangles are connected")[1].splitlines()]
+    assert ["f_1/1", "2", "3", "1,200", "0", "5", "1"] in lines
+
+
 def test_a_store_without_upper_bounds_has_lower_ones(near: xr.DataTree) -> None:
     near["proximity"] = xr.DataTree(near["proximity"].to_dataset().drop_vars("hausdorff_upper"))
     assert re.search(r"f_1/0 +≥ 0\.25 +0\.125", format_table(near))

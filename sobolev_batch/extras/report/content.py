@@ -34,7 +34,7 @@ from sobolev_batch.extras.leagues.league import (
 )
 from sobolev_batch.store.objects import Objects
 from sobolev_batch.tables.conclusion import VERDICT_COLUMNS, Row, study_verdict
-from sobolev_batch.tables.convergence import page_columns, table, tables_of, unit_notes, with_remarks
+from sobolev_batch.tables.convergence import CONNECTION_COLUMNS, page_columns, table, tables_of, unit_notes, with_remarks
 from sobolev_batch.tables.open import finished_group, has_proximity, open_store, placement_doubts
 from sobolev_batch.tables.rendering import Column
 from sobolev_batch.tables.text import minus, percent
@@ -43,7 +43,7 @@ from sobolev_batch.transform.lattice import Lattice
 # Rows of all convergence tables together, of the table of meshes, and of reasons; browsers become slow beyond.
 MOST_CONVERGENCE_ROWS, MOST_MESH_ROWS, _MOST_REASONS = 10_000, 5_000, 2_000
 
-_COUNTS = ["vertices", "triangles", "points", "boundary_edges", "nonmanifold_edges"]
+_COUNTS = ["vertices", "triangles", "points", *(column.name for column in CONNECTION_COLUMNS)]
 _MESH_COLUMNS = (
     Column("mesh", "mesh", kind="label"),
     Column("vertices", "vertices", "{:,.0f}".format),
@@ -51,8 +51,7 @@ _MESH_COLUMNS = (
     Column("seconds", "seconds", "{:.2f}".format),
     Column("backend", "backend", kind="text"),
     Column("area", "area", "{:.4g}".format),
-    Column("boundary_edges", "boundary edges", "{:,.0f}".format),
-    Column("nonmanifold_edges", "non-manifold", "{:,.0f}".format),
+    *CONNECTION_COLUMNS,
     Column("points", "quadrature points", "{:,.0f}".format),
     Column("worker", "worker", kind="text"),
     Column("finished", "finished, UTC", kind="text"),
