@@ -21,7 +21,8 @@ No folder imports one below it; the first four import neither dask nor zarr. See
 
 The public names by subject:
 
-- Numbers with their errors, of surfaces and of fields: `distance`, `norm`. Their causes: `spectrum` (wavelengths),
+- Numbers with their errors, of surfaces and of fields: `distance`, `norm`; of a sequence of meshes, with observed
+  orders: `convergence`. Their causes: `spectrum` (wavelengths),
   `witness` (places). For orientation: `yardsticks`, and `proximity` (Hausdorff, Chamfer) and
   `vertex_distances`.
 - Meshes: `Mesh`, `as_mesh` (of paths, arrays and other libraries' meshes), `read_mesh`, `write_mesh`; `fit` moves the
@@ -37,7 +38,7 @@ The public names by subject:
   functions return), `errors`.
 """
 
-from importlib import import_module  # noqa: TID251 -- of modules of this package
+from importlib import import_module, metadata  # noqa: TID251 -- of modules of this package
 from typing import Any
 
 import lazy_loader
@@ -50,6 +51,8 @@ _RETURN_FIELDS = ("fourier_transform", "open_store")
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return metadata.version("sobolev-batch")
     if name in _RETURN_FIELDS:
         import_module(f"{__name__}.tables.accessor")
     if name == "open_store":

@@ -30,6 +30,7 @@ from .norms.causes import spectrum as spectrum
 from .norms.causes import witness as witness
 from .norms.distances import distance as distance
 from .norms.distances import norm as norm
+from .norms.rates import convergence as convergence
 from .norms.fields import fourier_transform as fourier_transform
 from .norms.yardsticks import yardsticks as yardsticks
 from .store.unlock import unlock as unlock
@@ -41,3 +42,4 @@ from .tables.open import open_store as open_store
 from .transform.lattice import Lattice as Lattice
 
 __all__: list[str]
+__version__: str

@@ -15,6 +15,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.proximity import METRICS, OF_ONE_MESH
 from sobolev_batch.norms.columns import parts_as_variables
 from sobolev_batch.norms.estimate import AREA_AND_SHAPE, PARTS
+from sobolev_batch.norms.rates import observed_rates
 from sobolev_batch.parameters import fraction
 from sobolev_batch.sources.programs import Cost
 from sobolev_batch.tables import Format
@@ -36,7 +37,6 @@ from sobolev_batch.tables.open import (
     unit_of,
 )
 from sobolev_batch.tables.rendering import Column, Section, rendered
-from sobolev_batch.tables.results import observed_rates
 from sobolev_batch.tables.store_accessor import convergence_at, order_note
 from sobolev_batch.tables.text import between, count, percent, with_error, wrapped
 from sobolev_batch.transform.lattice import Orders

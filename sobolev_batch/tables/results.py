@@ -14,18 +14,17 @@ from sobolev_batch.arrays import Reals
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
 from sobolev_batch.norms.columns import dataset_of, describe
 from sobolev_batch.norms.estimate import AREA_AND_SHAPE, NormEstimate
+from sobolev_batch.norms.rates import observed_rates
 from sobolev_batch.sources.programs import Cost
 from sobolev_batch.tables.open import FROM_COARSE_TO_FINE
 from sobolev_batch.tables.reducer import Reducer
 from sobolev_batch.tables.shells import chunks_of_spectra, read_spectra
 
 # Columns of the table of meshes that all tables have as coordinates, besides times and other metadata.
-COORDINATES = ("family", "name", "level", "status", "vertices", "triangles", "edge_length_mean", "seconds")
+_IDENTITY = ("family", "name", "is_reference", "level", "status")
+COORDINATES = (*_IDENTITY, "vertices", "triangles", "edge_length_mean", "seconds")
 # Those that only some studies have.
 SOME_COORDINATES = {"time", *(item.name for item in fields(Cost))}
-
-# A rate is formed between meshes whose sizes differ by this factor at least: between nearly equal ones chance decides.
-_LEAST_RATIO = 1.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,29 +130,3 @@ def coordinates_of(meshes: xr.Dataset, orders: Sequence[float]) -> xr.Dataset:
     return describe(
         xr.Dataset(coords={**coordinates.variables, "order": ("order", np.array(orders, dtype=np.float64))})
     )
-
-
-def observed_rates(distances: Reals, errors: Reals, sizes: Reals) -> tuple[Reals, Reals]:
-    """Return the observed order p in distance ~ size^p between each mesh and a coarser one, with its error.
-
-    The coarser one is the next whose size is larger by a tenth at least. From distances, their errors and mean edge
-    lengths (n,) follow log(d_coarse/d)/log(h_coarse/h) and its error, (n,) each: NaN for the coarsest meshes, for
-    meshes without a distance or size, and for distances below their error.
-
-    >>> sizes = np.array([0.4, 0.2, 0.1])
-    >>> observed_rates(3 * sizes**2, np.zeros(3), sizes)[0].round(6)
-    array([nan,  2.,  2.])
-    """
-    rates, uncertainties = np.full(len(distances), np.nan), np.full(len(distances), np.nan)
-    usable = np.flatnonzero(np.isfinite(sizes) & (sizes > 0) & (distances > 0) & (errors < distances))
-    by_size = usable[np.argsort(-sizes[usable], kind="stable")]
-    coarser_counts = np.searchsorted(-sizes[by_size], -_LEAST_RATIO * sizes[by_size], side="right")
-    for fine, count in zip(by_size, coarser_counts, strict=True):
-        if count:
-            coarse = by_size[count - 1]
-            span = np.log(sizes[coarse] / sizes[fine])
-            rates[fine] = np.log(distances[coarse] / distances[fine]) / span
-            # The widest that both distances allow.
-            widest = sum(-np.log1p(-errors[i] / distances[i]) for i in (coarse, fine))
-            uncertainties[fine] = widest / span
-    return rates, uncertainties

@@ -10,8 +10,8 @@ import xarray as xr
 from distributed import Client
 
 from sobolev_batch import Study, open_store, run, verify
+from sobolev_batch.norms.rates import observed_rates
 from sobolev_batch.store import encoding, layout
-from sobolev_batch.tables.results import observed_rates
 from tests.support.stores import assert_same_results
 from tests.support.studies import small_table
 

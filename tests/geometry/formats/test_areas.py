@@ -10,7 +10,7 @@ import pytest
 
 from sobolev_batch import read_mesh
 from sobolev_batch.errors import MeshError
-from tests.support.mesh_files import BIG, LITTLE, ply
+from tests.support.mesh_files import BIG, LITTLE, numbers, off, ply, stl_binary, stl_text
 from tests.support.shapes import BOX_AREA, BOX_TRIANGLES, BOX_VERTICES
 
 # Of each case: the end of the file's name, its bytes, and its area or the reason of its refusal.
@@ -39,7 +39,62 @@ def ply_with(kind: str, code: str, order: str) -> bytes:
     return header + end + rows + body
 
 
+OFF_BOX, STL_TEXT = off(BOX_VERTICES, BOX_TRIANGLES), stl_text(BOX_VERTICES, BOX_TRIANGLES)
+STL_BINARY, STL_SOLID = (stl_binary(BOX_VERTICES, BOX_TRIANGLES, start) for start in (b"box", b"solid box"))
+
+
+def off_with(kind: str, more: str, faces: list[list[int]] = BOX_TRIANGLES) -> bytes:
+    """The box with further numbers behind each vertex."""
+    rows = [f"{numbers(row)} {more}" for row in BOX_VERTICES] + [f"{len(f)} {' '.join(map(str, f))}" for f in faces]
+    return "\n".join([f"{kind}OFF", f"8 {len(faces)} 0", *rows, ""]).encode()
+
+
+def off_binary(kind: str = "", more: int = 0, colors: int = 0) -> bytes:
+    """The box in binary, with further numbers behind each vertex and each face."""
+    rows = b"".join(struct.pack(f">{3 + more}f", *row, *[0.5] * more) for row in BOX_VERTICES)
+    faces = b"".join(struct.pack(f">5i{colors}f", 3, *face, colors, *[0.5] * colors) for face in BOX_TRIANGLES)
+    return f"{kind}OFF BINARY\n".encode() + struct.pack(">3i", 8, 12, 0) + rows + faces
+
+
 CASES: dict[str, Case] = {
+    **{
+        f"stl, {what}": (".stl", content, expected)
+        for what, content, expected in (
+            ("a byte-order mark", BOM + STL_TEXT, BOX_AREA),
+            ("solid in a binary header", STL_SOLID, BOX_AREA),
+            ("solid in a binary header and a byte more", STL_SOLID + b"\0", BOX_AREA),
+            ("a byte behind the triangles", STL_BINARY + b"\0", BOX_AREA),
+            ("bytes behind the triangles", STL_BINARY + b"\n" * 49, BOX_AREA),
+            ("as many bytes as a triangle has", STL_BINARY + bytes(50), "holds 13.00 triangles, .* announces 12"),
+            ("solid in a binary header and a triangle more", STL_SOLID + bytes(50), "holds 13.00 triangles"),
+            ("solid in a binary header of a cut file", STL_SOLID[:-1], "holds 11.98 triangles, .* announces 12"),
+        )
+    },
+    **{
+        f"off, {what}": (".off", content, expected)
+        for what, content, expected in (
+            ("colours of three numbers", off_with("C", "255 0 0"), BOX_AREA),
+            ("colours of four numbers", off_with("C", "1 0.5 0 1"), BOX_AREA),
+            ("normals and colours", off_with("NC", "0 0 1 255 0 0 255"), BOX_AREA),
+            ("colours and normals", off_with("CN", "255 0 0 255 0 0 1"), BOX_AREA),
+            ("texture and all", off_with("STCN", "0 0 1 1 1 0 0 0 1"), BOX_AREA),
+            ("no magic word", OFF_BOX.removeprefix(b"OFF\n"), BOX_AREA),
+            ("no edge count and no magic word", replaced(OFF_BOX, (b"OFF\n8 12 0\n", b"8 12\n")), BOX_AREA),
+            ("faces over two lines", re.sub(rb"(?m)^(3 \d) ", rb"\1\n", OFF_BOX), BOX_AREA),
+            ("a number on each line", b"OFF\n8 12 0\n" + b"\n".join(OFF_BOX.split()[4:]), BOX_AREA),
+            ("binary", off_binary(), BOX_AREA),
+            ("binary with colours", off_binary("C", 4, 3), BOX_AREA),
+            ("binary with normals", off_binary("N", 3), BOX_AREA),
+            ("four dimensions", b"4" + OFF_BOX, "does not begin with OFF"),
+            ("normals of two numbers", off_with("N", "0 1"), "vertex 1 has 10 numbers, expected 6"),
+            ("colours of five numbers", off_with("C", "1 1 1 1 1"), "vertex 1 has 8 numbers"),
+            ("a corner missing", replaced(OFF_BOX, (b"\n3 4 6 7", b"\n3 4 6")), "face 3 has 7 numbers, expected 4"),
+            ("a face more", OFF_BOX + b"3 0 1 2\n", "but more follows: '3 0 1 2'"),
+            ("a face less", OFF_BOX.removesuffix(b"3 1 7 3\n"), "face 12 has 0 numbers"),
+            ("binary and cut", off_binary()[:-1], "breaks off in face 12 of 12"),
+            ("binary and a byte more", off_binary() + b"\n", "has 1 bytes behind"),
+        )
+    },
     **{
         f"ply, {what}": (".ply", content, BOX_AREA)
         for what, content in {
