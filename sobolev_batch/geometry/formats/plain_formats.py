@@ -5,6 +5,7 @@ They are parsed here because the libraries at hand silently lose or change faces
 
 from __future__ import annotations
 
+import codecs
 import io
 import re
 from array import array
@@ -21,8 +22,7 @@ from sobolev_batch.geometry.surface import normals
 
 # Numbers per vertex line: x y z, with a weight, a colour, or both.
 _OBJ_VERTEX_SIZES = (3, 4, 6, 7)
-# Further numbers per vertex line, by the kind of file, and per face line: a colour or its index.
-_OFF_EXTRAS = {"": 0, "N": 3, "C": 4, "CN": 7}
+# Further numbers per face: a colour or its index.
 _OFF_FACE_EXTRAS = (0, 1, 3, 4)
 # Digits of an index or count: all that fit into 64 bits. Other digits than these are digits to Python too.
 _MOST_DIGITS = 18
@@ -32,6 +32,8 @@ _LONGEST_LINE = 1 << 20
 # Seventeen digits give every double back.
 _DIGITS = "%.17g"
 _STL_HEADER_BYTES = 84
+# A text has no zero byte; a binary file of fewer than 16 million triangles has one within this many.
+_STL_START_BYTES = 1024
 _STL_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
@@ -54,44 +56,85 @@ def parse_obj(data: bytes) -> Raw:
 
 
 def parse_off(data: bytes) -> Raw:
-    """Return the vertices (n, 3) and triangles (m, 3) of an OFF file in text."""
+    """Return the vertices (n, 3) and triangles (m, 3) of an OFF file, in text or binary."""
     lines = (words for line in _text_lines(data) if (words := line.partition("#")[0].split()))
     first = next(lines, [""])
-    kind = re.fullmatch(r"(C?N?)OFF", first[0])
-    if kind is None:
-        raise MeshError("the file does not begin with OFF, COFF, NOFF or CNOFF")
-    counts = first[1:] or next(lines, [])
+    # The word may be missing.
+    kind, counts = ("OFF", first) if _COUNT.fullmatch(first[0]) else (first[0], first[1:])
+    if not re.fullmatch("(ST|C|N)*OFF", kind):
+        raise MeshError("the file does not begin with OFF, which ST, C and N may precede, nor with its counts")
+    has_colors = "C" in kind
+    least = 3 + 3 * ("N" in kind) + 2 * ("ST" in kind)
+    if counts == ["BINARY"]:
+        return _parsed_binary_off(data, least + 4 * has_colors)
+    counts = counts or next(lines, [])
     if len(counts) not in (2, 3) or not all(_COUNT.fullmatch(word) for word in counts):
         raise MeshError("the OFF header does not announce vertices and faces")
     vertex_count, face_count = int(counts[0]), int(counts[1])
     vertices, corners, sizes = array("d"), array("q"), array("q")
-    found = 0
-    for found, words in enumerate(lines, 1):
-        if found <= vertex_count:
-            if len(words) != 3 + _OFF_EXTRAS[kind[1]]:
-                raise MeshError(f"vertex {found} has {len(words)} numbers, expected {3 + _OFF_EXTRAS[kind[1]]}")
-            vertices.extend(_parsed_numbers(words, f"vertex {found}")[:3])
-            continue
-        face = f"face {found - vertex_count}"
-        size = _integer(words[0], face)
-        if size < 0 or len(words) - 1 - size not in _OFF_FACE_EXTRAS:
-            raise MeshError(f"{face} announces {size} corners, but {len(words) - 1} numbers follow")
-        corners.extend(_integer(word, face) for word in words[1 : 1 + size])
+    for number in range(1, vertex_count + 1):
+        vertex = f"vertex {number}"
+        words = _off_row(next(lines, []), lines, vertex, least + 3 * has_colors, (0, 1) if has_colors else (0,))
+        vertices.extend(_parsed_numbers(words[:3], vertex))
+    for number in range(1, face_count + 1):
+        face, words = f"face {number}", next(lines, [])
+        size = _integer(words[0], face) if words else 0
+        corners.extend(
+            _integer(word, face) for word in _off_row(words, lines, face, 1 + size, _OFF_FACE_EXTRAS)[1 : 1 + size]
+        )
         sizes.append(size)
-    if vertex_count + face_count != found:
+    if words := next(lines, []):
         raise MeshError(
-            f"the OFF header announces {vertex_count + face_count} lines, {vertex_count} for vertices and "
-            f"{face_count} for faces, found {found}"
+            f"the OFF header announces {vertex_count} vertices and {face_count} faces, but more follows: "
+            f"{' '.join(words)[:80]!r}"
         )
     return cut_polygons(np.array(vertices).reshape(-1, 3), np.array(corners), np.array(sizes))
 
 
+def _off_row(words: list[str], lines: Iterator[list[str]], owner: str, least: int, more: tuple[int, ...]) -> list[str]:
+    """Return the words of a row, and of the lines on which it goes on until it has the least number of words.
+
+    A row of one line may have more, such as a colour or its index.
+    """
+    first = len(words)
+    while len(words) < least and (following := next(lines, [])):
+        words += following
+    if len(words) - least not in (more if len(words) == first else (0,)):
+        raise MeshError(f"{owner} has {len(words)} numbers, expected {least}, or the file breaks off there")
+    return words
+
+
+def _parsed_binary_off(data: bytes, width: int) -> Raw:
+    """Return what a binary OFF file holds, whose vertices have so many numbers: all are of 32 bits, highest first."""
+    start = data.index(b"\n") + 1
+    words = np.frombuffer(data, ">i4", (len(data) - start) // 4, start)
+    vertex_count, face_count = words[:2].tolist()
+    place = 3 + width * vertex_count
+    if min(vertex_count, face_count) < 0 or place > len(words):
+        raise MeshError(f"the OFF header announces {vertex_count} vertices and {face_count} faces, more than there are")
+    vertices = words[3:place].view(">f4").reshape(-1, width)[:, :3]
+    faces = [words[:0]]
+    for number in range(1, face_count + 1):
+        size = words.item(place) if place < len(words) else -1
+        end = place + 1 + size
+        more = words.item(end) if size >= 0 and end < len(words) else -1
+        if more not in _OFF_FACE_EXTRAS:
+            raise MeshError(f"the file breaks off in face {number} of {face_count}, or has wrong counts before")
+        faces.append(words[place + 1 : end])
+        place = end + 1 + more
+    if start + 4 * place != len(data):
+        raise MeshError(f"the file has {len(data) - start - 4 * place} bytes behind its {face_count} faces")
+    sizes = np.array([len(face) for face in faces[1:]])
+    return cut_polygons(vertices.astype(np.float32), np.concatenate(faces).astype(np.int64), sizes)
+
+
 def parse_stl(data: bytes) -> Raw:
     """Return the vertices and triangles of an STL file; corners that coincide exactly are merged."""
-    announced = int.from_bytes(data[80:_STL_HEADER_BYTES], "little")
-    if len(data) >= _STL_HEADER_BYTES and len(data) == _STL_HEADER_BYTES + _STL_RECORD.itemsize * announced:
-        corners = np.frombuffer(data, _STL_RECORD, offset=_STL_HEADER_BYTES)["corners"].reshape(-1, 3)
-    elif data.lstrip()[:5].lower() == b"solid":
+    start, announced = data[:_STL_START_BYTES], int.from_bytes(data[80:_STL_HEADER_BYTES], "little")
+    # Fewer bytes than those of a triangle may follow.
+    if len(data) >= _STL_HEADER_BYTES and (len(data) - _STL_HEADER_BYTES) // _STL_RECORD.itemsize == announced:
+        corners = np.frombuffer(data, _STL_RECORD, announced, _STL_HEADER_BYTES)["corners"].reshape(-1, 3)
+    elif b"\0" not in start and start.removeprefix(codecs.BOM_UTF8).lstrip()[:5].lower() == b"solid":
         corners = _stl_text_corners(data)
     else:
         count = (len(data) - _STL_HEADER_BYTES) / _STL_RECORD.itemsize
