@@ -71,8 +71,8 @@ class ObjectPlan:
         reference: Label of the reference.
         stored: Labels of the surfaces whose fields the store has already.
         refused: Reason for each surface that fits into no worker, by label.
-        doubtful: Reason for each surface that cannot be read, or may be in another unit or place than the reference, as
-            long as surfaces are quickly looked at.
+        doubtful: Reason for each surface that cannot be read, or may be in another unit or place than the reference, or
+            was noted where its file was read, as long as surfaces are quickly looked at.
         lattice: Lattice of all fields.
         octaves: Number of octaves that are sampled beyond the lattice.
         dtype: Type of the fields, "complex128" or "complex64".
@@ -393,12 +393,13 @@ def _plan(study: Study, location: Location, workers: Workers, client: Client | N
 
 
 def _doubts_of(study_plan: Plan, stored: Mapping[str, Record]) -> dict[str, str]:
-    """Return why surfaces cannot be read, or hardly be compared with the reference, by label; none is read twice."""
+    """Return why surfaces cannot be read, or what makes one doubt them, by label; none is read twice."""
     others = {row.label: row for row in study_plan.rows if row.label != study_plan.reference}
     # What is stored need not be read again.
     known = {label: Quality.from_json(stored[label].quality).extent for label in others if label in stored}
-    look = Look({**study_plan.look.extents, **known}, dict(study_plan.look.set_aside))
+    seen = study_plan.look
+    look = Look({**seen.extents, **known}, dict(seen.set_aside), dict(seen.notes))
     members = {label: (row.family, row.member) for label, row in others.items()}
     look.at_all(members, study_plan.similarity, study_plan.reference_extent)
     doubts = {label: placement_doubt(extent, study_plan.reference_extent) for label, extent in look.extents.items()}
-    return look.set_aside | {label: doubt for label, doubt in doubts.items() if doubt is not None}
+    return look.notes | look.set_aside | {label: doubt for label, doubt in doubts.items() if doubt is not None}

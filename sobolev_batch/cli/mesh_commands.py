@@ -306,6 +306,7 @@ class _Comparison:
             "deviation": None if deviations is None else asdict(deviations),
             "doubt": self.doubt,
             "defects": {"a": self.first.defects, "b": self.second.defects},
+            "notes": {"a": self.first.notes, "b": self.second.notes},
             "unit": self.options.unit,
         }
 
@@ -346,7 +347,7 @@ def _moved(mesh: Mesh, motion: Reals) -> Mesh:
     """Return a mesh after a rigid motion (4, 4)."""
     from sobolev_batch.geometry.mesh import Mesh
 
-    return Mesh(mesh.vertices @ motion[:3, :3].T + motion[:3, 3], mesh.triangles)
+    return Mesh(mesh.vertices @ motion[:3, :3].T + motion[:3, 3], mesh.triangles, mesh.notes)
 
 
 def _motion_text(motion: Reals) -> str:
@@ -365,8 +366,9 @@ def _motion_text(motion: Reals) -> str:
 
 
 def _remarks(meshes: Mapping[str, Mesh], doubt: str | None, size: float, unit: str | None) -> Iterator[str]:
-    """Yield what may make one doubt a comparison: defects of meshes, their places, and a unit far from their size."""
+    """Yield what may make one doubt a comparison: defects, notes, places, and a unit far from their size."""
     yield from (f"{name}: {', '.join(mesh.defects)}" for name, mesh in meshes.items() if mesh.defects)
+    yield from (f"{name}: {note}" for name, mesh in meshes.items() for note in mesh.notes)
     first = next(iter(meshes))
     if doubt is not None:
         yield f"{first}: {doubt}"
@@ -470,6 +472,7 @@ def _fact_lines(facts: Mapping[str, Any]) -> Iterator[str]:
         f"aspect ratio up to {facts['aspect_ratio']:.3g} (median {facts['aspect_ratio_median']:.3g})"
     )
     yield f"  {'; '.join(facts['defects']) or 'closed, all triangles face outwards'}"
+    yield from (f"  note: {note}" for note in facts["notes"])
 
 
 def _facts(path: Path, mesh: Mesh) -> dict[str, Any]:
@@ -490,4 +493,5 @@ def _facts(path: Path, mesh: Mesh) -> dict[str, Any]:
         "aspect_ratio_median": float(np.median(ratios)),
         **mesh.counts,
         "defects": mesh.defects,
+        "notes": mesh.notes,
     }

@@ -15,6 +15,7 @@ import numpy as np
 
 from sobolev_batch.arrays import ComplexDtype, Reals
 from sobolev_batch.errors import AccuracyError, MeshError, StudyError, one_line
+from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Extent, Similarity, Surface
 from sobolev_batch.machine import available_cores
 from sobolev_batch.norms.accuracy.octaves import solve_in_octaves
@@ -58,10 +59,12 @@ class Look:
     Attributes:
         extents: Extents in the study's unit of length.
         set_aside: Reasons why others cannot be compared with the reference.
+        notes: What was noted where files were read, see `Mesh`.
     """
 
     extents: dict[str, Extent] = field(default_factory=dict)
     set_aside: dict[str, str] = field(default_factory=dict)
+    notes: dict[str, str] = field(default_factory=dict)
 
     def at(self, label: str, member: Member, similarity: Similarity, reference: Extent) -> Surface | None:
         """Return a surface in the study's unit; None where it cannot be made, or reaches far beyond the reference."""
@@ -74,7 +77,13 @@ class Look:
             self.set_aside[label] = one_line(error)
             return None
         self.extents[label] = surface.extent
+        self.take_notes(label, surface)
         return surface
+
+    def take_notes(self, label: str, surface: Surface) -> None:
+        """Keep the notes of a mesh, if it has any."""
+        if isinstance(surface, Mesh) and surface.notes:
+            self.notes[label] = "; ".join(surface.notes)
 
     def at_all(self, members: Members, similarity: Similarity, reference: Extent) -> None:
         """Look at the quickly loaded surfaces that were not looked at yet, as memory permits."""

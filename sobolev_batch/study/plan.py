@@ -133,6 +133,7 @@ def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan
     similarity = study.object.scaling or Similarity.to_unit_ball(own)
     surface = similarity.apply(own)
     choice, look = _lattice_choice(study, similarity, members, reference, surface, earlier_choice)
+    look.take_notes(reference, surface)
     require_inside(surface, choice.lattice)
     if study.proximity is not None and not isinstance(surface, Mesh):
         raise StudyError(
