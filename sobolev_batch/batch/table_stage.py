@@ -239,6 +239,7 @@ def _meshes_table(workspace: Workspace, placed: Sequence[Placed]) -> xr.Dataset:
     columns: dict[str, NDArray[np.generic]] = {
         "family": _strings([row.family for row in rows]),
         "name": _strings([row.member.name for row in rows]),
+        "is_reference": np.array([row.label == workspace.plan.reference for row in rows]),
         "level": np.array([row.member.level for row in rows], dtype=np.int64),
         "rank": np.array(ranks, dtype=np.int64),
         "ordered_by": _strings(criteria),

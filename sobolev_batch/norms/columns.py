@@ -77,6 +77,7 @@ VARIABLES: Mapping[str, Mapping[str, str]] = {
     "family": described("family of the mesh"),
     "name": described("name of the mesh in its family"),
     "study": described("study of the mesh, where several stores are open as one"),
+    "is_reference": described("true for the reference, whose distance is zero"),
     "level": described("refinement level; -1 without levels", NUMBER),
     "rank": described("place in the family, from coarse to fine where it has such an order", NUMBER),
     "ordered_by": described("what orders the family: level, triangles, names or time"),

@@ -23,6 +23,7 @@ from sobolev_batch.norms.spectrum import RadialAxis
 from sobolev_batch.norms.tail.sampling import TailSampling
 from sobolev_batch.store.encoding import ROOT, array_keys, dataset_keys
 from sobolev_batch.store.layout import (
+    DESCRIPTION,
     FIELD,
     NUMERICS,
     OCTAVES,
@@ -371,6 +372,7 @@ def _attributes(plan: Plan, labels: Sequence[str]) -> dict[str, Any]:
     study, planned = plan.study, {row.label for row in plan.rows}
     return {
         "title": study.object.title,
+        "description": DESCRIPTION,
         "schema_version": SCHEMA_VERSION,
         "study": {
             "name": plan.name,

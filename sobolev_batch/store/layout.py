@@ -53,6 +53,11 @@ SPECTRA_KEYS, PAIRS_KEYS = f"{SPECTRA_GROUP}/key", f"{DISTANCES}/key"
 # Among its versions, and those of the tables, is that of the numerics by which fields were computed.
 NUMERICS = "numerics"
 DIGEST, UNFINISHED, OBJECTS, REMOVED = "digest", "unfinished", "objects", "removed"
+# What a reader finds first.
+DESCRIPTION = (
+    "Begin with the group convergence: distances of meshes to their reference. To read all groups: "
+    'xarray.open_datatree(store, engine="zarr"), or sobolev_batch.open_store(store)'
+)
 # Tables whose rows the root of several objects repeats.
 TABLES_OF_ALL = ("meshes", "convergence", "proximity")
 # These arrays have chunks for rows, which need not be computed.

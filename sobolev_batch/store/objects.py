@@ -15,7 +15,7 @@ from sobolev_batch.errors import DamageError, InputError, StoreError
 from sobolev_batch.sources.names import node_problem, quoted
 from sobolev_batch.store.create import list_records, record_keys
 from sobolev_batch.store.encoding import ROOT
-from sobolev_batch.store.layout import OBJECTS, PAGE, RECORD, RECORDS, TABLES_OF_ALL, Store
+from sobolev_batch.store.layout import DESCRIPTION, OBJECTS, PAGE, RECORD, RECORDS, TABLES_OF_ALL, Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import LOCK_KEYS
 from sobolev_batch.store.metadata import SCHEMA_VERSION
@@ -128,8 +128,8 @@ class Objects:
             "lacking": {name: list(one.lacking) for name, one in study.objects.items() if one.lacking},
             "table": dict(study.table),
         }
-        attributes = {"title": study.title, "schema_version": SCHEMA_VERSION, "study": entry}
-        root.documents[""] = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
+        attributes = {"title": study.title, "description": DESCRIPTION, "schema_version": SCHEMA_VERSION}
+        root.documents[""] = {"zarr_format": 3, "node_type": "group", "attributes": {**attributes, "study": entry}}
         made = cls(root, study.title, study.name, tuple(study.objects), study.table)
         if present is None or present.names != made.names:
             kept = {} if present is None else present.recorded()

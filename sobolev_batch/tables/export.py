@@ -8,6 +8,7 @@ from typing import Literal
 import xarray as xr
 
 from sobolev_batch.errors import from_extra, written
+from sobolev_batch.store.lock import utc_now
 from sobolev_batch.tables.convergence import table
 from sobolev_batch.tables.open import AnyStore, as_tree, finished_group, stores_of
 from sobolev_batch.tables.rendering import json_text, machine_table
@@ -45,6 +46,8 @@ def _groups_of(store: AnyStore) -> xr.DataTree:
         root = xr.Dataset(attrs=tree.attrs)
         for group, one in (("", root), *((g, tree[g].to_dataset().load()) for g in _GROUPS if g in tree.children)):
             groups["/".join(filter(None, ("", name, group))) or "/"] = _plain(one)
+    groups.setdefault("/", xr.Dataset())
+    groups["/"].attrs |= {"Conventions": "CF-1.11", "history": f"{utc_now()} sobolev-batch export"}
     return xr.DataTree.from_dict(groups)
 
 
@@ -55,6 +58,9 @@ def _plain(dataset: xr.Dataset) -> xr.Dataset:
         if variable.dtype.kind in "TU":
             copy[name] = variable.astype(object)
         copy[name].attrs = _texts(variable.attrs)
+        if "unit length" in copy[name].attrs.get("units", ""):
+            # UDUNITS, and whoever follows CF, know no unit that is the study's own.
+            copy[name].attrs["units_in_words"] = copy[name].attrs.pop("units")
         copy[name].encoding = {}
     copy.attrs = _texts(dataset.attrs)
     return copy

@@ -44,13 +44,16 @@ def test_tables_have_coordinates_and_nothing_but_nan_of_a_mesh_that_failed(store
         assert small["mesh"].values.tolist() == ["ico/0", "ico/1", "reference"]
         assert small["family"].values.tolist() == ["ico", "ico", "reference"]
         failed = whole.sel(mesh="lost/nowhere").drop_vars(
-            ["rank", "row", "finished", "resolved", "within"], errors="ignore"
+            ["rank", "row", "finished", "numerics", "resolved", "within"], errors="ignore"
         )
         assert failed["status"] == "failed"
         assert all(values.isnull().all() for values in (*failed.data_vars.values(), failed["vertices"]))
     finished = tree["meshes"].to_dataset()["finished"]
     assert finished.dtype.kind == "M"
     assert finished.isnull().sum() == 0
+    references = tree["convergence"].to_dataset()["is_reference"]
+    assert (references.dtype.kind, references["mesh"].values[references].tolist()) == ("b", ["reference"])
+    assert "convergence" in tree.attrs["description"]
     smallest = tree["convergence"].to_dataset()["relative"].groupby("family").min()
     assert smallest["family"].values.tolist() == ["ico", "lost", "reference"]
     assert smallest.isnull().any("order").values.tolist() == [False, True, False]
