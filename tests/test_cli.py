@@ -105,6 +105,9 @@ def test_tables_as_files_of_other_programs(folder: Path, tmp_path: Path) -> None
             tree = xr.open_datatree(path, engine=library)
             assert tree["convergence"].to_dataset()["family"].values.tolist() == ["ico", "ico", "reference"]
             assert json.loads(tree.attrs["study"])["name"] == "cli"
+            assert (tree.attrs["Conventions"], tree.attrs["history"][-20:]) == ("CF-1.11", "sobolev-batch export")
+            units = {v.attrs.get("units", "") for node in tree.subtree for v in node.variables.values()}
+            assert units <= {"", "1", "s", "degree", "byte"}
 
 
 def test_tables_in_every_format_at_lists_of_orders(folder: Path) -> None:
