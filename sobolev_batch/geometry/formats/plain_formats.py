@@ -22,6 +22,13 @@ from sobolev_batch.geometry.surface import normals
 
 # Numbers per vertex line: x y z, with a weight, a colour, or both.
 _OBJ_VERTEX_SIZES = (3, 4, 6, 7)
+# Words of lines without a surface of their own: those of the format, and two for values of vertices; then those of
+# surfaces and curves of free form, and of other files.
+_OBJ_SKIPPED = re.compile(
+    "v[tnpcw]|[plgso]|mg|use(mtl|map)|m(tl|ap)lib|bevel|[cd]_interp|lod|(shadow|trace)_obj|[cs]tech|cstype|deg|bmat|"
+    "step|parm|trim|hole|scrv|sp|end|con|res"
+)
+_OBJ_REFUSED = ("surf", "curv", "curv2", "bsp", "bzp", "cdc", "cdp", "call", "csh")
 # Further numbers per face: a colour or its index.
 _OFF_FACE_EXTRAS = (0, 1, 3, 4)
 # Digits of an index or count: all that fit into 64 bits. Other digits than these are digits to Python too.
@@ -40,18 +47,20 @@ _STL_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attr
 def parse_obj(data: bytes) -> Raw:
     """Return the vertices (n, 3) and triangles (m, 3) of an OBJ file, all its objects and groups together."""
     vertices, corners, sizes = array("d"), array("q"), array("q")
-    for line in _joined_lines(data):
+    for line_number, line in _joined_lines(data):
         words = line.partition("#")[0].split()
-        if not words:
-            continue
-        if words[0] == "v":
+        kind = words[0].lower() if words else "g"
+        if kind == "v":
             number = len(vertices) // 3 + 1
             if len(words) - 1 not in _OBJ_VERTEX_SIZES:
                 raise MeshError(f"vertex {number} has {len(words) - 1} coordinates, expected three")
             vertices.extend(_parsed_numbers(words[1:4], f"vertex {number}"))
-        elif words[0] == "f":
+        elif kind in ("f", "fo"):
             corners.extend(_obj_corner(word, len(vertices) // 3, len(sizes) + 1) for word in words[1:])
             sizes.append(len(words) - 1)
+        elif not _OBJ_SKIPPED.fullmatch(kind):
+            problem = "which is not read; export polygons" if kind in _OBJ_REFUSED else "no word of the OBJ format"
+            raise MeshError(f"line {line_number} begins with {words[0][:40]!r}, {problem}")
     return cut_polygons(np.array(vertices).reshape(-1, 3), np.array(corners), np.array(sizes))
 
 
@@ -188,11 +197,12 @@ def _text_lines(data: bytes) -> Iterator[str]:
         yield line
 
 
-def _joined_lines(data: bytes) -> Iterator[str]:
-    """Yield the lines of an OBJ file, where one that ends in a backslash goes on in the next."""
+def _joined_lines(data: bytes) -> Iterator[tuple[int, str]]:
+    """Yield the lines of an OBJ file with the number of their last one; one that ends in a backslash goes on."""
     parts: list[str] = []
     length = 0
-    for line in _text_lines(data):
+    number = 0
+    for number, line in enumerate(_text_lines(data), 1):
         is_continued = line.endswith("\\\n")
         parts.append(f"{line[:-2]} " if is_continued else line)
         length += len(line)
@@ -201,10 +211,10 @@ def _joined_lines(data: bytes) -> Iterator[str]:
                 f"a line goes on for more than {_LONGEST_LINE} characters; cut its polygon into smaller ones"
             )
         if not is_continued:
-            yield "".join(parts)
+            yield number, "".join(parts)
             parts, length = [], 0
     if parts:
-        yield "".join(parts)
+        yield number, "".join(parts)
 
 
 def _parsed_numbers(words: list[str], owner: str) -> list[float]:

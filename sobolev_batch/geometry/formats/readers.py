@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import gzip
 import zlib
 from io import BufferedReader
@@ -25,6 +26,16 @@ from sobolev_batch.geometry.formats.ply import HEADER_BYTES
 from sobolev_batch.geometry.mesh import Mesh
 
 _LONGEST_REASON = 250
+# How files begin that are taken for meshes, in lower case, and what they are.
+_MISTAKEN = {
+    b"<!doctype html": "a web page, such as the message of a server; download the file again",
+    b"<html": "a web page, such as the message of a server; download the file again",
+    b"version https://git-lfs": "a pointer of Git's large file storage; fetch the file itself by git lfs pull",
+    codecs.BOM_UTF16_LE: "a text in UTF-16; save it in UTF-8",
+    codecs.BOM_UTF16_BE: "a text in UTF-16; save it in UTF-8",
+    b"\x1f\x8b": "compressed by gzip; let its name end in .gz",
+}
+_START_BYTES = 1024
 # Factor by which gzip usually shrinks mesh files.
 _PACKING = 4
 
@@ -65,11 +76,12 @@ def read_mesh_by(path: Path, read: Read) -> Mesh:
             f"{path}: no mesh format that is read has this name; known are {known} and FreeSurfer's names such as "
             "lh.pial, each also with .gz. docs/formats.md shows how to convert others"
         )
-    form = BY_SUFFIX[suffix]
+    form, start = BY_SUFFIX[suffix], b""
     try:
         # The header of a PLY file tells more than its length.
         require_memory_to_read(expected_size(path)[1])
         data = [read_unpacked(path, form.memory_bytes / form.file_bytes, read)]
+        start = data[0][:_START_BYTES]
         # Numbers that overflow become infinite, which the mesh refuses.
         with np.errstate(all="ignore"):
             # Only the parser holds the bytes, so that it can free them early.
@@ -78,14 +90,13 @@ def read_mesh_by(path: Path, read: Read) -> Mesh:
                 array.setflags(write=False)
             return Mesh(*raw)
     except MeshError as error:
-        raise MeshError(f"{path}: {_shortened(error)}") from error
+        raise MeshError(f"{path}: {_mistaken(start) or _shortened(error)}") from error
     except MemoryError as error:
         raise MeshError(f"{path}: reading it takes more memory than there is: {_shortened(error)}") from error
     except Exception as error:
         # On damaged input parsers raise anything from struct.error to RecursionError.
-        raise MeshError(
-            f"{path}: not a readable {suffix.removeprefix('.')} file: {type(error).__name__}: {_shortened(error)}"
-        ) from error
+        reason = _mistaken(start) or f"{type(error).__name__}: {_shortened(error)}"
+        raise MeshError(f"{path}: not a readable {suffix.removeprefix('.')} file: {reason}") from error
 
 
 def expected_size(path: Path) -> tuple[int, float]:
@@ -109,6 +120,12 @@ def expected_size(path: Path) -> tuple[int, float]:
         return 0, 0.0
     triangles = int(length / form.file_bytes)
     return triangles, float(triangles * form.memory_bytes)
+
+
+def _mistaken(start: bytes) -> str:
+    """Return what a file is that begins so and could not be read; empty where that is not known."""
+    start = start.removeprefix(codecs.BOM_UTF8).lstrip().lower()
+    return next((f"it is {what}" for begin, what in _MISTAKEN.items() if start.startswith(begin)), "")
 
 
 def _shortened(error: Exception) -> str:

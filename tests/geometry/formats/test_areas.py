@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import re
 import struct
 from pathlib import Path
@@ -10,8 +11,8 @@ import pytest
 
 from sobolev_batch import read_mesh
 from sobolev_batch.errors import MeshError
-from tests.support.mesh_files import BIG, LITTLE, numbers, off, ply, stl_binary, stl_text
-from tests.support.shapes import BOX_AREA, BOX_TRIANGLES, BOX_VERTICES
+from tests.support.mesh_files import BIG, LITTLE, numbers, obj, off, ply, stl_binary, stl_text
+from tests.support.shapes import BOX_AREA, BOX_QUADS, BOX_TRIANGLES, BOX_VERTICES
 
 # Of each case: the end of the file's name, its bytes, and its area or the reason of its refusal.
 Case = tuple[str, bytes, float | str]
@@ -142,6 +143,67 @@ CASES: dict[str, Case] = {
         replaced(ply(BOX_VERTICES, []), (PLY_FACES.replace(b"12", b"0"), b"element range_grid 0\n")),
         "holds points and no surface",
     ),
+}
+
+
+# Faces that are not convex, with their areas; the last has a hole, which a bridge joins to its outline.
+OUTLINES: dict[str, tuple[list[tuple[float, float]], float]] = {
+    "arrow": ([(0, 0), (4, 0), (4, 4), (3, 1)], 4.0),
+    "L": ([(0, 0), (3, 0), (3, 1), (1, 1), (1, 3), (0, 3)], 5.0),
+    "hole": ([(0, 0), (4, 0), (4, 4), (0, 4), (0, 0), (1, 1), (1, 3), (3, 3), (3, 1), (1, 1)], 12.0),
+}
+
+
+def vtk(vertices: list[tuple[float, ...]], face: list[int]) -> bytes:
+    """A legacy file of VTK of one polygon."""
+    points = "\n".join(map(numbers, vertices))
+    return (
+        f"# vtk DataFile Version 3.0\nscan\nASCII\nDATASET POLYDATA\nPOINTS {len(vertices)} double\n{points}\n"
+        f"POLYGONS 1 {len(face) + 1}\n{len(face)} {' '.join(map(str, face))}\n"
+    ).encode()
+
+
+for _name, (_outline, _area) in OUTLINES.items():
+    _vertices, _face = [(x, 1.0, y) for x, y in _outline], [*range(len(_outline))]
+    CASES |= {
+        f"obj, {_name}": (".obj", obj(_vertices, [_face]), _area),
+        f"off, {_name}": (".off", off(_vertices, [_face]), _area),
+        f"ply, {_name}": (".ply", ply(_vertices, [_face], LITTLE), _area),
+        f"vtk, {_name}": (".vtk", vtk(_vertices, _face), _area),
+    }
+
+OBJ_BOX = obj(BOX_VERTICES, BOX_QUADS)
+CASES |= {
+    **{
+        f"obj, {what}": (".obj", content, BOX_AREA)
+        for what, content in {
+            "words in upper case": OBJ_BOX.upper() + b"VN 0 0 1\nG box\n",
+            "fo for some faces": OBJ_BOX.replace(b"f 1", b"fo 1"),
+            "words without area": b"mtllib a.mtl\no b\ng c\ns 1\nusemtl d\nvp 0.5\nvt 0 0\nvn 0 0 1\nlod 1\n"
+            + OBJ_BOX
+            + b"l 1 2 3\np 1\ncstype bspline\ndeg 2\nparm u 0 1\nend\n",
+        }.items()
+    },
+    "obj, a free-form surface": (
+        ".obj",
+        OBJ_BOX + b"surf 0 1 0 1 1 2 3 4\n",
+        "line 15 begins with 'surf', which is not",
+    ),
+    "obj, a free-form curve": (".obj", OBJ_BOX + b"CURV 0 1 1 2\n", "line 15 begins with 'CURV', which is not read"),
+    "obj, strips": (".obj", OBJ_BOX + b"f 1 \\\n2 3\nts 1 2 3\n", "line 17 begins with 'ts', no word of the OBJ"),
+    "obj, a word cut short": (".obj", OBJ_BOX + b"vq 1 2 3\n", "begins with 'vq', no word of the OBJ format"),
+}
+
+# What is no mesh file, whatever its name says.
+CASES |= {
+    f"{ending}, {what}": (ending, content, reason)
+    for ending in (".obj", ".off", ".stl", ".ply", ".vtk", ".gltf")
+    for what, content, reason in (
+        ("web page", b"\n<!DOCTYPE HTML><html>404</html>", "it is a web page"),
+        ("pointer", b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n", "git lfs pull"),
+        ("UTF-16", OBJ_BOX.decode().encode("utf-16"), "save it in UTF-8"),
+        ("compressed", gzip.compress(OBJ_BOX), "let its name end in .gz"),
+    )
 }
 
 
