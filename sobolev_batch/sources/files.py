@@ -13,7 +13,6 @@ import time
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from glob import has_magic
 from importlib.metadata import PackageNotFoundError, distribution
 from io import BufferedReader
@@ -27,7 +26,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from sobolev_batch.errors import MeshError, StudyError
 from sobolev_batch.geometry.formats.by_name import mesh_format, mesh_stem
 from sobolev_batch.geometry.formats.parsing import checked_length, open_regular
-from sobolev_batch.geometry.formats.readers import expected_size, read_mesh_by
+from sobolev_batch.geometry.formats.readers import expected_size, files_beside, read_mesh_by
 from sobolev_batch.geometry.surface import Surface, is_finite_number
 from sobolev_batch.sources.names import (
     caseless_key,
@@ -225,11 +224,13 @@ class FileMember(Member):
 
     def load(self) -> Surface:
         """Read the file; its digest is then known without reading it again."""
-        return read_mesh_by(self.path, partial(_read_once, self.path))
+        return read_mesh_by(self.path, _read_once)
 
     def fingerprint(self) -> Fingerprint:
-        """Return the format, and the digest of the file."""
-        return {"file": file_digest(self.path), "format": mesh_format(self.path)}
+        """Return the format, and the digest of the file and of those beside it that it needs."""
+        own = {"file": file_digest(self.path), "format": mesh_format(self.path)}
+        beside = [file_digest(path) for path in files_beside(self.path)]
+        return {**own, "beside": beside} if beside else own
 
     def expected_size(self) -> ExpectedSize:
         """Return the size that the header announces, or that the length of the file suggests."""
@@ -358,9 +359,9 @@ def file_digest(path: Path) -> str:
         raise MeshError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
 
 
-def _read_once(path: Path, file: BufferedReader, length: int) -> bytes:
+def _read_once(file: BufferedReader, length: int) -> bytes:
     """Read an open file, and remember its digest."""
-    state, data = _settled_state(path, file), file.read(length)
+    state, data = _settled_state(Path(file.name), file), file.read(length)
     _remembered(state, hashlib.sha256(data).hexdigest())
     return data
 

@@ -1,16 +1,19 @@
-"""glTF 2.0: scenes of triangles, .gltf or .glb.
+"""glTF 2.0: scenes of triangles, .gltf or .glb, as they stand before any animation.
 
-The library at hand silently leaves out primitives, placements and encodings; here they are refused. Source: Khronos
-Group, "glTF 2.0" (2021).
+The library at hand silently leaves out primitives, placements and encodings; here they are read or refused. Source:
+Khronos Group, "glTF 2.0" (2021), with KHR_mesh_quantization and EXT_mesh_gpu_instancing.
 """
 
 from __future__ import annotations
 
 import base64
 import json
+import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from itertools import count, takewhile
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,33 +21,53 @@ from numpy.typing import NDArray
 from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.formats.by_name import Format
-from sobolev_batch.geometry.formats.parsing import Raw, merge_coincident, unpacked_limit
+from sobolev_batch.geometry.formats.parsing import Raw, merge_coincident, triangle_strips, unpacked_limit
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC3": 3}
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 # Modes of primitives: points and lines have none of the area; triangles, strips and fans of them follow.
-_TRIANGLES = 4
-# Required extensions that do not change the positions of vertices.
-_HARMLESS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "KHR_mesh_quantization", "KHR_xmp")
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_INSTANCING = "EXT_mesh_gpu_instancing"
+# Required extensions that do not change the positions of vertices, or that are read.
+_HARMLESS = re.compile(rf"[A-Z]+_(materials|texture|lights)_.*|KHR_mesh_quantization|KHR_xmp.*|{_INSTANCING}")
 
 
-def parse_gltf(data: bytes) -> Raw:
-    """Return the vertices and triangles of the default scene, in its own frame; coinciding vertices are merged."""
+def parse_gltf(data: bytes, beside: Mapping[str, bytes]) -> Raw:
+    """Return the vertices and triangles of the default scene, in its own frame; coinciding vertices are merged.
+
+    What other files hold is given by their names, as `files_beside` returns them.
+    """
     tree, binary = _document(data)
-    required = [name for name in tree.get("extensionsRequired", []) if not str(name).startswith(_HARMLESS)]
+    required = [name for name in map(str, tree.get("extensionsRequired", [])) if not _HARMLESS.fullmatch(name)]
     if required:
-        raise MeshError(f"it requires the glTF extension {', '.join(map(str, required))}; export it without")
-    buffers = _loaded_buffers(tree, binary)
-    most = unpacked_limit(len(data))
+        raise MeshError(f"it requires the glTF extension {', '.join(required)}; export it without")
+    buffers = _loaded_buffers(tree, binary, beside)
+    most = unpacked_limit(len(data) + sum(map(len, beside.values())))
     placed: list[tuple[Reals, Indices]] = []
     total = 0
-    for matrix, mesh in _placed_meshes(tree):
-        for vertices, triangles in _primitives(tree, buffers, tree["meshes"][mesh]):
-            placed.append((vertices @ matrix[:3, :3].T + matrix[:3, 3], triangles))
-            total += vertices.nbytes + triangles.nbytes
-            # Any number of nodes may place one mesh, and any number of primitives use one array.
-            if total > most:
-                raise MeshError(f"its scene repeats parts until they take more than {most} bytes; export it unfolded")
+    matrices = _node_matrices(tree)
+    for index, matrix in matrices.items():
+        node = tree["nodes"][index]
+        if "mesh" not in node:
+            continue
+        mesh = tree["meshes"][node["mesh"]]
+        for primitive in mesh["primitives"]:
+            if primitive.get("mode", _TRIANGLES) < _TRIANGLES:
+                continue
+            vertices, triangles = _primitive(tree, buffers, primitive, node.get("weights", mesh.get("weights", [])))
+            if "skin" in node:
+                skin, attributes = tree["skins"][node["skin"]], primitive["attributes"]
+                vertices = _skinned(tree, buffers, attributes, skin, matrices, vertices)
+            for instance in _instances(tree, buffers, node):
+                # Its joints alone place a skin.
+                one = np.eye(4) if "skin" in node else matrix @ instance
+                placed.append((vertices @ one[:3, :3].T + one[:3, 3], triangles))
+                total += vertices.nbytes + triangles.nbytes
+                # Any number of nodes may place one mesh, and any number of primitives use one array.
+                if total > most:
+                    raise MeshError(
+                        f"its scene repeats parts until they take more than {most} bytes; export it unfolded"
+                    )
     if not placed:
         raise MeshError("the file's scene has no faces")
     offsets = np.cumsum([0, *(len(vertices) for vertices, _ in placed)])
@@ -52,7 +75,13 @@ def parse_gltf(data: bytes) -> Raw:
     return merge_coincident(np.concatenate([vertices for vertices, _ in placed]), triangles)
 
 
-def _loaded_buffers(tree: dict[str, Any], binary: bytes | None) -> list[bytes]:
+def files_beside(data: bytes) -> tuple[str, ...]:
+    """Return the names of files that hold the buffers of a document."""
+    uris = [buffer.get("uri") for buffer in _document(data)[0].get("buffers", [])]
+    return tuple(unquote(uri) for uri in uris if uri is not None and not uri.startswith("data:"))
+
+
+def _loaded_buffers(tree: dict[str, Any], binary: bytes | None, beside: Mapping[str, bytes]) -> list[bytes]:
     """Return the bytes of each buffer of a document."""
     buffers: list[bytes] = []
     for index, buffer in enumerate(tree.get("buffers", [])):
@@ -64,19 +93,19 @@ def _loaded_buffers(tree: dict[str, Any], binary: bytes | None) -> list[bytes]:
         elif uri.startswith("data:"):
             buffers.append(base64.b64decode(uri.partition(",")[2], validate=True))
         else:
-            raise MeshError(f"its buffer {uri[:80]!r} is a file of its own; export the scene as one file, .glb")
+            buffers.append(beside[unquote(uri)])
         if len(buffers[-1]) < buffer["byteLength"]:
             raise MeshError(f"buffer {index} announces {buffer['byteLength']} bytes, found {len(buffers[-1])}")
     return buffers
 
 
 def _values(tree: dict[str, Any], buffers: list[bytes], index: int, kind: str) -> NDArray[Any]:
-    """Return the values of an accessor: (count,) of a SCALAR, (count, 3) of a VEC3."""
+    """Return the values of an accessor: (count,) of a SCALAR, (count, 3) of a VEC3 and so on."""
     accessor = tree["accessors"][index]
     if accessor["type"] != kind:
         raise MeshError(f"accessor {index} has the type {accessor['type']}, expected {kind}")
-    if "sparse" in accessor or accessor.get("normalized") or "bufferView" not in accessor:
-        raise MeshError(f"accessor {index} is sparse, normalized or without data: not supported, export it plainly")
+    if "sparse" in accessor or "bufferView" not in accessor:
+        raise MeshError(f"accessor {index} is sparse or without data: not supported, export it plainly")
     view = tree["bufferViews"][accessor["bufferView"]]
     dtype, width, count = np.dtype(_COMPONENTS[accessor["componentType"]]), _WIDTHS[kind], accessor["count"]
     stride = view.get("byteStride", dtype.itemsize * width)
@@ -90,6 +119,8 @@ def _values(tree: dict[str, Any], buffers: list[bytes], index: int, kind: str) -
     if start < 0 or start + view["byteLength"] > len(buffer):
         raise MeshError(f"a buffer view ends at byte {start + view['byteLength']} of a buffer of {len(buffer)}")
     values: NDArray[Any] = np.ndarray((count, width), dtype, buffer, start + offset, (stride, dtype.itemsize))
+    if accessor.get("normalized"):
+        values = np.maximum(values / np.iinfo(dtype).max, -1.0)
     return values[:, 0] if kind == "SCALAR" else values
 
 
@@ -98,10 +129,9 @@ def _document(data: bytes) -> tuple[dict[str, Any], bytes | None]:
     binary = None
     if data[:4] == b"glTF":
         version, length = struct.unpack_from("<II", data, 4)
-        if version != 2 or length != len(data):
-            raise MeshError(
-                f"a GLB file of version {version} and {length} bytes, found {len(data)}; expected version 2"
-            )
+        _require_second(str(version))
+        if length != len(data):
+            raise MeshError(f"a GLB file announces {length} bytes, found {len(data)}")
         size = struct.unpack_from("<I", data, 12)[0]
         rest = data[20 + size :]
         if rest:
@@ -113,11 +143,18 @@ def _document(data: bytes) -> tuple[dict[str, Any], bytes | None]:
     tree = json.loads(data.decode("utf-8"))
     if not isinstance(tree, dict):
         raise MeshError("the file's JSON is not an object")
+    # The meshes of the first version have names.
+    _require_second(str(tree.get("asset", {}).get("version", 1 + isinstance(tree.get("meshes", []), list))))
     return tree, binary
 
 
-def _placed_meshes(tree: dict[str, Any]) -> Iterator[tuple[Reals, int]]:
-    """Yield the index of each mesh of the default scene, with the matrix that places it."""
+def _require_second(version: str) -> None:
+    if version.split(".")[0] != "2":
+        raise MeshError(f"it is of version {version[:20]} of glTF, expected 2.0; export it as glTF 2.0")
+
+
+def _node_matrices(tree: dict[str, Any]) -> dict[int, Reals]:
+    """Return the matrix that places each node of the default scene, by the node's index."""
     nodes = tree.get("nodes", [])
     scenes = tree.get("scenes")
     if scenes:
@@ -126,16 +163,14 @@ def _placed_meshes(tree: dict[str, Any]) -> Iterator[tuple[Reals, int]]:
         children = {child for node in nodes for child in node.get("children", [])}
         roots = [index for index in range(len(nodes)) if index not in children]
     pending = [(index, np.eye(4)) for index in reversed(roots)]
-    visited: set[int] = set()
+    found: dict[int, Reals] = {}
     while pending:
         index, parent_matrix = pending.pop()
-        if index in visited or not 0 <= index < len(nodes):
+        if index in found or not 0 <= index < len(nodes):
             raise MeshError(f"node {index} of the scene is missing or has two parents")
-        visited.add(index)
-        matrix = parent_matrix @ _matrix(nodes[index])
+        found[index] = matrix = parent_matrix @ _matrix(nodes[index])
         pending += [(child, matrix) for child in reversed(nodes[index].get("children", []))]
-        if "mesh" in nodes[index]:
-            yield matrix, nodes[index]["mesh"]
+    return found
 
 
 def _matrix(node: dict[str, Any]) -> Reals:
@@ -153,28 +188,72 @@ def _matrix(node: dict[str, Any]) -> Reals:
     return matrix
 
 
-def _primitives(tree: dict[str, Any], buffers: list[bytes], mesh: dict[str, Any]) -> Iterator[tuple[Reals, Indices]]:
-    """Yield positions and triangles of each primitive that has area, so no points or lines."""
-    for primitive in mesh["primitives"]:
-        mode = primitive.get("mode", _TRIANGLES)
-        if mode < _TRIANGLES:
-            continue
-        if mode > _TRIANGLES:
-            raise MeshError(f"a primitive has the mode {mode}, strips or fans; export plain triangles")
-        vertices = _values(tree, buffers, primitive["attributes"]["POSITION"], "VEC3").astype(np.float64)
-        if "indices" in primitive:
-            corners = _values(tree, buffers, primitive["indices"], "SCALAR").astype(np.int64)
-        else:
-            corners = np.arange(len(vertices), dtype=np.int64)
-        if len(corners) % 3:
-            raise MeshError(f"{len(corners)} indices make no whole triangles")
+def _instances(tree: dict[str, Any], buffers: list[bytes], node: dict[str, Any]) -> Iterator[Reals]:
+    """Yield the matrix of each instance of a node's mesh, within the node."""
+    extension = node.get("extensions", {}).get(_INSTANCING)
+    if extension is None:
+        yield np.eye(4)
+        return
+    kinds = {"TRANSLATION": "VEC3", "ROTATION": "VEC4", "SCALE": "VEC3"}
+    columns = {
+        name.lower(): _values(tree, buffers, index, kinds[name])
+        for name, index in extension["attributes"].items()
+        if name in kinds
+    }
+    for rows in zip(*columns.values(), strict=True):
+        yield _matrix(dict(zip(columns, rows, strict=True)))
+
+
+def _skinned(
+    tree: dict[str, Any],
+    buffers: list[bytes],
+    attributes: dict[str, int],
+    skin: dict[str, Any],
+    matrices: dict[int, Reals],
+    vertices: Reals,
+) -> Reals:
+    """Return the vertices of a skin where its joints hold them."""
+    joints = np.array([matrices[joint] for joint in skin["joints"]])
+    if "inverseBindMatrices" in skin:
+        inverse = _values(tree, buffers, skin["inverseBindMatrices"], "MAT4").reshape(-1, 4, 4).transpose(0, 2, 1)
+        joints = joints @ inverse[: len(joints)]
+    found = np.zeros_like(vertices)
+    for group in takewhile(lambda group: f"JOINTS_{group}" in attributes, count()):
+        held = _values(tree, buffers, attributes[f"JOINTS_{group}"], "VEC4")
+        weights = _values(tree, buffers, attributes[f"WEIGHTS_{group}"], "VEC4")
+        for joint in range(4):
+            by = joints[held[:, joint], :3]
+            found += weights[:, joint, None] * (np.einsum("nij,nj->ni", by[..., :3], vertices) + by[..., 3])
+    return found
+
+
+def _primitive(
+    tree: dict[str, Any], buffers: list[bytes], primitive: dict[str, Any], weights: list[float]
+) -> tuple[Reals, Indices]:
+    """Return positions and triangles of a primitive, morphed by the weights of its targets."""
+    vertices = _values(tree, buffers, primitive["attributes"]["POSITION"], "VEC3").astype(np.float64)
+    for target, weight in zip(primitive.get("targets", []), weights, strict=False):
+        if weight and "POSITION" in target:
+            vertices += weight * _values(tree, buffers, target["POSITION"], "VEC3")
+    if "indices" in primitive:
+        corners = _values(tree, buffers, primitive["indices"], "SCALAR").astype(np.int64)
+    else:
+        corners = np.arange(len(vertices), dtype=np.int64)
+    mode = primitive.get("mode", _TRIANGLES)
+    if mode == _STRIP:
+        triangles = triangle_strips(corners, np.array([len(corners)]))
+    elif mode == _FAN and len(corners) > 2:
+        triangles = np.stack([np.full(len(corners) - 2, corners[0]), corners[1:-1], corners[2:]], axis=1)
+    elif mode == _TRIANGLES and len(corners) % 3 == 0:
         triangles = corners.reshape(-1, 3)
-        bad = np.flatnonzero((triangles >= len(vertices)).any(axis=1))
-        if bad.size:
-            raise MeshError(
-                f"{bad.size} of {len(triangles)} triangles of a primitive have indices outside 0..{len(vertices) - 1}"
-            )
-        yield vertices, triangles
+    else:
+        raise MeshError(f"{len(corners)} indices make no whole triangles of the mode {mode}")
+    bad = np.flatnonzero((triangles >= len(vertices)).any(axis=1))
+    if bad.size:
+        raise MeshError(
+            f"{bad.size} of {len(triangles)} triangles of a primitive have indices outside 0..{len(vertices) - 1}"
+        )
+    return vertices, triangles
 
 
-FORMATS = (Format((".gltf", ".glb"), parse_gltf, 18, 190),)
+FORMATS = (Format((".gltf", ".glb"), parse_gltf, 18, 190, files_beside=files_beside),)

@@ -30,22 +30,25 @@ class Format:
 
     Attributes:
         suffixes: Suffixes of its files, in lower case; one name without a dot where `is_name` tells its files.
-        parse: Function of the contents of a file, which returns vertices and triangles.
+        parse: Function of the contents of a file, which returns vertices and triangles. If there is `files_beside`, its
+            second argument is the contents of those files by their names.
         file_bytes: Bytes of each triangle, in a file of nothing but positions and triangles.
         memory_bytes: Bytes of each triangle, at the measured peak of reading it.
         write: Function of a mesh, which returns the contents of a file; None for a format that is only read.
         is_name: Tells whether a name in lower case, without .gz, is that of a file of the format, where no suffix does.
         announced_size: Function of the beginning of a file and its length, which estimates its triangles and the peak
             of the memory that reading takes, where the beginning tells more than the length.
+        files_beside: Function of the contents of a file, which returns the relative paths of files that it needs.
     """
 
     suffixes: tuple[str, ...]
-    parse: Callable[[bytes], Raw]
+    parse: Callable[..., Raw]
     file_bytes: int
     memory_bytes: int
     write: Callable[[Mesh], bytes] | None = None
     is_name: Callable[[str], bool] | None = None
     announced_size: Callable[[bytes, int], tuple[int, float]] | None = None
+    files_beside: Callable[[bytes], tuple[str, ...]] | None = None
 
 
 _PLAIN = (

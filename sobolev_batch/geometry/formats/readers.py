@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import gzip
 import zlib
+from collections.abc import Iterable
 from io import BufferedReader
 from pathlib import Path
 
@@ -38,6 +39,8 @@ _MISTAKEN = {
 _START_BYTES = 1024
 # Factor by which gzip usually shrinks mesh files.
 _PACKING = 4
+# Bytes of a file that is mostly a list of files beside it; larger ones hold their data themselves.
+_LONGEST_INDEX = 16 << 20
 
 
 def read_mesh(path: str | Path) -> Mesh:
@@ -67,6 +70,30 @@ def read_mesh(path: str | Path) -> Mesh:
     return read_mesh_by(Path(path), BufferedReader.read)
 
 
+def files_beside(path: Path) -> tuple[Path, ...]:
+    """Return the files in its folder that a mesh file needs; none where it cannot be read."""
+    form = BY_SUFFIX.get(mesh_format(path))
+    if form is None or form.files_beside is None:
+        return ()
+    try:
+        data = read_unpacked(path, form.memory_bytes / form.file_bytes)
+        return tuple(_files_beside(path, form.files_beside(data)).values())
+    except Exception:
+        # Parsers raise anything; reading the mesh tells what is wrong.
+        return ()
+
+
+def _files_beside(path: Path, names: Iterable[str]) -> dict[str, Path]:
+    """Return the paths of files that a file names; MeshError for one that does not lie in its folder, or below."""
+    found, folder = {}, path.parent.resolve()
+    for name in names:
+        # Links are followed here, so that none leads elsewhere.
+        found[name] = (folder / name).resolve()
+        if not found[name].is_relative_to(folder) or ":" in name:
+            raise MeshError(f"it needs {name[:80]!r}, which is no file in its folder; export it as one file")
+    return found
+
+
 def read_mesh_by(path: Path, read: Read) -> Mesh:
     """Read a mesh as `read_mesh` does, by a function that reads the bytes of its file."""
     suffix = mesh_format(path)
@@ -85,7 +112,14 @@ def read_mesh_by(path: Path, read: Read) -> Mesh:
         # Numbers that overflow become infinite, which the mesh refuses.
         with np.errstate(all="ignore"):
             # Only the parser holds the bytes, so that it can free them early.
-            raw = Raw(*form.parse(data.pop()))
+            if form.files_beside is None:
+                raw = Raw(*form.parse(data.pop()))
+            else:
+                factor = form.memory_bytes / form.file_bytes
+                parts = _files_beside(path, form.files_beside(data[0]))
+                require_memory_to_read(factor * (len(data[0]) + sum(part.stat().st_size for part in parts.values())))
+                beside = {name: read_unpacked(part, factor, read) for name, part in parts.items()}
+                raw = Raw(*form.parse(data.pop(), beside))
             for array in (raw.vertices, raw.triangles):
                 array.setflags(write=False)
             return Mesh(*raw)
@@ -116,6 +150,8 @@ def expected_size(path: Path) -> tuple[int, float]:
             if form.announced_size is not None:
                 unpacked = gzip.GzipFile(fileobj=file) if is_gzipped(path) else file
                 return form.announced_size(unpacked.read(HEADER_BYTES), length)
+        if length <= _LONGEST_INDEX:
+            length += sum(part.stat().st_size for part in files_beside(path))
     except (OSError, EOFError, ValueError, zlib.error, MeshError):
         return 0, 0.0
     triangles = int(length / form.file_bytes)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+import sobolev_batch as sb
 from sobolev_batch.errors import MeshError
 from sobolev_batch.shapes import icosphere
+from sobolev_batch.sources.files import FileMember
 from tests.support.mesh_files import Gltf, Read, box_scene
 from tests.support.shapes import BOX_AREA, BOX_TRIANGLES, BOX_VERTICES, CLOSED, box, mesh_counts, soup
 
@@ -64,14 +67,136 @@ def test_gltf_parts_with_many_vertices_do_not_run_into_each_other(read: Read, le
 
 
 @pytest.mark.parametrize("mode", range(7))
-def test_gltf_points_and_lines_have_no_area_and_strips_are_refused(read: Read, mode: int) -> None:
+def test_gltf_points_and_lines_have_no_area(read: Read, mode: int) -> None:
     corners = [[0, 0, 9], [1, 0, 9], [0, 2, 9], [1, 2, 9]]
-    scene = Gltf([[(BOX_VERTICES, BOX_TRIANGLES, None), (corners, [0, 1, 2], mode)]], [{"mesh": 0}])
-    if mode > 4:
-        with pytest.raises(MeshError, match=f"the mode {mode}, strips or fans; export plain triangles"):
-            read(".glb", scene.glb())
-    else:
-        assert read(".glb", scene.glb()).area == (29 if mode == 4 else 28)
+    # As a fan, the corners go round.
+    indices = {4: [0, 1, 2, 1, 3, 2], 5: [0, 1, 2, 3], 6: [0, 1, 3, 2]}.get(mode, [0, 1, 2])
+    scene = Gltf([[(BOX_VERTICES, BOX_TRIANGLES, None), (corners, indices, mode)]], [{"mesh": 0}])
+    assert read(".glb", scene.glb()).area == (30 if mode >= 4 else 28)
+
+
+def instanced() -> Gltf:
+    """Three boxes: as it is, turned and twice as large, and three times as large; 14 times its area."""
+    scene = box_scene()
+    attributes = {
+        "TRANSLATION": scene.accessor([[0, 0, 0], [9, 0, 0], [0, 40, 0]], "VEC3", "float32"),
+        "ROTATION": scene.accessor(np.array([[0, 0, 0, 1], ROTATION, [0, 0, 0, 1]]), "VEC4", "float32"),
+        "SCALE": scene.accessor([[1, 1, 1], [2, 2, 2], [3, 3, 3]], "VEC3", "float32"),
+        "_ID": scene.accessor([0, 1, 2], "SCALAR", "float32"),
+    }
+    scene.tree["nodes"][0]["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": attributes}}
+    scene.tree["extensionsRequired"] = ["EXT_mesh_gpu_instancing"]
+    return scene
+
+
+def skinned(weights: list[float]) -> Gltf:
+    """The box on two joints, one of them below the other: twice as large, and shifted by 5 from there."""
+    scene = box_scene()
+    scene.tree["nodes"] = [{"mesh": 0, "skin": 0, "scale": [10] * 3}, {"scale": [2] * 3, "children": [2]}]
+    scene.tree["nodes"].append({"translation": [5, 0, 0]})
+    scene.tree["scenes"][0]["nodes"] = [0, 1]
+    scene.tree["skins"] = [{"joints": [2, 1]}]
+    attributes = scene.tree["meshes"][0]["primitives"][0]["attributes"]
+    attributes["JOINTS_0"] = scene.accessor([[0, 1, 0, 0]] * 8, "VEC4", "uint8")
+    attributes["WEIGHTS_0"] = scene.accessor([[*weights, 0, 0]] * 8, "VEC4", "float32")
+    return scene
+
+
+def bound() -> Gltf:
+    """The box on two joints as it was bound to them: where it was."""
+    scene = skinned([0.25, 0.75])
+    inverse = [np.diag([0.5, 0.5, 0.5, 1.0]) for _ in range(2)]
+    inverse[0][0, 3] = -5.0
+    columns = np.array([matrix.T.ravel() for matrix in inverse])
+    scene.tree["skins"][0]["inverseBindMatrices"] = scene.accessor(columns, "MAT4", "float32")
+    return scene
+
+
+def morphed(*, of_node: bool) -> Gltf:
+    """The box with a target of twice its size, a quarter of the way there, and one that is not used."""
+    scene = box_scene()
+    mesh = scene.tree["meshes"][0]
+    targets = [{"POSITION": scene.accessor(BOX_VERTICES * factor, "VEC3", "float32")} for factor in (1, 99)]
+    mesh["primitives"][0]["targets"] = [*targets, {"NORMAL": 0}]
+    mesh["weights"] = [0.25 if not of_node else 7, 0, 1]
+    if of_node:
+        scene.tree["nodes"][0]["weights"] = [0.25, 0, 0]
+    return scene
+
+
+def quantised(dtype: str) -> Gltf:
+    """The box with its coordinates as fractions of the largest integer, and a node that undoes that."""
+    scene = box_scene()
+    most = np.iinfo(dtype).max
+    rows = np.zeros((8, 4 if dtype.endswith("int8") else 3))
+    rows[:, :3] = BOX_VERTICES / [1, 2, 4] * most
+    position = scene.accessor(rows, "VEC3", dtype)
+    scene.tree["bufferViews"][-1]["byteStride"] = rows.shape[1] * np.dtype(dtype).itemsize
+    scene.tree["accessors"][position]["normalized"] = True
+    scene.tree["meshes"][0]["primitives"][0]["attributes"]["POSITION"] = position
+    scene.tree["nodes"][0]["scale"] = [1, 2, 4]
+    scene.tree["extensionsRequired"] = ["KHR_mesh_quantization"]
+    return scene
+
+
+# Scenes, and the area and the upper corner of what they show before any animation.
+SHOWN: dict[str, tuple[Gltf, float, list[float]]] = {
+    "instances": (instanced(), 14 * 28, [9, 46, 12]),
+    "a joint below another": (skinned([1, 0]), 4 * 28, [12, 4, 8]),
+    "between two joints": (skinned([0.5, 0.5]), 4 * 28, [7, 4, 8]),
+    "bound": (bound(), 28, [1, 2, 4]),
+    "weights of the mesh": (morphed(of_node=False), 1.25**2 * 28, [1.25, 2.5, 5]),
+    "weights of the node": (morphed(of_node=True), 1.25**2 * 28, [1.25, 2.5, 5]),
+    **{dtype: (quantised(dtype), 28, [1, 2, 4]) for dtype in ("int8", "uint8", "int16", "uint16")},
+}
+
+
+@pytest.mark.parametrize("name", SHOWN)
+def test_gltf_scenes_are_read_as_they_stand(read: Read, name: str) -> None:
+    scene, area, upper = SHOWN[name]
+    mesh = read(".glb", scene.glb())
+    assert mesh.area == pytest.approx(area, rel=1e-6)
+    assert mesh.extent.box[1] == pytest.approx(upper, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    "extension", ["EXT_texture_webp", "KHR_texture_basisu", "MSFT_texture_dds", "KHR_materials_ior"]
+)
+def test_gltf_materials_do_not_matter(read: Read, extension: str) -> None:
+    scene = box_scene()
+    scene.tree["extensionsRequired"] = [extension]
+    assert read(".glb", scene.glb()).area == BOX_AREA
+
+
+@pytest.mark.parametrize("named", [{"asset": {"version": "1.0"}}, {"meshes": {"box": {}}, "asset": {}}])
+def test_gltf_of_the_first_version_is_named(read: Read, named: dict[str, Any]) -> None:
+    scene = box_scene()
+    scene.tree.update(named)
+    with pytest.raises(MeshError, match=r"is of version 1.* of glTF, expected 2\.0"):
+        read(".gltf", scene.gltf())
+
+
+def test_gltf_buffers_may_lie_in_the_same_folder(tmp_path: Path) -> None:
+    scene = box_scene()
+    path, inner, outer = tmp_path / "scan.gltf", tmp_path / "of scan" / "1.bin", tmp_path.parent / "outer.bin"
+    inner.parent.mkdir()
+    for part in (inner, outer):
+        part.write_bytes(scene.blob)
+    path.write_bytes(scene.gltf("of%20scan/1.bin"))
+    assert soup(sb.read_mesh(path)) == soup(box())
+    member = FileMember("scan", -1, path)
+    before = member.fingerprint()
+    assert member.expected_size().projected_bytes > 0
+    inner.write_bytes(scene.blob[::-1])
+    assert member.fingerprint() != before
+    inner.unlink()
+    inner.symlink_to(outer)
+    for uri in ("nowhere.bin", "of%20scan/1.bin", "../outer.bin", outer.as_posix(), f"file://{outer}"):
+        path.write_bytes(scene.gltf(uri))
+        reason = "No such file" if uri == "nowhere.bin" else "is no file in its folder"
+        with pytest.raises(MeshError, match=reason):
+            sb.read_mesh(path)
+    assert [*member.fingerprint()] == ["file", "format"]
 
 
 def test_gltf_vertices_may_be_interleaved_with_others(read: Read) -> None:
