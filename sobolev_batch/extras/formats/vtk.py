@@ -1,4 +1,4 @@
-"""VTK's files: polygons, and unstructured grids of polygons.
+"""VTK's files: polygons and strips of triangles, also in unstructured grids.
 
 VTK, which the extra vtk installs, reports what it cannot read and returns the rest; here every report is an error.
 """
@@ -18,11 +18,13 @@ from numpy.typing import NDArray
 from sobolev_batch.arrays import Indices
 from sobolev_batch.errors import MeshError, from_extra
 from sobolev_batch.geometry.formats.by_name import Format
-from sobolev_batch.geometry.formats.parsing import Raw, xml_events
+from sobolev_batch.geometry.formats.parsing import Raw, triangle_strips, xml_events
 from sobolev_batch.geometry.formats.polygons import cut_polygons
 
-# VTK's numbers for types of cells: vertices and lines, then those with area, triangles, polygons and quadrilaterals.
-_WITHOUT_AREA, _VTK_TRIANGLE, _POLYGON, _QUAD = (1, 2, 3, 4), 5, 7, 9
+# VTK's numbers for types of cells: vertices and lines, those with area, and those with flat faces around a volume.
+_WITHOUT_AREA, _VTK_TRIANGLE, _STRIP, _POLYGON, _PIXEL, _QUAD = (1, 2, 3, 4), 5, 6, 7, 8, 9
+_WITH_VOLUME = range(10, 17)
+_SURFACE = "python -c \"import pyvista; pyvista.read('scan{}').extract_surface().triangulate().save('scan.vtp')\""
 _RAW_DATA = re.compile(rb"<AppendedData[^>]{0,200}encoding\s{0,9}=\s{0,9}[\"']raw[\"'][^>]{0,200}>\s{0,99}_")
 _END = b"</VTKFile>"
 # VTK has one place for the reports of all threads.
@@ -42,23 +44,21 @@ def parse_vtk(data: bytes, suffix: str) -> Raw:
         # PyVista knows what each version of VTK calls them.
         kinds = np.asarray(pyvista.wrap(dataset).celltypes, dtype=np.int64)
     elif kind == "vtkPolyData":
-        if dataset.GetNumberOfStrips():
-            raise MeshError("the file has strips; cut them: in PyVista by mesh.triangulate()")
         cells = dataset.GetPolys()
-        kinds = np.full(cells.GetNumberOfCells(), _POLYGON)
+        kinds = np.repeat([_POLYGON, _STRIP], [cells.GetNumberOfCells(), dataset.GetNumberOfStrips()])
+        cells.Append(dataset.GetStrips())
     else:
-        raise MeshError(
-            f"the file holds {kind}, no polygons; take its surface first: in PyVista by "
-            "mesh.extract_surface().triangulate(), then save it as .vtp"
-        )
+        raise MeshError(f"the file holds {kind}, no polygons; take its surface: {_SURFACE.format(suffix)}")
     ghosts = dataset.GetCellGhostArray()
     if ghosts is not None and _vtk_values(ghosts).any():
         raise MeshError(
             "the file has ghost cells, which belong to other parts of a surface; remove them: in PyVista by "
             "mesh.remove_ghost_cells()"
         )
-    faces = _faces(kinds, _vtk_values(cells.GetConnectivityArray()), _vtk_values(cells.GetOffsetsArray()))
-    return cut_polygons(_vtk_values(dataset.GetPoints().GetData()), *faces)
+    corners, offsets = _vtk_values(cells.GetConnectivityArray()), _vtk_values(cells.GetOffsetsArray())
+    *faces, notes = _faces(kinds, corners, offsets, suffix)
+    raw = cut_polygons(_vtk_values(dataset.GetPoints().GetData()), *faces)
+    return raw._replace(notes=raw.notes + notes)
 
 
 def _check_xml(data: bytes) -> None:
@@ -95,9 +95,10 @@ def _dataset(data: bytes, suffix: str) -> Any:
         finally:
             vtkLogger.SetStderrVerbosity(verbosity)
             vtkOutputWindow.SetInstance(window)
-    if reports.GetOutput():
-        # Each report begins with a place in VTK's code.
-        raise MeshError(f"VTK reports: {re.sub(r'.*, line [0-9]+|[(]0x[0-9a-f]+[)]', '', reports.GetOutput())}")
+    if report := reports.GetOutput():
+        # It is bytes where it quotes what is no UTF-8. Each report begins with a place in VTK's code.
+        text = report.decode(errors="replace") if isinstance(report, bytes) else report
+        raise MeshError(f"VTK reports: {re.sub(r'.*, line [0-9]+|[(]0x[0-9a-f]+[)]', '', text)}")
     return reader.GetOutput()
 
 
@@ -109,21 +110,32 @@ def _vtk_values(array: Any) -> NDArray[Any]:
     return values.astype(np.int64) if values.dtype.kind in "iu" else values
 
 
-def _faces(kinds: Indices, corners: Indices, offsets: Indices) -> tuple[Indices, Indices]:
-    """Return the corners of cells with area, and their numbers, from those of all and the places where each begins."""
+def _faces(kinds: Indices, corners: Indices, offsets: Indices, suffix: str) -> tuple[Indices, Indices, tuple[str, ...]]:
+    """Return the corners of faces, and their numbers, from those of all cells and the places where each begins."""
     sizes = np.diff(offsets)
     if len(sizes) != len(kinds) or (sizes < 0).any() or sizes.sum() != len(corners):
         raise MeshError(f"the offsets of its {len(kinds)} cells do not run from 0 up to their {len(corners)} corners")
-    has_area = ~np.isin(kinds, _WITHOUT_AREA)
-    expected = np.select([kinds == _VTK_TRIANGLE, kinds == _QUAD, kinds == _POLYGON], [3, 4, sizes], -1)
-    wrong = np.flatnonzero(has_area & (sizes != expected))
+    has_area, has_volume = ~np.isin(kinds, _WITHOUT_AREA), np.isin(kinds, _WITH_VOLUME)
+    notes: tuple[str, ...] = ()
+    if has_volume.any() and (has_area & ~has_volume).any():
+        has_area &= ~has_volume
+        counts = f"{np.count_nonzero(has_volume):,} cells with volume", f"{np.count_nonzero(has_area):,} faces"
+        notes = (f"{counts[0]} are left out beside {counts[1]}",)
+    is_strip, is_pixel = kinds == _STRIP, kinds == _PIXEL
+    known = [kinds == _VTK_TRIANGLE, (kinds == _QUAD) | is_pixel, (kinds == _POLYGON) | is_strip]
+    wrong = np.flatnonzero(has_area & (sizes != np.select(known, [3, 4, sizes], -1)))
     if wrong.size:
         raise MeshError(
             f"cell {wrong[0] + 1} is of VTK's type {kinds[wrong[0]]} with {sizes[wrong[0]]} corners, no flat polygon; "
-            "take the surface and cut it into triangles first: in PyVista by "
-            "grid.extract_surface().triangulate(), then save it as .vtp"
+            f"take the surface: {_SURFACE.format(suffix)}"
         )
-    return corners[np.repeat(has_area, sizes)], sizes[has_area]
+    # The corners of a pixel lie row by row, and not around it.
+    last = offsets[:-1][is_pixel, None] + [2, 3]
+    corners[last] = corners[last[:, ::-1]]
+    strips = triangle_strips(corners[np.repeat(is_strip, sizes)], sizes[is_strip])
+    has_area &= ~is_strip
+    corners = np.concatenate([corners[np.repeat(has_area, sizes)], strips.ravel()])
+    return corners, np.concatenate([sizes[has_area], np.full(len(strips), 3)]), notes
 
 
 FORMATS = (

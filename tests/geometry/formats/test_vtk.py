@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -84,10 +85,9 @@ BAD: dict[str, tuple[Callable[[], Any], str]] = {
     "two corners": (lambda: polygons([*BOX_TRIANGLES, [0, 1]]), "face 13 has 2 vertices"),
     "NaN": (lambda: polygons(BOX_TRIANGLES, BOX_VERTICES / np.where(BOX_VERTICES == 4, 0, 1)), "infinite"),
     "lines alone": (lambda: pyvista.PolyData(BOX_VERTICES, lines=[2, 0, 7]), "no faces"),
-    "tetrahedra": (lambda: grid([[0, 1, 2, 4]], 10), "type 10 with 4 corners.*extract_surface"),
+    "tetrahedra": (lambda: grid([[0, 1, 2, 4]], 10), r"type 10 with 4 corners.*read\('scan.vtk'\).extract_surface"),
     "triangles of four corners": (lambda: grid(BOX_QUADS, 5), "type 5 with 4 corners"),
-    "pixels": (lambda: grid([[0, 1, 2, 3]], 8), "type 8 with 4 corners.*extract_surface"),
-    "strips": (lambda: polygons(BOX_QUADS[1:], strips=[4, 0, 1, 2, 3]), "strips; cut them"),
+    "curved triangles": (lambda: grid([[0, 1, 2, 3, 4, 5]], 22), "type 22 with 6 corners.*extract_surface"),
     "ghosts": (with_ghosts, "ghost cells"),
     "an image": (lambda: pyvista.ImageData(dimensions=(3, 3, 3)), "vtkStructuredPoints.*extract_surface"),
 }
@@ -99,6 +99,43 @@ def test_what_makes_no_mesh_is_refused(tmp_path: Path, name: str) -> None:
     make, reason = BAD[name]
     with pytest.raises(MeshError, match=f"scan.vtk: .*{reason}"):
         read_mesh(saved(make(), tmp_path / "scan.vtk"))
+
+
+def test_what_the_library_reports_need_not_be_text(tmp_path: Path) -> None:
+    path = saved(polygons(BOX_TRIANGLES), tmp_path / "scan.vtk", binary=False)
+    path.write_bytes(path.read_bytes().replace(b"POLYGONS", b"POLYG\xff\xfeNS"))
+    with pytest.raises(MeshError, match=r"scan\.vtk: VTK reports: .*Unrecognized keyword: polyg"):
+        read_mesh(path)
+
+
+# Grids of cells by their types, and what notes tell of their other cells.
+GRIDS: dict[str, tuple[list[tuple[int, list[list[int]]]], str]] = {
+    "pixels": ([(8, [[q[0], q[1], q[3], q[2]] for q in BOX_QUADS])], ""),
+    "strips": ([(6, [[q[0], q[1], q[3], q[2]] for q in BOX_QUADS[:3]]), (5, BOX_TRIANGLES[6:])], ""),
+    "faces of tetrahedra": ([(10, [[0, 1, 2, 4], [1, 2, 3, 7]]), (9, BOX_QUADS)], "2 cells with volume .* 6 faces"),
+}
+
+
+@pytest.mark.parametrize("name", GRIDS)
+@pytest.mark.parametrize("suffix", [".vtk", ".vtu"])
+def test_grids_give_their_faces(tmp_path: Path, name: str, suffix: str) -> None:
+    parts, note = GRIDS[name]
+    faces = [face for _, some in parts for face in some]
+    kinds = [kind for kind, some in parts for _ in some]
+    pyvista.UnstructuredGrid(cells(faces), kinds, BOX_VERTICES).save(tmp_path / f"scan{suffix}")
+    mesh = read_mesh(tmp_path / f"scan{suffix}")
+    # Neither strips nor pixels tell the side.
+    counts = {key: value for key, value in CLOSED.items() if key != "inconsistent_edges"}
+    assert mesh.area == BOX_AREA
+    assert counts.items() <= mesh.counts.items()
+    assert re.fullmatch(f"({note}.*)?", "".join(mesh.notes))
+
+
+@pytest.mark.parametrize("suffix", [".vtk", ".vtp"])
+def test_strips_lie_beside_polygons(tmp_path: Path, suffix: str) -> None:
+    strips = [number for q in BOX_QUADS[:2] for number in (4, q[0], q[1], q[3], q[2])]
+    read = read_mesh(saved(polygons(BOX_QUADS[2:], strips=strips), tmp_path / f"scan{suffix}"))
+    assert (read.area, read.counts) == (BOX_AREA, CLOSED)
 
 
 def test_a_comment_without_end_is_refused_before_the_library_reads_it(tmp_path: Path) -> None:
