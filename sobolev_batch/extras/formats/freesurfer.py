@@ -21,6 +21,9 @@ _MAGIC = b"\xff\xff\xfe"
 _HEADER_LINES = re.compile(rb"[^\n]{0,1000}\n[^\n]{0,1000}\n")
 # Behind the triangles there may be the geometry of the volume, which begins with one of these.
 _VOLUME = (b"\0\0\0\x14", b"\0\0\0\2\0\0\0\0\0\0\0\x14")
+# The middle of that volume, where the coordinates of the surface have their origin, within some hundred bytes.
+_MIDDLE = re.compile(rb"valid = 1\b.*\ncras\s{0,9}=([^\n]{1,200})", re.DOTALL)
+_VOLUME_BYTES = 4096
 
 
 def is_freesurfer_name(name: str) -> bool:
@@ -57,7 +60,11 @@ def parse_freesurfer(data: bytes) -> Raw:
         raise MeshError(f"the file has {len(data) - end} bytes behind its {triangles} triangles")
     coordinates = np.frombuffer(data, ">f4", 3 * vertices, start)
     corners = np.frombuffer(data, ">i4", 3 * triangles, start + coordinates.nbytes)
-    return Raw(coordinates.reshape(-1, 3), corners.reshape(-1, 3))
+    middle = _MIDDLE.search(data[end : end + _VOLUME_BYTES])
+    shift = middle[1].decode("ascii", errors="replace").split() if middle else []
+    is_shifted = any(map(float, shift))
+    notes = (f"the file has the shift c_ras = ({' '.join(shift)}) to the frame of the scanner, which is not applied",)
+    return Raw(coordinates.reshape(-1, 3), corners.reshape(-1, 3), notes if is_shifted else ())
 
 
 FORMATS = (Format(("freesurfer",), parse_freesurfer, 18, 80, is_name=is_freesurfer_name),)

@@ -34,12 +34,19 @@ def parse_gifti(data: bytes) -> Raw:
     announced, found = None, 0
     attributes: Mapping[str, str] = {}
     texts: list[str] | None = None
+    notes: tuple[str, ...] = ()
     for event, name, values in xml_events(data, "GIFTI"):
         match event, name:
             case "start", "GIFTI":
                 announced = values.get("NumberOfDataArrays")
             case "start", "DataArray":
                 attributes, found = values, found + 1
+            case "start", "MatrixData" if attributes.get("Intent") == _POINTS:
+                texts = []
+            case "end", "MatrixData" if texts is not None:
+                if not np.array_equal(np.array("".join(texts).split(), dtype=np.float64), np.eye(4).ravel()):
+                    notes = ("the file has a transform to another frame of coordinates, which is not applied",)
+                texts = None
             case "start", "Data":
                 # Others hold normals, or values at vertices.
                 texts = [] if attributes.get("Intent") in arrays else None
@@ -59,7 +66,7 @@ def parse_gifti(data: bytes) -> Raw:
         raise MeshError(
             f"a GIFTI surface has one point set and one triangle array, found {len(points)} and {len(faces)}"
         )
-    return Raw(points[0], faces[0])
+    return Raw(points[0], faces[0], notes)
 
 
 def _decoded(text: str, attributes: Mapping[str, str], number: int, most_bytes: int) -> NDArray[Any]:

@@ -7,6 +7,7 @@ import re
 import struct
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sobolev_batch import read_mesh
@@ -217,3 +218,38 @@ def test_files_have_their_area_or_the_reason_of_a_refusal(tmp_path: Path, name: 
             read_mesh(path)
     else:
         assert read_mesh(path).area == pytest.approx(expected, rel=1e-6)
+
+
+def frame_of_volume(middle: str, valid: int = 1) -> bytes:
+    return freesurfer(
+        BOX_VERTICES, BOX_TRIANGLES, VOLUME.replace(b"valid = 1", b"valid = %d" % valid) + middle.encode()
+    )
+
+
+GIFTI_BOX = gifti(BOX_VERTICES, np.array(BOX_TRIANGLES, np.int32))
+MOVED = "the file has a transform to another frame"
+# Of each case: the end of the file's name, its bytes, and how its only note begins; none where that is empty.
+NOTED: dict[str, tuple[str, bytes, str]] = {
+    "freesurfer, away from the scanner": (
+        "_lh.pial",
+        frame_of_volume("cras   = 5.5 -18.0 1e1\n"),
+        "the file has the shift c_ras = (5.5 -18.0 1e1) to",
+    ),
+    "freesurfer, at the scanner": ("_lh.pial", frame_of_volume("cras   = 0 0.0 -0\n"), ""),
+    "freesurfer, no valid volume": ("_lh.pial", frame_of_volume("cras   = 5 1 1\n", 0), ""),
+    "gifti, moved": (".gii", GIFTI_BOX.replace(b"1.000000   0.000000", b"1.000000   0.5", 1), MOVED),
+    "gifti, matrix of four numbers": (
+        ".gii",
+        re.sub(rb"(?s)(<MatrixData>).*?(</)", rb"\1 1 0 0 1\2", GIFTI_BOX),
+        MOVED,
+    ),
+    "gifti, not moved": (".gii", GIFTI_BOX, ""),
+}
+
+
+@pytest.mark.parametrize("name", NOTED)
+def test_transforms_that_are_not_applied_are_noted(read: Read, name: str) -> None:
+    ending, content, note = NOTED[name]
+    mesh = read(ending, content)
+    assert mesh.area == BOX_AREA
+    assert [found[: len(note)] for found in mesh.notes] == ([note] if note else [])
