@@ -69,6 +69,8 @@ _POWER = 4
 # The worst places face one way if the mean of their normals is as long, and the usual view shows them if the cosine
 # between both is as large. A view that is steeper than this height of the unit vector is turned to the usual one.
 _ONE_WAY, _SHOWN, _STEEPEST = 0.5, 0.4, 0.9
+# Triangles whose values are at least this fraction of the largest one are as bad as the worst.
+_WORST = 0.99
 
 # Points belong to the base that a mesh rests on up to this fraction of its height. The y axis points up only if the
 # base below it covers this fraction of the bounding box, and more than the factor times what that of the z axis covers.
@@ -136,23 +138,33 @@ class MeshView:
         return np.array([float(limit) or 1.0 for limit in limits])
 
     def towards_worst(self) -> Self:
-        """Return the view from the side of the worst places at the first order, if the usual view hides them."""
-        strength = (np.minimum(np.abs(self.values[0]) / self.color_limits[0], 1.0) ** _POWER)[self.triangles].mean(
-            axis=1
-        )
-        # The orientation of triangles is not to be trusted: away from the middle of the mesh.
-        middle = (self.vertices.min(axis=0) + self.vertices.max(axis=0)) / 2
-        own_normals = normals(self.vertices, self.triangles)
-        outwards = np.einsum("ij,ij->i", own_normals, self.vertices[self.triangles].mean(axis=1) - middle)
-        facing = strength @ (own_normals * np.where(outwards < 0, -1, 1)[:, None])
-        total = strength @ np.linalg.norm(own_normals, axis=1)
-        length = float(np.linalg.norm(facing))
-        if length <= _ONE_WAY * total or facing @ FRONT >= _SHOWN * length:
+        """Return the view from the side of the worst places at the first order, if the usual view hides them.
+
+        The worst triangle faces the eye of a view that is not the usual one.
+        """
+        moduli = np.abs(self.values[0])[self.triangles].mean(axis=1)
+        strength = np.minimum(moduli / self.color_limits[0], 1.0) ** _POWER
+        outwards = self._outwards()
+        facing, worst = strength @ outwards, outwards[np.argmax(moduli)]
+        shows_worst = np.any(outwards[moduli >= _WORST * moduli.max()] @ FRONT > 0)
+        length, total = float(np.linalg.norm(facing)), strength @ np.linalg.norm(outwards, axis=1)
+        goes_one_way = length > _ONE_WAY * total
+        if shows_worst and (not goes_one_way or facing @ FRONT >= _SHOWN * length):
             return self
-        eye = facing / length
+        eye = facing / length if goes_one_way and facing @ worst > 0 else worst / (np.linalg.norm(worst) or 1.0)
         if abs(eye[2]) > _STEEPEST:
             eye = eye + FRONT / 2
-        return replace(self, eye=eye / np.linalg.norm(eye))
+        return replace(self, eye=eye / np.linalg.norm(eye)) if eye @ worst > 0 else self
+
+    def _outwards(self) -> Reals:
+        """Return normals (m, 3) of twice the area that point outwards, as far as the mesh tells where that is."""
+        own_normals, mesh = normals(self.vertices, self.triangles), Mesh(self.vertices, self.triangles)
+        if np.isfinite(mesh.volume):
+            return own_normals * np.copysign(1.0, mesh.volume)
+        # The orientation of others is not to be trusted: away from the middle of the mesh.
+        middle = (self.vertices.min(axis=0) + self.vertices.max(axis=0)) / 2
+        outwards = np.einsum("ij,ij->i", own_normals, self.vertices[self.triangles].mean(axis=1) - middle)
+        return own_normals * np.where(outwards < 0, -1, 1)[:, None]
 
 
 def make_views(

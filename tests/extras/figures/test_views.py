@@ -336,6 +336,19 @@ def test_the_worst_place_is_in_front_whatever_the_orientation(sign: int) -> None
         assert (eye == FRONT).all() or eye @ place > 0.85
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_worst_triangle_faces_the_eye_though_it_faces_the_middle_of_the_mesh(sign: int) -> None:
+    # A post at the corner of a plate, whose inner sides face the middle of both.
+    plate, post = trimesh.creation.box((40, 40, 1)), trimesh.creation.box((2, 2, 30))
+    post.apply_translation((-18, 18, 15.5))
+    both = trimesh.util.concatenate(plate, post)
+    for face in range(len(plate.faces), len(both.faces)):
+        values = np.zeros(len(both.vertices))
+        values[both.faces[face]] = 1.0
+        seen = turned(values, both.vertices, np.asarray(both.faces, np.int32)[:, ::sign])
+        assert both.face_normals[face] @ seen.eye > 0, face
+
+
 def test_nothing_turns_what_is_the_same_all_around_and_small_parts_do_not_take_the_colours() -> None:
     for constant in (1.0, 0.0):
         assert (turned(np.full(len(SPHERE.vertices), constant)).eye == FRONT).all()
