@@ -12,7 +12,20 @@ import pytest
 
 from sobolev_batch import read_mesh
 from sobolev_batch.errors import MeshError
-from tests.support.mesh_files import BIG, LITTLE, numbers, obj, off, ply, stl_binary, stl_text
+from tests.support.mesh_files import (
+    BIG,
+    LITTLE,
+    VOLUME,
+    Read,
+    freesurfer,
+    gifti,
+    numbers,
+    obj,
+    off,
+    ply,
+    stl_binary,
+    stl_text,
+)
 from tests.support.shapes import BOX_AREA, BOX_QUADS, BOX_TRIANGLES, BOX_VERTICES
 
 # Of each case: the end of the file's name, its bytes, and its area or the reason of its refusal.
