@@ -357,12 +357,14 @@ def test_what_dask_says_of_its_own_code_is_left_out(folder: Path, monkeypatch: p
         try:
             raise RuntimeError("deep inside")
         except RuntimeError:
-            logging.getLogger("distributed.utils").exception("")
-            logging.getLogger("distributed.nanny").exception("Worker died")
+            log.exception("")
+            log.exception("Worker died")
         raise sb.errors.ClusterError("the scheduler was lost")
 
+    log = logging.getLogger("distributed.of_a_test")
+    log.setLevel(logging.ERROR)
     # As in a process whose log was set up before Dask's.
-    monkeypatch.setattr(logging.getLogger("distributed"), "propagate", True)
+    monkeypatch.setattr(log.parent, "propagate", True)
     monkeypatch.setattr("sobolev_batch.batch.status.status", lose)
     done = call("status", "x.zarr", folder=folder)
     assert (done.returncode, done.stderr) == (1, "error: Worker died\nerror: the scheduler was lost\n")
