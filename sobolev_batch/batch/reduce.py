@@ -190,7 +190,7 @@ def reduce(
         require_blocking(client)
     limit, remesher = Limit.parse(within, order, unit), _permitted(method, search)
     # It refuses a wrong precision.
-    remesher.search(limit.value, 1, precision)
+    remesher.search(limit, 1, 1.0, precision)
     folder = None if output is None else Location.parse(output).absolute()
     searches = [
         RecordedSearch(one, one, limit, remesher, folder or InMemory(), name, f"{name}{suffix}", precision)

@@ -451,8 +451,8 @@ def _settings_text(attributes: Mapping[str, Any]) -> str:
 def info_command(files: tuple[Path, ...], style: str) -> None:
     """Print what mesh files hold: counts, size, and what is unusual.
 
-    Lengths are in the unit of each file. Edges of one triangle are open. The aspect ratio of an equilateral triangle
-    is 1.
+    Lengths are in the unit of each file. Edges of one triangle are open, and vertices of the same place are one.
+    The aspect ratio of an equilateral triangle is 1.
     """
     from sobolev_batch.geometry.formats.readers import read_mesh
 
@@ -462,16 +462,27 @@ def info_command(files: tuple[Path, ...], style: str) -> None:
 
 def _fact_lines(facts: Mapping[str, Any]) -> Iterator[str]:
     """Yield what is known of a mesh, for people."""
-    box = ", ".join(f"{axis} {low:.6g} to {high:.6g}" for axis, low, high in zip("xyz", *facts["box"], strict=True))
+    ends = list(zip("xyz", *facts["box"], strict=True))
+    size = max(high - low for _, low, high in ends)
+    # Far from the origin, coordinates need more digits.
+    digits = 6 + math.ceil(math.log10(max(1.0, *(max(-low, high) / size for _, low, high in ends))))
+    box = ", ".join(f"{axis} {low:.{digits}g} to {high:.{digits}g}" for axis, low, high in ends)
+    extents = " by ".join(f"{high - low:.6g}" for _, low, high in ends)
     volume = "none: it is not closed" if math.isnan(facts["volume"]) else f"{facts['volume']:.6g}"
     yield f"{facts['file']}: {facts['triangles']:,} triangles, {facts['vertices']:,} vertices"
     yield f"  area {facts['area']:.6g}, volume {volume}"
-    yield f"  box {box}"
+    yield f"  box {box}: {extents}"
     yield (
         f"  smallest angle {facts['smallest_angle']:.3g}° (median {facts['smallest_angle_median']:.3g}°), "
         f"aspect ratio up to {facts['aspect_ratio']:.3g} (median {facts['aspect_ratio_median']:.3g})"
     )
     yield f"  {'; '.join(facts['defects']) or 'closed, all triangles face outwards'}"
+    if facts["components"] > 1:
+        closed = "" if facts["boundary_edges"] else "closed "
+        inside = f", {facts['nested']:,} inside others" if facts["nested"] else ""
+        yield f"  {facts['components']:,} {closed}components{inside}"
+    if 2 * facts["duplicate_triangles"] == facts["triangles"]:
+        yield "  every triangle is there twice"
     yield from (f"  note: {note}" for note in facts["notes"])
 
 
@@ -479,6 +490,9 @@ def _facts(path: Path, mesh: Mesh) -> dict[str, Any]:
     """Return what is known of a mesh by itself, lengths in its own unit."""
     import numpy as np
 
+    from sobolev_batch.geometry.parts import nested_parts
+
+    merged = mesh.merged or mesh
     angles, ratios = mesh.smallest_angles, mesh.aspect_ratios
     return {
         "file": path,
@@ -491,7 +505,8 @@ def _facts(path: Path, mesh: Mesh) -> dict[str, Any]:
         "smallest_angle_median": float(np.median(angles)),
         "aspect_ratio": float(ratios.max()),
         "aspect_ratio_median": float(np.median(ratios)),
-        **mesh.counts,
+        **merged.counts,
+        "nested": nested_parts(merged),
         "defects": mesh.defects,
         "notes": mesh.notes,
     }

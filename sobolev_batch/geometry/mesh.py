@@ -186,9 +186,22 @@ class Mesh:
             "euler_characteristic": len(self.used_vertices) - edges + len(self.triangles),
         }
 
+    @cached_property
+    def merged(self) -> Mesh | None:
+        """The mesh whose vertices of the same place are one, as of seams that double them; None where that is none.
+
+        It is looked for where the mesh has open edges or several components.
+        """
+        if not self.counts["boundary_edges"] and self.counts["components"] == 1:
+            return None
+        vertices, triangles = merge_coincident(self.vertices, self.triangles)
+        return Mesh.from_checked(vertices, triangles) if len(vertices) < len(self.vertices) else None
+
     @property
     def defects(self) -> tuple[str, ...]:
         """Defects in words: all that keeps the mesh from being a closed surface that faces outwards; empty without any.
+
+        Seams that double vertices are none.
 
         >>> import sobolev_batch as sb
         >>> sphere = sb.shapes.icosphere(1)
@@ -204,7 +217,8 @@ class Mesh:
             "duplicate_triangles": ("duplicate triangle", ", counted twice"),
             "zero_area_triangles": ("triangle", " without area"),
         }
-        found = {key: self.counts[key] for key in words if self.counts[key]}
+        counts = (self.merged or self).counts
+        found = {key: counts[key] for key in words if counts[key]}
         texts = [f"{n:,} {words[key][0]}{'s' * (n != 1)}{words[key][1]}" for key, n in found.items()]
         return (*texts, *(["all triangles face inwards"] if self.volume < 0 else []))
 
@@ -213,14 +227,14 @@ class Mesh:
         """Enclosed volume, in cubed units of length; negative where triangles, seen from outside, run clockwise.
 
         NaN unless each edge has two triangles that face the same side: `counts` has no boundary, non-manifold or
-        inconsistent edges.
+        inconsistent edges, at least once vertices of the same place are one.
 
         >>> import sobolev_batch as sb
         >>> f"{sb.shapes.icosphere(5).volume:.3f}"
         '4.187'
         """
         if any(self.counts[f"{kind}_edges"] for kind in ("boundary", "nonmanifold", "inconsistent")):
-            return np.nan
+            return self.merged.volume if self.merged else np.nan
         # From a point nearby: far from the origin, the parts cancel.
         origin = self.vertices[self.triangles[0, 0]]
         parts = []
@@ -396,6 +410,15 @@ def _used(triangles: Indices, vertex_count: int) -> Indices:
     used = np.zeros(vertex_count, dtype=bool)
     used[triangles] = True
     return np.flatnonzero(used).astype(np.int64, copy=False)
+
+
+def merge_coincident(vertices: NDArray[Any], triangles: Indices) -> tuple[NDArray[Any], Indices]:
+    """Merge vertices with exactly the same coordinates, for formats and programs that repeat them."""
+    if not np.isfinite(vertices).all():
+        # The mesh refuses them and names the entries.
+        return vertices, triangles
+    merged, indices = np.unique(vertices, axis=0, return_inverse=True)
+    return merged, indices.reshape(-1)[triangles]
 
 
 def _array(values: ArrayLike, name: str) -> NDArray[Any]:

@@ -21,7 +21,7 @@ from sobolev_batch.sources.mesh_cache import Folder
 from sobolev_batch.sources.registry import Member, load_mesh
 
 # Raise it whenever a mesh of one size is judged in another way: trials of another version are made again.
-_VERSION = 2
+_VERSION = 3
 # Measured peak of a trial: for each triangle of the original, and of the libraries.
 _TRIAL_BYTES, _LEAST_BYTES = 1400, 3e8
 
@@ -33,11 +33,13 @@ class SearchRecord:
     Attributes:
         digest: Digest of the search; another one has other trials.
         triangles: Triangles of the original.
+        radius: Radius of its bounding sphere.
         mesh_digest: Digest of the file of the best mesh.
     """
 
     digest: str
     triangles: int
+    radius: float
     mesh_digest: str = ""
     trials: tuple[Trial, ...] = ()
 
@@ -88,7 +90,8 @@ class RecordedSearch:
 
     def begun(self) -> SearchRecord:
         """Return the record of a search that begins; MeshError where the original cannot be read."""
-        return SearchRecord(self.digest, len(load_mesh(self.original).triangles))
+        mesh = load_mesh(self.original)
+        return SearchRecord(self.digest, len(mesh.triangles), mesh.bounding_sphere[1])
 
     def bracket(self, record: SearchRecord) -> Bracket:
         """Return what the trials say."""
@@ -132,7 +135,7 @@ class RecordedSearch:
         return Mesh(*parse_ply(self._read_mesh(record)))
 
     def _search(self, record: SearchRecord) -> Search:
-        return self.remesher.search(self.limit.value, record.triangles, self.precision)
+        return self.remesher.search(self.limit, record.triangles, record.radius, self.precision)
 
     def _key_of_mesh(self, record: SearchRecord) -> str:
         return self.mesh_key or f"{record.digest}.ply"

@@ -20,17 +20,19 @@ from sobolev_batch.geometry.surface import is_finite_number
 PRECISION, _MOST_TRIALS = 0.05, 16
 # Exponent of distances in the size before two trials show one, and the range in which a shown one is believed.
 _FIRST_SLOPE, _LEAST_SLOPE, _LARGEST_SLOPE = 1.0, 0.3, 3.0
-# Logarithm of a distance over the limit, in place of a zero; and the largest one that counts at the end of a bracket:
-# beyond it, distances say little about where the limit is met.
-_NONE, _NEAR = -7.0, 0.5
+# Least logarithm of a distance over the limit, also in place of a zero; and the largest one that counts at the end of a
+# bracket: beyond it, distances say little about where the limit is met.
+_LEAST_EXCESS, _NEAR = -7.0, 0.5
 # How far beside the predicted size to try, as a fraction of the last bracket's width: on the side where the bracket is
 # wider, so that the trial likely ends the search.
 _BESIDE = 0.4
-# Trials after which each one cuts off at least this fraction of the bracket. One spot that decimation spoils early may
-# keep the largest deviation the same for many sizes, which then follows no power.
-_PATIENCE, _LEAST_CUT = 3, 0.45
-# Several trials at a time lie a bracket's last width apart, or this fraction of the way to the predicted size.
-_APART, _SPREAD = 0.9, 0.4
+# A step is so short, or cuts off so much of the bracket, that halves can end the search within as many trials. One spot
+# that decimation spoils early may keep the largest deviation the same for many sizes, which then follows no power.
+# The last bracket is then this fraction of its width, since whole numbers are rounded.
+_FEW_TRIALS, _CLOSED = 8, 0.85
+# Several trials at a time lie a bracket's last width apart, or this fraction of the way to the predicted size. The
+# first ones lie apart by this logarithm.
+_APART, _SPREAD, _FIRST_APART = 0.9, 0.4, 0.7
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,7 @@ class Search:
         low: Smallest size to try.
         high: Largest size to try.
         is_whole: True where sizes are whole numbers.
+        first: Size to try first; None for the middle.
         larger_is_coarser: Whether a larger size makes a coarser mesh; None to find out by the triangles of trials.
         precision: Width of the last bracket, as a fraction of the size.
 
@@ -99,6 +102,7 @@ class Search:
     high: float
     is_whole: bool = False
     larger_is_coarser: bool | None = None
+    first: float | None = None
     precision: float = PRECISION
 
     def __post_init__(self) -> None:
@@ -128,12 +132,14 @@ class Search:
         end = coarsest if bracket.failed is None else sign * math.log(bracket.failed.size)
         if len(trials) >= _MOST_TRIALS or not self._is_open(bracket, start, end):
             return ()
-        valued = [one for one in trials if math.isfinite(one.estimate)]
         points = {
-            sign * math.log(one.size): math.log(one.estimate / self.limit) if one.estimate > 0 else _NONE
-            for one in valued
+            sign * math.log(one.size): math.log(max(one.estimate / self.limit, math.exp(_LEAST_EXCESS)))
+            for one in trials
+            if math.isfinite(one.estimate)
         }
         places = self._places(points, bracket, start, end, count)
+        if self.first is not None and not trials:
+            places = [sign * math.log(self.first) + _FIRST_APART * (k - (count - 1) / 2) for k in range(count)]
         tried = {one.size for one in trials}
         sizes = dict.fromkeys(self._size(sign, place, bracket) for place in places)
         return tuple(size for size in sizes if size not in tried)
@@ -163,17 +169,23 @@ class Search:
             return [start] if is_last else [start + (end - start) * k / (count + 1) for k in range(1, count + 1)]
         # Steps towards an end that was not tried double, and arrive there.
         least = _BESIDE * width * 2.0 ** len(points)
+        reach = _CLOSED * max(math.log1p(PRECISION) * 2.0 ** (_FEW_TRIALS - 1 - len(points)), width)
         if bracket.best is None:
-            guess = min(_extrapolated(points) - _BESIDE * width, end - least)
+            step = end - _extrapolated(points, end) + _BESIDE * width
+            guess = end - max(min(step, reach), least)
             guess = start if guess < start + width else guess
         elif bracket.failed is None:
-            guess = max(_extrapolated(points) + _BESIDE * width, start + least)
+            step = _extrapolated(points, start) + _BESIDE * width - start
+            guess = start + max(min(step, reach), least)
             guess = end if guess > end - width else guess
         else:
             # Sobolev distances follow a power closely; the first secant step then arrives.
-            guess = _extrapolated(points) if len(points) == 2 else _interpolated(points, start, end)
+            is_first = len(points) == 2
+            guess = _extrapolated(points, start) if is_first else _interpolated(points, start, end)
             guess += _BESIDE * width * (1 if 2 * guess < start + end else -1)
-            margin = max((_LEAST_CUT if len(points) > _PATIENCE else 0.0) * (end - start), _BESIDE * width / 2)
+            is_hopeless = end - start > 2 * reach
+            least_cut = end - start - reach if not is_hopeless else 0.0 if is_first else (end - start) / 2
+            margin = max(least_cut, _BESIDE * width / 2)
             guess = min(max(guess, start + margin), end - margin)
         apart = max(_APART * width, _SPREAD * min(abs(guess - place) for place in points))
         beside = (guess + apart * k * side for k in range(1, count) for side in (1, -1))
@@ -189,9 +201,9 @@ class Search:
         return float(min(max(round(size), min(finer, coarser)), max(finer, coarser)))
 
 
-def _extrapolated(points: Mapping[float, float]) -> float:
-    """Return the place where the excess would be zero, by the two places that are nearest to it."""
-    (place, excess), *others = sorted(points.items(), key=lambda point: abs(point[1]))
+def _extrapolated(points: Mapping[float, float], end: float) -> float:
+    """Return the place where the excess would be zero, by the two places that are nearest to the end of a bracket."""
+    (place, excess), *others = sorted(points.items(), key=lambda point: abs(point[0] - end))
     slope = (others[0][1] - excess) / (others[0][0] - place) if others else _FIRST_SLOPE
     return place - excess / min(max(slope, _LEAST_SLOPE), _LARGEST_SLOPE)
 

@@ -210,7 +210,7 @@ def test_a_tolerance_that_nothing_meets_and_one_that_four_triangles_meet() -> No
     assert itself.mesh.digest == lumpy(2).digest
     least = found_by(lumpy(2), within=5.0)
     assert least.bracket.best is not None
-    assert (least.bracket.best.size, least.bracket.failed, len(least.trials)) == (4, None, 2)
+    assert (least.bracket.best.size, least.bracket.failed, len(least.trials)) == (4, None, 1)
     # The library stops at eight.
     assert 4 <= least.bracket.best.triangles <= 8
 

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 import sobolev_batch as sb
+from sobolev_batch.reduction.limit import Limit
+from sobolev_batch.reduction.remesher import Remesher
 from sobolev_batch.reduction.search import Search, Trial
 
 
@@ -57,6 +59,41 @@ def test_powers_take_few_trials() -> None:
         for limit in np.geomspace(1e-4, 0.1, 7):
             search = Search(float(limit), 4, 100_000, is_whole=True, larger_is_coarser=False)
             assert len(trials_of(search, lambda n, power=exponent: 3.0 * n**-power)) <= 8  # type: ignore[misc]
+
+
+def test_steps_take_few_trials_from_a_guess_on() -> None:
+    # Distances of a power, that stay the same over ranges of sizes up to a factor of 2.2.
+    counts = []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        steps = 4 * np.exp(np.concatenate([[0], np.cumsum(rng.uniform(0.02, 0.8, 40))]))
+        fewest = rng.choice(steps[(steps > 50) & (steps < 20_000)])
+        search = Search(
+            10 * fewest**-1.1, 4, 100_000, True, larger_is_coarser=False, first=fewest * np.exp(rng.uniform(-1.2, 1.2))
+        )
+        distance = lambda n, own=steps: 10 * own[np.searchsorted(own, n, side="right") - 1] ** -1.1  # noqa: E731
+        counts.append(len(trials_of(search, distance)))
+    assert np.mean(counts) < 7.5
+    assert np.quantile(counts, 0.95) <= 8
+
+
+def test_the_first_size_is_that_of_the_tolerance_whatever_the_unit() -> None:
+    remesher = Remesher.parse("decimate")
+    for scale in (1e-3, 1.0, 1e3):
+        (size,) = remesher.search(Limit(0.002 * scale), 100_000, scale).next([])
+        assert 1000 < size == remesher.search(Limit(0.002, -2.0), 100_000, scale).next([])[0] < 10_000
+        assert size / remesher.search(Limit(0.02 * scale), 100_000, scale).next([])[0] == pytest.approx(10)
+    # Not the mesh itself, of which nothing is learned.
+    assert remesher.search(Limit(1e-6), 5000, 1.0).next([])[0] < 4000
+
+
+def test_the_estimate_of_a_sobolev_distance_guides_where_bounds_are_wide() -> None:
+    coarse, fine = sb.shapes.icosphere(3), sb.shapes.icosphere(5)
+    exact = sb.distance(coarse, fine, order=-2, rtol=0.05)["relative"].item()
+    estimate, lower, upper = Limit(0.7 * exact, -2.0).bounds(coarse, fine)
+    assert 0.7 * exact < lower <= exact
+    assert upper > 2 * exact
+    assert estimate == pytest.approx(exact, rel=0.1)
 
 
 @pytest.mark.parametrize("power", [1, -1])

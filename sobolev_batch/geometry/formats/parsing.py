@@ -192,12 +192,3 @@ def triangle_strips(corners: Indices, sizes: Indices) -> Indices:
     ranks = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
     places, odd = np.repeat(begins, counts) + ranks, ranks % 2
     return np.stack([corners[places + odd], corners[places + 1 - odd], corners[places + 2]], axis=1)
-
-
-def merge_coincident(vertices: NDArray[np.floating], triangles: Indices) -> Raw:
-    """Merge vertices with exactly the same coordinates, for formats that repeat them."""
-    if not np.isfinite(vertices).all():
-        # The mesh refuses them and names the entries.
-        return Raw(vertices, triangles)
-    merged, indices = np.unique(vertices, axis=0, return_inverse=True)
-    return Raw(merged, indices.reshape(-1)[triangles])

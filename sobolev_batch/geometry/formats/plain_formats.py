@@ -15,9 +15,9 @@ import numpy as np
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import MeshError
-from sobolev_batch.geometry.formats.parsing import Raw, merge_coincident
+from sobolev_batch.geometry.formats.parsing import Raw
 from sobolev_batch.geometry.formats.polygons import cut_polygons
-from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.geometry.mesh import Mesh, merge_coincident
 from sobolev_batch.geometry.surface import normals
 
 # Numbers per vertex line: x y z, with a weight, a colour, or both.
@@ -152,7 +152,7 @@ def parse_stl(data: bytes) -> Raw:
         )
     if not len(corners):
         raise MeshError("the file has no faces")
-    return merge_coincident(corners, np.arange(len(corners), dtype=np.int64).reshape(-1, 3))
+    return Raw(*merge_coincident(corners, np.arange(len(corners), dtype=np.int64).reshape(-1, 3)))
 
 
 def write_obj(mesh: Mesh) -> bytes:

@@ -37,6 +37,8 @@ _MISTAKEN = {
     b"\x1f\x8b": "compressed by gzip; let its name end in .gz",
 }
 _START_BYTES = 1024
+# Coordinates so many times the size of a mesh have four digits of it in single precision.
+_FAR = 1000
 # Factor by which gzip usually shrinks mesh files.
 _PACKING = 4
 # Bytes of a file that is mostly a list of files beside it; larger ones hold their data themselves.
@@ -120,6 +122,7 @@ def read_mesh_by(path: Path, read: Read) -> Mesh:
                 require_memory_to_read(factor * (len(data[0]) + sum(part.stat().st_size for part in parts.values())))
                 beside = {name: read_unpacked(part, factor, read) for name, part in parts.items()}
                 raw = Raw(*form.parse(data.pop(), beside))
+            raw = _noted(raw)
             for array in (raw.vertices, raw.triangles):
                 array.setflags(write=False)
             return Mesh(*raw)
@@ -156,6 +159,24 @@ def expected_size(path: Path) -> tuple[int, float]:
         return 0, 0.0
     triangles = int(length / form.file_bytes)
     return triangles, float(triangles * form.memory_bytes)
+
+
+def _noted(raw: Raw) -> Raw:
+    """Leave out vertices that are no numbers and that no triangle uses; note that, and digits that were lost."""
+    vertices, triangles, notes = raw
+    is_bad = ~np.isfinite(vertices).all(axis=1)
+    if is_bad.any() and 0 <= triangles.min() <= triangles.max() < len(vertices) and not is_bad[triangles].any():
+        vertices, triangles = vertices[~is_bad], (np.cumsum(~is_bad) - 1)[triangles]
+        notes += (f"{np.count_nonzero(is_bad):,} vertices without coordinates, which no face uses, are left out",)
+    if vertices.dtype == np.float32 and len(vertices):
+        lower, upper = vertices.min(axis=0).astype(np.float64), vertices.max(axis=0).astype(np.float64)
+        times = np.abs([lower, upper]).max() / np.linalg.norm(upper - lower)
+        if _FAR < times < np.inf:
+            notes += (
+                f"coordinates are {times:,.0f} times the size of the mesh, of which single precision keeps "
+                f"{max(0.0, -np.log10(times * np.finfo(np.float32).eps / 2)):.0f} digits",
+            )
+    return Raw(vertices, triangles, notes)
 
 
 def _mistaken(start: bytes) -> str:

@@ -1,0 +1,43 @@
+"""The connected parts of a mesh, and which of them lie inside others."""
+
+from __future__ import annotations
+
+import igl
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from sobolev_batch.geometry.mesh import Mesh
+
+# Among more parts, none are looked for inside others.
+_MOST_PARTS = 1000
+
+
+def nested_parts(mesh: Mesh) -> int:
+    """Return how many parts, which share no vertices, others wind around; zero where there are more than 1000 parts.
+
+    >>> import numpy as np
+    >>> import sobolev_batch as sb
+    >>> ball = sb.shapes.icosphere(1)
+    >>> vertices, triangles = [np.concatenate([ball.vertices, ball.vertices / 2]), np.tile(ball.triangles, (2, 1))]
+    >>> triangles[80:] += 42
+    >>> nested_parts(sb.Mesh(vertices, triangles))
+    1
+    """
+    a, b, c = mesh.triangles.T
+    links = coo_array(
+        (np.ones(2 * len(a), np.int8), (np.tile(a, 2), np.concatenate([b, c]))), (len(mesh.vertices),) * 2
+    )
+    parts = connected_components(links, directed=False)[1][a]
+    order = np.argsort(parts, kind="stable")
+    starts = np.flatnonzero(np.diff(parts[order], prepend=-1))
+    if not 1 < len(starts) <= _MOST_PARTS:
+        return 0
+    triangles, corners = mesh.triangles[order], mesh.vertices[mesh.triangles[order]]
+    lower, upper = np.minimum.reduceat(corners.min(axis=1), starts), np.maximum.reduceat(corners.max(axis=1), starts)
+    points, is_inside = corners[starts, 0], np.zeros(len(starts), bool)
+    for part, own in enumerate(np.split(triangles, starts[1:])):
+        others = np.flatnonzero(~is_inside & (lower > lower[part]).all(axis=1) & (upper < upper[part]).all(axis=1))
+        if others.size:
+            is_inside[others] = np.abs(igl.fast_winding_number(mesh.vertices, own, points[others])) > 1 / 2
+    return int(np.count_nonzero(is_inside))
