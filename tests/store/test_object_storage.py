@@ -161,7 +161,7 @@ def test_credentials_stay_in_the_environment(server: Server, tmp_path: Path, url
     done = command("--debug", "run", "study.toml", "--store", url, folder=tmp_path, AWS_SESSION_TOKEN=TOKEN)
     assert done.returncode == 0, done.stderr
     assert f"3 computed, 0 reused, 0 failed; store: {url}\n" in done.stdout
-    assert "DEBUG" in done.stderr
+    assert "debug " in done.stderr
     keys = server.keys(key_of(url))
     stored = b"".join(server.client().get_object(Bucket=BUCKET, Key=key)["Body"].read() for key in keys)
     for hidden in (SECRET, TOKEN, "Signature=", "tester", server.url):
