@@ -48,12 +48,12 @@ class TableOptions:
         return open_store(self.store)
 
 
-def table_options(command: Callable[..., None]) -> Callable[..., None]:
+def table_options(command: Callable[..., int | None]) -> Callable[..., int | None]:
     """Add the argument and the options of all tables to a command, which takes them as one value."""
 
     @wraps(command)
-    def with_options(store: Location, style: Format, orders: tuple[float, ...] | None, **more: Any) -> None:
-        command(TableOptions(store, style, orders), **more)
+    def with_options(store: Location, style: Format, orders: tuple[float, ...] | None, **more: Any) -> int | None:
+        return command(TableOptions(store, style, orders), **more)
 
     order = orders_option("Print the table of this order, which may be any below -1/2.", "the study's")
     return store_argument(format_option(order(with_options)))

@@ -424,25 +424,49 @@ def time_command(table: TableOptions, truth: str | None, factor: float) -> None:
     help="Compare at equal sizes, or list the meshes that no other beats in distance and cost.",
 )
 @click.option("--x", help="Take this size or cost of a mesh. [default: triangles by size, make_seconds by cost]")
+@click.option(
+    "--y",
+    "columns",
+    multiple=True,
+    default=["relative"],
+    show_default=True,
+    help="Compare this column of the table, of which less is better; may be repeated.",
+)
 @click.option("--family", "families", multiple=True, help="Compare this method; may be repeated. [default: all]")
 @click.option("--against", type=location, metavar="STORE", help="Compare with this earlier study instead.")
+@click.option(
+    "--most", type=click.FloatRange(min=1.0), metavar="RATIO", help="A mean ratio to the earlier study above it fails."
+)
 def league_command(
-    table: TableOptions, by: str, x: str | None, families: tuple[str, ...], against: Location | None
-) -> None:
+    table: TableOptions,
+    by: str,
+    x: str | None,
+    columns: tuple[str, ...],
+    families: tuple[str, ...],
+    against: Location | None,
+    most: float | None,
+) -> int:
     """Rank methods over the objects of STORE.
 
     With --by cost, STORE may also be that of one object. With --against, compare each method with itself in an earlier
-    study instead.
+    study instead. The exit status is then 1 if any method is farther by the test (or has more of another column than
+    the distance), or if its mean ratio is above --most.
     """
     from sobolev_batch.extras.leagues.changes import compare_studies, format_changes
     from sobolev_batch.extras.leagues.costs import format_cost_leagues
     from sobolev_batch.extras.leagues.league import format_league, league
 
+    is_worse = False
     if against is not None:
-        text = format_changes(compare_studies(table.store, against, table.orders), table.style)
+        changes = compare_studies(table.store, against, table.orders, y=columns)
+        changes = changes[changes["method"].isin(families or changes["method"])]
+        is_worse = bool((changes["verdict"] == "farther").any() or (most and (changes["ratio"] > most).any()))
+        text = format_changes(changes, table.style)
     elif by == "cost":
         by_cost = league(table.store, table.orders, by="cost", x=x, methods=families or None)
         text = format_cost_leagues(by_cost, table.style)
     else:
-        text = format_league(league(table.store, table.orders, x=x, methods=families or None), table.style)
+        by_size = [league(table.store, table.orders, x=x, y=y, methods=families or None) for y in columns]
+        text = format_league([one for leagues in by_size for one in leagues], table.style)
     echo_lines(text)
+    return int(is_worse)

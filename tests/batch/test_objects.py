@@ -17,6 +17,7 @@ import zarr
 from distributed import Client
 
 import sobolev_batch as sb
+from sobolev_batch.extras.leagues import changes
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, locked
@@ -214,7 +215,7 @@ def test_a_second_run_computes_what_is_new(store: Path, threads: Client) -> None
 
 
 @pytest.mark.extras
-def test_a_league_needs_no_more_than_the_store(store: Path) -> None:
+def test_a_league_needs_no_more_than_the_store(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     leagues = sb.league(store)
     assert [one.order for one in leagues] == [-10.0, -3.0]
     assert leagues[1].table["method"].tolist() == ["ico", "egg"]
@@ -222,6 +223,17 @@ def test_a_league_needs_no_more_than_the_store(store: Path) -> None:
     frame = sb.compare_studies(store, store, -3)
     assert frame["ratio"].tolist() == [1.0, 1.0]
     assert set(frame["verdict"]) == {"undecided"}
+    # Twice as many triangles are worse, at all orders alike; the exit status says so.
+    more = sb.open_store(store / "a").load()
+    more["meshes"] = xr.DataTree(more["meshes"].to_dataset().assign_coords(triangles=2 * more["meshes"]["triangles"]))
+    frame = sb.compare_studies({"a": more}, {"a": store / "a"}, y=("relative", "triangles"))
+    grown = frame[frame["y"] == "triangles"].set_index("method")["ratio"].to_dict()
+    assert (len(frame), grown) == (6, {"ico": pytest.approx(2.0), "egg": pytest.approx(2.0)})
+    monkeypatch.setattr(changes, "compare_studies", lambda *_, **__: frame)
+    for words, status in (([], 0), (["--most", "2.1"], 0), (["--most", "1.05"], 1)):
+        assert call("table", "league", store, "--against", store, *words).returncode == status
+    frame.loc[0, "verdict"] = "farther"
+    assert call("table", "league", store, "--against", store).returncode == 1
     with pytest.raises(sb.errors.StoreError, match="it holds the store of one object"):
         sb.league(store / "a")
     with pytest.raises(sb.errors.StoreError, match="nowhere"):

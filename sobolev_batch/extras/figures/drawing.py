@@ -38,7 +38,7 @@ from sobolev_batch.extras.figures.style import (
 )
 from sobolev_batch.extras.leagues.costs import CostLeague, objects_text
 from sobolev_batch.extras.leagues.evolution import evolution
-from sobolev_batch.extras.leagues.league import League
+from sobolev_batch.extras.leagues.league import RELATIVE, League
 from sobolev_batch.tables.convergence import table
 from sobolev_batch.tables.matrix import pairs_of
 from sobolev_batch.tables.open import (
@@ -167,11 +167,14 @@ def moving_families(selection: Selection) -> list[str]:
 
 
 def draw_league(_leagues: Sequence[League], league: League, axes: Axes) -> None:
-    """Draw the mean relative distance of each method of a league against the mean size of its meshes."""
+    """Draw the mean of each method of a league with its interval, and all meshes as dots, at their sizes."""
     set_log_scale(axes, "xy")
     for number, method in enumerate(league.methods):
-        mean = league.mean_curve(method)
-        draw_curve(axes, np.exp(mean.sizes), np.exp(mean.values), mean.bars, style_of(number), shortened(method))
+        style, (sizes, means) = style_of(number), league.mean_curve(method)
+        draw_curve(axes, sizes, means[:, 0], np.zeros(len(sizes)), style, shortened(method))
+        axes.fill_between(sizes, means[:, 1], means[:, 2], color=style["color"], alpha=0.2, linewidth=0)
+        for curve in (one[method] for one in league.curves.values() if method in one):
+            axes.plot(np.exp(curve.sizes), np.exp(curve.values), ".", color=style["color"], alpha=0.5, markersize=3)
     _describe(axes, league)
 
 
@@ -196,9 +199,11 @@ def draw_cost_league(_leagues: Sequence[CostLeague], league: CostLeague, axes: A
 
 
 def _describe(axes: Axes, league: League | CostLeague, note: str = "") -> None:
-    set_title(axes, f"order {league.order:g}, mean of {objects_text(len(league.objects))}", note)
+    y = getattr(league, "y", RELATIVE)
+    order = f"order {league.order:g}, " if y == RELATIVE else ""
+    set_title(axes, f"{order}mean of {objects_text(len(league.objects))}", note)
     axes.set_xlabel(escaped(label_of(league.x)))
-    axes.set_ylabel("relative Sobolev distance")
+    axes.set_ylabel("relative Sobolev distance" if y == RELATIVE else escaped(label_of(y)))
 
 
 def draw_spectrum(selection: Selection, order: float, axes: Axes) -> None:

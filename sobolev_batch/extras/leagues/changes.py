@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+
 import numpy as np
 import pandas as pd
 import xarray as xr
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.extras.leagues.league import ENDS, AnyStores, interval_text, number_text
-from sobolev_batch.extras.leagues.statistics import adjusted, interval, sign_flip_test
+from sobolev_batch.extras.leagues.league import ENDS, RELATIVE, AnyStores, interval_text, number_text, orders_of
+from sobolev_batch.extras.leagues.statistics import adjusted, interval, numbers_of, sign_flip_test
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.study.comparable import SIGNIFICANCE, least_objects
 from sobolev_batch.tables import Format
@@ -19,13 +21,14 @@ from sobolev_batch.tables.text import wrapped
 from sobolev_batch.transform.lattice import Orders
 
 _NOTE = """\
-A ratio below 1 says that the new study is nearer to the references. It is the geometric mean
-over the {units}, with its 95 % interval. The verdict is that of the permutation test of pairs, at
-the level of 5 % for all methods together."""
+A ratio below 1 says that the new study is better: nearer to the references, or less of another
+number. It is the geometric mean over the {units}, with its 95 % interval. The verdict is that of
+the permutation test of pairs, at the level of 5 % for all methods together."""
 # These tell the rows that two studies have in common.
 _KEYS = ["order", "mesh"]
 _COLUMNS = (
     Column("method", "method"),
+    Column("y", "by"),
     Column("verdict", "verdict"),
     Column("ratio", "new/old", number_text),
     Column("low", "95 % interval", interval_text(number_text), "high"),
@@ -35,7 +38,13 @@ _COLUMNS = (
 )
 
 
-def compare_studies(new: AnyStores | AnyStore, old: AnyStores | AnyStore, order: Orders | None = None) -> pd.DataFrame:
+def compare_studies(
+    new: AnyStores | AnyStore,
+    old: AnyStores | AnyStore,
+    order: Orders | None = None,
+    *,
+    y: str | Sequence[str] = RELATIVE,
+) -> pd.DataFrame:
     """Compare the distances of two studies of the same objects, such as those of two releases of a remesher.
 
     Meshes of the same label are compared, by the ratio of their distances to the same reference. Relative distances
@@ -45,13 +54,16 @@ def compare_studies(new: AnyStores | AnyStore, old: AnyStores | AnyStore, order:
         new: Store of the new study, of several objects or of one; or stores of single objects by their names.
         old: Store of the old study, likewise.
         order: One of the stores' orders, or several; default all that both have.
+        y: What to compare, one or several columns of `table` of which less is better: "relative", "hausdorff",
+            "make_seconds", "triangles" (of searched families) and so on.
 
     Returns:
-        A row for each order and method (family): order, method; objects and meshes, their numbers; ratio, the geometric
-        mean of the ratios of new to old distances, with the ends low and high of its interval over the objects, or over
-        the meshes of a single object; p, the p-value of the paired permutation test, adjusted for the number of methods
-        (Holm); verdict, "nearer" or "farther" by this test at the level of 5 %, else "undecided"; worst, the mesh whose
-        distance grew most, and worst_ratio, by how much.
+        A row for each y, order and method (family): y, order, method; objects and meshes, their numbers; ratio, the
+        geometric mean of the ratios of new to old numbers, with the ends low and high of its interval over the objects,
+        or over the meshes of a single object; p, the p-value of the paired permutation test, adjusted for the number of
+        methods (Holm); verdict, "nearer" or "farther" by this test at the level of 5 %, else "undecided"; worst, the
+        mesh whose number grew most, and worst_ratio, by how much. A y that is the same at all orders has rows at the
+        first one.
 
     Raises:
         InputError: The studies have no mesh in common, or an object has another reference or unit of length.
@@ -68,35 +80,39 @@ def compare_studies(new: AnyStores | AnyStore, old: AnyStores | AnyStore, order:
         raise InputError(
             f"the studies have no object in common: the new one has {', '.join(news)}, the old one {', '.join(olds)}"
         )
-    frames = [_joined(name, news[name], olds[name], order) for name in common]
+    columns = [y] if isinstance(y, str) else list(y)
+    frames = [frame for name in common for frame in _joined(name, news[name], olds[name], order, columns)]
     joined = pd.concat(frames, ignore_index=True)
     if joined.empty:
         raise InputError("the studies have no mesh in common that both have computed at the same order")
     rows = [
-        {"order": s, "method": method, **_change(meshes)}
-        for (s, method), meshes in joined.groupby(["order", "family"], sort=False)
+        {"y": name, "order": s, "method": method, **_change(meshes)}
+        for (name, s, method), meshes in joined.groupby(["y", "order", "family"], sort=False)
     ]
     result = pd.DataFrame(rows)
-    for _, of_order in result.groupby("order", sort=False):
+    for _, of_order in result.groupby(["y", "order"], sort=False):
         result.loc[of_order.index, "p"] = adjusted(of_order["p"].to_numpy())
     words = np.where(result["ratio"] < 1, "nearer", "farther")
-    result.insert(8, "verdict", np.where(result["p"] < SIGNIFICANCE, words, "undecided"))
+    result.insert(9, "verdict", np.where(result["p"] < SIGNIFICANCE, words, "undecided"))
     return result
 
 
-def _joined(name: str, new: AnyStore, old: AnyStore, order: Orders | None) -> pd.DataFrame:
-    """Return the meshes that two stores of an object have in common, with the logarithms of their ratios."""
+def _joined(
+    name: str, new: AnyStore, old: AnyStore, order: Orders | None, columns: Sequence[str]
+) -> Iterator[pd.DataFrame]:
+    """Yield for each column the meshes that two stores of an object have in common, with logarithms of ratios."""
     trees = as_tree(new), as_tree(old)
     if trees[0].attrs["similarity"] != trees[1].attrs["similarity"] or len({_identity(tree) for tree in trees}) > 1:
         raise InputError(
             f"{name or 'the studies'}: they have different references or units of length, so their distances cannot be "
             "compared; give both the same [reference] and [scaling]"
         )
-    first, second = (_distances(table(tree, order)) for tree in trees)
-    both = first.merge(second, on=_KEYS, suffixes=("", "_old"))
-    ratios = np.log(both["relative"] / both["relative_old"])
-    errors = both["share"] + both["share_old"]
-    return both.assign(object=name, log_ratio=ratios, log_error=errors)
+    tables = [table(tree, order) for tree in trees]
+    for y in columns:
+        first, second = (_numbers(frame[frame["order"].isin(orders_of([frame], y))], y) for frame in tables)
+        both = first.merge(second, on=_KEYS, suffixes=("", "_old"))
+        ratios, errors = np.log(both["value"] / both["value_old"]), both["share"] + both["share_old"]
+        yield both.assign(y=y, object=name, log_ratio=ratios, log_error=errors)
 
 
 def _identity(tree: xr.DataTree) -> str:
@@ -105,12 +121,12 @@ def _identity(tree: xr.DataTree) -> str:
     return digest or repr(sorted(tree.attrs["study"]["table"]["reference"].items()))
 
 
-def _distances(frame: pd.DataFrame) -> pd.DataFrame:
-    known = frame[frame["relative"].notna()]
-    relative = np.maximum(known["relative"], NEXT_TO_EQUAL)
+def _numbers(frame: pd.DataFrame, y: str) -> pd.DataFrame:
+    values, errors = numbers_of(frame, y)
+    values = np.maximum(values, NEXT_TO_EQUAL) if y == RELATIVE else np.where(values > 0, values, np.nan)
     with np.errstate(divide="ignore"):
-        share = -np.log1p(-np.minimum(known["relative_error"] / relative, 1.0))
-    return known[[*_KEYS, "family"]].assign(relative=relative, share=share)
+        share = -np.log1p(-np.minimum(errors / values, 1.0))
+    return frame[[*_KEYS, "family"]].assign(value=values, share=share)[np.isfinite(values)]
 
 
 def _change(meshes: pd.DataFrame) -> dict[str, object]:

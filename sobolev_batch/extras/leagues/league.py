@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -12,6 +13,7 @@ from typing import Literal, overload
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError, StoreError
@@ -20,6 +22,7 @@ from sobolev_batch.extras.leagues.statistics import (
     Curve,
     adjusted,
     common_sizes,
+    filled,
     interval,
     sign_flip_test,
     within_objects,
@@ -38,14 +41,16 @@ from sobolev_batch.tables.text import wrapped
 from sobolev_batch.transform.lattice import Orders
 
 LEAGUE_NOTE = """\
-Relative distances are geometric means over the objects, at equal {x}. Their 95 % intervals
-leave out what the objects themselves differ by, and hold the errors of the distances. A rank
-such as 1-3 says which places the intervals allow. Rates are orders of convergence in the edge
-length. Two methods differ where the permutation test of pairs says so, at the level of 5 %
-for all pairs together."""
+Numbers ({y}) are geometric means over the objects, at equal {x}. Their 95 % intervals leave
+out what the objects themselves differ by, and hold the errors of the numbers. A rank such as
+1-3 says which places the intervals allow. Rates are slopes over the edge length. Two methods
+differ where the permutation test of pairs says so, at the level of 5 % for all pairs together.
+Pairs are compared at the sizes and over the objects that both have."""
 
 # The store of several objects, or stores of single objects by their names.
 AnyStores = str | Path | Location | Mapping[str, AnyStore]
+# What methods are compared by unless another number is named.
+RELATIVE = "relative"
 # Columns of the ends of an interval.
 ENDS = ("low", "high")
 
@@ -65,15 +70,20 @@ def interval_text(shown: Callable[[float], str]) -> Callable[[float, float], str
     return lambda low, high: f"{shown(low)} to {shown(high)}"
 
 
-LEAGUE_COLUMNS = (
-    Column("method", "method", kind="label"),
-    Column("rank", "rank", lambda first, last: f"{first}" if first == last else f"{first}-{last}", "last_rank"),
-    Column("relative", "relative", percent_text),
-    Column("low", "95 % interval", interval_text(percent_text), "high"),
-    Column("rate", "rate", number_text),
-    Column("rate_low", "95 % interval", interval_text(number_text), "rate_high"),
-    Column("objects", "objects"),
-)
+def league_columns(y: str) -> tuple[Column, ...]:
+    """Return the columns of `League.table` for people."""
+    shown = percent_text if y == RELATIVE else number_text
+    return (
+        Column("method", "method", kind="label"),
+        Column("rank", "rank", lambda first, last: f"{first}" if first == last else f"{first}-{last}", "last_rank"),
+        Column(y, y, shown),
+        Column("low", "95 % interval", interval_text(shown), "high"),
+        Column("rate", "rate", number_text),
+        Column("rate_low", "95 % interval", interval_text(number_text), "rate_high"),
+        Column("objects", "objects"),
+    )
+
+
 PAIR_COLUMNS = (
     Column("method", "method", kind="label"),
     Column("other", "other", kind="text"),
@@ -81,6 +91,7 @@ PAIR_COLUMNS = (
     Column("low", "95 % interval", interval_text(number_text), "high"),
     Column("p", "p", "{:.2g}".format),
     Column("nearer", "nearer", kind="text"),
+    Column("objects", "objects"),
 )
 
 
@@ -91,11 +102,15 @@ class League(ShownTables):
     Attributes:
         order: Sobolev order s.
         x: Size at which methods are compared, such as "triangles".
-        objects: Names of the objects that have all methods.
+        y: What they are compared by, such as "relative" or "hausdorff".
+        objects: Names of the objects that have two methods at least.
         methods: Names of the methods.
-        left_out: Why other objects are not there, by name.
+        left_out: Why other objects, and single methods of an object (object/method), are not there, by name.
+        curves: The meshes of each method, for each object: logarithms of sizes and numbers, and errors of these.
+        known: Which methods (objects, methods) each object has.
         sizes: Logarithms of the sizes (objects, sizes) at which the methods are compared.
-        values_at: Logarithms of relative distances (objects, methods, sizes).
+        values_at: Logarithms of the numbers (objects, methods, sizes). Those that are not known follow from the others
+            of the object, and the mean ratios to these.
         errors_at: Bounds on the errors of these.
         slopes: Observed rates in the edge length, and bounds on their errors (objects, methods, 2); NaN without one.
 
@@ -107,9 +122,12 @@ class League(ShownTables):
 
     order: float
     x: str
+    y: str
     objects: tuple[str, ...]
     methods: tuple[str, ...]
     left_out: Mapping[str, str]
+    curves: Mapping[str, Mapping[str, Curve]]
+    known: NDArray[np.bool_]
     sizes: Reals
     values_at: Reals
     errors_at: Reals
@@ -117,7 +135,7 @@ class League(ShownTables):
 
     @property
     def values(self) -> Reals:
-        """Logarithms of relative distances (objects, methods), averaged over the sizes."""
+        """Logarithms of the numbers (objects, methods), averaged over the sizes."""
         return np.asarray(self.values_at.mean(axis=-1))
 
     @property
@@ -125,33 +143,37 @@ class League(ShownTables):
         """Bounds (objects, methods) on the errors of these."""
         return np.asarray(self.errors_at.mean(axis=-1))
 
-    def mean_curve(self, method: str) -> Curve:
-        """Return the mean over the objects of a method's distances at each size, whose mean is that of the table."""
-        number = self.methods.index(method)
-        parts = self.sizes, self.values_at[:, number], self.errors_at[:, number]
-        return Curve(*(np.mean(part, axis=0) for part in parts))
+    def mean_curve(self, method: str) -> tuple[Reals, Reals]:
+        """Return sizes (n,), and means over the objects with the ends of their intervals (n, 3), as in the table."""
+        number, count = self.methods.index(method), len(self.objects)
+        means = []
+        for values, errors in zip(self.values_at.transpose(2, 0, 1), self.errors_at.transpose(2, 0, 1), strict=True):
+            spread = within_objects(values)[number] if count > 1 else np.nan
+            means.append(interval(values[:, number], errors[:, number], spread))
+        return np.exp(self.sizes.mean(axis=0)), np.exp(means)
 
     @property
     def caption(self) -> str:
         """Caption of its table."""
-        return f"League at order {self.order:g}, over {objects_text(len(self.objects))}"
+        of, at = ("", f" at order {self.order:g}") if self.y == RELATIVE else (f" by {self.y}", "")
+        return f"League{of}{at}, over {objects_text(len(self.objects))}"
 
     @cached_property
     def table(self) -> pd.DataFrame:
         """Methods from the nearest to the farthest, one row each.
 
         Columns: rank and last_rank, the best and the worst place that the interval of the method allows; method;
-        objects, their number; relative, the geometric mean of its relative distances at equal sizes, with the ends low
-        and high of its interval; rate, the mean observed order of convergence in the edge length, with rate_low and
-        rate_high.
+        objects, the number of those that have it; by its name, as "relative", the geometric mean of its numbers at
+        equal sizes, with the ends low and high of its interval; rate, the mean observed order of convergence in the
+        edge length, with rate_low and rate_high.
         """
         count = len(self.objects)
         spreads = within_objects(self.values) if count > 1 else np.full(len(self.methods), np.nan)
         slopes = [of_method[np.isfinite(of_method[:, 0])] for of_method in self.slopes.swapaxes(0, 1)]
-        frame = pd.DataFrame({"method": self.methods, "objects": count})
-        frame[["relative", *ENDS]] = np.exp(list(map(interval, self.values.T, self.errors.T, spreads)))
+        frame = pd.DataFrame({"method": self.methods, "objects": self.known.sum(axis=0)})
+        frame[[self.y, *ENDS]] = np.exp(list(map(interval, self.values.T, self.errors.T, spreads)))
         frame[["rate", "rate_low", "rate_high"]] = [interval(*known.T) for known in slopes]
-        frame = frame.sort_values("relative", kind="stable", ignore_index=True)
+        frame = frame.sort_values(self.y, kind="stable", ignore_index=True)
         low, high = frame["low"].to_numpy(), frame["high"].to_numpy()
         # Where there are no intervals, any place is possible.
         frame.insert(0, "rank", [1 + int(np.sum(high < end)) for end in low])
@@ -160,19 +182,22 @@ class League(ShownTables):
 
     @cached_property
     def pairs(self) -> pd.DataFrame:
-        """Each two methods, compared on the same objects.
+        """Each two methods, compared over the objects that have both, at the sizes that both have there.
 
-        Columns: method, other; ratio, the geometric mean over the objects of the ratio of their distances at equal
+        Columns: method, other; ratio, the geometric mean over the objects of the ratio of their numbers at equal
         sizes, with the ends low and high of its interval; p, the p-value of the paired permutation test, adjusted for
-        the number of pairs (Holm); nearer, the method that is nearer by this test at the level of 5 %, or nothing.
+        the number of pairs (Holm); nearer, the method with the smaller numbers by this test at the level of 5 %, or
+        nothing; objects, the number of those compared.
         """
         rows = []
-        for i, j in combinations(range(len(self.methods)), 2):
-            differences = self.values[:, i] - self.values[:, j]
-            errors = self.errors[:, i] + self.errors[:, j]
+        for first, second in combinations(self.methods, 2):
+            pairs = [(one[first], one[second]) for one in self.curves.values() if {first, second} <= one.keys()]
+            found = [(*a.at(sizes), *b.at(sizes)) for a, b in pairs if (sizes := common_sizes([a, b])) is not None]
+            means = np.reshape(found, (len(found), 4, -1)).mean(axis=2) if found else np.empty((0, 4))
+            differences, errors = means[:, 0] - means[:, 2], means[:, 1] + means[:, 3]
             ratio = np.exp(interval(differences, errors))
-            rows.append([self.methods[i], self.methods[j], *ratio, sign_flip_test(differences, errors)])
-        frame = pd.DataFrame(rows, columns=["method", "other", "ratio", *ENDS, "p"])
+            rows.append([first, second, *ratio, sign_flip_test(differences, errors), len(found)])
+        frame = pd.DataFrame(rows, columns=["method", "other", "ratio", *ENDS, "p", "objects"])
         frame["p"] = adjusted(frame["p"].to_numpy(dtype=np.float64))
         nearer = np.where(frame["ratio"] < 1, frame["method"], frame["other"])
         frame["nearer"] = np.where(frame["p"] < SIGNIFICANCE, nearer, "")
@@ -191,6 +216,7 @@ def league(
     *,
     by: Literal["size"] = "size",
     x: str | None = None,
+    y: str = RELATIVE,
     methods: Sequence[str] | None = None,
 ) -> tuple[League, ...]: ...
 
@@ -212,12 +238,14 @@ def league(
     *,
     by: Literal["size", "cost"] = "size",
     x: str | None = None,
+    y: str = RELATIVE,
     methods: Sequence[str] | None = None,
 ) -> tuple[League, ...] | tuple[CostLeague, ...]:
     """Rank the methods of a study over its objects, for each order.
 
-    Methods are the families that the objects have in common. On each object, they are compared at equal sizes: at sizes
-    evenly spaced over the range that all of them have, with straight lines on logarithmic axes between their meshes.
+    Methods are families. On each object, they are compared at equal sizes: at sizes evenly spaced over the range that
+    all of them have, with straight lines on logarithmic axes between their meshes. A method that an object lacks, or
+    has at other sizes, is compared over the other objects.
     By cost, they need nothing in common: what counts are the meshes that no other one of the object beats in both its
     distance and its cost. docs/leagues.md explains the intervals and the test.
 
@@ -229,6 +257,9 @@ def league(
         x: Size or cost of a mesh: "triangles" (the default by size), "vertices", "edge_length", "make_seconds" (the
             default by cost), "make_cpu_seconds", "make_peak_bytes", or a number among the metadata of the meshes, such
             as the seconds that a method took.
+        y: What methods are compared by, a column of `table` of which less is better: "relative", "hausdorff", "rms",
+            "make_seconds", "triangles" (of searched families, at equal x="target_tolerance") and so on. Its errors are
+            those of the column with _error. One that is the same at all orders has one league.
         methods: Names of the methods to compare; default all.
 
     Returns:
@@ -236,8 +267,8 @@ def league(
         `CostLeague.means` and `CostLeague.meshes`.
 
     Raises:
-        InputError: There are no tables yet, an order, size or method is unknown, no object has all methods, or no mesh
-            has the cost.
+        InputError: There are no tables yet, an order, size or method is unknown, no objects connect all methods, or no
+            mesh has the cost.
         StoreError: The location has no store.
 
     >>> import sobolev_batch as sb
@@ -267,7 +298,7 @@ def league(
     tables = tables_of(stores, order)
     if by == "cost":
         return cost_leagues_of(tables, objects, x or DEFAULT_COST, _chosen(tables, methods))
-    return leagues_of(tables, objects, x=x or "triangles", methods=methods)
+    return leagues_of(tables, objects, x=x or "triangles", y=y, methods=methods)
 
 
 def leagues_of(
@@ -275,13 +306,21 @@ def leagues_of(
     objects: Sequence[str],
     *,
     x: str = "triangles",
+    y: str = RELATIVE,
     methods: Sequence[str] | None = None,
 ) -> tuple[League, ...]:
     """Rank methods by the rows of `table` of each object that has some, among all objects; see `league`."""
-    orders = list(dict.fromkeys(s for frame in tables.values() for s in frame["order"]))
+    orders = orders_of(tables.values(), y)
     chosen = _chosen(tables, methods)
     unfinished = dict.fromkeys((name for name in objects if name not in tables), "it has no tables yet")
-    return tuple(_league(tables, s, x, chosen, unfinished) for s in orders)
+    return tuple(_league(tables, s, x, y, chosen, unfinished) for s in orders)
+
+
+def orders_of(frames: Iterable[pd.DataFrame], y: str) -> list[float]:
+    """Return the orders of tables; the first one alone if a number is the same at all of them."""
+    orders = list(dict.fromkeys(s for frame in frames for s in frame["order"]))
+    is_same = all(y in frame and frame.groupby("mesh")[y].nunique().le(1).all() for frame in frames)
+    return orders[:1] if y != RELATIVE and is_same else orders
 
 
 def _chosen(tables: Mapping[str, pd.DataFrame], methods: Sequence[str] | None) -> list[str]:
@@ -295,46 +334,72 @@ def _chosen(tables: Mapping[str, pd.DataFrame], methods: Sequence[str] | None) -
 
 
 def _league(
-    tables: Mapping[str, pd.DataFrame], order: float, x: str, methods: Sequence[str], unfinished: Mapping[str, str]
+    tables: Mapping[str, pd.DataFrame],
+    order: float,
+    x: str,
+    y: str,
+    methods: Sequence[str],
+    unfinished: Mapping[str, str],
 ) -> League:
-    rows: dict[str, tuple[Reals, ...]] = {}
-    left_out = dict(unfinished)
+    rows: dict[str, tuple[Reals, Reals, Reals, Reals]] = {}
+    known: dict[str, dict[str, Curve]] = {}
+    left_out, least = dict(unfinished), np.log(NEXT_TO_EQUAL) if y == RELATIVE else -np.inf
     for name, frame in tables.items():
         at_order = frame[frame["order"] == order]
-        curves = _curves(at_order, x, methods)
-        common = common_sizes([curves[method] for method in methods]) if len(curves) == len(methods) else None
-        exact = [method for method, curve in curves.items() if np.any(curve.values < np.log(NEXT_TO_EQUAL))]
-        if len(curves) < len(methods):
-            left_out[name] = f"no distance of {', '.join(method for method in methods if method not in curves)}"
-        elif exact:
-            left_out[name] = f"{', '.join(exact)} reproduced it, up to rounding"
-        elif common is None:
-            left_out[name] = gap_of({method: curve.range for method, curve in curves.items()})
-        else:
-            values, errors = zip(*(curve.at(common) for curve in curves.values()), strict=True)
-            slopes = [curve.slope() for curve in _curves(at_order, EDGE_LENGTH, methods).values()]
-            rows[name] = common, np.array(values), np.array(errors), np.array(slopes)
-    if not rows:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:3])
-        raise InputError(
-            f"no object can serve to compare the methods {', '.join(methods)} ({reasons}); compare fewer methods, "
-            'or compare them by cost (table league --by cost, in Python by="cost")'
-        )
-    arrays = (np.array(parts) for parts in zip(*rows.values(), strict=True))
-    return League(order, x, tuple(rows), tuple(methods), left_out, *arrays)
+        found = _curves(at_order, x, y, methods)
+        why = {method: f"no {y if y != RELATIVE else 'distance'} of {method}" for method in methods}
+        why |= {method: f"{method} reproduced it, up to rounding" for method in found}
+        curves = {method: curve for method, curve in found.items() if np.all(curve.values >= least)}
+        known[name], in_common = curves, _with_common_sizes(curves)
+        lacking = [method for method in methods if method not in in_common]
+        ranges = {method: curve.range for method, curve in curves.items()}
+        why |= {method: gap_of(ranges) for method in curves}
+        common = common_sizes([*in_common.values()]) if in_common else None
+        if common is None or len(in_common) < min(2, len(methods)):
+            left_out[name] = "; ".join(dict.fromkeys(why[method] for method in lacking or methods))
+            continue
+        left_out |= {f"{name}/{method}": why[method] for method in lacking}
+        at = {method: curve.at(common) for method, curve in in_common.items()}
+        missing = np.full((2, len(common)), np.nan)
+        values, errors = np.array([at.get(method, missing) for method in methods]).swapaxes(0, 1)
+        slopes = {method: curve.slope() for method, curve in _curves(at_order, EDGE_LENGTH, y, methods).items()}
+        rows[name] = common, values, errors, np.array([slopes.get(method, (np.nan, np.nan)) for method in methods])
+    if rows:
+        sizes, values, errors, slopes_of = (np.array(parts) for parts in zip(*rows.values(), strict=True))
+        is_known = np.isfinite(values).all(axis=2)
+        with suppress(np.linalg.LinAlgError):
+            values = np.stack([filled(at_size) for at_size in values.transpose(2, 0, 1)], axis=2)
+            errors = np.where(np.isnan(errors), np.nanmean(errors, axis=0), errors)
+            parts = sizes, values, errors, slopes_of
+            return League(order, x, y, tuple(rows), tuple(methods), left_out, known, is_known, *parts)
+    reasons = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:3])
+    raise InputError(
+        f"no objects can serve to compare the methods {', '.join(methods)} ({reasons}); compare fewer methods, "
+        'or compare them by cost (table league --by cost, in Python by="cost")'
+    )
 
 
-def _curves(frame: pd.DataFrame, x: str, methods: Sequence[str]) -> dict[str, Curve]:
-    """Return the curve of each method that has distances from an object."""
-    curves = {method: Curve.from_rows(frame[frame["family"] == method], x) for method in methods}
+def _with_common_sizes(curves: Mapping[str, Curve]) -> dict[str, Curve]:
+    """Return the curves of most methods, as far as they have sizes in common: those farthest from the others go."""
+    kept = dict(curves)
+    while len(kept) > 2 and common_sizes([*kept.values()]) is None:
+        middles = {method: sum(curve.range) / 2 for method, curve in kept.items()}
+        center = float(np.median([*middles.values()]))
+        del kept[max(middles, key=lambda method: abs(middles[method] - center))]
+    return kept
+
+
+def _curves(frame: pd.DataFrame, x: str, y: str, methods: Sequence[str]) -> dict[str, Curve]:
+    """Return the curve of each method that has numbers for an object."""
+    curves = {method: Curve.from_rows(frame[frame["family"] == method], x, y) for method in methods}
     return {method: curve for method, curve in curves.items() if curve is not None}
 
 
 def format_league(leagues: Sequence[League], style: Format = "text") -> str:
     """Return leagues as text; see `league`."""
     frame = pd.concat([one.table.assign(order=one.order) for one in leagues], ignore_index=True)
-    sections = [Section(one.caption, [(LEAGUE_COLUMNS[:-1], one.table)], pair_lines(one)) for one in leagues]
-    notes = wrapped(LEAGUE_NOTE.format(x=leagues[0].x))
+    sections = [Section(one.caption, [(league_columns(one.y), one.table)], pair_lines(one)) for one in leagues]
+    notes = wrapped(LEAGUE_NOTE.format(x=leagues[0].x, y=", ".join(dict.fromkeys(one.y for one in leagues))))
     notes += [f"{name} is left out{where}: {reason}." for name, where, reason in left_out(leagues)]
     return rendered(style, frame[["order", *frame.columns.drop("order")]], sections, notes)
 
@@ -356,7 +421,8 @@ def pair_lines(league: League) -> list[str]:
     for row in league.pairs.itertuples():
         if row.nearer:
             farther, ratio = (row.other, 1 / row.ratio) if row.nearer == row.method else (row.method, row.ratio)
-            lines.append(f"{row.nearer} is {ratio:.3g} times nearer than {farther} (p = {row.p:.2g}).")
+            less = "is {} times nearer than" if league.y == RELATIVE else f"has {{}} times less {league.y} than"
+            lines.append(f"{row.nearer} {less.format(f'{ratio:.3g}')} {farther} (p = {row.p:.2g}).")
     count, methods = len(league.objects), len(league.table)
     if not lines and methods > 1:
         least = least_objects(len(league.pairs))

@@ -13,6 +13,8 @@ import pandas as pd
 from scipy.special import stdtrit
 
 from sobolev_batch.arrays import Reals
+from sobolev_batch.errors import InputError
+from sobolev_batch.sources.names import quoted
 from sobolev_batch.study.comparable import Range, common_range
 from sobolev_batch.tables.open import sizes_of
 
@@ -20,20 +22,20 @@ from sobolev_batch.tables.open import sizes_of
 _SIZES = 5
 # Meshes whose sizes differ by a smaller factor tell no rate.
 _SMALLEST_RANGE = 1.1
-# The bar of a logarithm with a larger error would leave no room for the distances.
-_LARGEST_ERROR = 3.0
 CONFIDENCE = 0.95
+# Numbers of `table` that no method should have little of.
+_MORE_IS_BETTER = ("fscore", "precision", "recall", "smallest_angle")
 # All changes of sign are tried for as many objects, and as many random ones for more.
 _MOST_ENUMERATED, _DRAWS, _SEED = 14, 20_000, 0
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """The distances of the meshes of one method from one object.
+    """The distances of the meshes of one method from one object, or another number of theirs.
 
     Attributes:
         sizes: Logarithms of the sizes (n,), ascending.
-        values: Logarithms of the relative distances (n,).
+        values: Logarithms of the distances (n,).
         errors: Bounds on the errors of these logarithms (n,), infinite where a distance is not larger than its error.
     """
 
@@ -42,29 +44,21 @@ class Curve:
     errors: Reals
 
     @classmethod
-    def from_rows(cls, rows: pd.DataFrame, x: str) -> Self | None:
-        """Return the curve of some rows of `table`, of one order and family; None where no mesh has a distance."""
-        sizes, relative = sizes_of(rows, x), rows["relative"].to_numpy()
-        known = np.isfinite(sizes) & np.isfinite(relative)
+    def from_rows(cls, rows: pd.DataFrame, x: str, y: str = "relative") -> Self | None:
+        """Return the curve of some rows of `table`, of one order and family; None where no mesh has the numbers."""
+        sizes, (values, errors) = sizes_of(rows, x), numbers_of(rows, y)
+        known = np.isfinite(sizes) & np.isfinite(values)
         if not known.any():
             return None
         order = np.argsort(sizes[known], kind="stable")
-        relative = relative[known][order]
-        relative_errors = rows["relative_error"].to_numpy()[known][order]
+        values, errors = values[known][order], errors[known][order]
         with np.errstate(divide="ignore", invalid="ignore"):
-            shares = np.fmin(relative_errors / relative, 1.0)
-            return cls(np.log(sizes[known][order]), np.log(relative), -np.log1p(-shares))
+            return cls(np.log(sizes[known][order]), np.log(values), -np.log1p(-np.fmin(errors / values, 1.0)))
 
     @property
     def range(self) -> Range:
         """Smallest and largest size, as logarithms."""
         return float(self.sizes[0]), float(self.sizes[-1])
-
-    @property
-    def bars(self) -> Reals:
-        """Errors (n,) of the distances themselves; where nothing bounds one, it is as large as the distance."""
-        factors = np.where(np.isfinite(self.errors), np.expm1(np.minimum(self.errors, _LARGEST_ERROR)), 1.0)
-        return np.exp(self.values) * factors
 
     def at(self, sizes: Reals) -> tuple[Reals, Reals]:
         """Return the logarithms of the distances at some sizes, on straight lines between the meshes, with errors.
@@ -89,6 +83,39 @@ class Curve:
         with np.errstate(invalid="ignore"):
             error = float(np.abs(weights) @ self.errors)
         return float(weights @ self.values), np.inf if np.isnan(error) else error
+
+
+def numbers_of(frame: pd.DataFrame, y: str) -> tuple[Reals, Reals]:
+    """Return a column of `table` of which less is better, NaN where it is not known, and its errors.
+
+    InputError where it has no such numbers.
+    """
+    if y in _MORE_IS_BETTER or y not in frame or not pd.api.types.is_numeric_dtype(frame[y]):
+        known = [name for name in frame.select_dtypes("number") if name not in _MORE_IS_BETTER]
+        raise InputError(f"no number of which less is better is named {quoted(y)}; known are {', '.join(known)}")
+    values = frame[y].to_numpy(dtype=np.float64, na_value=np.nan)
+    if f"{y}_upper" in frame:
+        return values, frame[f"{y}_upper"].to_numpy(dtype=np.float64) - values
+    return values, frame[f"{y}_error"].to_numpy(dtype=np.float64) if f"{y}_error" in frame else np.zeros(len(frame))
+
+
+def filled(values: Reals) -> Reals:
+    """Return values (objects, methods) with those that are NaN by the sum of an effect of the object and the method.
+
+    Effects are those of least squares. LinAlgError where some methods have no object in common with the others.
+
+    >>> filled(np.array([[1.0, 2.0, 4.0], [11.0, np.nan, 14.0]]))
+    array([[ 1.,  2.,  4.],
+           [11., 12., 14.]])
+    """
+    objects, methods = values.shape
+    rows, columns = np.indices(values.shape).reshape(2, -1)
+    design = np.hstack([np.eye(objects)[rows], np.eye(methods)[columns]])
+    known = np.isfinite(values).ravel()
+    if np.linalg.matrix_rank(design[known]) < objects + methods - 1:
+        raise np.linalg.LinAlgError
+    effects = np.linalg.lstsq(design[known], values.ravel()[known])[0]
+    return np.where(np.isnan(values), (design @ effects).reshape(values.shape), values)
 
 
 def common_sizes(curves: Sequence[Curve]) -> Reals | None:

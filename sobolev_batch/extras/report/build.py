@@ -224,9 +224,9 @@ def league_data(leagues: Sequence[League], name: str, orders: Sequence[str]) -> 
         "size": label_of(leagues[0].x) if leagues else "",
         "league": [
             [
-                _line(method, np.exp(curve.sizes), np.exp(curve.values), curve.bars)
+                _line(method, sizes, means[:, 0], means[:, 2] - means[:, 0])
                 for method in league.methods
-                for curve in [league.mean_curve(method)]
+                for sizes, means in [league.mean_curve(method)]
             ]
             for league in leagues
         ],

@@ -23,10 +23,11 @@ from sobolev_batch.extras.leagues.costs import (
     front_columns,
 )
 from sobolev_batch.extras.leagues.league import (
-    LEAGUE_COLUMNS,
     LEAGUE_NOTE,
     PAIR_COLUMNS,
+    RELATIVE,
     League,
+    league_columns,
     leagues_of,
     left_out,
     number_text,
@@ -34,7 +35,14 @@ from sobolev_batch.extras.leagues.league import (
 )
 from sobolev_batch.store.objects import Objects
 from sobolev_batch.tables.conclusion import VERDICT_COLUMNS, Row, study_verdict
-from sobolev_batch.tables.convergence import CONNECTION_COLUMNS, page_columns, table, tables_of, unit_notes, with_remarks
+from sobolev_batch.tables.convergence import (
+    CONNECTION_COLUMNS,
+    page_columns,
+    table,
+    tables_of,
+    unit_notes,
+    with_remarks,
+)
 from sobolev_batch.tables.open import finished_group, has_proximity, open_store, placement_doubts
 from sobolev_batch.tables.rendering import Column
 from sobolev_batch.tables.text import minus, percent
@@ -67,7 +75,9 @@ _OBJECT_COLUMNS = (
     Column("above_rtol", "above rtol", "{:,}".format),
 )
 # The relative distance comes first: a narrow screen shows no more without scrolling.
-_LEAGUE_COLUMNS = tuple(sorted(LEAGUE_COLUMNS, key=lambda column: (column.kind != "label", column.name != "relative")))
+_LEAGUE_COLUMNS = tuple(
+    sorted(league_columns(RELATIVE), key=lambda column: (column.kind != "label", column.name != "relative"))
+)
 
 
 @dataclass(frozen=True)
@@ -216,7 +226,7 @@ def league_content(objects: Objects, status: Status) -> dict[str, Any]:
         "leagues": leagues,
         "no_league": no_league,
         "differences": tuple(tuple(pair_lines(one)) for one in leagues),
-        "note": LEAGUE_NOTE.format(x=leagues[0].x).replace("\n", " ") if leagues else "",
+        "note": LEAGUE_NOTE.format(x=leagues[0].x, y=RELATIVE).replace("\n", " ") if leagues else "",
         "league": PageTable("league", _LEAGUE_COLUMNS, ranked, [*by_order]),
         "pairs": PageTable("pairs", PAIR_COLUMNS, pairs, [*by_order]) if pairs else None,
         "objects": PageTable("objects", _OBJECT_COLUMNS, of_objects, orders),

@@ -116,6 +116,68 @@ def test_objects_that_cannot_be_compared_are_left_out_and_named(
     np.testing.assert_allclose(made.table["rate"], 2.0)
 
 
+def test_a_method_that_an_object_lacks_drops_no_object_for_the_others() -> None:
+    rng = np.random.default_rng(8)
+    factors, scales = {"a": 1.0, "b": 1.5, "c": 3.0}, rng.uniform(0.01, 10, 8)
+    tables = {f"{i}": of_powers(factors, scale) for i, scale in enumerate(scales)}
+    whole = ranked(tables)
+    # One lacks c. Another has it at sizes that it shares with no other method, and a third has a at those.
+    tables["0"] = of_powers({"a": 1.0, "b": 1.5}, scales[0])
+    for name, method in (("1", "c"), ("2", "a")):
+        is_far = tables[name]["family"] == method
+        tables[name].loc[is_far, "triangles"] *= 1000
+        tables[name].loc[is_far, "relative"] /= 1000
+    made = ranked(tables)
+    assert made.objects == whole.objects
+    assert list(made.left_out) == ["0/c", "1/c", "2/a"]
+    assert made.left_out["0/c"] == "no distance of c"
+    assert made.table.set_index("method")["objects"].to_dict() == {"a": 7, "b": 8, "c": 6}
+    pairs = made.pairs.set_index(["method", "other"])
+    assert pairs["objects"].to_dict() == {("a", "b"): 7, ("a", "c"): 5, ("b", "c"): 6}
+    np.testing.assert_allclose(pairs["ratio"], [1 / 1.5, 1 / 3, 1.5 / 3])
+    # As all ratios are the same, those that are not known are known from the others.
+    for name in ("relative", "low", "high"):
+        np.testing.assert_allclose(made.table[name], whole.table[name], rtol=1e-9)
+    with pytest.raises(sb.errors.InputError, match="no objects can serve to compare the methods a, b, c, d"):
+        ranked({"x": of_powers({"a": 1, "b": 2}, 1.0), "y": of_powers({"c": 1, "d": 2}, 1.0)})
+
+
+def test_methods_are_compared_by_any_number() -> None:
+    def with_lengths(scale: float) -> pd.DataFrame:
+        rows = pd.concat(of_powers({"a": 1, "b": 2}, 1.0).assign(order=order) for order in (-2.0, -4.0))
+        lengths = scale * np.where(rows["family"] == "a", 3.0, 1.0) * rows["triangles"] ** -0.5
+        return rows.assign(hausdorff=lengths, hausdorff_upper=1.01 * lengths, rms=lengths / 9, fscore=0.5)
+
+    tables = {f"{i}": with_lengths(scale) for i, scale in enumerate((1.0, 20.0, 0.3, 7.0, 0.6, 4.0))}
+    for y, error in (("hausdorff", 0.01), ("rms", 0.0)):
+        made = ranked(tables, y=y)
+        assert made.table["method"].tolist() == ["b", "a"]
+        (pair,) = made.pairs.to_dict("records")
+        assert (pair["ratio"], pair["nearer"]) == (pytest.approx(3.0), "b")
+        assert np.log(pair["high"] / pair["low"]) == pytest.approx(4 * error, rel=0.02, abs=1e-9)
+        text = format_league([made])
+        assert f"League by {y}, over 6 objects" in text
+        assert f"b has 3 times less {y} than a" in text
+        assert sb.plot.league(made).get_ylabel() != sb.plot.league(ranked(tables, y="hausdorff_upper")).get_ylabel()
+    for y in ("fscore", "colour", "mesh"):
+        with pytest.raises(sb.errors.InputError, match=f"less is better is named '{y}'; known are .*hausdorff, "):
+            ranked(tables, y=y)
+
+
+def test_the_picture_has_the_interval_of_the_table_and_every_mesh() -> None:
+    tables = {f"{i}": of_powers({"a": 1.0, "b": 1.5 + 0.1 * i}, scale) for i, scale in enumerate((1.0, 5.0, 0.2))}
+    made = ranked(tables)
+    axes = sb.plot.league(made)
+    dots = np.concatenate([np.asarray(line.get_xydata()) for line in axes.lines if line.get_marker() == "."])
+    meshes = pd.concat(tables.values())[["triangles", "relative"]].to_numpy()
+    np.testing.assert_allclose(np.sort(dots, axis=0), np.sort(meshes, axis=0))
+    # Methods that keep their ratio to each other at all sizes have intervals as wide as those of the table.
+    bands = [np.asarray(one.get_paths()[0].vertices) for one in axes.collections if one.get_alpha()]
+    ends = [band[band[:, 0] == band[:, 0].max(), 1] for band in bands]
+    table = made.table.set_index("method").loc[list(made.methods)]
+    np.testing.assert_allclose([end.max() / end.min() for end in ends], table["high"] / table["low"])
+
+
 def test_methods_may_be_chosen_and_must_be_known() -> None:
     one = of_powers({"a": 1}, 1.0)
     assert ranked({"x": POWERS, "y": one}, methods=["a"]).objects == ("x", "y")
