@@ -10,7 +10,7 @@ import tomllib
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import chain, takewhile
 from pathlib import Path, PurePosixPath
 from string import Template
@@ -19,6 +19,7 @@ from sobolev_batch.batch.start import MADE_MESHES
 from sobolev_batch.errors import MeshError, StudyError, written
 from sobolev_batch.geometry.formats.by_name import is_mesh_name, mesh_stem
 from sobolev_batch.geometry.formats.readers import expected_size, read_mesh
+from sobolev_batch.geometry.surface import Extent, placement_doubt
 from sobolev_batch.shown import Shown, reasons
 from sobolev_batch.sources.files import MOST_MESHES
 from sobolev_batch.sources.names import caseless_key, label_problem, name_problem, natural_key, quoted
@@ -62,6 +63,7 @@ class StudyDraft(Shown):
         path: Path of the file.
         summary: Lines on the reference, and on the meshes of each family or object.
         left_out: Reason for each mesh file of the folder that the study does not name, by path.
+        doubtful: Question for each small file that looks as if its reference were another one, by path.
 
     >>> from pathlib import Path
     >>> import sobolev_batch as sb
@@ -75,11 +77,13 @@ class StudyDraft(Shown):
     path: Path
     summary: Sequence[str]
     left_out: Mapping[str, str]
+    doubtful: Mapping[str, str] = field(default_factory=dict)
 
     def __str__(self) -> str:
         file, more = shlex.quote(str(self.path)), len(self.summary) - _MOST_LINES
         families = [*self.summary[:_MOST_LINES], *([f"and {more} more"] if more > 0 else [])]
-        left_out = [f"{name}: {text}" for name, text in reasons("left out", self.left_out)]
+        named = reasons("left out", self.left_out), reasons("doubtful", self.doubtful)
+        left_out = [f"{name}: {text}" for name, text in chain(*named)]
         following = [f"next: sobolev-batch plan {file}", f"      sobolev-batch run {file}"]
         return "\n".join(map(visible, [f"{self.path}: {families[0]}", *families[1:], *left_out, *following]))
 
@@ -90,7 +94,8 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
     The reference is the mesh that is called original, reference, target or ground truth, or else the one with the most
     triangles. Each folder is a family; the meshes of a single folder are families by their names without the number at
     the end. Where several files are called references and others belong to them by name, the study has several
-    objects. Files are looked at, and only small ones are read.
+    objects, and so it has where the names of all files begin with those of finer ones, in any folder. Files are looked
+    at, and only small ones are read.
 
     Args:
         folder: Folder with meshes, in it or in folders below.
@@ -126,10 +131,16 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
     problem = _path_problem(str(below))
     if problem is not None:
         raise StudyError(f"{folder}: its path cannot be in a study file: {problem}; rename it")
-    sizes, left_out = _look_at(folder)
-    references = _references(list(sizes)) or {"": _reference(folder, sizes, left_out)}
+    sizes, extents, left_out = _look_at(folder)
+    references = _references(sizes) or {"": _reference(folder, sizes, left_out)}
     families = _families(sizes, references)
     used = {*references.values(), *chain.from_iterable(families.values())}
+    doubts = {
+        str(path): placement_doubt(extents[path], extents[references[name]])
+        for (name, _), paths in families.items()
+        for path in paths
+        if {path, references[name]} <= extents.keys()
+    }
     left_out |= {str(path): "its name is that of no object" for path in sizes if path not in used}
     is_single = "" in references
     if is_single:
@@ -144,11 +155,11 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
         len(study.object.members)
     with written(output, "the study", StudyError), output.open("x", encoding="utf-8", newline="\n") as file:
         file.write(text)
-    return StudyDraft(output, summary, left_out)
+    return StudyDraft(output, summary, left_out, {path: doubt for path, doubt in doubts.items() if doubt})
 
 
-def _look_at(folder: Path) -> tuple[dict[PurePosixPath, int], dict[str, str]]:
-    """Return the number of triangles of each mesh file that a study can name, and the reason for each other file.
+def _look_at(folder: Path) -> tuple[dict[PurePosixPath, int], dict[PurePosixPath, Extent], dict[str, str]]:
+    """Return the triangles of each mesh file that a study can name, extents of small ones, and reasons for others.
 
     Paths below the folder are in their natural order. Hidden files, stores, the meshes made beside these, and links to
     folders are left out. Small files are read as a whole, up to some bytes together.
@@ -163,6 +174,7 @@ def _look_at(folder: Path) -> tuple[dict[PurePosixPath, int], dict[str, str]]:
         if len(found) > MOST_MESHES:
             raise StudyError(f"{folder} has more than {MOST_MESHES} mesh files; name a folder with fewer")
     sizes: dict[PurePosixPath, int] = {}
+    extents: dict[PurePosixPath, Extent] = {}
     left_out: dict[str, str] = {}
     names: dict[str, str] = {}
     left = _MOST_BYTES
@@ -178,11 +190,12 @@ def _look_at(folder: Path) -> tuple[dict[PurePosixPath, int], dict[str, str]]:
             # A file without an expected size is of another format, damaged or empty.
             if size <= left or not triangles:
                 left -= size
-                triangles = len(read_mesh(folder / below).triangles)
+                mesh = read_mesh(folder / below)
+                triangles, extents[PurePosixPath(below)] = len(mesh.triangles), mesh.extent
             sizes[PurePosixPath(below)] = triangles
         except (MeshError, OSError) as error:
             left_out[below] = str(error).removeprefix(f"{folder / below}: ")
-    return sizes, left_out
+    return sizes, extents, left_out
 
 
 def _path_problem(path: str) -> str | None:
@@ -220,19 +233,34 @@ def _free_name(wanted: str, taken: Iterable[str] = (), fallback: str = "meshes")
     return next(candidate for candidate in numbered if caseless_key(candidate) not in known)
 
 
-def _references(paths: Sequence[PurePosixPath]) -> dict[str, PurePosixPath]:
+def _references(sizes: Mapping[PurePosixPath, int]) -> dict[str, PurePosixPath]:
     """Return the references by their objects; none where all files are of one object.
 
     There are several objects if several files are called references, and each has files of its name.
     """
-    called = [path for path in paths if _is_called_reference(path)]
+    called = [path for path in sizes if _is_called_reference(path)] or _continued(sizes)
     references = {_object_of(path): path for path in called}
-    owners = {_owner(path, references) for path in paths if path not in called}
+    owners = {_owner(path, references) for path in sizes if path not in called}
     are_names = all(
         name_problem(name, _LONGEST_NAME, RESERVED) is None and not name.startswith((".", "__")) for name in references
     )
     are_different = 2 <= len({*map(caseless_key, references)}) == len(called)
     return references if are_names and are_different and references.keys() <= owners else {}
+
+
+def _continued(sizes: Mapping[PurePosixPath, int]) -> list[PurePosixPath]:
+    """Return the files whose names all others have or continue, in any folder, and with fewer triangles; or none."""
+    finest = {mesh_stem(path): path for path in sorted(sizes, key=lambda path: sizes[path])}
+    owners = {}
+    for path, size in sizes.items():
+        stem = mesh_stem(path)
+        beginnings = (stem[:end] for end in range(len(stem) - 1, 0, -1) if not stem[end].isalnum())
+        owners[path] = owner = next((finest[name] for name in beginnings if name in finest), finest[stem])
+        # Files of one name may be of two methods, unless one is much finer.
+        if path != owner and size * (1 + (owner == finest[stem])) > sizes[owner]:
+            return []
+    own = [path for path, owner in owners.items() if path == owner]
+    return own if {*own} == {owner for path, owner in owners.items() if path != owner} else []
 
 
 def _families(paths: Iterable[PurePosixPath], references: Mapping[str, PurePosixPath]) -> _Families:

@@ -55,6 +55,7 @@ SEVERAL_OBJECTS: dict[str, tuple[list[str], str]] = {
         ["objects/big cow/original.ply", "objects/cow/original.ply"],
         "objects/{object}/{method}_{size}.ply",
     ),
+    "names in any folder": (["in/big cow.ply", "in/cow.ply"], "out/{object}_{method}_{size}.ply"),
     "hostile": (["[o]/originals/big cow.ply", "[o]/originals/cow.ply"], "[o]/*{method}?/{object}_{size}.ply"),
 }
 
@@ -117,6 +118,26 @@ def test_several_objects(tmp_path: Path, layout: str) -> None:
     families = {(one, family): paths for one in studies for family, paths in files_of(studies[one]).items()}
     found = {path: (one, family.strip("*?")) for (one, family), paths in families.items() for path in paths.values()}
     assert (found, summary[0]) == (own, "2 objects: big cow, cow")
+
+
+@pytest.mark.parametrize(("level", "is_paired"), [(2, False), (3, True)])
+def test_files_of_one_name_belong_together_where_one_is_finer(tmp_path: Path, level: int, is_paired: bool) -> None:
+    for number in range(3):
+        write(tmp_path / f"a/part_{number}.ply", 2)
+        write(tmp_path / f"b/part_{number}.ply", level)
+    summary = sb.init_study(tmp_path, tmp_path / "study.toml").summary
+    assert (summary[0] == "3 objects: part_0, part_1, part_2") == is_paired
+
+
+def test_meshes_far_larger_than_their_reference_are_named(tmp_path: Path) -> None:
+    for number in range(2):
+        write(tmp_path / f"in/part_{number}.ply", 2)
+        write(tmp_path / f"out/part_{number}_low.ply", 1)
+    ball = sb.shapes.icosphere(1)
+    sb.write_mesh(sb.Mesh(25.4 * ball.vertices, ball.triangles), tmp_path / "out/part_1_low.ply")
+    draft = sb.init_study(tmp_path, tmp_path / "study.toml")
+    assert list(draft.doubtful) == ["out/part_1_low.ply"]
+    assert "doubtful: out/part_1_low.ply: it is 25.4 times as large" in str(draft)
 
 
 @pytest.mark.parametrize(
