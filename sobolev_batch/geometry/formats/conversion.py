@@ -6,15 +6,16 @@ Libraries are known by the names of their classes, and none is imported.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from sobolev_batch.errors import InputError, MeshError
 from sobolev_batch.geometry.closed_forms import Sphere
+from sobolev_batch.geometry.formats.polygons import cut_polygons
 from sobolev_batch.geometry.formats.readers import read_mesh
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.smooth import Smooth
@@ -31,8 +32,8 @@ _EXPECTED = (
     "Open3D"
 )
 _SURFACES = "a Sphere, a parametrised surface (Ellipsoid, Torus, ParametrisedSurface)"
-# Cells of meshio without area.
-_WITHOUT_AREA = ("vertex", "line", "line3")
+# Cells of meshio with flat faces, and those without area.
+_FACES, _WITHOUT_AREA = ("triangle", "quad", "polygon"), ("vertex", "line", "line3")
 
 
 def as_mesh(mesh: MeshLike) -> Mesh:
@@ -44,18 +45,20 @@ def as_mesh(mesh: MeshLike) -> Mesh:
     - the path of a mesh file, as text or `pathlib.Path`: see `read_mesh`;
     - a pair (vertices, triangles) of arrays, (n, 3) and (m, 3);
     - a ``trimesh.Trimesh``, or a ``trimesh.Scene`` of one mesh, which is placed as in the scene;
-    - a ``pyvista.PolyData`` of triangles;
-    - a ``meshio.Mesh`` with cells of the type "triangle"; its vertices and lines have no area and are left out;
+    - a ``pyvista.PolyData`` without strips;
+    - a ``meshio.Mesh`` with cells of the types "triangle", "quad" and "polygon"; its vertices and lines have no area
+      and are left out;
     - an ``open3d.geometry.TriangleMesh`` or ``open3d.t.geometry.TriangleMesh``.
 
-    Coordinates become float64, and are copied. Vertices stay as they are: none are merged, moved or left out. For the
-    way back there are `Mesh.to_trimesh` and `Mesh.to_pyvista`, and the arrays of the mesh.
+    Coordinates become float64, and are copied. Polygons are cut into triangles as in files: see `read_mesh`. Vertices
+    stay as they are: none are merged, moved or left out. For the way back there are `Mesh.to_trimesh` and
+    `Mesh.to_pyvista`, and the arrays of the mesh.
 
     Args:
         mesh: Any of these.
 
     Raises:
-        InputError: It is none of these, or not of triangles alone; the message gives the type that was found.
+        InputError: It is none of these, or has other faces than polygons; the message gives the type that was found.
         MeshError: The file cannot be read, or the arrays make no mesh: see `Mesh`.
 
     >>> import sobolev_batch as sb
@@ -106,20 +109,26 @@ def _of_scene(found: Any) -> Mesh:
 
 
 def _of_pyvista(found: Any) -> Mesh:
-    faces = np.asarray(found.faces)
-    if found.n_strips or len(faces) % 4 or (faces[::4] != 3).any():
-        raise InputError("it has polygons or strips; pass mesh.triangulate()")
-    return Mesh(found.points, faces.reshape(-1, 4)[:, 1:])
+    if found.n_strips:
+        raise InputError("it has strips of triangles; pass mesh.triangulate()")
+    return _of_faces(found.points, [found.regular_faces] if found.is_all_triangles else found.irregular_faces)
 
 
 def _of_meshio(found: Any) -> Mesh:
-    others = {cells.type for cells in found.cells} - {"triangle", *_WITHOUT_AREA}
+    others = {cells.type for cells in found.cells} - {*_FACES, *_WITHOUT_AREA}
     if others:
-        raise InputError(f"it has cells of the type {', '.join(sorted(others))}, expected triangles alone")
-    triangles = [cells.data for cells in found.cells if cells.type == "triangle"]
-    if not triangles:
+        raise InputError(f"it has cells of the type {', '.join(sorted(others))}, expected triangles and polygons alone")
+    return _of_faces(found.points, [cells.data for cells in found.cells if cells.type in _FACES and len(cells.data)])
+
+
+def _of_faces(vertices: NDArray[Any], faces: Sequence[NDArray[Any]]) -> Mesh:
+    """Return the mesh of polygons, each array of which has one (k,) or several of as many corners (n, k)."""
+    if not faces:
         raise MeshError("the mesh has no triangles")
-    return Mesh(found.points, np.concatenate(triangles))
+    if vertices.shape[1:] != (3,):
+        raise MeshError(f"the vertices have the shape {vertices.shape}, expected (n, 3)")
+    sizes = np.concatenate([np.full(one.size // one.shape[-1], one.shape[-1]) for one in faces])
+    return Mesh(*cut_polygons(vertices, np.concatenate([one.ravel() for one in faces]), sizes))
 
 
 def _of_open3d(found: Any) -> Mesh:

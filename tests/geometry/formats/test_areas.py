@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import re
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -168,7 +169,7 @@ OUTLINES: dict[str, tuple[list[tuple[float, float]], float]] = {
 }
 
 
-def vtk(vertices: list[tuple[float, ...]], face: list[int]) -> bytes:
+def vtk(vertices: Sequence[tuple[float, ...]], face: list[int]) -> bytes:
     """A legacy file of VTK of one polygon."""
     points = "\n".join(map(numbers, vertices))
     return (

@@ -70,6 +70,26 @@ def test_meshes_of_other_libraries_stay_as_they_are(name: str) -> None:
     assert sb.as_mesh(MAKERS[name]()).digest == original().digest
 
 
+# A square, a triangle, an arrow and an L with their areas; a cut from the first corner would make the last two larger.
+CORNERS = np.array([(0, 0, 0), (0, 2, 0), (2, 2, 0), (2, 0, 0), (0.5, 1.5, 0), (2, 1, 0), (1, 1, 0), (1, 0, 0)])
+FACES = {(0, 1, 2, 3): 4.0, (0, 1, 3): 2.0, (0, 1, 2, 4): 1.0, (2, 5, 6, 7, 0, 1): 3.0}
+POLYGONS: dict[str, Callable[[], Any]] = {
+    "pyvista": lambda: pyvista.PolyData(CORNERS, np.concatenate([[len(face), *face] for face in FACES])),
+    "meshio": lambda: meshio.Mesh(
+        CORNERS,
+        [({3: "triangle", 4: "quad"}.get(len(face), "polygon"), [face]) for face in FACES] + [("quad", [])],
+    ),
+}
+
+
+@pytest.mark.parametrize("library", POLYGONS)
+def test_polygons_of_other_libraries_are_cut_as_in_files(library: str) -> None:
+    mesh = sb.as_mesh(POLYGONS[library]())
+    assert mesh.areas.sum() == pytest.approx(sum(FACES.values()))
+    assert mesh.notes == ()
+    assert sb.as_mesh(pyvista.Box(quads=True)).area == pytest.approx(24.0)
+
+
 @pytest.mark.parametrize("name", ["trimesh", "pyvista"])
 def test_nothing_is_shared_with_other_libraries(name: str) -> None:
     mesh = original()
@@ -88,16 +108,16 @@ def two_parts() -> Any:
     return made
 
 
-QUADS = np.insert(np.array(BOX_QUADS), 0, 4, axis=1).ravel()
 WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "number": (lambda: 7, "expected a Mesh, the path of a mesh file, a pair .* or Open3D; found int"),
     "three": (lambda: (1, 2, 3), "found tuple"),
-    "quadrilaterals": (lambda: pyvista.PolyData(BOX_VERTICES, QUADS), r"PolyData is no mesh .* mesh\.triangulate"),
-    "strips": (lambda: pyvista.Sphere().strip(), "it has polygons or strips"),
+    "strips": (lambda: pyvista.Sphere().strip(), r"PolyData is no mesh .* strips of triangles; .*mesh\.triangulate"),
     "no faces": (lambda: pyvista.PolyData(BOX_VERTICES), r"the pyvista\.PolyData is no mesh .*no triangles"),
     "grid": (lambda: box().to_pyvista().cast_to_unstructured_grid(), "found pyvista.UnstructuredGrid"),
     "tetrahedra": (lambda: meshio.Mesh(BOX_VERTICES, [("tetra", [[0, 1, 2, 4]])]), "cells of the type tetra"),
-    "flat": (lambda: meshio.Mesh(BOX_VERTICES[:, :2], [("triangle", BOX_TRIANGLES)]), r"\(n, 3\), found \(8, 2\)"),
+    "flat": (lambda: meshio.Mesh(BOX_VERTICES[:, :2], [("quad", BOX_QUADS)]), r"shape \(8, 2\), expected \(n, 3\)"),
+    "outside": (lambda: meshio.Mesh(BOX_VERTICES, [("quad", [[0, 1, 2, 8]])]), r"face 1 has an index outside 0\.\.7"),
+    "no cells": (lambda: meshio.Mesh(BOX_VERTICES, [("line", [[0, 1]])]), "the mesh has no triangles"),
     "two parts": (two_parts, r"it holds 2 parts, .* as scene\.to_mesh\(\)"),
 }
 
