@@ -170,14 +170,11 @@ class Search:
         # Steps towards an end that was not tried double, and arrive there.
         least = _BESIDE * width * 2.0 ** len(points)
         reach = _CLOSED * max(math.log1p(PRECISION) * 2.0 ** (_FEW_TRIALS - 1 - len(points)), width)
-        if bracket.best is None:
-            step = end - _extrapolated(points, end) + _BESIDE * width
-            guess = end - max(min(step, reach), least)
-            guess = start if guess < start + width else guess
-        elif bracket.failed is None:
-            step = _extrapolated(points, start) + _BESIDE * width - start
-            guess = start + max(min(step, reach), least)
-            guess = end if guess > end - width else guess
+        if bracket.best is None or bracket.failed is None:
+            (near, far), side = ((end, start), -1) if bracket.best is None else ((start, end), 1)
+            step = side * (_extrapolated(points, near) - near) + _BESIDE * width
+            guess = near + side * max(min(step, reach), least)
+            guess = far if side * (far - guess) < width else guess
         else:
             # Sobolev distances follow a power closely; the first secant step then arrives.
             is_first = len(points) == 2

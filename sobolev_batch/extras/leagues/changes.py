@@ -123,7 +123,7 @@ def _identity(tree: xr.DataTree) -> str:
 
 def _numbers(frame: pd.DataFrame, y: str) -> pd.DataFrame:
     values, errors = numbers_of(frame, y)
-    values = np.maximum(values, NEXT_TO_EQUAL) if y == RELATIVE else np.where(values > 0, values, np.nan)
+    values = np.maximum(values, NEXT_TO_EQUAL) if y == RELATIVE else values
     with np.errstate(divide="ignore"):
         share = -np.log1p(-np.minimum(errors / values, 1.0))
     return frame[[*_KEYS, "family"]].assign(value=values, share=share)[np.isfinite(values)]

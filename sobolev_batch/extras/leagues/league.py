@@ -347,13 +347,14 @@ def _league(
     for name, frame in tables.items():
         at_order = frame[frame["order"] == order]
         found = _curves(at_order, x, y, methods)
-        why = {method: f"no {y if y != RELATIVE else 'distance'} of {method}" for method in methods}
-        why |= {method: f"{method} reproduced it, up to rounding" for method in found}
         curves = {method: curve for method, curve in found.items() if np.all(curve.values >= least)}
         known[name], in_common = curves, _with_common_sizes(curves)
         lacking = [method for method in methods if method not in in_common]
-        ranges = {method: curve.range for method, curve in curves.items()}
-        why |= {method: gap_of(ranges) for method in curves}
+        why = {method: f"no {y if y != RELATIVE else 'distance'} of {method}" for method in methods}
+        why |= {method: f"{method} reproduced it, up to rounding" for method in found}
+        why |= dict.fromkeys(
+            curves, gap_of({method: curve.range for method, curve in curves.items()}) if curves else ""
+        )
         common = common_sizes([*in_common.values()]) if in_common else None
         if common is None or len(in_common) < min(2, len(methods)):
             left_out[name] = "; ".join(dict.fromkeys(why[method] for method in lacking or methods))
