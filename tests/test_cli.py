@@ -156,10 +156,13 @@ def test_compare_to_an_accuracy_and_on_a_lattice(folder: Path) -> None:
     assert re.search(rf"^Chamfer, the sum of both means: {near['chamfer']:.3f}\d* ± \S+ \(s\.e\.\)$", shown, re.M)
     for written, own in (("new/w-a.ply", "1.off"), ("new/w-b.ply", "3.off")):
         assert np.array_equal(sb.read_mesh(folder / written).vertices, sb.read_mesh(folder / own).vertices)
-        distances = PlyData.read(folder / written)["vertex"].data["distance"]
+        columns = PlyData.read(folder / written)["vertex"].data
+        distances = columns["distance"]
         # Both are inscribed in one sphere.
         assert 0 <= distances.max() <= near["hausdorff"]
         assert ("a.ply" in written) == bool((distances < 1e-9).all())
+        assert columns["signed_distance"][distances > 1e-9] == pytest.approx(distances[distances > 1e-9])
+    assert f"\nmean distance of A, positive outside of B and negative inside: {near['bias']:.2f}" in shown
 
 
 def test_compare_names_units_and_defects(folder: Path) -> None:
@@ -218,6 +221,9 @@ def test_a_hole_that_was_closed_is_seen(folder: Path) -> None:
     assert (found["outcome"], found["length"], found["unit"]) == ("not within", 2.0, None)
     assert 2.9 < found["forward"]["lower"] == found["lower"] <= found["upper"]
     assert np.linalg.norm(found["place"]) < 1e-9
+    # What is 2 from the rim of the hole is a millionth of the plate.
+    share, error = found["beyond"]
+    assert 0 <= share < 4 * error < 1e-3
 
 
 def document(*arguments: str, folder: Path, status: int = 0) -> dict[str, Any]:

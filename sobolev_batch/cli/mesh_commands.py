@@ -223,7 +223,8 @@ def _judge_deviation_of_files(options: _CompareOptions, within: str) -> int:
     verdict = judge_deviation(options.a, options.b, within, options.unit)
     answer = {"a": options.a, "b": options.b, "outcome": verdict.outcome, "length": verdict.length}
     bounds = asdict(verdict.deviations.both) | asdict(verdict.deviations)
-    echo_result(options.style, visible(f"{options.a.name}: {verdict}"), answer | {"unit": verdict.unit} | bounds)
+    answer |= {"unit": verdict.unit, "beyond": verdict.beyond}
+    echo_result(options.style, visible(f"{options.a.name}: {verdict}"), answer | bounds)
     return _STATUSES[verdict.outcome]
 
 
@@ -397,6 +398,9 @@ def _proximity_lines(found: Mapping[str, float], meshes: tuple[Mesh, Mesh], unit
         ending = " deg" if name.startswith("normal") else ""
         rows.append([title, *(f"{found[f'{name}{way}']:.4g}{ending}" for way in ("_forward", "_backward", ""))])
     yield from printed_table(rows, [f"in {unit}", "A to B", "B to A", "larger"], "text").split("\n")
+    if not math.isnan(found["bias"]):
+        signed = with_error(found["bias"], found["bias_error"])
+        yield f"mean distance of A, positive outside of B and negative inside: {signed} (s.e.)"
     yield f"Chamfer, the sum of both means: {with_error(found['chamfer'], found['chamfer_error'])} (s.e.)"
     yield (
         f"F-score at {found['threshold']:.4g}: {100 * found['fscore']:.4g} % "

@@ -1,4 +1,4 @@
-"""Distances of points from the triangles of a mesh, and the closest triangle, found by libigl's tree of boxes."""
+"""Distances of points from the triangles of a mesh, the closest ones and the sides, found by libigl's tree of boxes."""
 
 from __future__ import annotations
 
@@ -78,6 +78,26 @@ class Triangles:
             is_above &= dot(arms, outward[:, triangles]) <= 0
         heights = dot(arms, self._normals[:, triangles]) ** 2 * self._inverse_sizes[triangles]
         return np.where(is_above, np.minimum(least, heights), least)
+
+
+def signs(mesh: Mesh, points: Reals) -> Reals | None:
+    """Return 1 for each point (n, 3) outside of a mesh, and -1 for each one inside; None where the mesh has no sides.
+
+    It has some if its triangles are oriented consistently, once vertices of the same place are one. Outside of an open
+    mesh is the side that triangles face. Source: J. A. Baerentzen, H. Aanaes, "Signed distance computation using the
+    angle weighted pseudonormal" (2005), doi:10.1109/TVCG.2005.49.
+    """
+    own = mesh.merged or mesh
+    if any(own.counts[f"{kind}_edges"] for kind in ("nonmanifold", "inconsistent")):
+        return None
+    # Far from the origin and for large or small coordinates, digits would be lost.
+    origin = own.vertices[own.triangles[0, 0]]
+    vertices, places = own.vertices - origin, points - origin
+    scale = 2.0 ** float(np.frexp(np.abs(vertices).max())[1])
+    by_pseudonormals = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
+    triangles = np.ascontiguousarray(own.triangles, dtype=np.int64)
+    signed = np.reshape(igl.signed_distance(places / scale, vertices / scale, triangles, by_pseudonormals)[0], -1)
+    return np.where((signed < 0) != (own.volume < 0), -1.0, 1.0)
 
 
 def _inverse(values: Reals) -> Reals:

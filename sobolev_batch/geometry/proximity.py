@@ -6,7 +6,7 @@ import numpy as np
 
 from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import InputError
-from sobolev_batch.geometry.closest import Triangles
+from sobolev_batch.geometry.closest import Triangles, signs
 from sobolev_batch.geometry.deviation import Deviations, directed_deviation
 from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
 from sobolev_batch.geometry.mesh import Mesh, Vectors, cross, cross_lengths, dot
@@ -23,7 +23,7 @@ _SYMMETRIC = ("hausdorff", "hausdorff_upper", "mean", "rms", *(f"p{percent}" for
 _BOTH_WAYS = (*_SYMMETRIC, "normal_mean", "normal_max")
 LENGTHS = (
     *(f"{name}{way}" for name in _SYMMETRIC for way in ("", "_forward", "_backward")),
-    *("mean_error", "rms_error", "chamfer", "chamfer_error", "threshold"),
+    *("mean_error", "rms_error", "bias", "bias_error", "chamfer", "chamfer_error", "threshold"),
 )
 NUMBERS = (
     *LENGTHS,
@@ -35,6 +35,7 @@ METRICS = {
     "hausdorff": ("hausdorff", "hausdorff_upper"),
     "mean": ("mean", "mean_error"),
     "rms": ("rms", "rms_error"),
+    "bias": ("bias", "bias_error"),
     "percentiles": tuple(f"p{percent}" for percent in _PERCENTILES),
     "chamfer": ("chamfer", "chamfer_error"),
     "fscore": ("fscore", "precision", "recall"),
@@ -72,6 +73,9 @@ def proximity(
           they are the bounds of `largest_deviation`, 1 % apart;
         - mean and rms: mean distance, and root of the mean squared distance, by area; their standard errors, since
           points are random, are mean_error and rms_error;
+        - bias and bias_error: mean distance of points of a, positive outside of b and negative inside, and its
+          standard error; NaN if triangles of b are not oriented consistently. An open mesh has its outside where its
+          triangles face;
         - p50, p95 and p99: the distance below which 50, 95 and 99 % of the area are;
         - chamfer: the sum of both means, not squared; chamfer_error is its standard error;
         - fscore: harmonic mean of precision, the fraction of the area of a within the threshold of b, and recall, that
@@ -136,6 +140,10 @@ def proximity_and_deviations(
         found |= {f"{name}{('_forward', '_backward')[way]}": float(value) for name, value in numbers.items()}
         means.append((float(distances.mean()), error))
         rms_error = scale * float(squares.std(ddof=1)) / (2 * rms * np.sqrt(points)) if rms else 0.0
+        if own is meshes[0]:
+            sides = signs(meshes[1], drawn)
+            signed = distances * (np.nan if sides is None else sides)
+            found |= {"bias": float(signed.mean()), "bias_error": float(signed.std(ddof=1)) / np.sqrt(points)}
         found["rms_error"] = max(found.get("rms_error", 0.0), rms_error)
         matched.append(float(np.mean(distances <= limit)))
     precision, recall = matched
@@ -153,19 +161,36 @@ def proximity_and_deviations(
     return numbers, Deviations(*deviations)
 
 
-def vertex_distances(mesh: MeshLike, other: MeshLike) -> Reals:
+def share_beyond(a: MeshLike, b: MeshLike, length: float, points: int = DEFAULT_POINTS) -> tuple[float, float]:
+    """Return the share of the area that is farther from the other mesh than a length, by random points, and its error.
+
+    It is the larger of both directions. The standard error is that of a share which is one point larger.
+    """
+    meshes = as_mesh(a), as_mesh(b)
+    rng = np.random.default_rng(0)
+    count = max(
+        np.count_nonzero(Triangles(other).closest(_drawn(mesh, points, rng)[0])[0] > length)
+        for mesh, other in (meshes, meshes[::-1])
+    )
+    likely = (count + 1) / (points + 2)
+    return count / points, float(np.sqrt(likely * (1 - likely) / points))
+
+
+def vertex_distances(mesh: MeshLike, other: MeshLike, *, signed: bool = False) -> Reals:
     """Measure the distance of each vertex of a mesh from the closest point of another mesh.
 
     Args:
         mesh: Mesh whose vertices are measured, or what `as_mesh` makes one of.
         other: Mesh from which they are measured, in the same unit of length, or what `as_mesh` makes one of.
+        signed: Whether distances of vertices inside of the other mesh are negative. An open mesh has its outside where
+            its triangles face.
 
     Returns:
-        Distances (n,) of float64, unsigned, exact to rounding, in the unit of the meshes; NaN for a vertex that no
-        triangle uses.
+        Distances (n,) of float64, exact to rounding, in the unit of the meshes; NaN for a vertex that no triangle uses.
 
     Raises:
-        InputError: see `as_mesh`.
+        InputError: Signs are requested, but triangles of the other mesh are not oriented consistently; or see
+            `as_mesh`.
 
     >>> import sobolev_batch as sb
     >>> ball = sb.shapes.icosphere(3)
@@ -174,8 +199,13 @@ def vertex_distances(mesh: MeshLike, other: MeshLike) -> Reals:
     ((642,), 1.0, 1.0)
     """
     mesh, other = as_mesh(mesh), as_mesh(other)
-    distances = np.full(len(mesh.vertices), np.nan)
-    distances[mesh.used_vertices] = Triangles(other).closest(mesh.vertices[mesh.used_vertices])[0]
+    distances, used = np.full(len(mesh.vertices), np.nan), mesh.used_vertices
+    distances[used] = Triangles(other).closest(mesh.vertices[used])[0]
+    if signed:
+        sides = signs(other, mesh.vertices[used])
+        if sides is None:
+            raise InputError(f"the other mesh has no outside: {', '.join(other.defects)}")
+        distances[used] *= sides
     return distances
 
 

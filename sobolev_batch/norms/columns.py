@@ -127,6 +127,8 @@ VARIABLES: Mapping[str, Mapping[str, str]] = {
     },
     "mean_error": described("standard error of the mean distance", FILE_LENGTH),
     "rms_error": described("standard error of the root mean square", FILE_LENGTH),
+    "bias": described("mean distance from the reference, positive outside and negative inside", FILE_LENGTH),
+    "bias_error": described("standard error of the bias", FILE_LENGTH),
     "chamfer": described("Chamfer distance: the sum of both mean distances", FILE_LENGTH),
     "chamfer_error": described("standard error of the Chamfer distance", FILE_LENGTH),
     "fscore": described("F-score, the harmonic mean of precision and recall", NUMBER),

@@ -49,7 +49,9 @@ from sobolev_batch.transform.lattice import Lattice, check_orders
 
 # "auto" leaves it to each worker.
 Backends = Literal["auto", "cpu", "gpu"]
-Metric = Literal["hausdorff", "mean", "rms", "percentiles", "chamfer", "fscore", "normals", "volume", "triangles"]
+Metric = Literal[
+    "hausdorff", "mean", "rms", "bias", "percentiles", "chamfer", "fscore", "normals", "volume", "triangles"
+]
 
 # Deeper tables are mistakes.
 _DEEPEST = 20

@@ -83,7 +83,8 @@ Distances of orders are computed in {}."""
 _PROXIMITY_NOTE = """\
 Other distances are the same at all orders. They are those of points to the other mesh, the
 larger of both directions. The Hausdorff distance is between the bounds; other numbers are
-those of sampled points, with standard errors. Chamfer is the sum of the mean distances of
+those of sampled points, with standard errors. The bias is the mean distance of points of
+the mesh, positive outside of the reference and negative inside. Chamfer is the sum of the mean distances of
 both directions. Normals are compared as lines."""
 _ACCURACY_NOTE = """\
 The study requests an error of at most {rtol:g} of each distance; a distance
@@ -112,6 +113,7 @@ _METRIC_COLUMNS = (
     Column("hausdorff", "Hausdorff", between, "hausdorff_upper"),
     Column("mean", "mean ± s.e.", with_error, "mean_error"),
     Column("rms", "RMS ± s.e.", with_error, "rms_error"),
+    Column("bias", "bias ± s.e.", with_error, "bias_error"),
     *(Column(f"p{percent}", f"{percent} % ≤", "{:.3g}".format) for percent in (50, 95, 99)),
     Column("chamfer", "Chamfer ± s.e.", with_error, "chamfer_error"),
     Column("fscore", "F-score", lambda score: f"{100 * score:.1f} %"),
@@ -148,8 +150,8 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
           decides on it (level, triangles, names or time);
         - status, reason, triangles, vertices, seconds (of computing), edge_length (mean), and the metadata that the
           study gives its meshes; what a remesher may break, by the names of `Mesh.counts`: components,
-          euler_characteristic, boundary_edges, nonmanifold_edges, inconsistent_edges and zero_area_triangles; make_seconds, make_cpu_seconds, make_peak_bytes and exit_status of what made them,
-          where the study does;
+          euler_characteristic, boundary_edges, nonmanifold_edges, inconsistent_edges and zero_area_triangles;
+          make_seconds, make_cpu_seconds, make_peak_bytes and exit_status of what made them, where the study does;
         - distance (to the reference), error and its parts truncation, aliasing, discretisation and statistical;
           relative and relative_error (over the norm of the reference);
         - area_part and shape_part: what a change of total area alone explains of the distance, and the rest. Their

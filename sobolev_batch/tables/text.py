@@ -47,7 +47,7 @@ def with_error(value: float, error: float = math.nan, unit: str = "") -> str:
     if not math.isfinite(error) or error == 0:
         return f"{shown} ± {'0' if error == 0 else '?'}"
     above, last = _rounded_up(error, 1), _last_digit(value, error)
-    if POWER in shown and above < value * 1e3 and _magnitude(above) >= last:
+    if POWER in shown and above < abs(value) * 1e3 and _magnitude(above) >= last:
         power = _magnitude(round(value, -last))
         size, decimals = 10.0**power, max(0, power - last)
         return f"({value / size:.{decimals}f} ± {above / size:.{decimals}f}){_power(power)}{unit}"

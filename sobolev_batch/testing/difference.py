@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import xarray as xr
 
 from sobolev_batch.arrays import ComplexDtype, Reals
 from sobolev_batch.errors import InputError, from_extra, written
+from sobolev_batch.geometry.closest import signs
 from sobolev_batch.geometry.formats.ply import write_ply
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.proximity import vertex_distances
@@ -40,8 +41,8 @@ class VertexWitness:
         orders: Orders s of these.
         title: What was compared with what.
         unit: Unit of length of the context, in that of the mesh.
-        distances: Distance (vertices,) of each vertex from the reference, in the unit of the mesh; None if not asked
-            for.
+        distances: Distances (vertices,) of vertices from the reference by their names in files, in the unit of the
+            mesh; see `named_distances`. None if not asked for.
         context: What the unit belongs to, a "study" or a "comparison".
     """
 
@@ -50,7 +51,7 @@ class VertexWitness:
     orders: Sequence[float]
     title: str
     unit: float
-    distances: Reals | None = None
+    distances: Mapping[str, Reals] | None = None
     context: str = "study"
 
     @property
@@ -71,6 +72,8 @@ class VertexWitness:
         ]
         if self.distances is not None:
             notes.append("distance to the closest point of the reference, in the unit of the mesh")
+        if self.distances is not None and "signed_distance" in self.distances:
+            notes.append("signed_distance is positive outside of the reference and negative inside")
         return notes
 
     def to_ply(self) -> bytes:
@@ -82,8 +85,9 @@ class VertexWitness:
         }
         first = next(iter(rows))
         quality = {"quality": rows[first].astype(np.float32)}
-        others = {} if self.distances is None else {"distance": self.distances}
-        return write_ply(self.mesh, {**quality, **rows, **others}, [*self.notes, f"quality repeats {first}"])
+        return write_ply(
+            self.mesh, {**quality, **rows, **(self.distances or {})}, [*self.notes, f"quality repeats {first}"]
+        )
 
 
 def order_text(order: float) -> str:
@@ -103,6 +107,13 @@ def witness_at_vertices(
     values = np.full((len(orders), len(mesh.vertices)), np.nan)
     values[:, used] = witness(a, b, list(orders), mesh.vertices[used], dtype=dtype)
     return values
+
+
+def named_distances(mesh: Mesh, other: Mesh) -> dict[str, Reals]:
+    """Return the distance (n,) of each vertex from another mesh, also with its sign where that mesh has sides."""
+    distances = vertex_distances(mesh, other)
+    sides = signs(other, mesh.vertices)
+    return {"distance": distances} | ({} if sides is None else {"signed_distance": sides * distances})
 
 
 def require_place(path: Path) -> None:
@@ -146,7 +157,7 @@ def write_difference(
         if isinstance(own, Mesh) and isinstance(mesh, Mesh):
             values = witness_at_vertices(*fields, (order,), mesh, dtype="complex64")
             is_measured = distances is not None and isinstance(other, Mesh) and not is_picture
-            lengths = vertex_distances(own, other) if is_measured else None
+            lengths = named_distances(own, other) if is_measured else None
             title = f"{label} against b, comparison {path.name}"
             one = VertexWitness(own, values, (order,), title, 1 / similarity.scale, lengths, "comparison")
             found[path.with_name(f"{path.name}-{label}.ply")] = one

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from sobolev_batch.geometry.deviation import Deviation, Deviations, largest_deviation
 from sobolev_batch.geometry.formats.conversion import MeshLike
+from sobolev_batch.geometry.proximity import share_beyond
 from sobolev_batch.parameters import length_in
-from sobolev_batch.tables.text import between
+from sobolev_batch.tables.text import between, percent
 
 # Digits of places: of their largest coordinate, or of the deviation where that is larger.
 _PLACE_DIGITS = 6
@@ -23,11 +24,14 @@ class DeviationVerdict:
         length: The length, in the unit of the meshes.
         unit: Name of this unit; None where it is not known.
         deviations: Bounds of the largest deviation, only as close as the answer needs.
+        beyond: Share of the area that is farther away, the larger of both directions, and its standard error; zero
+            where the meshes are within the length.
     """
 
     length: float
     unit: str | None
     deviations: Deviations
+    beyond: tuple[float, float] = (0.0, 0.0)
 
     @property
     def outcome(self) -> Literal["within", "not within", "undecided"]:
@@ -36,16 +40,18 @@ class DeviationVerdict:
         return "undecided" if is_within is None else "within" if is_within else "not within"
 
     def __str__(self) -> str:
-        """Return the answer with the bounds and the place."""
+        """Return the answer with the bounds and the place, and the share of the area beyond the length."""
         length = f"{self.length:.6g}{f' {self.unit}' if self.unit else ''}"
         answer = f"undecided whether within {length}" if self.outcome == "undecided" else f"{self.outcome} {length}"
-        return f"{answer}: largest deviation {deviation_text(self.deviations.both, self.unit)}"
+        beyond = "" if self.outcome == "within" else f"; {percent(*self.beyond)} of the area is farther away"
+        return f"{answer}: largest deviation {deviation_text(self.deviations.both, self.unit)}{beyond}"
 
 
 def judge_deviation(a: MeshLike, b: MeshLike, length: float | str, unit: str | None = None) -> DeviationVerdict:
     """Return whether the largest deviation of two meshes is within a length; see `assert_within`."""
     limit = length_in(length, unit)
-    return DeviationVerdict(limit, unit, largest_deviation(a, b, within=limit))
+    verdict = DeviationVerdict(limit, unit, largest_deviation(a, b, within=limit))
+    return verdict if verdict.outcome == "within" else replace(verdict, beyond=share_beyond(a, b, limit))
 
 
 def assert_within(a: MeshLike, b: MeshLike, length: float | str, *, unit: str | None = None) -> Deviations:
@@ -66,8 +72,8 @@ def assert_within(a: MeshLike, b: MeshLike, length: float | str, *, unit: str | 
         answer needs.
 
     Raises:
-        AssertionError: A point is farther away, or rounding leaves that open. The message is one line, with the bounds
-            and the place.
+        AssertionError: A point is farther away, or rounding leaves that open. The message is one line, with the bounds,
+            the place, and the share of the area that is farther away.
         InputError: The length is not positive, or has a unit that cannot be converted; or see `as_mesh`.
 
     >>> import sobolev_batch as sb
@@ -77,7 +83,7 @@ def assert_within(a: MeshLike, b: MeshLike, length: float | str, *, unit: str | 
     >>> sb.testing.assert_within(coarse, fine, 0.001)
     Traceback (most recent call last):
         ...
-    AssertionError: not within 0.001: largest deviation 0.00... to 0.0..., at (...)
+    AssertionError: not within 0.001: largest deviation 0.00... to 0.0..., at (...); 9... % of the area is farther away
     """
     __tracebackhide__ = True
     verdict = judge_deviation(a, b, length, unit)

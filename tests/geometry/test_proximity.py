@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 import sobolev_batch as sb
-from sobolev_batch.geometry.proximity import MOST_POINTS, proximity
+from sobolev_batch.geometry.proximity import MOST_POINTS, proximity, share_beyond
 
 
 def square(side: float, height: float = 0.0, *, stray: tuple[float, float, float] | None = None) -> sb.Mesh:
@@ -136,6 +136,79 @@ def test_vertices_of_spheres_and_plates_have_distances_in_closed_form(unit: floa
     # A larger plate reaches beyond a smaller one: its corners have a diagonal to go.
     larger = square(8.0 * unit, 4.0 * unit)
     assert sb.vertex_distances(larger, plate) == pytest.approx(np.full(4, np.sqrt(9 + 9 + 16) * unit), rel=1e-12)
+
+
+def in_box(points: Any, side: float = 1.0) -> Any:
+    return np.abs(points).max(axis=1) < side / 2
+
+
+def in_needle(points: Any) -> Any:
+    # The sides of this pyramid over a thin triangle meet at angles of a few degrees.
+    return (np.c_[points, np.ones(len(points))] @ np.linalg.inv(np.c_[NEEDLE.vertices, np.ones(4)]) > 0).all(axis=1)
+
+
+def as_mesh(made: Any, *, turned: bool = False) -> sb.Mesh:
+    return sb.Mesh(np.asarray(made.vertices), np.asarray(made.faces)[:, :: -1 if turned else 1])
+
+
+def apart(mesh: sb.Mesh) -> sb.Mesh:
+    return sb.Mesh(mesh.vertices[mesh.triangles].reshape(-1, 3), np.arange(3 * len(mesh.triangles)).reshape(-1, 3))
+
+
+NEEDLE = sb.Mesh([[0, 0, 0], [1, 0, 0], [0.5, 0.05, 0], [0.5, 0.02, 1]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+BOX, HOLE = as_mesh(trimesh.creation.box((1, 1, 1))), as_mesh(trimesh.creation.box((0.6, 0.6, 0.6)), turned=True)
+HOLLOW = sb.Mesh(np.vstack([BOX.vertices, HOLE.vertices]), np.vstack([BOX.triangles, HOLE.triangles + 8]))
+
+
+@pytest.mark.parametrize(
+    ("mesh", "is_inside"),
+    [
+        (BOX, in_box),
+        (sb.Mesh(BOX.vertices, BOX.triangles[:, ::-1]), in_box),
+        (HOLLOW, lambda points: in_box(points) & ~in_box(points, 0.6)),
+        (NEEDLE, in_needle),
+        # Every triangle has vertices of its own: across sharp edges, normals of single triangles mislead.
+        (apart(NEEDLE), in_needle),
+        # What is above a sheet is where its triangles face; beyond its ends, on the side of its plane.
+        (square(2.0), lambda points: points[:, 2] < 0),
+    ],
+)
+@pytest.mark.parametrize(("unit", "origin"), [(1.0, 0.0), (1e-60, 0.0), (1e30, 0.0), (1.0, 2.0**20)])
+def test_distances_are_negative_inside(mesh: sb.Mesh, is_inside: Any, unit: float, origin: float) -> None:
+    points = np.random.default_rng(5).uniform(-1.2, 1.2, (3000, 3))
+    points[2000:] = 1.0001 * mesh.vertices[np.arange(1000) % len(mesh.vertices)] + 1e-3 * points[2000:]
+    cloud, other = (
+        sb.Mesh(unit * one.vertices + origin, one.triangles)
+        for one in (sb.Mesh(points, np.arange(3000).reshape(-1, 3)), mesh)
+    )
+    found = sb.vertex_distances(cloud, other, signed=True)
+    np.testing.assert_array_equal(np.abs(found), sb.vertex_distances(cloud, other))
+    np.testing.assert_array_equal(found < 0, is_inside(points))
+
+
+def test_the_bias_is_the_mean_distance_with_its_sign() -> None:
+    ball = sb.shapes.icosphere(4)
+    larger = sb.Mesh(1.5 * ball.vertices, ball.triangles)
+    for a, b, expected in ((larger, ball, 0.5), (ball, larger, -0.5)):
+        assert proximity(a, b, points=2000)["bias"] == pytest.approx(expected, abs=4e-3)
+    # Noise is outside as often as inside.
+    factors = 1 + 0.01 * np.random.default_rng(1).normal(size=(len(ball.vertices), 1))
+    noisy = proximity(sb.Mesh(factors * ball.vertices, ball.triangles), ball, points=2000)
+    assert abs(noisy["bias"]) < 4 * noisy["bias_error"] < noisy["mean_forward"] / 5
+    # One triangle faces the other side, so that there is no outside.
+    turned = ball.triangles.copy()
+    turned[0] = turned[0, ::-1]
+    assert np.isnan(proximity(larger, sb.Mesh(ball.vertices, turned), points=100)["bias"])
+    with pytest.raises(sb.errors.InputError, match="no outside: 3 edges"):
+        sb.vertex_distances(larger, sb.Mesh(ball.vertices, turned), signed=True)
+
+
+def test_the_share_of_the_area_beyond_a_length() -> None:
+    # A square of side 4 around one of side 2: all but what is within the threshold of the smaller one.
+    share, error = share_beyond(square(2.0), square(4.0), 0.5)
+    assert 0 < error < 0.01
+    assert abs(share - (1 - (4 + 4 * 2 * 0.5 + np.pi * 0.5**2) / 16)) < 4 * error
+    assert share_beyond(square(4.0), square(4.0, 0.25), 0.26) == (0.0, pytest.approx(1e-4, rel=0.01))
 
 
 def test_distances_of_vertices_are_measured_between_meshes_alone() -> None:

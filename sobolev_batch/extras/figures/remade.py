@@ -17,7 +17,6 @@ import xarray as xr
 from sobolev_batch.batch.start import MADE_MESHES
 from sobolev_batch.errors import InputError, SobolevBatchError, from_extra, written
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.geometry.proximity import vertex_distances
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.sources.mesh_cache import MeshCache
 from sobolev_batch.sources.names import file_stem
@@ -34,7 +33,7 @@ from sobolev_batch.tables.open import (
     reference_of,
     require_one_object,
 )
-from sobolev_batch.testing.difference import VertexWitness, order_text, witness_at_vertices
+from sobolev_batch.testing.difference import VertexWitness, named_distances, order_text, witness_at_vertices
 from sobolev_batch.transform.lattice import Orders, check_orders
 
 SUFFIXES = (".ply", ".vtp")
@@ -110,7 +109,7 @@ class StudyMeshes:
         with fields_read(self.tree):
             values = witness_at_vertices(*fields_of(self.tree, label), orders, scaled)
         title = f"{label} against {reference_of(self.tree)}, study {self.tree.attrs['study']['name']}"
-        lengths = None if reference is None else vertex_distances(own, reference)
+        lengths = None if reference is None else named_distances(own, reference)
         return VertexWitness(own, values, orders, title, 1 / self.similarity.scale, lengths)
 
     def stem(self, label: str) -> str:
@@ -246,7 +245,7 @@ def _vtp(found: VertexWitness) -> bytes:
     for name, row in zip(names, found.values, strict=True):
         surface.point_data[name] = row
     if found.distances is not None:
-        surface.point_data["distance"] = found.distances
+        surface.point_data.update(found.distances)
     surface.point_data.active_scalars_name = names[0]
     surface.field_data["notes"] = found.notes
     # VTK writes into memory, since it does not report a full disk.
