@@ -90,8 +90,10 @@ def cut_polygons(vertices: NDArray[Any], corners: Indices, sizes: Indices) -> Ra
         face = int(np.searchsorted(np.cumsum(sizes), np.argmax((corners < 0) | (corners >= len(vertices))), "right"))
         raise MeshError(f"face {face + 1} has an index outside 0..{len(vertices) - 1}")
     axes = [np.ascontiguousarray(axis, np.float64) for axis in vertices.T]
-    # Vertices that no face uses may be no numbers.
-    found = _Found(float(np.linalg.norm(np.fmax.reduce(vertices, axis=0) - np.fmin.reduce(vertices, axis=0))))
+    # Vertices that no face uses may lie anywhere, and be no numbers.
+    is_used = np.zeros(len(vertices), bool)
+    is_used[corners] = True
+    found = _Found(float(np.linalg.norm([np.ptp(axis[is_used]) for axis in axes])))
     if (sizes == 4).all():
         return Raw(vertices, _cut_quads(axes, corners.reshape(-1, 4), found), found.notes(len(sizes)))
     starts = np.cumsum(sizes) - sizes

@@ -94,6 +94,13 @@ def test_quadrilaterals_bend_along_the_diagonal_of_the_smaller_angle_and_the_eff
     )
 
 
+@pytest.mark.parametrize("unused", [[0.0, 0.0, 0.0], [np.inf, 0.0, 0.0], [np.nan, np.nan, np.nan]], ids=str)
+@pytest.mark.parametrize("size", [4, 7])
+def test_vertices_that_no_face_uses_hide_nothing(unused: list[float], size: int) -> None:
+    raw = cut_polygons(np.vstack([bent(size, 0) + 5e6, [unused]]), np.arange(size), np.array([size]))
+    assert [note[:25] for note in raw.notes] == ["1 of 1 faces are not flat"]
+
+
 def test_a_saddle_is_cut_from_its_lowest_corner_in_any_order() -> None:
     x, y = (grid.ravel() for grid in np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9)))
     vertices = np.column_stack([x, y, 0.3 * x * y])
