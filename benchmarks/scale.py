@@ -6,15 +6,17 @@ import resource
 import shutil
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from distributed import Client, LocalCluster
 
 import sobolev_batch as sb
-from benchmarks.table import Row
+from benchmarks.table import Row, at_most
 from benchmarks.timing import Effort, elapsed_seconds
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.execution import Progress
@@ -106,6 +108,12 @@ def many_objects(effort: Effort) -> Iterator[Row]:
 
 
 def waiting_workers(effort: Effort) -> Iterator[Row]:
+    """How long workers wait while other objects have work, and how many threads are kept busy."""
+    yield from _waiting_objects(effort)
+    yield from _idle_threads(effort)
+
+
+def _waiting_objects(effort: Effort) -> Iterator[Row]:
     """Wall time of objects whose meshes only wait, beside that of one: a worker is idle where no object has work."""
     seconds, most = (15, 8) if not effort.quick else (1, 2)
     times = {}
@@ -135,7 +143,57 @@ def waiting_workers(effort: Effort) -> Iterator[Row]:
             )
             times[count] = time.perf_counter() - started
     what = f"{most} objects x 2 commands that wait {seconds} s, 8 workers: wall time over that of one object"
-    yield Row("objects", what, f"{times[most] / times[1]:.3g} ({times[1]:.3g} and {times[most]:.3g} s)")
+    ratio, both = times[most] / times[1], f"{times[most]:.3g} and {times[1]:.3g} s"
+    yield Row("waiting", what, both, ratio=ratio, target=at_most(2.5))
+
+
+def _idle_threads(effort: Effort) -> Iterator[Row]:
+    """Share of the time until the last mesh is begun for which threads make none; making one is to sleep."""
+    threads, objects, each, seconds = (256, 60, 40, 20.0) if not effort.quick else (8, 2, 12, 0.5)
+    with TemporaryDirectory() as name:
+        folder, times = Path(name), Path(name) / "times.txt"
+        _write_icosahedra(folder, objects)
+        mesh = {"source": "files", "paths": ["{object}.off"]}
+        study = {
+            **_STUDY,
+            "reference": mesh,
+            "object": [{"name": f"{number:07}"} for number in range(objects)],
+            "family": [
+                {
+                    "name": "slept",
+                    "source": _Sleeping(times, seconds),
+                    "mesh": mesh,
+                    "share": list(range(each)),
+                    "version": "1",
+                }
+            ],
+        }
+        # Threads take little memory while they sleep, and the machine has less than the 256 would be given.
+        memory = "lambda: (10**12, 'a simulated machine')"
+        preload = f"from sobolev_batch.batch.cluster import workers; workers.machine_memory = {memory}"
+        cluster = LocalCluster(n_workers=2, threads_per_worker=threads // 2, preload=[preload], dashboard_address=None)
+        with cluster, Client(cluster) as client:
+            sb.run(sb.Study.from_table(study, folder=folder), folder / "slept.zarr", client)
+        begins, ends = np.loadtxt(times).T
+    busy = np.minimum(ends, begins.max()) - begins
+    idle = float(1 - busy.sum() / (threads * np.ptp(begins)))
+    what = f"{objects * each} meshes of {objects} objects that take {seconds:g} s and more, {threads} threads"
+    yield Row("waiting", f"{what}: time without a mesh", f"{idle:.1%}", ratio=idle, target=at_most(0.05))
+
+
+@dataclass(frozen=True)
+class _Sleeping:
+    """A remesher that takes its time, and notes when."""
+
+    times: Path
+    seconds: float
+
+    def __call__(self, mesh: sb.Mesh, share: int) -> sb.Mesh:
+        begin = time.time()
+        time.sleep(self.seconds * (1 + share / 2000))
+        with self.times.open("a") as file:
+            file.write(f"{begin!r} {time.time()!r}\n")
+        return sb.Mesh(mesh.vertices * (1 + 1e-3 * share), mesh.triangles)
 
 
 _OBJECTS: dict[str, Any] = {
