@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import mapbox_earcut
@@ -22,53 +21,13 @@ _EQUAL_COSINES = 1e-9
 _NO_COSINE = -0.5
 # Weights of the axes in the height of a vertex: no usual edge is at right angles to them, so that none lies level.
 _AXES = (1.0, 0.618, 0.414)
-# Faces that are bent by less, as a fraction of the size of the mesh, are flat: single precision rounds as much.
-_FLAT = 1e-6
+# Faces that are bent by less, as a fraction of the size of the mesh, are flat: single precision rounds as much. Areas
+# that differ by less, as a fraction, are equal, and those below a fraction of the squared size are rounding.
+_FLAT, _EQUAL_AREAS, _NO_AREA = 1e-6, 1e-6, 1e-12
 # The largest turn to the wrong side, and error of the sum of all turns, of a convex polygon, in radians.
 _WRONG_TURN, _WRONG_SUM = 1e-9, 1e-3
-# Areas of a face that differ by less, as a fraction, are equal, and those below a fraction of the squared size of the
-# mesh are rounding.
-_EQUAL_AREAS, _NO_AREA = 1e-6, 1e-12
-
-
-@dataclass
-class _Found:
-    """What the faces of a file have that leaves their area open; heights and areas in units of length."""
-
-    size: float
-    bent: int = 0
-    height: float = 0.0
-    difference: float = 0.0
-    crossed: int = 0
-    crossed_area: float = 0.0
-    bent_area: float = 0.0
-
-    def add(self, heights: Reals, areas: Reals, differences: Reals, is_crossed: NDArray[np.bool_]) -> None:
-        """Count faces by their heights, their areas, and how those differ between the ways to cut them."""
-        has_area = areas > _NO_AREA * self.size**2
-        is_crossed = has_area & is_crossed
-        is_bent = has_area & ~is_crossed & (heights > _FLAT * self.size)
-        self.bent += int(np.count_nonzero(is_bent))
-        self.height = max(self.height, float(heights.max(initial=0.0, where=is_bent)))
-        self.difference += float(differences.sum(where=is_bent))
-        self.crossed += int(np.count_nonzero(is_crossed))
-        self.crossed_area += float(areas.sum(where=is_crossed))
-        self.bent_area += float(areas.sum(where=is_bent))
-
-    def notes(self, faces: int) -> tuple[str, ...]:
-        """Return what was found, in words."""
-        found = []
-        if self.bent:
-            found.append(
-                f"{self.bent:,} of {faces:,} faces are not flat: the other way to cut them moves them by up to "
-                f"{self.height:.2g} and changes their area of {self.bent_area:.3g} by {self.difference:.2g}"
-            )
-        if self.crossed:
-            found.append(
-                f"{self.crossed:,} of {faces:,} faces cross themselves or fold over, so that nothing tells their area; "
-                f"{self.crossed_area:.3g} is counted"
-            )
-        return tuple(found)
+# Of faces: heights above and below their planes, areas, those with another cut, and whether they cross themselves.
+_Measures = list[tuple[Reals, Reals, Reals, NDArray[np.bool_]]]
 
 
 def cut_polygons(vertices: NDArray[Any], corners: Indices, sizes: Indices) -> Raw:
@@ -93,27 +52,48 @@ def cut_polygons(vertices: NDArray[Any], corners: Indices, sizes: Indices) -> Ra
     # Vertices that no face uses may lie anywhere, and be no numbers.
     is_used = np.zeros(len(vertices), bool)
     is_used[corners] = True
-    found = _Found(float(np.linalg.norm([np.ptp(axis[is_used]) for axis in axes])))
+    size = float(np.linalg.norm([np.ptp(axis[is_used]) for axis in axes]))
+    found: _Measures = [(*np.zeros((3, 0)), np.zeros(0, bool))]
     if (sizes == 4).all():
-        return Raw(vertices, _cut_quads(axes, corners.reshape(-1, 4), found), found.notes(len(sizes)))
-    starts = np.cumsum(sizes) - sizes
-    parts, owners = [], []
+        return Raw(vertices, _cut_quads(axes, corners.reshape(-1, 4), found), _notes(found, size, len(sizes)))
+    starts, parts, owners = np.cumsum(sizes) - sizes, [], []
     for faces in (np.flatnonzero(sizes == 3), np.flatnonzero(sizes == 4), np.flatnonzero(sizes > 4)):
         if not faces.size:
             continue
-        size = int(sizes[faces[0]])
-        if size > 4:
+        number = sizes[faces[0]]
+        if number > 4:
             triangles, own = _cut_others(axes, corners[np.repeat(sizes > 4, sizes)], sizes[faces], found)
         else:
-            triangles, own = corners[starts[faces, None] + np.arange(size)], np.arange(len(faces)).repeat(size - 2)
-            triangles = triangles if size == 3 else _cut_quads(axes, triangles, found)
+            triangles, own = corners[starts[faces, None] + np.arange(number)], np.arange(len(faces)).repeat(number - 2)
+            triangles = triangles if number == 3 else _cut_quads(axes, triangles, found)
         parts.append(triangles)
         owners.append(faces[own])
     order = np.argsort(np.concatenate(owners), kind="stable")
-    return Raw(vertices, np.concatenate(parts)[order], found.notes(len(sizes)))
+    return Raw(vertices, np.concatenate(parts)[order], _notes(found, size, len(sizes)))
 
 
-def _cut_quads(axes: list[Reals], quads: Indices, found: _Found) -> Indices:
+def _notes(found: _Measures, size: float, faces: int) -> tuple[str, ...]:
+    """Return what leaves the area of faces open, in words, from the size of the mesh and the number of faces."""
+    heights, areas, others = (np.concatenate([one[i] for one in found]) for i in range(3))
+    has_area = areas > _NO_AREA * size**2
+    is_crossed = has_area & np.concatenate([one[3] for one in found])
+    is_bent = has_area & ~is_crossed & (heights > _FLAT * size)
+    notes = []
+    if bent := np.count_nonzero(is_bent):
+        notes.append(
+            f"{bent:,} of {faces:,} faces are not flat: the other way to cut them moves them by up to "
+            f"{heights[is_bent].max():.2g} and changes their area of {areas[is_bent].sum():.3g} by "
+            f"{np.abs(areas - others)[is_bent].sum():.2g}"
+        )
+    if crossed := np.count_nonzero(is_crossed):
+        notes.append(
+            f"{crossed:,} of {faces:,} faces cross themselves or fold over, so that nothing tells their area; "
+            f"{areas[is_crossed].sum():.3g} is counted"
+        )
+    return tuple(notes)
+
+
+def _cut_quads(axes: list[Reals], quads: Indices, found: _Measures) -> Indices:
     """Return the triangles (2 k, 3) of quadrilaterals (k, 4)."""
     cut = quads.take([0, 1, 2, 0, 2, 3], axis=1)
     for start in range(0, len(quads), _BATCH):
@@ -136,8 +116,8 @@ def _edges(axes: list[Reals], quads: Indices) -> list[tuple[Reals, Reals, Reals]
     return [(x.take(one) - first[0], y.take(one) - first[1], z.take(one) - first[2]) for one in others]
 
 
-def _is_turned(axes: list[Reals], quads: Indices, found: _Found) -> NDArray[np.bool_]:
-    """Tell which quadrilaterals (k, 4) are better cut from their second corner, and count those that are not flat."""
+def _is_turned(axes: list[Reals], quads: Indices, found: _Measures) -> NDArray[np.bool_]:
+    """Tell which quadrilaterals (k, 4) are better cut from their second corner, and measure them."""
     b, c, d = (np.array(edge) for edge in _edges(axes, quads))
     # Twice the areas, with the normals, of the triangles abc, acd, bcd and abd.
     first, second, fourth = (np.array(cross(*pair)) for pair in ((b, c), (c, d), (b, d)))
@@ -153,14 +133,13 @@ def _is_turned(axes: list[Reals], quads: Indices, found: _Found) -> NDArray[np.b
     is_lower = np.minimum(heights[1], heights[3]) < np.minimum(heights[0], heights[2])
     gain = cosines[1] - cosines[0]
     turned: NDArray[np.bool_] = np.where(np.abs(gain) < _EQUAL_COSINES, is_lower, gain > 0)
-    areas = lengths[0] + lengths[1], lengths[2] + lengths[3]
+    areas = [(lengths[0] + lengths[1]) / 2, (lengths[2] + lengths[3]) / 2]
     offsets = np.divide(np.abs(dot(whole, b)), lengths[4], out=np.zeros(len(quads)), where=lengths[4] > 0)
-    area, difference = np.where(turned, areas[1], areas[0]) / 2, np.abs(areas[1] - areas[0]) / 2
-    found.add(offsets, area, difference, np.maximum(*cosines) < _NO_COSINE)
+    found.append((offsets, np.where(turned, *areas[::-1]), np.where(turned, *areas), np.maximum(*cosines) < _NO_COSINE))
     return turned
 
 
-def _cut_others(axes: list[Reals], corners: Indices, sizes: Indices, found: _Found) -> tuple[Indices, Indices]:
+def _cut_others(axes: list[Reals], corners: Indices, sizes: Indices, found: _Measures) -> tuple[Indices, Indices]:
     """Return the triangles (k, 3) of polygons of more than four corners, and the polygon of each triangle (k,)."""
     starts, polygon = np.cumsum(sizes) - sizes, np.repeat(np.arange(len(sizes)), sizes)
     heights = np.nan_to_num(sum(weight * axis[corners] for weight, axis in zip(_AXES, axes, strict=True)))
@@ -188,7 +167,6 @@ def _cut_others(axes: list[Reals], corners: Indices, sizes: Indices, found: _Fou
     ranks = np.arange(len(owners)) - (np.cumsum(sizes - 2) - (sizes - 2))[owners]
     fans = starts[owners, None] + np.stack([np.zeros_like(ranks), ranks + 1, ranks + 2], axis=1)
     parts, of_parts = [fans[is_simple[owners]]], [owners[is_simple[owners]]]
-    is_crossed = np.zeros(len(sizes), bool)
     for one in np.flatnonzero(~is_simple):
         own = slice(starts[one], starts[one] + sizes[one])
         ears = mapbox_earcut.triangulate_float64(plane[:, own].T.copy(), np.array(sizes[one : one + 1], np.uint32))
@@ -196,14 +174,13 @@ def _cut_others(axes: list[Reals], corners: Indices, sizes: Indices, found: _Fou
         ears = ears.reshape(-1, 3)[:, :: 1 if twice[one] > 0 else -1].astype(np.int64) + starts[one]
         parts.append(ears if len(ears) else fans[owners == one])
         of_parts.append(np.full(len(parts[-1]), one))
-        a, b, c = (plane[:, corner] for corner in parts[-1].T)
-        total = np.abs((b - a)[0] * (c - a)[1] - (b - a)[1] * (c - a)[0]).sum()
-        is_crossed[one] = abs(total - abs(twice[one])) > _EQUAL_AREAS * total
     triangles, owners = np.concatenate(parts), np.concatenate(of_parts)
     lengths = np.sqrt(dot(normals, normals))
     offsets = dot(points, normals[:, polygon] / np.where(lengths > 0, lengths, 1.0)[polygon])
     a, b, c = (points[:, corner] for corner in triangles.T)
     areas = np.bincount(owners, cross_lengths(b - a, c - a), len(sizes)) / 2
     heights = np.maximum.reduceat(offsets, starts) - np.minimum.reduceat(offsets, starts)
-    found.add(heights, areas, np.abs(areas - lengths / 2), is_crossed)
+    u, v = plane[:, triangles[:, 1:]] - plane[:, triangles[:, :1]]
+    in_plane = np.bincount(owners, np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]), len(sizes))
+    found.append((heights, areas, lengths / 2, in_plane - np.abs(twice) > _EQUAL_AREAS * in_plane))
     return corners[triangles], owners

@@ -164,12 +164,14 @@ def expected_size(path: Path) -> tuple[int, float]:
 def _noted(raw: Raw) -> Raw:
     """Leave out vertices that are no numbers and that no triangle uses; note that, and digits that were lost."""
     vertices, triangles, notes = raw
-    is_bad = ~np.isfinite(vertices).all(axis=1)
-    if is_bad.any() and 0 <= triangles.min() <= triangles.max() < len(vertices) and not is_bad[triangles].any():
-        vertices, triangles = vertices[~is_bad], (np.cumsum(~is_bad) - 1)[triangles]
-        notes += (f"{np.count_nonzero(is_bad):,} vertices without coordinates, which no face uses, are left out",)
+    if not np.isfinite(vertices).all() and 0 <= triangles.min() <= triangles.max() < len(vertices):
+        is_bad = ~np.isfinite(vertices).all(axis=1)
+        if not is_bad[triangles].any():
+            vertices, triangles = vertices[~is_bad], (np.cumsum(~is_bad) - 1)[triangles]
+            notes += (f"{np.count_nonzero(is_bad):,} vertices without coordinates, which no face uses, are left out",)
     if vertices.dtype == np.float32 and len(vertices):
-        lower, upper = vertices.min(axis=0).astype(np.float64), vertices.max(axis=0).astype(np.float64)
+        # By columns, which is several times as fast.
+        lower, upper = np.array([(axis.min(), axis.max()) for axis in vertices.T], np.float64).T
         times = np.abs([lower, upper]).max() / np.linalg.norm(upper - lower)
         if _FAR < times < np.inf:
             notes += (
