@@ -17,6 +17,7 @@ from benchmarks.scale import many_objects, tiny_meshes, waiting_workers
 from benchmarks.studies import all_pairs, study_overhead
 from benchmarks.table import Row, format_table
 from benchmarks.timing import Effort, machine_facts
+from benchmarks.tolerance import tolerances
 from benchmarks.transforms import against_the_direct_sum, against_the_paper, as_in_the_paper, growth
 from benchmarks.verdicts import verdicts
 
@@ -34,6 +35,7 @@ _ITEMS: dict[str, Callable[[Effort], Iterator[Row]]] = {
     "11": fits,
     "12": reconstructions,
     "13": verdicts,
+    "14": tolerances,
     "growth": growth,
     "scale": tiny_meshes,
     "objects": many_objects,
@@ -57,7 +59,8 @@ def main() -> None:
         f"times are medians of {effort.repeats} turns each, taken alternately",
         "items 1 to 4: ratios of times are other / ours; items 5 to 7, 9, 11 and 12: ours / other; item 10: processor "
         "seconds, and other / ours against sums; item 13: seconds, and those of Hausdorff and Chamfer distances; "
-        "distances: relative difference",
+        "item 14: processor seconds, of searches over those of a single decimation and distance; distances: relative "
+        "difference",
     ]
     print("\n".join(["", format_table(rows), "", *facts]))
     if options.markdown:

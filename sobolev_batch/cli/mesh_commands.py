@@ -221,7 +221,7 @@ def _judge_deviation_of_files(options: _CompareOptions, within: str) -> int:
     from sobolev_batch.testing.within import judge_deviation
 
     verdict = judge_deviation(options.a, options.b, within, options.unit)
-    answer = {"a": options.a, "b": options.b, "outcome": verdict.outcome, "length": verdict.length}
+    answer: dict[str, Any] = {"a": options.a, "b": options.b, "outcome": verdict.outcome, "length": verdict.length}
     bounds = asdict(verdict.deviations.both) | asdict(verdict.deviations)
     answer |= {"unit": verdict.unit, "beyond": verdict.beyond}
     echo_result(options.style, visible(f"{options.a.name}: {verdict}"), answer | bounds)

@@ -156,8 +156,8 @@ def write_difference(
     for label, name, own, other, mesh in zip("ab", names, (a, b), (b, a), centered, strict=True):
         if isinstance(own, Mesh) and isinstance(mesh, Mesh):
             values = witness_at_vertices(*fields, (order,), mesh, dtype="complex64")
-            is_measured = distances is not None and isinstance(other, Mesh) and not is_picture
-            lengths = named_distances(own, other) if is_measured else None
+            is_measured = distances is not None and not is_picture
+            lengths = named_distances(own, other) if is_measured and isinstance(other, Mesh) else None
             title = f"{label} against b, comparison {path.name}"
             one = VertexWitness(own, values, (order,), title, 1 / similarity.scale, lengths, "comparison")
             found[path.with_name(f"{path.name}-{label}.ply")] = one
