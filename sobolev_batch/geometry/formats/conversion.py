@@ -128,7 +128,9 @@ def _of_faces(vertices: NDArray[Any], faces: Sequence[NDArray[Any]]) -> Mesh:
     if vertices.shape[1:] != (3,):
         raise MeshError(f"the vertices have the shape {vertices.shape}, expected (n, 3)")
     sizes = np.concatenate([np.full(one.size // one.shape[-1], one.shape[-1]) for one in faces])
-    return Mesh(*cut_polygons(vertices, np.concatenate([one.ravel() for one in faces]), sizes))
+    # Numbers that overflow become infinite, which the mesh refuses.
+    with np.errstate(all="ignore"):
+        return Mesh(*cut_polygons(vertices, np.concatenate([one.ravel() for one in faces]), sizes))
 
 
 def _of_open3d(found: Any) -> Mesh:

@@ -143,7 +143,9 @@ def parse_stl(data: bytes) -> Raw:
     # Fewer bytes than those of a triangle may follow.
     if len(data) >= _STL_HEADER_BYTES and (len(data) - _STL_HEADER_BYTES) // _STL_RECORD.itemsize == announced:
         corners = np.frombuffer(data, _STL_RECORD, announced, _STL_HEADER_BYTES)["corners"].reshape(-1, 3)
-    elif b"\0" not in start and start.removeprefix(codecs.BOM_UTF8).lstrip()[:5].lower() == b"solid":
+    elif b"\0" not in start:
+        if start.removeprefix(codecs.BOM_UTF8).lstrip()[:5].lower() != b"solid":
+            raise MeshError("the file is a text that does not begin with solid, as STL files in text do")
         corners = _stl_text_corners(data)
     else:
         count = (len(data) - _STL_HEADER_BYTES) / _STL_RECORD.itemsize

@@ -117,6 +117,7 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "tetrahedra": (lambda: meshio.Mesh(BOX_VERTICES, [("tetra", [[0, 1, 2, 4]])]), "cells of the type tetra"),
     "flat": (lambda: meshio.Mesh(BOX_VERTICES[:, :2], [("quad", BOX_QUADS)]), r"shape \(8, 2\), expected \(n, 3\)"),
     "outside": (lambda: meshio.Mesh(BOX_VERTICES, [("quad", [[0, 1, 2, 8]])]), r"face 1 has an index outside 0\.\.7"),
+    "infinite": (lambda: meshio.Mesh(BOX_VERTICES + np.inf, [("quad", BOX_QUADS)]), "NaN or infinite coordinates"),
     "no cells": (lambda: meshio.Mesh(BOX_VERTICES, [("line", [[0, 1]])]), "the mesh has no triangles"),
     "two parts": (two_parts, r"it holds 2 parts, .* as scene\.to_mesh\(\)"),
 }
