@@ -88,12 +88,12 @@ class Curve:
 def numbers_of(frame: pd.DataFrame, y: str) -> tuple[Reals, Reals]:
     """Return a column of `table` of which less is better, and its errors; InputError where it has no such numbers.
 
-    What is not known is NaN, and so are numbers without a logarithm, but for distances of zero.
+    Of a bias, the modulus is meant. What is not known is NaN, and so is zero, but for distances.
     """
     if y in _MORE_IS_BETTER or y not in frame or not pd.api.types.is_numeric_dtype(frame[y]):
         known = [name for name in frame.select_dtypes("number") if name not in _MORE_IS_BETTER]
         raise InputError(f"no number of which less is better is named {quoted(y)}; known are {', '.join(known)}")
-    values = frame[y].to_numpy(dtype=np.float64, na_value=np.nan)
+    values = np.abs(frame[y].to_numpy(dtype=np.float64, na_value=np.nan))
     values = np.where((values > 0) | (y == "relative"), values, np.nan)
     if f"{y}_upper" in frame:
         return values, frame[f"{y}_upper"].to_numpy(dtype=np.float64) - values

@@ -146,10 +146,12 @@ def test_methods_are_compared_by_any_number() -> None:
     def with_lengths(scale: float) -> pd.DataFrame:
         rows = pd.concat(of_powers({"a": 1, "b": 2}, 1.0).assign(order=order) for order in (-2.0, -4.0))
         lengths = scale * np.where(rows["family"] == "a", 3.0, 1.0) * rows["triangles"] ** -0.5
-        return rows.assign(hausdorff=lengths, hausdorff_upper=1.01 * lengths, rms=lengths / 9, fscore=0.5)
+        return rows.assign(
+            hausdorff=lengths, hausdorff_upper=1.01 * lengths, rms=lengths / 9, bias=-lengths, fscore=0.5
+        )
 
     tables = {f"{i}": with_lengths(scale) for i, scale in enumerate((1.0, 20.0, 0.3, 7.0, 0.6, 4.0))}
-    for y, error in (("hausdorff", 0.01), ("rms", 0.0)):
+    for y, error in (("hausdorff", 0.01), ("rms", 0.0), ("bias", 0.0)):
         made = ranked(tables, y=y)
         assert made.table["method"].tolist() == ["b", "a"]
         (pair,) = made.pairs.to_dict("records")
