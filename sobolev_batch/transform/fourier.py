@@ -58,9 +58,9 @@ _STAND_IN_LEVEL = 2
 # A sphere, transformed in a fraction of a second, mostly spreading its points.
 _TRIAL_LEVEL, _TRIAL_LATTICE = 5, Lattice(5.0, 64)
 _NANO = 1e-9
-# Raise it whenever the numbers for a given surface and settings change: stored fields of another version are then
-# computed again instead of being compared with new ones.
-NUMERICS_VERSION = 7
+# Raise it whenever the numbers for a given surface and settings change, or the surface that is read from a file: stored
+# fields of another version are then computed again instead of being compared with new ones.
+NUMERICS_VERSION = 8
 
 _log = logging.getLogger(__name__)
 
