@@ -19,7 +19,9 @@ FEATURES = "sobolev_batch.features"
 _EXTRAS = "sobolev_batch.extras"
 _OF_EXTRAS = {
     SOURCES: {"fit": "fitting.families:FitSource", "refine": "fitting.families:RefineSource"},
-    FORMATS: {name: f"formats.{name}:FORMATS" for name in ("gltf", "gifti", "freesurfer", "vtk")},
+    FORMATS: {
+        name: f"formats.{name}:FORMATS" for name in ("gltf", "gifti", "freesurfer", "vtk", "printing", "remeshing")
+    },
     COMMANDS: {
         "fit": "commands:fit_command",
         "init": "commands:init_command",

@@ -19,7 +19,19 @@ from typing import Any
 
 import numpy as np
 
-from tests.support.mesh_files import LITTLE, Gltf, box_scene, gifti, obj, ply, stl_text
+from tests.support.mesh_files import (
+    LITTLE,
+    Gltf,
+    box_scene,
+    gifti,
+    gmsh,
+    model,
+    obj,
+    object_3mf,
+    package_3mf,
+    ply,
+    stl_text,
+)
 from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES
 
 # Writes an attack into a folder, and returns the path of the file to read.
@@ -94,6 +106,29 @@ def _gifti_data(data: bytes) -> bytes:
     return before + b"<Data>" + data + b"</Data>" + rest.partition(b"</Data>")[2]
 
 
+def _of_components(number: int, inner: int) -> str:
+    """An object that holds another one ten times."""
+    return f'<object id="{number}"><components>{f"""<component objectid="{inner}"/>""" * 10}</components></object>'
+
+
+def _changed_length(content: bytes) -> bytes:
+    """An archive whose last entry says that it unpacks to a terabyte, which no file of this length does."""
+    place = content.rindex(b"PK\1\2") + 24
+    return content[:place] + b"\xfe\xff\xff\xff" + content[place + 4 :]
+
+
+def _gmsh_with(order: str, what: str, number: int) -> bytes:
+    """A Gmsh mesh that announces so many blocks, nodes of a block, or cells of one."""
+    before, count = {"blocks": ((), 2), "nodes": ((2, 1, 1), 7), "cells": ((2, 1, 2), 12)}[what]
+    old, new = (
+        struct.pack(f"<{len(before)}iQ", *before, some)
+        if order
+        else (b"%d %d %d\n%d\n" % (*before, some) if before else b"$Nodes\n%d " % some)
+        for some in (count, number)
+    )
+    return _changed(gmsh(BOX_VERTICES, BOX_TRIANGLES, order), old, new)
+
+
 @cache
 def _bomb(content: bytes) -> bytes:
     """Two hundred megabytes of one byte, packed a thousandfold."""
@@ -134,7 +169,7 @@ def _changed(content: bytes, old: bytes, new: bytes) -> bytes:
 
 _OBJ, _PLY = obj(BOX_VERTICES, BOX_TRIANGLES), ply(BOX_VERTICES, BOX_TRIANGLES)
 _DIGITS = b"9" * 5000
-_FORMATS = (".ply", ".obj", ".stl", ".off", ".gltf", ".glb", ".gii", "_lh.pial")
+_FORMATS = (".ply", ".obj", ".stl", ".off", ".gltf", ".glb", ".gii", "_lh.pial", ".mesh", ".msh", ".3mf")
 
 ATTACKS: dict[str, Attack] = {
     # What is no file.
@@ -250,6 +285,42 @@ ATTACKS: dict[str, Attack] = {
             + b"\n1\n"
         ),
     ),
+    # 3MF.
+    "3mf, bomb": _file(".3mf", lambda: package_3mf(model("") + b" " * 200 * _MEGABYTE)),
+    "3mf, bomb in another part": _file(
+        ".3mf",
+        lambda: package_3mf(model("", '<item objectid="1" p:path="/a"/>'), a=model("") + b" " * 200 * _MEGABYTE),
+    ),
+    "3mf, entities": _file(".3mf", package_3mf(_entities().replace(b"GIFTI", b"model"))),
+    "3mf, a part outside": _file(".3mf", package_3mf(model("", '<item objectid="1" p:path="../../etc/passwd"/>'))),
+    "3mf, an object of itself": _file(".3mf", package_3mf(model(_of_components(1, 1) * 2))),
+    "3mf, objects of objects": _file(
+        ".3mf", package_3mf(model("".join(_of_components(i, i + 1) for i in range(1, 25))))
+    ),
+    "3mf, supports of supports": _file(
+        ".3mf",
+        package_3mf(
+            model("".join(_of_components(i, i + 1) for i in range(1, 25)) + object_3mf([], [], 25, 'type="support"'))
+        ),
+    ),
+    "3mf, many items": _file(".3mf", package_3mf(model(object_3mf([], []), '<item objectid="1"/>' * 300_000))),
+    "3mf, a length that lies": _file(".3mf", lambda: _changed_length(package_3mf(model("") + b" " * 9999))),
+    # Medit and Gmsh.
+    "medit, a count of many digits": _file(".mesh", b"MeshVersionFormatted 2 Dimension 3 Vertices " + _DIGITS),
+    "medit, many sections": _file(".mesh", b"MeshVersionFormatted 2 Dimension 3 " + b"Aaa 1 " * 300_000),
+    "medit, many cells": _file(".mesh", b"MeshVersionFormatted 2 Dimension 3 Triangles 9e18 Vertices 1e300"),
+    "gmsh, blocks that go back": _file(
+        ".msh",
+        gmsh(BOX_VERTICES, BOX_TRIANGLES).replace(
+            b"$Nodes\n2 8 3 80\n2 1 1\n7\n", b"$Nodes\n999999999999999 8 3 80\n2 1 1\n-4\n"
+        ),
+    ),
+    **{
+        f"gmsh {order or 'text'}, {what} of {number}": _file(".msh", _gmsh_with(order, what, number))
+        for order in ("", "<")
+        for what in ("blocks", "nodes", "cells")
+        for number in (2**31, 2**62, 2**64 - 1)
+    },
     # FreeSurfer.
     "freesurfer, endless line": _file("_lh.pial", b"\xff\xff\xfe" + b"x" * 2 * _MEGABYTE),
     "freesurfer, sparse": _sparse("_lh.pial", b"\xff\xff\xfe\n\n" + b"\x7f\xff\xff\xff" * 2),

@@ -6,8 +6,10 @@ They check nothing, so that tests can write damaged files: with wrong counts, in
 from __future__ import annotations
 
 import base64
+import io
 import json
 import struct
+import zipfile
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -213,6 +215,95 @@ def freesurfer(
     return header + rows.astype(">f4").tobytes() + corners.astype(">i4").tobytes() + volume
 
 
+def medit(vertices: ArrayLike, faces: Faces, more: str = "", *, face_count: int | None = None) -> bytes:
+    """Return a Medit mesh of triangles and quadrilaterals, with more sections behind them."""
+    lines = ["MeshVersionFormatted 2 # by hand", "", "Dimension", "3", "Vertices", str(len(np.asarray(vertices)))]
+    lines += [f"{numbers(row)} 0" for row in np.asarray(vertices)]
+    for name, size in (("Triangles", 3), ("Quadrilaterals", 4)):
+        rows = [face for face in faces if len(face) == size]
+        lines += [name, str(len(rows) if face_count is None else face_count)] if rows or size == 3 else []
+        lines += [" ".join(str(vertex + 1) for vertex in row) + " 7" for row in rows]
+    return "\n".join([*lines, more, "End", ""]).encode()
+
+
+def gmsh_first(vertices: ArrayLike, faces: Faces, *, face_count: int | None = None) -> bytes:
+    """Return a Gmsh mesh of the format 2.2, with nodes numbered 10, 20 ... from the last, and a point and a line."""
+    rows = [f"{10 * (i + 1)} {numbers(row)}" for i, row in enumerate(np.asarray(vertices))][::-1]
+    cells = ["1 15 2 0 1 10", "2 1 2 0 1 10 20"]
+    cells += [
+        f"{i + 9} {len(face) - 1} 3 0 1 2 " + " ".join(str(10 * (v + 1)) for v in face) for i, face in enumerate(faces)
+    ]
+    count = str(len(cells) if face_count is None else face_count + 2)
+    lines = ["$MeshFormat", "2.2 0 8", "$EndMeshFormat", "$PhysicalNames", "0", "$EndPhysicalNames"]
+    lines += ["$Nodes", str(len(rows)), *rows, "$EndNodes", "$Elements", count, *cells, "$EndElements", ""]
+    return "\n".join(lines).encode()
+
+
+def gmsh(vertices: ArrayLike, faces: Faces, order: str = "", *, face_count: int | None = None) -> bytes:
+    """Return a Gmsh mesh of the format 4.1, in text or in binary of an order, with nodes of parametric coordinates."""
+
+    def packed(code: str, *values: float) -> bytes:
+        return (
+            struct.pack(f"{order}{len(values)}{code}", *values) if order else f"{' '.join(map(str, values))}\n".encode()
+        )
+
+    rows = np.asarray(vertices, dtype=np.float64)
+    sections = {b"MeshFormat": b"4.1 %d 8\n" % bool(order) + (packed("i", 1) + b"\n" if order else b"")}
+    nodes = packed("Q", 2, len(rows), 3, 10 * len(rows)) + packed("i", 2, 1, 1) + packed("Q", len(rows) - 1)
+    nodes += b"".join(packed("Q", 10 * (i + 1)) for i in range(1, len(rows)))
+    nodes += b"".join(packed("d", *map(float, row), 0.5, 0.25) for row in rows[1:])
+    nodes += packed("i", 0, 1, 0) + packed("Q", 1) + packed("Q", 10) + packed("d", *map(float, rows[0]))
+    kinds = sorted({len(face) for face in faces})
+    cells = packed("Q", len(kinds) + 1, len(faces) + 1, 1, len(faces) + 1)
+    cells += packed("i", 0, 1, 15) + packed("Q", 1) + packed("Q", 1, 10)
+    for size in kinds:
+        some = [face for face in faces if len(face) == size]
+        cells += packed("i", 2, 1, size - 1) + packed("Q", len(some) if face_count is None else face_count)
+        cells += b"".join(packed("Q", i + 2, *(10 * (vertex + 1) for vertex in face)) for i, face in enumerate(some))
+    sections |= {b"Nodes": nodes, b"Elements": cells}
+    return b"".join(
+        b"$%s\n%s\n$End%s\n" % (name, body.rstrip(b"\n") if not order else body, name)
+        for name, body in sections.items()
+    )
+
+
+AS_IT_IS = "1 0 0 0 1 0 0 0 1 0 0 0"
+_NO_DATE = (1980, 1, 1, 0, 0, 0)
+
+
+def archive(parts: dict[str, bytes]) -> bytes:
+    """Return a zip archive of parts by their names."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as package:
+        for name, content in parts.items():
+            package.writestr(zipfile.ZipInfo(name, _NO_DATE), content, zipfile.ZIP_DEFLATED)
+    return file.getvalue()
+
+
+def model(objects: str, items: str = '<item objectid="1"/>', attributes: str = 'unit="millimeter"') -> bytes:
+    """Return the main part of a 3MF file."""
+    start = f'<model {attributes} xmlns:p="http://schemas.microsoft.com/3dmanufacturing/production/2015/06">'
+    return f"{start}<resources>{objects}</resources><build>{items}</build></model>".encode()
+
+
+def object_3mf(vertices: ArrayLike, faces: Faces, number: int = 1, attributes: str = "") -> str:
+    rows = "".join('<vertex x="{!r}" y="{!r}" z="{!r}"/>'.format(*map(float, row)) for row in np.asarray(vertices))
+    triangles = "".join('<triangle v1="{}" v2="{}" v3="{}"/>'.format(*face) for face in faces)
+    mesh = f"<mesh><vertices>{rows}</vertices><triangles>{triangles}</triangles></mesh>"
+    return f'<object id="{number}" {attributes}>{mesh}</object>'
+
+
+def package_3mf(main: bytes, **parts: bytes) -> bytes:
+    """Return a 3MF file of its main part and others by their names."""
+    kind = "http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"
+    relations = f'<Relationships><Relationship Target="/3D/main.model" Id="r" Type="{kind}"/></Relationships>'
+    return archive({"_rels/.rels": relations.encode(), "3D/main.model": main, **parts})
+
+
+def three_mf(vertices: ArrayLike, faces: Faces) -> bytes:
+    return package_3mf(model(object_3mf(vertices, faces)))
+
+
 # What stands in a surface behind its triangles: the geometry of the volume that it was made of.
 VOLUME = (
     b"\0\0\0\2\0\0\0\0\0\0\0\x14valid = 1  # volume info valid\nfilename = ../mri/filled.mgz\nvolume = 256 256 256\n"
@@ -247,6 +338,12 @@ BOXES: dict[str, Content] = {
     "gifti ascii": (".gii", gifti(BOX_VERTICES, np.array(BOX_TRIANGLES, np.int32), "GIFTI_ENCODING_ASCII")),
     "freesurfer": ("_lh.pial", freesurfer(BOX_VERTICES, BOX_TRIANGLES, VOLUME)),
     "freesurfer without volume": (".rh.white", freesurfer(BOX_VERTICES, BOX_TRIANGLES)),
+    "medit": (".mesh", medit(BOX_VERTICES, BOX_TRIANGLES)),
+    "gmsh 2.2": (".msh", gmsh_first(BOX_VERTICES, BOX_TRIANGLES)),
+    "gmsh 4.1": (".msh", gmsh(BOX_VERTICES, BOX_TRIANGLES)),
+    "gmsh 4.1 little": (".msh", gmsh(BOX_VERTICES, BOX_TRIANGLES, "<")),
+    "gmsh 4.1 big": (".msh", gmsh(BOX_VERTICES, BOX_TRIANGLES, ">")),
+    "3mf": (".3mf", three_mf(BOX_VERTICES, BOX_TRIANGLES)),
     "gifti by columns": (".gii", gifti(BOX_VERTICES, np.array(BOX_TRIANGLES, np.int32), ordering="F")),
 }
 
@@ -262,4 +359,9 @@ WRITERS: dict[str, tuple[str, Callable[..., bytes]]] = {
     "glb": (".glb", lambda vertices, faces: Gltf([[(vertices, faces, None)]], [{"mesh": 0}]).glb()),
     "gifti": (".gii", lambda vertices, faces: gifti(vertices, np.array(faces, np.int32).reshape(-1, 3))),
     "freesurfer": ("_lh.pial", freesurfer),
+    "medit": (".mesh", medit),
+    "gmsh 2.2": (".msh", gmsh_first),
+    "gmsh 4.1": (".msh", gmsh),
+    "gmsh 4.1 little": (".msh", partial(gmsh, order="<")),
+    "3mf": (".3mf", three_mf),
 }

@@ -1,4 +1,4 @@
 """Formats that are read rarely, and only read.
 
-In: glTF, GIFTI, FreeSurfer and VTK files. Out: vertices and triangles.
+In: glTF, GIFTI, FreeSurfer, VTK, 3MF, Medit and Gmsh files. Out: vertices and triangles.
 """

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sobolev_batch.arrays import Indices
 from sobolev_batch.errors import MeshError, from_extra
 from sobolev_batch.geometry.formats.by_name import Format
-from sobolev_batch.geometry.formats.parsing import Raw, triangle_strips, xml_events
+from sobolev_batch.geometry.formats.parsing import Raw, beside_volume, triangle_strips, xml_events
 from sobolev_batch.geometry.formats.polygons import cut_polygons
 
 # VTK's numbers for types of cells: vertices and lines, those with area, and those with flat faces around a volume.
@@ -116,11 +116,8 @@ def _faces(kinds: Indices, corners: Indices, offsets: Indices, suffix: str) -> t
     if len(sizes) != len(kinds) or (sizes < 0).any() or sizes.sum() != len(corners):
         raise MeshError(f"the offsets of its {len(kinds)} cells do not run from 0 up to their {len(corners)} corners")
     has_area, has_volume = ~np.isin(kinds, _WITHOUT_AREA), np.isin(kinds, _WITH_VOLUME)
-    notes: tuple[str, ...] = ()
-    if has_volume.any() and (has_area & ~has_volume).any():
-        has_area &= ~has_volume
-        counts = f"{np.count_nonzero(has_volume):,} cells with volume", f"{np.count_nonzero(has_area):,} faces"
-        notes = (f"{counts[0]} are left out beside {counts[1]}",)
+    # Without any face beside them, they are refused.
+    has_area &= ~has_volume | ~(has_area & ~has_volume).any()
     is_strip, is_pixel = kinds == _STRIP, kinds == _PIXEL
     known = [kinds == _VTK_TRIANGLE, (kinds == _QUAD) | is_pixel, (kinds == _POLYGON) | is_strip]
     wrong = np.flatnonzero(has_area & (sizes != np.select(known, [3, 4, sizes], -1)))
@@ -135,7 +132,8 @@ def _faces(kinds: Indices, corners: Indices, offsets: Indices, suffix: str) -> t
     strips = triangle_strips(corners[np.repeat(is_strip, sizes)], sizes[is_strip])
     has_area &= ~is_strip
     corners = np.concatenate([corners[np.repeat(has_area, sizes)], strips.ravel()])
-    return corners, np.concatenate([sizes[has_area], np.full(len(strips), 3)]), notes
+    sizes = np.concatenate([sizes[has_area], np.full(len(strips), 3)])
+    return corners, sizes, beside_volume(int(has_volume.sum()), len(sizes))
 
 
 FORMATS = (

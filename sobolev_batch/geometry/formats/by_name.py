@@ -73,11 +73,22 @@ BY_SUFFIX = _known()
 WRITERS = {suffix: form.write for suffix, form in BY_SUFFIX.items() if form.write is not None}
 
 
+# Commands that convert files of formats that are not read, by suffix.
+CONVERTED = {
+    ".dae": "pip install trimesh pycollada; python -c "
+    "\"import trimesh; trimesh.load('scan.dae').to_mesh().export('scan.ply')\"",
+    ".wrl": "pip install pymeshlab; python -c "
+    "\"import pymeshlab; m = pymeshlab.MeshSet(); m.load_new_mesh('scan.wrl'); "
+    "m.generate_by_merging_visible_meshes(); m.save_current_mesh('scan.ply', save_textures=False)\"",
+    **{suffix: f"pip install meshio; meshio convert scan{suffix} scan.vtu" for suffix in (".inp", ".bdf", ".nas")},
+}
+
+
 def mesh_format(path: PurePath) -> str:
     """Return the suffix in lower case and without .gz, or the name of a format without suffixes."""
     name = _unpacked_name(path).lower()
     suffix = Path(name).suffix
-    if suffix in BY_SUFFIX:
+    if suffix in BY_SUFFIX or suffix in CONVERTED:
         return suffix
     return next((form.suffixes[0] for form in BY_SUFFIX.values() if form.is_name and form.is_name(name)), suffix)
 

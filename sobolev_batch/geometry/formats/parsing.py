@@ -111,7 +111,9 @@ def unpacked_limit(packed_bytes: int) -> int:
     return min(_LARGEST_BYTES, max(_HARMLESS_BYTES, _LARGEST_PACKING * packed_bytes))
 
 
-def xml_events(data: bytes, kind: str) -> Iterator[tuple[str, str, dict[str, str]]]:
+def xml_events(
+    data: bytes, kind: str, most_elements: int = _MOST_ELEMENTS
+) -> Iterator[tuple[str, str, dict[str, str]]]:
     """Parse XML a little at a time, and refuse what would take memory out of proportion in a file of some kind.
 
     Yield ("start", name, attributes) and ("end", name, {}) of each element, and ("text", piece, {}) between them.
@@ -146,9 +148,9 @@ def xml_events(data: bytes, kind: str) -> Iterator[tuple[str, str, dict[str, str
         for event in events:
             elements += event[0] == "start"
             depth += (event[0] == "start") - (event[0] == "end")
-            if depth > _DEEPEST or elements > _MOST_ELEMENTS:
+            if depth > _DEEPEST or elements > most_elements:
                 raise MeshError(
-                    f"the XML has element {elements} at the depth {depth}; a {kind} file has at most {_MOST_ELEMENTS} "
+                    f"the XML has element {elements} at the depth {depth}; a {kind} file has at most {most_elements} "
                     f"elements, nested up to {_DEEPEST} deep: save it with the surface alone"
                 )
             yield event
@@ -172,6 +174,11 @@ def _unpacked_bounded(packed: bytes, factor: float) -> bytes:
             if data.tell() > _HARMLESS_BYTES:
                 require_memory_to_read(factor * data.tell())
     return data.getvalue()
+
+
+def beside_volume(cells: int, faces: int) -> tuple[str, ...]:
+    """Return what notes say of cells with volume, which have no part in the surface of the faces beside them."""
+    return (f"{cells:,} cells with volume are left out beside {faces:,} faces",) if cells else ()
 
 
 def triangle_strips(corners: Indices, sizes: Indices) -> Indices:

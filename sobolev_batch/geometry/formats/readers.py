@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from sobolev_batch.errors import MeshError
-from sobolev_batch.geometry.formats.by_name import BY_SUFFIX, mesh_format
+from sobolev_batch.geometry.formats.by_name import BY_SUFFIX, CONVERTED, mesh_format
 from sobolev_batch.geometry.formats.parsing import (
     Raw,
     Read,
@@ -46,7 +46,7 @@ _LONGEST_INDEX = 16 << 20
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """Read a mesh from a PLY, OBJ, STL, OFF, glTF, GLB, GIFTI, VTK or FreeSurfer file, gzipped or not.
+    """Read a mesh from a PLY, OBJ, STL, OFF, glTF, GIFTI, VTK, 3MF, Medit, Gmsh or FreeSurfer file, gzipped or not.
 
     The format follows from the name: FreeSurfer's are such as lh.pial, VTK's end in .vtk, .vtp or .vtu. Coordinates
     keep the precision of the file. Polygons are cut into triangles, where they bend least. STL and glTF repeat
@@ -99,6 +99,8 @@ def _files_beside(path: Path, names: Iterable[str]) -> dict[str, Path]:
 def read_mesh_by(path: Path, read: Read) -> Mesh:
     """Read a mesh as `read_mesh` does, by a function that reads the bytes of its file."""
     suffix = mesh_format(path)
+    if suffix in CONVERTED:
+        raise MeshError(f"{path}: files of its format are not read; convert it: {CONVERTED[suffix]}")
     if suffix not in BY_SUFFIX:
         known = ", ".join(name for name, form in BY_SUFFIX.items() if form.is_name is None)
         raise MeshError(

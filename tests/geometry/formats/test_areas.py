@@ -20,14 +20,20 @@ from tests.support.mesh_files import (
     Read,
     freesurfer,
     gifti,
+    gmsh,
+    gmsh_first,
+    medit,
+    model,
     numbers,
     obj,
+    object_3mf,
     off,
+    package_3mf,
     ply,
     stl_binary,
     stl_text,
 )
-from tests.support.shapes import BOX_AREA, BOX_QUADS, BOX_TRIANGLES, BOX_VERTICES
+from tests.support.shapes import BOX_AREA, BOX_MIXED, BOX_QUADS, BOX_TRIANGLES, BOX_VERTICES
 
 # Of each case: the end of the file's name, its bytes, and its area or the reason of its refusal.
 Case = tuple[str, bytes, float | str]
@@ -223,6 +229,118 @@ CASES |= {
 }
 
 
+TETRAHEDRA = "Tetrahedra 2 1 2 3 5 0 2 3 4 8 0"
+HALVED = "0.5 0 0 0 0.5 0 0 0 0.5 7 7 7"
+BOX_3MF = object_3mf(BOX_VERTICES, BOX_TRIANGLES)
+DOUBLED = (
+    '<object id="2"><components><component objectid="1"/><component objectid="1" transform="{}"/></components></object>'
+)
+LINEAR = gmsh(BOX_VERTICES, BOX_QUADS)
+CASES |= {
+    "medit, quadrilaterals": (".mesh", medit(BOX_VERTICES, BOX_QUADS), BOX_AREA),
+    "medit, both": (".mesh", medit(BOX_VERTICES, BOX_MIXED), BOX_AREA),
+    "medit, more sections": (
+        ".mesh",
+        medit(BOX_VERTICES, BOX_TRIANGLES, f"RequiredTriangles 1 1 {TETRAHEDRA}"),
+        BOX_AREA,
+    ),
+    "medit, one line": (
+        ".mesh",
+        b" ".join(medit(BOX_VERTICES, BOX_MIXED).replace(b"# by hand", b"").split()),
+        BOX_AREA,
+    ),
+    "medit, tetrahedra alone": (".mesh", medit(BOX_VERTICES, [], TETRAHEDRA), "2 cells with volume and no faces"),
+    "medit, plane": (".mesh", medit(BOX_VERTICES, BOX_QUADS).replace(b"\n3\n", b"\n2\n", 1), "not of dimension 3"),
+    "medit, curved": (".mesh", medit(BOX_VERTICES, BOX_QUADS, "TrianglesP2 1"), "has TrianglesP2, which are curved"),
+    "medit, a face too few": (
+        ".mesh",
+        medit(BOX_VERTICES, BOX_TRIANGLES, face_count=13),
+        "announces 13 rows of 4 numbers",
+    ),
+    "medit, two sections of faces": (".mesh", medit(BOX_VERTICES, BOX_TRIANGLES, "Triangles 0"), "repeats a section"),
+    "medit, binary": (".mesh", b"\1\0\0\0\3\0\0\0", "does not begin with MeshVersionFormatted"),
+    "gmsh, quadrilaterals": (".msh", LINEAR, BOX_AREA),
+    "gmsh, both": (".msh", gmsh(BOX_VERTICES, BOX_MIXED), BOX_AREA),
+    "gmsh, both in the old format": (".msh", gmsh_first(BOX_VERTICES, BOX_MIXED), BOX_AREA),
+    "gmsh, both in binary": (".msh", gmsh(BOX_VERTICES, BOX_MIXED, ">"), BOX_AREA),
+    "gmsh, curved": (".msh", replaced(LINEAR, (b"2 1 3\n", b"2 1 10\n")), "cells of Gmsh's type 10"),
+    "gmsh, a node that is not there": (
+        ".msh",
+        replaced(LINEAR, (b"\n2 10 20", b"\n2 10 25")),
+        "a node that is not there",
+    ),
+    "gmsh, a node beyond the last": (
+        ".msh",
+        replaced(LINEAR, (b"\n2 10 20", b"\n2 10 99")),
+        "a node that is not there",
+    ),
+    "gmsh, old and binary": (
+        ".msh",
+        b"$MeshFormat\n2.2 1 8\n\1\0\0\0\n$EndMeshFormat\n",
+        "gmsh scan.msh -save -format msh41",
+    ),
+    "gmsh, no cells": (".msh", LINEAR.partition(b"$Elements")[0], "no section .Elements"),
+    "3mf, placed twice": (
+        ".3mf",
+        package_3mf(model(BOX_3MF, f'<item objectid="1"/><item objectid="1" transform="{HALVED}"/>')),
+        1.25 * BOX_AREA,
+    ),
+    "3mf, components": (
+        ".3mf",
+        package_3mf(model(BOX_3MF + DOUBLED.format(HALVED), f'<item objectid="2" transform="{HALVED}"/>')),
+        1.25 * BOX_AREA / 4,
+    ),
+    "3mf, a turn and a stretch": (
+        ".3mf",
+        # The x axis becomes y, twice as long: sides of 2, 2 and 4.
+        package_3mf(model(BOX_3MF, '<item objectid="1" transform="0 2 0 -1 0 0 0 0 1 5 0 0"/>')),
+        40.0,
+    ),
+    "3mf, an object in another part": (
+        ".3mf",
+        package_3mf(
+            model(
+                DOUBLED.format(HALVED).replace('objectid="1"', 'objectid="1" p:path="/3D/a.model"'),
+                '<item objectid="2"/>',
+            ),
+            **{"3D/a.model": model(BOX_3MF, "")},
+        ),
+        1.25 * BOX_AREA,
+    ),
+    "3mf, supports": (
+        ".3mf",
+        package_3mf(
+            model(
+                BOX_3MF + object_3mf(BOX_VERTICES, BOX_TRIANGLES, 2, 'type="support"'),
+                '<item objectid="1"/><item objectid="2"/>',
+            )
+        ),
+        BOX_AREA,
+    ),
+    "3mf, not built": (".3mf", package_3mf(model(BOX_3MF, "")), "builds no faces"),
+    "3mf, an extension": (
+        ".3mf",
+        package_3mf(model(BOX_3MF, attributes='requiredextensions="b p" xmlns:b="http://x/beamlattice/2017/02"')),
+        "requires the 3MF extension http://x/beamlattice/2017/02",
+    ),
+    "3mf, several units": (
+        ".3mf",
+        package_3mf(model(BOX_3MF, '<item objectid="1" p:path="/a"/>'), a=model(BOX_3MF, "", attributes='unit="inch"')),
+        "several units of length: inch, millimeter",
+    ),
+    "3mf, an index beyond the last": (
+        ".3mf",
+        package_3mf(model(object_3mf(BOX_VERTICES, [[0, 1, 8]]))),
+        r"object 1 has an index outside 0\.\.7",
+    ),
+    "3mf, no archive": (".3mf", b"PK", "not a readable 3mf file: BadZipFile"),
+    "collada": (".dae", b"<COLLADA/>", r"trimesh\.load\('scan\.dae'\)"),
+    "vrml": (".wrl", b"#VRML", r"load_new_mesh\('scan\.wrl'\)"),
+    "abaqus": (".inp", b"*Heading", "meshio convert scan.inp scan.vtu"),
+    "nastran": ("lh.bdf", b"BEGIN BULK", "meshio convert scan.bdf scan.vtu"),
+}
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_files_have_their_area_or_the_reason_of_a_refusal(tmp_path: Path, name: str) -> None:
     ending, content, expected = CASES[name]
@@ -259,11 +377,18 @@ NOTED: dict[str, tuple[str, bytes, str]] = {
         MOVED,
     ),
     "gifti, not moved": (".gii", GIFTI_BOX, ""),
+    "medit, tetrahedra": (
+        ".mesh",
+        medit(BOX_VERTICES, BOX_QUADS, TETRAHEDRA),
+        "2 cells with volume are left out beside 6 faces",
+    ),
+    "3mf, in inches": (".3mf", package_3mf(model(BOX_3MF, attributes='unit="inch"')), "its unit of length is the inch"),
+    "3mf, in millimetres": (".3mf", package_3mf(model(BOX_3MF, attributes="")), ""),
 }
 
 
 @pytest.mark.parametrize("name", NOTED)
-def test_transforms_that_are_not_applied_are_noted(read: Read, name: str) -> None:
+def test_what_is_left_out_is_noted(read: Read, name: str) -> None:
     ending, content, note = NOTED[name]
     mesh = read(ending, content)
     assert mesh.area == BOX_AREA

@@ -38,7 +38,7 @@ from tests.support.shapes import (
 # Warnings are let through here, as they are in real runs: an error must not rest on one.
 pytestmark = pytest.mark.filterwarnings("ignore")
 
-FORMATS = [".ply", ".obj", ".stl", ".off", ".gltf", ".glb", ".gii", "_lh.pial"]
+FORMATS = [".ply", ".obj", ".stl", ".off", ".gltf", ".glb", ".gii", "_lh.pial", ".mesh", ".msh", ".3mf"]
 NAN_AT_3 = BOX_VERTICES.copy()
 NAN_AT_3[3, 1] = np.nan
 INDEX_MINUS_1, INDEX_8 = [*BOX_TRIANGLES, [0, 1, -1]], [*BOX_TRIANGLES, [0, 1, 8]]
@@ -47,7 +47,7 @@ INT_TRIANGLES = np.array(BOX_TRIANGLES, dtype=np.int32)
 MANY = 10**15
 # Bad meshes, and the formats that can hold them.
 POLYGONS = [".ply", ".obj", ".off"]
-INDEXED = [*POLYGONS, ".glb", ".gii", "_lh.pial"]
+INDEXED = [*POLYGONS, ".glb", ".gii", "_lh.pial", ".mesh", ".msh", ".3mf"]
 MESHES: dict[str, tuple[Any, Any, list[str]]] = {
     "NaN": (NAN_AT_3, BOX_TRIANGLES, FORMATS),
     "no faces": (BOX_VERTICES, [], FORMATS),
@@ -288,8 +288,8 @@ def test_names_without_a_known_format_are_refused_with_the_page_that_converts(tm
 
 # Forms in which a cut shows wherever it falls, and how many bytes at the end mean nothing.
 # The last line of text may lose its end, but no corner.
-SPARE = dict.fromkeys(("ply little", "stl binary", "glb", "gifti", "freesurfer"), 0)
-SPARE |= {"stl ascii": 5, "ply ascii": 1, "off": 1}
+SPARE = dict.fromkeys(("ply little", "stl binary", "glb", "gifti", "freesurfer", "3mf"), 0)
+SPARE |= {"stl ascii": 5, "ply ascii": 1, "off": 1, "gmsh 2.2": 1, "gmsh 4.1": 1, "gmsh 4.1 little": 1, "medit": 6}
 TETRAHEDRON = TETRAHEDRON_VERTICES, TETRAHEDRON_TRIANGLES
 CUTTABLE: dict[str, tuple[str, bytes, int]] = {
     **{name: (WRITERS[name][0], WRITERS[name][1](*TETRAHEDRON), spare) for name, spare in SPARE.items()},

@@ -1,0 +1,173 @@
+"""Medit's and Gmsh's meshes: the triangles and quadrilaterals beside cells with volume.
+
+Sources: P. Frey, "MEDIT: An interactive mesh visualization software" (2001); C. Geuzaine and J.-F. Remacle, "Gmsh
+Reference Manual", https://gmsh.info/doc/texinfo/gmsh.html, with the formats MSH 2 and MSH 4.1.
+"""
+
+from __future__ import annotations
+
+import re
+from array import array
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sobolev_batch.arrays import Reals
+from sobolev_batch.errors import MeshError
+from sobolev_batch.geometry.formats.by_name import Format
+from sobolev_batch.geometry.formats.parsing import Raw, beside_volume
+from sobolev_batch.geometry.formats.polygons import cut_polygons
+
+# Medit's cells with volume.
+_MEDIT_VOLUMES = ("Tetrahedra", "Prisms", "Pyramids", "Hexahedra")
+# Gmsh's numbers of cells: their corners, and which have an area or a volume.
+_CORNERS = {1: 2, 2: 3, 3: 4, 4: 4, 5: 8, 6: 6, 7: 5, 15: 1}
+_WITH_AREA, _WITH_VOLUME = (2, 3), (4, 5, 6, 7)
+
+
+def parse_medit(data: bytes) -> Raw:
+    """Return the vertices and triangles of a Medit mesh in text."""
+    # Words have three letters or more, of which the first is a capital; numbers may have an e.
+    start, *words = re.split(rb"([A-Z][A-Za-z0-9]{2,})", re.sub(rb"#[^\n]*", b"", data))
+    names = [word.decode("ascii") for word in words[::2]]
+    sections = dict(zip(names, words[1::2], strict=True))
+    if start.strip() or names[:1] != ["MeshVersionFormatted"] or len(sections) < len(names):
+        raise MeshError("it does not begin with MeshVersionFormatted, as Medit's text does, or repeats a section")
+    if sections.get("Dimension", b"").split() != [b"3"]:
+        raise MeshError("it is not of dimension 3")
+    if curved := [name for name in names if re.match("(Triangles|Quadrilaterals)[PQ]", name)]:
+        raise MeshError(f"it has {curved[0]}, which are curved; save it with flat faces")
+    vertices, *faces = (
+        _medit_rows(name, sections.get(name, b"0"), width)[:, :-1]
+        for name, width in (("Vertices", 4), ("Triangles", 4), ("Quadrilaterals", 5))
+    )
+    volumes = sum(int(_numbers(sections[name], name)[0]) for name in _MEDIT_VOLUMES if name in sections)
+    return _surface(vertices, [corners - 1 for corners in faces], volumes)
+
+
+def parse_gmsh(data: bytes) -> Raw:
+    """Return the vertices and triangles of a Gmsh mesh: of its format 4.1, or of 2.2 in text."""
+    head = re.match(rb"\$MeshFormat\s+(2\.2\s+0|4\.1\s+[01])\s+8[ \t]*\r?\n(.{4})", data, re.DOTALL)
+    if head is None:
+        raise MeshError(
+            "it is no Gmsh mesh of the format 4.1, or 2.2 in text; convert it: "
+            "gmsh scan.msh -save -format msh41 -o surface.msh"
+        )
+    order = "" if head[1].endswith(b"0") else "<" if head[2] == b"\1\0\0\0" else ">"
+    nodes, cells = (_Numbers(data, name, order) for name in (b"Nodes", b"Elements"))
+    read = _of_second_format if head[1].startswith(b"2") else _of_fourth_format
+    numbered, rows = read(nodes, cells)
+    faces = [corners for kind, corners in rows if kind in _WITH_AREA]
+    volumes = sum(len(corners) for kind, corners in rows if kind in _WITH_VOLUME)
+    # Nodes have any numbers, in any order.
+    order_of_nodes = np.argsort(numbered[:, 0])
+    known = numbered[order_of_nodes, 0]
+    places = [np.searchsorted(known, corners) for corners in faces]
+    for corners, place in zip(faces, places, strict=True):
+        if (place == len(known)).any() or (known[place] != corners).any():
+            raise MeshError("it has a face with a node that is not there")
+    return _surface(numbered[:, 1:], [order_of_nodes[place] for place in places], volumes)
+
+
+class _Numbers:
+    """The numbers of a section of a Gmsh mesh, one after the other: in text, or in binary of some order of bytes."""
+
+    def __init__(self, data: bytes, name: bytes, order: str) -> None:
+        section = re.search(rb"\$%s[ \t]*\r?\n(.*)\$End%s" % (name, name), data, re.DOTALL)
+        if section is None:
+            raise MeshError(f"it has no section ${name.decode()} that ends")
+        self.order, self.place = order, 0
+        self.values: Any = section[1] if order else np.array(_numbers(section[1], name.decode()))
+
+    def take(self, count: int, code: str = "u8") -> NDArray[Any]:
+        """Return so many numbers more, in binary of a type of NumPy."""
+        start = self.place
+        if self.order:
+            dtype = np.dtype(self.order + code)
+            self.place += count * dtype.itemsize
+            found = np.frombuffer(self.values[start : self.place], dtype)
+        else:
+            self.place += count
+            found = self.values[start : self.place]
+        if not 0 <= count <= len(found):
+            raise MeshError("a section breaks off, or has wrong counts before")
+        return found
+
+    def count(self) -> int:
+        """Return the next number, which counts others."""
+        return int(self.take(1)[0])
+
+
+# What is read of nodes and cells: the number and the coordinates of each node (n, 4), and kinds with corners (m, k).
+_Read = tuple[Reals, list[tuple[int, NDArray[Any]]]]
+
+
+def _of_second_format(nodes: _Numbers, cells: _Numbers) -> _Read:
+    numbered = nodes.take(4 * nodes.count()).reshape(-1, 4)
+    rows: dict[int, list[list[float]]] = {kind: [] for kind in _CORNERS}
+    count, numbers, place = cells.count(), cells.values.tolist(), 1
+    for _ in range(count):
+        # Its number, its kind, and a count of tags, which come before its corners.
+        _, kind, tags = numbers[place : place + 3]
+        end = place + 3 + int(tags) + _corners(int(kind))
+        if not place + 3 <= end - _corners(int(kind)) <= end <= len(numbers):
+            raise MeshError("a section breaks off, or has wrong counts before")
+        rows[int(kind)].append(numbers[end - _corners(int(kind)) : end])
+        place = end
+    return numbered, [(kind, np.array(found)) for kind, found in rows.items() if found]
+
+
+def _of_fourth_format(nodes: _Numbers, cells: _Numbers) -> _Read:
+    numbered, rows = [np.zeros((0, 4))], []
+    for _ in range(int(nodes.take(4)[0])):
+        dimension, _, has_parameters = nodes.take(3, "i4").tolist()
+        count = nodes.count()
+        width = 3 + int(dimension) * int(has_parameters)
+        numbers = nodes.take(count)
+        numbered.append(np.column_stack([numbers, nodes.take(count * width, "f8").reshape(count, width)[:, :3]]))
+    for _ in range(int(cells.take(4)[0])):
+        kind, count = int(cells.take(3, "i4")[2]), cells.count()
+        rows.append((kind, cells.take(count * (1 + _corners(kind))).reshape(count, -1)[:, 1:]))
+    return np.concatenate(numbered), rows
+
+
+def _corners(kind: int) -> int:
+    if kind not in _CORNERS:
+        raise MeshError(f"it has cells of Gmsh's type {kind}, which are curved or rare; save it with linear ones")
+    return _CORNERS[kind]
+
+
+def _medit_rows(name: str, section: bytes, width: int) -> Reals:
+    """Return the rows (n, width) of a section of a Medit mesh."""
+    count, *values = _numbers(section, name) or [-1.0]
+    if len(values) != count * width:
+        raise MeshError(
+            f"its section {name} announces {count:g} rows of {width} numbers, and has {len(values)} numbers"
+        )
+    return np.array(values).reshape(-1, width)
+
+
+def _numbers(section: bytes, name: str) -> array[float]:
+    try:
+        if b"_" in section:
+            raise ValueError("an underscore, which is Python's spelling")
+        return array("d", map(float, section.split()))
+    except ValueError as error:
+        raise MeshError(f"its section {name} has a word that is no number: {error}") from error
+
+
+def _surface(vertices: Reals, faces: Sequence[NDArray[Any]], volumes: int) -> Raw:
+    """Return the surface of faces (m, k) of each number of corners, beside so many cells with volume."""
+    corners = np.concatenate([np.zeros(0), *(some.ravel() for some in faces)])
+    sizes = np.repeat([some.shape[1] for some in faces], [len(some) for some in faces])
+    if not len(sizes) and volumes:
+        raise MeshError(f"it has {volumes:,} cells with volume and no faces; save its surface beside them")
+    if (corners != np.floor(corners)).any():
+        raise MeshError("it has indices that are not integers")
+    raw = cut_polygons(vertices, corners.astype(np.int64), sizes)
+    return raw._replace(notes=(*raw.notes, *beside_volume(volumes, len(sizes))))
+
+
+FORMATS = (Format((".mesh",), parse_medit, 40, 360), Format((".msh",), parse_gmsh, 48, 430))
