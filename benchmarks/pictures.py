@@ -226,6 +226,38 @@ def _draw_usual_distances(_: Path, path: Path) -> None:
     _save(figure, path)
 
 
+def _draw_tolerance(meshes: Path, path: Path) -> None:
+    """Draw the fewest triangles within tolerances; mmgs_O3, the program of Mmg, is to be on the path."""
+    import numpy as np
+    from matplotlib.figure import Figure
+
+    import sobolev_batch as sb
+    from sobolev_batch.extras.figures.style import draw_curve, set_log_scale, style_of
+
+    cow = sb.read_mesh(meshes / "spot_23k.obj")
+    radius = cow.bounding_sphere[1]
+    command = ["mmgs_O3", "-in", "{input}", "-out", "{output}", "-hausd", "{hausd}", "-v", "0"]
+    mmg = {"source": "command", "command": command, "input": ".mesh", "output": ".mesh"}
+    figure = Figure(figsize=(6.4, 3.6), layout="constrained")
+    axes = figure.subplots()
+    set_log_scale(axes, "xy")
+    for number, (label, method) in enumerate({"decimation": "decimate", "mmg": mmg, "pyacvd": "remesh"}.items()):
+        places, values = [], []
+        # Even triangles within less are nearly all of the cow's, or more.
+        for tolerance in (0.05, 0.02, 0.01) if method == "remesh" else (0.05, 0.02, 0.01, 0.005):
+            within = tolerance * radius
+            ends = {"hausd": (0.01 * within, 3 * within)} if method is mmg else None
+            found = sb.reduce(cow, within, method=method, search=ends, workers=1)["mesh"].bracket
+            if found.best is not None:
+                places.append(tolerance)
+                values.append(found.best.triangles)
+        draw_curve(axes, np.array(places), np.array(values), np.zeros(len(values)), style_of(number), label)
+    axes.set_xlabel("largest deviation / radius")
+    axes.set_ylabel("triangles of Spot the cow")
+    axes.legend(fontsize="small")
+    _save(figure, path)
+
+
 def _draw_head(_: Path, path: Path) -> None:
     from benchmarks.reconstruction import draw_row, head_with_ears, reconstructed
 
@@ -279,6 +311,9 @@ PICTURES = {
     ),
     "report": Picture(_draw_report, ("benchmarks.pictures:_draw_report",), (_CORTEX, *_PAGE)),
     "one-per-cent": Picture(_draw_one_per_cent, ("benchmarks.pictures:_draw_one_per_cent", *_WITNESS), is_cow=True),
+    "tolerance": Picture(
+        _draw_tolerance, ("benchmarks.pictures:_draw_tolerance", f"{_FIGURES}style:draw_curve"), is_cow=True
+    ),
     "reconstruction": Picture(_draw_head, ("benchmarks.pictures:_draw_head", *_ROW)),
     "reconstruction-stages": Picture(_draw_stages, ("benchmarks.pictures:_draw_stages", *_ROW), is_cow=True),
 }
