@@ -237,11 +237,12 @@ def _draw_tolerance(meshes: Path, path: Path) -> None:
     cow = sb.read_mesh(meshes / "spot_23k.obj")
     radius = cow.bounding_sphere[1]
     command = ["mmgs_O3", "-in", "{input}", "-out", "{output}", "-hausd", "{hausd}", "-v", "0"]
-    mmg = {"source": "command", "command": command, "input": ".mesh", "output": ".mesh"}
+    mmg: dict[str, Any] = {"source": "command", "command": command, "input": ".mesh", "output": ".mesh"}
+    methods: dict[str, Any] = {"decimation": "decimate", "mmg": mmg, "pyacvd": "remesh"}
     figure = Figure(figsize=(6.4, 3.6), layout="constrained")
     axes = figure.subplots()
     set_log_scale(axes, "xy")
-    for number, (label, method) in enumerate({"decimation": "decimate", "mmg": mmg, "pyacvd": "remesh"}.items()):
+    for number, (label, method) in enumerate(methods.items()):
         places, values = [], []
         # Even triangles within less are nearly all of the cow's, or more.
         for tolerance in (0.05, 0.02, 0.01) if method == "remesh" else (0.05, 0.02, 0.01, 0.005):
