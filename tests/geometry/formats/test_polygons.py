@@ -101,15 +101,17 @@ def test_vertices_that_no_face_uses_hide_nothing(unused: list[float], size: int)
     assert [note[:25] for note in raw.notes] == ["1 of 1 faces are not flat"]
 
 
-def test_a_saddle_is_cut_from_its_lowest_corner_in_any_order() -> None:
-    x, y = (grid.ravel() for grid in np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9)))
-    vertices = np.column_stack([x, y, 0.3 * x * y])
-    corners = (np.arange(8)[:, None] * 9 + np.arange(8)).reshape(-1, 1) + np.array([0, 1, 10, 9])
+def test_saddles_that_bend_alike_are_cut_from_their_lowest_corner() -> None:
+    # Rounding alone would choose a diagonal of these.
+    saddle = np.array([[0, 0, 0.1], [1, 0, -0.1], [1, 1, 0.1], [0, 1, -0.1]])
+    places = [saddle @ TURN + shift for shift in np.random.default_rng(2).normal(size=(64, 3))]
+    vertices, corners = np.concatenate(places), np.arange(256).reshape(64, 4)
     found = set()
     for first in range(4):
         triangles = cut_polygons(vertices, np.roll(corners, first, 1).ravel(), np.full(64, 4)).triangles
         found.add(frozenset(frozenset(triangle) for triangle in triangles.tolist()))
     assert len(found) == 1
+    assert len({tuple(sorted(triangle % 4)) for triangle in triangles}) == 2
 
 
 @pytest.mark.parametrize(
