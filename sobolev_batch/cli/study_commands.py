@@ -231,6 +231,7 @@ def _range(context: click.Context, param: click.Parameter, value: str | None) ->
     metavar="NAME=LOW:HIGH",
     help="Search a parameter between two values; whole numbers try those alone. [default: triangles]",
 )
+@click.option("--suffix", metavar="SUFFIX", help="Give a command files of this format, such as .mesh. [default: .ply]")
 @click.option("--output", required=True, metavar="FOLDER|URL", help="Write meshes and records of trials there.")
 @_workers_option
 @_scheduler_option()
@@ -244,6 +245,7 @@ def reduce_command(
     style: Format,
     scheduler: str | None,
     trust_network: bool,
+    suffix: str | None,
     **settings: Any,
 ) -> None:
     """Find the fewest triangles of each mesh within a tolerance.
@@ -259,6 +261,10 @@ def reduce_command(
 
     if scheduler and settings["workers"]:
         raise click.UsageError("--workers is for processes on this machine; a scheduler has its own")
+
+    if suffix:
+        words = shlex.split(settings["method"])
+        settings["method"] = {"source": "command", "command": words, "input": suffix, "output": suffix}
 
     def tell(one: Reduction) -> None:
         if len(files) > 1:

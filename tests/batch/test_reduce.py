@@ -298,12 +298,24 @@ def test_no_original_is_replaced(scan: Path) -> None:
 
 @pytest.mark.process
 def test_the_command_goes_on_after_it_was_killed(tmp_path: Path) -> None:
-    (tmp_path / "rings.py").write_text(SCRIPT)
+    (tmp_path / "rings.py").write_text(f"{SCRIPT}\nassert sys.argv[1][-4:] == sys.argv[2][-4:] == '.off'")
     sb.write_mesh(disc(lumpy(1), 2 * np.pi / 500), tmp_path / "flat.ply")
     (tmp_path / "broken.ply").write_text("ply")
     files = [str(tmp_path / name) for name in ("flat.ply", "broken.ply")]
-    method = ["--with", RINGS.replace("{folder}", str(tmp_path)), "--search", "edge=0.05:1.5", "--workers", "1"]
-    words = ["reduce", *files, "--within", "0.3mm", "--unit", "cm", *method, "--output", str(tmp_path / "reduced")]
+    method = ["--with", RINGS.replace("{folder}", str(tmp_path)), "--search", "edge=0.05:1.5", "--suffix", ".off"]
+    words = [
+        "reduce",
+        *files,
+        "--within",
+        "0.3mm",
+        "--unit",
+        "cm",
+        *method,
+        "--workers",
+        "1",
+        "--output",
+        str(tmp_path / "reduced"),
+    ]
     record = tmp_path / "reduced" / "flat.json"
     with started(*words) as process:
         while not (record.exists() and len(json.loads(record.read_bytes())["trials"]) >= 2):
