@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.formats.by_name import Format
-from sobolev_batch.geometry.formats.parsing import Raw, triangle_strips, unpacked_limit
+from sobolev_batch.geometry.formats.parsing import Raw, joined, triangle_strips, unpacked_limit
 from sobolev_batch.geometry.mesh import merge_coincident
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -71,9 +71,7 @@ def parse_gltf(data: bytes, beside: Mapping[str, bytes]) -> Raw:
                     )
     if not placed:
         raise MeshError("the file's scene has no faces")
-    offsets = np.cumsum([0, *(len(vertices) for vertices, _ in placed)])
-    triangles = np.concatenate([indices + offset for (_, indices), offset in zip(placed, offsets[:-1], strict=True)])
-    return Raw(*merge_coincident(np.concatenate([vertices for vertices, _ in placed]), triangles))
+    return Raw(*merge_coincident(*joined(placed)))
 
 
 def files_beside(data: bytes) -> tuple[str, ...]:

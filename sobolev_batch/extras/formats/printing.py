@@ -17,7 +17,7 @@ import numpy as np
 from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.formats.by_name import Format
-from sobolev_batch.geometry.formats.parsing import Raw, require_memory_to_read, unpacked_limit, xml_events
+from sobolev_batch.geometry.formats.parsing import Raw, joined, require_memory_to_read, unpacked_limit, xml_events
 
 _RELATIONS, _OF_MODEL = "_rels/.rels", "/3dmodel"
 _UNIT, _SUPPORTS = "millimeter", ("support", "solidsupport")
@@ -118,16 +118,15 @@ def parse_3mf(data: bytes) -> Raw:
     relations = xml_events(package.read(_RELATIONS), "3MF")
     roots = [values["Target"] for _, _, values in relations if values.get("Type", "").endswith(_OF_MODEL)]
     package.part("".join(roots[:1]).lstrip("/"))
-    placed = [one for item in package.items for one in package.placed(item, np.eye(4))]
-    if len(package.units) != 1:
-        raise MeshError(f"its parts have several units of length: {', '.join(sorted(package.units))}")
+    # What further parts would build does not count.
+    placed = [one for item in tuple(package.items) for one in package.placed(item, np.eye(4))]
     if not sum(len(triangles) for _, triangles in placed):
         raise MeshError("the file builds no faces")
-    starts = np.cumsum([0, *(len(vertices) for vertices, _ in placed)])
-    triangles = [indices + start for (_, indices), start in zip(placed, starts[:-1], strict=True)]
+    if len(package.units) > 1:
+        raise MeshError(f"its parts have several units of length: {', '.join(sorted(package.units))}")
     notes = [f"{package.supports} supports are left out"] if package.supports else []
     notes += [f"its unit of length is the {unit}" for unit in package.units - {_UNIT}]
-    return Raw(np.concatenate([vertices for vertices, _ in placed]), np.concatenate(triangles), tuple(notes))
+    return Raw(*joined(placed), tuple(notes))
 
 
 def _placing(values: Mapping[str, str], part: str) -> _Placing:

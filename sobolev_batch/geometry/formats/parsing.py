@@ -8,7 +8,7 @@ import io
 import os
 import stat
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from io import BufferedReader
 from pathlib import Path, PurePath
 from typing import IO, Any, NamedTuple, cast
@@ -17,7 +17,7 @@ from xml.parsers import expat
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.arrays import Indices
+from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import MeshError
 from sobolev_batch.machine import machine_memory
 from sobolev_batch.parameters import format_bytes
@@ -179,6 +179,13 @@ def _unpacked_bounded(packed: bytes, factor: float) -> bytes:
 def beside_volume(cells: int, faces: int) -> tuple[str, ...]:
     """Return what notes say of cells with volume, which have no part in the surface of the faces beside them."""
     return (f"{cells:,} cells with volume are left out beside {faces:,} faces",) if cells else ()
+
+
+def joined(parts: Sequence[tuple[Reals, Indices]]) -> tuple[Reals, Indices]:
+    """Return the vertices (n, 3) and triangles (m, 3) of parts as those of one mesh."""
+    offsets = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
+    triangles = [indices + offset for (_, indices), offset in zip(parts, offsets[:-1], strict=True)]
+    return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(triangles)
 
 
 def triangle_strips(corners: Indices, sizes: Indices) -> Indices:
