@@ -160,7 +160,7 @@ class MeshView:
         """Return normals (m, 3) of twice the area that point outwards, as far as the mesh tells where that is."""
         own_normals, mesh = normals(self.vertices, self.triangles), Mesh(self.vertices, self.triangles)
         if np.isfinite(mesh.volume):
-            return own_normals * np.copysign(1.0, mesh.volume)
+            return own_normals if mesh.volume > 0 else -own_normals
         # The orientation of others is not to be trusted: away from the middle of the mesh.
         middle = (self.vertices.min(axis=0) + self.vertices.max(axis=0)) / 2
         outwards = np.einsum("ij,ij->i", own_normals, self.vertices[self.triangles].mean(axis=1) - middle)
