@@ -30,6 +30,8 @@ _BESIDE = 0.4
 # that decimation spoils early may keep the largest deviation the same for many sizes, which then follows no power.
 # The last bracket is then this fraction of its width, since whole numbers are rounded.
 _FEW_TRIALS, _CLOSED = 8, 0.85
+# Widths that differ by this fraction are equal.
+_EQUAL = 1e-9
 # Several trials at a time lie a bracket's last width apart, or this fraction of the way to the predicted size. The
 # first ones lie apart by this logarithm.
 _APART, _SPREAD, _FIRST_APART = 0.9, 0.4, 0.7
@@ -156,7 +158,8 @@ class Search:
         if bracket.best is None or bracket.failed is None:
             return end > start or bracket.best == bracket.failed
         is_adjacent = self.is_whole and abs(bracket.best.size - bracket.failed.size) <= 1
-        return end - start > math.log1p(self.precision) and not is_adjacent
+        # Rounding must not tell 760 and 798 apart from a width of 5 %.
+        return end - start > math.log1p(self.precision) * (1 + _EQUAL) and not is_adjacent
 
     def _places(
         self, points: Mapping[float, float], bracket: Bracket, start: float, end: float, count: int

@@ -77,6 +77,13 @@ def test_steps_take_few_trials_from_a_guess_on() -> None:
     assert np.quantile(counts, 0.95) <= 8
 
 
+def test_a_bracket_of_exactly_the_width_is_closed() -> None:
+    search = Search(1.0, 4, 100_000, is_whole=True, larger_is_coarser=False)
+    for failed in range(20, 4000, 20):
+        sizes = (failed, False), (1.05 * failed, True)
+        assert search.next([Trial(round(n), round(n), 1.0, 1.0, 1.0, is_within=held) for n, held in sizes]) == ()
+
+
 def test_the_first_size_is_that_of_the_tolerance_whatever_the_unit() -> None:
     remesher = Remesher.parse("decimate")
     for scale in (1e-3, 1.0, 1e3):
