@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import gzip
+import re
 import zlib
 from collections.abc import Iterable
 from io import BufferedReader
@@ -27,15 +28,15 @@ from sobolev_batch.geometry.formats.ply import HEADER_BYTES
 from sobolev_batch.geometry.mesh import Mesh
 
 _LONGEST_REASON = 250
-# How files begin that are taken for meshes, in lower case, and what they are.
+# How files begin that are taken for meshes, and what they are.
 _MISTAKEN = {
-    b"<!doctype html": "a web page, such as the message of a server; download the file again",
-    b"<html": "a web page, such as the message of a server; download the file again",
-    b"version https://git-lfs": "a pointer of Git's large file storage; fetch the file itself by git lfs pull",
-    codecs.BOM_UTF16_LE: "a text in UTF-16; save it in UTF-8",
-    codecs.BOM_UTF16_BE: "a text in UTF-16; save it in UTF-8",
-    b"\x1f\x8b": "compressed by gzip; let its name end in .gz",
+    rb"(<\?xml[^>]*>\s*)?<(!doctype )?(html|error)\b": "the message of a server or a web page; download the file again",
+    rb"version https://git-lfs": "a pointer of Git's large file storage; fetch the file itself by git lfs pull",
+    rb"\xff\xfe|\xfe\xff": "a text in UTF-16; save it in UTF-8",
+    rb"\x1f\x8b": "compressed by gzip; let its name end in .gz",
 }
+# How files of some formats begin.
+_BEGINNINGS = {".ply": rb"ply\s", ".stl": rb"solid\s", ".off": rb"(st|c|n)*off\s", ".vtk": rb"# vtk ", ".glb": rb"gltf"}
 _START_BYTES = 1024
 # Coordinates so many times the size of a mesh have four digits of it in single precision.
 _FAR = 1000
@@ -124,17 +125,19 @@ def read_mesh_by(path: Path, read: Read) -> Mesh:
                 require_memory_to_read(factor * (len(data[0]) + sum(part.stat().st_size for part in parts.values())))
                 beside = {name: read_unpacked(part, factor, read) for name, part in parts.items()}
                 raw = Raw(*form.parse(data.pop(), beside))
-            raw = _noted(raw)
+            raw = _without_unused(raw)
             for array in (raw.vertices, raw.triangles):
                 array.setflags(write=False)
-            return Mesh(*raw)
+            mesh = Mesh(*raw)
+            is_single = raw.vertices.dtype.newbyteorder("=") == np.float32
+            return _with_lost_digits(mesh) if is_single else mesh
     except MeshError as error:
-        raise MeshError(f"{path}: {_mistaken(start) or _shortened(error)}") from error
+        raise MeshError(f"{path}: {_mistaken(start, suffix) or _shortened(error)}") from error
     except MemoryError as error:
         raise MeshError(f"{path}: reading it takes more memory than there is: {_shortened(error)}") from error
     except Exception as error:
         # On damaged input parsers raise anything from struct.error to RecursionError.
-        reason = _mistaken(start) or f"{type(error).__name__}: {_shortened(error)}"
+        reason = _mistaken(start, suffix) or f"{type(error).__name__}: {_shortened(error)}"
         raise MeshError(f"{path}: not a readable {suffix.removeprefix('.')} file: {reason}") from error
 
 
@@ -163,30 +166,36 @@ def expected_size(path: Path) -> tuple[int, float]:
     return triangles, float(triangles * form.memory_bytes)
 
 
-def _noted(raw: Raw) -> Raw:
-    """Leave out vertices that are no numbers and that no triangle uses; note that, and digits that were lost."""
+def _without_unused(raw: Raw) -> Raw:
+    """Leave out vertices that are no numbers and that no triangle uses, with a note."""
     vertices, triangles, notes = raw
     if not np.isfinite(vertices).all() and 0 <= triangles.min() <= triangles.max() < len(vertices):
         is_bad = ~np.isfinite(vertices).all(axis=1)
         if not is_bad[triangles].any():
             vertices, triangles = vertices[~is_bad], (np.cumsum(~is_bad) - 1)[triangles]
             notes += (f"{np.count_nonzero(is_bad):,} vertices without coordinates, which no face uses, are left out",)
-    if vertices.dtype == np.float32 and len(vertices):
-        # By columns, which is several times as fast.
-        lower, upper = np.array([(axis.min(), axis.max()) for axis in vertices.T], np.float64).T
-        times = np.abs([lower, upper]).max() / np.linalg.norm(upper - lower)
-        if _FAR < times < np.inf:
-            notes += (
-                f"coordinates are {times:,.0f} times the size of the mesh, of which single precision keeps "
-                f"{max(0.0, -np.log10(times * np.finfo(np.float32).eps / 2)):.0f} digits",
-            )
     return Raw(vertices, triangles, notes)
 
 
-def _mistaken(start: bytes) -> str:
+def _with_lost_digits(mesh: Mesh) -> Mesh:
+    """Note it where a mesh in single precision is far from the origin for its size."""
+    lower, upper = np.array([(axis.min(), axis.max()) for axis in mesh.used_coordinates]).T
+    times = np.abs([lower, upper]).max() / np.linalg.norm(upper - lower)
+    if times <= _FAR:
+        return mesh
+    note = (
+        f"coordinates are {times:,.0f} times the size of the mesh, of which single precision keeps "
+        f"{max(0.0, -np.log10(times * np.finfo(np.float32).eps / 2)):.0f} digits"
+    )
+    return Mesh.from_checked(mesh.vertices, mesh.triangles, (*mesh.notes, note))
+
+
+def _mistaken(start: bytes, suffix: str) -> str:
     """Return what a file is that begins so and could not be read; empty where that is not known."""
-    start = start.removeprefix(codecs.BOM_UTF8).lstrip().lower()
-    return next((f"it is {what}" for begin, what in _MISTAKEN.items() if start.startswith(begin)), "")
+    start = start.removeprefix(codecs.BOM_UTF8).lstrip()
+    known = {pattern: f"is {what}" for pattern, what in _MISTAKEN.items()}
+    known |= {at: f"begins as a {other} file; name it so" for other, at in _BEGINNINGS.items() if other != suffix}
+    return next((f"it {what}" for pattern, what in known.items() if re.match(pattern, start, re.IGNORECASE)), "")
 
 
 def _shortened(error: Exception) -> str:

@@ -221,11 +221,26 @@ CASES |= {
     f"{ending}, {what}": (ending, content, reason)
     for ending in (".obj", ".off", ".stl", ".ply", ".vtk", ".gltf")
     for what, content, reason in (
-        ("web page", b"\n<!DOCTYPE HTML><html>404</html>", "it is a web page"),
+        ("web page", b"\n<!DOCTYPE HTML><html>404</html>", "or a web page"),
+        (
+            "message of a server",
+            b'<?xml version="1.0"?>\n<Error><Code>AccessDenied</Code></Error>',
+            "message of a server",
+        ),
         ("pointer", b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n", "git lfs pull"),
         ("UTF-16", OBJ_BOX.decode().encode("utf-16"), "save it in UTF-8"),
         ("compressed", gzip.compress(OBJ_BOX), "let its name end in .gz"),
     )
+}
+CASES |= {
+    f"obj, {suffix} by its contents": (".obj", content, f"it begins as a {suffix} file; name it so")
+    for suffix, content in {
+        ".ply": PLY_BOX,
+        ".off": off_with("N", "0 0 1"),
+        ".stl": STL_TEXT,
+        ".vtk": vtk(BOX_VERTICES.tolist(), BOX_QUADS[0]),
+        ".glb": b"glTF\2\0\0\0",
+    }.items()
 }
 
 
