@@ -17,7 +17,6 @@ import zarr
 from distributed import Client
 
 import sobolev_batch as sb
-from sobolev_batch.extras.leagues import changes
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, locked
@@ -229,7 +228,7 @@ def test_a_league_needs_no_more_than_the_store(store: Path, monkeypatch: pytest.
     frame = sb.compare_studies({"a": more}, {"a": store / "a"}, y=("relative", "triangles"))
     grown = frame[frame["y"] == "triangles"].set_index("method")["ratio"].to_dict()
     assert (len(frame), grown) == (6, {"ico": pytest.approx(2.0), "egg": pytest.approx(2.0)})
-    monkeypatch.setattr(changes, "compare_studies", lambda *_, **__: frame)
+    monkeypatch.setattr("sobolev_batch.extras.leagues.changes.compare_studies", lambda *_, **__: frame)
     for words, status in (([], 0), (["--most", "2.1"], 0), (["--most", "1.05"], 1)):
         assert call("table", "league", store, "--against", store, *words).returncode == status
     frame.loc[0, "verdict"] = "farther"
