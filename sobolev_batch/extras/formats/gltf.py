@@ -199,6 +199,8 @@ def _instances(tree: dict[str, Any], buffers: list[bytes], node: dict[str, Any])
         for name, index in extension["attributes"].items()
         if name in kinds
     }
+    if not columns:
+        raise MeshError(f"a node has instances ({_INSTANCING}) without places; export it without the extension")
     for rows in zip(*columns.values(), strict=True):
         yield _matrix(dict(zip(columns, rows, strict=True)))
 

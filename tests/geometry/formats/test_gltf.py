@@ -159,6 +159,16 @@ def test_gltf_scenes_are_read_as_they_stand(read: Read, name: str) -> None:
     assert mesh.extent.box[1] == pytest.approx(upper, abs=1e-5)
 
 
+def test_gltf_instances_without_places_do_not_vanish(read: Read) -> None:
+    scene = instanced()
+    attributes = scene.tree["nodes"][0]["extensions"]["EXT_mesh_gpu_instancing"]["attributes"]
+    scene.tree["nodes"][0]["extensions"]["EXT_mesh_gpu_instancing"]["attributes"] = {"_ID": attributes["_ID"]}
+    scene.tree["nodes"].append({"mesh": 0})
+    scene.tree["scenes"][0]["nodes"].append(1)
+    with pytest.raises(MeshError, match=r"instances .* without places"):
+        read(".glb", scene.glb())
+
+
 @pytest.mark.parametrize(
     "extension", ["EXT_texture_webp", "KHR_texture_basisu", "MSFT_texture_dds", "KHR_materials_ior"]
 )
