@@ -33,7 +33,8 @@ def test_a_cluster_that_adapts_from_no_worker_at_all(study: Study) -> None:
     options = {"processes": False, "protocol": "inproc://", "threads_per_worker": 1}
     pages = {"dashboard_address": "127.0.0.1:0", "worker_dashboard_address": "127.0.0.1:0"}
     with LocalCluster(n_workers=0, **options, **pages) as cluster, Client(cluster) as client:
-        cluster.adapt(minimum=0, maximum=1, interval="20ms")
+        # A worker that has just started does not leave again before it is set up.
+        cluster.adapt(minimum=0, maximum=1, interval="20ms", wait_count=100_000)
         assert len(run(study, "memory://adapted.zarr", client).computed) == 5
 
 
