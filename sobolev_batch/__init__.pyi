@@ -30,8 +30,8 @@ from .norms.causes import spectrum as spectrum
 from .norms.causes import witness as witness
 from .norms.distances import distance as distance
 from .norms.distances import norm as norm
-from .norms.rates import convergence as convergence
 from .norms.fields import fourier_transform as fourier_transform
+from .norms.rates import convergence as convergence
 from .norms.yardsticks import yardsticks as yardsticks
 from .store.unlock import unlock as unlock
 from .study.study import Study as Study

@@ -131,7 +131,9 @@ def test_tables_tell_what_a_remesher_broke(tree: xr.DataTree) -> None:
     sound, holed = (1, 2, 0, 0, 0, 0), (2, 3, 1200, 0, 5, 1)
 
     def text(second: tuple[int, ...]) -> str:
-        numbers = dict(zip((*names, "zero_area_triangles"), zip(sound, second, [np.nan] * 6, sound), strict=False))
+        numbers = dict(
+            zip((*names, "zero_area_triangles"), zip(sound, second, [np.nan] * 6, sound, strict=False), strict=False)
+        )
         made: xr.DataTree = tree.copy()
         made["meshes"] = xr.DataTree(
             tree["meshes"].to_dataset().assign({k: ("mesh", [*v]) for k, v in numbers.items()})
