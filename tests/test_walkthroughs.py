@@ -109,7 +109,7 @@ SEEN: dict[str, tuple[Callable[[Path], None], *tuple[str, ...]]] = {
         remeshers,
         r"League at order -4, over 4 objects",
         "take 9 or more",
-        r"^mine +undecided +0\.\d",
+        r"^mine +relative +undecided +0\.\d",
     ),
     "Surfaces of brains": (brains, "correlation with age: 0.9", "shows where s03 differs"),
     "Two hundred scans on a cluster": (scans, "201 of 201 complete", "211 of 211 complete", "nothing is damaged"),

@@ -130,10 +130,12 @@ def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 @pytest.mark.slow
 def test_the_examples_in_python_run(capsys: pytest.CaptureFixture[str]) -> None:
-    exec("".join(blocks(PAGE, "python")[:2]), {})
-    first, second = capsys.readouterr().out.splitlines()
+    exec("".join(blocks(PAGE, "python")[:3]), {})
+    first, *_, finest, last = capsys.readouterr().out.splitlines()
     assert re.fullmatch(r"\[[\d.e-]+ +[\d.e-]+ *\] ± \[[\d.e-]+ +[\d.e-]+ *\]", first)
-    assert float(second.split()[0]) > 1.6**2
+    # The rate is quadratic in the edge length.
+    assert float(finest.split()[2]) == pytest.approx(2, abs=0.1)
+    assert float(last.split()[0]) > 1.6**2
 
 
 @pytest.mark.slow

@@ -226,7 +226,8 @@ class State:
             growth = energies[-1] / energies[-2] if self.octaves and energies[-2] > 0 else 1.0
             expected = self.expected * np.clip(_OF_GROWTH * growth, 1.0, _GROWTH)
             permitted = _REMAINDER_FRACTION * self._permitted_of(self.squares + expected)
-            return float(np.max(_OF_OTHERS * expected / permitted))
+            with np.errstate(divide="ignore"):
+                return float(np.max(_OF_OTHERS * expected / permitted))
         values, errors = self.remainders[-1].at(self.problem.orders)
         if self.for_others:
             errors = np.maximum(errors, _OF_OTHERS * np.abs(values))
