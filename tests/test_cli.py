@@ -130,6 +130,12 @@ def test_tables_in_every_format_at_lists_of_orders(folder: Path) -> None:
 
 def test_compare_is_exact_to_1_per_cent_without_options(folder: Path) -> None:
     shown = output("compare", "1.off", "3.off", folder=folder)
+    # What it means, and nothing of how it was computed.
+    assert re.search(
+        r"^At order -2, this is as far as 3\.off moved by (\S+) % of its radius, \S+ file units\.$", shown, re.M
+    )
+    assert "xi_max" not in shown and "order -2: " not in shown
+    shown = output("compare", "1.off", "3.off", "--verbose", folder=folder)
     value, error = map(float, re.findall(r"1\.off differs from 3\.off by (\S+) % ± (\S+) % at order -2", shown)[0])
     # One digit is shown of the error, rounded up.
     assert error <= 0.02 * value
@@ -138,7 +144,7 @@ def test_compare_is_exact_to_1_per_cent_without_options(folder: Path) -> None:
 
 
 def test_compare_to_an_accuracy_and_on_a_lattice(folder: Path) -> None:
-    sampled = output("compare", "1.off", "3.off", "--order", "-2", "--rtol", "1e-2", folder=folder)
+    sampled = output("compare", "1.off", "3.off", "--order", "-2", "--rtol", "1e-2", "--verbose", folder=folder)
     assert re.search(r"^xi_max \d\S*, M \d+, complex64.*, seed 0$", sampled, re.M)
     assert re.search(r"^order -2: distance \S+ ± \S+ \(truncation \S+, aliasing \S+, discretisation", sampled, re.M)
     options = ("--order=-4,-6", "--xi-max", "3", "--M", "24", "--yardsticks", "--proximity", "--witness", "new/w")
@@ -147,9 +153,13 @@ def test_compare_to_an_accuracy_and_on_a_lattice(folder: Path) -> None:
     for yardstick in (r"moved by \S+ %", r"with noise of \S+ %", r"decimated to \d+ triangles"):
         assert len(re.findall(rf"^  3\.off {yardstick}", shown, re.M)) == 2
     near = sb.proximity(*(sb.read_mesh(folder / name) for name in ("1.off", "3.off")))
-    deviations = re.findall(r"^largest deviation, ([AB] to [AB]|both): +(\S+)(?: to (\S+))?, at \(.*\)$", shown, re.M)
-    for (direction, lower, upper), way in zip(deviations, ("_forward", "_backward", ""), strict=True):
-        assert direction == {"_forward": "A to B", "_backward": "B to A", "": "both"}[way]
+    bounds = r"(\S+)(?: to (\S+))?(?: file units)?, at \(.*\)"
+    of_both = rf"^The largest deviation of 1\.off and 3\.off from each other is {bounds}\.$"
+    deviations = [
+        re.findall(of_both, shown.splitlines()[0])[0],
+        *re.findall(rf"^largest deviation, . to .: {bounds}$", shown, re.M),
+    ]
+    for (lower, upper), way in zip(deviations, ("", "_forward", "_backward"), strict=True):
         assert float(lower) == pytest.approx(near[f"hausdorff{way}"], rel=1e-3, abs=1e-9)
         assert float(upper or lower) == pytest.approx(near[f"hausdorff_upper{way}"], rel=1e-3, abs=1e-9)
     assert re.search(rf"^mean +{near['mean_forward']:.4g} ", shown, re.M)
@@ -171,7 +181,7 @@ def test_compare_names_units_and_defects(folder: Path) -> None:
     inverted = sb.Mesh(100 * ball.vertices, ball.triangles[:, ::-1])
     sb.write_mesh(part, folder / "part.off")
     sb.write_mesh(inverted, folder / "inverted.off")
-    files = ("part.off", "inverted.off", "--order=-4", "--unit", "mm")
+    files = ("part.off", "inverted.off", "--order=-4", "--unit", "mm", "--verbose")
     done = [call("compare", *files, *more, folder=folder) for more in ((), ("--no-scaling",))]
     scaled, kept = (one.stdout + one.stderr for one in done)
     for shown in (scaled, kept):

@@ -71,6 +71,7 @@ class _CompareOptions:
     no_scaling: bool
     below: float | None
     within: str | None
+    verbose: bool
     style: str
 
     def __post_init__(self) -> None:
@@ -157,12 +158,18 @@ class _CompareOptions:
     help="Divide each axis of the lattice into M intervals, in place of --rtol. [default: 64 with --xi-max]",
 )
 @click.option("--yardsticks", is_flag=True, help="Print which move, noise and decimation bring B as far from itself.")
-@click.option("--proximity", is_flag=True, help="Also print the largest deviation, mean, RMS and other distances.")
+@click.option(
+    "--proximity", is_flag=True, help="Also print distances of points: the largest deviation, mean, RMS and others."
+)
 @click.option(
     "--threshold", type=float, help="Take this length for the F-score of --proximity. [default: 1 % of the radius of B]"
 )
 @click.option("--align", is_flag=True, help="First move A rigidly to where it is nearest to B.")
-@click.option("--unit", metavar="NAME", help="Name the unit of length of both files, such as mm.")
+@click.option(
+    "--unit",
+    metavar="NAME",
+    help="Name the unit of length of both files, such as mm. The first line is then the largest deviation.",
+)
 @click.option(
     "--witness",
     type=PATH,
@@ -178,15 +185,17 @@ class _CompareOptions:
     help="Tell by the exit status whether no point of either mesh is farther from the other one than LENGTH, such as "
     "0.1 in the files' unit, or 0.1mm with --unit. A percentage is that of --below.",
 )
+@click.option("--verbose", is_flag=True, help="Also print the parts of each error, and the settings that were chosen.")
 @json_option
 @click.pass_context
 def compare_command(context: click.Context, /, **options: Any) -> None:
     """Print how much two meshes differ.
 
-    B is the reference. The difference is given in per cent of its norm, with a bound on the error, and with the share
-    of the squared distance that a change of area explains. With --below, print one line on whether both are the same
-    surface, and with --within, on whether they are as near everywhere as a length. The exit status is then 0 if they
-    are, 1 if they are not, 4 if that cannot be told, and 2 after any error.
+    B is the reference. The difference is given in per cent of its norm, with a bound on the error, with the share
+    of the squared distance that a change of area explains, and with the move of B that takes it as far from itself.
+    With --below, print one line on whether both are the same surface, and with --within, on whether they are as near
+    everywhere as a length. The exit status is then 0 if they are, 1 if they are not, 4 if that cannot be told, and 2
+    after any error.
     """
     if options["below"] is not None or options["within"] is not None:
         # The usual status of other errors says that the files differ.
@@ -236,8 +245,9 @@ class _Comparison:
         first: The mesh of A in the unit of the file, where it was moved to.
         second: That of B.
         similarity: From this unit to that of the distances.
-        results: What `distance` or `yardsticks` returns.
-        nearness: What `proximity` returns, in the unit of the files, and the largest deviations; None if not asked for.
+        results: What `yardsticks` returns, of moves alone if no others were asked for.
+        nearness: What `proximity` returns, in the unit of the files; None if not asked for.
+        deviations: Largest deviations in this unit; None if it has no name and `proximity` was not asked for.
         motion: Rigid motion (4, 4) of A, and the distance before; None if not asked for.
         doubt: Question whether both are in one unit and place; None where they look it.
     """
@@ -247,18 +257,20 @@ class _Comparison:
     second: Mesh
     similarity: Similarity
     results: xr.Dataset
-    nearness: tuple[dict[str, float], Deviations] | None
+    nearness: dict[str, float] | None
+    deviations: Deviations | None
     motion: tuple[Reals, xr.Dataset] | None
     doubt: str | None
 
     @classmethod
     def of_files(cls, options: _CompareOptions) -> _Comparison:
         """Read and compare two files; what may make one doubt the result is printed as a note."""
+        from sobolev_batch.geometry.deviation import largest_deviation
         from sobolev_batch.geometry.formats.readers import read_mesh
         from sobolev_batch.geometry.proximity import proximity_and_deviations
         from sobolev_batch.geometry.surface import Similarity, placement_doubt
         from sobolev_batch.norms.distances import distance
-        from sobolev_batch.norms.yardsticks import yardsticks
+        from sobolev_batch.norms.yardsticks import CHANGES, yardsticks
         from sobolev_batch.testing.difference import require_place
 
         accuracy = options.accuracy
@@ -278,9 +290,14 @@ class _Comparison:
         for line in _remarks({options.a.name: first, options.b.name: second}, doubt, radius, options.unit):
             echo(f"note: {line}", err=True)
         # Bad settings are refused before a long computation.
-        nearness = proximity_and_deviations(first, second, threshold=options.threshold) if options.proximity else None
-        results = (yardsticks if options.yardsticks else distance)(*pair, orders, **accuracy)
-        return cls(options, first, second, similarity, results, nearness, motion, doubt)
+        nearness, deviations = None, None
+        if options.proximity:
+            nearness, deviations = proximity_and_deviations(first, second, threshold=options.threshold)
+        elif options.unit is not None:
+            deviations = largest_deviation(first, second)
+        changes = CHANGES if options.yardsticks else ("moved",)
+        results = yardsticks(*pair, orders, **accuracy, changes=changes)
+        return cls(options, first, second, similarity, results, nearness, deviations, motion, doubt)
 
     @property
     def area_change(self) -> float:
@@ -293,7 +310,6 @@ class _Comparison:
         from sobolev_batch.norms.columns import parts_as_variables
 
         motion, before = self.motion or (None, None)
-        nearness, deviations = self.nearness or (None, None)
         return {
             "a": self.options.a,
             "b": self.options.b,
@@ -303,8 +319,8 @@ class _Comparison:
             "motion": None if motion is None else motion.tolist(),
             "before": None if before is None else before["relative"].item(),
             "settings": self.results.attrs,
-            "proximity": nearness,
-            "deviation": None if deviations is None else asdict(deviations),
+            "proximity": self.nearness,
+            "deviation": None if self.deviations is None else asdict(self.deviations),
             "doubt": self.doubt,
             "defects": {"a": self.first.defects, "b": self.second.defects},
             "notes": {"a": self.first.notes, "b": self.second.notes},
@@ -315,24 +331,32 @@ class _Comparison:
     def lines(self) -> Iterator[str]:
         """The same for people."""
         from sobolev_batch.tables.text import percent
+        from sobolev_batch.testing.within import deviation_text
 
         options, length = self.options, self.options.unit or FILE_UNITS
+        name, reference, radius = options.a.name, options.b.name, self.second.bounding_sphere[1]
+        if self.deviations is not None:
+            largest = deviation_text(self.deviations.both, length)
+            yield f"The largest deviation of {name} and {reference} from each other is {largest}."
         if self.motion is not None:
             motion, before = self.motion
             yield f"where it is in the file: {percent(before['relative'].item(), before['relative_error'].item())}"
             yield _motion_text(motion)
         rtol = options.accuracy["rtol"]
-        yield from _answers(options.a.name, options.b.name, self.results, self.area_change, rtol)
-        radius, origin = self.second.bounding_sphere[1], " ".join(f"{x:.6g}" for x in self.similarity.origin)
-        yield (
-            f"distances of orders are in {length}; the radius of {options.b.name} is {radius:.6g}"
-            if options.no_scaling
-            else f"distances of orders are in radii of {options.b.name}, {radius:.6g} {length} each "
-            f"(scale {self.similarity.scale:.6g}, origin {origin})"
-        )
-        if self.nearness is not None:
-            yield from _deviation_lines(self.nearness[1], options.unit)
-            yield from _proximity_lines(self.nearness[0], (self.first, self.second), length)
+        yield from _answers(name, reference, self.results, self.area_change, radius, length)
+        yield from _details(self.results, rtol, is_whole=options.verbose)
+        if options.verbose:
+            origin = " ".join(f"{x:.6g}" for x in self.similarity.origin)
+            yield (
+                f"distances of orders are in {length}; the radius of {reference} is {radius:.6g}"
+                if options.no_scaling
+                else f"distances of orders are in radii of {reference}, {radius:.6g} {length} each "
+                f"(scale {self.similarity.scale:.6g}, origin {origin})"
+            )
+        if self.nearness is not None and self.deviations is not None:
+            for direction, way in (("A to B", self.deviations.forward), ("B to A", self.deviations.backward)):
+                yield f"largest deviation, {direction}: {deviation_text(way, options.unit)}"
+            yield from _proximity_lines(self.nearness, (self.first, self.second), length)
 
     def write_witness(self, path: Path) -> str:
         """Write or draw where the meshes differ, and return a line about it; see `write_difference`."""
@@ -380,14 +404,6 @@ def _remarks(meshes: Mapping[str, Mesh], doubt: str | None, size: float, unit: s
         )
 
 
-def _deviation_lines(found: Deviations, unit: str | None) -> Iterator[str]:
-    """Yield the largest deviation each way and both, with its place."""
-    from sobolev_batch.testing.within import deviation_text
-
-    for direction, way in (("A to B", found.forward), ("B to A", found.backward), ("both", found.both)):
-        yield f"{f'largest deviation, {direction}:':<26} {deviation_text(way, unit)}"
-
-
 def _proximity_lines(found: Mapping[str, float], meshes: tuple[Mesh, Mesh], unit: str) -> Iterator[str]:
     """Yield the usual distances in both directions, what is made of them, and the shapes of both meshes."""
     from sobolev_batch.tables.rendering import printed_table
@@ -414,30 +430,38 @@ def _proximity_lines(found: Mapping[str, float], meshes: tuple[Mesh, Mesh], unit
         )
 
 
-def _answers(name: str, reference: str, results: xr.Dataset, area_change: float, rtol: float | None) -> Iterator[str]:
-    """Yield a sentence for each order, what is as far away if that was measured, and then the numbers."""
+def _answers(
+    name: str, reference: str, results: xr.Dataset, area_change: float, radius: float, unit: str
+) -> Iterator[str]:
+    """Yield for each order a sentence, and then what is as far away; the radius of the reference is in a unit."""
     from sobolev_batch.tables.text import answer, likeness
 
     by_order = [results.sel(order=order) for order in results["order"].values]
     yield from dict.fromkeys(answer(name, reference, result, area_change) for result in by_order)
-    # Of equal meshes there is no more to tell.
-    unequal = [result for result in by_order if result["distance"] > 0]
-    for result in unequal if "moved" in results else ():
-        yield from likeness(visible(name), visible(reference), result).split("\n")
-    yield from (_details(result, rtol) for result in unequal)
-    if rtol is not None and "M" in results.attrs:
-        yield _settings_text(results.attrs)
+    for result in by_order:
+        # Of equal meshes there is no more to tell.
+        if result["distance"] > 0:
+            text = likeness(visible(name), visible(reference), result, radius, unit)
+            yield from text.split("\n") if text else ()
 
 
-def _details(result: xr.Dataset, rtol: float | None) -> str:
-    """Return the distance of one order and the parts of its error, on one line."""
+def _details(results: xr.Dataset, rtol: float | None, *, is_whole: bool) -> Iterator[str]:
+    """Yield where an error is larger than requested, and if the whole is asked for, parts of errors and settings."""
     from sobolev_batch.tables.text import with_error
 
-    by_part = result["error_part"].to_series()
-    parts = ", ".join(f"{name} {part:.0e}" for name, part in by_part.items() if name != "statistical" or part > 0)
-    remark = "" if rtol is None or result["within"].item() else f", more than rtol {rtol:g}"
-    distance_text = with_error(result["distance"].item(), result["error"].item())
-    return f"order {result['order'].item():g}: distance {distance_text} ({parts}){remark}"
+    for order in results["order"].values:
+        result = results.sel(order=order)
+        is_short = rtol is not None and not result["within"].item()
+        remark = f"more than rtol {rtol:g}" if is_short else ""
+        if is_whole and result["distance"] > 0:
+            by_part = result["error_part"].to_series()
+            parts = ", ".join(f"{name} {part:.0e}" for name, part in by_part.items() if name != "statistical" or part)
+            value = with_error(result["distance"].item(), result["error"].item())
+            yield f"order {order:g}: distance {value} ({parts}){remark and f', {remark}'}"
+        elif is_short:
+            yield f"order {order:g}: the error is {remark}"
+    if is_whole and rtol is not None and "M" in results.attrs:
+        yield _settings_text(results.attrs)
 
 
 def _settings_text(attributes: Mapping[str, Any]) -> str:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
-from typing import cast
+from typing import Literal, cast, get_args
 
 import numpy as np
 import xarray as xr
 
 from sobolev_batch.arrays import Reals
-from sobolev_batch.errors import LatticeError, MeshError
+from sobolev_batch.errors import InputError, LatticeError, MeshError
 from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.machine import available_cores
@@ -38,7 +38,8 @@ _LARGEST_STEP = math.log(16.0)
 _LEAST_POWER = 0.1
 # Least and largest moves and noise, as fractions of the radius, and the fewest triangles.
 _LEAST, _MOST, _FEWEST_TRIANGLES = 1e-10, 4.0, 4
-_CHANGES = ("moved", "noise", "decimated")
+Change = Literal["moved", "noise", "decimated"]
+CHANGES: tuple[Change, ...] = get_args(Change)
 
 
 def yardsticks(
@@ -51,11 +52,12 @@ def yardsticks(
     memory: float | str | None = None,
     best_effort: bool = False,
     seed: int = 0,
+    changes: Collection[Change] = CHANGES,
 ) -> xr.Dataset:
     """Return the distance of two meshes, and which changes of the second one bring it as far from itself.
 
     Distances of the changed meshes are computed at the frequencies of the first distance. For each order there are
-    about three of noise and five of decimation: expect several times the time of `distance`.
+    about three of noise and five of decimation: expect several times the time of `distance`. A move takes hardly any.
 
     Args:
         a: Mesh; see `as_mesh` for what may stand for it.
@@ -66,9 +68,10 @@ def yardsticks(
         memory: Memory that a transform may take with rtol; see `distance`.
         best_effort: As for `distance`.
         seed: Seed of the noise, and with rtol of the random frequencies.
+        changes: The changes to look for.
 
     Returns:
-        What `distance` returns, and over `order` the changes of b: `moved`, its move in any direction (root mean
+        What `distance` returns, and over `order` these changes of b: `moved`, its move in any direction (root mean
         square over all of them), and `noise`, the standard deviation of Gaussian noise at its vertices along its
         normals, both as fractions of the radius of its bounding sphere; `decimated`, the number of triangles left by
         quadric edge collapse. All are float64, NaN where no such change is as far away, and where the distance is not
@@ -78,7 +81,7 @@ def yardsticks(
     Raises:
         OrderError: An order is not below -1/2.
         LatticeError: A mesh does not fit into the lattice.
-        InputError: A surface is no mesh, or there is neither a lattice nor an rtol, or both.
+        InputError: A surface is no mesh, a change is unknown, or there is neither a lattice nor an rtol, or both.
         AccuracyError: The rtol is out of reach, and no best effort; the message gives the reachable one.
 
     >>> import sobolev_batch as sb
@@ -88,6 +91,8 @@ def yardsticks(
     """
     a, b = as_mesh(a), as_mesh(b)
     check_seed(seed)
+    if unknown := set(changes) - set(CHANGES):
+        raise InputError(f"changes must be among {', '.join(CHANGES)}, found {', '.join(map(repr, sorted(unknown)))}")
     orders, solved = check_orders(order), None
     if rtol is None:
         found = distance(a, b, order, lattice=lattice, memory=memory, best_effort=best_effort)
@@ -95,7 +100,7 @@ def yardsticks(
         accuracy = accuracy_of(rtol, memory, best_effort=best_effort)
         found, solved = to_accuracy("distance", (a, b), order, lattice, accuracy, seed)
     distances, errors, relative = (np.atleast_1d(found[name].values) for name in ("distance", "error", "relative"))
-    columns = {name: np.full(len(orders), np.nan) for change in _CHANGES for name in (change, f"{change}_error")}
+    columns = {name: np.full(len(orders), np.nan) for change in changes for name in (change, f"{change}_error")}
     if distances.any():
         values_errors = np.maximum(_VALUES_ACCURACY * np.maximum(distances, errors), _ROUNDING * b.area)
         target = ErrorTarget(orders, tuple(values_errors.tolist()))
@@ -107,14 +112,15 @@ def yardsticks(
             values = frequencies.values(b, target, Execution(threads=available_cores()))
         curves = _curves(b, frequencies, values, target, float(relative.min()), seed)
         for i in np.flatnonzero(distances > errors).tolist():
-            for change, curve in curves.items():
+            for change in changes:
+                curve = curves[change]
                 columns[change][i], columns[f"{change}_error"][i] = curve.equivalent(i, distances[i], errors[i])
     return found.assign(labelled(order, columns, {}).data_vars)
 
 
 def _curves(
     mesh: Mesh, frequencies: Frequencies, values: SurfaceValues, target: ErrorTarget, start: float, seed: int
-) -> dict[str, _Curve]:
+) -> dict[Change, _Curve]:
     """Return the distance of a mesh from itself by the amount of each change; searches begin with a relative one."""
 
     def apart(changed: Mesh) -> Reals:

@@ -162,29 +162,37 @@ def answer(name: str, reference: str, result: xr.Dataset | Mapping[str, float], 
     return f"{name} differs from {reference} by {amount} {at_order}: not resolved."
 
 
-def likeness(name: str, reference: str, result: xr.Dataset | Mapping[str, float]) -> str:
-    """Return a sentence about changes that bring the reference as far from itself, from `yardsticks` at one order.
+def likeness(name: str, reference: str, result: xr.Dataset | Mapping[str, float], radius: float, unit: str) -> str:
+    """Return sentences about changes that bring the reference as far from itself, from `yardsticks` at one order.
+
+    The radius is that of the reference in a unit. Without noise and decimation there is one sentence about the move.
 
     >>> amounts = {"order": -2.0, "moved": 0.0081, "noise": 0.0032, "decimated": 2312.0}
     >>> errors = {"moved_error": 1e-4, "noise_error": 1e-4, "decimated_error": 40.0}
-    >>> print(likeness("small.obj", "large.obj", {**amounts, **errors}))
+    >>> print(likeness("small.obj", "large.obj", {**amounts, **errors}, 50.0, "mm"))
     At order -2, small.obj is as far from large.obj as
-      large.obj moved by 0.81 % of its radius,
-      large.obj with noise of 0.32 % of its radius,
+      large.obj moved by 0.81 % of its radius, 0.41 mm,
+      large.obj with noise of 0.32 % of its radius, 0.16 mm,
       large.obj decimated to 2,300 triangles.
     """
-    amounts = {kind: float(result[kind]) for kind in ("moved", "noise", "decimated")}
+    kinds = [kind for kind in ("moved", "noise", "decimated") if kind in result]
+    amounts = {kind: float(result[kind]) for kind in kinds if not math.isnan(result[kind])}
     errors = {kind: max(float(result[f"{kind}_error"]), second_digit(amount)) for kind, amount in amounts.items()}
-    texts = {
-        "moved": f"moved by {rounded(100 * amounts['moved'], 100 * errors['moved'], ' %')} of its radius",
-        "noise": f"with noise of {rounded(100 * amounts['noise'], 100 * errors['noise'], ' %')} of its radius",
-        "decimated": f"decimated to {count_text(amounts['decimated'], errors['decimated'])} triangles",
-    }
-    known = [f"  {reference} {text}" for kind, text in texts.items() if not math.isnan(amounts[kind])]
+
+    def length(kind: str) -> str:
+        fraction, own = (rounded(size * amounts[kind], size * errors[kind]) for size in (100.0, radius))
+        return f"{fraction} % of its radius, {own} {unit}"
+
+    wordings = {"moved": "moved by {}", "noise": "with noise of {}"}
+    texts = [f"  {reference} {wordings[kind].format(length(kind))}" for kind in amounts if kind in wordings]
+    if "decimated" in amounts:
+        texts.append(f"  {reference} decimated to {count_text(amounts['decimated'], errors['decimated'])} triangles")
     at_order = f"At order {float(result['order']):g}, "
-    if not known:
+    if kinds == ["moved"]:
+        return f"{at_order}this is as far as{texts[0][1:]}." if texts else ""
+    if not texts:
         return f"{at_order}no move, noise or decimation of {reference} is known to be as far from it."
-    return f"{at_order}{name} is as far from {reference} as\n" + ",\n".join(known) + "."
+    return f"{at_order}{name} is as far from {reference} as\n" + ",\n".join(texts) + "."
 
 
 def _share_text(result: xr.Dataset | Mapping[str, float], area_change: float) -> str:
