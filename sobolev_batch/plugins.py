@@ -31,7 +31,11 @@ _OF_EXTRAS = {
         "table time": "commands:time_command",
         "witness": "commands:witness_command",
     },
-    FEATURES: {"align": "fitting.align:align", "picture": "figures.views:write_difference_picture"},
+    FEATURES: {
+        "align": "fitting.align:align",
+        "picture": "figures.views:write_difference_picture",
+        "comparison": "report.comparison:comparison_page",
+    },
 }
 
 

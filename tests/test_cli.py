@@ -301,7 +301,7 @@ def test_an_error_is_no_difference(folder: Path, monkeypatch: pytest.MonkeyPatch
     def fail(*_: object, **__: object) -> None:
         raise RuntimeError("broken")
 
-    monkeypatch.setattr("sobolev_batch.testing.verdict.same_surface", fail)
+    monkeypatch.setattr("sobolev_batch.cli.comparison.same_surface", fail)
     for options in (("--below", "0.1"), ("--below=0.1",)):
         done = call("compare", "1.off", "3.off", *options, folder=folder)
         assert (done.returncode, done.stdout) == (2, "")

@@ -169,11 +169,18 @@ def share_beyond(a: MeshLike, b: MeshLike, length: float, points: int = DEFAULT_
     meshes = as_mesh(a), as_mesh(b)
     rng = np.random.default_rng(0)
     count = max(
-        np.count_nonzero(Triangles(other).closest(_drawn(mesh, points, rng)[0])[0] > length)
-        for mesh, other in (meshes, meshes[::-1])
+        np.count_nonzero(sampled_distances(mesh, other, rng, points) > length) for mesh, other in (meshes, meshes[::-1])
     )
     likely = (count + 1) / (points + 2)
     return count / points, float(np.sqrt(likely * (1 - likely) / points))
+
+
+def sampled_distances(
+    mesh: Mesh, other: Mesh, rng: np.random.Generator, points: int = DEFAULT_POINTS, *, signed: bool = False
+) -> Reals:
+    """Return the distances (n,) of random points, spread evenly by area, from another mesh; see `vertex_distances`."""
+    drawn, _ = _drawn(mesh, points, rng)
+    return _distances(drawn, other, signed=signed)
 
 
 def vertex_distances(mesh: MeshLike, other: MeshLike, *, signed: bool = False) -> Reals:
@@ -200,13 +207,15 @@ def vertex_distances(mesh: MeshLike, other: MeshLike, *, signed: bool = False) -
     """
     mesh, other = as_mesh(mesh), as_mesh(other)
     distances, used = np.full(len(mesh.vertices), np.nan), mesh.used_vertices
-    distances[used] = Triangles(other).closest(mesh.vertices[used])[0]
-    if signed:
-        sides = signs(other, mesh.vertices[used])
-        if sides is None:
-            raise InputError(f"the other mesh has no outside: {', '.join(other.defects)}")
-        distances[used] *= sides
+    distances[used] = _distances(mesh.vertices[used], other, signed=signed)
     return distances
+
+
+def _distances(points: Reals, other: Mesh, *, signed: bool) -> Reals:
+    sides = signs(other, points) if signed else np.ones(len(points))
+    if sides is None:
+        raise InputError(f"the other mesh has no outside: {', '.join(other.defects)}")
+    return Triangles(other).closest(points)[0] * sides
 
 
 def _drawn(mesh: Mesh, points: int, rng: np.random.Generator) -> tuple[Reals, Indices]:

@@ -150,7 +150,7 @@ def write_difference(
     similarity = Similarity.to_unit_ball(b) if scaling else Similarity()
     pair = [similarity.apply(surface) for surface in (a, b)]
     centered = list(map(centering(pair).apply, pair))
-    fields = _fields(centered, order)
+    fields = picture_fields(centered, order)
     is_picture = path.suffix in _PICTURES
     found, drawn = dict[Path, VertexWitness](), []
     for label, name, own, other, mesh in zip("ab", names, (a, b), (b, a), centered, strict=True):
@@ -176,7 +176,7 @@ def write_difference(
     return f"{near if greatest else 'they differ nowhere'}; witness: {' '.join(map(str, files))}"
 
 
-def _fields(surfaces: Sequence[Surface], order: float) -> tuple[xr.DataArray, xr.DataArray]:
+def picture_fields(surfaces: Sequence[Surface], order: float) -> tuple[xr.DataArray, xr.DataArray]:
     """Return the Fourier fields of two surfaces around the origin, on a lattice for pictures."""
     extent = Extent.union([surface.extent for surface in surfaces])
     area = np.array(sum(surface.area for surface in surfaces))

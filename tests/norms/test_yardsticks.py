@@ -84,3 +84,11 @@ def test_a_move_is_as_far_beyond_all_frequencies_too() -> None:
     direct = distance(moved(found["moved"].item()), BALL, -2.0, rtol=0.01)
     share = found["moved_error"].item() / found["moved"].item()
     assert direct["distance"].item() == pytest.approx(found["distance"].item(), rel=share + 0.01)
+
+
+def test_changes_are_chosen() -> None:
+    found = yardsticks(moved(0.1), BALL, ORDERS, lattice=LATTICE, changes=["moved"])
+    np.testing.assert_allclose(found["moved"], 0.1, rtol=0.05)
+    assert "noise" not in found and "decimated_error" not in found
+    with pytest.raises(InputError, match="'turned'"):
+        yardsticks(moved(0.1), BALL, lattice=LATTICE, changes=["turned"])  # type: ignore[list-item]

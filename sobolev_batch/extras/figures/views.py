@@ -108,7 +108,8 @@ class MeshView:
         original_triangles: Number of triangles of the mesh itself; the view has fewer where it is a simplification,
             and more where it subdivides them.
         eye: Unit vector (3,) to the viewer of pictures.
-        unit: Unit of length of values that are distances; None for a witness function.
+        unit: Unit of length of values that are distances, with a sign where some are negative; None for a witness
+            function.
     """
 
     label: str
@@ -206,8 +207,13 @@ def make_views(
 
 def _turned(views: Sequence[MeshView], up: Axis | None = None) -> list[MeshView]:
     """Return views with one axis upwards, by a cyclic permutation of all, each from the side of its worst places."""
-    turn = _AXES.index("z") - _AXES.index(up or up_axis(np.concatenate([view.vertices for view in views])))
+    turn = upwards(np.concatenate([view.vertices for view in views]), up)
     return [replace(view, vertices=np.roll(view.vertices, turn, axis=1)).towards_worst() for view in views]
+
+
+def upwards(points: Reals, up: Axis | None = None) -> int:
+    """Return by how many axes points (n, 3) are rolled until one axis, by default their `up_axis`, is the third."""
+    return _AXES.index("z") - _AXES.index(up or up_axis(points))
 
 
 def up_axis(points: Reals) -> Axis:
@@ -234,29 +240,45 @@ def _extremes(tree: xr.DataTree, order: float, families: Sequence[str]) -> Itera
 
 
 def _view(label: str, fields: Fields, mesh: Mesh, orders: tuple[float, ...], most: int) -> MeshView:
+    view = _shown(label, mesh, most)
+    if len(view.triangles) == view.original_triangles:
+        values = witness_at_vertices(*fields, orders, mesh)[:, mesh.used_vertices]
+    else:
+        values = witness(*fields, list(orders), view.vertices, dtype="complex64").to_numpy()
+    return replace(view, values=values, orders=orders)
+
+
+def _shown(label: str, mesh: Mesh, most: int) -> MeshView:
+    """Return a view of a mesh without values: its own vertices that are in use, in their order, or others."""
     used = mesh.used_vertices
     number = np.empty(len(mesh.vertices), dtype=np.int32)
     number[used] = np.arange(len(used))
     own, corners = mesh.vertices[used], number[mesh.triangles]
     vertices, triangles = _for_display(own, corners, most)
-    if vertices is own:
-        values = witness_at_vertices(*fields, orders, mesh)[:, used]
-    else:
-        # Collapsed edges may leave the period by a hair where the mesh fills it.
-        vertices = np.clip(vertices, own.min(axis=0), own.max(axis=0))
-        values = witness(*fields, list(orders), vertices, dtype="complex64").to_numpy()
-    return MeshView(label, vertices, triangles, values, orders, len(corners))
+    # Collapsed edges may leave the period by a hair where the mesh fills it.
+    vertices = vertices if vertices is own else np.clip(vertices, own.min(axis=0), own.max(axis=0))
+    return MeshView(label, vertices, triangles, np.zeros((0, len(vertices))), (), len(corners))
 
 
-def _with_distances(view: MeshView, mesh: Mesh, other: Mesh, unit: str, scale: float) -> MeshView:
+def distance_view(label: str, mesh: Mesh, other: Mesh, unit: str, most: int, *, signed: bool) -> MeshView:
+    """Return a view of a mesh with its distances from another one, positive outside and negative inside if signed."""
+    return _with_distances(_shown(label, mesh, most), mesh, other, unit, 1.0, signed=signed)
+
+
+def _with_distances(
+    view: MeshView, mesh: Mesh, other: Mesh, unit: str, scale: float, *, signed: bool = False
+) -> MeshView:
     """Return the view of a mesh with distances from another mesh in a unit, which is this scale in that of both."""
     if len(view.triangles) >= view.original_triangles:
-        distances = vertex_distances(Mesh(view.vertices, view.triangles), other)
+        distances = vertex_distances(Mesh(view.vertices, view.triangles), other, signed=signed)
     else:
         # Simplification moves vertices by more than what is to be seen. No vertex of the mesh gets lost.
-        exact, own = vertex_distances(mesh, other)[mesh.used_vertices], mesh.vertices[mesh.used_vertices]
-        distances = exact[cKDTree(own).query(view.vertices)[1]]
-        np.maximum.at(distances, cKDTree(view.vertices).query(own)[1], exact)
+        exact, own = vertex_distances(mesh, other, signed=signed)[mesh.used_vertices], mesh.vertices[mesh.used_vertices]
+        places = np.concatenate([np.arange(len(view.vertices)), cKDTree(view.vertices).query(own)[1]])
+        values = np.concatenate([exact[cKDTree(own).query(view.vertices)[1]], exact])
+        order, distances = np.argsort(np.abs(values)), np.empty(len(view.vertices))
+        # Of those at one place, the last one stays: the largest.
+        distances[places[order]] = values[order]
     return replace(view, values=distances[None] / scale, unit=unit)
 
 

@@ -120,7 +120,7 @@ def make_report(
     content = league_content(objects, Status.from_store(store))
     charts = league_data(content["leagues"], content["name"], content["orders"])
     families = content["costs"][0].methods if content["costs"] else charts["families"]
-    return _filled("league", content, {**charts, "families": list(families), "costs": cost_data(content["costs"])})
+    return filled("league", content, {**charts, "families": list(families), "costs": cost_data(content["costs"])})
 
 
 def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], up: Axis | None) -> Page:
@@ -133,12 +133,12 @@ def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], u
         views, missing = make_views(tree, folder, witnesses, up=up)
     charts = {**chart_data(tree, spectra, views), "costs": cost_data(content["costs"])}
     content["omissions"] += chart_omissions(tree, charts, omission, views, missing)
-    page = _filled("study", content, charts, omission=omission, views=views, missing=missing)
+    page = filled("study", content, charts, omission=omission, views=views, missing=missing)
     require_unchanged(tree)
     return page
 
 
-def _filled(template: str, content: dict[str, Any], charts: Json, **values: Any) -> Page:
+def filled(template: str, content: dict[str, Any], charts: Json, **values: Any) -> Page:
     """Return a page from its template, with all that it needs to be drawn, and what it leaves out."""
     # Two thirds of a page, if the browser were not to unpack it.
     library = plotly.offline.get_plotlyjs()
@@ -211,7 +211,7 @@ def chart_data(tree: xr.DataTree, spectra: xr.Dataset | None, views: Sequence[Me
         "matrix": _matrices(tree, orders),
         "spectrum": None if spectra is None else _spectra(spectra),
         "energy": None if spectra is None else _energy(spectra, families_of(tree)),
-        "witness": [_view(view) for view in views],
+        "witness": [view_data(view) for view in views],
     }
 
 
@@ -241,7 +241,7 @@ def cost_data(leagues: Sequence[CostLeague]) -> list[Json] | None:
                 _line(method, rows[league.x], rows["relative"], rows["relative_error"], labels=rows["member"].tolist())
                 for method, rows in league.means.groupby("method", sort=False)
             ],
-            "front": {"x": _numbers(league.front[league.x]), "y": _numbers(league.front["relative"])},
+            "front": {"x": numbers(league.front[league.x]), "y": numbers(league.front["relative"])},
         }
         for league in leagues
     ] or None
@@ -249,7 +249,7 @@ def cost_data(leagues: Sequence[CostLeague]) -> list[Json] | None:
 
 def _line(family: str, places: Any, values: Any, errors: Any, **others: Any) -> Json:
     """Return the data of a line with error bars in the colour of a family."""
-    return {"family": family, "x": _numbers(places), "y": _numbers(values), "errors": _numbers(errors, 2), **others}
+    return {"family": family, "x": numbers(places), "y": numbers(values), "errors": numbers(errors, 2), **others}
 
 
 def chart_omissions(
@@ -331,8 +331,8 @@ def _matrices(tree: xr.DataTree, orders: list[float]) -> Json | None:
 def _matrix(pairs: xr.Dataset) -> Json:
     distances = pairs["distance"].values
     return {
-        "values": [_numbers(row[:i]) for i, row in enumerate(distances)],
-        "errors": [_numbers(row[:i], digits=2) for i, row in enumerate(pairs["error"].values)],
+        "values": [numbers(row[:i]) for i, row in enumerate(distances)],
+        "errors": [numbers(row[:i], digits=2) for i, row in enumerate(pairs["error"].values)],
         "clustered": clustered_order(distances).tolist(),
     }
 
@@ -342,7 +342,7 @@ def _spectra(spectra: xr.Dataset) -> Json:
     return {
         "labels": spectra["mesh"].values.tolist(),
         "bands": spectra["text"].values.tolist(),
-        "shares": [[_numbers(row, digits=3) for row in of_order] for of_order in shares],
+        "shares": [[numbers(row, digits=3) for row in of_order] for of_order in shares],
     }
 
 
@@ -354,7 +354,8 @@ def _energy(spectra: xr.Dataset, family_of: Mapping[str, str]) -> list[Json]:
     ]
 
 
-def _view(view: MeshView) -> Json:
+def view_data(view: MeshView) -> Json:
+    """Return the data of a mesh that plotly.js draws."""
     # Two bytes are enough for most indices.
     index = "<u2" if len(view.vertices) <= 1 << 16 else "<i4"
     return {
@@ -364,12 +365,13 @@ def _view(view: MeshView) -> Json:
         "points": [_packed(axis, "<f4") for axis in view.vertices.T],
         "corners": [_packed(corner, index) for corner in view.triangles.T],
         "values": [_packed(values, "<f4") for values in view.values],
-        "limits": _numbers(view.color_limits),
-        "extent": _numbers(np.ptp(view.vertices, axis=0)),
+        "limits": numbers(view.color_limits),
+        "extent": numbers(np.ptp(view.vertices, axis=0)),
     }
 
 
-def _numbers(values: Any, digits: int = 4) -> list[float | None]:
+def numbers(values: Any, digits: int = 4) -> list[float | None]:
+    """Return numbers with some digits, and null for those that are missing."""
     return [float(f"{value:.{digits}g}") if math.isfinite(value) else None for value in values]
 
 

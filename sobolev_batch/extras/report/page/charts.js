@@ -60,7 +60,8 @@
   const draw = (name, traces, changes, modeBarButtons = flat) => {
     const place = document.getElementById(`chart-${name}`);
     const config = { responsive: true, displaylogo: false, modeBarButtons, displayModeBar: narrow() ? false : "hover" };
-    const size = { height: Number(place.dataset.height), ...(isPrinted() ? { width: 640 } : {}) };
+    const width = place.closest(".columns") ? 310 : 640;
+    const size = { height: Number(place.dataset.height), ...(isPrinted() ? { width } : {}) };
     Plotly.react(place, traces, layout({ ...size, ...changes }), config);
   };
 
@@ -255,39 +256,93 @@
     });
   };
 
-  const witness = () => {
-    const { label, points: [x, y, z], corners: [i, j, k], values, extent, triangles, shown } = data.witness[state.view];
-    const ends = (state.common ? data.witness : [data.witness[state.view]]).map(({ limits }) => limits[state.order]);
-    const limit = Math.max(...ends);
-    const whole = triangles.toLocaleString("en");
-    document.getElementById("size").textContent = shown < triangles
-      ? `Shown with ${shown.toLocaleString("en")} of ${whole} triangles.`
-      : `It has ${whole} triangles.`;
-    const hidden = { visible: false, showbackground: false };
-    const height = narrow() ? 420 : 560;
-    // A mesh whose bounding box has this diagonal is seen whole from the camera, wherever it turns to.
-    const diagonal = 1.5 * Math.min(1, 1.1 * document.getElementById("chart-witness").clientWidth / height);
+  const hidden = { visible: false, showbackground: false };
+  // A mesh whose bounding box has this diagonal is seen whole from the camera, wherever it turns to.
+  const scene = (extent, width, height) => {
+    const diagonal = 1.5 * Math.min(1, 1.1 * width / height);
     const sides = extent.map((side) => Math.max(side, 1e-3 * Math.hypot(...extent)) * diagonal / Math.hypot(...extent));
-    draw("witness", [{
-      type: "mesh3d", x, y, z, i, j, k, intensity: values[state.order], cmin: -limit, cmax: limit, hoverinfo: "x+y+z+text",
-      hovertemplate: `${plain(label).replaceAll("%", "&#37;")}<br>%{intensity:.3g}<extra></extra>`, flatshading: false,
-      colorscale: [[0, color("less")], [0.5, color("neutral")], [1, color("more")]],
-      lighting: { ambient: 0.8, diffuse: 0.45, specular: 0.08, roughness: 0.8 },
-      colorbar: { outlinewidth: 0, thickness: 12, exponentformat: "power", len: 0.8,
-        ...(narrow() ? { orientation: "h", y: -0.05, yanchor: "top" } : {}) },
-    }], {
+    return {
+      xaxis: hidden, yaxis: hidden, zaxis: hidden, aspectmode: "manual",
+      aspectratio: { x: sides[0], y: sides[1], z: sides[2] },
+      camera: { eye: { x: 1.1, y: -1.25, z: 0.7 } }, uirevision: "kept",
+    };
+  };
+  const mesh = ({ label, points: [x, y, z], corners: [i, j, k] }, intensity, [low, high], colorscale) => ({
+    type: "mesh3d", x, y, z, i, j, k, intensity, cmin: low, cmax: high, hoverinfo: "x+y+z+text", colorscale,
+    hovertemplate: `${plain(label).replaceAll("%", "&#37;")}<br>%{intensity:.3g}<extra></extra>`, flatshading: false,
+    lighting: { ambient: 0.8, diffuse: 0.45, specular: 0.08, roughness: 0.8 },
+    colorbar: { outlinewidth: 0, thickness: 12, exponentformat: "power", len: 0.8,
+      ...(narrow() ? { orientation: "h", y: -0.05, yanchor: "top" } : {}) },
+  });
+  const diverging = () => [[0, color("less")], [0.5, color("neutral")], [1, color("more")]];
+
+  const witness = () => {
+    const view = data.witness[state.view];
+    const ends = (state.common ? data.witness : [view]).map(({ limits }) => limits[state.order]);
+    const limit = Math.max(...ends);
+    const whole = view.triangles.toLocaleString("en");
+    document.getElementById("size").textContent = view.shown < view.triangles
+      ? `Shown with ${view.shown.toLocaleString("en")} of ${whole} triangles.`
+      : `It has ${whole} triangles.`;
+    const height = narrow() ? 420 : 560;
+    draw("witness", [mesh(view, view.values[state.order], [-limit, limit], diverging())], {
       height, margin: { l: 0, r: 0, t: 0, b: 0 },
-      scene: {
-        xaxis: hidden, yaxis: hidden, zaxis: hidden, aspectmode: "manual",
-        aspectratio: { x: sides[0], y: sides[1], z: sides[2] },
-        camera: { eye: { x: 1.1, y: -1.25, z: 0.7 } }, uirevision: "kept",
-      },
+      scene: scene(view.extent, document.getElementById("chart-witness").clientWidth, height),
     }, space);
+  };
+
+  // Both meshes beside each other, or below each other where it is narrow, turned together.
+  const pair = () => {
+    const { views, place: [x, y, z], largest, signed } = data.pair;
+    const place = document.getElementById("chart-pair");
+    const [height, beside] = [isPrinted() ? 300 : narrow() ? 640 : 440, !narrow() || isPrinted()];
+    const width = isPrinted() ? 640 : place.clientWidth;
+    const colors = signed ? diverging() : [[0, color("neutral")], [1, color("more")]];
+    const traces = views.flatMap((view, i) => {
+      const own = i ? "scene2" : "scene";
+      return [
+        { ...mesh(view, view.values[0], [signed ? -largest : 0, largest], colors), scene: own, showscale: !i },
+        { type: "scatter3d", mode: "markers", x: [x], y: [y], z: [z], scene: own, showlegend: false, hoverinfo: "text",
+          text: ["largest deviation"], marker: { size: 9, symbol: "circle-open", color: color("ink"), line: { width: 3 } } },
+      ];
+    });
+    const scenes = views.map(({ extent }, i) => ({
+      ...scene(extent, beside ? width / 2 : width, beside ? height : height / 2),
+      domain: beside ? { x: [i / 2, (i + 1) / 2], y: [0, 1] } : { x: [0, 1], y: [(1 - i) / 2, (2 - i) / 2] },
+    }));
+    draw("pair", traces, { height, margin: { l: 0, r: 0, t: 0, b: 0 }, scene: scenes[0], scene2: scenes[1] }, space);
+    if (!place.dataset.tied) {
+      place.dataset.tied = "yes";
+      place.on("plotly_relayout", (changed) => {
+        for (const [own, other] of [["scene", "scene2"], ["scene2", "scene"]]) {
+          const camera = changed[`${own}.camera`];
+          if (camera) Plotly.relayout(place, { [`${other}.camera`]: camera });
+        }
+      });
+    }
+  };
+
+  const histogram = () => {
+    const { x, shares } = data.histogram;
+    const traces = shares.map((share, i) => ({
+      type: "scatter", mode: "lines", name: short(data.families[i], 24), x, y: share.map((one) => one || null),
+      line: { color: series(data.families[i]), width: 1.8, shape: "hvh" }, hoverinfo: "x+y",
+    }));
+    draw("histogram", traces, {
+      xaxis: { exponentformat: "power", nticks: 6 }, yaxis: { type: "log", tickformat: ".2~%", dtick: 1 },
+    });
+  };
+
+  const bands = () => {
+    const { texts, shares } = data.bands;
+    draw("bands", [{ type: "bar", x: texts.map(plain), y: shares, marker: { color: color("most") }, hoverinfo: "x+y" }], {
+      xaxis: { type: "category", tickangle: -45 }, yaxis: { tickformat: ".0%", rangemode: "tozero" },
+    });
   };
 
   const drawings = [data.convergence && convergence, data.league?.length && league, data.costs && costs, data.evolution && evolution,
     data.matrix && matrix, data.spectrum && spectrum, data.energy && energy,
-    data.witness?.length && witness].filter(Boolean);
+    data.witness?.length && witness, data.pair && pair, data.histogram && histogram, data.bands && bands].filter(Boolean);
   const redraw = () => { for (const drawing of drawings) drawing(); };
 
   document.addEventListener("order", ({ detail }) => { state.order = detail; redraw(); });

@@ -1,0 +1,376 @@
+"""Two mesh files, and how much they differ: the options of compare, its numbers, and what people read of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import xarray as xr
+from scipy.spatial.transform import Rotation
+
+from sobolev_batch.arrays import Reals
+from sobolev_batch.cli.output import echo
+from sobolev_batch.geometry.deviation import Deviations, largest_deviation
+from sobolev_batch.geometry.formats.readers import read_mesh
+from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.geometry.proximity import proximity_and_deviations
+from sobolev_batch.geometry.surface import Similarity, placement_doubt
+from sobolev_batch.norms import DEFAULT_ORDER
+from sobolev_batch.norms.columns import parts_as_variables
+from sobolev_batch.norms.distances import distance
+from sobolev_batch.norms.yardsticks import CHANGES, yardsticks
+from sobolev_batch.parameters import fraction
+from sobolev_batch.plugins import FEATURES, extra
+from sobolev_batch.tables.rendering import printed_table
+from sobolev_batch.tables.text import answer, likeness, percent, with_error
+from sobolev_batch.testing.difference import require_place, write_difference
+from sobolev_batch.testing.verdict import same_surface
+from sobolev_batch.testing.within import deviation_text, judge_deviation
+from sobolev_batch.transform.lattice import Lattice
+from sobolev_batch.visible import FILE_UNITS, visible
+
+# Options that every verdict knows; those of one on a fraction of the norm, which chooses the accuracy of the distance
+# itself; and those of one on a length.
+_KNOWN = {"a", "b", "below", "within", "report", "style"}
+_KNOWN_OF_FRACTIONS, _KNOWN_OF_LENGTHS = {"orders", "memory", "no_scaling"}, {"unit"}
+
+# A radius beyond it, or below its inverse, is far from the unit of length.
+_FAR_UNIT = 10.0
+# Default of compare, which then takes the nearest attainable accuracy.
+_DEFAULT_RTOL = 1e-2
+# A turn by less, in degrees, or a shift by less than this fraction of the largest one, is rounding.
+_NO_MOTION = 1e-9
+# Numbers of `proximity` that are printed in both directions.
+_DISTANCES = {
+    "mean": "mean",
+    "rms": "RMS",
+    "p50": "50 % within",
+    "p95": "95 % within",
+    "p99": "99 % within",
+    "normal_mean": "normals, mean",
+    "normal_max": "normals, largest",
+}
+
+
+@dataclass(frozen=True)
+class CompareOptions:
+    """The arguments and options of compare, by the names of its parameters; None where one is not given."""
+
+    a: Path
+    b: Path
+    orders: tuple[float, ...] | None
+    rtol: float | None
+    memory: int | None
+    best_effort: bool
+    xi_max: float | None
+    intervals: int | None
+    yardsticks: bool
+    proximity: bool
+    threshold: float | None
+    align: bool
+    unit: str | None
+    witness: Path | None
+    report: Path | None
+    no_scaling: bool
+    below: float | None
+    within: str | None
+    verbose: bool
+    style: str
+
+    def __post_init__(self) -> None:
+        if self.below is not None or self.within is not None:
+            self._check_verdict()
+        elif self.has_lattice and self.rtol is not None:
+            raise click.UsageError("--rtol chooses the lattice; leave out --xi-max and --M")
+
+    def _check_verdict(self) -> None:
+        if self.below is not None and self.within is not None:
+            raise click.UsageError("--below and --within ask for one verdict each; leave out one of them")
+        option, allowed = "--within" if self.below is None else "--below", self.allowed_fraction
+        known = _KNOWN | (_KNOWN_OF_LENGTHS if allowed is None else _KNOWN_OF_FRACTIONS)
+        context = click.get_current_context()
+        given = [
+            parameter.opts[0]
+            for parameter in context.command.params
+            if parameter.name not in known and getattr(self, str(parameter.name)) not in (None, False)
+        ]
+        if given:
+            asked = f"{option} with a length" if allowed is None else option
+            raise click.UsageError(f"{asked} gives a verdict and no numbers; leave out {', '.join(sorted(given))}")
+        if allowed is not None and not 0 < allowed < 1:
+            raise click.UsageError(f"{option} takes a fraction between 0 and 1, or 0 and 100 %, found {allowed:g}")
+        if len(self.chosen_orders) > 1:
+            raise click.UsageError(f"{option} takes one --order")
+
+    @property
+    def allowed_fraction(self) -> float | None:
+        """The fraction of the norm of B that the distance may have for a verdict; None for one on a length, or none."""
+        if self.within is None:
+            return self.below
+        return fraction(self.within) if self.within.rstrip().endswith("%") else None
+
+    def verdict(self) -> tuple[str, dict[str, Any]] | None:
+        """The line and the numbers of the verdict that is asked for; None without one."""
+        numbers: dict[str, Any] = {"a": self.a, "b": self.b}
+        if (tolerance := self.allowed_fraction) is not None:
+            settings: dict[str, Any] = {"scaling": not self.no_scaling, "memory": self.memory}
+            same = same_surface(self.a, self.b, tolerance=tolerance, order=self.chosen_orders[0], **settings)
+            return f"{self.a.name}: {same}", vars(same) | numbers | {"distance": same.distance, "error": same.error}
+        if self.within is None:
+            return None
+        near = judge_deviation(self.a, self.b, self.within, self.unit)
+        numbers |= {"outcome": near.outcome, "length": near.length, "unit": near.unit, "beyond": near.beyond}
+        return f"{self.a.name}: {near}", numbers | asdict(near.deviations.both) | asdict(near.deviations)
+
+    @property
+    def chosen_orders(self) -> tuple[float, ...]:
+        """The orders, by default one."""
+        return self.orders or (DEFAULT_ORDER,)
+
+    @property
+    def has_lattice(self) -> bool:
+        """True if the lattice is given, in place of an accuracy."""
+        return self.xi_max is not None or self.intervals is not None
+
+    @property
+    def accuracy(self) -> dict[str, Any]:
+        """The settings of `distance`."""
+        settings = {"rtol": self.rtol, "memory": self.memory, "best_effort": self.best_effort}
+        if self.has_lattice:
+            xi_max = 5.0 if self.xi_max is None else self.xi_max
+            return settings | {"lattice": Lattice(xi_max, 64 if self.intervals is None else self.intervals)}
+        return settings if self.rtol is not None else settings | {"rtol": _DEFAULT_RTOL, "best_effort": True}
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Two meshes of files, and how much they differ.
+
+    Attributes:
+        first: The mesh of A in the unit of the file, where it was moved to.
+        second: That of B.
+        similarity: From this unit to that of the distances.
+        results: What `yardsticks` returns, of moves alone if no others were asked for.
+        nearness: What `proximity` returns, in the unit of the files; None if not asked for.
+        deviations: Largest deviations in this unit; None if it has no name and `proximity` was not asked for.
+        motion: Rigid motion (4, 4) of A, and the distance before; None if not asked for.
+        doubt: Question whether both are in one unit and place; None where they look it.
+    """
+
+    options: CompareOptions
+    first: Mesh
+    second: Mesh
+    similarity: Similarity
+    results: xr.Dataset
+    nearness: dict[str, float] | None
+    deviations: Deviations | None
+    motion: tuple[Reals, xr.Dataset] | None
+    doubt: str | None
+
+    @classmethod
+    def of_files(cls, options: CompareOptions) -> Comparison:
+        """Read and compare two files; what may make one doubt the result is printed as a note."""
+        accuracy = options.accuracy
+        first, second = read_mesh(options.a), read_mesh(options.b)
+        for path in (options.witness, options.report):
+            if path is not None:
+                require_place(path)
+        similarity = Similarity() if options.no_scaling else Similarity.to_unit_ball(second)
+        orders, motion = options.chosen_orders, None
+        if options.align:
+            align = extra(FEATURES, "align", "--align")
+            before = distance(similarity.apply(first), similarity.apply(second), orders[0], **accuracy)
+            motion = align(first, second, order=orders[0]), before
+            first = _moved(first, motion[0])
+        pair = similarity.apply(first), similarity.apply(second)
+        doubt = placement_doubt(*(surface.extent for surface in pair))
+        for line in _remarks(options, first, second, doubt):
+            echo(f"note: {line}", err=True)
+        # Bad settings are refused before a long computation.
+        nearness, deviations = None, None
+        if options.proximity or options.report is not None:
+            nearness, deviations = proximity_and_deviations(first, second, threshold=options.threshold)
+        elif options.unit is not None:
+            deviations = largest_deviation(first, second)
+        changes = CHANGES if options.yardsticks else ("moved",)
+        results = yardsticks(*pair, orders, **accuracy, changes=changes)
+        return cls(options, first, second, similarity, results, nearness, deviations, motion, doubt)
+
+    @property
+    def area_change(self) -> float:
+        """Area of A over that of B, minus one."""
+        return self.first.area / self.second.area - 1
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """All numbers, for programs."""
+        motion, before = self.motion or (None, None)
+        return {
+            "a": self.options.a,
+            "b": self.options.b,
+            "area_change": self.area_change,
+            **vars(self.similarity),
+            "orders": parts_as_variables(self.results).to_dataframe().reset_index().to_dict(orient="records"),
+            "motion": None if motion is None else motion.tolist(),
+            "before": None if before is None else before["relative"].item(),
+            "settings": self.results.attrs,
+            "proximity": self.nearness,
+            "deviation": None if self.deviations is None else asdict(self.deviations),
+            "doubt": self.doubt,
+            "defects": {"a": self.first.defects, "b": self.second.defects},
+            "notes": {"a": self.first.notes, "b": self.second.notes},
+            "unit": self.options.unit,
+        }
+
+    @property
+    def unit(self) -> str:
+        """Name of the unit of length of both files."""
+        return self.options.unit or FILE_UNITS
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """Names of both files."""
+        return self.options.a.name, self.options.b.name
+
+    @property
+    def lines(self) -> Iterator[str]:
+        """The same for people."""
+        yield from self.sentences
+        if self.options.verbose:
+            yield from self.details
+        if self.nearness is not None and self.deviations is not None and self.options.proximity:
+            for direction, way in (("A to B", self.deviations.forward), ("B to A", self.deviations.backward)):
+                yield f"largest deviation, {direction}: {deviation_text(way, self.unit)}"
+            yield from printed_table(self.rows, [f"in {self.unit}", "A to B", "B to A", "larger"], "text").split("\n")
+            yield from _proximity_lines(self.nearness, (self.first, self.second))
+
+    @property
+    def sentences(self) -> Iterator[str]:
+        """What the comparison says, and where an error is larger than requested."""
+        rtol, by_order = self.options.accuracy["rtol"], self._by_order
+        if self.deviations is not None:
+            largest = deviation_text(self.deviations.both, self.unit)
+            yield f"The largest deviation of {self.names[0]} and {self.names[1]} from each other is {largest}."
+        if self.motion is not None:
+            motion, before = self.motion
+            yield f"where it is in the file: {percent(before['relative'].item(), before['relative_error'].item())}"
+            yield _motion_text(motion)
+        yield from dict.fromkeys(answer(*self.names, result, self.area_change) for result in by_order)
+        # Of equal meshes there is no more to tell.
+        unequal = [result for result in by_order if result["distance"] > 0]
+        for result in unequal:
+            name, reference = map(visible, self.names)
+            text = likeness(name, reference, result, self.second.bounding_sphere[1], self.unit)
+            yield from text.split("\n") if text else ()
+        for result in unequal:
+            if rtol is not None and not result["within"]:
+                yield f"order {result['order'].item():g}: the error is more than rtol {rtol:g}"
+
+    @property
+    def details(self) -> Iterator[str]:
+        """Parts of the errors, and the settings that were chosen."""
+        for result in self._by_order:
+            if result["distance"] > 0:
+                by_part = result["error_part"].to_series()
+                parts = ", ".join(
+                    f"{name} {part:.0e}" for name, part in by_part.items() if name != "statistical" or part
+                )
+                distance_text = with_error(result["distance"].item(), result["error"].item())
+                yield f"order {result['order'].item():g}: distance {distance_text} ({parts})"
+        if self.options.accuracy["rtol"] is not None and "M" in self.results.attrs:
+            yield _settings_text(self.results.attrs)
+        radius, origin = self.second.bounding_sphere[1], " ".join(f"{x:.6g}" for x in self.similarity.origin)
+        yield (
+            f"distances of orders are in {self.unit}; the radius of {self.names[1]} is {radius:.6g}"
+            if self.options.no_scaling
+            else f"distances of orders are in radii of {self.names[1]}, {radius:.6g} {self.unit} each "
+            f"(scale {self.similarity.scale:.6g}, origin {origin})"
+        )
+
+    @property
+    def remarks(self) -> Iterator[str]:
+        """What may make one doubt the comparison."""
+        return _remarks(self.options, self.first, self.second, self.doubt)
+
+    @property
+    def rows(self) -> list[list[str]]:
+        """The usual distances of points: their name, from A to B, from B to A, and the larger one."""
+        found, rows = self.nearness or {}, []
+        for name, title in _DISTANCES.items() if found else ():
+            ending = " deg" if name.startswith("normal") else ""
+            rows.append([title, *(f"{found[f'{name}{way}']:.4g}{ending}" for way in ("_forward", "_backward", ""))])
+        return rows
+
+    @property
+    def _by_order(self) -> list[xr.Dataset]:
+        return [self.results.sel(order=order) for order in self.results["order"].values]
+
+    def write_witness(self, path: Path) -> str:
+        """Write or draw where the meshes differ, and return a line about it; see `write_difference`."""
+        unit, order = self.unit if self.options.proximity else None, self.options.chosen_orders[0]
+        settings: dict[str, Any] = {"scaling": not self.options.no_scaling, "names": self.names, "distances": unit}
+        return write_difference(self.first, self.second, path, order, **settings)
+
+
+def _moved(mesh: Mesh, motion: Reals) -> Mesh:
+    """Return a mesh after a rigid motion (4, 4)."""
+    return Mesh(mesh.vertices @ motion[:3, :3].T + motion[:3, 3], mesh.triangles, mesh.notes)
+
+
+def _motion_text(motion: Reals) -> str:
+    """Return a rigid motion (4, 4) in words, with its numbers."""
+    vector = Rotation.from_matrix(motion[:3, :3]).as_rotvec(degrees=True)
+    angle = math.hypot(*vector)
+    # What rounding makes of zero would be read as a motion.
+    moved = np.where(np.abs(motion[:3, 3]) < _NO_MOTION * np.abs(motion[:3, 3]).max(), 0.0, motion[:3, 3])
+    axis, shift = (" ".join(f"{x:.6g}" for x in numbers) for numbers in (vector / (angle or 1.0), moved))
+    if angle < _NO_MOTION:
+        return f"moved: shifted by ({shift})"
+    return f"moved: rotated by {angle:.6g} degrees around ({axis}) through the origin, then shifted by ({shift})"
+
+
+def _remarks(options: CompareOptions, first: Mesh, second: Mesh, doubt: str | None) -> Iterator[str]:
+    """Yield what may make one doubt a comparison: defects, notes, places, and a unit far from the meshes' size."""
+    named = ((options.a.name, first), (options.b.name, second))
+    yield from (f"{name}: {', '.join(mesh.defects)}" for name, mesh in named if mesh.defects)
+    yield from (f"{name}: {note}" for name, mesh in named for note in mesh.notes)
+    if doubt is not None:
+        yield f"{options.a.name}: {doubt}"
+    size = second.bounding_sphere[1] if options.no_scaling else 1.0
+    if not 1 / _FAR_UNIT < size < _FAR_UNIT:
+        yield (
+            f"without scaling, wavelengths above 1 {options.unit or 'file unit'} weigh alike and shorter ones less, "
+            f"and the reference has a radius of {size:.4g}; leave out --no-scaling to weigh them against it"
+        )
+
+
+def _proximity_lines(found: Mapping[str, float], meshes: tuple[Mesh, Mesh]) -> Iterator[str]:
+    """Yield what is made of the usual distances in both directions, and the shapes of both meshes."""
+    if not math.isnan(found["bias"]):
+        signed = with_error(found["bias"], found["bias_error"])
+        yield f"mean distance of A, positive outside of B and negative inside: {signed} (s.e.)"
+    yield f"Chamfer, the sum of both means: {with_error(found['chamfer'], found['chamfer_error'])} (s.e.)"
+    yield (
+        f"F-score at {found['threshold']:.4g}: {100 * found['fscore']:.4g} % "
+        f"({100 * found['precision']:.4g} % of A, {100 * found['recall']:.4g} % of B)"
+    )
+    for label, mesh in zip("AB", meshes, strict=True):
+        volume = "not closed" if math.isnan(mesh.volume) else f"volume {mesh.volume:.6g}"
+        angle, ratio = mesh.smallest_angles.min(), mesh.aspect_ratios.max()
+        yield (
+            f"{label}: {volume}, area {mesh.area:.6g}, smallest angle {angle:.3g} deg, aspect ratio at most {ratio:.3g}"
+        )
+
+
+def _settings_text(attributes: Mapping[str, Any]) -> str:
+    """Return what was chosen for an accuracy, on one line."""
+    text = f"xi_max {attributes['xi_max']:.4g}, M {attributes['M']}, {attributes['dtype']}"
+    if attributes["octaves"]:
+        octaves = f"{attributes['octaves']} octave{'s' * (attributes['octaves'] != 1)}"
+        text += f", {octaves} up to {attributes['highest_frequency']:.4g}"
+    return f"{text}, seed {attributes['seed']}"
