@@ -179,8 +179,7 @@ def sampled_distances(
     mesh: Mesh, other: Mesh, rng: np.random.Generator, points: int = DEFAULT_POINTS, *, signed: bool = False
 ) -> Reals:
     """Return the distances (n,) of random points, spread evenly by area, from another mesh; see `vertex_distances`."""
-    drawn, _ = _drawn(mesh, points, rng)
-    return _distances(drawn, other, signed=signed)
+    return point_distances(_drawn(mesh, points, rng)[0], other, signed=signed)
 
 
 def vertex_distances(mesh: MeshLike, other: MeshLike, *, signed: bool = False) -> Reals:
@@ -207,11 +206,12 @@ def vertex_distances(mesh: MeshLike, other: MeshLike, *, signed: bool = False) -
     """
     mesh, other = as_mesh(mesh), as_mesh(other)
     distances, used = np.full(len(mesh.vertices), np.nan), mesh.used_vertices
-    distances[used] = _distances(mesh.vertices[used], other, signed=signed)
+    distances[used] = point_distances(mesh.vertices[used], other, signed=signed)
     return distances
 
 
-def _distances(points: Reals, other: Mesh, *, signed: bool) -> Reals:
+def point_distances(points: Reals, other: Mesh, *, signed: bool = False) -> Reals:
+    """Return the distances (n,) of points (n, 3) from a mesh; see `vertex_distances`."""
     sides = signs(other, points) if signed else np.ones(len(points))
     if sides is None:
         raise InputError(f"the other mesh has no outside: {', '.join(other.defects)}")

@@ -16,7 +16,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import LinearLocator, MaxNLocator
+from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -38,7 +38,7 @@ from sobolev_batch.extras.figures.style import (
     write_figures,
 )
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.geometry.proximity import vertex_distances
+from sobolev_batch.geometry.proximity import point_distances
 from sobolev_batch.geometry.subdivision import subdivided
 from sobolev_batch.geometry.surface import normals
 from sobolev_batch.norms.causes import witness
@@ -80,6 +80,7 @@ _BASE, _BROAD, _BROADER = 0.03, 0.1, 2.0
 _HEIGHT_INCHES, MOST_ORDERS, _PANELS_IN_A_ROW, _MOST_COMPARED = 5.0, 6, 3, 9
 # So many meshes of a store are shown unless some are named.
 _MOST_EXTREMES = 4
+# Small meshes are divided into about as many triangles, since values vary within theirs.
 _ENOUGH_TRIANGLES = 6_000
 # Larger meshes take minutes to be made again.
 _LARGEST_MADE = 2_000_000
@@ -248,32 +249,33 @@ def _view(label: str, fields: Fields, mesh: Mesh, orders: tuple[float, ...], mos
     return replace(view, values=values, orders=orders)
 
 
-def _shown(label: str, mesh: Mesh, most: int) -> MeshView:
+def _shown(label: str, mesh: Mesh, most: int, enough: int = _ENOUGH_TRIANGLES) -> MeshView:
     """Return a view of a mesh without values: its own vertices that are in use, in their order, or others."""
     used = mesh.used_vertices
     number = np.empty(len(mesh.vertices), dtype=np.int32)
     number[used] = np.arange(len(used))
     own, corners = mesh.vertices[used], number[mesh.triangles]
-    vertices, triangles = _for_display(own, corners, most)
+    vertices, triangles = _for_display(own, corners, most, enough)
     # Collapsed edges may leave the period by a hair where the mesh fills it.
     vertices = vertices if vertices is own else np.clip(vertices, own.min(axis=0), own.max(axis=0))
     return MeshView(label, vertices, triangles, np.zeros((0, len(vertices))), (), len(corners))
 
 
-def distance_view(label: str, mesh: Mesh, other: Mesh, unit: str, most: int, *, signed: bool) -> MeshView:
-    """Return a view of a mesh with its distances from another one, positive outside and negative inside if signed."""
-    return _with_distances(_shown(label, mesh, most), mesh, other, unit, 1.0, signed=signed)
-
-
-def _with_distances(
-    view: MeshView, mesh: Mesh, other: Mesh, unit: str, scale: float, *, signed: bool = False
+def distance_view(
+    label: str, mesh: Mesh, other: Mesh, unit: str, most: int, scale: float = 1.0, *, signed: bool = False
 ) -> MeshView:
-    """Return the view of a mesh with distances from another mesh in a unit, which is this scale in that of both."""
-    if len(view.triangles) >= view.original_triangles:
-        distances = vertex_distances(Mesh(view.vertices, view.triangles), other, signed=signed)
+    """Return a view of a mesh with distances from another one, in a unit which is this scale in that of both.
+
+    Signed ones are positive outside of the other mesh and negative inside.
+    """
+    # All vertices of a simplified mesh may lie on the other one: what lies between them counts, too.
+    view = _shown(label, mesh, most, 4 * most)
+    if len(view.triangles) >= len(mesh.triangles):
+        distances = point_distances(view.vertices, other, signed=signed)
     else:
-        # Simplification moves vertices by more than what is to be seen. No vertex of the mesh gets lost.
-        exact, own = vertex_distances(mesh, other, signed=signed)[mesh.used_vertices], mesh.vertices[mesh.used_vertices]
+        # Simplification moves vertices by more than what is to be seen. No vertex and no triangle gets lost.
+        own = np.concatenate([mesh.vertices[mesh.used_vertices], np.mean(mesh.corners(), axis=0)])
+        exact = point_distances(own, other, signed=signed)
         places = np.concatenate([np.arange(len(view.vertices)), cKDTree(view.vertices).query(own)[1]])
         values = np.concatenate([exact[cKDTree(own).query(view.vertices)[1]], exact])
         order, distances = np.argsort(np.abs(values)), np.empty(len(view.vertices))
@@ -282,15 +284,18 @@ def _with_distances(
     return replace(view, values=distances[None] / scale, unit=unit)
 
 
-def _for_display(vertices: Reals, triangles: Triangles, most: int) -> tuple[Reals, Triangles]:
-    """Simplify a large mesh, and subdivide a small one so that values vary within its triangles."""
+def _for_display(vertices: Reals, triangles: Triangles, most: int, enough: int) -> tuple[Reals, Triangles]:
+    """Simplify a mesh of more triangles than the most, and subdivide a small one up to enough of them.
+
+    Values then vary within the triangles of a small one.
+    """
     # Without this extra, large meshes take longer to draw.
     if len(triangles) > most and find_spec("fast_simplification"):
         import fast_simplification
 
         simplified = fast_simplification.simplify(vertices, triangles, target_count=most)
         return np.asarray(simplified[0], dtype=np.float64), np.asarray(simplified[1], dtype=np.int32)
-    while 4 * len(triangles) <= min(most, _ENOUGH_TRIANGLES):
+    while 4 * len(triangles) <= enough:
         finer = subdivided(Mesh(vertices, triangles))
         vertices, triangles = finer.vertices, finer.triangles.astype(np.int32)
     return vertices, triangles
@@ -430,8 +435,11 @@ def write_difference_picture(
     views = [_view(name, fields, mesh, (order,), PICTURE_LIMITS[1]) for name, mesh in meshes]
     rows = [_turned(views)]
     if distances is not None:
-        pairs = zip(views, [mesh for _, mesh in meshes], [mesh for _, mesh in reversed(meshes)], strict=True)
-        rows.append(_turned([_with_distances(*each, distances, scale) for each in pairs]))
+        pairs = zip(meshes, [mesh for _, mesh in reversed(meshes)], strict=True)
+        # Distances vary more within triangles: fewer are enough, and each of these may be divided.
+        most = PICTURE_LIMITS[1] // 4
+        views = [distance_view(name, mesh, other, distances, most, scale) for (name, mesh), other in pairs]
+        rows.append(_turned(views))
     with drawing(None):
         figure, panels = _panels(len(rows) * len(views), None, above=0.0, beside=1.2)
         for row in rows:
@@ -439,7 +447,7 @@ def write_difference_picture(
             strongest = max(row, key=lambda view: float(view.color_limits[0]))
             for axes, view in zip(in_row, row, strict=True):
                 draw_mesh(axes, replace(view, eye=strongest.eye), limit=strongest.color_limits[0])
-                largest = "" if view.unit is None else f"up to {view.values.max():.4g} {escaped(view.unit)}"
+                largest = "" if view.unit is None else f"points up to {view.values.max():.3g} {escaped(view.unit)} away"
                 count = f"{view.original_triangles:,} triangles"
                 set_title(axes, shortened(view.label), largest or count, _seen(strongest))
             for axes in in_row:
@@ -463,14 +471,16 @@ def _add_colorbar(
         ax=panels,
         shrink=0.8,
         orientation="horizontal",
-        ticks=MaxNLocator(4, symmetric=True) if unit is None else LinearLocator(5),
+        ticks=MaxNLocator(4, symmetric=unit is None),
         format="{x:.4g}",
         aspect=20 if isinstance(panels, Axes) else 50,
         extend=EXTENDS[ends],
     )
     beyond = f"\narrows: up to {1 - COVERED_AREA:.0%} of the area" if any(ends) else ""
-    order = f"witness, order {views[0].orders[index]:g}"
-    areas = f"missing area \N{LEFT RIGHT ARROW} extra area\n{order}{beyond}"
-    distances = f"distance to the closest point of the other mesh, in {escaped(unit or '')}"
-    bar.set_label(areas if unit is None else distances, fontsize="small")
+    if unit is None:
+        order = f"witness, order {views[0].orders[index]:g}"
+        text = f"missing area \N{LEFT RIGHT ARROW} extra area\n{order}{beyond}"
+    else:
+        text = f"distance to the closest point of the other mesh, in {escaped(unit)}"
+    bar.set_label(text, fontsize="small")
     bar.ax.tick_params(labelsize="x-small")

@@ -65,7 +65,7 @@ def comparison_page(path: Path, comparison: Comparison, verdict: str = "") -> No
         "title": " and ".join(comparison.names),
         "orders": [],
         "versions": {"sobolev-batch": __version__},
-        "sentences": [verdict] * bool(verdict) + list(comparison.sentences),
+        "sentences": [f"{verdict}."] * bool(verdict) + list(comparison.sentences),
         "names": comparison.names,
         "triangles": [len(mesh.triangles) for mesh in meshes],
         "distances": PageTable("distances", columns, rows, is_sortable=False),

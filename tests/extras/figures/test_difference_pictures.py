@@ -62,15 +62,27 @@ def test_a_picture_has_distances_in_the_unit_of_the_files(
     panels = [axes for axes in figure.axes if axes.get_label() != "<colorbar>"]
     titles = [axes.get_title().splitlines() for axes in panels]
     assert [title[0] for title in titles] == [*names, *names]
-    found = [float(re.findall(r"^up to (\S+) \\\$mm\\\$$", title[1])[0]) for title in titles[2:]]
-    assert found == pytest.approx(lengths(), rel=1e-3)
+    found = [float(re.findall(r"^points up to (\S+) \\\$mm\\\$ away$", title[1])[0]) for title in titles[2:]]
+    assert found == pytest.approx(lengths(), rel=5e-3)
     largest = max(lengths())
     # Both meshes are drawn to one scale, and so are their distances.
     assert panels[0].dataLim.bounds == panels[1].dataLim.bounds
     bar = figure.axes[-1]
     assert bar.get_xlim() == pytest.approx((0, largest), rel=1e-9)
-    assert bar.get_xticks() == pytest.approx(np.linspace(0, largest, 5), rel=1e-9)
+    steps = np.diff(bar.get_xticks())
+    assert len(steps) > 2
+    assert steps == pytest.approx(steps[0])
     assert bar.get_xlabel() == r"distance to the closest point of the other mesh, in \$mm\$"
+
+
+@pytest.mark.parametrize("most", [8_000, 300])
+def test_distances_between_vertices_are_shown(most: int) -> None:
+    """The vertices of the coarse ball lie on the fine one, and its triangles inside."""
+    coarse, fine = sb.shapes.icosphere(2), sb.shapes.icosphere(5)
+    view = views.distance_view("coarse", coarse, fine, "mm", most, signed=True)
+    lower, upper = (-getattr(sb.largest_deviation(coarse, fine).forward, name) for name in ("lower", "upper"))
+    assert upper <= view.values.min() <= 0.95 * lower
+    assert view.values.max() < 1e-3
 
 
 def test_a_picture_needs_matplotlib(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -40,6 +40,7 @@
   };
   const number = (value) => (value === null ? "?" : value.toPrecision(4));
   const narrow = () => innerWidth < 700;
+  const isSheet = document.body.classList.contains("sheet");
   const isPrinted = () => document.documentElement.classList.contains("printed");
 
   const layout = (changes) => {
@@ -61,7 +62,8 @@
     const place = document.getElementById(`chart-${name}`);
     const config = { responsive: true, displaylogo: false, modeBarButtons, displayModeBar: narrow() ? false : "hover" };
     const width = place.closest(".columns") ? 310 : 640;
-    const size = { height: Number(place.dataset.height), ...(isPrinted() ? { width } : {}) };
+    const height = Number(place.dataset.height);
+    const size = isPrinted() ? { height: isSheet ? 0.72 * height : height, width } : { height };
     Plotly.react(place, traces, layout({ ...size, ...changes }), config);
   };
 
@@ -295,7 +297,7 @@
   const pair = () => {
     const { views, place: [x, y, z], largest, signed } = data.pair;
     const place = document.getElementById("chart-pair");
-    const [height, beside] = [isPrinted() ? 300 : narrow() ? 640 : 440, !narrow() || isPrinted()];
+    const [height, beside] = [isPrinted() ? 230 : narrow() ? 640 : 440, !narrow() || isPrinted()];
     const width = isPrinted() ? 640 : place.clientWidth;
     const colors = signed ? diverging() : [[0, color("neutral")], [1, color("more")]];
     const traces = views.flatMap((view, i) => {

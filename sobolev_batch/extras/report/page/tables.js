@@ -96,7 +96,7 @@
   show(chosen ? Number(chosen.value) : 0);
 
   const copy = document.getElementById("copy");
-  copy.addEventListener("click", async () => {
+  copy?.addEventListener("click", async () => {
     const text = document.getElementById("study");
     try {
       await navigator.clipboard.writeText(text.textContent);
