@@ -12,7 +12,7 @@ import numpy as np
 
 from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.formats.by_name import Format
-from sobolev_batch.geometry.formats.parsing import Raw
+from sobolev_batch.geometry.formats.parsing import Raw, reals
 
 # lh.pial, rh.white, sub-01.lh.sphere.reg, inner_skull.surf; but lh.aparc.annot has values at vertices.
 _NAME = re.compile(r"(?:^|[._-])[lr]h\.[^.].*(?<!\.annot)(?<!\.label)(?<!\.mgh)(?<!\.mgz)$|.\.surf$")
@@ -62,7 +62,7 @@ def parse_freesurfer(data: bytes) -> Raw:
     corners = np.frombuffer(data, ">i4", 3 * triangles, start + coordinates.nbytes)
     middle = _MIDDLE.search(data[end : end + _VOLUME_BYTES])
     shift = middle[1].decode("ascii", errors="replace").split() if middle else []
-    is_shifted = any(map(float, shift))
+    is_shifted = any(reals(shift, "c_ras"))
     notes = (f"the file has the shift c_ras = ({' '.join(shift)}) to the frame of the scanner, which is not applied",)
     return Raw(coordinates.reshape(-1, 3), corners.reshape(-1, 3), notes if is_shifted else ())
 

@@ -7,7 +7,6 @@ missing arrays; here they are refused. Source: "GIFTI surface data format" 1.0 (
 from __future__ import annotations
 
 import base64
-import io
 import math
 import zlib
 from collections.abc import Mapping
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.formats.by_name import Format
-from sobolev_batch.geometry.formats.parsing import Raw, unpacked_limit, xml_events
+from sobolev_batch.geometry.formats.parsing import Raw, as_declared, reals, unpacked_limit, whole, xml_events
 
 _MOST_DIMENSIONS = 6
 _GIFTI_TYPES = {
@@ -44,7 +43,7 @@ def parse_gifti(data: bytes) -> Raw:
             case "start", "MatrixData" if attributes.get("Intent") == _POINTS:
                 texts = []
             case "end", "MatrixData" if texts is not None:
-                if not np.array_equal(np.array("".join(texts).split(), dtype=np.float64), np.eye(4).ravel()):
+                if not np.array_equal(reals("".join(texts).split(), "its transform"), np.eye(4).ravel()):
                     notes = ("the file has a transform to another frame of coordinates, which is not applied",)
                 texts = None
             case "start", "Data":
@@ -59,7 +58,7 @@ def parse_gifti(data: bytes) -> Raw:
                 if len(of_kind) > 1:
                     break
     else:
-        if announced is not None and int(announced) != found:
+        if announced is not None and whole(announced, "the GIFTI header") != found:
             raise MeshError(f"the GIFTI header announces {announced[:20]} arrays, found {found}")
     points, faces = arrays.values()
     if len(points) != 1 or len(faces) != 1:
@@ -77,10 +76,11 @@ def _decoded(text: str, attributes: Mapping[str, str], number: int, most_bytes: 
     dtype = _GIFTI_TYPES.get(kind := attributes.get("DataType", ""))
     if dtype is None:
         raise MeshError(f"array {number} of the file is of the type {kind[:40]!r}, expected {', '.join(_GIFTI_TYPES)}")
-    count = int(attributes.get("Dimensionality", 0))
+    owner = f"array {number} of the file"
+    count = whole(attributes.get("Dimensionality", ""), owner)
     if not 1 <= count <= _MOST_DIMENSIONS:
         raise MeshError(f"array {number} of the file has {count} dimensions, expected 1 to {_MOST_DIMENSIONS}")
-    shape = [int(attributes[f"Dim{axis}"]) for axis in range(count)]
+    shape = [whole(attributes.get(f"Dim{axis}", ""), owner) for axis in range(count)]
     if min(shape) < 0:
         raise MeshError(f"array {number} of the file has a negative dimension: {shape}")
     size = math.prod(shape) * dtype.itemsize
@@ -88,7 +88,7 @@ def _decoded(text: str, attributes: Mapping[str, str], number: int, most_bytes: 
     if encoding == "ASCII":
         if not text.strip():
             raise MeshError(f"array {number} of the file is empty")
-        values: NDArray[Any] = np.loadtxt(io.StringIO(text), dtype, comments=None, ndmin=1)
+        values = as_declared(reals(text.split(), owner), dtype, owner)
     else:
         decoded = base64.b64decode(text)
         if encoding == "GZipBase64Binary":

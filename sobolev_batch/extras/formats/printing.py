@@ -17,7 +17,15 @@ import numpy as np
 from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.formats.by_name import Format
-from sobolev_batch.geometry.formats.parsing import Raw, joined, require_memory_to_read, unpacked_limit, xml_events
+from sobolev_batch.geometry.formats.parsing import (
+    Raw,
+    joined,
+    reals,
+    require_memory_to_read,
+    unpacked_limit,
+    whole,
+    xml_events,
+)
 
 _RELATIONS, _OF_MODEL = "_rels/.rels", "/3dmodel"
 _UNIT, _SUPPORTS = "millimeter", ("support", "solidsupport")
@@ -80,9 +88,9 @@ class _Package:
                 case "start", "object":
                     found = objects[values["id"]] = _Object(values.get("type", "model"))
                 case "start", "vertex":
-                    found.vertices.extend(float(values[axis]) for axis in "xyz")
+                    found.vertices.extend(reals([values[axis] for axis in "xyz"], "a vertex"))
                 case "start", "triangle":
-                    found.triangles.extend(int(values[corner]) for corner in ("v1", "v2", "v3"))
+                    found.triangles.extend(whole(values[corner], "a triangle") for corner in ("v1", "v2", "v3"))
                 case "start", "component":
                     found.components.append(_placing(values, name))
                 case "start", "item":
@@ -131,7 +139,7 @@ def parse_3mf(data: bytes) -> Raw:
 
 def _placing(values: Mapping[str, str], part: str) -> _Placing:
     """Return which object a component or an item of a part places, and how."""
-    matrix = np.array(values.get("transform", _AS_IT_IS).split(), dtype=np.float64).reshape(4, 3)
+    matrix = np.array(reals(values.get("transform", _AS_IT_IS).split(), "a transform")).reshape(4, 3)
     other = next((value for name, value in values.items() if name.endswith(":path")), part)
     return other.lstrip("/"), values["objectid"], matrix
 

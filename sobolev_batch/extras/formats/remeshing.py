@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.formats.by_name import Format
-from sobolev_batch.geometry.formats.parsing import Raw, beside_volume
+from sobolev_batch.geometry.formats.parsing import Raw, beside_volume, reals
 from sobolev_batch.geometry.formats.polygons import cut_polygons
 
 # Medit's cells with volume.
@@ -30,7 +30,7 @@ _WITH_AREA, _WITH_VOLUME = (2, 3), (4, 5, 6, 7)
 def parse_medit(data: bytes) -> Raw:
     """Return the vertices and triangles of a Medit mesh in text."""
     # Words have three letters or more, of which the first is a capital; numbers may have an e.
-    start, *words = re.split(rb"([A-Z][A-Za-z0-9]{2,})", re.sub(rb"#[^\n]*", b"", data))
+    start, *words = re.split(rb"\b([A-Z][A-Za-z0-9]{2,})", re.sub(rb"#[^\n]*", b"", data))
     names = [word.decode("ascii") for word in words[::2]]
     sections = dict(zip(names, words[1::2], strict=True))
     if start.strip() or names[:1] != ["MeshVersionFormatted"] or len(sections) < len(names):
@@ -150,12 +150,7 @@ def _medit_rows(name: str, section: bytes, width: int) -> Reals:
 
 
 def _numbers(section: bytes, name: str) -> array[float]:
-    try:
-        if b"_" in section:
-            raise ValueError("an underscore, which is Python's spelling")
-        return array("d", map(float, section.split()))
-    except ValueError as error:
-        raise MeshError(f"its section {name} has a word that is no number: {error}") from error
+    return reals(section.decode("ascii", "replace").split(), f"its section {name}")
 
 
 def _surface(vertices: Reals, faces: Sequence[NDArray[Any]], volumes: int) -> Raw:

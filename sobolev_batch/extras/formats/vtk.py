@@ -1,120 +1,291 @@
 """VTK's files: polygons and strips of triangles, also in unstructured grids.
 
-VTK, which the extra vtk installs, reports what it cannot read and returns the rest; here every report is an error.
+They are parsed here because VTK itself ends the process, or fills the memory, on some damaged files, and returns the
+rest of others. Source: Kitware, "VTK File Formats", https://docs.vtk.org/en/latest/vtk_file_formats.
 """
 
 from __future__ import annotations
 
+import base64
 import re
-from collections import deque
+import zlib
+from collections.abc import Mapping
 from functools import partial
-from tempfile import NamedTemporaryFile
-from threading import Lock
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Indices
-from sobolev_batch.errors import MeshError, from_extra
+from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.formats.by_name import Format
-from sobolev_batch.geometry.formats.parsing import Raw, beside_volume, triangle_strips, xml_events
+from sobolev_batch.geometry.formats.parsing import (
+    Raw,
+    as_declared,
+    beside_volume,
+    reals,
+    triangle_strips,
+    unpacked_limit,
+    whole,
+    xml_events,
+)
 from sobolev_batch.geometry.formats.polygons import cut_polygons
 
 # VTK's numbers for types of cells: vertices and lines, those with area, and those with flat faces around a volume.
 _WITHOUT_AREA, _VTK_TRIANGLE, _STRIP, _POLYGON, _PIXEL, _QUAD = (1, 2, 3, 4), 5, 6, 7, 8, 9
 _WITH_VOLUME = range(10, 17)
 _SURFACE = "python -c \"import pyvista; pyvista.read('scan{}').extract_surface().triangulate().save('scan.vtp')\""
-_RAW_DATA = re.compile(rb"<AppendedData[^>]{0,200}encoding\s{0,9}=\s{0,9}[\"']raw[\"'][^>]{0,200}>\s{0,99}_")
-_END = b"</VTKFile>"
-# VTK has one place for the reports of all threads.
-_shared = Lock()
+_PACKED_ANEW = "python -c \"import pyvista; pyvista.read('scan.vtp').save('new.vtp')\""
+_KINDS, _FACES = ("polydata", "unstructuredgrid", "unstructured_grid"), ("polys", "strips", "cells")
+# The codes that NumPy has for the types of numbers in XML and in legacy files, and what these call cells.
+_TYPES = {f"{kind}{bits}": f"{kind[0]}{bits // 8}" for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64)}
+_LEGACY = {"char": "i1", "short": "i2", "int": "i4", "long": "i8", "float": "f4", "double": "f8", "vtkidtype": "i4"}
+_LEGACY |= {f"unsigned_{name}": f"u{_LEGACY[name][1]}" for name in ("char", "short", "int", "long")}
+_LEGACY |= {f"vtktype{name}": code for name, code in _TYPES.items()}
+_CELLS = {"polygons": "polys", "triangle_strips": "strips", "cells": "cells", "vertices": "verts", "lines": "lines"}
+_START = re.compile(
+    rb"\s*# vtk datafile version +(\d+)\.\d[^\n]*\n[^\n]*\n\s*(ascii|binary)\s+dataset\s+(\w+)[ \t\r]*\n", re.IGNORECASE
+)
+_LINE = re.compile(rb"\s*([^\n]{0,1000})\n?")
+# What ends the values of a file, which stand before its points, and what is told of an array.
+_SKIPPED = {"field": re.compile(rb"\s(?=POINTS )"), "metadata": re.compile(rb"\n[ \t\r]*\n|\Z")}
+_GHOSTS = re.compile(
+    rb"(COLOR_SCALARS )?vtkGhostType(?: 1 \d+)?(?: unsigned_char)?(?: 1)?[ \r]*\n(?:LOOKUP_TABLE \w+[ \r]*\n)?"
+)
+_APPENDED = re.compile(rb"<AppendedData[^>]{0,200}encoding\s{0,9}=\s{0,9}[\"'](raw|base64)[\"'][^>]{0,200}>\s{0,99}_")
+_END, _END_OF_DATA = b"</VTKFile>", b"</AppendedData>"
+# Usual bytes of a number in text.
+_WORD_BYTES = 16
+# The arrays of a part of a data set: "points", "ghosts", "types", and "polys offsets" and "polys connectivity" or such.
+_Arrays = dict[str, NDArray[Any]]
+_NONE = np.zeros(0, np.int64)
 
 
 def parse_vtk(data: bytes, suffix: str) -> Raw:
     """Return the vertices and triangles of a VTK file, legacy (.vtk) or XML (.vtp, .vtu)."""
-    if suffix != ".vtk":
-        _check_xml(data)
-    with from_extra("vtk", "VTK files need", MeshError):
-        import pyvista
-    dataset = _dataset(data, suffix)
-    kind = "nothing" if dataset is None else dataset.GetClassName()
-    if kind == "vtkUnstructuredGrid":
-        cells = dataset.GetCells()
-        # PyVista knows what each version of VTK calls them.
-        kinds = np.asarray(pyvista.wrap(dataset).celltypes, dtype=np.int64)
-    elif kind == "vtkPolyData":
-        cells = dataset.GetPolys()
-        kinds = np.repeat([_POLYGON, _STRIP], [cells.GetNumberOfCells(), dataset.GetNumberOfStrips()])
-        cells.Append(dataset.GetStrips())
-    else:
-        raise MeshError(f"the file holds {kind}, no polygons; take its surface: {_SURFACE.format(suffix)}")
-    ghosts = dataset.GetCellGhostArray()
-    if ghosts is not None and _vtk_values(ghosts).any():
+    kind, pieces = _of_legacy(data) if suffix == ".vtk" else _of_xml(data)
+    if kind.lower() not in _KINDS:
+        raise MeshError(f"the file holds {kind[:40]}, no polygons; take its surface: {_SURFACE.format(suffix)}")
+    if any(piece.get("ghosts", _NONE).any() for piece in pieces):
         raise MeshError(
             "the file has ghost cells, which belong to other parts of a surface; remove them: in PyVista by "
             "mesh.remove_ghost_cells()"
         )
-    corners, offsets = _vtk_values(cells.GetConnectivityArray()), _vtk_values(cells.GetOffsetsArray())
-    *faces, notes = _faces(kinds, corners, offsets, suffix)
-    raw = cut_polygons(_vtk_values(dataset.GetPoints().GetData()), *faces)
+    cells, points = [(_NONE, _NONE, _NONE)], [np.zeros((0, 3), np.float32)]
+    for piece in pieces:
+        coordinates = piece.get("points", points[0])
+        for name, cell_type in zip(_FACES, (_POLYGON, _STRIP, None), strict=True):
+            corners, offsets = (
+                piece.get(f"{name} {one}", _NONE).astype(np.int64) for one in ("connectivity", "offsets")
+            )
+            sizes = np.diff(offsets, prepend=0)
+            if (sizes < 0).any() or sizes.sum() != len(corners):
+                raise MeshError(f"the offsets of its {name} do not run from 0 up to their {len(corners)} corners")
+            kinds = piece.get("types", _NONE) if cell_type is None else np.full(len(sizes), cell_type)
+            if len(kinds) != len(sizes):
+                raise MeshError(f"it has {len(sizes)} cells and the types of {len(kinds)}")
+            if len(pieces) > 1 and corners.size and not 0 <= corners.min() <= corners.max() < len(coordinates) // 3:
+                raise MeshError(f"a piece has an index outside 0..{len(coordinates) // 3 - 1}")
+            cells.append((kinds, corners + sum(map(len, points)), sizes))
+        points.append(coordinates.reshape(-1, 3))
+    kinds, corners, sizes = map(np.concatenate, zip(*cells, strict=True))
+    corners, sizes, notes = _faces(kinds, corners, sizes, suffix)
+    raw = cut_polygons(np.concatenate(points), corners, sizes)
     return raw._replace(notes=raw.notes + notes)
 
 
-def _check_xml(data: bytes) -> None:
-    """Refuse XML that would keep the library busy, and a file that breaks off."""
+class _Legacy:
+    """The lines and arrays of a legacy file, one after the other."""
+
+    def __init__(self, data: bytes, place: int, is_text: bool) -> None:
+        self.data, self.place, self.is_text = data, place, is_text
+
+    def line(self) -> list[str]:
+        """Return the words of the next line that has some; none at the end."""
+        found = _LINE.match(self.data, self.place)
+        self.place = found.end() if found else len(self.data)
+        return found[1].decode("ascii", "replace").split() if found else []
+
+    def array(self, count: int, kind: str) -> NDArray[Any]:
+        """Return so many numbers of a type."""
+        if kind.lower() not in _LEGACY:
+            raise MeshError(f"it has numbers of the type {kind[:40]!r}, which is none of {', '.join(_LEGACY)}")
+        dtype, left = np.dtype(_LEGACY[kind.lower()]).newbyteorder(">"), len(self.data) - self.place
+        if not 0 <= count <= left // (1 if self.is_text else dtype.itemsize):
+            raise MeshError(f"the file breaks off: it announces {count} numbers, and has {left} bytes more")
+        if not self.is_text:
+            self.place += count * dtype.itemsize
+            return np.frombuffer(self.data, dtype, count, self.place - count * dtype.itemsize)
+        # Each word is followed by another, or by the end: longer pieces are split until that is so.
+        words, width = list[str](), 0
+        while len(words) <= count and width < left:
+            width = min(max(2 * width, _WORD_BYTES * (count + 1)), left)
+            words = self.data[self.place : self.place + width].decode("ascii", "replace").split(None, count)
+        self.place += width - sum(map(len, words[count:]))
+        if len(words) < count:
+            raise MeshError(f"the file breaks off: it announces {count} numbers, and has {len(words)}")
+        return as_declared(reals(words[:count], "the file"), dtype.newbyteorder("="), "the file")
+
+    def cells(self, counts: tuple[int, int], is_new: bool) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return the places where cells of a section end, and the corners of all, by the counts of its first line."""
+        if is_new:
+            offsets, corners = (self.array(count, self.line()[1]) for count in counts)
+            if offsets[:1].any():
+                raise MeshError("the offsets of its cells do not begin with 0")
+            return offsets[1:], corners
+        numbers = self.array(counts[1], "int")
+        places, place, values = [], 0, numbers.tolist()
+        for _ in range(counts[0]):
+            places.append(place)
+            place += 1 + (values[place] if place < len(values) and values[place] >= 0 else len(values))
+        if place != len(values):
+            raise MeshError(f"a section announces {counts[0]} cells of {counts[1]} numbers, which it has not")
+        return np.cumsum(numbers[places], dtype=np.int64), np.delete(numbers, places)
+
+
+def _of_legacy(data: bytes) -> tuple[str, list[_Arrays]]:
+    """Return what kind of data set a legacy file has, and the arrays of its one piece."""
+    start = _START.match(data)
+    if start is None:
+        raise MeshError("it does not begin as a legacy file of VTK does, or names no data set")
+    kind, found, done = start[3].decode("ascii", "replace"), _Arrays(), set[str]()
+    file = _Legacy(data, start.end(), start[2].lower() == b"ascii")
+    while kind.lower() in _KINDS and (words := file.line()):
+        name = words[0].lower()
+        if name in done and name not in _SKIPPED:
+            raise MeshError(f"it repeats the section {name.upper()}")
+        done.add(name)
+        match [name, *words[1:]]:
+            case ["points", count, number]:
+                found["points"] = file.array(3 * whole(count, name), number)
+            case [("polygons" | "triangle_strips" | "cells" | "vertices" | "lines"), first, second]:
+                ends, corners = file.cells((whole(first, name), whole(second, name)), int(start[1][:9]) >= 5)
+                found |= {f"{_CELLS[name]} offsets": ends, f"{_CELLS[name]} connectivity": corners}
+            case ["cell_types", count]:
+                found["types"] = file.array(whole(count, name), "int")
+            case ["field" | "metadata", *_] if end := _SKIPPED[name].search(data, file.place):
+                file.place = end.end()
+            case ["cell_data", count]:
+                # Only the values of ghost cells matter.
+                last = data.find(b"POINT_DATA ", file.place)
+                if ghosts := _GHOSTS.search(data, file.place, len(data) if last < 0 else last):
+                    file.place = ghosts.end()
+                    found["ghosts"] = file.array(
+                        whole(count, name), "double" if ghosts[1] and file.is_text else "unsigned_char"
+                    )
+                break
+            case ["point_data", _]:
+                file.place = max(data.find(b"CELL_DATA ", file.place), 0) or len(data)
+            case _:
+                raise MeshError(f"it has the line {' '.join(words)[:80]!r} where legacy files have none")
+    return kind, [found]
+
+
+def _of_xml(data: bytes) -> tuple[str, list[_Arrays]]:
+    """Return what kind of data set a file of XML has, and the arrays of its pieces."""
     if not data.rstrip().endswith(_END):
         raise MeshError(f"the file breaks off: it does not end with {_END.decode()}")
-    raw = _RAW_DATA.search(data)
-    # Raw bytes are no XML.
-    document = data if raw is None else data[: raw.end()] + b"</AppendedData>" + _END
-    deque(xml_events(document, "VTK"), maxlen=0)
+    # Data behind the XML need not be XML.
+    start, end = _APPENDED.search(data), data.rfind(_END_OF_DATA)
+    document = data if start is None else data[: start.end()] + _END_OF_DATA + _END
+    behind = (data[start.end() : end], start[1] == b"base64") if start and end > 0 else (b"", False)
+    root, counts, attributes = dict[str, str](), dict[str, str](), dict[str, str]()
+    pieces, arrays, texts = list[_Arrays](), _Arrays(), list[str]()
+    section, depth = "", 0
+    for event, name, values in xml_events(document, "VTK"):
+        depth += (event == "start") - (event == "end")
+        match event, name:
+            case "start", "VTKFile":
+                root = values
+            case "start", "Piece":
+                counts, arrays = values, _Arrays()
+                pieces.append(arrays)
+            case "end", "Piece":
+                _require_announced(counts, arrays)
+            case _, ("Points" | "Polys" | "Strips" | "Cells" | "CellData"):
+                section = name.lower() if event == "start" else ""
+            case "start", "DataArray":
+                # Only its own text holds its values, and not that of elements within it.
+                attributes, texts, depth = values, [], 0
+            case "text", piece if depth == 0:
+                texts.append(piece)
+            case "end", "DataArray" if section:
+                key = section if section == "points" else f"{section} {attributes.get('Name', '').lower()}"
+                key = {"celldata vtkghosttype": "ghosts", "cells types": "types"}.get(key, key)
+                if key in arrays:
+                    raise MeshError(f"a piece repeats the array {key[:40]!r}")
+                if not key.startswith("celldata"):
+                    arrays[key] = _decoded(attributes, "".join(texts), behind, root, unpacked_limit(len(data)))
+    return root.get("type", "nothing"), pieces
 
 
-def _dataset(data: bytes, suffix: str) -> Any:
-    """Return the data set in a file, if VTK reports nothing about it."""
-    from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkStringOutputWindow
-    from vtkmodules.vtkIOLegacy import vtkDataSetReader
-    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader, vtkXMLUnstructuredGridReader
-
-    readers: dict[str, Any] = {
-        ".vtk": vtkDataSetReader,
-        ".vtp": vtkXMLPolyDataReader,
-        ".vtu": vtkXMLUnstructuredGridReader,
-    }
-    reports, reader = vtkStringOutputWindow(), readers[suffix]()
-    with NamedTemporaryFile(suffix=suffix) as file, _shared:
-        file.write(data)
-        file.flush()
-        window, verbosity = vtkOutputWindow.GetInstance(), vtkLogger.GetCurrentVerbosityCutoff()
-        vtkOutputWindow.SetInstance(reports)
-        vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
-        try:
-            reader.SetFileName(file.name)
-            reader.Update()
-        finally:
-            vtkLogger.SetStderrVerbosity(verbosity)
-            vtkOutputWindow.SetInstance(window)
-    if report := reports.GetOutput():
-        # It is bytes where it quotes what is no UTF-8. Each report begins with a place in VTK's code.
-        text = report.decode(errors="replace") if isinstance(report, bytes) else report
-        raise MeshError(f"VTK reports: {re.sub(r'.*, line [0-9]+|[(]0x[0-9a-f]+[)]', '', text)}")
-    return reader.GetOutput()
+def _require_announced(counts: Mapping[str, str], arrays: _Arrays) -> None:
+    """Refuse a piece whose arrays have other numbers of entries than it announces."""
+    lengths = {name: len(arrays.get(f"{name} offsets", _NONE)) for name in _FACES}
+    for name, length in {**lengths, "points": len(arrays.get("points", _NONE)) / 3}.items():
+        announced = whole(counts.get(f"NumberOf{name.capitalize()}", "0"), "a piece")
+        if announced != length:
+            raise MeshError(f"a piece announces {announced} {name}, and has {length:g}")
 
 
-def _vtk_values(array: Any) -> NDArray[Any]:
-    """Return an array of VTK's, with integers in 64 bits."""
-    from vtkmodules.util.numpy_support import vtk_to_numpy
+def _decoded(
+    attributes: Mapping[str, str], text: str, behind: tuple[bytes, bool], root: Mapping[str, str], most: int
+) -> NDArray[Any]:
+    """Return the values of a DataArray, from its text or from what lies behind the XML, as at most so many bytes."""
+    kind, form, owner = (
+        attributes.get("type", ""),
+        attributes.get("format", ""),
+        f"its array {attributes.get('Name')!r}",
+    )
+    if kind.lower() not in _TYPES or form not in ("ascii", "binary", "appended"):
+        raise MeshError(f"{owner} has the type {kind[:40]!r} and the format {form[:40]!r}, which VTK does not have")
+    dtype, order = np.dtype(_TYPES[kind.lower()]), ">" if root.get("byte_order") == "BigEndian" else "<"
+    if form == "ascii":
+        return as_declared(reals(text.split(), owner), dtype, owner)
+    head = np.dtype(order + _TYPES.get(root.get("header_type", "").lower(), "u4"))
+    source, is_base64 = behind if form == "appended" else ("".join(text.split()).encode(), True)
+    place = whole(attributes.get("offset", ""), owner) if form == "appended" else 0
 
-    values = np.asarray(vtk_to_numpy(array))
-    return values.astype(np.int64) if values.dtype.kind in "iu" else values
+    def fetch(place: int, count: int) -> tuple[bytes, int]:
+        """Return so many bytes from a place on, and the place behind them."""
+        end = place + (-(-count // 3) * 4 if is_base64 else count)
+        found = base64.b64decode(source[place:end], validate=True)[:count] if is_base64 else source[place:end]
+        if len(found) < count or place < 0:
+            raise MeshError(f"the data of {owner} break off")
+        return found, end
+
+    # The number of bytes that follow; of blocks in packed data.
+    first, after = fetch(place, head.itemsize)
+    count = int(np.frombuffer(first, head)[0])
+    if packed := root.get("compressor"):
+        if packed != "vtkZLibDataCompressor":
+            raise MeshError(f"it is packed by {packed[:40]!r}; save it anew: {_PACKED_ANEW}")
+        header, after = fetch(place, head.itemsize * (3 + count))
+        size, last, *lengths = np.frombuffer(header, head)[1:].tolist()
+        sizes = [*[size] * (count - 1), last or size][:count]
+        if sum(sizes) > most:
+            raise MeshError(f"its arrays unpack to more than {most} bytes: no mesh file shrinks that far")
+        blocks, ends = fetch(after, sum(lengths))[0], np.cumsum([0, *lengths]).tolist()
+        # One byte more shows whether there are more.
+        parts = [
+            zlib.decompressobj().decompress(blocks[begin:end], expected + 1)
+            for begin, end, expected in zip(ends[:-1], ends[1:], sizes, strict=True)
+        ]
+        if [*map(len, parts)] != sizes:
+            raise MeshError(f"{owner} unpacks to other sizes than announced")
+        data = b"".join(parts)
+    elif is_base64 and source[after - 1 : after] == b"=":
+        # Some programs end the count as a text of its own.
+        data, _ = fetch(after, count)
+    else:
+        data = fetch(place, head.itemsize + count)[0][head.itemsize :]
+    if len(data) % dtype.itemsize:
+        raise MeshError(f"{owner} has {len(data)} bytes, which are no whole numbers of {dtype.itemsize}")
+    return np.frombuffer(data, np.dtype(order + dtype.str[1:]))
 
 
-def _faces(kinds: Indices, corners: Indices, offsets: Indices, suffix: str) -> tuple[Indices, Indices, tuple[str, ...]]:
-    """Return the corners of faces, and their numbers, from those of all cells and the places where each begins."""
-    sizes = np.diff(offsets)
-    if len(sizes) != len(kinds) or (sizes < 0).any() or sizes.sum() != len(corners):
-        raise MeshError(f"the offsets of its {len(kinds)} cells do not run from 0 up to their {len(corners)} corners")
+def _faces(kinds: Indices, corners: Indices, sizes: Indices, suffix: str) -> tuple[Indices, Indices, tuple[str, ...]]:
+    """Return the corners of faces, and their numbers, from those of all cells."""
     has_area, has_volume = ~np.isin(kinds, _WITHOUT_AREA), np.isin(kinds, _WITH_VOLUME)
     # Without any face beside them, they are refused.
     has_area &= ~has_volume | ~(has_area & ~has_volume).any()
@@ -127,7 +298,7 @@ def _faces(kinds: Indices, corners: Indices, offsets: Indices, suffix: str) -> t
             f"take the surface: {_SURFACE.format(suffix)}"
         )
     # The corners of a pixel lie row by row, and not around it.
-    last = offsets[:-1][is_pixel, None] + [2, 3]
+    last = (np.cumsum(sizes) - sizes)[is_pixel, None] + [2, 3]
     corners[last] = corners[last[:, ::-1]]
     strips = triangle_strips(corners[np.repeat(is_strip, sizes)], sizes[is_strip])
     has_area &= ~is_strip

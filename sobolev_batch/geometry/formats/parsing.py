@@ -6,8 +6,10 @@ import errno
 import gzip
 import io
 import os
+import re
 import stat
 import zlib
+from array import array
 from collections.abc import Callable, Iterator, Sequence
 from io import BufferedReader
 from pathlib import Path, PurePath
@@ -15,7 +17,7 @@ from typing import IO, Any, NamedTuple, cast
 from xml.parsers import expat
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import MeshError
@@ -46,6 +48,11 @@ _MEMORY_PART = 0.75
 # five deep and a few hundred.
 _LONGEST_MARKUP, _DEEPEST, _MOST_ELEMENTS = 1 << 16, 100, 100_000
 _XML_BYTES = 1 << 14
+# Digits of an integer: all that fit into 64 bits.
+_MOST_DIGITS = 18
+_REAL = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
+# Fortran writes the exponents of doubles with a D.
+_FORTRAN = re.compile(r"(?<=[0-9.])[dD](?=[+-]?[0-9])")
 # The index that ends a strip of triangles within a list.
 _BREAK = -1
 
@@ -174,6 +181,43 @@ def _unpacked_bounded(packed: bytes, factor: float) -> bytes:
             if data.tell() > _HARMLESS_BYTES:
                 require_memory_to_read(factor * data.tell())
     return data.getvalue()
+
+
+def reals(words: Sequence[str], owner: str) -> array[float]:
+    """Return words as numbers, spelled as in C or Fortran; an error begins with their owner, such as "vertex 7"."""
+    text = "".join(words)
+    try:
+        # Python takes underscores too, and the digits of all scripts.
+        if "_" in text or not text.isascii():
+            raise ValueError("no spelling of C")
+        return array("d", map(float, words))
+    except ValueError as error:
+        plain = [_FORTRAN.sub("e", word) for word in words]
+        wrong = [word for word in plain if not _REAL.fullmatch(word)]
+        if wrong:
+            raise MeshError(f"{owner} has a word that is not a number: {wrong[0][:40]!r}") from error
+        return array("d", map(float, plain))
+
+
+def whole(word: str, owner: str) -> int:
+    """Return a word as an integer; an error begins with its owner, such as "face 7"."""
+    try:
+        if len(word) > _MOST_DIGITS or "_" in word or not word.isascii():
+            raise ValueError("too long, or no spelling of C")
+        return int(word)
+    except ValueError as error:
+        raise MeshError(f"{owner} has {word[:40]!r} for an integer of up to {_MOST_DIGITS} digits") from error
+
+
+def as_declared(numbers: NDArray[Any] | array[float], declared: DTypeLike, owner: str) -> NDArray[Any]:
+    """Return numbers of a text, which are doubles, in their declared type, and others as they are."""
+    values = np.asarray(numbers)
+    with np.errstate(all="ignore"):
+        converted = values.astype(np.dtype(declared).newbyteorder(values.dtype.byteorder), copy=False)
+    wrong = values[converted != values] if converted is not values and converted.dtype.kind in "iu" else []
+    if len(wrong):
+        raise MeshError(f"{owner} has {wrong[0]:g} for an integer of {8 * converted.itemsize} bits")
+    return converted
 
 
 def beside_volume(cells: int, faces: int) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import MeshError
-from sobolev_batch.geometry.formats.parsing import Raw
+from sobolev_batch.geometry.formats.parsing import Raw, reals, whole
 from sobolev_batch.geometry.formats.polygons import cut_polygons
 from sobolev_batch.geometry.mesh import Mesh, merge_coincident
 from sobolev_batch.geometry.surface import normals
@@ -31,9 +31,7 @@ _OBJ_SKIPPED = re.compile(
 _OBJ_REFUSED = ("surf", "curv", "curv2", "bsp", "bzp", "cdc", "cdp", "call", "csh")
 # Further numbers per face: a colour or its index.
 _OFF_FACE_EXTRAS = (0, 1, 3, 4)
-# Digits of an index or count: all that fit into 64 bits. Other digits than these are digits to Python too.
-_MOST_DIGITS = 18
-_COUNT = re.compile(f"[0-9]{{1,{_MOST_DIGITS}}}")
+_COUNT = re.compile("[0-9]{1,18}")
 # Characters of a line: a polygon of a hundred thousand corners.
 _LONGEST_LINE = 1 << 20
 # Seventeen digits give every double back.
@@ -54,7 +52,7 @@ def parse_obj(data: bytes) -> Raw:
             number = len(vertices) // 3 + 1
             if len(words) - 1 not in _OBJ_VERTEX_SIZES:
                 raise MeshError(f"vertex {number} has {len(words) - 1} coordinates, expected three")
-            vertices.extend(_parsed_numbers(words[1:4], f"vertex {number}"))
+            vertices.extend(reals(words[1:4], f"vertex {number}"))
         elif kind in ("f", "fo"):
             corners.extend(_obj_corner(word, len(vertices) // 3, len(sizes) + 1) for word in words[1:])
             sizes.append(len(words) - 1)
@@ -84,12 +82,12 @@ def parse_off(data: bytes) -> Raw:
     for number in range(1, vertex_count + 1):
         vertex = f"vertex {number}"
         words = _off_row(next(lines, []), lines, vertex, least + 3 * has_colors, (0, 1) if has_colors else (0,))
-        vertices.extend(_parsed_numbers(words[:3], vertex))
+        vertices.extend(reals(words[:3], vertex))
     for number in range(1, face_count + 1):
         face, words = f"face {number}", next(lines, [])
-        size = _integer(words[0], face) if words else 0
+        size = whole(words[0], face) if words else 0
         corners.extend(
-            _integer(word, face) for word in _off_row(words, lines, face, 1 + size, _OFF_FACE_EXTRAS)[1 : 1 + size]
+            whole(word, face) for word in _off_row(words, lines, face, 1 + size, _OFF_FACE_EXTRAS)[1 : 1 + size]
         )
         sizes.append(size)
     if words := next(lines, []):
@@ -219,30 +217,9 @@ def _joined_lines(data: bytes) -> Iterator[tuple[int, str]]:
         yield number, "".join(parts)
 
 
-def _parsed_numbers(words: list[str], owner: str) -> list[float]:
-    """Return words as numbers; an error begins with their owner, such as "vertex 7"."""
-    try:
-        if any("_" in word for word in words):
-            raise ValueError("Python's spelling, not that of any mesh format")
-        return [float(word) for word in words]
-    except ValueError as error:
-        raise MeshError(f"{owner} has a coordinate that is not a number: {' '.join(words)[:80]!r}") from error
-
-
-def _integer(word: str, owner: str) -> int:
-    try:
-        if len(word) > _MOST_DIGITS or "_" in word:
-            raise ValueError("too long, or Python's spelling")
-        return int(word)
-    except ValueError as error:
-        raise MeshError(
-            f"{owner} has an index that is no integer of up to {_MOST_DIGITS} digits: {word[:80]!r}"
-        ) from error
-
-
 def _obj_corner(word: str, vertices_so_far: int, face: int) -> int:
     """Return the index from 0 of a corner such as 7, 7/1, 7//3 or -1; negative ones count back from their line."""
-    index = _integer(word.partition("/")[0], f"face {face}")
+    index = whole(word.partition("/")[0], f"face {face}")
     if index == 0:
         raise MeshError(f"face {face} has the vertex index 0; OBJ counts from 1")
     if index > 0:
@@ -267,7 +244,7 @@ def _stl_text_corners(data: bytes) -> Reals:
             case "vertex":
                 if len(words) != 4:
                     raise MeshError(f"facet {facet} has a vertex of {len(words) - 1} coordinates, expected three")
-                corners.extend(_parsed_numbers(words[1:], f"facet {facet}"))
+                corners.extend(reals(words[1:], f"facet {facet}"))
                 facet_corners += 1
             case "endfacet":
                 if facet_corners != 3:

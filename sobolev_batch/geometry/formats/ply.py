@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Indices
 from sobolev_batch.errors import MeshError
-from sobolev_batch.geometry.formats.parsing import Raw, triangle_strips
+from sobolev_batch.geometry.formats.parsing import Raw, as_declared, reals, triangle_strips, whole
 from sobolev_batch.geometry.formats.polygons import cut_polygons
 from sobolev_batch.geometry.mesh import Mesh
 
@@ -35,11 +35,9 @@ _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _CODES = {"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d"}
 _CODES |= {"int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I"}
 _CODES |= {"int64": "q", "uint64": "Q", "float16": "e", "float32": "f", "float64": "d"}
-_TEXT, _FRACTIONS = "=d", "efd"
+_TEXT = "=d"
 _CORNERS = ("vertex_indices", "vertex_index")
 _WANTED = {"vertex": ("x", "y", "z"), "face": _CORNERS, "tristrips": _CORNERS}
-# Digits of a count: all that fit into 64 bits.
-_MOST_DIGITS = 18
 # Bytes of a number in text: a digit and the character that ends it.
 _TEXT_BYTES = 2
 # Bytes of text that become words at a time, which take some twenty times as many.
@@ -173,9 +171,9 @@ def _parsed_header(data: bytes) -> tuple[dict[str, _Element], int, bool]:
             case ["format", name, "1.0"] if name in _ORDERS and not order:
                 order = _ORDERS[name]
             case ["element", name, count] if order and name not in elements:
-                if not count.isdigit() or len(count) > _MOST_DIGITS:
-                    raise MeshError(f"the PLY header announces {count[:40]!r} entries of {name[:40]!r}")
-                elements[name] = element = _Element(name, int(count), {})
+                elements[name] = element = _Element(name, whole(count, "the PLY header"), {})
+                if element.count < 0:
+                    raise MeshError(f"the PLY header announces {count} entries of {name[:40]!r}")
             case ["property", *words, name] if elements and name not in element.properties:
                 match [_CODES.get(word, word) for word in words]:
                     case [code] if code in _CODES.values():
@@ -193,23 +191,18 @@ def _parsed_header(data: bytes) -> tuple[dict[str, _Element], int, bool]:
 
 def _numbers(data: bytes, start: int, rows: int) -> tuple[array[float], array[int]]:
     """Return all numbers of a text from a place on, and how many each line has that has some, up to a line too many."""
-    if data.find(b"_", start) >= 0:
-        raise MeshError("the PLY file has a number with an underscore, which is Python's spelling and not that of PLY")
     numbers, sizes, carried = array("d"), array("I"), 0
-    try:
-        while start < len(data):
-            space = _SPACE.search(data, start + _CHUNK_BYTES)
-            end = space.end() if space else len(data)
-            lines = [line.split() for line in data[start:end].split(b"\n")]
-            numbers.extend(map(float, chain.from_iterable(lines)))
-            first, *others = map(len, lines)
-            # The last line goes on in the next chunk.
-            *whole, carried = first + carried, *others
-            sizes.extend(filter(None, whole))
-            del sizes[rows + 1 :]
-            start = end
-    except ValueError as error:
-        raise MeshError(f"the PLY file has a word that is no number: {error}") from error
+    while start < len(data):
+        space = _SPACE.search(data, start + _CHUNK_BYTES)
+        end = space.end() if space else len(data)
+        lines = [line.split() for line in data[start:end].decode("ascii", "replace").split("\n")]
+        numbers.extend(reals([*chain.from_iterable(lines)], "the PLY file"))
+        first, *others = map(len, lines)
+        # The last line goes on in the next chunk.
+        *whole_lines, carried = first + carried, *others
+        sizes.extend(filter(None, whole_lines))
+        del sizes[rows + 1 :]
+        start = end
     sizes.extend(filter(None, [carried]))
     return numbers, sizes
 
@@ -248,7 +241,9 @@ def _columns(
     else:
         values, sizes, end = _walked(element, wanted, count, body, start)
     for name in wanted:
-        values[name] = _as_declared(values[name], element.properties[name].declared, f"{element.name} {name}")
+        values[name] = as_declared(
+            values[name], element.properties[name].declared, f"the PLY property {element.name} {name}"
+        )
     return {name: (values[name], sizes.get(name)) for name in wanted}, sizes, end
 
 
@@ -278,16 +273,6 @@ def _walked(
     found = dict(zip(element.properties, steps, strict=True))
     of_lists = {name: np.array(sizes, np.int64) for name, (head, _, sizes, *_) in found.items() if head}
     return {name: np.frombuffer(found[name][3], element.properties[name].stored) for name in wanted}, of_lists, place
-
-
-def _as_declared(values: NDArray[Any], declared: str, owner: str) -> NDArray[Any]:
-    """Return numbers of a text, which are doubles, in their declared type, and others as they are."""
-    with np.errstate(all="ignore"):
-        converted = values.astype(np.dtype(declared).newbyteorder(values.dtype.byteorder), copy=False)
-    wrong = [] if converted is values or declared in _FRACTIONS else values[converted != values]
-    if len(wrong):
-        raise MeshError(f"the PLY property {owner} has {wrong[0]:g} for an integer of {8 * converted.itemsize} bits")
-    return converted
 
 
 def _corners(element: str, columns: Mapping[str, _Column]) -> tuple[Indices, Indices]:
