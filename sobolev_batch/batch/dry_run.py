@@ -187,16 +187,14 @@ class StudyPlan(Shown):
         return {**numbers, "objects": objects, "missing": self.missing, "total_bytes": self.total_bytes}
 
     def __str__(self) -> str:
-        shown = [
-            ("", one.lines) if not name else (f"{visible(name)}:", one.lines) for name, one in self.objects.items()
-        ]
-        lines = [line for head, rows in shown for line in (*filter(None, [head]), *starmap(_beside, rows))]
-        lines += [beside(f"{visible(name)}: ", reason) for name, reason in self.refused.items()]
-        lines += starmap(_beside, zip(chain(["time"], repeat("")), self.time, strict=False))
+        lines = [*starmap(_beside, zip(chain(["time"], repeat("")), self.time, strict=False))]
         lines += [_beside("warning", text) for text in self.warnings]
         if "" not in self.objects:
             looked = f", of which {len(self.objects) + len(self.refused)} were looked at" if self.share > 1 else ""
-            lines.append(f"{self.count:,} objects{looked}; {format_bytes(self.total_bytes)} of fields")
+            lines.append(_beside("objects", f"{self.count:,}{looked}; {format_bytes(self.total_bytes)} of fields"))
+        lines += [beside(f"{visible(name)}: ", reason) for name, reason in self.refused.items()]
+        for name, one in self.objects.items():
+            lines += [*([f"{visible(name)}:"] if name else []), *starmap(_beside, one.lines)]
         return "\n".join(lines)
 
 
@@ -207,9 +205,6 @@ def _beside(name: str, text: str) -> str:
 def _study_lines(plan: Plan) -> Iterator[tuple[str, str]]:
     """Yield what is shown of a plan whatever computes it."""
     study, lattice, similarity, tail = plan.study, plan.lattice, plan.similarity, plan.tail
-    yield "study", study.object.title
-    families = f"{len(study.object.families)} famil{'y' if len(study.object.families) == 1 else 'ies'}"
-    yield "surfaces", f"{len(plan.rows)} in {families}, reference {plan.reference}"
     yield "similarity", f"scale {similarity.scale:.9g}, origin {' '.join(f'{x:.9g}' for x in similarity.origin)}"
     spacing = f"spacing {lattice.spacing:g}, half period {lattice.half_period:g}"
     yield "lattice", f"xi_max {lattice.xi_max:g}, M {lattice.M}, {spacing}"
@@ -241,19 +236,11 @@ def _study_lines(plan: Plan) -> Iterator[tuple[str, str]]:
         )
 
 
-def _task_lines(
-    plan: Plan,
-    workers: Workers,
-    sizes: Mapping[str, Sizes],
-    refused: Mapping[str, str],
-    doubtful: Mapping[str, str],
-) -> Iterator[tuple[str, str]]:
-    gpus = sum(member.backend == "gpu" for member in workers.members)
-    yield (
-        "workers",
-        f"{len(workers.members)}, with {workers.threads} threads and {gpus} GPUs together; for tasks, "
-        f"{format_bytes(workers.allowed_bytes_per_task)} or more of memory a thread",
-    )
+def _task_lines(plan: Plan, sizes: Mapping[str, Sizes]) -> Iterator[tuple[str, str]]:
+    """Yield what is computed, and the memory that it takes."""
+    families = f"{len(plan.study.object.families)} famil{'y' if len(plan.study.object.families) == 1 else 'ies'}"
+    yield "study", plan.study.object.title
+    yield "surfaces", f"{len(plan.rows)} in {families}, reference {plan.reference}"
     tasks = sum(len(groups) for groups, *_ in sizes.values())
     yield "tasks", f"{tasks} for {len(sizes)} surfaces; chunks of the lattice: {len(plan.blocks)}"
     if sizes:
@@ -262,8 +249,14 @@ def _task_lines(
     if plan.study.pairs == "all":
         needed = PAIR_BYTES * len(plan.study.orders) * len(plan.rows) ** 2
         yield "all pairs", f"{tile_count(len(plan.rows))} tiles, {format_bytes(needed)} on disk"
-    yield from reasons("refused", refused)
-    yield from reasons("doubtful", doubtful)
+
+
+def _workers_text(workers: Workers) -> str:
+    gpus = sum(member.backend == "gpu" for member in workers.members)
+    return (
+        f"{len(workers.members)}, with {workers.threads} threads and {gpus} GPUs together; for tasks, "
+        f"{format_bytes(workers.allowed_bytes_per_task)} or more of memory a thread"
+    )
 
 
 def plan(
@@ -292,6 +285,7 @@ def plan(
     >>> len(found.object.labels), found.missing, found.object.lattice
     (5, (), Lattice(xi_max=5.0, M=48))
     >>> print(found)  # doctest: +ELLIPSIS
+    time:          nothing is missing
     study:         ...
     surfaces:      5 in 1 family, reference reference
     ...
@@ -384,10 +378,13 @@ def _plan(study: Study, location: Location, workers: Workers, client: Client | N
         planning_seconds=planning_seconds,
         lacks_tables=not seconds and (workspace is None or not lacks_nothing(workspace)),
         lines=(
-            *_study_lines(study_plan),
-            *_task_lines(study_plan, workers, sizes, refused, doubtful),
+            *_task_lines(study_plan, sizes),
             ("storage", f"{format_bytes(study_plan.field_bytes)} per surface, {total_bytes} in all"),
             ("store", f"{location}, {len(stored)} of {count} already stored"),
+            *reasons("refused", refused),
+            *reasons("doubtful", doubtful),
+            *_study_lines(study_plan),
+            ("workers", _workers_text(workers)),
         ),
     )
 

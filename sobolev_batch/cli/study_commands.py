@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from sobolev_batch.store.location import Location
     from sobolev_batch.tables import Format
 
-# Lines about distances that are less accurate than requested.
-_MOST_IMPRECISE = 10
+# Lines about distances that are less accurate than requested, and about objects.
+_MOST_IMPRECISE, _MOST_OBJECTS = 10, 10
 
 
 _study_argument = click.argument("study", type=PATH)
@@ -75,6 +75,7 @@ _only_option = click.option(
 )
 @_allow_commands_option
 @_only_option
+@click.option("--tables", is_flag=True, help="Also print the distance of each mesh, as table does.")
 @click.pass_context
 def run_command(
     context: click.Context,
@@ -83,20 +84,21 @@ def run_command(
     store: Location | None,
     scheduler: str | None,
     trust_network: bool,
+    tables: bool,
     **settings: Any,
 ) -> None:
-    """Compute what is missing of STUDY and print its tables.
+    """Compute what is missing of STUDY and print the verdict.
 
     Ctrl-C and SIGTERM end it. The same command continues from the store. For several objects it
-    prints their league; an object that cannot be carried out stops no other.
+    prints their league, and the objects, the worst first; an object that cannot be carried out stops no other.
 
     The exit status is 3 if a mesh failed, or if a distance is less accurate than the study requires.
     """
     from sobolev_batch.batch.cluster.clients import remote_client
     from sobolev_batch.batch.run import run
     from sobolev_batch.study.study import as_study
-    from sobolev_batch.tables.conclusion import format_verdict
-    from sobolev_batch.tables.convergence import format_table, table
+    from sobolev_batch.tables.conclusion import format_objects, format_verdict
+    from sobolev_batch.tables.convergence import format_table
     from sobolev_batch.tables.open import open_store
 
     if scheduler and (settings["workers"] or settings["memory"]):
@@ -108,15 +110,18 @@ def run_command(
     with progress_reports() as show, connected as client:
         summary = run(parsed, store, client, on_progress=show, **settings)
     if "" in parsed.objects:
-        tree = open_store(summary.store)
-        frame = table(tree)
-        echo_lines(format_table(tree, frames={"": frame}))
-        echo()
-        echo_lines(format_verdict(tree, frame=frame))
+        echo_lines(format_verdict(open_store(summary.store)))
     else:
         _print_league(context, summary.store)
+        echo()
+        echo_lines(format_objects(summary.store, most=_MOST_OBJECTS))
+    if tables:
+        echo()
+        echo_lines(format_table(summary.store))
     echo()
     echo(str(summary).partition("\n")[0])
+    if not tables:
+        echo(f"all distances: sobolev-batch table {shlex.quote(summary.store)}")
     for label, reason in summary.not_compared.items():
         echo(f"{label}: {reason}", err=True)
     for label, error in list(summary.imprecise.items())[:_MOST_IMPRECISE]:

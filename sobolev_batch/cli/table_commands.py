@@ -103,6 +103,15 @@ def verdict_command(table: TableOptions) -> None:
     echo_lines(format_verdict(table.tree, table.style, table.orders))
 
 
+@table_command.command("objects")
+@table_options
+def objects_command(table: TableOptions) -> None:
+    """Print the nearest mesh of each object, the worst objects first."""
+    from sobolev_batch.tables.conclusion import format_objects
+
+    echo_lines(format_objects(table.store, table.style, table.orders))
+
+
 @table_command.command("smallest")
 @table_options
 @below_option("Take what is below FRACTION, such as 1%, of the norm of the reference.", required=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -11,10 +12,10 @@ import pandas as pd
 import xarray as xr
 
 from sobolev_batch.tables import Format
-from sobolev_batch.tables.convergence import nearest, smallest_of, table
-from sobolev_batch.tables.open import require_one_object
+from sobolev_batch.tables.convergence import nearest, remarks, smallest_of, table, tables_of
+from sobolev_batch.tables.open import AnyStore, require_one_object
 from sobolev_batch.tables.rendering import Column, Section, rendered
-from sobolev_batch.tables.text import count, minus, percent, spread
+from sobolev_batch.tables.text import count, minus, percent, spread, wrapped
 
 # A row of a table: a record of a frame. It may also have its "order"; a "mark", a short remark about its marked number;
 # the number of its "color"; and the text "absent" in place of all numbers, with the section "reasons" that explains it.
@@ -26,7 +27,7 @@ _SAME_SIZE = 1.2
 # More rows are no verdict any more.
 _MOST_SIZES = 8
 _MOST_FAMILIES = 6
-MOST_NAMED = 3
+MOST_NAMED, _MOST_REMARKS = 3, 10
 
 VERDICT_COLUMNS = (
     Column("verdict", "verdict", kind="label"),
@@ -34,6 +35,14 @@ VERDICT_COLUMNS = (
     Column("relative", "relative", percent, "relative_error"),
     Column("triangles", "triangles", count),
     Column("remark", "remark", kind="text"),
+)
+_OBJECT_COLUMNS = (
+    Column("object", "object", kind="label"),
+    Column("mesh", "nearest mesh", kind="text"),
+    Column("relative", "relative", percent, "relative_error"),
+    Column("meshes", "meshes", count),
+    Column("missing", "missing", count),
+    Column("above_rtol", "above rtol", count),
 )
 
 
@@ -61,8 +70,34 @@ def study_verdict(frame: pd.DataFrame, failed: Mapping[str, str]) -> tuple[tuple
         )
         if shown < total
     ]
-    sentences = tuple(_sentence(order, rows, frame.attrs["reference"]) for order, rows in groups)
-    return sentences, lines, " and ".join(omitted)
+    sentences = []
+    for order, rows in groups:
+        at_sizes = [rows[rows["mesh"].isin(labels)] for labels in sizes]
+        sentences.append(f"{_of_sizes(order, at_sizes)}{_sentence(order, rows, frame.attrs['reference'])}")
+    return tuple(sentences), lines, " and ".join(omitted)
+
+
+def _of_sizes(order: float, at_sizes: Sequence[pd.DataFrame]) -> str:
+    """Return a sentence on which family is nearest where meshes of several families have about as many triangles."""
+    wins, leads = Counter[str](), []
+    for members in at_sizes:
+        if (closest := nearest(members)) is not None:
+            best, rivals = closest
+            families = members["family"]
+            if not any(members["mesh"].isin(rivals) & (families != best["family"])):
+                wins[best["family"]] += 1
+                second = members["distance"][families != best["family"]].min()
+                leads.append(second / best["distance"] if best["resolved"] else math.inf)
+    if not wins:
+        return ""
+    total, at_order = len(at_sizes), minus(f"at order {order:g}")
+    where = "at the same size" if total == 1 else f"at {{}} of {total:,} sizes"
+    counts = [f"{family} is nearest {where.format(count)}" for family, count in wins.most_common(_MOST_FAMILIES)]
+    if len(wins) > 1 or wins.total() < total or not np.isfinite(leads).all():
+        return f"{', '.join(counts)}, {at_order}. "
+    low, high = (f"{lead:.2g}" for lead in (min(leads), max(leads)))
+    lead = low if low == high else f"{low} to {high}"
+    return f"{counts[0].replace(f'{total} of', 'each of')}, {lead} times nearer than the next, {at_order}. "
 
 
 def _sentence(order: float, rows: pd.DataFrame, reference: str) -> str:
@@ -172,24 +207,50 @@ def _names(labels: Sequence[str]) -> str:
     return ", ".join(labels[:MOST_NAMED]) + (f" and {more:,} more" if more > 0 else "")
 
 
-def format_verdict(
-    tree: xr.DataTree,
-    style: Format = "text",
-    orders: Sequence[float] | None = None,
-    *,
-    frame: pd.DataFrame | None = None,
-) -> str:
-    """Return the verdict on the study of an open store as text, or its rows for programs; its `table` may be given."""
+def format_verdict(tree: xr.DataTree, style: Format = "text", orders: Sequence[float] | None = None) -> str:
+    """Return the verdict on the study of an open store as text, or its rows for programs."""
     require_one_object(tree)
-    frame = table(tree, orders) if frame is None else frame
+    frame = table(tree, orders)
     reasons = frame[frame["status"] != "complete"].drop_duplicates("mesh").set_index("mesh")["reason"]
-    _, rows, omitted = study_verdict(frame, reasons.to_dict())
+    sentences, rows, omitted = study_verdict(frame, reasons.to_dict())
     names = ("order", "verdict", "mesh", "relative", "relative_error", "triangles", "remark", "absent")
     for_programs = pd.DataFrame(rows, columns=[*names]).astype({"triangles": "Int64"})
     blank = {"mesh": "", "relative": math.nan, "triangles": pd.NA}
     full = [{**blank, "remark": row.get("absent", ""), **row, "absent": ""} for row in rows]
-    sections = [
+    sections = [Section(sentences=[line for sentence in sentences for line in wrapped(sentence)])]
+    sections += [
         Section(f"Verdict at order {order:g}", [(VERDICT_COLUMNS, [row for row in full if row["order"] == order])])
         for order in frame["order"].drop_duplicates()
     ]
-    return rendered(style, for_programs, sections, [f"Only {omitted} are shown."] if omitted else [])
+    notes, known = [f"Only {omitted} are shown."] if omitted else [], remarks(tree, frame)
+    notes += known[:_MOST_REMARKS]
+    notes += [f"and {len(known) - _MOST_REMARKS:,} more remarks"] if len(known) > _MOST_REMARKS else []
+    return rendered(style, for_programs, sections, notes)
+
+
+def format_objects(
+    store: AnyStore, style: Format = "text", orders: Sequence[float] | None = None, *, most: int | None = None
+) -> str:
+    """Return a row for each object, the worst ones first, or at most some of them.
+
+    Those are first that lack most meshes, and then those whose nearest mesh is farthest from its reference.
+    """
+    rows: list[Row] = []
+    for name, frame in tables_of(store, orders).items():
+        for order, of_order in frame.groupby("order", sort=False):
+            known = of_order[of_order["distance"].notna()]
+            best = None if known.empty else known.loc[known["relative"].idxmin()]
+            numbers = (
+                {"mesh": "", "relative": math.nan} if best is None else best[["mesh", "relative", "relative_error"]]
+            )
+            count = {"meshes": len(known), "missing": len(of_order) - len(known)}
+            imprecise = int((known["resolved"].astype(bool) & ~known["within"].astype(bool)).sum())
+            rows.append({"order": order, "object": name, **numbers, **count, "above_rtol": imprecise})
+    frame = pd.DataFrame(rows).sort_values(["missing", "relative"], ascending=False, kind="stable")
+    sections, notes = [], []
+    for order, of_order in frame.groupby("order", sort=False):
+        shown = of_order.to_dict(orient="records")[:most]
+        sections.append(Section(f"Objects at order {order:g}, the worst first", [(_OBJECT_COLUMNS, shown)]))
+        if len(shown) < len(of_order):
+            notes = [f"{len(of_order) - len(shown):,} more: sobolev-batch table objects STORE"]
+    return rendered(style, frame, sections, notes)

@@ -246,7 +246,9 @@ def _rows(tree: xr.DataTree, order: Orders | None) -> pd.DataFrame:
         # Tables of older versions lack some.
         numbers = {key: row[key].values[others] for key in _NUMBERS if key in row}
         frames.append(pd.DataFrame({"order": s, **columns, **numbers, **nearness}))
-    frame = pd.concat(frames, ignore_index=True).astype({name: "Int64" for name in _COUNTS if name in about})
+    counts = {name: "Int64" for name in _COUNTS if name in about}
+    frame = pd.concat(frames, ignore_index=True).astype(counts)
+    frame.loc[frame["status"] != "complete", [*counts]] = pd.NA
     frame.attrs = {key: convergence.attrs[key] for key in ("rtol", "computed") if key in convergence.attrs}
     if known := metadata_of(tree):
         frame.attrs["metadata"] = known
@@ -283,13 +285,9 @@ def format_table(
     orders: Sequence[float] | None = None,
     *,
     x: str = EDGE_LENGTH,
-    frames: Mapping[str, pd.DataFrame] | None = None,
 ) -> str:
-    """Return the convergence tables of a store, or of several objects by their names, as text.
-
-    What `tables_of` returns for them may be given.
-    """
-    frames = tables_of(store, orders, x=x) if frames is None else frames
+    """Return the convergence tables of a store, or of several objects by their names, as text."""
+    frames = tables_of(store, orders, x=x)
     stores = stores_of(store)
     trees = {name: as_tree(stores[name]) for name in frames}
     rows = _joined(frames)
@@ -317,8 +315,7 @@ def _sections(name: str, tree: xr.DataTree, frame: pd.DataFrame, x: str) -> Iter
         yield Section("How triangles are connected", [((_MESH, *connection), once)])
     if "computed" in frame.attrs:
         yield Section(sentences=order_note(tree, frame.attrs["computed"]))
-    doubts = [f"{mesh}: {doubt}" for mesh, doubt in placement_doubts(tree).items()]
-    yield Section(sentences=[*_failures(tree, frame), *doubts])
+    yield Section(sentences=remarks(tree, frame))
 
 
 def nearest(frame: pd.DataFrame) -> tuple[pd.Series, tuple[str, ...]] | None:
@@ -382,7 +379,8 @@ def unit_notes(trees: Sequence[xr.DataTree]) -> list[str]:
     return _UNIT_NOTE.format(", ".join(units), own).splitlines()
 
 
-def _failures(tree: xr.DataTree, frame: pd.DataFrame) -> list[str]:
+def remarks(tree: xr.DataTree, frame: pd.DataFrame) -> list[str]:
+    """Return why meshes of an object are missing or lack a number, and what makes one doubt others."""
     rows = frame.drop_duplicates("mesh")
     failures = [f"{row.mesh} failed: {row.reason}" for row in rows.query("status == 'failed'").itertuples(index=False)]
     if missing := int((rows["status"] == "missing").sum()):
@@ -390,7 +388,7 @@ def _failures(tree: xr.DataTree, frame: pd.DataFrame) -> list[str]:
     if has_proximity(tree):
         reasons = finished_group(tree, "proximity")["reason"].to_series()
         failures += [f"{mesh} has no proximity: {reason}" for mesh, reason in reasons.items() if reason]
-    return failures
+    return [*failures, *(f"{mesh}: {doubt}" for mesh, doubt in placement_doubts(tree).items())]
 
 
 def _with_rates(frame: pd.DataFrame, x: str) -> pd.DataFrame:

@@ -109,7 +109,7 @@ def test_meshes_that_take_long_to_make_count(plan: Plan) -> None:
 def test_workers_of_a_cluster_are_tried(client: Client, plan: Plan) -> None:
     found = sb.plan(sb.Study.from_table(small_table()), "memory://forecast-cluster.zarr", client)
     assert 0 < found.seconds <= found.processor_seconds < 60
-    *_, first, second = str(found).splitlines()
+    first, second, *_ = str(found).splitlines()
     assert re.fullmatch(r"time: +about \d+(\.\d+)? s for 5 missing fields, with 2 tasks at once", first)
     assert second.endswith("the speed is that of a transform on a worker")
     assert "1 tiles, 2.4KB on disk" in str(found)
@@ -130,7 +130,7 @@ def test_of_many_objects_some_are_looked_at(tmp_path: Path, monkeypatch: pytest.
     assert (found.count, found.share) == (40, 2.5)
     assert found.total_bytes == 40 * found.objects["ball00"].total_bytes
     assert "for 200 missing fields" in str(found)
-    assert str(found).splitlines()[-1].startswith("40 objects, of which 16 were looked at")
+    assert re.search("^objects: +40, of which 16 were looked at; ", str(found), re.M)
 
 
 def made_of(**families: Mapping[str, Any] | list[int]) -> list[dict[str, Any]]:
@@ -235,7 +235,7 @@ def test_a_plan_fits_the_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     found = sb.plan(sb.Study.from_table(small_table(study={"name": "small", "title": title})), tmp_path / ("x" * 60))
     lines = str(found).splitlines()
     assert {len(line) > 60 for line in lines if "x" * 60 not in line} == {False}
-    assert " ".join(str(found).split()).startswith(f"study: {title}")
+    assert f" study: {title} " in " ".join(str(found).split())
     assert lines[1].startswith(" " * 15)
 
 

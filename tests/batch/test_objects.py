@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from sobolev_batch.store.lock import Lock, locked
 from sobolev_batch.store.objects import Objects
 from sobolev_batch.store.records import Records
 from sobolev_batch.study.plan import Plan, make_plan
+from sobolev_batch.tables.conclusion import format_objects
 from tests.support.commands import call
 from tests.support.stores import flip
 from tests.support.studies import GONE, balls, methods_of, small_table
@@ -58,7 +60,7 @@ def test_each_object_has_a_store_of_its_own(store: Path, threads: Client, tmp_pa
     assert ours.equals(own)
     tree = xr.open_datatree(store, engine="zarr", consolidated=False)
     assert tree["a/convergence"]["distance"].sizes == {"mesh": 5, "order": 2}
-    assert tree.attrs["study"]["objects"] == ["a", "gone", "b"]
+    assert json.loads(tree.attrs["study"])["objects"] == ["a", "gone", "b"]
 
 
 def test_what_is_damaged_is_named_with_its_object(changeable: Path) -> None:
@@ -153,13 +155,13 @@ def test_a_plan_goes_on_past_an_object_that_cannot_be(tmp_path: Path) -> None:
     assert plan.objects["b"].store == str(tmp_path / "s.zarr" / "b")
     assert plan.total_bytes == 2 * plan.objects["a"].total_bytes
     assert "the reference cannot be made" in plan.refused["gone"]
-    assert str(plan).startswith("a:\nstudy:")
+    assert "\na:\nstudy:" in str(plan)
     path.write_text(tomli_w.dumps(made.table))
     done = call("plan", path, "--store", tmp_path / "s.zarr")
     assert done.returncode == 3
     heads = [line for line in done.stdout.splitlines() if line.startswith(("a:", "gone:", "b:"))]
-    assert heads[:2] == ["a:", "b:"]
-    assert heads[2].startswith("gone: the reference cannot be made")
+    assert heads[0].startswith("gone: the reference cannot be made")
+    assert heads[1:] == ["a:", "b:"]
     done = call("plan", path, "--store", tmp_path / "s.zarr", "--format", "json")
     table = json.loads(done.stdout)
     assert (done.returncode, list(table["objects"]), list(table["refused"])) == (3, ["a", "b"], ["gone"])
@@ -351,3 +353,14 @@ def test_a_run_of_a_part_takes_objects_families_or_members(changeable: Path, thr
     assert set(sb.run(study, changeable, threads).computed) == {"q/ico/1", "q/ico/2", "q/egg/2"}
     with pytest.raises(sb.errors.StudyError, match="no object, family or member of the study is 'r'"):
         sb.run(study, changeable, threads, only=["r"])
+
+
+def test_objects_are_listed_from_the_worst_one(store: Path) -> None:
+    rows = pd.read_csv(StringIO(format_objects(store, "csv", [-3.0])))
+    assert rows["object"].tolist() == rows.sort_values("relative", ascending=False)["object"].tolist()
+    table = sb.table(store, -3.0)
+    for _, row in rows.iterrows():
+        of_object = table[(table["object"] == row["object"]) & (table["mesh"] != "reference")]
+        assert row["relative"] == of_object["relative"].min()
+        assert (row["meshes"], row["missing"]) == (len(of_object), 0)
+    assert f"{len(rows) - 1} more: sobolev-batch table objects" in format_objects(store, most=1)

@@ -22,6 +22,7 @@ from sobolev_batch.tables.conclusion import format_verdict
 from sobolev_batch.tables.convergence import format_smallest, format_table
 from sobolev_batch.tables.matrix import format_matrix
 from sobolev_batch.tables.rendering import printed_table
+from tests.support.made_tree import root_attributes
 from tests.support.studies import small_table
 
 
@@ -35,9 +36,13 @@ def test_text_shows_values_rates_what_is_missing_and_a_verdict(tree: xr.DataTree
     assert "\n\nf_1/2 failed: no 50% of it | is <there>\n\n" in text
     # A mesh need not be resolved to be nearer than all others.
     unresolved, sure = (format_verdict(tree, "text", [order]).splitlines() for order in (-2.5, -10.0))
-    assert " ".join(unresolved[4].split()) == "nearest of all f_1/1 5.000 % ± 0.005 % 1,280"
-    assert " ".join(sure[4].split()) == "nearest of all f_1/1 2.500 % ± 0.003 % 1,280"
-    assert sure[-1].split() == ["missing", "f_1/2"]
+    assert " ".join(unresolved[6].split()) == "nearest of all f_1/1 5.000 % ± 0.005 % 1,280"
+    assert " ".join(sure[6].split()) == "nearest of all f_1/1 2.500 % ± 0.003 % 1,280"
+    assert [" ".join(line.split()) for line in sure[-3:]] == [
+        "missing f_1/2",
+        "",
+        "f_1/2 failed: no 50% of it | is <there>",
+    ]
     frame = pd.read_csv(StringIO(format_verdict(tree, "csv", [-10.0])))
     assert frame.loc[0, ["verdict", "mesh", "triangles"]].tolist() == ["nearest of all", "f_1/1", 1280]
 
@@ -152,8 +157,7 @@ def test_a_store_without_upper_bounds_has_lower_ones(near: xr.DataTree) -> None:
 
 
 def test_lengths_are_in_the_unit_of_the_files(near: xr.DataTree) -> None:
-    near.attrs["similarity"] = {"scale": 0.02, "origin": [0.0, 0.0, 0.0]}
-    near.attrs["study"]["table"]["study"]["length_unit"] = "mm"
+    near.attrs = root_attributes(0.02, length_unit="mm")
     near["proximity"].attrs["metrics"] = ["hausdorff", "volume"]
     volumes = ("mesh", [4.0, np.nan, np.nan, np.nan])
     near["meshes"] = xr.DataTree(near["meshes"].to_dataset().assign(volume=volumes))

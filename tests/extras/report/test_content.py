@@ -65,6 +65,7 @@ def test_the_nearest_mesh_of_each_size_and_the_smallest_below_bounds() -> None:
     meshes = [("a", 100, 0.2), ("b", 110, 0.1), ("a", 400, 0.02), ("b", 390, 0.04), ("b", 4000, 0.005)]
     sentence, rows, omitted = verdict_on(frame(meshes))
     assert sentence == (
+        "b is nearest at 1 of 2 sizes, a is nearest at 1 of 2 sizes, at order −2. "
         "Of 5 meshes, b/4000 is nearest to the reference at order −2: it differs by 0.5000\xa0%\xa0±\xa00.0005\xa0%."
     )
     assert rows["100 to 110 triangles"] == ["b/110", "10.00 % ± 0.01 %", "110", "2 times nearer than a/100"]
@@ -104,7 +105,9 @@ def test_a_mesh_that_equals_the_reference_is_nearest() -> None:
     made = frame([("a", 100, 0.0), ("b", 100, 1.03), ("b", 400, 0.7)], error=0.03)
     made.loc[0, ["error", "relative_error", "resolved"]] = 8e-10, 2e-10, False
     sentence, rows, _ = verdict_on(made)
-    assert sentence.startswith("Of 3 meshes, a/100 is nearest to the reference")
+    assert sentence.startswith(
+        "a is nearest at the same size, at order −2. Of 3 meshes, a/100 is nearest to the reference"
+    )
     assert "open" not in sentence
     assert rows["100 triangles"] == ["a/100", "0 % ± 2 × 10⁻⁸ %", "100", "below its error, nearer than b/100"]
     # Another one may be as near.
@@ -115,6 +118,19 @@ def test_a_mesh_that_equals_the_reference_is_nearest() -> None:
     made.loc[1, "error"] = np.nan
     sentence, _, _ = verdict_on(made)
     assert sentence.endswith("whether one of b/400, b/100 is nearer.")
+
+
+def test_the_first_sentence_compares_meshes_of_one_size() -> None:
+    meshes = [("a", 100, 0.2), ("b", 100, 0.5), ("a", 400, 0.02), ("b", 400, 0.06), ("b", 4000, 0.005)]
+    sentence, _, _ = verdict_on(frame(meshes))
+    assert sentence.startswith("a is nearest at each of 2 sizes, 2.5 to 3 times nearer than the next, at order −2. ")
+    # The errors of the small ones leave open which is nearer.
+    made = frame(meshes)
+    made.loc[[0, 1], "error"] = 4.0
+    sentence, _, _ = verdict_on(made)
+    assert sentence.startswith("a is nearest at 1 of 2 sizes, at order −2. Of 5 meshes, b/4000 ")
+    made.loc[[2, 3], "error"] = 4.0
+    assert verdict_on(made)[0].startswith("Of 5 meshes, b/4000 ")
 
 
 def test_the_nearest_of_all_is_compared_with_its_like() -> None:
