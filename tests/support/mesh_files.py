@@ -239,6 +239,21 @@ def gmsh_first(vertices: ArrayLike, faces: Faces, *, face_count: int | None = No
     return "\n".join(lines).encode()
 
 
+def gmsh_first_binary(vertices: ArrayLike, faces: Faces, order: str = "<") -> bytes:
+    """Return the same in binary of an order, with two blocks of each kind of cell, and tetrahedra after them."""
+    rows = [struct.pack(f"{order}i3d", 10 * (i + 1), *map(float, row)) for i, row in enumerate(np.asarray(vertices))]
+    cells = [struct.pack(f"{order}6i", 15, 1, 2, 1, 0, 1) + struct.pack(f"{order}i", 10)]
+    for size in sorted({len(face) for face in faces}):
+        some = [face for face in faces if len(face) == size]
+        for part in (some[:1], some[1:]):
+            cells.append(struct.pack(f"{order}3i", size - 1, len(part), 3) if part else b"")
+            cells += [struct.pack(f"{order}{4 + size}i", 9, 0, 1, 2, *(10 * (v + 1) for v in face)) for face in part]
+    cells.append(struct.pack(f"{order}3i", 4, 1, 0) + struct.pack(f"{order}5i", 99, 10, 20, 30, 50))
+    head = b"$MeshFormat\n2.2 1 8\n" + struct.pack(f"{order}i", 1) + b"\n$EndMeshFormat\n$Nodes\n"
+    body = b"%d\n%s\n$EndNodes\n$Elements\n" % (len(rows), b"".join(rows[::-1]))
+    return head + body + b"%d\n%s\n$EndElements\n" % (2 + len(faces), b"".join(cells))
+
+
 def gmsh(vertices: ArrayLike, faces: Faces, order: str = "", *, face_count: int | None = None) -> bytes:
     """Return a Gmsh mesh of the format 4.1, in text or in binary of an order, with nodes of parametric coordinates."""
 
@@ -340,6 +355,7 @@ BOXES: dict[str, Content] = {
     "freesurfer without volume": (".rh.white", freesurfer(BOX_VERTICES, BOX_TRIANGLES)),
     "medit": (".mesh", medit(BOX_VERTICES, BOX_TRIANGLES)),
     "gmsh 2.2": (".msh", gmsh_first(BOX_VERTICES, BOX_TRIANGLES)),
+    "gmsh 2.2 little": (".msh", gmsh_first_binary(BOX_VERTICES, BOX_TRIANGLES)),
     "gmsh 4.1": (".msh", gmsh(BOX_VERTICES, BOX_TRIANGLES)),
     "gmsh 4.1 little": (".msh", gmsh(BOX_VERTICES, BOX_TRIANGLES, "<")),
     "gmsh 4.1 big": (".msh", gmsh(BOX_VERTICES, BOX_TRIANGLES, ">")),

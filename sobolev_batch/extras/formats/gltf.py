@@ -51,13 +51,13 @@ def parse_gltf(data: bytes, beside: Mapping[str, bytes]) -> Raw:
         node = tree["nodes"][index]
         if "mesh" not in node:
             continue
-        mesh = tree["meshes"][node["mesh"]]
+        mesh = _entry(tree, "meshes", node["mesh"])
         for primitive in mesh["primitives"]:
             if primitive.get("mode", _TRIANGLES) < _TRIANGLES:
                 continue
             vertices, triangles = _primitive(tree, buffers, primitive, node.get("weights", mesh.get("weights", [])))
             if "skin" in node:
-                skin, attributes = tree["skins"][node["skin"]], primitive["attributes"]
+                skin, attributes = _entry(tree, "skins", node["skin"]), primitive["attributes"]
                 vertices = _skinned(tree, buffers, attributes, skin, matrices, vertices)
             for instance in _instances(tree, buffers, node):
                 # Its joints alone place a skin.
@@ -98,14 +98,26 @@ def _loaded_buffers(tree: dict[str, Any], binary: bytes | None, beside: Mapping[
     return buffers
 
 
-def _values(tree: dict[str, Any], buffers: list[bytes], index: int, kind: str) -> NDArray[Any]:
-    """Return the values of an accessor: (count,) of a SCALAR, (count, 3) of a VEC3 and so on."""
-    accessor = tree["accessors"][index]
+def _entry(tree: Mapping[str, Any], kind: str, index: Any) -> Any:
+    """Return an entry of a list of the document; its index need not be one."""
+    entries = tree.get(kind, [])
+    if type(index) is not int or not 0 <= index < len(entries):
+        raise MeshError(f"it refers to the entry {str(index)[:20]} of its {kind}, of which it has {len(entries)}")
+    return entries[index]
+
+
+def _values(
+    tree: dict[str, Any], buffers: list[bytes], index: int, kind: str, expected: int | None = None
+) -> NDArray[Any]:
+    """Return the values of an accessor: (count,) of a SCALAR, (count, 3) of a VEC3 and so on, as many as expected."""
+    accessor = _entry(tree, "accessors", index)
+    if expected not in (None, accessor["count"]):
+        raise MeshError(f"accessor {index} has {accessor['count']} entries, expected {expected}")
     if accessor["type"] != kind:
         raise MeshError(f"accessor {index} has the type {accessor['type']}, expected {kind}")
     if "sparse" in accessor or "bufferView" not in accessor:
         raise MeshError(f"accessor {index} is sparse or without data: not supported, export it plainly")
-    view = tree["bufferViews"][accessor["bufferView"]]
+    view = _entry(tree, "bufferViews", accessor["bufferView"])
     dtype, width, count = np.dtype(_COMPONENTS[accessor["componentType"]]), _WIDTHS[kind], accessor["count"]
     stride = view.get("byteStride", dtype.itemsize * width)
     offset = accessor.get("byteOffset", 0)
@@ -114,7 +126,7 @@ def _values(tree: dict[str, Any], buffers: list[bytes], index: int, kind: str) -
         raise MeshError(f"accessor {index} has entries of {dtype.itemsize * width} bytes every {stride} bytes")
     if min(offset, count) < 0 or end > view["byteLength"]:
         raise MeshError(f"accessor {index} announces {count} entries, more than its {view['byteLength']} bytes hold")
-    start, buffer = view.get("byteOffset", 0), buffers[view["buffer"]]
+    start, buffer = view.get("byteOffset", 0), _entry({"buffers": buffers}, "buffers", view["buffer"])
     if start < 0 or start + view["byteLength"] > len(buffer):
         raise MeshError(f"a buffer view ends at byte {start + view['byteLength']} of a buffer of {len(buffer)}")
     values: NDArray[Any] = np.ndarray((count, width), dtype, buffer, start + offset, (stride, dtype.itemsize))
@@ -157,7 +169,7 @@ def _node_matrices(tree: dict[str, Any]) -> dict[int, Reals]:
     nodes = tree.get("nodes", [])
     scenes = tree.get("scenes")
     if scenes:
-        roots = scenes[tree.get("scene", 0)].get("nodes", [])
+        roots = _entry(tree, "scenes", tree.get("scene", 0)).get("nodes", [])
     else:
         children = {child for node in nodes for child in node.get("children", [])}
         roots = [index for index in range(len(nodes)) if index not in children]
@@ -165,10 +177,11 @@ def _node_matrices(tree: dict[str, Any]) -> dict[int, Reals]:
     found: dict[int, Reals] = {}
     while pending:
         index, parent_matrix = pending.pop()
-        if index in found or not 0 <= index < len(nodes):
-            raise MeshError(f"node {index} of the scene is missing or has two parents")
-        found[index] = matrix = parent_matrix @ _matrix(nodes[index])
-        pending += [(child, matrix) for child in reversed(nodes[index].get("children", []))]
+        if index in found:
+            raise MeshError(f"node {index} of the scene has two parents")
+        node = _entry(tree, "nodes", index)
+        found[index] = matrix = parent_matrix @ _matrix(node)
+        pending += [(child, matrix) for child in reversed(node.get("children", []))]
     return found
 
 
@@ -214,14 +227,18 @@ def _skinned(
     vertices: Reals,
 ) -> Reals:
     """Return the vertices of a skin where its joints hold them."""
+    if lost := [joint for joint in skin["joints"] if joint not in matrices]:
+        raise MeshError(f"a skin has the joint {str(lost[0])[:20]}, which is no node of the scene; export it whole")
     joints = np.array([matrices[joint] for joint in skin["joints"]])
     if "inverseBindMatrices" in skin:
         inverse = _values(tree, buffers, skin["inverseBindMatrices"], "MAT4").reshape(-1, 4, 4).transpose(0, 2, 1)
+        if len(inverse) < len(joints):
+            raise MeshError(f"a skin has {len(joints)} joints and {len(inverse)} matrices to bind them")
         joints = joints @ inverse[: len(joints)]
     found = np.zeros_like(vertices)
     for group in takewhile(lambda group: f"JOINTS_{group}" in attributes, count()):
-        held = _values(tree, buffers, attributes[f"JOINTS_{group}"], "VEC4")
-        weights = _values(tree, buffers, attributes[f"WEIGHTS_{group}"], "VEC4")
+        held = _values(tree, buffers, attributes[f"JOINTS_{group}"], "VEC4", len(vertices))
+        weights = _values(tree, buffers, attributes[f"WEIGHTS_{group}"], "VEC4", len(vertices))
         for joint in range(4):
             by = joints[held[:, joint], :3]
             found += weights[:, joint, None] * (np.einsum("nij,nj->ni", by[..., :3], vertices) + by[..., 3])
@@ -235,7 +252,7 @@ def _primitive(
     vertices = _values(tree, buffers, primitive["attributes"]["POSITION"], "VEC3").astype(np.float64)
     for target, weight in zip(primitive.get("targets", []), weights, strict=False):
         if weight and "POSITION" in target:
-            vertices += weight * _values(tree, buffers, target["POSITION"], "VEC3")
+            vertices += weight * _values(tree, buffers, target["POSITION"], "VEC3", len(vertices))
     if "indices" in primitive:
         corners = _values(tree, buffers, primitive["indices"], "SCALAR").astype(np.int64)
     else:

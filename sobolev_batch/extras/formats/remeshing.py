@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.formats.by_name import Format
-from sobolev_batch.geometry.formats.parsing import Raw, beside_volume, reals
+from sobolev_batch.geometry.formats.parsing import Raw, beside_volume, reals, whole
 from sobolev_batch.geometry.formats.polygons import cut_polygons
 
 # Medit's cells with volume.
@@ -48,12 +48,11 @@ def parse_medit(data: bytes) -> Raw:
 
 
 def parse_gmsh(data: bytes) -> Raw:
-    """Return the vertices and triangles of a Gmsh mesh: of its format 4.1, or of 2.2 in text."""
-    head = re.match(rb"\$MeshFormat\s+(2\.2\s+0|4\.1\s+[01])\s+8[ \t]*\r?\n(.{4})", data, re.DOTALL)
+    """Return the vertices and triangles of a Gmsh mesh of the format 2.2 or 4.1."""
+    head = re.match(rb"\s*\$MeshFormat\s+((?:2\.[0-2]|4\.1)\s+[01])\s+8[ \t]*\r?\n(.{4})", data, re.DOTALL)
     if head is None:
         raise MeshError(
-            "it is no Gmsh mesh of the format 4.1, or 2.2 in text; convert it: "
-            "gmsh scan.msh -save -format msh41 -o surface.msh"
+            "it is no Gmsh mesh of the format 2.2 or 4.1; convert it: gmsh scan.msh -save -format msh41 -o surface.msh"
         )
     order = "" if head[1].endswith(b"0") else "<" if head[2] == b"\1\0\0\0" else ">"
     nodes, cells = (_Numbers(data, name, order) for name in (b"Nodes", b"Elements"))
@@ -87,7 +86,8 @@ class _Numbers:
         if self.order:
             dtype = np.dtype(self.order + code)
             self.place += count * dtype.itemsize
-            found = np.frombuffer(self.values[start : self.place], dtype)
+            held = max(0, min(count, (len(self.values) - start) // dtype.itemsize))
+            found = np.frombuffer(self.values, dtype, held, min(start, len(self.values)))
         else:
             self.place += count
             found = self.values[start : self.place]
@@ -99,12 +99,20 @@ class _Numbers:
         """Return the next number, which counts others."""
         return int(self.take(1)[0])
 
+    def line(self) -> int:
+        """Return a count that is a line of its own, as in binary of the format 2.2."""
+        end = self.values.find(b"\n", self.place) + 1
+        text, self.place = self.values[self.place : end].decode("ascii", "replace").strip(), end
+        return whole(text, "a section")
+
 
 # What is read of nodes and cells: the number and the coordinates of each node (n, 4), and kinds with corners (m, k).
 _Read = tuple[Reals, list[tuple[int, NDArray[Any]]]]
 
 
 def _of_second_format(nodes: _Numbers, cells: _Numbers) -> _Read:
+    if nodes.order:
+        return _of_second_binary(nodes, cells)
     numbered = nodes.take(4 * nodes.count()).reshape(-1, 4)
     rows: dict[int, list[list[float]]] = {kind: [] for kind in _CORNERS}
     count, numbers, place = cells.count(), cells.values.tolist(), 1
@@ -117,6 +125,24 @@ def _of_second_format(nodes: _Numbers, cells: _Numbers) -> _Read:
         rows[int(kind)].append(numbers[end - _corners(int(kind)) : end])
         place = end
     return numbered, [(kind, np.array(found)) for kind, found in rows.items() if found]
+
+
+def _of_second_binary(nodes: _Numbers, cells: _Numbers) -> _Read:
+    count = nodes.line()
+    # A number of four bytes and three coordinates of eight.
+    records = nodes.take(28 * count, "u1").reshape(count, 28)
+    numbers, places = (np.ascontiguousarray(part) for part in np.split(records, [4], axis=1))
+    rows: dict[int, list[NDArray[Any]]] = {kind: [] for kind in _CORNERS}
+    left = cells.line()
+    while left > 0:
+        kind, count, tags = cells.take(3, "i4").tolist()
+        width = 1 + tags + _corners(kind)
+        if tags < 0 or not 0 < count <= left:
+            raise MeshError("a section breaks off, or has wrong counts before")
+        rows[kind].append(cells.take(count * width, "i4").reshape(count, width)[:, 1 + tags :])
+        left -= count
+    numbered = np.column_stack([numbers.view(f"{nodes.order}i4"), places.view(f"{nodes.order}f8")])
+    return numbered, [(kind, np.concatenate(found)) for kind, found in rows.items() if found]
 
 
 def _of_fourth_format(nodes: _Numbers, cells: _Numbers) -> _Read:

@@ -84,11 +84,6 @@ def parse_ply(data: bytes) -> Raw:
     """Return the vertices and triangles of a PLY file, in its own precision."""
     elements, start, is_text = _parsed_header(data[:HEADER_BYTES])
     counts = {name: element.count for name, element in elements.items()}
-    if counts.get("vertex") and not any(map(counts.get, ("face", "tristrips"))):
-        raise MeshError(
-            f"the PLY file has {counts['vertex']} vertices and no faces: it holds points and no surface; make a mesh "
-            "of them first"
-        )
     left = len(data) - start
     # The last number of a text need not be followed by anything.
     if sum(one.count * one.least_bytes(is_text) for one in elements.values()) - is_text > left:
@@ -112,7 +107,7 @@ def parse_ply(data: bytes) -> Raw:
     if counts.get("tristrips"):
         found.append(Raw(vertices, triangle_strips(*_corners("tristrips", columns["tristrips"]))))
     if not found:
-        raise MeshError("the file has no faces")
+        found.append(cut_polygons(vertices, *np.zeros((2, 0), np.int64)))
     return found[0]._replace(triangles=np.concatenate([one.triangles for one in found])) if found[1:] else found[0]
 
 

@@ -24,8 +24,8 @@ _AXES = (1.0, 0.618, 0.414)
 # Faces that are bent by less, as a fraction of the size of the mesh, are flat: single precision rounds as much. Areas
 # that differ by less, as a fraction, are equal, and those below a fraction of the squared size are rounding.
 _FLAT, _EQUAL_AREAS, _NO_AREA = 1e-6, 1e-6, 1e-12
-# The largest turn to the wrong side, and error of the sum of all turns, of a convex polygon, in radians.
-_WRONG_TURN, _WRONG_SUM = 1e-9, 1e-3
+# The largest turn to the wrong side of a convex polygon, in radians, and error of the sum of all, in whole turns.
+_WRONG_TURN, _WRONG_SUM = 1e-9, 1e-4
 # Of faces: heights above and below their planes, areas, those with another cut, and whether they cross themselves.
 _Measures = list[tuple[Reals, Reals, Reals, NDArray[np.bool_]]]
 
@@ -39,7 +39,8 @@ def cut_polygons(vertices: NDArray[Any], corners: Indices, sizes: Indices) -> Ra
     polygons, one after the other, the sizes their numbers.
     """
     if not len(sizes):
-        raise MeshError("the file has no faces")
+        points = f": its {len(vertices):,} vertices are points or lines; make a surface of them first"
+        raise MeshError(f"the file has no faces{points * (len(vertices) > 0)}")
     short = np.flatnonzero(sizes < 3)
     if short.size:
         raise MeshError(f"face {short[0] + 1} has {sizes[short[0]]} vertices, expected three or more")
@@ -142,11 +143,8 @@ def _is_turned(axes: list[Reals], quads: Indices, found: _Measures) -> NDArray[n
 def _cut_others(axes: list[Reals], corners: Indices, sizes: Indices, found: _Measures) -> tuple[Indices, Indices]:
     """Return the triangles (k, 3) of polygons of more than four corners, and the polygon of each triangle (k,)."""
     starts, polygon = np.cumsum(sizes) - sizes, np.repeat(np.arange(len(sizes)), sizes)
-    heights = np.nan_to_num(sum(weight * axis[corners] for weight, axis in zip(_AXES, axes, strict=True)))
-    lowest = np.flatnonzero(heights == np.minimum.reduceat(heights, starts)[polygon])
-    lowest = lowest[np.searchsorted(polygon[lowest], np.arange(len(sizes)))]
     begins, rank = starts[polygon], np.arange(len(corners)) - starts[polygon]
-    corners = corners[begins + (rank + (lowest - starts)[polygon]) % sizes[polygon]]
+    corners = corners[begins + (rank + _lowest(axes, corners, starts, polygon)[polygon]) % sizes[polygon]]
     following = begins + (rank + 1) % sizes[polygon]
     # From a point nearby: far from the origin, the parts cancel.
     points = np.array([axis[corners] - axis[corners[begins]] for axis in axes])
@@ -156,31 +154,51 @@ def _cut_others(axes: list[Reals], corners: Indices, sizes: Indices, found: _Mea
     dropped = np.abs(normals).argmax(axis=0)
     twice = normals[dropped, np.arange(len(sizes))]
     plane = np.array([points[(dropped[polygon] + shift) % 3, np.arange(len(corners))] for shift in (1, 2)])
+    turns = _turns(plane, following, np.sign(twice)[polygon])
+    whole_turns = np.add.reduceat(turns, starts) / (2 * np.pi)
+    is_convex = (np.minimum.reduceat(turns, starts) > -_WRONG_TURN) & (np.abs(whole_turns - 1) < _WRONG_SUM)
+    # Coordinates that are no numbers are refused later.
+    is_convex |= ~np.isfinite(np.add.reduceat(np.abs(points).sum(axis=0), starts))
+    triangles, owners = _fans_and_ears(plane, sizes, is_convex, twice)
+    lengths = np.sqrt(dot(normals, normals))
+    offsets = dot(points, normals[:, polygon] / np.where(lengths > 0, lengths, 1.0)[polygon])
+    heights = np.maximum.reduceat(offsets, starts) - np.minimum.reduceat(offsets, starts)
+    a, b, c = (points[:, corner] for corner in triangles.T)
+    areas = np.bincount(owners, cross_lengths(b - a, c - a), len(sizes)) / 2
+    u, v = plane[:, triangles[:, 1:]] - plane[:, triangles[:, :1]]
+    in_plane = np.bincount(owners, np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]), len(sizes))
+    # Where an outline turns back by half a turn, nothing tells the side to which it turns.
+    tips = np.add.reduceat(turns > np.pi - _WRONG_TURN, starts)
+    is_crossed = (np.abs(in_plane - np.abs(twice)) > _EQUAL_AREAS * in_plane) | (whole_turns - tips > 3 / 2)
+    found.append((heights, areas, lengths / 2, is_crossed))
+    return corners[triangles], owners
+
+
+def _lowest(axes: list[Reals], corners: Indices, starts: Indices, polygon: Indices) -> Indices:
+    """Return the rank of the lowest corner of each polygon, from the places where they start."""
+    heights = np.nan_to_num(sum(weight * axis[corners] for weight, axis in zip(_AXES, axes, strict=True)))
+    lowest = np.flatnonzero(heights == np.minimum.reduceat(heights, starts)[polygon])
+    return np.asarray(lowest[np.searchsorted(polygon[lowest], np.arange(len(starts)))] - starts)
+
+
+def _turns(plane: Reals, following: NDArray[Any], side: Reals) -> Reals:
+    """Return by how much outlines (2, n) turn at the corner behind each, in radians, positive to the side of each."""
     sides = plane[:, following] - plane
     nexts = sides[:, following]
-    turns = np.arctan2((sides[0] * nexts[1] - sides[1] * nexts[0]) * np.sign(twice)[polygon], (sides * nexts).sum(0))
-    is_simple = np.minimum.reduceat(turns, starts) > -_WRONG_TURN
-    is_simple &= np.abs(np.add.reduceat(turns, starts) - 2 * np.pi) < _WRONG_SUM
-    # Coordinates that are no numbers are refused later.
-    is_simple |= ~np.isfinite(np.add.reduceat(np.abs(points).sum(axis=0), starts))
-    owners = np.repeat(np.arange(len(sizes)), sizes - 2)
+    return np.asarray(np.arctan2((sides[0] * nexts[1] - sides[1] * nexts[0]) * side, (sides * nexts).sum(0)))
+
+
+def _fans_and_ears(plane: Reals, sizes: Indices, is_convex: NDArray[np.bool_], twice: Reals) -> tuple[Indices, Indices]:
+    """Return triangles (k, 3) of outlines (2, n), and their polygons (k,): fans of convex ones, and ears of others."""
+    starts, owners = np.cumsum(sizes) - sizes, np.repeat(np.arange(len(sizes)), sizes - 2)
     ranks = np.arange(len(owners)) - (np.cumsum(sizes - 2) - (sizes - 2))[owners]
     fans = starts[owners, None] + np.stack([np.zeros_like(ranks), ranks + 1, ranks + 2], axis=1)
-    parts, of_parts = [fans[is_simple[owners]]], [owners[is_simple[owners]]]
-    for one in np.flatnonzero(~is_simple):
+    parts, of_parts = [fans[is_convex[owners]]], [owners[is_convex[owners]]]
+    for one in np.flatnonzero(~is_convex):
         own = slice(starts[one], starts[one] + sizes[one])
         ears = mapbox_earcut.triangulate_float64(plane[:, own].T.copy(), np.array(sizes[one : one + 1], np.uint32))
         # All ears face the same side. Without any the outline encloses nothing.
         ears = ears.reshape(-1, 3)[:, :: 1 if twice[one] > 0 else -1].astype(np.int64) + starts[one]
         parts.append(ears if len(ears) else fans[owners == one])
         of_parts.append(np.full(len(parts[-1]), one))
-    triangles, owners = np.concatenate(parts), np.concatenate(of_parts)
-    lengths = np.sqrt(dot(normals, normals))
-    offsets = dot(points, normals[:, polygon] / np.where(lengths > 0, lengths, 1.0)[polygon])
-    a, b, c = (points[:, corner] for corner in triangles.T)
-    areas = np.bincount(owners, cross_lengths(b - a, c - a), len(sizes)) / 2
-    heights = np.maximum.reduceat(offsets, starts) - np.minimum.reduceat(offsets, starts)
-    u, v = plane[:, triangles[:, 1:]] - plane[:, triangles[:, :1]]
-    in_plane = np.bincount(owners, np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]), len(sizes))
-    found.append((heights, areas, lengths / 2, in_plane - np.abs(twice) > _EQUAL_AREAS * in_plane))
-    return corners[triangles], owners
+    return np.concatenate(parts), np.concatenate(of_parts)

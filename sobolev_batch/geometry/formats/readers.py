@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import binascii
 import codecs
 import gzip
+import json
 import re
 import zlib
 from collections.abc import Iterable
 from io import BufferedReader
 from pathlib import Path
+from xml.parsers.expat import ExpatError
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -32,12 +36,24 @@ _LONGEST_REASON = 250
 _MISTAKEN = {
     rb"(<\?xml[^>]*>\s*)?<(!doctype )?(html|error)\b": "the message of a server or a web page; download the file again",
     rb"version https://git-lfs": "a pointer of Git's large file storage; fetch the file itself by git lfs pull",
-    rb"\xff\xfe|\xfe\xff": "a text in UTF-16; save it in UTF-8",
+    rb"\xff\xfe|\xfe\xff|([\t-~]\0|\0[\t-~]){4}": "a text in UTF-16; save it in UTF-8",
     rb"\x1f\x8b": "compressed by gzip; let its name end in .gz",
 }
 # How files of some formats begin.
 _BEGINNINGS = {".ply": rb"ply\s", ".stl": rb"solid\s", ".off": rb"(st|c|n)*off\s", ".vtk": rb"# vtk ", ".glb": rb"gltf"}
+_BEGINNINGS |= {".3mf": rb"pk\x03\x04", ".msh": rb"\$meshformat", ".mesh": rb"meshversionformatted"}
 _START_BYTES = 1024
+# What errors of libraries mean on damaged input, the special ones first.
+_DAMAGES: dict[type[Exception], str] = {
+    json.JSONDecodeError: "its JSON is damaged",
+    ExpatError: "its XML is damaged",
+    UnicodeError: "its text is damaged, or not in UTF-8",
+    BadZipFile: "it is no whole zip archive",
+    zlib.error: "its packed data are damaged",
+    binascii.Error: "its data in base64 are damaged",
+    KeyError: "it lacks an entry",
+    Exception: "it has entries that do not fit together, or breaks off",
+}
 # Coordinates so many times the size of a mesh have four digits of it in single precision.
 _FAR = 1000
 # Factor by which gzip usually shrinks mesh files.
@@ -101,7 +117,8 @@ def read_mesh_by(path: Path, read: Read) -> Mesh:
     """Read a mesh as `read_mesh` does, by a function that reads the bytes of its file."""
     suffix = mesh_format(path)
     if suffix in CONVERTED:
-        raise MeshError(f"{path}: files of its format are not read; convert it: {CONVERTED[suffix]}")
+        name, command = CONVERTED[suffix]
+        raise MeshError(f"{path}: it is a file of the format {name}, which is not read; convert it: {command}")
     if suffix not in BY_SUFFIX:
         known = ", ".join(name for name, form in BY_SUFFIX.items() if form.is_name is None)
         raise MeshError(
@@ -137,7 +154,8 @@ def read_mesh_by(path: Path, read: Read) -> Mesh:
         raise MeshError(f"{path}: reading it takes more memory than there is: {_shortened(error)}") from error
     except Exception as error:
         # On damaged input parsers raise anything from struct.error to RecursionError.
-        reason = _mistaken(start, suffix) or f"{type(error).__name__}: {_shortened(error)}"
+        damage = next(what for kind, what in _DAMAGES.items() if isinstance(error, kind))
+        reason = _mistaken(start, suffix) or f"{damage}: {_shortened(error)}"
         raise MeshError(f"{path}: not a readable {suffix.removeprefix('.')} file: {reason}") from error
 
 

@@ -18,10 +18,12 @@ from tests.support.mesh_files import (
     LITTLE,
     VOLUME,
     Read,
+    box_scene,
     freesurfer,
     gifti,
     gmsh,
     gmsh_first,
+    gmsh_first_binary,
     medit,
     model,
     numbers,
@@ -163,7 +165,7 @@ CASES: dict[str, Case] = {
     "ply, points": (
         ".ply",
         replaced(ply(BOX_VERTICES, []), (PLY_FACES.replace(b"12", b"0"), b"element range_grid 0\n")),
-        "holds points and no surface",
+        "its 8 vertices are points or lines",
     ),
 }
 
@@ -250,7 +252,7 @@ BOX_3MF = object_3mf(BOX_VERTICES, BOX_TRIANGLES)
 DOUBLED = (
     '<object id="2"><components><component objectid="1"/><component objectid="1" transform="{}"/></components></object>'
 )
-LINEAR = gmsh(BOX_VERTICES, BOX_QUADS)
+LINEAR, GMSH_OLD = gmsh(BOX_VERTICES, BOX_QUADS), gmsh_first_binary(BOX_VERTICES, BOX_MIXED)
 CASES |= {
     "medit, quadrilaterals": (".mesh", medit(BOX_VERTICES, BOX_QUADS), BOX_AREA),
     "medit, both": (".mesh", medit(BOX_VERTICES, BOX_MIXED), BOX_AREA),
@@ -289,11 +291,28 @@ CASES |= {
         replaced(LINEAR, (b"\n2 10 20", b"\n2 10 99")),
         "a node that is not there",
     ),
-    "gmsh, old and binary": (
+    "gmsh, a format that nobody writes": (".msh", b"$MeshFormat\n4 0 8\n$EndMeshFormat\n", "-save -format msh41"),
+    **{
+        f"gmsh, both in the old format, binary of order {order}": (
+            ".msh",
+            gmsh_first_binary(BOX_VERTICES, BOX_MIXED, order),
+            BOX_AREA,
+        )
+        for order in "<>"
+    },
+    "gmsh, the old format in binary, cut": (
         ".msh",
-        b"$MeshFormat\n2.2 1 8\n\1\0\0\0\n$EndMeshFormat\n",
-        "gmsh scan.msh -save -format msh41",
+        replaced(GMSH_OLD, (GMSH_OLD[-60:-40], b"")),
+        "breaks off, or has wrong counts|Gmsh's type 20",
     ),
+    **{
+        f"medit, {spelling.decode()} for 4": (
+            ".mesh",
+            replaced(medit(BOX_VERTICES, BOX_MIXED), (b"4.0", spelling)),
+            BOX_AREA,
+        )
+        for spelling in (b"4.0D+00", b"4D0", b".4d1", b"400.d-2")
+    },
     "gmsh, no cells": (".msh", LINEAR.partition(b"$Elements")[0], "no section .Elements"),
     "3mf, placed twice": (
         ".3mf",
@@ -349,11 +368,57 @@ CASES |= {
         package_3mf(model(object_3mf(BOX_VERTICES, [[0, 1, 8]]))),
         r"object 1 has an index outside 0\.\.7",
     ),
-    "3mf, no archive": (".3mf", b"PK", "not a readable 3mf file: BadZipFile"),
-    "collada": (".dae", b"<COLLADA/>", r"trimesh\.load\('scan\.dae'\)"),
-    "vrml": (".wrl", b"#VRML", r"load_new_mesh\('scan\.wrl'\)"),
-    "abaqus": (".inp", b"*Heading", "meshio convert scan.inp scan.vtu"),
-    "nastran": ("lh.bdf", b"BEGIN BULK", "meshio convert scan.bdf scan.vtu"),
+    "3mf, no archive": (".3mf", b"PK", "no whole zip archive"),
+    "collada": (".dae", b"<COLLADA/>", r"format COLLADA.*trimesh\.load\('scan\.dae'\)"),
+    "vrml": (".wrl", b"#VRML", r"format VRML.*load_new_mesh\('scan\.wrl'\)"),
+    "abaqus": (".inp", b"*Heading", "format Abaqus.*meshio convert scan.inp scan.vtu"),
+    "nastran": ("lh.bdf", b"BEGIN BULK", "format Nastran.*meshio convert scan.bdf scan.vtu"),
+    "step": (".STEP", b"ISO-10303-21;", "format STEP.*gmsh scan.step -2 -o scan.stl"),
+    "a collection": (".vtm", b"<VTKFile/>", r"VTK collection.*read\('scan.vtm'\).combine\(\).extract"),
+}
+
+# Numbers that Python reads and no format has: with underscores, and digits of other scripts.
+_SPELLED = {
+    ".obj": obj(BOX_VERTICES, BOX_TRIANGLES),
+    ".off": OFF_BOX,
+    ".stl": STL_TEXT,
+    ".ply": PLY_BOX,
+    ".mesh": medit(BOX_VERTICES, BOX_TRIANGLES),
+    ".msh": gmsh_first(BOX_VERTICES, BOX_TRIANGLES),
+    ".gii": gifti(BOX_VERTICES, np.array(BOX_TRIANGLES, np.int32), "GIFTI_ENCODING_ASCII"),
+    ".vtk": vtk(BOX_VERTICES.tolist(), BOX_QUADS[0]),
+}
+CASES |= {
+    f"{ending}, {spelling} for a number": (ending, re.sub(rb"\b4\.0+\b", spelling.encode(), content), "not a number")
+    for ending, content in _SPELLED.items()
+    for spelling in ("4_0", "\uff14", "0x4", "4e")
+}
+CASES |= {
+    f"3mf, {spelling} for a number": (
+        ".3mf",
+        package_3mf(model(BOX_3MF.replace("4.0", spelling))),
+        "a vertex has a word that is not a number",
+    )
+    for spelling in ("4_0", "\uff14", "0x4")
+}
+CASES |= {
+    "3mf, an index with an underscore": (
+        ".3mf",
+        package_3mf(model(BOX_3MF.replace('v1="4"', 'v1="0_4"'))),
+        "a triangle has '0_4' for an integer",
+    ),
+    "obj, lines": (
+        ".obj",
+        obj(BOX_VERTICES, []) + b"p 1 2\nl 3 4 5\n",
+        "no faces: its 8 vertices are points",
+    ),
+    "off, points": (".off", off(BOX_VERTICES, []), "no faces: its 8 vertices are points"),
+    **{
+        f"{ending}, {codec}": (ending, content.decode().encode(codec), "a text in UTF-16; save it in UTF-8")
+        for ending, content in {**_SPELLED, ".gltf": box_scene().gltf()}.items()
+        for codec in ("utf-16-le", "utf-16-be")
+    },
+    "obj, an archive": (".obj", package_3mf(model(BOX_3MF)), "begins as a .3mf file; name it so"),
 }
 
 

@@ -121,8 +121,10 @@ def test_saddles_that_bend_alike_are_cut_from_their_lowest_corner() -> None:
         [(0, 0), (3, 2), (3, 0), (0, 2)],
         [(0, 0), (2, 2), (2, 0), (0, 2), (-1, 1)],
         [(np.cos(t), np.sin(t)) for t in 4 * np.pi * np.arange(5) / 5],
+        [(0, 0), (2, 0), (2, 2), (0, 2)] * 2,
+        [(np.cos(t), np.sin(t)) for t in 4 * np.pi * np.arange(14) / 14],
     ],
-    ids=["bow tie", "larger on one side", "of five corners", "star"],
+    ids=["bow tie", "larger on one side", "of five corners", "star", "a square twice", "a heptagon twice"],
 )
 def test_outlines_that_cross_themselves_are_noted(outline: Any) -> None:
     for first in range(len(outline)):
