@@ -209,7 +209,9 @@ def _draw_usual_distances(_: Path, path: Path) -> None:
     rows = table(tree)
     rows = rows[rows["family"] == "decimated"].set_index("mesh")
     # From the unit of the file to the radius of the bounding sphere of the reference, one unit of the study.
-    usual = tree["proximity"].to_dataset().sel(mesh=rows.index.to_numpy()) * tree.attrs["similarity"]["scale"]
+    usual = (
+        tree["proximity"].to_dataset().sel(mesh=rows.index.to_numpy()) * json.loads(tree.attrs["similarity"])["scale"]
+    )
     figure = Figure(figsize=(6.4, 3.6), layout="constrained")
     axes = figure.subplots()
     set_log_scale(axes, "xy")

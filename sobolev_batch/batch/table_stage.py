@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, result_from, result_of
 from sobolev_batch.errors import DamageError
-from sobolev_batch.norms.columns import describe
+from sobolev_batch.norms.columns import VARIABLES, describe
 from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.norms.fields import Quality
 from sobolev_batch.sources.names import natural_key
@@ -251,8 +251,9 @@ def _meshes_table(workspace: Workspace, placed: Sequence[Placed]) -> xr.Dataset:
     for item in fields(Facts):
         values = [getattr(record.facts, item.name) for record in filled]
         # Nothing is known of a mesh that failed, which is not zero.
-        numbers_or_texts = _strings(values) if isinstance(item.default, str) else np.where(is_complete, values, np.nan)
-        columns[item.name] = numbers_or_texts
+        unknown = -1 if "valid_min" in VARIABLES[item.name] else np.nan
+        is_text = isinstance(item.default, str)
+        columns[item.name] = _strings(values) if is_text else np.where(is_complete, values, unknown)
     if any(record.cost for record in filled):
         costs = [record.cost or Cost() for record in filled]
         columns |= {item.name: np.array([getattr(cost, item.name) for cost in costs]) for item in fields(Cost)}

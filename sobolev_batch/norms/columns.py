@@ -21,27 +21,39 @@ FILE_LENGTH = "unit length of the files"
 NORM = "unit length^(1/2)"
 
 
-def described(long_name: str, units: str = "", **others: str) -> dict[str, str]:
+def described(long_name: str, units: str = "", **others: str | int) -> dict[str, Any]:
     """Return the attributes of a variable, which may have no unit."""
     return {"long_name": long_name, **({"units": units} if units else {}), **others}
 
 
+def _count(of: str) -> dict[str, Any]:
+    # What is below `valid_min` counts as missing in readers of NetCDF. xarray would make floats of counts with
+    # `_FillValue`.
+    return described(f"number of {of}", NUMBER, valid_min=0, description="-1 where it is not known")
+
+
+_BETWEEN = "not to be interpolated between orders: see the description of order"
 # Attributes of variables by name, in the results of functions and in stores. The tables of a store have no others, so
 # that the metadata of meshes may have any other name.
-VARIABLES: Mapping[str, Mapping[str, str]] = {
+VARIABLES: Mapping[str, Mapping[str, Any]] = {
     "mesh": described("label of the mesh"),
     "other": described("label of the other mesh"),
     "object": described("name of the object"),
     "reference": described("label of the reference of the object"),
     "unit_length": described("unit of length in which the object was computed, in that of the files"),
-    "order": described("Sobolev order s", NUMBER),
+    "order": described(
+        "Sobolev order s",
+        NUMBER,
+        description="numbers fall by powers between orders, so that interpolation is percents off; sobolev-batch table "
+        "--order and tree.sobolev.distance(order) compute any order from stored spectra",
+    ),
     "time": described("time of the mesh", description="in the unit of the study's times"),
     "fourier": described("Fourier transform of the area measure", convention="∫ exp(-2πi ξ·x) dμ(x)"),
     **{name: described(f"frequency along {name[-1]}", FREQUENCY) for name in AXES},
     "squared_distance": described("squared Sobolev distance", LENGTH),
     "gradient": described("derivative of the squared distance with respect to the vertices", NUMBER),
-    "norm": described("Sobolev norm", NORM, kernel="(1 + |ξ|²)^s"),
-    "distance": described("Sobolev distance", NORM, kernel="(1 + |ξ|²)^s"),
+    "norm": described("Sobolev norm", NORM, kernel="(1 + |ξ|²)^s", description=_BETWEEN),
+    "distance": described("Sobolev distance", NORM, kernel="(1 + |ξ|²)^s", description=_BETWEEN),
     "error": described("bound on the error", NORM, description="the sum of error_part"),
     "error_part": described("part of the bound on the error", NORM),
     "part": described(
@@ -50,7 +62,7 @@ VARIABLES: Mapping[str, Mapping[str, str]] = {
         "aliasing: spacing of the lattice; discretisation: quadrature and NUFFT; "
         "statistical: random frequencies, in 99 % of cases",
     ),
-    "relative": described("distance over the norm of the reference", NUMBER),
+    "relative": described("distance over the norm of the reference", NUMBER, description=_BETWEEN),
     "relative_error": described("bound on the error of the relative distance", NUMBER),
     "area_part": described("distance explained by a change of total area alone", NORM),
     "area_part_error": described("bound on the error of that part", NORM),
@@ -84,21 +96,25 @@ VARIABLES: Mapping[str, Mapping[str, str]] = {
     "row": described("number of the mesh in /fourier", NUMBER),
     "status": described("complete, failed or missing"),
     "reason": described("reason of a failure"),
-    "vertices": described("number of vertices", NUMBER),
-    "triangles": described("number of triangles", NUMBER),
-    "boundary_edges": described("number of edges of one triangle", NUMBER),
-    "nonmanifold_edges": described("number of edges of more than two triangles", NUMBER),
-    "inconsistent_edges": described("number of edges whose two triangles face opposite sides", NUMBER),
-    "components": described("number of parts that share no vertex", NUMBER),
-    "euler_characteristic": described("number of vertices less that of edges plus that of triangles", NUMBER),
+    "vertices": _count("vertices"),
+    "triangles": _count("triangles"),
+    "boundary_edges": _count("edges of one triangle"),
+    "nonmanifold_edges": _count("edges of more than two triangles"),
+    "inconsistent_edges": _count("edges whose two triangles face opposite sides"),
+    "components": _count("parts that share no vertex"),
+    "euler_characteristic": described(
+        "number of vertices less that of edges plus that of triangles",
+        NUMBER,
+        description="it may be negative, so that it is NaN where it is not known",
+    ),
     "volume": described("enclosed volume", VOLUME, description="negative for a mesh that is inside out"),
     "smallest_angle": described("smallest angle of the triangles", ANGLE),
     "aspect_ratio": described("largest aspect ratio of the triangles; 1 is equilateral", NUMBER),
-    "duplicate_triangles": described("number of triangles that repeat another", NUMBER),
-    "zero_area_triangles": described("number of triangles without area", NUMBER),
+    "duplicate_triangles": _count("triangles that repeat another"),
+    "zero_area_triangles": _count("triangles without area"),
     "digest": described("SHA-256 of vertices and triangles"),
     "key": described("SHA-256 of all that the field depends on"),
-    "points": described("number of quadrature points", NUMBER),
+    "points": _count("quadrature points"),
     "worker": described("address of the worker"),
     "backend": described("backend of the NUFFT"),
     "numerics": described("version of the numerics that computed the field", NUMBER),

@@ -254,7 +254,7 @@ def _spectra_keys(plan: Plan, mesh: NDArray[Any]) -> dict[str, bytes]:
     return keys
 
 
-def record_keys(rows: int, dimension: str = "mesh") -> dict[str, bytes]:
+def record_keys(rows: int, dimension: str = "row") -> dict[str, bytes]:
     """Return the keys of the arrays of records: a chunk for each row, which tasks write, and pages of many rows."""
     keys = {
         **array_keys(RECORD, str, (rows,), (1,), (dimension,)),

@@ -32,7 +32,15 @@ from sobolev_batch.errors import DamageError, StoreError
 from sobolev_batch.store.checked import CheckedStore, largest_chunk_bytes
 from sobolev_batch.store.encoding import LARGEST_CHUNK_BYTES, ROOT, chunk_of, dataset_keys
 from sobolev_batch.store.location import Location
-from sobolev_batch.store.metadata import MOST_BYTES, SCHEMA_VERSION, Document, chunk_shape, consolidated, problems_of
+from sobolev_batch.store.metadata import (
+    MOST_BYTES,
+    SCHEMA_VERSION,
+    Document,
+    attributes_of,
+    chunk_shape,
+    consolidated,
+    problems_of,
+)
 from sobolev_batch.study.lattice_choice import LatticeChoice
 
 _log = logging.getLogger(__name__)
@@ -129,7 +137,10 @@ class Store:
                 # zarr repeats in each group what the root has.
                 document.pop("consolidated_metadata", None)
                 self.documents.setdefault(name, document)
-            self.documents[""] = root
+            try:
+                self.documents[""] = {**root, "attributes": attributes_of(root)}
+            except ValueError as error:
+                raise self.damage(ROOT, str(error)) from error
         return True
 
     def attributes(self, *, of_objects: bool | None = False) -> dict[str, Any]:
@@ -330,8 +341,9 @@ class Store:
 
     def _root(self) -> Document:
         """Return the document at the root with those of all nodes, as zarr consolidates them, without the digest."""
-        attributes = {name: value for name, value in self.documents[""]["attributes"].items() if name != DIGEST}
-        return {**consolidated(self.documents), "attributes": attributes}
+        root = consolidated(self.documents)
+        root["attributes"].pop(DIGEST, None)
+        return root
 
     def _digest(self, root: Document) -> str:
         """Return the SHA-256 of a root and of all keys of the tables, coordinates and metadata that it lists."""

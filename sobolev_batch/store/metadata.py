@@ -7,6 +7,7 @@ reaches zarr or xarray before its documents were checked here.
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Iterator, Mapping
@@ -15,13 +16,15 @@ from typing import Any, TypeGuard
 from sobolev_batch.sources.names import node_problem
 
 # The layout that docs/store.md describes has this version.
-SCHEMA_VERSION = 12
+SCHEMA_VERSION = 13
 
 Document = dict[str, Any]
 
 # No document is larger. That of the root repeats all others, with about 1 kB for each.
 MOST_BYTES = 64_000_000
 
+# Attributes of the root that are tables. They are stored as JSON, since NetCDF has no attributes of attributes.
+_TABLES = ("study", "similarity", "versions")
 _GROUP_KEYS = {"attributes", "consolidated_metadata", "node_type", "zarr_format"}
 _ARRAY_KEYS = {
     *("attributes", "chunk_grid", "chunk_key_encoding", "codecs", "data_type", "dimension_names", "fill_value"),
@@ -49,7 +52,27 @@ def consolidated(documents: Mapping[str, Document]) -> Document:
     # Readers list the variables of a group in this order: the number and its error first.
     names = sorted(filter(None, documents), key=lambda name: name.split("/")[0])
     nodes = {name: documents[name] for name in names}
-    return {**documents[""], "consolidated_metadata": {"kind": "inline", "must_understand": False, "metadata": nodes}}
+    attributes = documents[""].get("attributes", {})
+    texts = {name: json.dumps(attributes[name]) for name in _TABLES if name in attributes}
+    listed = {"kind": "inline", "must_understand": False, "metadata": nodes}
+    return {**documents[""], "attributes": {**attributes, **texts}, "consolidated_metadata": listed}
+
+
+def attributes_of(root: Document) -> dict[str, Any]:
+    """Return the attributes of a root as it is stored, with its tables; ValueError where one is none."""
+    attributes: dict[str, Any] = dict(root.get("attributes", {}))
+    for name in _TABLES:
+        if isinstance(text := attributes.get(name), str):
+            attributes[name] = table_in(text)
+    return attributes
+
+
+def table_in(text: str) -> dict[str, Any]:
+    """Return the table that an attribute of the root holds as JSON; ValueError where it holds none."""
+    try:
+        return dict(json.loads(text))
+    except (TypeError, RecursionError) as error:
+        raise ValueError(f"no table: {error}") from error
 
 
 def problems_of(documents: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

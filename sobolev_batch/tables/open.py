@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
+from functools import lru_cache
 from itertools import accumulate, chain
 from pathlib import Path
 from typing import Any
@@ -17,7 +19,7 @@ import xarray as xr
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import DamageError, InputError, StoreError, one_line
-from sobolev_batch.geometry.surface import placement_doubt
+from sobolev_batch.geometry.surface import Similarity, placement_doubt
 from sobolev_batch.norms.columns import describe
 from sobolev_batch.norms.fields import Quality
 from sobolev_batch.sources.names import quoted
@@ -36,6 +38,7 @@ from sobolev_batch.store.layout import (
     table_attributes,
 )
 from sobolev_batch.store.location import Location
+from sobolev_batch.store.metadata import table_in
 from sobolev_batch.store.objects import stores_below
 from sobolev_batch.visible import FILE_UNITS
 
@@ -146,8 +149,8 @@ def _joined(trees: Sequence[xr.DataTree]) -> xr.DataTree:
                 f"{source_of(tree)}: it cannot be opened as one with {source_of(trees[0])}: "
                 f"they differ in {', '.join(differences)}"
             )
-    names, study = _names_in_all(trees), trees[0].attrs["study"]
-    stored = [set(tree.attrs["study"]["orders"]) for tree in trees]
+    names, study = _names_in_all(trees), root_table(trees[0], "study")
+    stored = [set(root_table(tree, "study")["orders"]) for tree in trees]
     orders = [s for s in study["orders"] if all(s in others for others in stored)]
     firsts = [*accumulate((store_of(tree).row_count for tree in trees), initial=0)]
     groups = {
@@ -161,7 +164,7 @@ def _joined(trees: Sequence[xr.DataTree]) -> xr.DataTree:
     groups["convergence"].attrs["reference"] = reference_of(trees[0])
     title = " + ".join(str(tree.attrs["title"]) for tree in trees)
     joined = xr.DataTree.from_dict(groups)
-    joined.attrs = {**trees[0].attrs, "title": title, "study": {**study, "name": title, "orders": orders}}
+    joined.attrs = {**trees[0].attrs, "title": title, "study": json.dumps({**study, "name": title, "orders": orders})}
     joined.encoding = {_PARTS: list(zip(trees, names, strict=True))}
     return joined
 
@@ -169,8 +172,8 @@ def _joined(trees: Sequence[xr.DataTree]) -> xr.DataTree:
 def _common(tree: xr.DataTree) -> dict[str, Any]:
     """Return what stores have in common that open as one."""
     reference = finished_group(tree, "meshes", load=False)["key"].sel(mesh=reference_of(tree)).item()
-    of_study = {name: tree.attrs["study"][name] for name in ("lattice", "dtype", "octaves")}
-    return {**of_study, "similarity": tree.attrs["similarity"], "reference": reference}
+    of_study = {name: root_table(tree, "study")[name] for name in ("lattice", "dtype", "octaves")}
+    return {**of_study, "similarity": root_table(tree, "similarity"), "reference": reference}
 
 
 def _names_in_all(trees: Sequence[xr.DataTree]) -> list[dict[str, str]]:
@@ -179,7 +182,7 @@ def _names_in_all(trees: Sequence[xr.DataTree]) -> list[dict[str, str]]:
     for tree, labels in zip(trees[1:], own[1:], strict=True):
         labels.remove(reference_of(tree))
     twice = next((label for label, count in Counter(chain(*own)).items() if count > 1), None)
-    begins = [f"{tree.attrs['study']['name']}/" if twice else "" for tree in trees]
+    begins = [f"{root_table(tree, 'study')['name']}/" if twice else "" for tree in trees]
     if twice and len(set(begins)) < len(begins):
         raise StoreError(f"{source_of(trees[0])}: another study of the same name has a mesh {quoted(twice)} too")
     names = [{label: f"{begin}{label}" for label in labels} for begin, labels in zip(begins, own, strict=True)]
@@ -189,7 +192,7 @@ def _names_in_all(trees: Sequence[xr.DataTree]) -> list[dict[str, str]]:
 
 def _part(tree: xr.DataTree, group: str, names: Mapping[str, str], first: int, orders: Sequence[float]) -> xr.Dataset:
     """Return a group of one of several stores: of these meshes, with their labels among all, and rows after others."""
-    part, study = tree[group].to_dataset(), str(tree.attrs["study"]["name"])
+    part, study = tree[group].to_dataset(), str(root_table(tree, "study")["name"])
     if "order" in part.dims:
         part = part.sel(order=list(orders))
     if "other" in part.dims:
@@ -317,14 +320,29 @@ def finished_group(tree: xr.DataTree, name: str, *, load: bool = True) -> xr.Dat
 
 def has_objects(tree: xr.DataTree) -> bool:
     """Return True for the root of several objects."""
-    return OBJECTS in tree.attrs.get("study", {})
+    return OBJECTS in root_table(tree, "study")
 
 
 def require_one_object(tree: xr.DataTree) -> None:
     """Refuse the root of several objects, by an InputError that names the store of one."""
     if has_objects(tree):
-        one = f"{source_of(tree)}/{next(iter(tree.attrs['study'][OBJECTS]), 'NAME')}"
+        one = f"{source_of(tree)}/{next(iter(root_table(tree, 'study')[OBJECTS]), 'NAME')}"
         raise InputError(f"{source_of(tree)}: the store of several objects; name that of one, such as {one}")
+
+
+def root_table(tree: xr.DataTree, name: str) -> dict[str, Any]:
+    """Return an attribute of the root of an open store that is a table; an empty one where it has none."""
+    return _table_in(tree.attrs[name]) if name in tree.attrs else {}
+
+
+# That of many objects is long.
+_table_in = lru_cache(table_in)
+
+
+def similarity_of(tree: xr.DataTree) -> Similarity:
+    """Return the map from the unit of length of the files to that of the study of an open store."""
+    table = root_table(tree, "similarity")
+    return Similarity(table["scale"], tuple(table["origin"]))
 
 
 def has_proximity(tree: xr.DataTree) -> bool:
@@ -389,8 +407,8 @@ def placement_doubts(tree: xr.DataTree) -> dict[str, str]:
 
 def unit_of(tree: xr.DataTree) -> tuple[str, float]:
     """Return the name of the unit of length of the files, and the study's unit in terms of it."""
-    header = tree.attrs.get("study", {}).get("table", {}).get("study", {})
-    return header.get("length_unit", FILE_UNITS), 1 / tree.attrs.get("similarity", {"scale": 1.0})["scale"]
+    header = root_table(tree, "study").get("table", {}).get("study", {})
+    return header.get("length_unit", FILE_UNITS), 1 / root_table(tree, "similarity").get("scale", 1.0)
 
 
 def study_unit(tree: xr.DataTree) -> str:

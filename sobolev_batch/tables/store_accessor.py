@@ -9,7 +9,6 @@ import xarray as xr
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import DamageError, InputError
-from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
 from sobolev_batch.norms.causes import band_coordinates
@@ -20,7 +19,14 @@ from sobolev_batch.sources.names import quoted
 from sobolev_batch.store.layout import QUALITY
 from sobolev_batch.store.records import Record, Records, rows_unlike_tables
 from sobolev_batch.store.workspace import complete_records
-from sobolev_batch.tables.open import finished_group, reference_of, require_unchanged, source_of, store_of
+from sobolev_batch.tables.open import (
+    finished_group,
+    reference_of,
+    require_unchanged,
+    similarity_of,
+    source_of,
+    store_of,
+)
 from sobolev_batch.tables.pairs import pair_distances
 from sobolev_batch.tables.reducer import Reducer
 from sobolev_batch.tables.results import Results, table_of
@@ -205,8 +211,6 @@ class StoreAccessor:
         dims, values, _ = axis = order_axis(order)
         squared = squares.T.reshape(*values.shape, -1)
         areas = reducer.areas[indices].sum()
-        stored = self._tree.attrs["similarity"]
-        similarity = Similarity(stored["scale"], tuple(stored["origin"]))
         with np.errstate(invalid="ignore"):
             share = squared / squared.sum(axis=-1)[..., None]
         return xr.Dataset(
@@ -216,7 +220,7 @@ class StoreAccessor:
                 "energy": ("band", energies, described("energy on a sphere of frequencies", AREA)),
                 "energy_error": ("band", deviations, described("standard error of the energy", AREA)),
             },
-            coords={"order": axis, **band_coordinates(lower, upper, similarity)},
+            coords={"order": axis, **band_coordinates(lower, upper, similarity_of(self._tree))},
             attrs={"kernel": KERNEL, "energy_limit": 2 * float(areas)},
         )
 

@@ -82,7 +82,7 @@ def test_what_is_damaged_is_named_with_its_object(changeable: Path) -> None:
 
 def test_objects_that_were_altered_or_traded_are_damage(changeable: Path) -> None:
     before, root = sb.table(changeable), changeable / "zarr.json"
-    for damaged in ("", root.read_text().replace('"objects": ["a", ', '"objects": ["../a", ')):
+    for damaged in ("", root.read_text().replace(r"\"objects\": [\"a\", ", r"\"objects\": [\"../a\", ")):
         root.write_text(damaged)
         with pytest.raises(sb.errors.DamageError):
             sb.status(changeable)
@@ -104,7 +104,7 @@ def test_tables_of_all_that_another_program_wrote_are_made_again(changeable: Pat
     assert sb.run(study_of([*balls(a=1.0), GONE, *balls(b=1.1)]), changeable, threads).computed == ()
     pd.testing.assert_frame_equal(sb.table(changeable), before)
     root.write_text(
-        root.read_text().replace('"data_type": "bool"', '"data_type": "int8"').replace('["a", ', '["../a", ')
+        root.read_text().replace('"data_type": "bool"', '"data_type": "int8"').replace(r"[\"a\", ", r"[\"../a\", ")
     )
     with pytest.raises(sb.errors.StoreError, match=r"an object has the name '\.\./a': it holds '/'"):
         sb.status(changeable)

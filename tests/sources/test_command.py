@@ -254,7 +254,7 @@ def test_a_study_of_remeshers_keeps_what_fails_apart(tmp_path: Path) -> None:
     )
     assert "front of the means" in call("table", "league", store, "--by", "cost", "--x", "make_cpu_seconds").stdout
     # What is stored names the function, whose meshes are found without it.
-    assert json.dumps(tree.attrs["study"]["table"]["family"][2]["function"]).endswith('halved"')
+    assert json.dumps(json.loads(tree.attrs["study"])["table"]["family"][2]["function"]).endswith('halved"')
     from sobolev_batch.extras.figures.remade import StudyMeshes
 
     meshes = StudyMeshes.from_tree(tree, ".")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -13,6 +15,12 @@ from sobolev_batch.transform.probe import Probe
 
 MESHES = ["f_1/0", "f_1/1", "f_1/2", "reference"]
 QUALITY = Quality(4 * np.pi, icosphere(0).extent, Probe()).to_json()
+
+
+def root_attributes(scale: float = 1.0, **header: str) -> dict[str, str]:
+    """Return the attributes of the root of a study with this section [study], whose tables are JSON."""
+    study = {"name": "made", "table": {"study": {"name": "made", **header}}}
+    return {"study": json.dumps(study), "similarity": json.dumps({"scale": scale, "origin": [0.0, 0.0, 0.0]})}
 
 
 @pytest.fixture
@@ -57,8 +65,7 @@ def tree() -> xr.DataTree:
         coords={"mesh": MESHES, "xi_x": axis, "xi_y": axis, "xi_z": axis[2:], "quality": ("mesh", [QUALITY] * 4)},
     )
     tree: xr.DataTree = xr.DataTree.from_dict({"/convergence": convergence, "/meshes": meshes, "/fourier": fourier})
-    study = {"name": "made", "table": {"study": {"name": "made"}}}
-    tree.attrs = {"study": study, "similarity": {"scale": 1.0, "origin": [0.0, 0.0, 0.0]}}
+    tree.attrs = root_attributes()
     return tree
 
 

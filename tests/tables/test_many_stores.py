@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -80,7 +81,7 @@ def test_meshes_of_different_stores_are_compared_by_their_fields(stores: tuple[s
 def test_a_label_that_comes_twice_begins_with_its_study(stores: tuple[str, str, str]) -> None:
     one, _, every = stores
     joined = sb.open_store([one, every])
-    names = {tree.attrs["study"]["name"] for tree in map(sb.open_store, (one, every))}
+    names = {json.loads(tree.attrs["study"])["name"] for tree in map(sb.open_store, (one, every))}
     assert {label.split("/")[0] for label in variable(joined, "norms", "mesh").values.tolist()} == {*names, "reference"}
     assert {family.split("/")[0] for family in variable(joined, "meshes", "family").values.tolist()} == {
         *names,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import xarray as xr
 from distributed import Client
 
+import sobolev_batch as sb
 from sobolev_batch import Study, open_store, run, verify
 from sobolev_batch.norms.rates import observed_rates
 from sobolev_batch.store import encoding, layout
@@ -40,14 +42,26 @@ def test_tables_have_coordinates_and_nothing_but_nan_of_a_mesh_that_failed(store
         xr.testing.assert_equal(tree[group]["error_part"].sum("part", skipna=False), tree[group]["error"])
     for group in ("meshes", "norms", "distances", "convergence"):
         whole = tree[group].to_dataset()
-        small = whole.where(whole["triangles"] < 100, drop=True)
+        counts = {name: whole[name] for name in ("vertices", "triangles", "points") if name in whole}
+        assert {values.dtype for values in counts.values()} == {np.dtype("int64")}
+        small = whole.where((whole["triangles"] >= 0) & (whole["triangles"] < 100), drop=True)
         assert small["mesh"].values.tolist() == ["ico/0", "ico/1", "reference"]
         assert small["family"].values.tolist() == ["ico", "ico", "reference"]
         failed = whole.sel(mesh="lost/nowhere").drop_vars(
             ["rank", "row", "finished", "numerics", "resolved", "within"], errors="ignore"
         )
+        unknown = [name for name, values in failed.variables.items() if values.attrs.get("valid_min") == 0]
+        assert {int(failed[name]) for name in unknown} == {-1}
+        assert {*counts} <= {*unknown}
+        failed = failed.drop_vars(unknown)
         assert failed["status"] == "failed"
-        assert all(values.isnull().all() for values in (*failed.data_vars.values(), failed["vertices"]))
+        assert all(
+            values.isnull().all()
+            for values in (*failed.data_vars.values(), failed["edge_length" if "edge_length" in failed else "area"])
+        )
+    rows = sb.table(store_path, -3.0).set_index("mesh")[["vertices", "triangles", "components", "euler_characteristic"]]
+    assert rows.loc["ico/1"].tolist() == [42, 80, 1, 2]
+    assert rows.loc["lost/nowhere"].isna().all()
     finished = tree["meshes"].to_dataset()["finished"]
     assert finished.dtype.kind == "M"
     assert finished.isnull().sum() == 0
@@ -57,6 +71,21 @@ def test_tables_have_coordinates_and_nothing_but_nan_of_a_mesh_that_failed(store
     smallest = tree["convergence"].to_dataset()["relative"].groupby("family").min()
     assert smallest["family"].values.tolist() == ["ico", "lost", "reference"]
     assert smallest.isnull().any("order").values.tolist() == [False, True, False]
+
+
+def test_open_stores_are_selected_by_mesh_and_written_as_netcdf(finished_store: Path, tmp_path: Path) -> None:
+    pytest.importorskip("h5netcdf")
+    for tree in (xr.open_datatree(finished_store, engine="zarr"), open_store(finished_store)):
+        one = tree.sel(mesh="ico/1", order=-3.0)
+        assert one["convergence/triangles"].item() == 80
+        tree.to_netcdf(tmp_path / "tree.nc", engine="h5netcdf")
+        with xr.open_datatree(tmp_path / "tree.nc", engine="h5netcdf") as again:
+            assert json.loads(again.attrs["study"])["table"]["study"]["name"] == "small"
+            for group in ("convergence", "spectra", "fourier"):
+                found, expected = (
+                    node[group].to_dataset().drop_vars("quality", errors="ignore").load() for node in (again, tree)
+                )
+                assert found.equals(expected), group
 
 
 @pytest.mark.parametrize(

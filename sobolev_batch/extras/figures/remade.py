@@ -32,6 +32,8 @@ from sobolev_batch.tables.open import (
     location_of,
     reference_of,
     require_one_object,
+    root_table,
+    similarity_of,
 )
 from sobolev_batch.testing.difference import VertexWitness, named_distances, order_text, witness_at_vertices
 from sobolev_batch.transform.lattice import Orders, check_orders
@@ -61,7 +63,7 @@ class StudyMeshes:
         require_one_object(tree)
         table = finished_group(tree, "meshes")
         try:
-            study = Study.from_table(tree.attrs["study"]["table"], folder=folder)
+            study = Study.from_table(root_table(tree, "study")["table"], folder=folder)
             # The place that the store itself names may be anybody's.
             with suppress(InputError):
                 place = root_of(Location.parse(location_of(tree)))
@@ -69,8 +71,7 @@ class StudyMeshes:
             members = study.object.members
         except SobolevBatchError as error:
             raise InputError(f"the study's meshes cannot be listed here: {error}") from error
-        similarity = tree.attrs["similarity"]
-        return cls(tree, members, table, Similarity(similarity["scale"], tuple(similarity["origin"])))
+        return cls(tree, members, table, similarity_of(tree))
 
     def make(self, label: str, most_triangles: float = math.inf) -> tuple[Mesh, Mesh]:
         """Return the mesh of a label in its own unit of length, and in the study's, or SobolevBatchError.
@@ -108,7 +109,7 @@ class StudyMeshes:
         own, scaled = self.make(label)
         with fields_read(self.tree):
             values = witness_at_vertices(*fields_of(self.tree, label), orders, scaled)
-        title = f"{label} against {reference_of(self.tree)}, study {self.tree.attrs['study']['name']}"
+        title = f"{label} against {reference_of(self.tree)}, study {root_table(self.tree, 'study')['name']}"
         lengths = None if reference is None else named_distances(own, reference)
         return VertexWitness(own, values, orders, title, 1 / self.similarity.scale, lengths)
 

@@ -35,7 +35,7 @@ from sobolev_batch.store.objects import Objects
 from sobolev_batch.study.comparable import SIGNIFICANCE, gap_of, least_objects
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.convergence import tables_of
-from sobolev_batch.tables.open import EDGE_LENGTH, AnyStore, as_tree
+from sobolev_batch.tables.open import EDGE_LENGTH, AnyStore, as_tree, root_table
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.text import wrapped
 from sobolev_batch.transform.lattice import Orders
@@ -288,7 +288,7 @@ def league(
         objects = found.names
     elif by == "cost":
         tree = as_tree(store)
-        objects = (str(tree.attrs["study"]["name"]),)
+        objects = (str(root_table(tree, "study")["name"]),)
         stores = {objects[0]: tree}
     else:
         raise StoreError(

@@ -43,7 +43,14 @@ from sobolev_batch.tables.convergence import (
     unit_notes,
     with_remarks,
 )
-from sobolev_batch.tables.open import finished_group, has_proximity, open_store, placement_doubts
+from sobolev_batch.tables.open import (
+    finished_group,
+    has_proximity,
+    open_store,
+    placement_doubts,
+    root_table,
+    similarity_of,
+)
 from sobolev_batch.tables.rendering import Column
 from sobolev_batch.tables.text import minus, percent
 from sobolev_batch.transform.lattice import Lattice
@@ -156,21 +163,21 @@ def _without_nulls(value: Any) -> Any:
 def study_content(tree: xr.DataTree, status: Status) -> dict[str, Any]:
     """Return what the template of an open store takes, nothing escaped; InputError where it has no tables yet."""
     meshes, convergence = finished_group(tree, "meshes"), finished_group(tree, "convergence")
-    attributes: Mapping[str, Any] = {str(key): value for key, value in tree.attrs.items()}
+    settings = root_table(tree, "study")
     families = tuple(dict.fromkeys(meshes["family"].values.tolist()))
-    frame, study = table(tree), attributes["study"]["table"]
+    frame, study = table(tree), settings["table"]
     missing = meshes.sel(mesh=meshes["status"] != "complete")
     failed = dict(zip(missing["mesh"].values.tolist(), missing["reason"].values.tolist(), strict=True))
     failed = {label: reason or "not computed" for label, reason in failed.items()}
     sentences, rows, omitted = study_verdict(frame, failed)
     orders = frame["order"].drop_duplicates().tolist()
     return {
-        **common_content(attributes["title"], study, {"": frame}, status, failed, attributes["versions"]),
+        **common_content(tree.attrs["title"], study, {"": frame}, status, failed, root_table(tree, "versions")),
         **cost_content({str(study["study"]["name"]): frame}, families),
         "reference": convergence.attrs["reference"],
-        "settings": attributes["study"],
-        "lattice": Lattice(**attributes["study"]["lattice"]),
-        "similarity": attributes["similarity"],
+        "settings": settings,
+        "lattice": Lattice(**settings["lattice"]),
+        "similarity": similarity_of(tree),
         "sentences": sentences,
         "verdict": PageTable("verdict", VERDICT_COLUMNS, rows, orders, is_sortable=False),
         "verdict_omitted": omitted,
@@ -219,7 +226,7 @@ def league_content(objects: Objects, status: Status) -> dict[str, Any]:
     of_objects = [row for s in orders for row in _object_rows(tables, s, by_order.get(s))]
     ranked, pairs = ([row for league in leagues for row in _rows(league, name)] for name in ("table", "pairs"))
     methods = leagues[0].methods if leagues else list(dict.fromkeys(pd.concat(tables.values())["family"]))
-    versions = open_store(objects.location.below(next(iter(tables)))).attrs["versions"]
+    versions = root_table(open_store(objects.location.below(next(iter(tables)))), "versions")
     return {
         **common_content(objects.title, objects.table, tables, status, status.failed, versions),
         **cost_content(tables, methods),

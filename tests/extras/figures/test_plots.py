@@ -23,6 +23,7 @@ from sobolev_batch.extras.figures.drawing import PLOTS, clustered_order, draw_sp
 from sobolev_batch.extras.figures.selection import Selection
 from sobolev_batch.extras.figures.style import Plot, drawing, notes_of, parse_size, set_log_scale, style_of
 from tests.support.commands import finished
+from tests.support.made_tree import root_attributes
 from tests.support.trees import distances_of, tree_of
 
 
@@ -240,12 +241,11 @@ def test_few_outliers_do_not_take_the_colours_of_a_matrix() -> None:
 
 
 def test_axes_name_the_unit_of_the_files(tree: xr.DataTree) -> None:
-    tree.attrs["similarity"] = {"scale": 0.02, "origin": [0.0, 0.0, 0.0]}
-    tree.attrs["study"]["table"]["study"]["length_unit"] = "$mm$"
+    tree.attrs = root_attributes(0.02, length_unit="$mm$")
     assert sb.plot.convergence(tree).get_xlabel() == r"mean edge length in units of 50 \$mm\$"
-    del tree.attrs["study"]["table"]["study"]["length_unit"]
+    tree.attrs = root_attributes(0.02)
     assert sb.plot.convergence(tree).get_xlabel() == "mean edge length in units of 50 file units"
-    tree.attrs["similarity"]["scale"] = 1.0
+    tree.attrs = root_attributes()
     assert sb.plot.convergence(tree).get_xlabel() == "mean edge length in file units"
     assert sb.plot.convergence(tree, x="triangles").get_xlabel() == "number of triangles"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import re
 import shutil
@@ -51,7 +52,7 @@ def evaluated(place: str, label: str, points: np.ndarray) -> np.ndarray:
     """By the public function, from the stored fields, at points in the meshes' own unit."""
     tree = sb.open_store(place)
     fields = tree["fourier"].to_dataset()["fourier"]
-    found = tree.attrs["similarity"]
+    found = json.loads(tree.attrs["similarity"])
     scaled = found["scale"] * (points - np.array(found["origin"]))
     return np.asarray(sb.witness(fields.sel(mesh=label), fields.sel(mesh="reference"), ORDERS, scaled).values)
 
