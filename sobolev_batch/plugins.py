@@ -34,7 +34,7 @@ _OF_EXTRAS = {
     FEATURES: {
         "align": "fitting.align:align",
         "picture": "figures.views:write_difference_picture",
-        "comparison": "report.comparison:comparison_page",
+        "comparison": "report.comparison_page:comparison_page",
     },
 }
 

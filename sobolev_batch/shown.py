@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from html import escape
-from typing import TYPE_CHECKING
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from sobolev_batch.visible import visible
 
@@ -46,6 +49,21 @@ class ShownTables(ABC):
         # pandas escapes names.
         tables = (table.to_html(index=False, float_format="{:.3g}".format) for table in self._tables if len(table))
         return _below(self.caption, "".join(tables))
+
+
+@contextmanager
+def progress_line(on_progress: Callable[[Any], object] | None) -> Iterator[Callable[[Any], object]]:
+    """Give a function that tells of progress: the given one, or in a notebook one that shows the last text, or none."""
+    # Whoever has no notebook has not imported it.
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    if on_progress is not None or not hasattr(shell, "kernel"):
+        yield on_progress or str
+        return
+    line = import_module("IPython.display").display({"text/plain": ""}, raw=True, display_id=True)
+    try:
+        yield lambda text: line.update({"text/plain": visible(str(text))}, raw=True)
+    finally:
+        line.update({"text/plain": ""}, raw=True)
 
 
 def reasons(name: str, by_label: Mapping[str, str]) -> Iterable[tuple[str, str]]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree
 
@@ -72,3 +74,27 @@ def test_a_league_shows_both_tables() -> None:
     assert tags.count("table") == 2
     assert HOSTILE_NAME in text
     assert "over 2 objects" in text
+
+
+def test_progress_is_told_and_shown_in_notebooks(monkeypatch: pytest.MonkeyPatch) -> None:
+    pair = sb.shapes.icosphere(1), sb.shapes.icosphere(2)
+    told: list[str] = []
+    sb.distance(*pair, -2.0, rtol=1e-1, on_progress=told.append)
+    assert told
+    assert all(line.startswith("the distance: ") for line in told)
+    shown: list[str] = []
+
+    class Line:
+        def update(self, data: dict[str, str], *, raw: bool) -> None:
+            assert raw
+            shown.append(data["text/plain"])
+
+    notebook = SimpleNamespace(get_ipython=lambda: SimpleNamespace(kernel=True))
+    monkeypatch.setitem(sys.modules, "IPython", notebook)
+    monkeypatch.setitem(sys.modules, "IPython.display", SimpleNamespace(display=lambda *_, **__: Line()))
+    sb.distance(*pair, -2.0, rtol=1e-1)
+    assert shown == [*told, ""]
+    shown.clear()
+    sb.fit(*pair, -4.0, steps=2)
+    assert shown[0].startswith("step 1 of at most 2: ")
+    assert shown[-1] == ""

@@ -149,7 +149,7 @@ def fit_command(
             bar.update(progress.step - bar.pos)
 
     with bar or nullcontext(), Deadline.with_results(has_begun.is_set):
-        fitted = method(similarity.apply(own), similarity.apply(goal), **settings, notify=show)
+        fitted = method(similarity.apply(own), similarity.apply(goal), **settings, on_progress=show)
     vertices = np.asarray(fitted.mesh.vertices) / similarity.scale + np.asarray(similarity.origin)
     result = Mesh(vertices, fitted.mesh.triangles)
     write_mesh(result, output)

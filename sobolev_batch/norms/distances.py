@@ -7,7 +7,7 @@ weighted sum of those. Fields are read block by block, so they need not fit into
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -37,6 +37,7 @@ from sobolev_batch.norms.fields import (
     shells_of,
 )
 from sobolev_batch.parameters import check_seed
+from sobolev_batch.shown import progress_line
 from sobolev_batch.transform.lattice import Lattice, Orders, SobolevWeights, check_orders
 from sobolev_batch.transform.spheres import sphere_distance, sphere_inner_product, sphere_norm
 
@@ -53,6 +54,7 @@ def norm(
     memory: float | str | None = None,
     best_effort: bool = False,
     seed: int = 0,
+    on_progress: Callable[[str], object] | None = None,
 ) -> xr.Dataset:
     """Return the Sobolev norm ||a||_s of a surface's area measure, with its error.
 
@@ -66,6 +68,7 @@ def norm(
         best_effort: Return the nearest that can be reached where the rtol is out of reach, instead of raising.
         seed: Seed of the random frequencies that measure the tail with rtol. The same seed gives the same result.
             A whole number from 0 on.
+        on_progress: Called with a line about each step with rtol; by default notebooks show the last one.
 
     Returns:
         Dataset over `order` with `norm`, its `error`, and `error_part`, the four parts of the error over `part`:
@@ -91,7 +94,7 @@ def norm(
     orders = check_orders(order)
     if rtol is not None:
         accuracy = accuracy_of(rtol, memory, best_effort=best_effort)
-        return to_accuracy("norm", (a,), order, lattice, accuracy, seed)[0]
+        return to_accuracy("norm", (a,), order, lattice, accuracy, seed, on_progress)[0]
     _refuse_settings_of_rtol(memory, best_effort=best_effort)
     if spheres := _spheres(a, lattice=lattice):
         values = np.array([sphere_norm(spheres[0], s) for s in orders])
@@ -112,6 +115,7 @@ def distance(
     memory: float | str | None = None,
     best_effort: bool = False,
     seed: int = 0,
+    on_progress: Callable[[str], object] | None = None,
 ) -> xr.Dataset:
     """Return the Sobolev distance ||a - b||_s of two surfaces' area measures, with its error.
 
@@ -127,6 +131,7 @@ def distance(
         best_effort: Return the nearest that can be reached where the rtol is out of reach, instead of raising.
         seed: Seed of the random frequencies that measure the tail with rtol. The same seed gives the same result.
             A whole number from 0 on.
+        on_progress: Called with a line about each step with rtol; by default notebooks show the last one.
 
     Returns:
         Dataset over `order` with `distance`, its `error`, and the parts of the error; see `norm`. `relative` is the
@@ -153,7 +158,7 @@ def distance(
     a, b = as_operand(a), as_operand(b)
     if rtol is not None:
         accuracy = accuracy_of(rtol, memory, best_effort=best_effort)
-        return to_accuracy("distance", (a, b), order, lattice, accuracy, seed)[0]
+        return to_accuracy("distance", (a, b), order, lattice, accuracy, seed, on_progress)[0]
     _refuse_settings_of_rtol(memory, best_effort=best_effort)
     if spheres := _spheres(a, b, lattice=lattice):
         return _distance_of_spheres(spheres[0], spheres[1], order)
@@ -185,7 +190,13 @@ def _refuse_settings_of_rtol(memory: float | str | None, *, best_effort: bool) -
 
 
 def to_accuracy(
-    name: str, operands: Sequence[OperandLike], order: Orders, lattice: Lattice | None, accuracy: Accuracy, seed: int
+    name: str,
+    operands: Sequence[OperandLike],
+    order: Orders,
+    lattice: Lattice | None,
+    accuracy: Accuracy,
+    seed: int,
+    on_progress: Callable[[str], object] | None = None,
 ) -> tuple[xr.Dataset, Reference | None]:
     """Compute a norm or distance, and its reference, to an accuracy; attributes hold the settings that were chosen."""
     orders = check_orders(order)
@@ -194,7 +205,8 @@ def to_accuracy(
         raise InputError("an rtol chooses the lattice: pass surfaces and no lattice, or a lattice and no rtol")
     check_seed(seed)
     problem = Problem.from_surfaces(surfaces, orders, accuracy, f"the {name}", available_cores())
-    solution = solve(problem, seed)
+    with progress_line(on_progress) as notify:
+        solution = solve(replace(problem, notify=notify), seed)
     attributes = {"rtol": accuracy.rtol, "seed": seed, **solution.settings}
     reference = None
     if name == "norm":

@@ -22,6 +22,7 @@ from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.distances import distance
 from sobolev_batch.norms.fields import Operand, OperandLike, as_operand
 from sobolev_batch.parameters import is_whole_number
+from sobolev_batch.shown import progress_line
 from sobolev_batch.transform.fourier import Execution, thread_count
 from sobolev_batch.transform.lattice import Lattice
 
@@ -93,8 +94,11 @@ class FitProgress:
     steps: int
     relative: float
 
+    def __str__(self) -> str:
+        return f"step {self.step} of at most {self.steps}: {self.relative:.3g} of the start"
 
-Notify = Callable[[FitProgress], None]
+
+Notify = Callable[[FitProgress], object]
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +139,7 @@ def fit(
     smoothing: float = DEFAULT_SMOOTHING,
     keep_boundary: bool = False,
     threads: int | None = None,
-    notify: Notify | None = None,
+    on_progress: Notify | None = None,
 ) -> Fit:
     """Move the vertices of a mesh to lower its Sobolev distance from a target.
 
@@ -155,7 +159,7 @@ def fit(
             the distance falls less. A start that is far away takes at least 4.
         keep_boundary: Leave vertices of open boundaries where they are.
         threads: Threads of the NUFFT; one per core by default.
-        notify: Called after each step.
+        on_progress: Called with a `FitProgress` after each step; by default notebooks show the last one.
 
     Returns:
         The fitted mesh with its distances before and after. It is never farther away than the start by more than the
@@ -175,7 +179,7 @@ def fit(
     mesh, target = as_mesh(mesh), as_operand(target)
     settings = FitSettings(order, steps, smoothing, keep_boundary)
     execution = Execution(threads=thread_count(threads))
-    return _measured(mesh, FitProblem.for_target(mesh, target, lattice, settings, execution), (), notify)
+    return _measured(mesh, FitProblem.for_target(mesh, target, lattice, settings, execution), (), on_progress)
 
 
 def fitted_mesh(
@@ -281,7 +285,7 @@ def measure_quality(problem: FitProblem, mesh: Mesh) -> FitQuality:
     return replace(quality, hausdorff=near["hausdorff"], chamfer=near["chamfer"])
 
 
-def _measured(given: Mesh, problem: FitProblem, goals: Sequence[int], notify: Notify | None) -> Fit:
+def _measured(given: Mesh, problem: FitProblem, goals: Sequence[int], on_progress: Notify | None) -> Fit:
     """Carry a fit out and measure it: return its mesh, or the given one if that is nearer.
 
     Refuse a field that cannot serve the order.
@@ -293,7 +297,8 @@ def _measured(given: Mesh, problem: FitProblem, goals: Sequence[int], notify: No
             f"distance {before.distance:.2g} has an error of {before.error:.2g}, so there is nothing that a fit could "
             "lower; take a more negative order, or a field on a larger lattice"
         )
-    run = _finished(problem, goals, notify)
+    with progress_line(on_progress) as notify:
+        run = _finished(problem, goals, notify)
     problem = run.problem
     mesh, remarks, end = problem.given_mesh(run.mesh), [], run.end
     try:
@@ -325,7 +330,7 @@ def refine(
     smoothing: float = DEFAULT_SMOOTHING,
     keep_boundary: bool = False,
     threads: int | None = None,
-    notify: Notify | None = None,
+    on_progress: Notify | None = None,
 ) -> Fit:
     """Split edges of a mesh where that lowers its Sobolev distance from a target most, and move its vertices.
 
@@ -346,7 +351,7 @@ def refine(
         smoothing: As for `fit`.
         keep_boundary: Leave vertices of open boundaries where they are. Their edges may be split.
         threads: As for `fit`.
-        notify: Called after each step.
+        on_progress: Called with a `FitProgress` after each step; by default notebooks show the last one.
 
     Returns:
         The finer mesh with the distances of the start and of itself. It is never farther away than the start by more
@@ -366,7 +371,7 @@ def refine(
     settings = FitSettings(order, steps, smoothing, keep_boundary)
     execution, goals = Execution(threads=thread_count(threads)), _goals(len(mesh.triangles), triangles)
     problem = FitProblem.for_target(welded(mesh)[0], target, lattice, settings, execution)
-    refined = _measured(mesh, problem, goals, notify)
+    refined = _measured(mesh, problem, goals, on_progress)
     count = len(refined.mesh.triangles)
     if count >= triangles or refined.end == End.INTERRUPTED.value:
         return refined

@@ -271,6 +271,7 @@ class State:
 
     def advanced(self, seconds: float, **changes: object) -> State:
         """Return the state after a step of some predicted time."""
+        self.problem.notify(f"{self.problem.label}: {len(self.octaves)} octaves, step {self.steps}")
         return replace(self, seconds=self.seconds + seconds, steps=self.steps + 1, **changes)  # type: ignore[arg-type]
 
 
@@ -282,6 +283,7 @@ def solve_in_octaves(problem: Problem, seed: int, aim: float = 1.0, for_others: 
     else the last one that can be sampled in some minutes. AccuracyError where the accuracy lies below rounding.
     """
     aimed = replace(problem, accuracy=replace(problem.accuracy, rtol=aim * problem.accuracy.rtol))
+    problem.notify(f"{problem.label}: octaves beyond a lattice")
     state = State.first(aimed, seed, for_others)
     for _ in range(_ROUNDS):
         while (farther := farther_out(state)) is not None:

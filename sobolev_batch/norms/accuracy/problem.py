@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Self, cast
@@ -54,6 +54,7 @@ class Problem:
         signs: Signs of the surfaces in the difference.
         apart: What the product of two surfaces that are far apart does not exceed (orders,); None for others.
         moved: Norm (orders,) that faces which were taken out do not exceed, as they are apart by a rounding of files.
+        notify: Called with a line about each step.
     """
 
     surfaces: Sequence[Surface]
@@ -66,6 +67,7 @@ class Problem:
     signs: Sequence[int] = (1, -1)
     apart: Reals | None = None
     moved: Reals | float = 0.0
+    notify: Callable[[str], object] = str
 
     @classmethod
     def from_surfaces(

@@ -386,6 +386,7 @@ def _compute(
     problem: Problem, lattice: Lattice, target: ErrorTarget, dtype: ComplexDtype | None = None
 ) -> tuple[Solution, Sums]:
     """Compute the norm or distance on a lattice, from fields with an error within a target; see `Problem.fields`."""
+    problem.notify(f"{problem.label}: a lattice of M = {lattice.M}")
     fields = problem.fields(lattice, target, dtype)
     found, sums = difference_on(problem, lattice, fields)
     return Solution(found, lattice, tuple(map(SurfaceValues, fields))), sums

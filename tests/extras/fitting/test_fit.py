@@ -107,7 +107,7 @@ def test_an_interrupt_keeps_the_best_so_far() -> None:
         if progress.step == 3:
             os.kill(os.getpid(), signal.SIGINT)
 
-    fitted = sb.fit(START, TARGET, -4.0, notify=interrupt)
+    fitted = sb.fit(START, TARGET, -4.0, on_progress=interrupt)
     assert fitted.end == "it was interrupted"
     assert fitted.steps == len(seen) == 3
     assert fitted.after.distance < fitted.before.distance

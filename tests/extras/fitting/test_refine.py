@@ -40,7 +40,7 @@ def test_the_target_can_be_a_field_alone() -> None:
 def test_progress_counts_all_rounds() -> None:
     seen: list[sb.fitting.FitProgress] = []
     found = sb.fitting.refine(
-        sb.shapes.icosphere(0), sb.shapes.Ellipsoid((1.3, 1, 1)), -4.0, triangles=70, steps=5, notify=seen.append
+        sb.shapes.icosphere(0), sb.shapes.Ellipsoid((1.3, 1, 1)), -4.0, triangles=70, steps=5, on_progress=seen.append
     )
     assert [progress.step for progress in seen] == list(range(1, found.steps + 1))
     assert {progress.steps for progress in seen} == {15}
@@ -53,7 +53,7 @@ def test_an_interrupt_keeps_the_best_mesh(monkeypatch: pytest.MonkeyPatch) -> No
             raise KeyboardInterrupt
 
     start, target = sb.shapes.icosphere(0), sb.shapes.Ellipsoid((1.3, 1, 1))
-    found = sb.fitting.refine(start, target, -4.0, triangles=70, steps=5, notify=interrupt)
+    found = sb.fitting.refine(start, target, -4.0, triangles=70, steps=5, on_progress=interrupt)
     assert found.end == "it was interrupted"
     assert 20 < len(found.mesh.triangles) < 70
     assert found.after.distance < found.before.distance
