@@ -43,12 +43,14 @@ GROUPS = {
         ),
     ),
     "Operate": ("docs/clusters", "docs/scale", "docs/reliability"),
-    "Project": ("docs/numerics", "docs/design", "benchmarks/RESULTS", "docs/stability", "CHANGELOG"),
+    "Project": ("docs/numerics", "docs/design", "benchmarks/RESULTS", "docs/stability", "CONTRIBUTING", "SECURITY", "CHANGELOG"),
 }
 ADDRESSES = {
     "README": "index.html",
     "workflows/README": "workflows.html",
     "benchmarks/RESULTS": "benchmarks.html",
+    "CONTRIBUTING": "contributing.html",
+    "SECURITY": "security.html",
     "CHANGELOG": "changelog.html",
 }
 PAGES = {
