@@ -43,7 +43,10 @@ GROUPS = {
         ),
     ),
     "Operate": ("docs/clusters", "docs/scale", "docs/reliability"),
-    "Project": ("docs/numerics", "docs/design", "benchmarks/RESULTS", "docs/stability", "CONTRIBUTING", "SECURITY", "CHANGELOG"),
+    "Project": (
+        *("docs/numerics", "docs/design", "benchmarks/RESULTS", "docs/stability"),
+        *("CONTRIBUTING", "SECURITY", "CHANGELOG"),
+    ),
 }
 ADDRESSES = {
     "README": "index.html",
