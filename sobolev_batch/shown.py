@@ -7,7 +7,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from html import escape
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from sobolev_batch.visible import visible
@@ -59,7 +58,9 @@ def progress_line(on_progress: Callable[[Any], object] | None) -> Iterator[Calla
     if on_progress is not None or not hasattr(shell, "kernel"):
         yield on_progress or str
         return
-    line = import_module("IPython.display").display({"text/plain": ""}, raw=True, display_id=True)
+    from IPython.display import display  # type: ignore[import-not-found,unused-ignore]
+
+    line = display({"text/plain": ""}, raw=True, display_id=True)
     try:
         yield lambda text: line.update({"text/plain": visible(str(text))}, raw=True)
     finally:

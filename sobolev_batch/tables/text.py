@@ -171,8 +171,8 @@ def likeness(name: str, reference: str, result: xr.Dataset | Mapping[str, float]
     >>> errors = {"moved_error": 1e-4, "noise_error": 1e-4, "decimated_error": 40.0}
     >>> print(likeness("small.obj", "large.obj", {**amounts, **errors}, 50.0, "mm"))
     At order -2, small.obj is as far from large.obj as
-      large.obj moved by 0.81 % of its radius, 0.41 mm,
-      large.obj with noise of 0.32 % of its radius, 0.16 mm,
+      large.obj moved by 0.81 % of its radius, 0.405 mm,
+      large.obj with noise of 0.32 % of its radius, 0.160 mm,
       large.obj decimated to 2,300 triangles.
     """
     kinds = [kind for kind in ("moved", "noise", "decimated") if kind in result]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sobolev_batch import __version__
 from sobolev_batch.cli.comparison import Comparison
 from sobolev_batch.errors import from_extra
 from sobolev_batch.geometry.closest import signs
@@ -64,7 +64,7 @@ def comparison_page(path: Path, comparison: Comparison, verdict: str = "") -> No
     content = {
         "title": " and ".join(comparison.names),
         "orders": [],
-        "versions": {"sobolev-batch": __version__},
+        "versions": {"sobolev-batch": version("sobolev-batch")},
         "sentences": [f"{verdict}."] * bool(verdict) + list(comparison.sentences),
         "names": comparison.names,
         "triangles": [len(mesh.triangles) for mesh in meshes],
