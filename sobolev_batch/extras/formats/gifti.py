@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.formats.by_name import Format
-from sobolev_batch.geometry.formats.parsing import Raw, as_declared, reals, unpacked_limit, whole, xml_events
+from sobolev_batch.geometry.formats.parsing import Raw, reals, typed, unpacked_limit, whole, xml_events
 
 _MOST_DIMENSIONS = 6
 _GIFTI_TYPES = {
@@ -88,7 +88,7 @@ def _decoded(text: str, attributes: Mapping[str, str], number: int, most_bytes: 
     if encoding == "ASCII":
         if not text.strip():
             raise MeshError(f"array {number} of the file is empty")
-        values = as_declared(reals(text.split(), owner), dtype, owner)
+        values = typed(text.split(), dtype, owner)
     else:
         decoded = base64.b64decode(text)
         if encoding == "GZipBase64Binary":

@@ -20,8 +20,13 @@ from sobolev_batch.geometry.formats.by_name import Format
 from sobolev_batch.geometry.formats.parsing import Raw, beside_volume, reals, whole
 from sobolev_batch.geometry.formats.polygons import cut_polygons
 
-# Medit's cells with volume.
+# Medit's cells with volume, and words of sections that have no part in a surface.
 _MEDIT_VOLUMES = ("Tetrahedra", "Prisms", "Pyramids", "Hexahedra")
+_MEDIT_SKIPPED = re.compile(
+    "MeshVersionFormatted|Dimension|Vertices|Triangles|Quadrilaterals|Edges|Corners|Ridges|BoundingBox|Geometry|Time|"
+    "AngleOfCornerBound|Iterations|End|(Required|Normal|Tangent|SubDomain|Parallel|[DI]?SolAt)[A-Za-z]*|"
+    "[A-Za-z]+OnGeometric[A-Za-z]+"
+)
 # Gmsh's numbers of cells: their corners, and which have an area or a volume.
 _CORNERS = {1: 2, 2: 3, 3: 4, 4: 4, 5: 8, 6: 6, 7: 5, 15: 1}
 _WITH_AREA, _WITH_VOLUME = (2, 3), (4, 5, 6, 7)
@@ -39,6 +44,8 @@ def parse_medit(data: bytes) -> Raw:
         raise MeshError("it is not of dimension 3")
     if curved := [name for name in names if re.match("(Triangles|Quadrilaterals)[PQ]", name)]:
         raise MeshError(f"it has {curved[0]}, which are curved; save it with flat faces")
+    if unknown := [name for name in names if name not in _MEDIT_VOLUMES and not _MEDIT_SKIPPED.fullmatch(name)]:
+        raise MeshError(f"it has a section {unknown[0][:40]!r}, which is not read and may hold faces; save it without")
     vertices, *faces = (
         _medit_rows(name, sections.get(name, b"0"), width)[:, :-1]
         for name, width in (("Vertices", 4), ("Triangles", 4), ("Quadrilaterals", 5))

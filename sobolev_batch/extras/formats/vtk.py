@@ -21,10 +21,9 @@ from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.formats.by_name import Format
 from sobolev_batch.geometry.formats.parsing import (
     Raw,
-    as_declared,
     beside_volume,
-    reals,
     triangle_strips,
+    typed,
     unpacked_limit,
     whole,
     xml_events,
@@ -124,7 +123,7 @@ class _Legacy:
         self.place += width - sum(map(len, words[count:]))
         if len(words) < count:
             raise MeshError(f"the file breaks off: it announces {count} numbers, and has {len(words)}")
-        return as_declared(reals(words[:count], "the file"), dtype.newbyteorder("="), "the file")
+        return typed(words[:count], dtype.newbyteorder("="), "the file")
 
     def cells(self, counts: tuple[int, int], is_new: bool) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return the places where cells of a section end, and the corners of all, by the counts of its first line."""
@@ -135,10 +134,10 @@ class _Legacy:
             return offsets[1:], corners
         numbers = self.array(counts[1], "int")
         places, place, values = [], 0, numbers.tolist()
-        for _ in range(counts[0]):
+        while len(places) < counts[0] and place < len(values):
             places.append(place)
-            place += 1 + (values[place] if place < len(values) and values[place] >= 0 else len(values))
-        if place != len(values):
+            place += 1 + (values[place] if values[place] >= 0 else len(values))
+        if place != len(values) or len(places) != counts[0]:
             raise MeshError(f"a section announces {counts[0]} cells of {counts[1]} numbers, which it has not")
         return np.cumsum(numbers[places], dtype=np.int64), np.delete(numbers, places)
 
@@ -241,7 +240,7 @@ def _decoded(
         raise MeshError(f"{owner} has the type {kind[:40]!r} and the format {form[:40]!r}, which VTK does not have")
     dtype, order = np.dtype(_TYPES[kind.lower()]), ">" if root.get("byte_order") == "BigEndian" else "<"
     if form == "ascii":
-        return as_declared(reals(text.split(), owner), dtype, owner)
+        return typed(text.split(), dtype, owner)
     head = np.dtype(order + _TYPES.get(root.get("header_type", "").lower(), "u4"))
     source, is_base64 = behind if form == "appended" else ("".join(text.split()).encode(), True)
     place = whole(attributes.get("offset", ""), owner) if form == "appended" else 0

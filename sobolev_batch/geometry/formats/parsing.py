@@ -51,6 +51,7 @@ _XML_BYTES = 1 << 14
 # Digits of an integer: all that fit into 64 bits.
 _MOST_DIGITS = 18
 _REAL = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
+_INTEGERS = re.compile("[-+0-9]*")
 # Fortran writes the exponents of doubles with a D.
 _FORTRAN = re.compile(r"(?<=[0-9.])[dD](?=[+-]?[0-9])")
 # The index that ends a strip of triangles within a list.
@@ -218,6 +219,13 @@ def as_declared(numbers: NDArray[Any] | array[float], declared: DTypeLike, owner
     if len(wrong):
         raise MeshError(f"{owner} has {wrong[0]:g} for an integer of {8 * converted.itemsize} bits")
     return converted
+
+
+def typed(words: Sequence[str], dtype: np.dtype[Any], owner: str) -> NDArray[Any]:
+    """Return words as numbers of a type; an error begins with their owner."""
+    if dtype.kind in "iu" and not _INTEGERS.fullmatch("".join(words)):
+        raise MeshError(f"{owner} has fractions or other words for integers")
+    return as_declared(reals(words, owner), dtype, owner)
 
 
 def beside_volume(cells: int, faces: int) -> tuple[str, ...]:

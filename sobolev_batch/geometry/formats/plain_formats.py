@@ -53,6 +53,8 @@ def parse_obj(data: bytes) -> Raw:
             if len(words) - 1 not in _OBJ_VERTEX_SIZES:
                 raise MeshError(f"vertex {number} has {len(words) - 1} coordinates, expected three")
             vertices.extend(reals(words[1:4], f"vertex {number}"))
+            if len(words) == 5 and words[4] != "1" and reals(words[4:], f"vertex {number}")[0] != 1:
+                raise MeshError(f"vertex {number} has the weight {words[4][:40]}, which only curves have")
         elif kind in ("f", "fo"):
             corners.extend(_obj_corner(word, len(vertices) // 3, len(sizes) + 1) for word in words[1:])
             sizes.append(len(words) - 1)
@@ -140,7 +142,10 @@ def parse_stl(data: bytes) -> Raw:
     start, announced = data[:_STL_START_BYTES], int.from_bytes(data[80:_STL_HEADER_BYTES], "little")
     # Fewer bytes than those of a triangle may follow.
     if len(data) >= _STL_HEADER_BYTES and (len(data) - _STL_HEADER_BYTES) // _STL_RECORD.itemsize == announced:
-        corners = np.frombuffer(data, _STL_RECORD, announced, _STL_HEADER_BYTES)["corners"].reshape(-1, 3)
+        records = np.frombuffer(data, _STL_RECORD, announced, _STL_HEADER_BYTES)
+        if len(data) > _STL_HEADER_BYTES + records.nbytes and records["attribute"].any():
+            raise MeshError("the file has more bytes than its triangles take, which may lie between them")
+        corners = records["corners"].reshape(-1, 3)
     elif b"\0" not in start:
         if start.removeprefix(codecs.BOM_UTF8).lstrip()[:5].lower() != b"solid":
             raise MeshError("the file is a text that does not begin with solid, as STL files in text do")
