@@ -12,6 +12,7 @@ from benchmarks.devices import on_a_gpu
 from benchmarks.fitting import fits
 from benchmarks.low_orders import low_orders
 from benchmarks.memory import peaks
+from benchmarks.peers import peers
 from benchmarks.reconstruction import reconstructions
 from benchmarks.scale import many_objects, tiny_meshes, waiting_workers
 from benchmarks.studies import all_pairs, study_overhead
@@ -40,6 +41,7 @@ _ITEMS: dict[str, Callable[[Effort], Iterator[Row]]] = {
     "scale": tiny_meshes,
     "objects": many_objects,
     "waiting": waiting_workers,
+    "peers": peers,
 }
 # Reconstructions take as long as everything else together.
 _BY_NAME = ("12",)

@@ -58,7 +58,7 @@ def progress_line(on_progress: Callable[[Any], object] | None) -> Iterator[Calla
     if on_progress is not None or not hasattr(shell, "kernel"):
         yield on_progress or str
         return
-    from IPython.display import display  # type: ignore[import-not-found,unused-ignore]
+    from IPython.display import display
 
     line = display({"text/plain": ""}, raw=True, display_id=True)
     try:
