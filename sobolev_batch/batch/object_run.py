@@ -112,7 +112,7 @@ def run_object(
     """
     if workspace is not None and lacks_nothing(workspace):
         # The last run may have been killed before it did.
-        Records(workspace.store).collect(workspace.records)
+        workspace.put_in_order()
         return Ended.of(workspace, set())
     cluster = equip()
     # Asked before anything is computed: a GPU that nobody has would be waited for.
@@ -169,7 +169,7 @@ def begin(study: Study, location: Location, workers: Workers | None) -> Begun | 
         compiled.use()
         workspace = Workspace.of_study(study, location)
     if lacks_nothing(workspace):
-        Records(workspace.store).collect(workspace.records)
+        workspace.put_in_order()
         return Begun(Ended.of(workspace, set()), ())
     if workers is None or not _is_small(workspace, workers):
         return _sent(workspace)
@@ -216,7 +216,7 @@ def _compute(cluster: Cluster, workspace: Workspace) -> Stages[Ended]:
         workspace = _received((yield from result_from(cluster, Task(lay_out_again, arguments, stage="layout"))))
         rows = workspace.pending
     yield from measure_proximities(cluster, workspace)
-    Records(workspace.store).collect(workspace.records)
+    workspace.put_in_order()
     return Ended.of(workspace, computed, None if tabulated is None else tabulated.tables)
 
 

@@ -7,7 +7,7 @@ from contextlib import nullcontext, suppress
 
 from sobolev_batch.errors import StoreError
 from sobolev_batch.store.encoding import ROOT
-from sobolev_batch.store.layout import FIELD, OCTAVES, RECORDS, TABLES_OF_ALL, Store
+from sobolev_batch.store.layout import FIELD, OCTAVES, RECORDS, TABLES_OF_ALL, TAGS, Store
 from sobolev_batch.store.location import PARTIAL_FILE, Location
 from sobolev_batch.store.lock import LOCK_KEYS, Lock, locked
 from sobolev_batch.store.objects import Objects, root_of
@@ -27,7 +27,7 @@ def prune_lost_objects(location: Location, *, is_dry: bool = True) -> int:
     if objects is None:
         return 0
     with nullcontext() if is_dry else locked(location, Lock.of_this_process()):
-        own = {*objects.names, *TABLES_OF_ALL, RECORDS, ROOT, *LOCK_KEYS}
+        own = {*objects.names, *TABLES_OF_ALL, RECORDS, ROOT, TAGS, *LOCK_KEYS}
         for name in sorted(location.names() - own):
             # Whatever else lies there is not ours, and another store least of all.
             place = None
@@ -51,7 +51,7 @@ def prune(location: Location, *, is_dry: bool = True) -> dict[str, int]:
         store = Store.open(location)
         contents = Contents.of_store(store)
         lost, kept = set(range(len(contents.labels))) - contents.rows.keys(), contents.complete.keys()
-        listed = {name.split("/")[0] for name in store.documents} | {ROOT, *LOCK_KEYS}
+        listed = {name.split("/")[0] for name in store.documents} | {ROOT, TAGS, *LOCK_KEYS}
         counts: Counter[str] = Counter()
         prefixes = set()
         for key, size in location.sizes("").items():

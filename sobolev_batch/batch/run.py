@@ -227,6 +227,7 @@ def carry_out(
             known = {**recorded, **{name: one.record for name, one in ended.items()}}
             objects.records.collect([known.get(name) for name in study.objects])
             _tabulate(objects, ended, tabulated & study.objects.keys())
+            objects.root.remember()
     return _summary(location, {name: ended[name] for name in study.objects if name in ended})
 
 

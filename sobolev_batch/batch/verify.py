@@ -21,6 +21,7 @@ from sobolev_batch.store.layout import (
     QUALITY,
     RECORDS,
     SPECTRA_KEYS,
+    TAGS,
     Store,
     table_names,
 )
@@ -109,7 +110,7 @@ def verify(store: str | Path | Location, on_progress: Callable[[int, int], None]
     """
     location = Location.parse(store)
     root, lock = root_of(location), Lock.of_this_process()
-    objects = Objects.read(location)
+    objects = Objects.read(location, is_thorough=True)
     if objects is None:
         # Where there is no store, this says so.
         Store.open(location)
@@ -123,7 +124,8 @@ def verify(store: str | Path | Location, on_progress: Callable[[int, int], None]
     try:
         # It is opened again: the last run may have ended since. Whoever unlocks it may change it.
         own = replace(location, fence=lock.of_holder(root).fence)
-        return _verify_all(own, None if objects is None else Objects.read(own), on_progress, may_write=True)
+        objects = objects and Objects.read(own, is_thorough=True)
+        return _verify_all(own, objects, on_progress, may_write=True)
     finally:
         release(root, lock)
 
@@ -160,7 +162,7 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, *, may
     records, unread = Records(store).examine()
     damaged = {row: f"its completion record is damaged ({what})" for row, what in unread.items()}
     tables, chunks = _damaged_tables(store), dict[tuple[str, Index], str]()
-    if not tables and not store.has_digest():
+    if not tables and not store.has_digest(is_thorough=True):
         tables[ROOT] = "tables, coordinates or metadata are not what was written together"
     try:
         Records(store).read_run()
@@ -198,6 +200,9 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, *, may
             Records(store).write(row, None)
         for place in chunks:
             withdraw_chunk(store, *place)
+        if tables:
+            # The next run reads all of them.
+            store.location.discard(TAGS)
     for (keys, index), what in chunks.items():
         tables[f"chunk {'/'.join(map(str, index))} of {keys.split('/')[0]}"] = what
     return Verification(

@@ -151,6 +151,10 @@ def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:
     fresh = Store(store.location)
     fresh.documents = _documents_of(record_keys(count))
     records, damaged = Records(fresh).examine()
+    # Rows end before the last page does.
+    count = max([len(stored), 1 + last, *(1 + row for row, record in enumerate(records) if record is not None)])
+    fresh.documents |= _documents_of(record_keys(count))
+    records, damaged = records[:count], {row: what for row, what in damaged.items() if row < count}
     keys = {row.key for row in plan.rows}
     if damage is not None and not any(record is not None and record.key in keys for record in records):
         raise DamageError(

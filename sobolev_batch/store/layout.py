@@ -14,7 +14,7 @@ import hashlib
 import json
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from itertools import accumulate
@@ -61,6 +61,9 @@ SPECTRA_KEYS, PAIRS_KEYS = f"{SPECTRA_GROUP}/key", f"{DISTANCES}/key"
 # Among its versions, and those of the tables, is that of the numerics by which fields were computed.
 NUMERICS = "numerics"
 DIGEST, UNFINISHED, OBJECTS, REMOVED = "digest", "unfinished", "objects", "removed"
+# This key at the root of a store in object storage holds, of keys below the digest, their SHA-256 and what the storage
+# says of their content when it lists them.
+TAGS = "tags.json"
 # What a reader finds first.
 DESCRIPTION = (
     "Begin with the group convergence: distances of meshes to their reference. To read all groups: "
@@ -72,8 +75,9 @@ TABLES_OF_ALL = ("meshes", "convergence", "proximity")
 _OF_ROWS = frozenset({FIELD, OCTAVES, RECORD, PAGE})
 # Most of the time of a request is spent waiting.
 _REQUESTS_AT_ONCE = 64
-# Documents, and hashes of keys.
-Metadata = tuple[dict[str, Document], dict[str, str]]
+# Hashes of keys, each with what the storage says of the content when it lists the key, if anything.
+Hashes = dict[str, tuple[str, str]]
+Metadata = tuple[dict[str, Document], Hashes]
 # Tasks write into the chunks of these groups; all others are tables, written, listed and hidden as a whole.
 GROUPS_OF_TASKS = ("fourier", OCTAVES_GROUP, SPECTRA_GROUP, RECORDS)
 
@@ -92,13 +96,14 @@ class Store:
     def __init__(self, store: str | Path | Location) -> None:
         self.location = Location.parse(store)
         self.documents: dict[str, Document] = {}
-        # These are the SHA-256 of keys below the digest, where this process knows them.
-        self._hashes: dict[str, str] = {}
+        # These are the SHA-256 of keys below the digest that this process knows, with their tags; see `remember`.
+        self._hashes: Hashes = {}
+        self._remembered: Hashes = {}
         self.lacks_tables = False
 
     def __getstate__(self) -> dict[str, Any]:
         carried = {name: self.documents[name] for name in self._arrays_in_progress if name in self.documents}
-        return {"location": self.location, "documents": carried, "_hashes": {}, "lacks_tables": self.lacks_tables}
+        return {**vars(self), "documents": carried, "_hashes": {}, "_remembered": {}}
 
     @classmethod
     def open(cls, store: str | Path | Location) -> Self:
@@ -296,20 +301,21 @@ class Store:
     def write(self, name: str, selection: Any, values: Any) -> None:
         """Write a selection of an array, made of whole chunks."""
         array = self.array(name)
-        self._forget(name)
+        self._forget(f"{name}/c")
         with self.location.access("written"):
             array[selection] = values
 
     def write_chunk(self, name: str, index: Sequence[int], values: NDArray[Any]) -> None:
         """Write one whole chunk of an array."""
-        self._forget(name)
+        self._forget(f"{name}/c")
         self.location.write({"/".join([name, "c", *map(str, index)]): chunk_of(values)})
 
     def publish(self, keys: Mapping[str, bytes]) -> None:
         """Write keys of new nodes. Readers find the nodes after `consolidate`."""
         self.location.write(keys)
+        tags = self._tags({key.split("/")[0] for key in keys})
         for key, content in keys.items():
-            self._hashes[key] = hashlib.sha256(content).hexdigest()
+            self._hashes[key] = hashlib.sha256(content).hexdigest(), tags.get(key, "")
             if key.endswith(f"/{ROOT}"):
                 self.documents[key.removesuffix(f"/{ROOT}")] = json.loads(content)
 
@@ -331,9 +337,14 @@ class Store:
         self.documents[""]["attributes"][DIGEST] = root["attributes"][DIGEST]
         self.location.write({ROOT: json.dumps(root).encode()})
 
-    def has_digest(self) -> bool:
-        """Return whether tables, coordinates and metadata are those that were written together."""
+    def has_digest(self, *, is_thorough: bool = False) -> bool:
+        """Return whether tables, coordinates and metadata are those that were written together.
+
+        Unless it is thorough, contents that object storage lists as it did before are not read again.
+        """
         try:
+            if not is_thorough:
+                self._recall()
             return bool(self.documents[""]["attributes"].get(DIGEST) == self._digest(self._root()))
         except (DamageError, ValueError, TypeError, KeyError):
             # zarr has no exception of its own for metadata that make no sense.
@@ -352,13 +363,33 @@ class Store:
         for name in self.whole_arrays():
             keys |= dict.fromkeys(self.chunk_keys(name), largest_chunk_bytes(self.documents[name]))
         unknown = {key: keys[key] for key in sorted(keys.keys() - self._hashes.keys())}
+        tags = self._tags({key.split("/")[0] for key in unknown})
         with ThreadPoolExecutor(_REQUESTS_AT_ONCE) as pool:
             # A thread takes longer to start than a file to be read.
             each = pool.map if self.location.scheme else map
             contents = each(self.location.read, unknown, unknown.values())
             for key, content in zip(unknown, contents, strict=True):
-                self._hashes[key] = hashlib.sha256(content or b"").hexdigest()
-        return digest_of([root, {key: self._hashes[key] for key in keys}])
+                self._hashes[key] = hashlib.sha256(content or b"").hexdigest(), tags.get(key, "")
+        return digest_of([root, {key: self._hashes[key][0] for key in keys}])
+
+    def remember(self) -> None:
+        """Write down the hashes of keys that have tags, so that later runs read only those that have changed since."""
+        tagged = {key: known for key, known in self._hashes.items() if known[1]}
+        if not tagged.items() <= self._remembered.items():
+            self.location.write({TAGS: json.dumps(tagged).encode()})
+            self._remembered = tagged
+
+    def _recall(self) -> None:
+        """Take the hashes over that were remembered of keys whose tags are the same."""
+        text = self.location.read(TAGS) if self.location.scheme else None
+        with suppress(ValueError, TypeError, AttributeError, RecursionError):  # Other texts are worth nothing.
+            known = {str(key): (str(one), str(tag)) for key, (one, tag) in json.loads(text or "{}").items()}
+            tags = self._tags({key.split("/")[0] for key in known})
+            self._remembered = {key: one for key, one in known.items() if tags.get(key) == one[1]}
+            self._hashes = self._remembered | self._hashes
+
+    def _tags(self, groups: Iterable[str]) -> dict[str, str]:
+        return {key: tag for group in sorted(groups) for key, tag in self.location.tags(group).items()}
 
     def _forget(self, name: str) -> None:
         self._hashes = {key: value for key, value in self._hashes.items() if not key.startswith(f"{name}/")}

@@ -190,6 +190,17 @@ class Location:
         with self.access("read"):
             return sync(self.zarr_store().sizes(prefix))
 
+    def tags(self, prefix: str) -> dict[str, str]:
+        """Return what object storage says of the content of every key below a prefix, another one for each content.
+
+        Local folders, and storage that says nothing, have none.
+        """
+        store = self.zarr_store()
+        with self.access("read"):
+            entries = sync(store.entries(prefix)) if isinstance(store, RemoteStore) else {}
+        tags = {key: entry.get("ETag", entry.get("etag")) for key, entry in entries.items()}
+        return {key: str(tag) for key, tag in tags.items() if tag}
+
     def names(self) -> frozenset[str]:
         """Return the names at the first level."""
         with self.access("read"):
@@ -439,9 +450,13 @@ class RemoteStore(FsspecStore):
 
     async def sizes(self, prefix: str) -> dict[str, int]:
         """Return the sizes of all keys below a prefix."""
+        return {key: entry["size"] for key, entry in (await self.entries(prefix)).items()}
+
+    async def entries(self, prefix: str) -> dict[str, dict[str, Any]]:
+        """Return what is listed of all keys below a prefix."""
         async with _in_time():
             entries = await self.fs._find(f"{self.path}/{prefix}", detail=True)
-        return {path.removeprefix(f"{self.path}/"): entry["size"] for path, entry in entries.items()}
+        return {path.removeprefix(f"{self.path}/"): entry for path, entry in entries.items()}
 
 
 @cache

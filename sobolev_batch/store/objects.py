@@ -15,7 +15,7 @@ from sobolev_batch.errors import DamageError, InputError, StoreError
 from sobolev_batch.sources.names import node_problem, quoted
 from sobolev_batch.store.create import list_records, record_keys
 from sobolev_batch.store.encoding import ROOT
-from sobolev_batch.store.layout import DESCRIPTION, OBJECTS, PAGE, RECORD, RECORDS, TABLES_OF_ALL, Store
+from sobolev_batch.store.layout import DESCRIPTION, OBJECTS, PAGE, RECORD, RECORDS, TABLES_OF_ALL, TAGS, Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import LOCK_KEYS
 from sobolev_batch.store.metadata import SCHEMA_VERSION
@@ -83,10 +83,10 @@ class Objects:
         return store.location
 
     @classmethod
-    def read(cls, location: Location) -> Self | None:
+    def read(cls, location: Location, *, is_thorough: bool = False) -> Self | None:
         """Return the objects of a store; None where it is that of an only object, or there is none.
 
-        DamageError where the list of objects was altered.
+        DamageError where the list of objects was altered. See `Store.has_digest` for what is thorough.
         """
         root = Store(location)
         with suppress(DamageError):  # An only object may have lost its root, which its readers say.
@@ -95,7 +95,7 @@ class Objects:
         study = root.documents.get("", {}).get("attributes", {}).get("study")
         if not isinstance(study, dict) or OBJECTS not in study:
             return None
-        if not root.lacks_tables and not root.has_digest():
+        if not root.lacks_tables and not root.has_digest(is_thorough=is_thorough):
             problem = "the list of its objects, or the table of all rows, is not what was written"
             raise DamageError(f"{location}: {problem}; run the study again", problem)
         root.attributes(of_objects=True)
@@ -114,7 +114,7 @@ class Objects:
             present = cls.read(location)
         if present is None:
             # Where it is damaged, the stores of the objects are still there.
-            location.require_free({ROOT, RECORDS, *LOCK_KEYS, *TABLES_OF_ALL, *study.objects})
+            location.require_free({ROOT, RECORDS, TAGS, *LOCK_KEYS, *TABLES_OF_ALL, *study.objects})
         elif present.name != study.name:
             raise StoreError(
                 f"{location}: it holds the store of another study, {present.name!r}, not {study.name!r}; "

@@ -233,9 +233,8 @@ class Records(Generic[RecordType]):
     def examine(self) -> tuple[list[RecordType | None], dict[int, str]]:
         """Return the completion record of each row, None if it has none that can be read, and the damage of those."""
         records: list[RecordType | None] = [None] * self.store.document(RECORD)["shape"][0]
-        step, paged = self._pages()
         own = [row for row in self.store.stored_chunks(RECORD) if row < len(records)]
-        lines, damage = self._lines(PAGE, range(paged), step) | self._lines(RECORD, own, 1), {}
+        lines, damage = self._lines(PAGE, range(len(records)), self._rows_per_page) | self._lines(RECORD, own, 1), {}
         for row, line in lines.items():
             try:
                 if isinstance(line, DamageError):
@@ -274,7 +273,7 @@ class Records(Generic[RecordType]):
         """
         with suppress(DamageError):
             line = str(self.store.read(RECORD, row))
-            if not line and not of_this_run and row < self._pages()[1]:
+            if not line and not of_this_run:
                 line = str(self.store.read(PAGE, row))
             return self.type.from_json(line, row)
         return None
@@ -285,27 +284,31 @@ class Records(Generic[RecordType]):
         self.store.write_chunk(RECORD, [row], np.array([line], dtype=object))
 
     def collect(self, records: Sequence[RecordType | None]) -> None:
-        """Collect the records of all rows in pages, each of rows that all have one, and remove their own chunks.
+        """Collect the records of rows in pages, each of rows that all have one, and remove their own chunks.
 
         If the process ends in between, a page and the chunks beside it say the same.
         """
-        step, paged = self._pages()
+        step = self._rows_per_page
         pages: dict[int, list[int]] = {}
-        for row in self.store.stored_chunks(RECORD) if paged else ():
+        for row in self.store.stored_chunks(RECORD):
             pages.setdefault(row // step, []).append(row)
         most_bytes = largest_chunk_bytes(self.store.document(PAGE))
         for page, own in pages.items():
             start = page * step
-            lines = [record.to_json(start + i) for i, record in enumerate(records[start : start + step]) if record]
-            if len(lines) == step and sum(map(len, lines)) < most_bytes // 2:
-                self.store.write(PAGE, slice(start, start + step), np.array(lines, dtype=object))
+            of_page = records[start : start + step]
+            lines = [record.to_json(start + i) for i, record in enumerate(of_page) if record]
+            # In a folder, few records are as quick to read, and less is lost with one of them.
+            fewest = 1 if self.store.location.scheme else step
+            if fewest <= len(of_page) == len(lines) and sum(map(len, lines)) < most_bytes // 2:
+                # A chunk is whole, also where rows end before it.
+                lines += [""] * (step - len(lines))
+                self.store.write_chunk(PAGE, [page], np.array(lines, dtype=object))
                 self.store.location.discard(*(f"{RECORD}/c/{row}" for row in own))
 
-    def _pages(self) -> tuple[int, int]:
-        """Return the number of rows of a page, and that of all rows that full pages may hold."""
-        document = self.store.document(PAGE)
-        (count,), (step,) = document["shape"], chunk_shape(document)
-        return step, count - count % step
+    @property
+    def _rows_per_page(self) -> int:
+        """Number of rows of a page; the last page may have fewer."""
+        return chunk_shape(self.store.document(PAGE))[0]
 
     def read_run(self) -> RunRecord | None:
         """Return the record of the latest run, or None before the first one."""

@@ -146,6 +146,11 @@ class Workspace(Contents):
         stored = self.stored
         return [i for i, row in self.rows.items() if row.is_chosen and i not in stored]
 
+    def put_in_order(self) -> None:
+        """Collect records in pages, and remember what tables hold: later runs take fewer requests."""
+        Records(self.store).collect(self.records)
+        self.store.remember()
+
     def _withdraw_lost_fields(self) -> None:
         """Withdraw the records of fields that are not in the store, or not as a whole."""
         complete = self.complete

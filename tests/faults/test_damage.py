@@ -316,9 +316,12 @@ def test_metadata_at_the_root_that_were_altered(
     store: Path, finished_store: Path, mended: Callable[..., None],
 ) -> None:  # fmt: skip
     root = json.loads((store / "zarr.json").read_text())
+    tables = {name: json.loads(root["attributes"][name]) for name in ("study", "similarity", "versions")}
+    root["attributes"] |= tables
     node = reduce(operator.getitem, place[:-1], root)
     assert node.get(place[-1]) != value
     node[place[-1]] = value
+    root["attributes"] |= {name: json.dumps(table) for name, table in tables.items()}
     (store / "zarr.json").write_text(json.dumps(root))
     if makes_sense:
         assert not verify(store).is_sound

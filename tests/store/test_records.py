@@ -66,7 +66,8 @@ def test_full_pages_take_the_place_of_chunks(scheme: str, store_path: Path) -> N
     store = filled(scheme + str(store_path))
     assert chunks(store) == [f"{OWN}/{row}" for row in range(5)]
     Records(store).collect(Records(store).read())
-    collected = [f"{PAGES}/0", f"{PAGES}/1", f"{OWN}/4"]
+    # In object storage the last page need not be full, since each chunk is a request.
+    collected = [f"{PAGES}/0", f"{PAGES}/1", f"{PAGES}/2" if scheme else f"{OWN}/4"]
     assert chunks(store) == sorted(collected)
     assert keys_of(store) == FIRST
     # New rows make the last page a full one.
@@ -110,7 +111,7 @@ def test_records_stay_the_same_wherever_collecting_ends(store_path: Path, monkey
 
         return call
 
-    for name in ("set", "delete"):
+    for name in ("put", "delete"):
         monkeypatch.setattr(FolderStore, name, dying(getattr(FolderStore, name)))
     for steps in range(20):
         store, left = Store.open(store_path), itertools.count(-steps)
