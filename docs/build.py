@@ -29,18 +29,10 @@ APIS = (API, *(f"{API}.{name}" for name in MODULES))
 # Pages by group, as in the README; the API follows the pages of the reference.
 GROUPS = {
     "": ("README",),
-    "Learn": ("docs/tutorial", "docs/walkthroughs", "docs/gallery", "workflows/README"),
+    "Learn": ("docs/tutorial", "docs/walkthroughs", "workflows/README"),
     "Reference": (
         *("docs/studies", "docs/remeshers", "docs/leagues", "docs/commands", "docs/formats", "docs/surfaces"),
-        *(
-            "docs/store",
-            "docs/queries",
-            "docs/testing",
-            "docs/tolerance",
-            "docs/fitting",
-            "docs/moving",
-            "docs/reconstruction",
-        ),
+        *("docs/store", "docs/queries", "docs/testing", "docs/tolerance", "docs/fitting", "docs/moving"),
     ),
     "Operate": ("docs/clusters", "docs/scale", "docs/reliability"),
     "Project": (
