@@ -6,6 +6,7 @@ import json
 import logging
 import os
 import re
+import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -36,7 +37,7 @@ from tests.faults.fatal import Moment
 from tests.support.commands import TOML, call, command, finished, read_until, started, write_toml
 from tests.support.processes import PATIENCE_SECONDS, tcp_cluster, wait_until
 from tests.support.shapes import TETRAHEDRON_TRIANGLES, TETRAHEDRON_VERTICES
-from tests.support.stores import assert_same_results, contents
+from tests.support.stores import assert_same_results, contents, flip
 from tests.support.studies import small_table, variable
 
 
@@ -149,6 +150,70 @@ def test_objects_go_on_wherever_their_driver_was_killed(
         assert_same_results(store_path / name, undisturbed / name)
     assert verify(store_path).is_sound
     assert table(store_path)["object"].unique().tolist() == ["a", "b"]
+
+
+# Pilots find a lattice that is too small; what is computed on it is laid out again, and computed on a larger one.
+GROWING = """
+import sys
+from distributed import Client
+import sobolev_batch as sb
+from sobolev_batch.batch import object_run
+from sobolev_batch.study import pilots
+from tests.support.studies import small_table
+
+run_pilot, object_run._SMALL_SECONDS = pilots.run_pilot, 0.0
+
+
+def on_small_lattice(problem):
+    distances, lattice, dtype = run_pilot(problem)
+    return distances, sb.Lattice(0.6 * lattice.xi_max, lattice.M), dtype
+
+
+pilots.run_pilot = on_small_lattice
+study = small_table(lattice=None, accuracy={"rtol": 5e-4}, norm={"orders": [-10.0, -4.0]})
+with Client(processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None) as client:
+    sb.run(sb.Study.from_table(study), sys.argv[1], client, on_progress=lambda one: print(one, file=sys.stderr))
+"""
+
+
+@pytest.mark.all
+@pytest.mark.parametrize("moment", ["[1/5]", "[3/5]", "tables reduced"])
+def test_a_larger_lattice_goes_on_where_its_driver_was_killed(moment: str, tmp_path: Path) -> None:
+    undisturbed, store_path = tmp_path / "undisturbed.zarr", tmp_path / "store.zarr"
+    done = finished(sys.executable, "-c", GROWING.replace("sys.argv[1]", repr(str(undisturbed))))
+    assert done.returncode == 0, done.stderr
+    assert "grown" in done.stderr or done.stderr.count("[5/5]") == 2
+    with started(script=GROWING.replace("sys.argv[1]", repr(str(store_path)))) as driver:
+        for _ in range(2):
+            read_until(driver, moment)
+        os.kill(driver.pid, signal.SIGKILL)
+        driver.wait()
+    again = finished(sys.executable, "-c", GROWING.replace("sys.argv[1]", repr(str(store_path))))
+    assert again.returncode == 0, again.stderr
+    assert_same_results(store_path, undisturbed)
+    assert verify(store_path).is_sound
+
+
+@pytest.mark.all
+@pytest.mark.parametrize("line", ["is damaged", "[1/1]"])
+def test_a_repair_goes_on_where_its_driver_was_killed(
+    line: str, finished_store: Path, store_path: Path, tmp_path: Path
+) -> None:
+    # New orders need all fields and no transform.
+    (tmp_path / "study.toml").write_text(tomli_w.dumps(small_table(norm={"orders": [-4.0]})))
+    undisturbed = tmp_path / "undisturbed.zarr"
+    for place in (undisturbed, store_path):
+        shutil.copytree(finished_store, place)
+        flip(place / "fourier/fourier/c/2/0/0/0")
+    assert call("run", tmp_path / "study.toml", "--store", undisturbed, "--workers", "1").returncode == 0
+    with started("run", tmp_path / "study.toml", "--store", store_path, "--workers", "1") as driver:
+        read_until(driver, line)
+        os.kill(driver.pid, signal.SIGKILL)
+        driver.wait()
+    again = call("run", tmp_path / "study.toml", "--store", store_path, "--workers", "1")
+    assert again.returncode == 0, again.stderr
+    assert_same_results(store_path, undisturbed)
+    assert verify(store_path).is_sound
 
 
 KILLS = 20
