@@ -96,6 +96,25 @@ def off(
     return (header + "".join(f"{line}\n" for line in lines)).encode()
 
 
+def off_binary(vertices: ArrayLike, faces: Faces, kind: str = "", more: int = 0, colors: int = 0) -> bytes:
+    """Return an OFF file in binary, with further numbers behind each vertex and each face."""
+    rows = b"".join(struct.pack(f">{3 + more}f", *row, *[0.5] * more) for row in np.asarray(vertices).tolist())
+    for face in faces:
+        rows += struct.pack(f">{len(face) + 2}i{colors}f", len(face), *face, colors, *[0.5] * colors)
+    return f"{kind}OFF BINARY\n".encode() + struct.pack(">3i", len(np.asarray(vertices)), len(faces), 0) + rows
+
+
+def vtk_legacy(vertices: ArrayLike, faces: Faces) -> bytes:
+    """Return a legacy file of VTK of polygons, in text."""
+    points = [numbers(row) for row in np.asarray(vertices)]
+    rows = "\n".join(" ".join(map(str, [len(face), *face])) for face in faces)
+    return (
+        f"# vtk DataFile Version 3.0\nscan\nASCII\nDATASET POLYDATA\nPOINTS {len(points)} double\n"
+        + "\n".join(points)
+        + f"\nPOLYGONS {len(faces)} {sum(map(len, faces)) + len(faces)}\n{rows}\n"
+    ).encode()
+
+
 def stl_text(vertices: ArrayLike, faces: Faces, name: str = "box") -> bytes:
     rows = np.asarray(vertices)
     facets = [

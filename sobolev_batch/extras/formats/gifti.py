@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.formats.by_name import Format
-from sobolev_batch.geometry.formats.parsing import Raw, reals, typed, unpacked_limit, whole, xml_events
+from sobolev_batch.geometry.formats.parsing import BYTE_ORDERS, Raw, reals, typed, unpacked_limit, whole, xml_events
 
 _MOST_DIMENSIONS = 6
 _GIFTI_TYPES = {
     f"NIFTI_TYPE_{name}": np.dtype(name.lower())
     for name in ("UINT8", "INT16", "UINT16", "INT32", "UINT32", "INT64", "UINT64", "FLOAT32", "FLOAT64")
 }
+_INDEXING: dict[str, Literal["C", "F"]] = {"RowMajorOrder": "C", "ColumnMajorOrder": "F"}
 _POINTS, _FACES = "NIFTI_INTENT_POINTSET", "NIFTI_INTENT_TRIANGLE"
 
 
@@ -84,7 +85,9 @@ def _decoded(text: str, attributes: Mapping[str, str], number: int, most_bytes: 
     if min(shape) < 0:
         raise MeshError(f"array {number} of the file has a negative dimension: {shape}")
     size = math.prod(shape) * dtype.itemsize
-    order: Literal["C", "F"] = "F" if attributes.get("ArrayIndexingOrder") == "ColumnMajorOrder" else "C"
+    order, endian = attributes.get("ArrayIndexingOrder", "RowMajorOrder"), attributes.get("Endian", "LittleEndian")
+    if order not in _INDEXING or endian not in BYTE_ORDERS:
+        raise MeshError(f"{owner} has the orders {order[:40]!r} and {endian[:40]!r}, which GIFTI does not have")
     if encoding == "ASCII":
         if not text.strip():
             raise MeshError(f"array {number} of the file is empty")
@@ -101,8 +104,8 @@ def _decoded(text: str, attributes: Mapping[str, str], number: int, most_bytes: 
         if len(decoded) != size:
             wrong = "more" if len(decoded) > size else "fewer"
             raise MeshError(f"array {number} of the file unpacks to {wrong} than the {size} bytes announced")
-        values = np.frombuffer(decoded, dtype.newbyteorder(">" if attributes.get("Endian") == "BigEndian" else "<"))
-    return np.asarray(values.reshape(shape, order=order))
+        values = np.frombuffer(decoded, dtype.newbyteorder(BYTE_ORDERS[endian]))
+    return np.asarray(values.reshape(shape, order=_INDEXING[order]))
 
 
 FORMATS = (Format((".gii",), parse_gifti, 10, 90),)

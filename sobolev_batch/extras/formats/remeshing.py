@@ -65,6 +65,8 @@ def parse_gmsh(data: bytes) -> Raw:
     nodes, cells = (_Numbers(data, name, order) for name in (b"Nodes", b"Elements"))
     read = _of_second_format if head[1].startswith(b"2") else _of_fourth_format
     numbered, rows = read(nodes, cells)
+    if nodes.has_more() or cells.has_more():
+        raise MeshError("a section has more numbers than it announces, or bytes too few")
     faces = [corners for kind, corners in rows if kind in _WITH_AREA]
     volumes = sum(len(corners) for kind, corners in rows if kind in _WITH_VOLUME)
     # Nodes have any numbers, in any order.
@@ -106,6 +108,11 @@ class _Numbers:
         """Return the next number, which counts others."""
         return int(self.take(1)[0])
 
+    def has_more(self) -> bool:
+        """Tell whether anything is left, or in binary not just the end of the line, since bytes are lost or added."""
+        left = self.values[self.place :]
+        return left not in (b"\n", b"\r\n") if self.order else len(left) > 0
+
     def line(self) -> int:
         """Return a count that is a line of its own, as in binary of the format 2.2."""
         end = self.values.find(b"\n", self.place) + 1
@@ -131,6 +138,7 @@ def _of_second_format(nodes: _Numbers, cells: _Numbers) -> _Read:
             raise MeshError("a section breaks off, or has wrong counts before")
         rows[int(kind)].append(numbers[end - _corners(int(kind)) : end])
         place = end
+    cells.place = place
     return numbered, [(kind, np.array(found)) for kind, found in rows.items() if found]
 
 

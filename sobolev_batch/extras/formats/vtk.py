@@ -20,6 +20,7 @@ from sobolev_batch.arrays import Indices
 from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.formats.by_name import Format
 from sobolev_batch.geometry.formats.parsing import (
+    BYTE_ORDERS,
     Raw,
     beside_volume,
     triangle_strips,
@@ -114,6 +115,9 @@ class _Legacy:
             raise MeshError(f"the file breaks off: it announces {count} numbers, and has {left} bytes more")
         if not self.is_text:
             self.place += count * dtype.itemsize
+            # Data that are shifted by a byte take the end of the line for a number.
+            if count and self.data[self.place : self.place + 1] not in (b"", b"\n", b"\r"):
+                raise MeshError("its data in binary do not end where a line does: bytes are missing, or too many")
             return np.frombuffer(self.data, dtype, count, self.place - count * dtype.itemsize)
         # Each word is followed by another, or by the end: longer pieces are split until that is so.
         words, width = list[str](), 0
@@ -133,7 +137,7 @@ class _Legacy:
                 raise MeshError("the offsets of its cells do not begin with 0")
             return offsets[1:], corners
         numbers = self.array(counts[1], "int")
-        places, place, values = [], 0, numbers.tolist()
+        places, place, values = list[int](), 0, numbers.tolist()
         while len(places) < counts[0] and place < len(values):
             places.append(place)
             place += 1 + (values[place] if values[place] >= 0 else len(values))
@@ -238,10 +242,15 @@ def _decoded(
     )
     if kind.lower() not in _TYPES or form not in ("ascii", "binary", "appended"):
         raise MeshError(f"{owner} has the type {kind[:40]!r} and the format {form[:40]!r}, which VTK does not have")
-    dtype, order = np.dtype(_TYPES[kind.lower()]), ">" if root.get("byte_order") == "BigEndian" else "<"
+    order, head_kind = root.get("byte_order", "LittleEndian"), root.get("header_type", "UInt32").lower()
+    if order not in BYTE_ORDERS or head_kind not in ("uint32", "uint64"):
+        raise MeshError(
+            f"it has the byte order {order[:40]!r} and counts in {head_kind[:40]!r}, which VTK does not have"
+        )
+    dtype = np.dtype(_TYPES[kind.lower()])
     if form == "ascii":
         return typed(text.split(), dtype, owner)
-    head = np.dtype(order + _TYPES.get(root.get("header_type", "").lower(), "u4"))
+    head = np.dtype(_TYPES[head_kind]).newbyteorder(BYTE_ORDERS[order])
     source, is_base64 = behind if form == "appended" else ("".join(text.split()).encode(), True)
     place = whole(attributes.get("offset", ""), owner) if form == "appended" else 0
 
@@ -264,23 +273,26 @@ def _decoded(
         sizes = [*[size] * (count - 1), last or size][:count]
         if sum(sizes) > most:
             raise MeshError(f"its arrays unpack to more than {most} bytes: no mesh file shrinks that far")
-        blocks, ends = fetch(after, sum(lengths))[0], np.cumsum([0, *lengths]).tolist()
+        (blocks, end), ends = fetch(after, sum(lengths)), np.cumsum([0, *lengths]).tolist()
         # One byte more shows whether there are more.
         parts = [
-            zlib.decompressobj().decompress(blocks[begin:end], expected + 1)
-            for begin, end, expected in zip(ends[:-1], ends[1:], sizes, strict=True)
+            zlib.decompressobj().decompress(blocks[begin:stop], expected + 1)
+            for begin, stop, expected in zip(ends[:-1], ends[1:], sizes, strict=True)
         ]
         if [*map(len, parts)] != sizes:
             raise MeshError(f"{owner} unpacks to other sizes than announced")
         data = b"".join(parts)
     elif is_base64 and source[after - 1 : after] == b"=":
         # Some programs end the count as a text of its own.
-        data, _ = fetch(after, count)
+        data, end = fetch(after, count)
     else:
-        data = fetch(place, head.itemsize + count)[0][head.itemsize :]
+        data, end = fetch(place, head.itemsize + count)
+        data = data[head.itemsize :]
     if len(data) % dtype.itemsize:
         raise MeshError(f"{owner} has {len(data)} bytes, which are no whole numbers of {dtype.itemsize}")
-    return np.frombuffer(data, np.dtype(order + dtype.str[1:]))
+    if form == "binary" and end != len(source):
+        raise MeshError(f"{owner} has more data than it announces")
+    return np.frombuffer(data, dtype.newbyteorder(BYTE_ORDERS[order]))
 
 
 def _faces(kinds: Indices, corners: Indices, sizes: Indices, suffix: str) -> tuple[Indices, Indices, tuple[str, ...]]:

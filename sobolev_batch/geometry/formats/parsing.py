@@ -13,7 +13,7 @@ from array import array
 from collections.abc import Callable, Iterator, Sequence
 from io import BufferedReader
 from pathlib import Path, PurePath
-from typing import IO, Any, NamedTuple, cast
+from typing import IO, Any, Literal, NamedTuple, cast
 from xml.parsers import expat
 
 import numpy as np
@@ -48,6 +48,8 @@ _MEMORY_PART = 0.75
 # five deep and a few hundred.
 _LONGEST_MARKUP, _DEEPEST, _MOST_ELEMENTS = 1 << 16, 100, 100_000
 _XML_BYTES = 1 << 14
+# What NumPy calls the orders of bytes that files of XML name.
+BYTE_ORDERS: dict[str, Literal["<", ">"]] = {"LittleEndian": "<", "BigEndian": ">"}
 # Digits of an integer: all that fit into 64 bits.
 _MOST_DIGITS = 18
 _REAL = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)

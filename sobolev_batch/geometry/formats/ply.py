@@ -185,7 +185,7 @@ def _parsed_header(data: bytes) -> tuple[dict[str, _Element], int, bool]:
 
 
 def _numbers(data: bytes, start: int, rows: int) -> tuple[array[float], array[int]]:
-    """Return all numbers of a text from a place on, and how many each line has that has some, up to a line too many."""
+    """Return all numbers of a text from a place on, and how many the first lines have that have some."""
     numbers, sizes, carried = array("d"), array("I"), 0
     while start < len(data):
         space = _SPACE.search(data, start + _CHUNK_BYTES)
@@ -196,23 +196,26 @@ def _numbers(data: bytes, start: int, rows: int) -> tuple[array[float], array[in
         # The last line goes on in the next chunk.
         *whole_lines, carried = first + carried, *others
         sizes.extend(filter(None, whole_lines))
-        del sizes[rows + 1 :]
+        del sizes[2 * rows + 1 :]
         start = end
     sizes.extend(filter(None, [carried]))
     return numbers, sizes
 
 
 def _require_aligned(lines: NDArray[np.uintc], rows: Sequence[Indices]) -> None:
-    """Refuse a text with as many lines as rows whose lines are not the rows: a number too many shifts all others."""
-    expected = np.concatenate(rows)
-    expected = expected[expected > 0]
-    if len(lines) == len(expected):
-        wrong = np.flatnonzero(lines != expected)
-        if wrong.size:
-            raise MeshError(
-                f"line {wrong[0] + 1} below the PLY header has {lines[wrong[0]]} numbers, expected "
-                f"{expected[wrong[0]]} for one row"
-            )
+    """Refuse a text where most rows, but not all, end with a line, or that has as many lines as rows and other ones.
+
+    A number too many or too few would shift all that follow.
+    """
+    sizes = np.concatenate(rows)
+    ends, lines_end = np.cumsum(sizes[sizes > 0]), np.cumsum(lines)
+    is_whole = np.isin(ends, lines_end)
+    wrong = np.flatnonzero(~is_whole & (ends <= lines_end[-1:]))
+    if wrong.size and (len(lines) == len(ends) or 2 * np.count_nonzero(is_whole) > len(ends)):
+        raise MeshError(
+            f"row {wrong[0] + 1} below the PLY header does not end with its line, as others do: "
+            "a line has a number too many or too few"
+        )
 
 
 def _columns(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import re
 import struct
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -30,10 +29,12 @@ from tests.support.mesh_files import (
     obj,
     object_3mf,
     off,
+    off_binary,
     package_3mf,
     ply,
     stl_binary,
     stl_text,
+    vtk_legacy,
 )
 from tests.support.shapes import BOX_AREA, BOX_MIXED, BOX_QUADS, BOX_TRIANGLES, BOX_VERTICES
 
@@ -73,13 +74,6 @@ def off_with(kind: str, more: str, faces: list[list[int]] = BOX_TRIANGLES) -> by
     return "\n".join([f"{kind}OFF", f"8 {len(faces)} 0", *rows, ""]).encode()
 
 
-def off_binary(kind: str = "", more: int = 0, colors: int = 0) -> bytes:
-    """The box in binary, with further numbers behind each vertex and each face."""
-    rows = b"".join(struct.pack(f">{3 + more}f", *row, *[0.5] * more) for row in BOX_VERTICES)
-    faces = b"".join(struct.pack(f">5i{colors}f", 3, *face, colors, *[0.5] * colors) for face in BOX_TRIANGLES)
-    return f"{kind}OFF BINARY\n".encode() + struct.pack(">3i", 8, 12, 0) + rows + faces
-
-
 CASES: dict[str, Case] = {
     **{
         f"stl, {what}": (".stl", content, expected)
@@ -107,17 +101,17 @@ CASES: dict[str, Case] = {
             ("no edge count and no magic word", replaced(OFF_BOX, (b"OFF\n8 12 0\n", b"8 12\n")), BOX_AREA),
             ("faces over two lines", re.sub(rb"(?m)^(3 \d) ", rb"\1\n", OFF_BOX), BOX_AREA),
             ("a number on each line", b"OFF\n8 12 0\n" + b"\n".join(OFF_BOX.split()[4:]), BOX_AREA),
-            ("binary", off_binary(), BOX_AREA),
-            ("binary with colours", off_binary("C", 4, 3), BOX_AREA),
-            ("binary with normals", off_binary("N", 3), BOX_AREA),
+            ("binary", off_binary(BOX_VERTICES, BOX_TRIANGLES), BOX_AREA),
+            ("binary with colours", off_binary(BOX_VERTICES, BOX_TRIANGLES, "C", 4, 3), BOX_AREA),
+            ("binary with normals", off_binary(BOX_VERTICES, BOX_TRIANGLES, "N", 3), BOX_AREA),
             ("four dimensions", b"4" + OFF_BOX, "does not begin with OFF"),
             ("normals of two numbers", off_with("N", "0 1"), "vertex 1 has 10 numbers, expected 6"),
             ("colours of five numbers", off_with("C", "1 1 1 1 1"), "vertex 1 has 8 numbers"),
             ("a corner missing", replaced(OFF_BOX, (b"\n3 4 6 7", b"\n3 4 6")), "face 3 has 7 numbers, expected 4"),
             ("a face more", OFF_BOX + b"3 0 1 2\n", "but more follows: '3 0 1 2'"),
             ("a face less", OFF_BOX.removesuffix(b"3 1 7 3\n"), "face 12 has 0 numbers"),
-            ("binary and cut", off_binary()[:-1], "breaks off in face 12 of 12"),
-            ("binary and a byte more", off_binary() + b"\n", "has 1 bytes behind"),
+            ("binary and cut", off_binary(BOX_VERTICES, BOX_TRIANGLES)[:-1], "breaks off in face 12 of 12"),
+            ("binary and a byte more", off_binary(BOX_VERTICES, BOX_TRIANGLES) + b"\n", "has 1 bytes behind"),
         )
     },
     **{
@@ -178,22 +172,13 @@ OUTLINES: dict[str, tuple[list[tuple[float, float]], float]] = {
 }
 
 
-def vtk(vertices: Sequence[tuple[float, ...]], face: list[int]) -> bytes:
-    """A legacy file of VTK of one polygon."""
-    points = "\n".join(map(numbers, vertices))
-    return (
-        f"# vtk DataFile Version 3.0\nscan\nASCII\nDATASET POLYDATA\nPOINTS {len(vertices)} double\n{points}\n"
-        f"POLYGONS 1 {len(face) + 1}\n{len(face)} {' '.join(map(str, face))}\n"
-    ).encode()
-
-
 for _name, (_outline, _area) in OUTLINES.items():
     _vertices, _face = [(x, 1.0, y) for x, y in _outline], [*range(len(_outline))]
     CASES |= {
         f"obj, {_name}": (".obj", obj(_vertices, [_face]), _area),
         f"off, {_name}": (".off", off(_vertices, [_face]), _area),
         f"ply, {_name}": (".ply", ply(_vertices, [_face], LITTLE), _area),
-        f"vtk, {_name}": (".vtk", vtk(_vertices, _face), _area),
+        f"vtk, {_name}": (".vtk", vtk_legacy(_vertices, [_face]), _area),
     }
 
 OBJ_BOX = obj(BOX_VERTICES, BOX_QUADS)
@@ -240,7 +225,7 @@ CASES |= {
         ".ply": PLY_BOX,
         ".off": off_with("N", "0 0 1"),
         ".stl": STL_TEXT,
-        ".vtk": vtk(BOX_VERTICES.tolist(), BOX_QUADS[0]),
+        ".vtk": vtk_legacy(BOX_VERTICES, BOX_QUADS[:1]),
         ".glb": b"glTF\2\0\0\0",
     }.items()
 }
@@ -386,7 +371,7 @@ _SPELLED = {
     ".mesh": medit(BOX_VERTICES, BOX_TRIANGLES),
     ".msh": gmsh_first(BOX_VERTICES, BOX_TRIANGLES),
     ".gii": gifti(BOX_VERTICES, np.array(BOX_TRIANGLES, np.int32), "GIFTI_ENCODING_ASCII"),
-    ".vtk": vtk(BOX_VERTICES.tolist(), BOX_QUADS[0]),
+    ".vtk": vtk_legacy(BOX_VERTICES, BOX_QUADS[:1]),
 }
 CASES |= {
     f"{ending}, {spelling} for a number": (ending, re.sub(rb"\b4\.0+\b", spelling.encode(), content), "not a number")
