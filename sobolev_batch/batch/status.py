@@ -42,6 +42,7 @@ class Status(Shown):
         rate: Surfaces that the latest run finishes in a second, as at the last of them; NaN before there are a few.
         lost_records: Labels of surfaces that the tables list, and whose completion records are gone, or others. A run
             that goes on computes them again.
+        not_begun: Names of the objects that no run has come to; how many surfaces they have is not known.
 
     >>> import sobolev_batch as sb
     >>> status = sb.status("storage/icosphere.zarr")
@@ -59,6 +60,7 @@ class Status(Shown):
     silence_seconds: float
     rate: float = math.nan
     lost_records: tuple[str, ...] = ()
+    not_begun: tuple[str, ...] = ()
 
     @classmethod
     def from_store(cls, store: AnyStore) -> Status:
@@ -67,7 +69,7 @@ class Status(Shown):
         objects = Objects.read(location)
         if objects is not None:
             run = objects.records.read_run()
-            tallies = dict(_tallies(objects, is_open=_goes_on(run)))
+            tallies = dict(_tallies(objects))
             moments = [one.finished for one in tallies.values() for _ in range(one.complete)]
         elif Store(location).is_unfinished:
             # Its run plans, or was ended while it did.
@@ -85,10 +87,11 @@ class Status(Shown):
             refused | labelled({name: one.failed for name, one in tallies.items()}),
             labelled({name: one.not_compared for name, one in tallies.items()}),
             run,
-            all(one.reduced for one in tallies.values()),
+            bool(tallies) and all(one.reduced for one in tallies.values()),
             age_seconds(run.seen) if _goes_on(run) and run is not None else 0.0,
             math.nan if run is None else _rate(moments, run),
             tuple(labelled({name: dict.fromkeys(one.lost_records) for name, one in tallies.items()})),
+            () if objects is None else tuple(name for name in objects.names if name not in tallies),
         )
 
     @property
@@ -105,6 +108,8 @@ class Status(Shown):
     def progress(self) -> str:
         """Progress in one line, as ``sobolev-batch status --follow`` shows it."""
         parts = [f"{self.total - self.waiting} of {self.total} done", f"{len(self.failed)} failed"]
+        if self.not_begun:
+            parts.append(f"{len(self.not_begun):,} objects not begun")
         if self.run is not None and self.run.state == "submitted":
             parts.append("no worker has taken it up yet")
         elif self.waiting == 0:
@@ -125,7 +130,7 @@ class Status(Shown):
     @property
     def is_incomplete(self) -> bool:
         """True if no run goes on, and surfaces lack a record, or have another one than the tables were made from."""
-        return not self.going_on and (self.waiting > 0 or bool(self.lost_records))
+        return not self.going_on and bool(self.waiting or self.lost_records or self.not_begun)
 
     @property
     def lost(self) -> bool:
@@ -139,9 +144,9 @@ class Status(Shown):
 
     def lines(self) -> Iterator[str]:
         """Yield the lines that ``sobolev-batch status`` prints."""
-        yield (
-            f"{self.store}: {self.complete} of {self.total} complete, {len(self.failed)} failed, {self.waiting} to go"
-        )
+        objects = f", and {len(self.not_begun):,} objects that are not begun" if self.not_begun else ""
+        counts = f"{self.complete} of {self.total} complete, {len(self.failed)} failed, {self.waiting} to go"
+        yield f"{self.store}: {counts}{objects}"
         lost = dict.fromkeys(self.lost_records, "its completion record is gone or another one; run the study again")
         for label, reason in (*self.failed.items(), *self.not_compared.items(), *lost.items()):
             yield f"{label}: {reason}"
@@ -177,20 +182,18 @@ class Status(Shown):
             yield f"done; {start}, ended {run.seen}"
 
 
-def _tallies(objects: Objects, *, is_open: bool) -> Iterator[tuple[str, ObjectRecord]]:
-    """Yield what is known of each object: by its record, or by its store where a run has not come to its end."""
+def _tallies(objects: Objects) -> Iterator[tuple[str, ObjectRecord]]:
+    """Yield what is known of each object that is begun: by its record, or by its store before its run has ended."""
     recorded, present = objects.recorded(), objects.location.names()
     for name in objects.names:
         record = recorded.get(name)
         if record is None:
             try:
-                place = objects.existing_store(name) if name in present else None
-                record = ObjectRecord() if place is None else Contents.of_store(Store.open(place)).tally()
+                if name not in present or (place := objects.existing_store(name)) is None:
+                    continue
+                record = Contents.of_store(Store.open(place)).tally()
             except DamageError as error:
                 record = ObjectRecord(reason=str(error))
-            if not record.reason and not is_open and not record.complete:
-                # Otherwise its turn may come.
-                record = ObjectRecord(reason="it has no results; run the study again to see why")
         yield name, record
 
 

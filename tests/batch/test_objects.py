@@ -18,6 +18,7 @@ import zarr
 from distributed import Client
 
 import sobolev_batch as sb
+from sobolev_batch.extras.report.build import make_report
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, locked
@@ -129,7 +130,7 @@ def require_named_damage(path: Path, objects: list[str], what: str) -> None:
     assert what in verified.tables[f"{objects[0]}/zarr.json"]
     # Their records were withdrawn.
     status = sb.status(path)
-    assert {*status.failed} == {*objects, "gone"}
+    assert {*status.failed, *status.not_begun} == {*objects, "gone"}
     assert what in status.failed[objects[0]]
 
 
@@ -353,6 +354,16 @@ def test_a_run_of_a_part_takes_objects_families_or_members(changeable: Path, thr
     assert set(sb.run(study, changeable, threads).computed) == {"q/ico/1", "q/ico/2", "q/egg/2"}
     with pytest.raises(sb.errors.StudyError, match="no object, family or member of the study is 'r'"):
         sb.run(study, changeable, threads, only=["r"])
+
+
+def test_objects_that_no_run_has_come_to_are_not_begun(tmp_path: Path, threads: Client) -> None:
+    path = tmp_path / "s.zarr"
+    sb.run(study_of(balls(a=1.0, b=1.1, c=1.2)), path, threads, only=["b", "c/ico"])
+    found = sb.status(path)
+    assert (found.not_begun, found.failed) == (("a",), {})
+    assert (found.complete, found.total, found.is_incomplete) == (8, 10, True)
+    assert "8 of 10 complete, 0 failed, 2 to go, and 1 objects that are not begun" in str(found)
+    assert "objects not begun" in make_report(path)[0]
 
 
 def test_objects_are_listed_from_the_worst_one(store: Path) -> None:
