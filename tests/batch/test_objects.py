@@ -18,7 +18,6 @@ import zarr
 from distributed import Client
 
 import sobolev_batch as sb
-from sobolev_batch.extras.report.build import make_report
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, locked
@@ -363,7 +362,6 @@ def test_objects_that_no_run_has_come_to_are_not_begun(tmp_path: Path, threads: 
     assert (found.not_begun, found.failed) == (("a",), {})
     assert (found.complete, found.total, found.is_incomplete) == (8, 10, True)
     assert "8 of 10 complete, 0 failed, 2 to go, and 1 objects that are not begun" in str(found)
-    assert "objects not begun" in make_report(path)[0]
 
 
 def test_objects_are_listed_from_the_worst_one(store: Path) -> None:
