@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -20,7 +22,7 @@ from sobolev_batch.shapes import Sphere
 from sobolev_batch.sources import check_source, registry
 from sobolev_batch.sources.registry import SurfaceMember, parse_source
 from sobolev_batch.study.plan import make_plan
-from tests.support.repository import blocks, install
+from tests.support.repository import ROOT, blocks, install
 from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES, Roof
 from tests.support.studies import SMALL_LATTICE, small_table, variable
 
@@ -108,24 +110,26 @@ def test_a_reference_that_does_not_settle_is_a_failed_row(
 PAGE = "docs/surfaces.md"
 
 
+def install_example(site: Path, of: str) -> str:
+    """Install the package of the page with an entry point of a group into a folder, and return the module's name."""
+    (entry_point,) = (text for text in blocks(PAGE, "toml") if f"sobolev_batch.{of}" in text)
+    match = re.fullmatch(r'\[project\.entry-points\."(.*)"\]\n(.*) = "(\w+):(\w+)"\n', entry_point)
+    assert match is not None
+    group, key, name, value = match.groups()
+    (module,) = (text for text in blocks(PAGE, "python") if re.search(rf"^(class )?{value}\b", text, re.MULTILINE))
+    install(site, name, f"[{group}]\n{key} = {name}:{value}\n", module)
+    return name
+
+
 @pytest.fixture
-def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The packages of the page, installed."""
-    entry_points = [text for text in blocks(PAGE, "toml") if text.startswith("[project.")]
-    modules = [text for text in blocks(PAGE, "python") if "(sb.sources.Source)" in text]
-    site, names = tmp_path / "site", []
-    for entry_point, module in zip(entry_points, modules, strict=True):
-        match = re.fullmatch(r'\[project\.entry-points\."(.*)"\]\n(.*) = "(\w+)(:\w+)"\n', entry_point)
-        assert match is not None
-        group, source, name, value = match.groups()
-        install(site, name, f"[{group}]\n{source} = {name}{value}\n", module)
-        names.append(name)
-    monkeypatch.syspath_prepend(str(site))
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The package of the page with a source, installed."""
+    name = install_example(tmp_path / "site", of="sources")
+    monkeypatch.syspath_prepend(str(tmp_path / "site"))
     registry._registry.cache_clear()
     yield
     registry._registry.cache_clear()
-    for name in names:
-        sys.modules.pop(name, None)
+    sys.modules.pop(name, None)
 
 
 @pytest.mark.slow
@@ -139,7 +143,7 @@ def test_the_examples_in_python_run(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("packages")
+@pytest.mark.usefixtures("package")
 def test_the_example_of_a_surface_runs_and_resumes(tmp_path: Path, threads: Client) -> None:
     def computed(height: float) -> tuple[str, ...]:
         family = [{"name": "ball", "source": "wavy-ball", "height": 0.0}]
@@ -156,30 +160,22 @@ def test_the_example_of_a_surface_runs_and_resumes(tmp_path: Path, threads: Clie
     assert ((distances.sel(mesh="ball/wavy-ball") > 0.01) & (distances.sel(mesh="ball/wavy-ball") < 3)).all()
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("packages")
-def test_the_example_of_a_format_runs_and_resumes(tmp_path: Path, threads: Client) -> None:
-    def write(**scales: float) -> None:
-        for name, scale in scales.items():
-            np.savez(tmp_path / f"{name}.npz", vertices=scale * BOX_VERTICES, triangles=BOX_TRIANGLES)
-
-    study = Study.from_table(
-        small_table(family=[{"name": "scan", "source": "numpy", "directory": "."}]), folder=tmp_path
+@pytest.mark.process
+def test_the_example_of_a_format_is_read(tmp_path: Path) -> None:
+    install_example(tmp_path / "site", of="formats")
+    np.savez(tmp_path / "box.npz", vertices=BOX_VERTICES, triangles=BOX_TRIANGLES)
+    command = [sys.executable, "-m", "sobolev_batch", "info", "box.npz"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path / "site"), str(ROOT)])}
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60, check=False
     )
-    store = tmp_path / "results.zarr"
-    write(small=0.2, large=0.3)
-    (tmp_path / "damaged.npz").write_text("no arrays")
-    first = run(study, store, threads)
-    assert first.computed == ("scan/large", "scan/small", "reference")
-    assert "damaged.npz: " in first.failed["scan/damaged"]
-    write(small=0.1)
-    assert run(study, store, threads).computed == ("scan/small",)
+    assert "box.npz: 12 triangles, 8 vertices" in done.stdout
 
 
-@pytest.mark.usefixtures("packages")
-def test_the_examples_conform(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("package")
+def test_the_example_conforms() -> None:
     check_source(parse_source({"source": "wavy-ball"}))
     (text,) = (text for text in blocks(PAGE, "python") if "def test_" in text)
     namespace: dict[str, Any] = {}
     exec(text, namespace)
-    namespace["test_the_source_conforms"](tmp_path)
+    namespace["test_the_source_conforms"]()
