@@ -179,6 +179,16 @@ def test_compare_to_an_accuracy_and_on_a_lattice(folder: Path) -> None:
     assert f"\nmean distance of A, positive outside of B and negative inside: {near['bias']:.2f}" in shown
 
 
+def test_compare_tells_files_of_one_name_apart_and_rounding_from_a_deviation(tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    for name in ("1.off", "other/1.off"):
+        sb.write_mesh(sb.Mesh(sb.shapes.icosphere(1).vertices + 7, sb.shapes.icosphere(1).triangles), tmp_path / name)
+    other = str(Path("other", "1.off"))
+    first, second = output("compare", "1.off", other, "--unit", "mm", folder=tmp_path).splitlines()
+    assert first.startswith(f"The largest deviation of 1.off and {other} from each other is 0 mm, at (")
+    assert second == f"1.off and {other} are identical: they have the same triangles."
+
+
 def test_compare_names_units_and_defects(folder: Path) -> None:
     ball = sb.shapes.icosphere(2)
     part = sb.Mesh(100 * ball.vertices, np.vstack([ball.triangles[1:], ball.triangles[5:6]]))

@@ -234,8 +234,9 @@ class Comparison:
 
     @property
     def names(self) -> tuple[str, str]:
-        """Names of both files."""
-        return self.options.a.name, self.options.b.name
+        """Names of both files, with their folders where these alone tell them apart."""
+        a, b = self.options.a, self.options.b
+        return (str(a), str(b)) if a.name == b.name else (a.name, b.name)
 
     @property
     def lines(self) -> Iterator[str]:

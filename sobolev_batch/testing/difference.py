@@ -122,7 +122,7 @@ def require_place(path: Path) -> None:
         with from_extra("plot", "a picture needs"):
             extra(FEATURES, "picture", _PURPOSE)
     if not path.name:
-        raise InputError(f"{str(path)!r} names no file; files get {str(Path('failures', 'part'))!r} and an ending")
+        raise InputError(f"{str(path)!r} names no file; give a name such as {str(Path('failures', 'part'))!r}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as error:

@@ -14,6 +14,8 @@ from sobolev_batch.tables.text import between, percent
 
 # Digits of places: of their largest coordinate, or of the deviation where that is larger.
 _PLACE_DIGITS = 6
+# Fraction of the largest coordinate below which a deviation is rounding.
+_ROUNDING = 1e-14
 
 
 @dataclass(frozen=True)
@@ -99,4 +101,6 @@ def deviation_text(deviation: Deviation, unit: str | None) -> str:
     decimals = _PLACE_DIGITS - 1 - math.floor(math.log10(largest)) if largest else 0
     # The sum turns a negative zero into zero.
     place = ", ".join(f"{round(x, decimals) + 0.0:.{_PLACE_DIGITS}g}" for x in deviation.place)
-    return f"{between(deviation.lower, deviation.upper, f' {unit}' if unit else '')}, at ({place})"
+    # Coordinates have no digits for less.
+    bounds = (0.0, 0.0) if deviation.upper <= _ROUNDING * largest else (deviation.lower, deviation.upper)
+    return f"{between(*bounds, f' {unit}' if unit else '')}, at ({place})"
