@@ -238,14 +238,16 @@ def _study_lines(plan: Plan) -> Iterator[tuple[str, str]]:
 
 def _task_lines(plan: Plan, sizes: Mapping[str, Sizes]) -> Iterator[tuple[str, str]]:
     """Yield what is computed, and the memory that it takes."""
+    if sizes:
+        largest, (*_, task_bytes) = max(sizes.items(), key=lambda item: item[1][-1])
+        yield "memory", f"up to {format_bytes(task_bytes)} in a task, of {largest}"
+    total_bytes = format_bytes(plan.field_bytes * len(plan.rows))
+    yield "storage", f"{format_bytes(plan.field_bytes)} per surface, {total_bytes} in all"
     families = f"{len(plan.study.object.families)} famil{'y' if len(plan.study.object.families) == 1 else 'ies'}"
     yield "study", plan.study.object.title
     yield "surfaces", f"{len(plan.rows)} in {families}, reference {plan.reference}"
     tasks = sum(len(groups) for groups, *_ in sizes.values())
     yield "tasks", f"{tasks} for {len(sizes)} surfaces; chunks of the lattice: {len(plan.blocks)}"
-    if sizes:
-        largest, (*_, task_bytes) = max(sizes.items(), key=lambda item: item[1][-1])
-        yield "memory", f"up to {format_bytes(task_bytes)} in a task, of {largest}"
     if plan.study.pairs == "all":
         needed = PAIR_BYTES * len(plan.study.orders) * len(plan.rows) ** 2
         yield "all pairs", f"{tile_count(len(plan.rows))} tiles, {format_bytes(needed)} on disk"
@@ -286,6 +288,8 @@ def plan(
     (5, (), Lattice(xi_max=5.0, M=48))
     >>> print(found)  # doctest: +ELLIPSIS
     time:          nothing is missing
+    memory:        ...
+    storage:       ...
     study:         ...
     surfaces:      5 in 1 family, reference reference
     ...
@@ -360,7 +364,6 @@ def _plan(study: Study, location: Location, workers: Workers, client: Client | N
     seconds, basis = seconds_of_missing(study_plan, stored, workers, client)
     bases.update(filter(None, [basis]))
     doubtful, count = _doubts_of(study_plan, stored), len(study_plan.rows)
-    total_bytes = format_bytes(study_plan.field_bytes * count)
     return ObjectPlan(
         store=str(location),
         labels=tuple(row.label for row in study_plan.rows),
@@ -379,7 +382,6 @@ def _plan(study: Study, location: Location, workers: Workers, client: Client | N
         lacks_tables=not seconds and (workspace is None or not lacks_nothing(workspace)),
         lines=(
             *_task_lines(study_plan, sizes),
-            ("storage", f"{format_bytes(study_plan.field_bytes)} per surface, {total_bytes} in all"),
             ("store", f"{location}, {len(stored)} of {count} already stored"),
             *reasons("refused", refused),
             *reasons("doubtful", doubtful),

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import xarray as xr
+
 from sobolev_batch.errors import InputError, from_extra
 from sobolev_batch.extras.leagues.costs import CostLeague
 from sobolev_batch.extras.leagues.league import League
@@ -25,7 +27,7 @@ from sobolev_batch.tables.open import (
 with from_extra("plot", "a plot needs"):
     from matplotlib.axes import Axes
 
-    from sobolev_batch.extras.figures.drawing import COST_LEAGUE, LEAGUE, PLOTS
+    from sobolev_batch.extras.figures.drawing import COST_LEAGUE, LEAGUE, PLOTS, RATES
     from sobolev_batch.extras.figures.selection import Selection
     from sobolev_batch.extras.figures.views import PICTURE_LIMITS, Axis, draw_witness, make_views
 
@@ -33,7 +35,7 @@ __all__ = ["convergence", "energy", "league", "matrix", "over_time", "spectrum",
 
 
 def convergence(
-    store: AnyStore,
+    store: AnyStore | xr.Dataset,
     order: float | None = None,
     ax: Axes | None = None,
     *,
@@ -47,7 +49,8 @@ def convergence(
     no place in the plot.
 
     Args:
-        store: Path, URL or opened DataTree of the store.
+        store: Path, URL or opened DataTree of the store, or what `sobolev_batch.convergence` returns, of which all
+            meshes are drawn.
         order: Order of the norm.
         ax: Axes to draw on.
         family: Families to draw.
@@ -61,7 +64,13 @@ def convergence(
     >>> ax.figure.savefig("convergence.pdf")
     >>> sb.plot.convergence("storage/icosphere.zarr", x="triangles", family="ico*").get_xlabel()
     'number of triangles'
+    >>> from sobolev_batch.shapes import Sphere, icosphere
+    >>> rates = sb.convergence([icosphere(1), icosphere(2)], Sphere(), -4.0, lattice=sb.Lattice(3.0, 24))
+    >>> sb.plot.convergence(rates).get_ylabel()
+    'relative Sobolev distance'
     """
+    if isinstance(store, xr.Dataset):
+        return RATES.on(ax, store, order)
     return _plot("convergence", Selection.from_store(store, order, family, x), ax)
 
 

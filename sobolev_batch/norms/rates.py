@@ -51,6 +51,8 @@ def convergence(
     Raises:
         InputError: There are no meshes, or neither an rtol nor a lattice; see also `distance`.
 
+    `sobolev_batch.plot.convergence` draws it.
+
     >>> from sobolev_batch import convergence
     >>> from sobolev_batch.shapes import Sphere, icosphere
     >>> found = convergence({f"level {k}": icosphere(k) for k in (1, 2, 3)}, Sphere(), -4.0, rtol=1e-2)

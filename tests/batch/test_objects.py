@@ -155,7 +155,7 @@ def test_a_plan_goes_on_past_an_object_that_cannot_be(tmp_path: Path) -> None:
     assert plan.objects["b"].store == str(tmp_path / "s.zarr" / "b")
     assert plan.total_bytes == 2 * plan.objects["a"].total_bytes
     assert "the reference cannot be made" in plan.refused["gone"]
-    assert "\na:\nstudy:" in str(plan)
+    assert "\na:\nmemory:" in str(plan)
     path.write_text(tomli_w.dumps(made.table))
     done = call("plan", path, "--store", tmp_path / "s.zarr")
     assert done.returncode == 3

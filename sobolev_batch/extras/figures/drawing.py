@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.ticker import PercentFormatter
@@ -102,6 +103,24 @@ def draw_convergence(selection: Selection, order: float, axes: Axes) -> None:
     gone = [name for name in frame["family"].drop_duplicates() if name not in set(drawn["family"])]
     set_title(axes, f"order {order:g}", _absent(frame, selection.x), _named("families not drawn: ", gone))
     axes.set_xlabel(escaped(label_of(selection.x, study_unit(selection.tree))))
+    axes.set_ylabel("relative Sobolev distance")
+
+
+def draw_rates(found: xr.Dataset, order: float | None, axes: Axes) -> None:
+    """Draw what `sobolev_batch.convergence` returns at one order, by default the first, from the finest mesh on."""
+    orders = np.atleast_1d(found["order"].values).tolist()
+    chosen = orders[0] if order is None else order
+    if chosen not in orders:
+        raise InputError(f"these meshes were not compared at order {chosen:g}, but at {', '.join(map(str, orders))}")
+    rows = (found.sel(order=chosen) if "order" in found.dims else found).sortby("edge_length")
+    rows = rows.isel(mesh=np.flatnonzero((rows["relative"] > 0) & (rows["edge_length"] > 0)))
+    places, values = rows["edge_length"].values, rows["relative"].values
+    set_log_scale(axes, "xy")
+    draw_curve(axes, places, values, rows["relative_error"].values, style_of(0), "meshes")
+    if len(places) > 1:
+        _draw_slope(axes, places, values, _SLOPES["edge_length"])
+    set_title(axes, f"order {chosen:g}")
+    axes.set_xlabel("mean edge length")
     axes.set_ylabel("relative Sobolev distance")
 
 
@@ -337,6 +356,7 @@ def _orders_if(has: Callable[[Selection], object]) -> Callable[[Selection], Sequ
 
 LEAGUE = Plot(draw_league, lambda leagues: leagues, 3.6)
 COST_LEAGUE = Plot(draw_cost_league, lambda leagues: leagues, 3.6)
+RATES = Plot(draw_rates, lambda found: found["order"].values.ravel(), 3.6)
 # The plots have the names of their files. Each panel shows one order.
 PLOTS: dict[str, Plot] = {
     "convergence": Plot(draw_convergence, lambda selection: selection.orders, 3.6),
