@@ -85,7 +85,7 @@ def _decoded(text: str, attributes: Mapping[str, str], number: int, most_bytes: 
     if min(shape) < 0:
         raise MeshError(f"array {number} of the file has a negative dimension: {shape}")
     size = math.prod(shape) * dtype.itemsize
-    order, endian = attributes.get("ArrayIndexingOrder", "RowMajorOrder"), attributes.get("Endian", "LittleEndian")
+    order, endian = attributes.get("ArrayIndexingOrder", ""), attributes.get("Endian", "")
     if order not in _INDEXING or endian not in BYTE_ORDERS:
         raise MeshError(f"{owner} has the orders {order[:40]!r} and {endian[:40]!r}, which GIFTI does not have")
     if encoding == "ASCII":

@@ -35,7 +35,7 @@ _WITH_AREA, _WITH_VOLUME = (2, 3), (4, 5, 6, 7)
 def parse_medit(data: bytes) -> Raw:
     """Return the vertices and triangles of a Medit mesh in text."""
     # Words have three letters or more, of which the first is a capital; numbers may have an e.
-    start, *words = re.split(rb"\b([A-Z][A-Za-z0-9]{2,})", re.sub(rb"#[^\n]*", b"", data))
+    start, *words = re.split(rb"\b([A-Z][A-Za-z0-9]{2,})", re.sub(rb"(?<!\S)#[^\n]*", b"", data))
     names = [word.decode("ascii") for word in words[::2]]
     sections = dict(zip(names, words[1::2], strict=True))
     if start.strip() or names[:1] != ["MeshVersionFormatted"] or len(sections) < len(names):

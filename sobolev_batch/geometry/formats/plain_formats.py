@@ -32,6 +32,8 @@ _OBJ_REFUSED = ("surf", "curv", "curv2", "bsp", "bzp", "cdc", "cdp", "call", "cs
 # Further numbers per face: a colour or its index.
 _OFF_FACE_EXTRAS = (0, 1, 3, 4)
 _COUNT = re.compile("[0-9]{1,18}")
+# Within a word it begins no comment.
+_COMMENT = re.compile(r"(?<!\S)#")
 # Characters of a line: a polygon of a hundred thousand corners.
 _LONGEST_LINE = 1 << 20
 # Seventeen digits give every double back.
@@ -46,7 +48,7 @@ def parse_obj(data: bytes) -> Raw:
     """Return the vertices (n, 3) and triangles (m, 3) of an OBJ file, all its objects and groups together."""
     vertices, corners, sizes = array("d"), array("q"), array("q")
     for line_number, line in _joined_lines(data):
-        words = line.partition("#")[0].split()
+        words = (_COMMENT.split(line)[0] if "#" in line else line).split()
         kind = words[0].lower() if words else "g"
         if kind == "v":
             number = len(vertices) // 3 + 1
@@ -66,7 +68,7 @@ def parse_obj(data: bytes) -> Raw:
 
 def parse_off(data: bytes) -> Raw:
     """Return the vertices (n, 3) and triangles (m, 3) of an OFF file, in text or binary."""
-    lines = (words for line in _text_lines(data) if (words := line.partition("#")[0].split()))
+    lines = (words for line in _text_lines(data) if (words := _COMMENT.split(line)[0].split()))
     first = next(lines, [""])
     # The word may be missing.
     kind, counts = ("OFF", first) if _COUNT.fullmatch(first[0]) else (first[0], first[1:])
