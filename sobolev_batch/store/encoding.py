@@ -69,10 +69,6 @@ def dataset_keys(group: str, dataset: xr.Dataset) -> dict[str, bytes]:
     """
     # The attribute that lists coordinates has blanks between them.
     dataset = dataset.reset_coords([name for name in dataset.coords if " " in str(name)])
-    for variable in dataset.variables.values():
-        if variable.dtype == bool:
-            # Older versions of xarray store them as integers otherwise.
-            variable.encoding = {**variable.encoding, "dtype": "bool"}
     encoded = {str(name): xr.conventions.encode_cf_variable(one) for name, one in dataset.variables.items()}
     if not all(map(_is_one_chunk, dataset.variables.values())):
         return _written(group, dataset)
@@ -143,6 +139,12 @@ def _written(group: str, dataset: xr.Dataset) -> dict[str, bytes]:
     # xarray writes several at a time, in any order.
     places = {str(name): place for place, name in enumerate(dataset.variables)}
     written = _bytes_of(keys)
+    for name in (name for name, variable in dataset.variables.items() if variable.dtype == bool):
+        # Versions of xarray before 2026.9 store them as integers, of the same bytes, with an attribute.
+        document = json.loads(written[f"{group}/{name}/{ROOT}"])
+        document["attributes"].pop("dtype", None)
+        document |= {"data_type": "bool", "fill_value": False}
+        written[f"{group}/{name}/{ROOT}"] = json.dumps(document, indent=2).encode()
     return {key: written[key] for key in sorted(written, key=lambda key: places.get(key.split("/")[1], -1))}
 
 

@@ -365,7 +365,7 @@ def test_objects_that_no_run_has_come_to_are_not_begun(tmp_path: Path, threads: 
 
 
 def test_objects_are_listed_from_the_worst_one(store: Path) -> None:
-    rows = pd.read_csv(StringIO(format_objects(store, "csv", [-3.0])))
+    rows = pd.read_csv(StringIO(format_objects(store, "csv", [-3.0])), float_precision="round_trip")
     assert rows["object"].tolist() == rows.sort_values("relative", ascending=False)["object"].tolist()
     table = sb.table(store, -3.0)
     for _, row in rows.iterrows():

@@ -34,7 +34,7 @@ from tests.support.processes import PATIENCE_SECONDS, listening, scheduler_addre
 from tests.support.recipes import (
     CERTIFICATES,
     FOLDER,
-    TABLE,
+    RESULT,
     add_command,
     documented,
     environment,
@@ -120,7 +120,7 @@ def test_a_study_on_local_jobs(tmp_path: Path) -> None:
     write_study(tmp_path)
     completed = jobqueue(tmp_path, "--system", "local", "--jobs", "1", "--adaptive", "--store", "results.zarr")
     assert completed.returncode == 0, completed.stderr
-    assert re.search(TABLE, completed.stdout)
+    assert re.search(RESULT, completed.stdout)
     assert completed.stderr.count(": complete") == 6
     assert (tmp_path / "results.zarr" / "zarr.json").exists()
     assert not list(tmp_path.glob(".sobolev-batch*"))
@@ -210,7 +210,7 @@ def test_a_study_in_one_allocation(tmp_path: Path) -> None:
     recipe = FOLDER / Path(script).name
     completed = run_recipe(tmp_path, "bash", recipe, study, "--store", "results.zarr", **variables)
     assert completed.returncode == 0, completed.stderr
-    assert re.search(TABLE, completed.stdout)
+    assert re.search(RESULT, completed.stdout)
     log = (tmp_path / "workers.log").read_text()
     for line in (r"Start worker at: +tls://127\.0\.0\.1", r"Memory: +2\.00 GiB", "End worker"):
         assert len(re.findall(line, log)) == 1
@@ -409,7 +409,7 @@ def test_a_study_over_tls(cluster: Cluster, certificates: Path, home: Path, tmp_
     variables = {"HOME": str(home), "DASK_CONFIG": str(certificates / "tls.yaml")}
     completed = run_recipe(tmp_path, *COMMAND, *words, **variables)
     assert completed.returncode == 0, completed.stderr
-    assert re.search(TABLE, completed.stdout)
+    assert re.search(RESULT, completed.stdout)
     meshes = open_store(tmp_path / "storage" / "small.zarr")["meshes"].to_dataset()
     assert all(worker.startswith("tls://") for worker in meshes["worker"].values.tolist())
     # Nothing listens beyond loopback.

@@ -240,12 +240,16 @@ def prepare_workers(client: Client, libraries: Iterable[str] = ()) -> Workers:
     client.subscribe_topic(_KEPT_OUT, lambda event: _log.warning("%s", event[1]))
     client.register_plugin(VersionPlugin(*require_same_versions(client, libraries)), name=_KEPT_OUT)
     client.register_plugin(BackendPlugin(), name=_NAME)
-    answers = client.run(_describe, on_error="return")
-    # A worker that is just leaving, or joining, does not count.
-    members = tuple(answers[address] for address in sorted(answers) if isinstance(answers[address], WorkerInfo))
-    if not members:
-        raise ClusterError("the cluster has no workers; start some with: dask worker ADDRESS")
-    return Workers(members)
+    while True:
+        answers = client.run(_describe, on_error="return")
+        # A worker that is just leaving, or joining, does not count.
+        members = tuple(answers[address] for address in sorted(answers) if isinstance(answers[address], WorkerInfo))
+        if members:
+            return Workers(members)
+        if answers.keys() & client.scheduler_info(n_workers=-1)["workers"].keys():
+            raise ClusterError("the cluster has no workers; start some with: dask worker ADDRESS")
+        # An adaptive cluster has retired those that it had.
+        await_a_worker(client)
 
 
 def await_a_worker(client: Client) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import socket
 import ssl
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,21 @@ def test_a_cluster_that_adapts_from_no_worker_at_all(study: Study) -> None:
         # A worker that has just started does not leave again before it is set up.
         cluster.adapt(minimum=0, maximum=1, interval="20ms", wait_count=100_000)
         assert len(run(study, "memory://adapted.zarr", client).computed) == 5
+
+
+def test_workers_that_leave_while_they_are_set_up_are_waited_for(
+    study: Study, threads: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_on_workers, asked = threads.run, list[str]()
+
+    def run_once_left(function: Callable[..., object], *arguments: object, **options: object) -> object:
+        asked.append(function.__name__)
+        # Of the worker that was there for the versions, nothing is heard any more.
+        return {} if asked.count("_describe") == 1 else run_on_workers(function, *arguments, **options)
+
+    monkeypatch.setattr(threads, "run", run_once_left)
+    assert len(run(study, "memory://left.zarr", threads).computed) == 5
+    assert asked.count("_describe") == 2
 
 
 @pytest.mark.all
