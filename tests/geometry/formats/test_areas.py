@@ -231,6 +231,7 @@ CASES |= {
 }
 
 
+GIFTI_BOX = gifti(BOX_VERTICES, np.array(BOX_TRIANGLES, np.int32))
 TETRAHEDRA = "Tetrahedra 2 1 2 3 5 0 2 3 4 8 0"
 HALVED = "0.5 0 0 0 0.5 0 0 0 0.5 7 7 7"
 BOX_3MF = object_3mf(BOX_VERTICES, BOX_TRIANGLES)
@@ -403,6 +404,45 @@ CASES |= {
         for ending, content in {**_SPELLED, ".gltf": box_scene().gltf()}.items()
         for codec in ("utf-16-le", "utf-16-be")
     },
+    # What would shift all that follows, or lose a part in silence.
+    "obj, a blank within a number": (
+        ".obj",
+        OBJ_BOX.replace(b"v 1.0 2.0 0.0", b"v 1 .0 2.0 0.0"),
+        "has the weight 0.0",
+    ),
+    "obj, a comment within a word": (".obj", OBJ_BOX.replace(b"f 1 ", b"f 1# ", 1), "has '1#' for an integer"),
+    "obj, a comment behind a face": (".obj", OBJ_BOX.replace(b"\nf", b" # 9\nf"), BOX_AREA),
+    "stl, a byte more between triangles": (".stl", STL_BINARY[:333] + b"\0" + STL_BINARY[333:], "lie between them"),
+    "ply, a line of two numbers": (
+        ".ply",
+        replaced(PLY_BOX, (b"\n3 4 6 7\n", b"\n3 4 6 7\n3 4\n")),
+        "end with its line",
+    ),
+    "medit, a word cut short": (
+        ".mesh",
+        replaced(medit(BOX_VERTICES, BOX_MIXED), (b"Quadrilaterals", b"Quadrilat")),
+        "a section 'Quadrilat', which is not read",
+    ),
+    "gmsh, a corner twice": (
+        ".msh",
+        re.sub(rb"(\d+)(\n\$EndElements)", rb"\1 \1\2", gmsh_first(BOX_VERTICES, BOX_MIXED)),
+        "more numbers than it announces",
+    ),
+    "gmsh, a byte lost": (
+        ".msh",
+        replaced(gmsh(BOX_VERTICES, BOX_MIXED, "<"), (b"\n$EndNodes", b"$EndNodes")),
+        "or bytes too few",
+    ),
+    "gifti, an order that does not exist": (
+        ".gii",
+        replaced(GIFTI_BOX, (b"RowMajorOrder", b"RowmajorOrder")),
+        "'RowmajorOrder' and .*, which GIFTI does not have",
+    ),
+    "gifti, fractions for indices": (
+        ".gii",
+        re.sub(rb"\b6 7\b", b"6.0 7", _SPELLED[".gii"]),
+        "fractions or other words",
+    ),
     "obj, an archive": (".obj", package_3mf(model(BOX_3MF)), "begins as a .3mf file; name it so"),
 }
 
@@ -425,7 +465,6 @@ def frame_of_volume(middle: str, valid: int = 1) -> bytes:
     )
 
 
-GIFTI_BOX = gifti(BOX_VERTICES, np.array(BOX_TRIANGLES, np.int32))
 MOVED = "the file has a transform to another frame"
 # Of each case: the end of the file's name, its bytes, and how its only note begins; none where that is empty.
 NOTED: dict[str, tuple[str, bytes, str]] = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -157,6 +158,76 @@ def test_gltf_scenes_are_read_as_they_stand(read: Read, name: str) -> None:
     mesh = read(".glb", scene.glb())
     assert mesh.area == pytest.approx(area, rel=1e-6)
     assert mesh.extent.box[1] == pytest.approx(upper, abs=1e-5)
+
+
+def changed(scene: Gltf, change: Callable[[dict[str, Any]], object]) -> Gltf:
+    change(scene.tree)
+    return scene
+
+
+def with_a_short(kind: str) -> Gltf:
+    """A scene with a target, or weights of joints, of one vertex, which must not count for all."""
+    scene = morphed(of_node=False) if kind == "POSITION" else skinned([1, 0])
+    primitive = scene.tree["meshes"][0]["primitives"][0]
+    owner = primitive["targets"][0] if kind == "POSITION" else primitive["attributes"]
+    owner[kind] = scene.accessor(
+        [[1, 0, 0, 0][: 3 + (kind != "POSITION")]], "VEC3" if kind == "POSITION" else "VEC4", "float32"
+    )
+    return scene
+
+
+def with_one_bind() -> Gltf:
+    scene = skinned([1, 0])
+    scene.tree["skins"][0]["inverseBindMatrices"] = scene.accessor(2 * np.eye(4).reshape(1, 16), "MAT4", "float32")
+    return scene
+
+
+# Documents that contradict themselves, and what is said of them.
+WRONG: dict[str, tuple[Gltf, str]] = {
+    "a joint outside of the scene": (
+        changed(skinned([1, 0]), lambda tree: tree["scenes"][0].update(nodes=[0])),
+        "joint 2, which is no node of the scene",
+    ),
+    "a joint that is not there": (
+        changed(skinned([1, 0]), lambda tree: tree["skins"][0].update(joints=[2, 99])),
+        "joint 99, which is no node",
+    ),
+    "a mesh from the end": (
+        changed(box_scene(), lambda tree: tree["nodes"][0].update(mesh=-1)),
+        "entry -1 of its meshes, of which it has 1",
+    ),
+    "a truth for a mesh": (
+        changed(box_scene(), lambda tree: tree["nodes"][0].update(mesh=False)),
+        "entry False of its",
+    ),
+    "a skin that is not there": (
+        changed(skinned([1, 0]), lambda tree: tree["nodes"][0].update(skin=1)),
+        "entry 1 of its skins, of which it has 1",
+    ),
+    "an accessor without a count": (
+        changed(box_scene(), lambda tree: tree["accessors"][0].pop("count")),
+        "lacks .*count",
+    ),
+    "a target of one vertex": (with_a_short("POSITION"), "has 1 entries, expected 8"),
+    "weights of one vertex": (with_a_short("WEIGHTS_0"), "has 1 entries, expected 8"),
+    "fewer matrices than joints": (with_one_bind(), "2 joints and 1 matrices"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_gltf_that_contradicts_itself_is_refused_with_the_reason(read: Read, name: str) -> None:
+    scene, reason = WRONG[name]
+    with pytest.raises(MeshError, match=reason):
+        read(".glb", scene.glb())
+
+
+@pytest.mark.parametrize(
+    "damaged", [b"{'nodes': []}", b"{", b'{"nodes": [\xff]}', b'{"nodes": [' + b"9" * 5000 + b"]}"]
+)
+def test_gltf_that_is_no_json_is_named_in_words(read: Read, damaged: bytes) -> None:
+    with pytest.raises(MeshError, match=r"its JSON is damaged|damaged, or not in UTF-8|do not fit together") as refusal:
+        read(".gltf", damaged)
+    assert "Error" not in str(refusal.value)
 
 
 def test_gltf_instances_without_places_do_not_vanish(read: Read) -> None:

@@ -219,3 +219,40 @@ def test_a_box_of_several_pieces_is_one(tmp_path: Path) -> None:
     path.write_bytes(start + piece + piece.replace(b"0 6 4", b"0 6 9") + end)
     with pytest.raises(MeshError, match=r"index outside 0\.\.7"):
         read_mesh(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        (b"UInt32", b"UInt31", "counts in 'uint31'"),
+        (b"LittleEndian", b"Littleendian", "byte order 'Littleendian'"),
+        (b'NumberOfPolys="12"', b'NumberOfPolys="11"', "announces 11 polys, and has 12"),
+        (b'Name="offsets"', b'Name="offset"', "announces|do not run"),
+        (b'"Float64"', b'"Float63"', "the type 'Float63'"),
+    ],
+)
+def test_xml_that_contradicts_itself_is_refused(tmp_path: Path, old: bytes, new: bytes, reason: str) -> None:
+    path = saved(polygons(BOX_TRIANGLES), tmp_path / "scan.vtp")
+    assert old in path.read_bytes()
+    path.write_bytes(path.read_bytes().replace(old, new))
+    with pytest.raises(MeshError, match=reason):
+        read_mesh(path)
+
+
+def test_a_count_of_billions_takes_no_memory(tmp_path: Path) -> None:
+    path = saved(polygons(BOX_TRIANGLES), tmp_path / "scan.vtk", binary=False)
+    text = path.read_bytes()
+    for old, new in ((b"POINTS 8", b"POINTS 3000000000"), (b"POLYGONS 13 36", b"POLYGONS 3000000000 36")):
+        assert old in text
+        path.write_bytes(text.replace(old, new))
+        with pytest.raises(MeshError, match="breaks off"):
+            read_mesh(path)
+
+
+def test_a_byte_lost_from_the_points_is_noticed(tmp_path: Path) -> None:
+    path = saved(polygons(BOX_TRIANGLES), tmp_path / "scan.vtk")
+    text = path.read_bytes()
+    start = text.index(b"double\n") + 40
+    path.write_bytes(text[:start] + text[start + 1 :])
+    with pytest.raises(MeshError, match="do not end where a line does"):
+        read_mesh(path)
