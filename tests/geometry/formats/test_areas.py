@@ -405,7 +405,7 @@ CASES |= {
         for codec in ("utf-16-le", "utf-16-be")
     },
     # What would shift all that follows, or lose a part in silence.
-    "obj, a blank within a number": (
+    "obj, a blank in a number": (
         ".obj",
         OBJ_BOX.replace(b"v 1.0 2.0 0.0", b"v 1 .0 2.0 0.0"),
         "has the weight 0.0",
@@ -413,10 +413,11 @@ CASES |= {
     "obj, a comment within a word": (".obj", OBJ_BOX.replace(b"f 1 ", b"f 1# ", 1), "has '1#' for an integer"),
     "obj, a comment behind a face": (".obj", OBJ_BOX.replace(b"\nf", b" # 9\nf"), BOX_AREA),
     "stl, a byte more between triangles": (".stl", STL_BINARY[:333] + b"\0" + STL_BINARY[333:], "lie between them"),
-    "ply, a line of two numbers": (
+    # Read as a stream, it has as many numbers as it needs, and a face of five corners.
+    "ply, a line more": (
         ".ply",
-        replaced(PLY_BOX, (b"\n3 4 6 7\n", b"\n3 4 6 7\n3 4\n")),
-        "end with its line",
+        replaced(ply(BOX_VERTICES, BOX_MIXED), (b"\n3 1 5 7", b"\n3 4\n3 1 5 7")),
+        "row 16 below the PLY header does not end with its line",
     ),
     "medit, a word cut short": (
         ".mesh",
@@ -441,7 +442,7 @@ CASES |= {
     "gifti, fractions for indices": (
         ".gii",
         re.sub(rb"\b6 7\b", b"6.0 7", _SPELLED[".gii"]),
-        "fractions or other words",
+        "fractions or other",
     ),
     "obj, an archive": (".obj", package_3mf(model(BOX_3MF)), "begins as a .3mf file; name it so"),
 }
