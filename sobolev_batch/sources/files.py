@@ -291,6 +291,8 @@ def matching_files(folder: Path, path: str) -> list[Path]:
     first = next(place for place, part in enumerate(parts) if has_magic(part))
     base, wild = folder.joinpath(*parts[:first]), parts[first:]
     try:
+        if any("**" in part and part != "**" for part in wild):
+            raise ValueError("Invalid pattern: ** is a whole part of a path")  # Python 3.13 takes it for *
         # At the end, ** stands for folders alone.
         found = [*base.glob("/".join([*wild, "*"] if wild[-1] == "**" else wild))]
     except ValueError as error:

@@ -116,4 +116,4 @@ def _missing(model: xr.Variable, count: int) -> NDArray[Any]:
     shape = (count, *model.shape[1:])
     if model.dtype.kind in "OTU":
         return np.full(shape, "", dtype=object)
-    return np.full(shape, np.datetime64("NaT") if model.dtype.kind == "M" else np.nan)
+    return np.full(shape, np.datetime64("NaT", "s") if model.dtype.kind == "M" else np.nan)

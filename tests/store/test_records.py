@@ -50,7 +50,8 @@ def filled(path: Path | str) -> Store:
 def keys_of(store: Store) -> list[str | None]:
     """The key of each row's record, read row by row and all together."""
     alone = [Records(store).read_one(row) for row in range(len(store.labels()))]
-    assert list(Records(store).read()) == alone
+    # From Python 3.13 on, NaN makes records unequal.
+    assert list(map(repr, Records(store).read())) == list(map(repr, alone))
     return [None if record is None else record.key for record in alone]
 
 

@@ -341,7 +341,7 @@ def test_keys_of_a_known_form_are_those_that_xarray_writes(seed: int, monkeypatc
     def dataset(count: int) -> xr.Dataset:
         texts = np.array(["", "é𝄞", "a" * 300] * count, dtype=object)[:count]
         times = np.datetime64("2026-11-26T20:00:00") + random.integers(0, 10**6, count).astype("timedelta64[s]")
-        times[0] = np.datetime64("NaT")
+        times[0] = np.datetime64("NaT", "s")
         columns: dict[str, Any] = {
             "distance": (("mesh", "order"), random.normal(size=(count, 2)), {"units": "1", "long_name": "distance"}),
             "level": ("mesh", random.integers(-5, 5, count)),
