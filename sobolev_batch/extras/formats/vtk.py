@@ -132,7 +132,13 @@ class _Legacy:
     def cells(self, counts: tuple[int, int], is_new: bool) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return the places where cells of a section end, and the corners of all, by the counts of its first line."""
         if is_new:
-            offsets, corners = (self.array(count, self.line()[1]) for count in counts)
+            found = []
+            for name, count in zip(("OFFSETS", "CONNECTIVITY"), counts, strict=True):
+                words = self.line()
+                if len(words) != 2 or words[0].upper() != name:
+                    raise MeshError(f"it has the line {' '.join(words)[:80]!r}, expected {name} and a type")
+                found.append(self.array(count, words[1]))
+            offsets, corners = found
             if offsets[:1].any():
                 raise MeshError("the offsets of its cells do not begin with 0")
             return offsets[1:], corners
@@ -267,7 +273,7 @@ def _decoded(
     count = int(np.frombuffer(first, head)[0])
     if packed := root.get("compressor"):
         if packed != "vtkZLibDataCompressor":
-            raise MeshError(f"it is packed by {packed[:40]!r}; save it anew: {_PACKED_ANEW}")
+            raise MeshError(f"it is packed by {packed[:40]!r}; save it anew, as .vtp or .vtu: {_PACKED_ANEW}")
         header, after = fetch(place, head.itemsize * (3 + count))
         size, last, *lengths = np.frombuffer(header, head)[1:].tolist()
         sizes = [*[size] * (count - 1), last or size][:count]
