@@ -21,7 +21,8 @@ def test_pictures_are_drawn_from_the_studies_and_the_code_of_today() -> None:
 def test_each_picture_is_on_a_page_and_small() -> None:
     pictures = {path.name: path.stat().st_size for path in draw.FOLDER.glob("*.png")}
     assert set(pictures) == {f"{name}.png" for name in draw.PICTURES}
-    shown = {Path(link).name for page in PAGES for link in re.findall(r"\(([\w./-]+\.png)\)", page.read_text())}
+    texts = [page.read_text(encoding="utf-8") for page in PAGES]
+    shown = {Path(link).name for text in texts for link in re.findall(r"\(([\w./-]+\.png)\)", text)}
     assert shown == set(pictures)
     assert max(pictures.values()) <= draw.LARGEST_BYTES
 

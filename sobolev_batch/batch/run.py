@@ -127,7 +127,7 @@ def run(
         require_blocking(client)
     study, location = ready_to_run(study, store, allow_commands=allow_commands, only=only)
     location = location if client is None else location.absolute()
-    notify, lock = on_progress or _ignore, Lock.of_this_process()
+    notify, lock = on_progress or (lambda progress: None), Lock.of_this_process()
     require_usable(location, of_objects="" not in study.objects)
     with ExitStack() as stack:
 
@@ -229,10 +229,6 @@ def carry_out(
             _tabulate(objects, ended, tabulated & study.objects.keys())
             objects.root.remember()
     return _summary(location, {name: ended[name] for name in study.objects if name in ended})
-
-
-def _ignore(progress: Progress) -> None:
-    """Report a step of a run to nobody."""
 
 
 def _own_cluster(

@@ -88,7 +88,7 @@ class Status(Shown):
             labelled({name: one.not_compared for name, one in tallies.items()}),
             run,
             bool(tallies) and all(one.reduced for one in tallies.values()),
-            age_seconds(run.seen) if _goes_on(run) and run is not None else 0.0,
+            age_seconds(run.seen) if run is not None and run.state in ("submitted", "running") else 0.0,
             math.nan if run is None else _rate(moments, run),
             tuple(labelled({name: dict.fromkeys(one.lost_records) for name, one in tallies.items()})),
             () if objects is None else tuple(name for name in objects.names if name not in tallies),
@@ -195,10 +195,6 @@ def _tallies(objects: Objects) -> Iterator[tuple[str, ObjectRecord]]:
             except DamageError as error:
                 record = ObjectRecord(reason=str(error))
         yield name, record
-
-
-def _goes_on(run: RunRecord | None) -> bool:
-    return run is not None and run.state in ("submitted", "running")
 
 
 def _rate(finished: Sequence[str], run: RunRecord) -> float:

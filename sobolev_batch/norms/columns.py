@@ -27,12 +27,12 @@ def described(long_name: str, units: str = "", **others: str | int) -> dict[str,
 
 
 def _count(of: str) -> dict[str, Any]:
-    # What is below `valid_min` counts as missing in readers of NetCDF. xarray would make floats of counts with
-    # `_FillValue`.
+    # What is below `valid_min` is missing to readers of NetCDF. With `_FillValue`, xarray would make floats of it.
     return described(f"number of {of}", NUMBER, valid_min=0, description="-1 where it is not known")
 
 
-_BETWEEN = "not to be interpolated between orders: see the description of order"
+# Between orders, numbers fall by powers.
+_BETWEEN = "interp is percents off between orders: sobolev-batch table --order, or tree.sobolev.distance(order)"
 # Attributes of variables by name, in the results of functions and in stores. The tables of a store have no others, so
 # that the metadata of meshes may have any other name.
 VARIABLES: Mapping[str, Mapping[str, Any]] = {
@@ -41,12 +41,7 @@ VARIABLES: Mapping[str, Mapping[str, Any]] = {
     "object": described("name of the object"),
     "reference": described("label of the reference of the object"),
     "unit_length": described("unit of length in which the object was computed, in that of the files"),
-    "order": described(
-        "Sobolev order s",
-        NUMBER,
-        description="numbers fall by powers between orders, so that interpolation is percents off; sobolev-batch table "
-        "--order and tree.sobolev.distance(order) compute any order from stored spectra",
-    ),
+    "order": described("Sobolev order s", NUMBER, description=_BETWEEN),
     "time": described("time of the mesh", description="in the unit of the study's times"),
     "fourier": described("Fourier transform of the area measure", convention="∫ exp(-2πi ξ·x) dμ(x)"),
     **{name: described(f"frequency along {name[-1]}", FREQUENCY) for name in AXES},
@@ -102,11 +97,7 @@ VARIABLES: Mapping[str, Mapping[str, Any]] = {
     "nonmanifold_edges": _count("edges of more than two triangles"),
     "inconsistent_edges": _count("edges whose two triangles face opposite sides"),
     "components": _count("parts that share no vertex"),
-    "euler_characteristic": described(
-        "number of vertices less that of edges plus that of triangles",
-        NUMBER,
-        description="it may be negative, so that it is NaN where it is not known",
-    ),
+    "euler_characteristic": described("vertices less edges plus triangles", NUMBER, description="NaN if not known"),
     "volume": described("enclosed volume", VOLUME, description="negative for a mesh that is inside out"),
     "smallest_angle": described("smallest angle of the triangles", ANGLE),
     "aspect_ratio": described("largest aspect ratio of the triangles; 1 is equilateral", NUMBER),

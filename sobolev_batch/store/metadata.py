@@ -60,11 +60,9 @@ def consolidated(documents: Mapping[str, Document]) -> Document:
 
 def attributes_of(root: Document) -> dict[str, Any]:
     """Return the attributes of a root as it is stored, with its tables; ValueError where one is none."""
-    attributes: dict[str, Any] = dict(root.get("attributes", {}))
-    for name in _TABLES:
-        if isinstance(text := attributes.get(name), str):
-            attributes[name] = table_in(text)
-    return attributes
+    attributes: dict[str, Any] = root.get("attributes", {})
+    texts = {name: attributes[name] for name in _TABLES if isinstance(attributes.get(name), str)}
+    return attributes | {name: table_in(text) for name, text in texts.items()}
 
 
 def table_in(text: str) -> dict[str, Any]:

@@ -64,12 +64,6 @@ class Objects:
         rows = self.root.read_strings("meshes/object") if "meshes" in self.root.documents else ()
         return frozenset(rows)
 
-    @property
-    def existing_stores(self) -> dict[str, Location]:
-        """Stores of the objects that have one, by name; see `existing_store`."""
-        found = {name: self.existing_store(name) for name in self.names}
-        return {name: place for name, place in found.items() if place is not None}
-
     def existing_store(self, name: str) -> Location | None:
         """Return the store of an object, None before its reference was made; DamageError where it is another's."""
         store = Store(self.location.below(name))
@@ -147,7 +141,9 @@ class Objects:
 def stores_below(location: Location) -> dict[str, Location]:
     """Return the stores of all objects that have one, by name; that of an only object without a name is under ""."""
     objects = Objects.read(location)
-    return {"": location} if objects is None else objects.existing_stores
+    if objects is None:
+        return {"": location}
+    return {name: place for name in objects.names if (place := objects.existing_store(name)) is not None}
 
 
 def root_of(location: Location) -> Location:

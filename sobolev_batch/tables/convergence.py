@@ -233,9 +233,6 @@ def _rows(tree: xr.DataTree, order: Orders | None) -> pd.DataFrame:
         proximity = finished_group(tree, "proximity").reindex(mesh=labels[others])
         asked = [f"{name}{way}" for name in _metrics_of(tree) for way in ("", "_forward", "_backward")]
         nearness = {name: proximity[name].values for name in asked if name in proximity}
-        if "hausdorff" in nearness:
-            # Older stores lack the upper bounds.
-            nearness.setdefault("hausdorff_upper", np.full(others.sum(), np.nan))
         nearness |= {name: meshes[name].values[others] for name in asked if name in OF_ONE_MESH}
         if "volume" in nearness:
             unit_length = meshes["unit_length"].values[others] if of_all else unit_of(tree)[1]

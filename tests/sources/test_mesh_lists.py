@@ -30,7 +30,8 @@ def test_a_csv_file_gives_paths_names_times_and_metadata(tmp_path: Path) -> None
     (tmp_path / "lists").mkdir()
     # As spreadsheets write it: a byte order mark, blanks, and cells that say nothing.
     (tmp_path / "lists/meshes.csv").write_text(
-        "\ufeffpath, name, time, tool, method_seconds, note\na.ply, 007, 0.5, QEM, 3.5,\n../b.obj, , , 5, , 12\n"
+        "\ufeffpath, name, time, tool, method_seconds, note\na.ply, 007, 0.5, QEM, 3.5,\n../b.obj, , , 5, , 12\n",
+        encoding="utf-8",
     )
     first, second = members("lists/meshes.csv", tmp_path)
     assert (first.name, first.time, first.path) == ("007", 0.5, tmp_path / "lists/a.ply")

@@ -151,11 +151,6 @@ def test_tables_tell_what_a_remesher_broke(tree: xr.DataTree) -> None:
     assert ["f_1/1", "2", "3", "1,200", "0", "5", "1"] in lines
 
 
-def test_a_store_without_upper_bounds_has_lower_ones(near: xr.DataTree) -> None:
-    near["proximity"] = xr.DataTree(near["proximity"].to_dataset().drop_vars("hausdorff_upper"))
-    assert re.search(r"f_1/0 +≥ 0\.25 +0\.125", format_table(near))
-
-
 def test_lengths_are_in_the_unit_of_the_files(near: xr.DataTree) -> None:
     near.attrs = root_attributes(0.02, length_unit="mm")
     near["proximity"].attrs["metrics"] = ["hausdorff", "volume"]
