@@ -73,42 +73,31 @@ BY_SUFFIX = _known()
 WRITERS = {suffix: form.write for suffix, form in BY_SUFFIX.items() if form.write is not None}
 
 
-# What files of other formats are, by suffix, and a command that converts one which is called scan.
-_MESHLAB = (
-    "pip install pymeshlab; python -c \"import pymeshlab; m = pymeshlab.MeshSet(); m.load_new_mesh('scan{}'); "
-    "m.generate_by_merging_visible_meshes(); m.save_current_mesh('scan.ply', save_textures=False)\""
+# Formats of files that are not read, by suffix, and commands that convert one which is called scan.
+_PYTHON = 'pip install {}; python -c "{}"'
+_MESHLAB = _PYTHON.format(
+    "pymeshlab",
+    "import pymeshlab; m = pymeshlab.MeshSet(); m.load_new_mesh('scan{0}'); "
+    "m.generate_by_merging_visible_meshes(); m.save_current_mesh('scan.ply', save_textures=False)",
 )
+_TRIMESH = "import trimesh; trimesh.load('scan.dae').to_mesh().export('scan.ply')"
+_PYVISTA = "import pyvista; pyvista.read('scan{0}').%sextract_surface().triangulate().save('scan.vtp')"
 _GMSH, _MESHIO = (
-    "pip install gmsh; gmsh scan{} -2 -o scan.stl",
-    "pip install meshio h5py; meshio convert scan{} scan.vtu",
-)
-_VTK = (
-    'pip install pyvista; python -c "import pyvista; '
-    "pyvista.read('scan{}').{}extract_surface().triangulate().save('scan.vtp')\""
+    "pip install gmsh; gmsh scan{0} -2 -o scan.stl",
+    "pip install meshio h5py; meshio convert scan{0} scan.vtu",
 )
 CONVERTED = {
-    ".dae": (
-        "COLLADA",
-        "pip install trimesh scipy pycollada; python -c "
-        "\"import trimesh; trimesh.load('scan.dae').to_mesh().export('scan.ply')\"",
-    ),
-    **{
-        suffix: (name, command.format(suffix, "combine()." if suffix == ".vtm" else ""))
-        for name, suffixes, command in (
-            ("VRML", ".wrl", _MESHLAB),
-            ("X3D", ".x3d", _MESHLAB),
-            ("3D Studio", ".3ds", _MESHLAB),
-            ("OpenCTM", ".ctm", _MESHLAB),
-            ("STEP", ".step .stp", _GMSH),
-            ("IGES", ".iges .igs", _GMSH),
-            ("BREP", ".brep", _GMSH),
-            ("Abaqus", ".inp", _MESHIO),
-            ("Nastran", ".bdf .nas", _MESHIO),
-            ("XDMF", ".xdmf", _MESHIO),
-            ("VTK collection", ".vtm .pvtu", _VTK),
-        )
-        for suffix in suffixes.split()
-    },
+    suffix: (name, command.format(suffix))
+    for name, suffixes, command in (
+        ("COLLADA", ".dae", _PYTHON.format("trimesh scipy pycollada", _TRIMESH)),
+        *(("VRML", ".wrl", _MESHLAB), ("X3D", ".x3d", _MESHLAB), ("3D Studio", ".3ds", _MESHLAB)),
+        *(("OpenCTM", ".ctm", _MESHLAB), ("STEP", ".step .stp", _GMSH), ("IGES", ".iges .igs", _GMSH)),
+        *(("BREP", ".brep", _GMSH), ("Abaqus", ".inp", _MESHIO), ("Nastran", ".bdf .nas", _MESHIO)),
+        ("XDMF", ".xdmf", _MESHIO),
+        ("VTK collection", ".vtm", _PYTHON.format("pyvista", _PYVISTA % "combine().")),
+        ("VTK collection", ".pvtu", _PYTHON.format("pyvista", _PYVISTA % "")),
+    )
+    for suffix in suffixes.split()
 }
 
 
