@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import os
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import meshio
 import nibabel
 import numpy as np
 import pytest
@@ -20,6 +24,7 @@ from sobolev_batch import read_mesh
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import MeshError
 from tests.support.mesh_files import BIG, LITTLE, obj, off, ply, vtk_legacy
+from tests.support.shapes import BOX_AREA, BOX_TRIANGLES, BOX_VERTICES
 
 pytestmark = pytest.mark.all
 Faces = list[list[int]]
@@ -199,3 +204,31 @@ def test_random_polyhedra_have_the_right_area_and_peers_the_same_or_that_of_fans
             same += [of_fans, newell(single, fans(faces))] if is_concave else []
             tolerance = 1e-3 if is_bent else 1e-9
             assert any(math.isclose(found, area, rel_tol=tolerance) for area in same), (name, peer, found, same)
+
+
+def by_meshio(path: Path) -> None:
+    meshio.Mesh(BOX_VERTICES, [("triangle", np.array(BOX_TRIANGLES))]).write(path)
+
+
+# What writes a file of a format that is not read, where its library is installed.
+OTHERS: dict[str, Callable[[Path], object]] = {
+    ".inp": by_meshio,
+    ".bdf": by_meshio,
+    ".vtm": lambda path: pyvista.MultiBlock([pyvista.wrap(trimesh.Trimesh(BOX_VERTICES, BOX_TRIANGLES))]).save(path),
+    ".dae": lambda path: trimesh.Trimesh(BOX_VERTICES, BOX_TRIANGLES).export(path),
+}
+
+
+@pytest.mark.parametrize("suffix", OTHERS)
+def test_the_command_of_a_refusal_converts_the_file(tmp_path: Path, suffix: str) -> None:
+    if suffix == ".dae":
+        pytest.importorskip("collada")
+    OTHERS[suffix](tmp_path / f"scan{suffix}")
+    with pytest.raises(MeshError, match="convert it: ") as refusal:
+        read_mesh(tmp_path / f"scan{suffix}")
+    install, command = str(refusal.value).partition("convert it: ")[2].split("; ", 1)
+    assert install.startswith("pip install ")
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    subprocess.run(command, shell=True, check=True, cwd=tmp_path, env={**os.environ, "PATH": path}, capture_output=True)
+    (made,) = [one for one in tmp_path.glob("scan.*") if one.suffix in (".ply", ".stl", ".vtu", ".vtp")]
+    assert read_mesh(made).area == pytest.approx(BOX_AREA, rel=1e-6)
