@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from benchmarks import pictures as draw
 PAGES = [*(draw.ROOT / "docs").glob("*.md"), draw.ROOT / "README.md"]
 
 
+@pytest.mark.skipif(sys.version_info[:2] != (3, 11), reason="digests are those of the syntax trees of Python 3.11")
 def test_pictures_are_drawn_from_the_studies_and_the_code_of_today() -> None:
     assert list(draw.stale()) == [], "these pictures are stale: make pictures"
     assert set(json.loads(draw.DIGESTS.read_text())) == set(draw.PICTURES)
