@@ -186,7 +186,7 @@ def test_compare_tells_files_of_one_name_apart_and_rounding_from_a_deviation(tmp
     other = str(Path("other", "1.off"))
     first, second = output("compare", "1.off", other, "--unit", "mm", folder=tmp_path).splitlines()
     assert first.startswith(f"The largest deviation of 1.off and {other} from each other is 0 mm, at (")
-    assert second == f"1.off and {other} are identical: they have the same triangles."
+    assert second == f"1.off and {other} are identical: they cover the same surface."
 
 
 def test_compare_names_units_and_defects(folder: Path) -> None:

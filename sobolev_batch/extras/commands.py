@@ -450,7 +450,7 @@ def league_command(
 
     With --by cost, STORE may also be that of one object. With --against, compare each method with itself in an earlier
     study instead. The exit status is then 1 if any method is farther by the test (or has more of another column than
-    the distance), or if its mean ratio is above --most.
+    the distance), if its mean ratio is above --most, or if a mesh of the earlier study is missing.
     """
     from sobolev_batch.extras.leagues.changes import compare_studies, format_changes
     from sobolev_batch.extras.leagues.costs import format_cost_leagues
@@ -459,8 +459,9 @@ def league_command(
     is_worse = False
     if against is not None:
         changes = compare_studies(table.store, against, table.orders, y=columns)
+        lost = changes.attrs["lost"]
         changes = changes[changes["method"].isin(families or changes["method"])]
-        is_worse = bool((changes["verdict"] == "farther").any() or (most and (changes["ratio"] > most).any()))
+        is_worse = bool(lost or (changes["verdict"] == "farther").any() or (most and (changes["ratio"] > most).any()))
         text = format_changes(changes, table.style)
     elif by == "cost":
         by_cost = league(table.store, table.orders, by="cost", x=x, methods=families or None)

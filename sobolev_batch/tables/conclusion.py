@@ -243,14 +243,15 @@ def format_objects(
             numbers = (
                 {"mesh": "", "relative": math.nan} if best is None else best[["mesh", "relative", "relative_error"]]
             )
-            count = {"meshes": len(known), "missing": len(of_order) - len(known)}
+            totals = {"meshes": len(known), "missing": len(of_order) - len(known)}
             imprecise = int((known["resolved"].astype(bool) & ~known["within"].astype(bool)).sum())
-            rows.append({"order": order, "object": name, **numbers, **count, "above_rtol": imprecise})
+            rows.append({"order": order, "object": name, **numbers, **totals, "above_rtol": imprecise})
     frame = pd.DataFrame(rows).sort_values(["missing", "relative"], ascending=False, kind="stable")
     sections, notes = [], []
     for order, of_order in frame.groupby("order", sort=False):
         shown = of_order.to_dict(orient="records")[:most]
-        sections.append(Section(f"Objects at order {order:g}, the worst first", [(_OBJECT_COLUMNS, shown)]))
+        columns = [one for one in _OBJECT_COLUMNS if one.format is not count or any(row[one.name] for row in shown)]
+        sections.append(Section(f"Objects at order {order:g}, the worst first", [(columns, shown)]))
         if len(shown) < len(of_order):
             notes = [f"{len(of_order) - len(shown):,} more: sobolev-batch table objects STORE"]
     return rendered(style, frame, sections, notes)

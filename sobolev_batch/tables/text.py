@@ -151,7 +151,7 @@ def answer(name: str, reference: str, result: xr.Dataset | Mapping[str, float], 
     numbers = {key: float(result[key]) for key in ("distance", "error", "relative", "relative_error")}
     at_order = f"at order {float(result['order']):g}"
     if numbers["distance"] == numbers["error"] == 0:
-        return f"{name} and {reference} are identical: they have the same triangles."
+        return f"{name} and {reference} are identical: they cover the same surface."
     if numbers["distance"] > numbers["error"]:
         amount = percent(numbers["relative"], numbers["relative_error"])
         return f"{name} differs from {reference} by {amount} {at_order}{_share_text(result, area_change)}."

@@ -233,8 +233,19 @@ def test_a_league_needs_no_more_than_the_store(store: Path, monkeypatch: pytest.
     monkeypatch.setattr("sobolev_batch.extras.leagues.changes.compare_studies", lambda *_, **__: frame)
     for words, status in (([], 0), (["--most", "2.1"], 0), (["--most", "1.05"], 1)):
         assert call("table", "league", store, "--against", store, *words).returncode == status
+    frame.attrs["lost"] = ("a/ico/1",)
+    done = call("table", "league", store, "--against", store)
+    assert (done.returncode, "a/ico/1 is in the old study, and missing in the new one." in done.stdout) == (1, True)
+    frame.attrs["lost"] = ()
     frame.loc[0, "verdict"] = "farther"
     assert call("table", "league", store, "--against", store).returncode == 1
+    # What an earlier study has and a new one lacks.
+    one, both = {"a": store / "a"}, {"a": store / "a", "b": store / "b"}
+    assert sb.compare_studies(one, both, -3).attrs["lost"] == ("b (all of it)",)
+    assert sb.compare_studies(both, one, -3).attrs["lost"] == ()
+    convergence = more["convergence"].to_dataset()
+    more["convergence"] = xr.DataTree(convergence.where(convergence["mesh"] != "ico/1"))
+    assert sb.compare_studies({"a": more}, one, -3).attrs["lost"] == ("a/ico/1",)
     with pytest.raises(sb.errors.StoreError, match="it holds the store of one object"):
         sb.league(store / "a")
     with pytest.raises(sb.errors.StoreError, match="nowhere"):

@@ -100,7 +100,7 @@ def test_distances_that_cannot_be_told_from_zero_and_unknown_errors() -> None:
     equal = "a.obj and b.obj are equal up to rounding at order -2: they differ by less than 2.1 × 10⁻¹¹ %."
     assert said(distance=1e-14, error=2e-13, relative=1e-14, relative_error=2e-13) == equal
     zero = dict.fromkeys(NUMBERS, 0.0)
-    assert said(**zero, **UNKNOWN) == "a.obj and b.obj are identical: they have the same triangles."
+    assert said(**zero, **UNKNOWN) == "a.obj and b.obj are identical: they cover the same surface."
     assert "by 1.020 % ± ? at order -2" in said(relative_error=_NAN)
     unknown = "a.obj differs from b.obj by an unknown amount at order -2: not resolved."
     assert said(error=_NAN, relative_error=_NAN) == unknown

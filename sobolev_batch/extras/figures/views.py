@@ -262,14 +262,23 @@ def _shown(label: str, mesh: Mesh, most: int, enough: int = _ENOUGH_TRIANGLES) -
 
 
 def distance_view(
-    label: str, mesh: Mesh, other: Mesh, unit: str, most: int, scale: float = 1.0, *, signed: bool = False
+    label: str,
+    mesh: Mesh,
+    other: Mesh,
+    unit: str,
+    most: int,
+    scale: float = 1.0,
+    *,
+    enough: int | None = None,
+    signed: bool = False,
 ) -> MeshView:
     """Return a view of a mesh with distances from another one, in a unit which is this scale in that of both.
 
-    Signed ones are positive outside of the other mesh and negative inside.
+    Triangles are divided up to enough of them, by default four times the most that a mesh keeps. Signed distances are
+    positive outside of the other mesh and negative inside.
     """
     # All vertices of a simplified mesh may lie on the other one: what lies between them counts, too.
-    view = _shown(label, mesh, most, 4 * most)
+    view = _shown(label, mesh, most, 4 * most if enough is None else enough)
     if len(view.triangles) >= len(mesh.triangles):
         distances = point_distances(view.vertices, other, signed=signed)
     else:

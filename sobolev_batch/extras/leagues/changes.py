@@ -63,7 +63,8 @@ def compare_studies(
         or over the meshes of a single object; p, the p-value of the paired permutation test, adjusted for the number of
         methods (Holm); verdict, "nearer" or "farther" by this test at the level of 5 %, else "undecided"; worst, the
         mesh whose number grew most, and worst_ratio, by how much. A y that is the same at all orders has rows at the
-        first one.
+        first one. The attribute `lost` of the frame has the labels of meshes that the old study has and the new one
+        lacks.
 
     Raises:
         InputError: The studies have no mesh in common, or an object has another reference or unit of length.
@@ -81,7 +82,8 @@ def compare_studies(
             f"the studies have no object in common: the new one has {', '.join(news)}, the old one {', '.join(olds)}"
         )
     columns = [y] if isinstance(y, str) else list(y)
-    frames = [frame for name in common for frame in _joined(name, news[name], olds[name], order, columns)]
+    lost = [f"{name} (all of it)" for name in olds if name not in news]
+    frames = [frame for name in common for frame in _joined(name, news[name], olds[name], order, columns, lost)]
     joined = pd.concat(frames, ignore_index=True)
     if joined.empty:
         raise InputError("the studies have no mesh in common that both have computed at the same order")
@@ -94,13 +96,17 @@ def compare_studies(
         result.loc[of_order.index, "p"] = adjusted(of_order["p"].to_numpy())
     words = np.where(result["ratio"] < 1, "nearer", "farther")
     result.insert(9, "verdict", np.where(result["p"] < SIGNIFICANCE, words, "undecided"))
+    result.attrs["lost"] = tuple(dict.fromkeys(lost))
     return result
 
 
 def _joined(
-    name: str, new: AnyStore, old: AnyStore, order: Orders | None, columns: Sequence[str]
+    name: str, new: AnyStore, old: AnyStore, order: Orders | None, columns: Sequence[str], lost: list[str]
 ) -> Iterator[pd.DataFrame]:
-    """Yield for each column the meshes that two stores of an object have in common, with logarithms of ratios."""
+    """Yield for each column the meshes that two stores of an object have in common, with logarithms of ratios.
+
+    Labels of the others that the old one has are added to those that are lost.
+    """
     trees = as_tree(new), as_tree(old)
     if trees[0].attrs["similarity"] != trees[1].attrs["similarity"] or len({_identity(tree) for tree in trees}) > 1:
         raise InputError(
@@ -111,6 +117,8 @@ def _joined(
     for y in columns:
         first, second = (_numbers(frame[frame["order"].isin(orders_of([frame], y))], y) for frame in tables)
         both = first.merge(second, on=_KEYS, suffixes=("", "_old"))
+        gone = second["mesh"][~second["mesh"].isin(first["mesh"])].unique()
+        lost += [f"{name}/{mesh}".lstrip("/") for mesh in gone]
         ratios, errors = np.log(both["value"] / both["value_old"]), both["share"] + both["share_old"]
         yield both.assign(y=y, object=name, log_ratio=ratios, log_error=errors)
 
@@ -156,4 +164,5 @@ def format_changes(changes: pd.DataFrame, style: Format = "text") -> str:
     least = least_objects(changes["method"].nunique())
     if (changes[units] < least).any():
         notes.append(f"With fewer than {least} {units}, the test decides nothing; look at the intervals.")
+    notes += [f"{label} is in the old study, and missing in the new one." for label in changes.attrs.get("lost", ())]
     return rendered(style, changes, sections, notes)

@@ -225,7 +225,9 @@ def league_data(leagues: Sequence[League], name: str, orders: Sequence[str]) -> 
         "size": label_of(leagues[0].x) if leagues else "",
         "league": [
             [
-                _line(method, sizes, means[:, 0], means[:, 2] - means[:, 0])
+                _line(
+                    method, sizes, means[:, 0], means[:, 2] - means[:, 0], lower=numbers(means[:, 0] - means[:, 1], 2)
+                )
                 for method in league.methods
                 for sizes, means in [league.mean_curve(method)]
             ]

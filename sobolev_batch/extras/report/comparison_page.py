@@ -19,16 +19,21 @@ from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.proximity import sampled_distances
 from sobolev_batch.geometry.surface import centering
 from sobolev_batch.norms.causes import spectrum
+from sobolev_batch.parameters import length_in
 from sobolev_batch.tables.rendering import Column
 from sobolev_batch.testing.difference import picture_fields
 
 with from_extra("report", "a report needs"):
-    from sobolev_batch.extras.figures.views import PAGE_LIMITS, distance_view, upwards
+    from sobolev_batch.extras.figures.views import FRONT, MeshView, distance_view, upwards
     from sobolev_batch.extras.report.build import filled, numbers, view_data, write_page
     from sobolev_batch.extras.report.content import PageTable
 
 # Points whose distances the histogram counts, on each mesh, and its bars.
 _POINTS, _BARS = 40_000, 40
+# Larger meshes are simplified, and small ones divided into about as many triangles. A page takes 40 bytes for each.
+_MOST_TRIANGLES, _ENOUGH_TRIANGLES = 150_000, 32_000
+# Colours end where no more of the area is farther away, if that is this much less than the largest deviation.
+_FARTHEST_AREA, _OUTLYING = 0.005, 1.5
 _HEADERS = ("distance of points", "A to B", "B to A", "larger")
 
 
@@ -42,23 +47,32 @@ def comparison_page(path: Path, comparison: Comparison, verdict: str = "") -> No
     shown = [Mesh(mesh.vertices - middle, mesh.triangles) for mesh in meshes]
     turn = upwards(shown[1].vertices[shown[1].used_vertices])
     views = [
-        distance_view(name, mesh, other, comparison.unit, PAGE_LIMITS[1], signed=signed)
+        distance_view(name, mesh, other, comparison.unit, _MOST_TRIANGLES, enough=_ENOUGH_TRIANGLES, signed=signed)
         for name, mesh, other in zip(comparison.names, shown, shown[::-1], strict=True)
     ]
+    place = np.roll(np.array(largest.place) - middle, turn)
+    # From the side of the bounding box that is nearest to the place.
+    towards = place / np.maximum(np.ptp(views[1].vertices, axis=0)[(np.arange(3) - turn) % 3], 1e-9)
+    eye = towards / (np.linalg.norm(towards) or 1.0) + FRONT / 2
+    histogram, limit = _histogram(meshes, largest.upper, signed=signed)
+    options = comparison.options
+    asked = None if options.allowed_fraction is not None else options.within
+    length = limit if asked is None else length_in(asked, options.unit)
     columns = [Column(name, name, kind="text" if i else "label") for i, name in enumerate(_HEADERS)]
     rows = [dict(zip(_HEADERS, row, strict=True)) for row in comparison.rows]
     charts = {
         "orders": [],
-        "name": comparison.options.a.stem,
+        "name": options.a.stem,
         "families": list(comparison.names),
         "unit": comparison.unit,
         "pair": {
             "views": [view_data(replace(view, vertices=np.roll(view.vertices, turn, axis=1))) for view in views],
-            "place": numbers(np.roll(np.array(largest.place) - middle, turn)),
-            "largest": largest.upper,
+            "place": numbers(place),
+            "eye": numbers(eye / np.linalg.norm(eye)),
+            "limit": float(f"{length:.3g}"),
             "signed": signed,
         },
-        "histogram": _histogram(meshes, largest.upper, signed=signed),
+        "histogram": histogram,
         "bands": _bands(comparison),
     }
     content = {
@@ -67,7 +81,9 @@ def comparison_page(path: Path, comparison: Comparison, verdict: str = "") -> No
         "versions": {"sobolev-batch": version("sobolev-batch")},
         "sentences": [f"{verdict}."] * bool(verdict) + list(comparison.sentences),
         "names": comparison.names,
-        "triangles": [len(mesh.triangles) for mesh in meshes],
+        "triangles": [_count_text(view) for view in views],
+        "limit": f"{length:.3g}",
+        "is_cut": length < largest.lower,
         "distances": PageTable("distances", columns, rows, is_sortable=False),
         "details": list(comparison.details),
         "remarks": list(comparison.remarks),
@@ -76,15 +92,20 @@ def comparison_page(path: Path, comparison: Comparison, verdict: str = "") -> No
     write_page(path, filled("comparison", content, charts)[0])
 
 
-def _histogram(meshes: Sequence[Mesh], largest: float, *, signed: bool) -> dict[str, Any]:
-    """Return shares of the area of each mesh, by the distance from the other one."""
+def _count_text(view: MeshView) -> str:
+    shown = f", shown with {len(view.triangles):,}" if len(view.triangles) < view.original_triangles else ""
+    return f"{view.original_triangles:,} triangles{shown}"
+
+
+def _histogram(meshes: Sequence[Mesh], largest: float, *, signed: bool) -> tuple[dict[str, Any], float]:
+    """Return shares of the area of each mesh, by the distance from the other one, and where colours end."""
     edges = np.linspace(-largest if signed else 0.0, largest, _BARS + 1)
     rng = np.random.default_rng(0)
-    shares = []
-    for mesh, other in (meshes, meshes[::-1]):
-        found = sampled_distances(mesh, other, rng, _POINTS, signed=signed)
-        shares.append(numbers(np.histogram(found, edges)[0] / _POINTS))
-    return {"x": numbers((edges[1:] + edges[:-1]) / 2), "shares": shares}
+    found = [sampled_distances(mesh, other, rng, _POINTS, signed=signed) for mesh, other in (meshes, meshes[::-1])]
+    shares = [numbers(np.histogram(distances, edges)[0] / _POINTS) for distances in found]
+    usual = max(float(np.quantile(np.abs(distances), 1 - _FARTHEST_AREA)) for distances in found)
+    limit = usual if 0 < usual * _OUTLYING < largest else largest
+    return {"x": numbers((edges[1:] + edges[:-1]) / 2), "shares": shares}, limit
 
 
 def _bands(comparison: Comparison) -> dict[str, Any]:

@@ -40,7 +40,9 @@ def data_of(page: Path) -> dict[str, Any]:
 def test_its_charts_hold_what_was_measured(tmp_path: Path) -> None:
     data = data_of(made_page(tmp_path))
     assert data["pair"]["signed"] is True
-    assert data["pair"]["largest"] == pytest.approx(2.6, rel=0.02)
+    # Colours tell most of the area apart, and not the spike from all else.
+    assert 0.5 <= data["pair"]["limit"] < 1.0
+    assert max(data["histogram"]["x"]) == pytest.approx(2.6, rel=0.04)
     # The tip of the spike, with the third axis upwards, and from the middle of the reference.
     tip = 1.26 * np.array(sb.shapes.icosphere(3).vertices[0]) * 10
     assert sorted(data["pair"]["place"]) == pytest.approx(sorted(tip), abs=1e-2)

@@ -89,10 +89,10 @@
     return { tickvals, ticktext: tickvals.map((x) => (plainly ? String(x) : x.toExponential().replace("-", "−"))) };
   };
 
-  const bars = (values, errors) => ({
+  const bars = (values, errors, lower = errors) => ({
     type: "data", symmetric: false, array: errors, thickness: 1, width: 3,
     // Below zero there is no logarithm.
-    arrayminus: errors.map((error, i) => Math.min(error, 0.999 * values[i])),
+    arrayminus: lower.map((error, i) => Math.min(error, 0.999 * values[i])),
   });
 
   const convergence = () => {
@@ -127,8 +127,8 @@
 
   const league = () => {
     const methods = data.league[state.order];
-    const traces = methods.map(({ family, x, y, errors }) => ({
-      type: "scatter", mode: "lines+markers", name: short(family, 40), x, y, error_y: bars(y, errors),
+    const traces = methods.map(({ family, x, y, errors, lower }) => ({
+      type: "scatter", mode: "lines+markers", name: short(family, 40), x, y, error_y: bars(y, errors, lower),
       line: { color: series(family), width: 1.8 },
       marker: { color: series(family), symbol: symbol(family), size: 8 },
       text: y.map((value, i) => `${plain(family)}<br>${plain(data.size)}: ${number(x[i])}` +
@@ -295,7 +295,7 @@
 
   // Both meshes beside each other, or below each other where it is narrow, turned together.
   const pair = () => {
-    const { views, place: [x, y, z], largest, signed } = data.pair;
+    const { views, place: [x, y, z], eye, limit, signed } = data.pair;
     const place = document.getElementById("chart-pair");
     const [height, beside] = [isPrinted() ? 230 : narrow() ? 640 : 440, !narrow() || isPrinted()];
     const width = isPrinted() ? 640 : place.clientWidth;
@@ -303,16 +303,17 @@
     const traces = views.flatMap((view, i) => {
       const own = i ? "scene2" : "scene";
       return [
-        { ...mesh(view, view.values[0], [signed ? -largest : 0, largest], colors), scene: own, showscale: !i },
+        { ...mesh(view, view.values[0], [signed ? -limit : 0, limit], colors), scene: own, showscale: !i },
         { type: "scatter3d", mode: "markers", x: [x], y: [y], z: [z], scene: own, showlegend: false, hoverinfo: "text",
           text: ["largest deviation"], marker: { size: 9, symbol: "circle-open", color: color("ink"), line: { width: 3 } } },
       ];
     });
     const scenes = views.map(({ extent }, i) => ({
       ...scene(extent, beside ? width / 2 : width, beside ? height : height / 2),
+      camera: { eye: { x: 1.8 * eye[0], y: 1.8 * eye[1], z: 1.8 * eye[2] } },
       domain: beside ? { x: [i / 2, (i + 1) / 2], y: [0, 1] } : { x: [0, 1], y: [(1 - i) / 2, (2 - i) / 2] },
     }));
-    draw("pair", traces, { height, margin: { l: 0, r: 0, t: 0, b: 0 }, scene: scenes[0], scene2: scenes[1] }, space);
+    draw("pair", traces, { height, margin: { l: 0, r: isPrinted() ? 30 : 0, t: 0, b: 0 }, scene: scenes[0], scene2: scenes[1] }, space);
     if (!place.dataset.tied) {
       place.dataset.tied = "yes";
       place.on("plotly_relayout", (changed) => {
