@@ -39,13 +39,14 @@ class MeshCache:
     that prints the version of a program has what it printed last.
 
     Attributes:
-        assumed: Commands whose versions were taken as they were printed last, by the keys of their files.
+        assumed: Commands whose versions were taken as they were printed last, and these, by the keys of their files.
+            Others may replace the files at any time.
         asked: Versions that commands have printed since this object was made, by the same keys.
     """
 
     folder: Folder
     may_run: bool = False
-    assumed: dict[str, Sequence[str]] = field(default_factory=dict, init=False, compare=False, repr=False)
+    assumed: dict[str, tuple[Sequence[str], str]] = field(default_factory=dict, init=False, compare=False, repr=False)
     asked: dict[str, str] = field(default_factory=dict, init=False, compare=False, repr=False)
 
     def read(self, digest: str) -> Mesh | None:
@@ -86,18 +87,19 @@ class MeshCache:
         key = f"version-{hashlib.sha256(shlex.join(command).encode()).hexdigest()}.txt"
         if key in self.asked:
             return self.asked[key]
-        known = (self.folder.read(key) or b"").decode()
-        if known:
-            self.assumed[key] = words
-            return known
-        return self._ask(key, words) if self.may_run else None
+        if key not in self.assumed:
+            known = (self.folder.read(key) or b"").decode()
+            if not known:
+                return self._ask(key, words) if self.may_run else None
+            self.assumed[key] = words, known
+        return self.assumed[key][1]
 
     def versions_changed(self) -> bool:
         """Ask for the versions that were assumed, each once, and return whether any is another one."""
-        known = {key: (self.folder.read(key) or b"").decode() for key in self.assumed}
-        changed = [self._ask(key, words) != known[key] for key, words in self.assumed.items() if self.may_run]
-        self.assumed.clear()
-        return any(changed)
+        for key, (words, _) in self.assumed.items():
+            if self.may_run and key not in self.asked:
+                self._ask(key, words)
+        return any(self.asked.get(key, known) != known for key, (_, known) in self.assumed.items())
 
     def _ask(self, key: str, words: Sequence[str]) -> str:
         """Return what a command prints, and keep it."""

@@ -123,11 +123,10 @@ class Workspace(Contents):
     @classmethod
     def of_study(cls, study: Study, location: Location) -> Self:
         """Plan a study of one object and prepare its store, which this process or its run has locked."""
-        plan = make_plan(study, stored_choice(location))
-        workspace, cache = cls.prepared(location, plan), plan.study.cache
-        if workspace.pending and cache is not None and cache.versions_changed():
+        workspace = cls.prepared(location, make_plan(study, stored_choice(location)))
+        if workspace.pending and study.cache is not None and study.cache.versions_changed():
             # A program of another version makes other meshes: the study is listed again.
-            return cls.of_study(study.not_listed(), location)
+            return cls.prepared(location, make_plan(study.not_listed(), stored_choice(location)))
         return workspace
 
     @property

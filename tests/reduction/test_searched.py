@@ -16,6 +16,8 @@ from sobolev_batch.reduction import searched
 from sobolev_batch.sources.mesh_cache import MeshCache
 from sobolev_batch.sources.registry import Member, load_mesh
 from sobolev_batch.store.location import Location
+from sobolev_batch.store.workspace import Workspace
+from sobolev_batch.study.plan import Plan
 from tests.batch.test_reduce import EndedError, disc, farthest, found_by, lumpy
 from tests.support.commands import call
 
@@ -206,3 +208,38 @@ def test_lengths_need_a_unit_and_a_reference_of_its_own(folder: Path) -> None:
     family = sb.Study.from_table({**study, "reference": {"source": "family", "family": "decimated"}}, folder=folder)
     with pytest.raises(sb.errors.StudyError, match=r"decimated.*a source of its own"):
         _ = family.object.members
+
+
+@pytest.mark.process
+def test_objects_planned_at_once_have_the_new_version_of_a_program(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = {"source": "command", "command": ["cp", "{input}", "{output}", "{n}"], "version": ["cat", "{folder}/V"]}
+    swept = {"name": "swept", **command, "n": 4, "mesh": {"source": "files", "paths": ["scans/a.ply"]}}
+    searching = {"name": "searched", **command, "within": "1 mm", "search": {"n": [4, 8]}}
+
+    def study(name: str) -> sb.Study:
+        made = sb.Study.from_table(table(swept, searching, name=name), folder=folder)
+        return made.with_cache(MeshCache(Location(str(folder / "made-meshes")), may_run=True))
+
+    def digests(one: sb.Study) -> dict[str, str]:
+        return {label: member.fingerprint_digest() for label, (_, member) in one.object.members.items()}
+
+    (folder / "V").write_text("1")
+    first = digests(study("a"))
+    (folder / "V").write_text("2")
+    prepared = Workspace.prepared
+
+    def meanwhile(location: Location, plan: Plan) -> Workspace:
+        # One worker has planned by what the last run knew when another one asks for the version.
+        assert {row.label: row.fingerprint for row in plan.rows} == first
+        monkeypatch.setattr(Workspace, "prepared", prepared)
+        Workspace.of_study(study("b"), Location(str(folder / "b.zarr")))
+        return prepared(location, plan)
+
+    monkeypatch.setattr(Workspace, "prepared", meanwhile)
+    rows = Workspace.of_study(study("a"), Location(str(folder / "a.zarr"))).plan.rows
+    assert {row.label: row.fingerprint for row in rows} == digests(study("a"))
+    # Tasks find what was planned.
+    assert [row.member.fingerprint_digest() for row in rows] == [row.fingerprint for row in rows]
+    assert sum(row.fingerprint != first[row.label] for row in rows) == 2
