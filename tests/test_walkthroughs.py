@@ -118,7 +118,13 @@ SEEN: dict[str, tuple[Callable[[Path], None], *tuple[str, ...]]] = {
         "simple.ply is as far from statue.ply as",
         "witness: where.png",
     ),
-    "A part in millimetres": (part, r"25\.4 times as small", "exported  exported/middle", "same surface", "fine.stl: within 0.1 mm"),
+    "A part in millimetres": (
+        part,
+        r"25\.4 times as small",
+        "exported  exported/middle",
+        "same surface",
+        "fine.stl: within 0.1 mm",
+    ),
 }
 
 
