@@ -179,6 +179,13 @@ def test_compare_to_an_accuracy_and_on_a_lattice(folder: Path) -> None:
     assert f"\nmean distance of A, positive outside of B and negative inside: {near['bias']:.2f}" in shown
 
 
+def test_info_goes_on_past_a_file_that_is_refused(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "empty.ply").touch()
+    done = call("info", tmp_path / "empty.ply", "1.off", folder=folder)
+    assert (done.returncode, done.stdout.startswith("1.off: 80 triangles")) == (2, True)
+    assert re.fullmatch(r"error: \S*empty\.ply: .+\n", done.stderr)
+
+
 def test_compare_tells_files_of_one_name_apart_and_rounding_from_a_deviation(tmp_path: Path) -> None:
     (tmp_path / "other").mkdir()
     for name in ("1.off", "other/1.off"):

@@ -12,6 +12,7 @@ import click
 from sobolev_batch.cli.options import PATH, below_option, json_option, memory_size, orders_option
 from sobolev_batch.cli.output import echo, echo_result
 from sobolev_batch.cli.program import ERROR_STATUS, EXIT_INPUT, cli
+from sobolev_batch.errors import MeshError
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.plugins import FEATURES, extra
 from sobolev_batch.visible import visible
@@ -121,7 +122,8 @@ def compare_command(context: click.Context, /, **options: Any) -> None:
 @cli.command("info")
 @click.argument("files", type=PATH, nargs=-1, required=True, metavar="FILE...")
 @json_option
-def info_command(files: tuple[Path, ...], style: str) -> None:
+@click.pass_context
+def info_command(context: click.Context, files: tuple[Path, ...], style: str) -> None:
     """Print what mesh files hold: counts, size, and what is unusual.
 
     Lengths are in the unit of each file. Edges of one triangle are open, and vertices of the same place are one.
@@ -129,8 +131,19 @@ def info_command(files: tuple[Path, ...], style: str) -> None:
     """
     from sobolev_batch.geometry.formats.readers import read_mesh
 
-    facts = [_facts(path, read_mesh(path)) for path in files]
-    echo_result(style, "\n".join(visible(line) for one in facts for line in _fact_lines(one)), {"files": facts})
+    facts: list[dict[str, Any]] = []
+    refused: list[MeshError] = []
+    for path in files:
+        try:
+            facts.append(_facts(path, read_mesh(path)))
+        except MeshError as error:
+            refused.append(error)
+    if facts:
+        echo_result(style, "\n".join(visible(line) for one in facts for line in _fact_lines(one)), {"files": facts})
+    for error in refused:
+        echo(f"error: {error}", err=True)
+    if refused:
+        context.exit(EXIT_INPUT)
 
 
 def _fact_lines(facts: Mapping[str, Any]) -> Iterator[str]:
