@@ -140,8 +140,8 @@ def info_command(context: click.Context, files: tuple[Path, ...], style: str) ->
             refused.append(error)
     if facts:
         echo_result(style, "\n".join(visible(line) for one in facts for line in _fact_lines(one)), {"files": facts})
-    for error in refused:
-        echo(f"error: {error}", err=True)
+    for refusal in refused:
+        echo(f"error: {refusal}", err=True)
     if refused:
         context.exit(EXIT_INPUT)
 
