@@ -128,6 +128,12 @@ class CompareOptions:
         return f"{self.a.name}: {near}", numbers | asdict(near.deviations.both) | asdict(near.deviations)
 
     @property
+    def names(self) -> tuple[str, str]:
+        """Names of both files, with their folders where these alone tell them apart."""
+        a, b = self.a, self.b
+        return (str(a), str(b)) if a.name == b.name else (a.name, b.name)
+
+    @property
     def chosen_orders(self) -> tuple[float, ...]:
         """The orders, by default one."""
         return self.orders or (DEFAULT_ORDER,)
@@ -233,12 +239,6 @@ class Comparison:
         return self.options.unit or FILE_UNITS
 
     @property
-    def names(self) -> tuple[str, str]:
-        """Names of both files, with their folders where these alone tell them apart."""
-        a, b = self.options.a, self.options.b
-        return (str(a), str(b)) if a.name == b.name else (a.name, b.name)
-
-    @property
     def lines(self) -> Iterator[str]:
         """The same for people."""
         yield from self.sentences
@@ -252,20 +252,21 @@ class Comparison:
 
     @property
     def sentences(self) -> Iterator[str]:
-        """What the comparison says, and where an error is larger than requested."""
+        """Sentences on what was found, and on errors that are larger than requested."""
         rtol, by_order = self.options.accuracy["rtol"], self._by_order
         if self.deviations is not None:
             largest = deviation_text(self.deviations.both, self.unit)
-            yield f"The largest deviation of {self.names[0]} and {self.names[1]} from each other is {largest}."
+            both = " and ".join(self.options.names)
+            yield f"The largest deviation of {both} from each other is {largest}."
         if self.motion is not None:
             motion, before = self.motion
             yield f"where it is in the file: {percent(before['relative'].item(), before['relative_error'].item())}"
             yield _motion_text(motion)
-        yield from dict.fromkeys(answer(*self.names, result, self.area_change) for result in by_order)
+        yield from dict.fromkeys(answer(*self.options.names, result, self.area_change) for result in by_order)
         # Of equal meshes there is no more to tell.
         unequal = [result for result in by_order if result["distance"] > 0]
         for result in unequal:
-            name, reference = map(visible, self.names)
+            name, reference = map(visible, self.options.names)
             text = likeness(name, reference, result, self.second.bounding_sphere[1], self.unit)
             yield from text.split("\n") if text else ()
         for result in unequal:
@@ -287,15 +288,15 @@ class Comparison:
             yield _settings_text(self.results.attrs)
         radius, origin = self.second.bounding_sphere[1], " ".join(f"{x:.6g}" for x in self.similarity.origin)
         yield (
-            f"distances of orders are in {self.unit}; the radius of {self.names[1]} is {radius:.6g}"
+            f"distances of orders are in {self.unit}; the radius of {self.options.names[1]} is {radius:.6g}"
             if self.options.no_scaling
-            else f"distances of orders are in radii of {self.names[1]}, {radius:.6g} {self.unit} each "
+            else f"distances of orders are in radii of {self.options.names[1]}, {radius:.6g} {self.unit} each "
             f"(scale {self.similarity.scale:.6g}, origin {origin})"
         )
 
     @property
     def remarks(self) -> Iterator[str]:
-        """What may make one doubt the comparison."""
+        """Reasons to doubt the comparison."""
         return _remarks(self.options, self.first, self.second, self.doubt)
 
     @property
@@ -314,7 +315,11 @@ class Comparison:
     def write_witness(self, path: Path) -> str:
         """Write or draw where the meshes differ, and return a line about it; see `write_difference`."""
         unit, order = self.unit if self.options.proximity else None, self.options.chosen_orders[0]
-        settings: dict[str, Any] = {"scaling": not self.options.no_scaling, "names": self.names, "distances": unit}
+        settings: dict[str, Any] = {
+            "scaling": not self.options.no_scaling,
+            "names": self.options.names,
+            "distances": unit,
+        }
         return write_difference(self.first, self.second, path, order, **settings)
 
 
@@ -337,11 +342,11 @@ def _motion_text(motion: Reals) -> str:
 
 def _remarks(options: CompareOptions, first: Mesh, second: Mesh, doubt: str | None) -> Iterator[str]:
     """Yield what may make one doubt a comparison: defects, notes, places, and a unit far from the meshes' size."""
-    named = ((options.a.name, first), (options.b.name, second))
+    named = list(zip(options.names, (first, second), strict=True))
     yield from (f"{name}: {', '.join(mesh.defects)}" for name, mesh in named if mesh.defects)
     yield from (f"{name}: {note}" for name, mesh in named for note in mesh.notes)
     if doubt is not None:
-        yield f"{options.a.name}: {doubt}"
+        yield f"{options.names[0]}: {doubt}"
     size = second.bounding_sphere[1] if options.no_scaling else 1.0
     if not 1 / _FAR_UNIT < size < _FAR_UNIT:
         yield (

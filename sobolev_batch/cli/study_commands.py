@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -113,8 +113,10 @@ def run_command(
         echo_lines(format_verdict(open_store(summary.store)))
     else:
         _print_league(context, summary.store)
-        echo()
-        echo_lines(format_objects(summary.store, most=_MOST_OBJECTS))
+        with suppress(InputError):  # As the league says, no object has tables.
+            objects = format_objects(summary.store, most=_MOST_OBJECTS)
+            echo()
+            echo_lines(objects)
     if tables:
         echo()
         echo_lines(format_table(summary.store))

@@ -91,13 +91,15 @@ def _of_sizes(order: float, at_sizes: Sequence[pd.DataFrame]) -> str:
     if not wins:
         return ""
     total, at_order = len(at_sizes), minus(f"at order {order:g}")
-    where = "at the same size" if total == 1 else f"at {{}} of {total:,} sizes"
-    counts = [f"{family} is nearest {where.format(count)}" for family, count in wins.most_common(_MOST_FAMILIES)]
-    if len(wins) > 1 or wins.total() < total or not np.isfinite(leads).all():
-        return f"{', '.join(counts)}, {at_order}. "
-    low, high = (f"{lead:.2g}" for lead in (min(leads), max(leads)))
-    lead = low if low == high else f"{low} to {high}"
-    return f"{counts[0].replace(f'{total} of', 'each of')}, {lead} times nearer than the next, {at_order}. "
+    is_sweep = len(wins) == 1 and wins.total() == total
+    parts = []
+    for family, number in wins.most_common(_MOST_FAMILIES):
+        where = "the same size" if total == 1 else f"{'each' if is_sweep else number} of {total:,} sizes"
+        parts.append(f"{family} is nearest at {where}")
+    if is_sweep and np.isfinite(leads).all():
+        low, high = (f"{lead:.2g}" for lead in (min(leads), max(leads)))
+        parts.append(f"{low if low == high else f'{low} to {high}'} times nearer than the next")
+    return f"{', '.join(parts)}, {at_order}. "
 
 
 def _sentence(order: float, rows: pd.DataFrame, reference: str) -> str:

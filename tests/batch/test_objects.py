@@ -375,6 +375,13 @@ def test_objects_that_no_run_has_come_to_are_not_begun(tmp_path: Path, threads: 
     assert "8 of 10 complete, 0 failed, 2 to go, and 1 objects that are not begun" in str(found)
 
 
+@pytest.mark.process
+def test_a_run_without_any_tables_says_so_and_ends_with_status_3(tmp_path: Path) -> None:
+    (tmp_path / "study.toml").write_text(tomli_w.dumps(study_of([GONE, {**GONE, "name": "lost"}]).table))
+    done = call("run", tmp_path / "study.toml", "--store", tmp_path / "s.zarr", "--workers", "1")
+    assert (done.returncode, done.stdout.startswith("no league: there are no tables yet")) == (3, True)
+
+
 def test_objects_are_listed_from_the_worst_one(store: Path) -> None:
     rows = pd.read_csv(StringIO(format_objects(store, "csv", [-3.0])))
     assert rows["object"].tolist() == rows.sort_values("relative", ascending=False)["object"].tolist()

@@ -48,7 +48,7 @@ def comparison_page(path: Path, comparison: Comparison, verdict: str = "") -> No
     turn = upwards(shown[1].vertices[shown[1].used_vertices])
     views = [
         distance_view(name, mesh, other, comparison.unit, _MOST_TRIANGLES, enough=_ENOUGH_TRIANGLES, signed=signed)
-        for name, mesh, other in zip(comparison.names, shown, shown[::-1], strict=True)
+        for name, mesh, other in zip(comparison.options.names, shown, shown[::-1], strict=True)
     ]
     place = np.roll(np.array(largest.place) - middle, turn)
     # From the side of the bounding box that is nearest to the place.
@@ -63,7 +63,7 @@ def comparison_page(path: Path, comparison: Comparison, verdict: str = "") -> No
     charts = {
         "orders": [],
         "name": options.a.stem,
-        "families": list(comparison.names),
+        "families": list(comparison.options.names),
         "unit": comparison.unit,
         "pair": {
             "views": [view_data(replace(view, vertices=np.roll(view.vertices, turn, axis=1))) for view in views],
@@ -76,11 +76,11 @@ def comparison_page(path: Path, comparison: Comparison, verdict: str = "") -> No
         "bands": _bands(comparison),
     }
     content = {
-        "title": " and ".join(comparison.names),
+        "title": " and ".join(comparison.options.names),
         "orders": [],
         "versions": {"sobolev-batch": version("sobolev-batch")},
         "sentences": [f"{verdict}."] * bool(verdict) + list(comparison.sentences),
-        "names": comparison.names,
+        "names": comparison.options.names,
         "triangles": [_count_text(view) for view in views],
         "limit": f"{length:.3g}",
         "is_cut": length < largest.lower,
