@@ -39,7 +39,7 @@ _ROUNDING = 32 * np.finfo(float).eps
 _EQUAL = 1e-9
 # Pieces that are cut at a time, in some 2 kB each; and pieces after which bounds stay apart.
 _BATCH, _MOST_PIECES = 1 << 15, 100_000_000
-# A plane that cuts off less of the sides than these fractions leaves slivers, and the piece is cut into four.
+# A plane that cuts off less of the sides than these fractions leaves slivers, and the piece is cut in two.
 _LEAST_CUT, _LEAST_SHORTER_CUT, _LARGEST_CUT = 0.05, 0.003, 0.97
 # Where so few pieces are left, the closest triangle to the worst corner of each is worth a search.
 _FEW = 4000
@@ -101,7 +101,8 @@ def largest_deviation(a: MeshLike, b: MeshLike, *, gap: float = DEFAULT_GAP, wit
     Args:
         a: First mesh, or what `as_mesh` makes one of.
         b: Second mesh, in the same unit of length, or what `as_mesh` makes one of.
-        gap: Largest gap between lower and upper bound, as a fraction of the distance; below rounding there is none.
+        gap: Largest gap between lower and upper bound, as a fraction of the distance, or what single precision may have
+            moved vertices by, where that is more; below rounding there is none.
         within: A length for the question whether the largest distance exceeds it. Bounds then stay as far apart as the
             answer permits, which is much faster where it is clear.
 
@@ -135,6 +136,7 @@ class _Bounds:
     Attributes:
         rounding: Distances that differ by less do not differ.
         gap: Gap that is permitted, as a fraction of the lower bound.
+        least_gap: Gap that is permitted however small that bound is: what files may have rounded.
         within: Length whose question is to be answered; None without a question.
         lower: Largest distance of a point so far, that of `place`.
         upper: Largest upper bound of the pieces that are not looked at any more.
@@ -143,6 +145,7 @@ class _Bounds:
 
     rounding: float
     gap: float
+    least_gap: float
     within: float | None
     lower: float = -1.0
     place: Reals = field(default_factory=lambda: np.zeros(3))
@@ -152,7 +155,9 @@ class _Bounds:
     @property
     def enough(self) -> float:
         """Upper bound of a piece below which it need not be cut."""
-        return self.rounding + (self.lower * (1 + self.gap) if self.within is None else self.within)
+        if self.within is not None:
+            return self.rounding + self.within
+        return self.rounding + self.lower + max(self.gap * self.lower, self.least_gap)
 
     @property
     def is_over(self) -> bool:
@@ -190,7 +195,8 @@ def directed_deviation(
     distances[used], closest[used] = other.closest(mesh.vertices[used])
     distances /= scale
     rounding = _ROUNDING * max(1.0, float(np.abs(vertices).max()))
-    bounds = _Bounds(rounding, gap, None if within is None else within / scale)
+    least_gap = max(mesh.rounding, other.rounding) / scale
+    bounds = _Bounds(rounding, gap, least_gap, None if within is None else within / scale)
     bounds.see(vertices[:, used], distances[used])
     # The farthest come first: with a high lower bound, fewer of the others are cut.
     order = np.argsort(-distances[mesh.triangles].max(axis=1), kind="stable")
@@ -238,7 +244,7 @@ def _cut(pieces: _Pieces, other: Triangles, bounds: _Bounds) -> _Pieces | None:
 
 
 def _parts(corners: Reals, best: Indices, worst: Indices, other: Triangles, bounds: _Bounds) -> _Pieces:
-    """Cut pieces: along the plane through a side of the best triangle of each, or into four."""
+    """Cut pieces: along the plane through a side of the best triangle of each, or in two."""
     pieces = np.arange(len(best))
     of_worst = best
     if len(best) <= _FEW:
@@ -270,10 +276,10 @@ def _parts(corners: Reals, best: Indices, worst: Indices, other: Triangles, boun
         & (shares.min(axis=0) < _LARGEST_CUT)
     )
     parts = [*_beside_plane(a[:, is_cut], b[:, is_cut], c[:, is_cut], shares[:, is_cut])]
-    parts += _quarters(a[:, ~is_cut], b[:, ~is_cut], c[:, ~is_cut])
+    parts += _halves(corners[..., ~is_cut])
     close = np.stack([best, of_worst])
     return _Pieces(
-        np.concatenate(parts, axis=2), np.concatenate([close[:, is_cut]] * 3 + [close[:, ~is_cut]] * 4, axis=1)
+        np.concatenate(parts, axis=2), np.concatenate([close[:, is_cut]] * 3 + [close[:, ~is_cut]] * 2, axis=1)
     )
 
 
@@ -283,7 +289,10 @@ def _beside_plane(a: Reals, b: Reals, c: Reals, shares: Reals) -> list[Reals]:
     return [np.stack(part) for part in ((a, along_b, along_c), (along_b, b, c), (along_b, c, along_c))]
 
 
-def _quarters(a: Reals, b: Reals, c: Reals) -> list[Reals]:
-    """Return triangles cut into four at the middles of their sides."""
-    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
-    return [np.stack(part) for part in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+def _halves(corners: Reals) -> list[Reals]:
+    """Return triangles (3, 3, n) cut at the middles of their longest sides: thin ones become less so."""
+    squares = np.stack([dot(side, side) for side in np.roll(corners, -1, axis=0) - corners])
+    first, which = squares.argmax(axis=0), np.arange(corners.shape[2])
+    a, b, c = (corners[(first + k) % 3, :, which].T for k in range(3))
+    middle = (a + b) / 2
+    return [np.stack(part) for part in ((a, middle, c), (middle, b, c))]

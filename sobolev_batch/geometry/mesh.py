@@ -34,6 +34,8 @@ _SECONDS = 6e-8
 # Twice the rounding error of a cross product, relative to the squared longest edge: a smaller area is not
 # distinguishable from zero in double precision.
 _AREA_RESOLUTION = 8 * np.finfo(np.float64).eps
+# Rounding to single precision along all axes, relative to the largest coordinate, with some margin.
+_SINGLE_ROUNDING = 2.0**-22
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +146,22 @@ class Mesh:
         vertices *= scale
         moved = Mesh.from_checked(vertices, self.triangles, self.notes)
         moved._require_sizes()
+        moved.__dict__["rounding"] = scale * self.rounding
         return moved
+
+    @cached_property
+    def rounding(self) -> float:
+        """How far single precision, as in STL, may have moved a vertex, in units of length; zero where it did not.
+
+        Coordinates that single precision holds count as rounded, also once they are scaled and moved.
+
+        >>> import sobolev_batch as sb
+        >>> sb.Mesh([[0, 0, 0], [4, 0, 0], [0, 4, 0]], [[0, 1, 2]]).rounding == 2**-20
+        True
+        """
+        with np.errstate(over="ignore"):
+            single = bool(np.all(self.vertices.astype(np.float32) == self.vertices))
+        return _SINGLE_ROUNDING * float(np.abs(self.vertices).max()) if single else 0.0
 
     @cached_property
     def used_vertices(self) -> Indices:

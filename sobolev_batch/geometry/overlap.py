@@ -19,8 +19,8 @@ from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Extent
 
-# Tolerances, relative to the largest coordinate: its rounding, and that in single precision, as in STL.
-ROUNDING, SINGLE_ROUNDING = 2.0**-47, 2.0**-22
+# Rounding, relative to the largest coordinate.
+ROUNDING = 2.0**-47
 # The grid of polygons, and the least height of triangles that are left, beside the rounding.
 _GRID, _LEAST_HEIGHT = 0.25, 2.0
 # How far off areas may be, relative to them, and the least fraction of them that is worth taking out.

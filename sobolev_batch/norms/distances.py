@@ -205,6 +205,7 @@ def to_accuracy(
         raise InputError("an rtol chooses the lattice: pass surfaces and no lattice, or a lattice and no rtol")
     check_seed(seed)
     problem = Problem.from_surfaces(surfaces, orders, accuracy, f"the {name}", available_cores())
+    problem = problem.up_to_rounding(surfaces)
     with progress_line(on_progress) as notify:
         solution = solve(replace(problem, notify=notify), seed)
     attributes = {"rtol": accuracy.rtol, "seed": seed, **solution.settings}
@@ -212,7 +213,7 @@ def to_accuracy(
     if name == "norm":
         dataset = labelled(order, solution.estimate.named(name), attributes)
     else:
-        reference = Reference.for_problem(problem, solution, seed) if problem.surfaces else None
+        reference = Reference.for_problem(problem, solution, seed) if problem.is_different else None
         estimate = ReferenceEstimate.of_equal(len(problem.orders)) if reference is None else reference.estimate
         dataset = labelled_distances(order, solution.estimate, estimate, attributes)
     within = accuracy.met(solution.estimate).reshape(np.shape(order))

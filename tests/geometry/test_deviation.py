@@ -11,6 +11,7 @@ from sobolev_batch import compiled
 from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.geometry import deviation
 from sobolev_batch.geometry.closest import Triangles
+from sobolev_batch.geometry.subdivision import subdivided
 
 
 def distance_from_triangles(points: Reals, mesh: sb.Mesh) -> Reals:
@@ -183,3 +184,27 @@ def test_the_compiled_loop_gives_the_distances_of_the_arrays() -> None:
 def test_refuses_what_is_no_length(wrong: dict[str, float]) -> None:
     with pytest.raises(sb.errors.InputError, match="must be a positive number, found"):
         sb.largest_deviation(sb.shapes.icosphere(0), sb.shapes.icosphere(1), **wrong)
+
+
+@pytest.mark.parametrize("is_forward", [True, False])
+def test_thin_triangles_cut_finer_in_single_precision_take_few_pieces(
+    is_forward: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ring = 2 * np.pi * np.arange(48) / 48
+    points = np.concatenate([[[40.0, 25.0]], np.c_[6 * np.cos(ring) - 25, 6 * np.sin(ring) + 5]])
+    coarse = sb.Mesh(np.c_[points, 0.1 * points[:, 0]].astype(np.float32), [[0, k, k % 48 + 1] for k in range(1, 49)])
+    fine = subdivided(subdivided(subdivided(coarse)))
+    fine, pieces = sb.Mesh(fine.vertices.astype(np.float32), fine.triangles), 0
+    squares = Triangles.squares
+
+    def counted(self: Triangles, at: Reals, triangles: Indices) -> Reals:
+        nonlocal pieces
+        pieces += len(triangles)
+        return squares(self, at, triangles)
+
+    monkeypatch.setattr(Triangles, "squares", counted)
+    pair = (fine, coarse) if is_forward else (coarse, fine)
+    found = deviation.directed_deviation(pair[0], Triangles(pair[1]))
+    # Rounding along the three axes, and the gap that it permits.
+    assert 0 < found.lower <= found.upper <= 3 * 2.0**-22 * 40
+    assert pieces < 600 * len(fine.triangles)

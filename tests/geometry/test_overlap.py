@@ -13,7 +13,7 @@ from scipy.stats import special_ortho_group
 
 from sobolev_batch import Mesh
 from sobolev_batch.arrays import Complexes, Reals
-from sobolev_batch.geometry.overlap import SINGLE_ROUNDING, Rests, rests_of
+from sobolev_batch.geometry.overlap import Rests, rests_of
 from sobolev_batch.shapes import icosphere
 from sobolev_batch.transform.exact import exact_transform
 from tests.coverage.solids import edited
@@ -21,6 +21,9 @@ from tests.support.rectangles import Rectangles
 from tests.support.shapes import soup
 
 FREQUENCIES: Reals = np.random.default_rng(3).normal(size=(40, 3)) * np.geomspace(0.1, 30, 40)[:, None]
+
+# Rounding to single precision.
+SINGLE_ROUNDING = 2.0**-22
 
 
 def values(mesh: Mesh | None) -> Complexes:

@@ -199,6 +199,10 @@ class Reference:
         own = replace(alone, surfaces=pair[1:], support=support, accuracy=accuracy)
         of_reference = solve(own, seed)
         frequencies, values = Frequencies.from_solution(own, of_reference), of_reference.values[0]
+        if not problem.surfaces:
+            norms = of_reference.estimate
+            errors = problem.moved * (norms.values + norms.errors)
+            return cls(frequencies, values, pair[1], ReferenceEstimate(norms, 0 * errors, errors))
         target = error_target(solution.estimate.values, problem.orders, problem.accuracy, problem.area)
         surfaces = [move.apply(surface) for surface in problem.surfaces]
         difference = [frequencies.values(surface, target, problem.execution) for surface in surfaces]

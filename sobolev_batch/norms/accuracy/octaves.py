@@ -53,6 +53,8 @@ _FEWEST_M, _FIRST_M, _LARGEST_M = 32, 64, 192
 _FILLED = np.pi / 12 * 7 / 8
 # Draws of an octave: the fewest, the most, and the most time for draws beside a lattice, as a fraction of its own.
 _FEWEST_DRAWS, _MOST_DRAWS, _DRAWS_FRACTION = 256, 1_000_000, 0.5
+# Part of the draws that flat faces need which they usually take beside lattices: chosen, not derived.
+_OF_DRAWS = 0.1
 # The fewest on flat faces without a lattice: where faces repeat, few draws would miss the frequency of the period.
 _FEWEST_FLAT_DRAWS = 20_000
 # Uniform directions among the draws, beside a lattice and without one.
@@ -327,7 +329,10 @@ def farther_out(state: State) -> State | None:
         points = min(points, beyond.covering)
     sampling = _first_sampling(state, octave) if can_go_on else None
     seconds = np.inf if sampling is None else state.sampling_seconds(sampling) + beyond.seconds(beyond.points) / 4
-    if not state.for_others and points <= _MOST_POINTS and beyond.seconds(points) < min(seconds, _MOST_SECONDS):
+    # On flat faces the first samples of an octave are the least of what it takes.
+    whole = _OF_DRAWS * _draws_needed(state, octave) * state.draw_seconds if state.normals and state.can_draw else 0.0
+    affordable = min(max(seconds, whole), _MOST_SECONDS)
+    if not state.for_others and points <= _MOST_POINTS and beyond.seconds(points) < affordable:
         return state.redrawn(len(state.octaves), points)
     if sampling is None:
         return _looked_at(state)
@@ -394,18 +399,7 @@ def _measured(state: State, sampling: OctaveSampling, known: MeasuredOctave | No
 
 def _first_sampling(state: State, octave: Octave) -> OctaveSampling:
     """Return the sampling of an octave that is predicted to be the cheapest one."""
-    orders, normals, rng = state.problem.orders, state.normals, state.rng
-    energy = state.octaves[-1].sums.energy if state.octaves else state.core.energy
-    energy = max(_GROWTH * energy, *state.remainders[-1].energies)
-    inside = np.array([octave.integral(order) for order in orders])
-    outside = np.array([tail_integral(octave.highest, order) for order in orders])
-    deviation = _FLAT_DEVIATION if normals else _CURVED_DEVIATION
-    # Relative errors of the energy that the octave's own part permits, and what lies beyond it.
-    # Very negative orders have nothing there.
-    with np.errstate(divide="ignore"):
-        own = np.sqrt(state.permitted_variances / _USUAL_OCTAVES) / (energy * inside)
-        further = _REMAINDER_FRACTION * state.permitted / (_QUANTILE * energy * outside)
-    count = int(np.clip((deviation / min(own.min(), further.min())) ** 2, _FEWEST_DRAWS, _MOST_DRAWS))
+    normals, rng, count = state.normals, state.rng, _draws_needed(state, octave)
     # As many samples as draws would need.
     intervals = int(np.clip(good_intervals((count / _FILLED) ** (1 / 3)), _FEWEST_M, _FIRST_M))
     lattice = _lattice(state, octave, intervals, rng)
@@ -419,6 +413,22 @@ def _first_sampling(state: State, octave: Octave) -> OctaveSampling:
         affordable = _DRAWS_FRACTION * seconds / state.draw_seconds
         beside = int(np.clip(min(count, affordable), _FEWEST_DRAWS, _MOST_DRAWS))
     return OctaveSampling(octave, (lattice,), beside, _seed(rng), normals, _UNIFORM_BESIDE_LATTICE)
+
+
+def _draws_needed(state: State, octave: Octave) -> int:
+    """Return how many drawn frequencies are likely to tell enough of an octave."""
+    orders = state.problem.orders
+    energy = state.octaves[-1].sums.energy if state.octaves else state.core.energy
+    energy = max(_GROWTH * energy, *state.remainders[-1].energies)
+    inside = np.array([octave.integral(order) for order in orders])
+    outside = np.array([tail_integral(octave.highest, order) for order in orders])
+    deviation = _FLAT_DEVIATION if state.normals else _CURVED_DEVIATION
+    # Relative errors of the energy that the octave's own part permits, and what lies beyond it.
+    # Very negative orders have nothing there.
+    with np.errstate(divide="ignore"):
+        own = np.sqrt(state.permitted_variances / _USUAL_OCTAVES) / (energy * inside)
+        further = _REMAINDER_FRACTION * state.permitted / (_QUANTILE * energy * outside)
+    return int(np.clip((deviation / min(own.min(), further.min())) ** 2, _FEWEST_DRAWS, _MOST_DRAWS))
 
 
 def _finer_samplings(state: State) -> dict[int, OctaveSampling]:

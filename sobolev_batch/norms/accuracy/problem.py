@@ -12,10 +12,19 @@ import numpy as np
 from sobolev_batch.arrays import ComplexDtype, Complexes, Reals
 from sobolev_batch.errors import AccuracyError
 from sobolev_batch.geometry.mesh import Mesh, shared_triangles
-from sobolev_batch.geometry.overlap import SINGLE_ROUNDING, rests_of
+from sobolev_batch.geometry.overlap import rests_of
+from sobolev_batch.geometry.refinement import distance_of_refinement
 from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Similarity, Surface, centering
 from sobolev_batch.norms.accuracy.tolerance import Accuracy, first_lattice, unreachable
-from sobolev_batch.norms.budget import APART_FRACTION, Sums, Support, norm_of_moves, product_apart, sums_of_shells
+from sobolev_batch.norms.budget import (
+    APART_FRACTION,
+    Sums,
+    Support,
+    norm_of_moves,
+    norm_of_rounding,
+    product_apart,
+    sums_of_shells,
+)
 from sobolev_batch.norms.estimate import NormEstimate, change_of_root
 from sobolev_batch.norms.fields import USUAL_DEGREE, Field, field_for
 from sobolev_batch.norms.tail.sampling import OctaveSampling
@@ -36,6 +45,10 @@ OFF_CENTER = 1e-3
 _PAIR = 2
 # Fraction of an error that faces may take that are apart by a rounding of files.
 _MOVED_FRACTION = 0.1
+# A rounding along one axis, as a part of what counts as one.
+_LEAST_MOVE = 1 / 8
+# Part of a norm below which a distance is not measured that roundings of files explain.
+_ROUNDED = 1e-2
 # Settings that each field has.
 _OF_FIELDS = ("eps", "quadrature_eps", "points")
 # An accuracy called reachable must hold when it is requested.
@@ -81,14 +94,32 @@ class Problem:
         settings = orders, accuracy, label, threads
         problem = cls._between(different, pair, *settings)
         meshes = [surface for surface in different.values() if isinstance(surface, Mesh)]
-        if len(meshes) < _PAIR or not any(_is_single(surface) for surface in pair):
+        rounding = _rounding(pair)
+        if len(meshes) < _PAIR or not rounding:
             return problem
-        rests = rests_of(meshes[0], meshes[1], SINGLE_ROUNDING)
+        rests = rests_of(meshes[0], meshes[1], rounding / max(mesh.extent.reach for mesh in meshes))
         closer = cls._between(_signed(rests.meshes), pair, *settings)
         moved = norm_of_moves(rests.areas, rests.distances, orders)
         if closer.surfaces and np.all(moved <= _MOVED_FRACTION * accuracy.rtol * closer.rough_values):
             return replace(closer, moved=moved)
         return problem
+
+    def up_to_rounding(self, surfaces: Sequence[Surface]) -> Self:
+        """Return the problem without surfaces where one mesh is the other one cut finer, and a file rounded them.
+
+        It stays as it is where that may be more than a small part of the norm. The surfaces are those it was made from.
+        """
+        rounding, meshes = _rounding(surfaces), [it for it in surfaces if isinstance(it, Mesh)]
+        if len(meshes) < _PAIR or not rounding or not self.surfaces:
+            return self
+        coarse, fine = sorted(meshes, key=lambda mesh: len(mesh.triangles))
+        distance = distance_of_refinement(fine, coarse, rounding)
+        if distance is None:
+            return self
+        # Moves within a plane show at folds alone.
+        moved = norm_of_rounding(fine.area, max(distance, _LEAST_MOVE * rounding), self.orders)
+        norm = replace(self, surfaces=self.pair[:1], signs=self.signs[:1])
+        return replace(self, surfaces=(), moved=moved) if np.all(moved <= _ROUNDED * norm.rough_values) else self
 
     @classmethod
     def _between(
@@ -127,6 +158,11 @@ class Problem:
     def is_whole(self) -> bool:
         """True if the surfaces are those that a distance is between: they share no triangles."""
         return self.surfaces is self.pair
+
+    @property
+    def is_different(self) -> bool:
+        """True if the surfaces differ, maybe by no more than rounding."""
+        return bool(self.surfaces) or bool(np.any(self.moved))
 
     @property
     def inexact_count(self) -> int:
@@ -257,9 +293,9 @@ def _signed(rests: Sequence[Mesh | None]) -> Mapping[int, Surface]:
     return {sign: rest for sign, rest in zip((1, -1), rests, strict=True) if rest is not None}
 
 
-def _is_single(surface: Surface) -> bool:
-    """Tell whether single precision holds the coordinates of a mesh, as where STL was read."""
-    return isinstance(surface, Mesh) and bool(np.all(surface.vertices.astype(np.float32) == surface.vertices))
+def _rounding(surfaces: Sequence[Surface]) -> float:
+    """Return how far a file may have moved the vertices of meshes, in units of length."""
+    return max([mesh.rounding for mesh in surfaces if isinstance(mesh, Mesh)], default=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,9 +332,10 @@ class Solution:
     alone: tuple[Solution, ...] = ()
 
     @classmethod
-    def zero(cls, orders: Sequence[float]) -> Self:
-        """Return the distance of equal surfaces, for which nothing is computed."""
-        return cls(NormEstimate(*np.zeros((5, len(orders)))))
+    def zero(cls, orders: Sequence[float], moved: Reals | float = 0.0) -> Self:
+        """Return the distance of surfaces that are equal, but for some moves, for which nothing is computed."""
+        zeros = np.zeros(len(orders))
+        return cls(NormEstimate(zeros, zeros, zeros, zeros + moved))
 
     @classmethod
     def of_apart(cls, problem: Problem, alone: Sequence[Solution]) -> Self:

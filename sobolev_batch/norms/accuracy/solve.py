@@ -103,7 +103,7 @@ def solve(problem: Problem, seed: int = 0) -> Solution:
     Surfaces that are far apart are solved one by one.
     """
     if not problem.surfaces:
-        return Solution.zero(problem.orders)
+        return Solution.zero(problem.orders, problem.moved)
     if problem.apart is not None:
         return Solution.of_apart(problem, [solve(norm, seed) for norm in problem.alone])
     strict = replace(problem, accuracy=replace(problem.accuracy, best_effort=False))

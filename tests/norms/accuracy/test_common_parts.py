@@ -11,6 +11,7 @@ from scipy.special import gamma
 from scipy.stats import special_ortho_group
 
 import sobolev_batch as sb
+from sobolev_batch.geometry.subdivision import icosphere, subdivided
 from sobolev_batch.norms.accuracy.problem import Problem, are_equal
 from sobolev_batch.norms.accuracy.solve import solve
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
@@ -34,6 +35,10 @@ def cut_anew(mesh: sb.Mesh, seed: int) -> sb.Mesh:
 def turned(mesh: sb.Mesh, *, single: bool = False) -> sb.Mesh:
     vertices = mesh.vertices @ TURN
     return sb.Mesh(vertices.astype(np.float32) if single else vertices, mesh.triangles)
+
+
+def rounded(mesh: sb.Mesh) -> sb.Mesh:
+    return sb.Mesh(mesh.vertices.astype(np.float32), mesh.triangles)
 
 
 def part_and_edited() -> tuple[sb.Mesh, sb.Mesh]:
@@ -119,3 +124,25 @@ def test_moved_faces_change_no_norm_by_more_than_the_bound(order: float) -> None
     far = 2 * np.sqrt(np.sqrt(np.pi) * gamma(-order - 0.5) / gamma(-order))
     found = norm_of_moves(np.ones(3), np.array([1e9, 0.0, 1e9]), [order]).item()
     assert found == pytest.approx(2 * far)
+
+
+# Else octaves would measure the rounding, for minutes.
+@pytest.mark.parametrize("order", [-1.0, -2.0, -4.0])
+@pytest.mark.parametrize("times", [0, 2])
+@pytest.mark.parametrize("similarity", [sb.shapes.Similarity(), sb.shapes.Similarity(0.31, (0.2, -0.1, 0.7))])
+def test_a_mesh_that_is_cut_finer_and_rounded_is_the_same_up_to_rounding(
+    order: float, times: int, similarity: sb.shapes.Similarity
+) -> None:
+    coarse = turned(BOX.mesh(), single=True) if times else icosphere(3)
+    fine = coarse
+    for _ in range(times):
+        fine = subdivided(fine)
+    a, b = similarity.apply(rounded(fine)), similarity.apply(coarse)
+    found, norm = sb.distance(a, b, order, rtol=1e-2), float(sb.norm(b, order, rtol=1e-2)["norm"])
+    error = float(found["error"])
+    assert found["distance"] == 0
+    assert "M" not in found.attrs
+    # On a lattice it is measured, as far as that reaches.
+    known = float(sb.distance(a, b, order, lattice=sb.Lattice(6.0, 48))["distance"])
+    assert 0 < known <= error < 1e-2 * norm
+    assert float(found["relative_error"]) == pytest.approx(error / norm, rel=0.1)

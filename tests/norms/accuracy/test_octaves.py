@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sobolev_batch import Mesh, distance
+from sobolev_batch import Mesh, distance, norm
 from sobolev_batch.errors import AccuracyError, InputError
+from sobolev_batch.geometry.subdivision import subdivided
 from sobolev_batch.norms.accuracy import octaves
 from sobolev_batch.norms.tail.remainder import Remainder, remainder
 from sobolev_batch.shapes import icosphere
@@ -199,3 +200,13 @@ def test_pilots_look_beyond_their_octaves_only_where_these_may_be_enough(monkeyp
     assert chosen is not None
     assert looked_at[-1] == chosen.highest_frequency
     assert len(looked_at) <= len(chosen.octaves) / 2
+
+
+# An octave on flat faces takes many draws, each over all triangles: more points beyond the lattice are cheaper.
+def test_finely_cut_flat_faces_need_no_octaves_for_their_norm() -> None:
+    plate = Rectangles.box([-50.0, -30.0, 0.0], [50.0, 30.0, 5.0]).mesh()
+    for _ in range(5):
+        plate = subdivided(plate)
+    found = norm(plate, -2.0, rtol=1e-2)
+    assert found.attrs["octaves"] == 0
+    assert found["within"]

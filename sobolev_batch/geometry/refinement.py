@@ -1,0 +1,70 @@
+"""Whether the triangles of a mesh are those of another one, cut into smaller ones and rounded, as files round them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sobolev_batch.arrays import Reals
+from sobolev_batch.geometry.closest import Triangles
+from sobolev_batch.geometry.mesh import Mesh
+
+# Height of thin triangles, in tolerances: the centre is a third of it away from each edge.
+_THIN = 8.0
+# A direction without pattern, along which triangles are compared.
+_DIRECTION = np.array([0.4862, -0.3817, 0.7863])
+
+
+def distance_of_refinement(fine: Mesh, coarse: Mesh, tolerance: float) -> float | None:
+    """Return how far the triangles of a mesh are at most from those of a coarser mesh in which they lie.
+
+    The corners of a triangle lie within the tolerance of the other one, and those in one triangle have together its
+    area, centre and moment of inertia, to what the tolerance permits along its edges. Parts that are covered twice
+    while others are bare change these.
+
+    Args:
+        fine: The finer mesh.
+        coarse: The coarser mesh.
+        tolerance: Largest distance, in units of length.
+
+    Returns:
+        The largest distance, in units of length; None where it is no refinement.
+
+    >>> from sobolev_batch.geometry.mesh import Mesh
+    >>> square = Mesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
+    >>> cut = Mesh([*square.vertices, [0.5, 0.5, 1e-9]], [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
+    >>> distance_of_refinement(cut, square, 1e-8)
+    1e-09
+    """
+    whole, corners = coarse.vertices[coarse.triangles], fine.vertices[fine.triangles]
+    centers, widths = whole.mean(axis=1), _longest(whole)
+    # Half the perimeter of a triangle is at most one and a half times its longest edge; both meshes may be off.
+    allowed = 6 * tolerance * widths
+    if abs(fine.area - coarse.area) > allowed.sum():
+        return None
+    triangles = Triangles(coarse)
+    of = triangles.closest(corners.mean(axis=1))[1]
+    squares = [triangles.squares(np.ascontiguousarray(corners[:, k].T / triangles.scale), of) for k in range(3)]
+    distances = triangles.scale * np.sqrt(np.max(squares, axis=0))
+    longest, areas = _longest(corners), np.asarray(fine.areas)
+    # The centre of one about as thin as the tolerance may lie in a neighbour of the triangle in which it does.
+    is_thin = 2 * areas <= _THIN * tolerance * longest
+    if np.any((distances > tolerance) & ~is_thin):
+        return None
+    missing = _moments(whole - centers[:, None], widths, np.asarray(coarse.areas))
+    for number, moments in enumerate(_moments(corners - centers[of, None], widths[of], areas)):
+        missing[number] -= np.bincount(of, moments, len(whole))
+    return min(float(distances.max()), tolerance) if np.all(np.abs(missing) <= allowed) else None
+
+
+def _longest(corners: Reals) -> Reals:
+    """Return the longest edge (m,) of triangles (m, 3, 3)."""
+    return np.asarray(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1))
+
+
+def _moments(corners: Reals, widths: Reals, areas: Reals) -> Reals:
+    """Return the area, the first moments and a second one of triangles (m, 3, 3), in some widths (m,), as (5, m)."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        relative = np.nan_to_num(corners / widths[:, None, None])
+    along = relative @ _DIRECTION
+    second = (np.sum(along**2, axis=1) + np.sum(along, axis=1) ** 2) / 12
+    return np.asarray(areas * np.stack([np.ones(len(areas)), *relative.mean(axis=1).T, second]))
