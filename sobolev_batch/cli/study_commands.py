@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Callable
 from contextlib import nullcontext, suppress
@@ -292,3 +293,11 @@ def _print_league(context: click.Context, place: str) -> None:
             context.invoke(command, store=location(place), orders=None)
     except InputError as error:
         echo(f"no league: {error}")
+
+
+@cli.command("schema")
+def schema_command() -> None:
+    """Print the JSON schema of study files, by which editors complete and check them."""
+    from sobolev_batch.study.json_schema import study_schema
+
+    echo_lines(json.dumps(study_schema(), indent=2))

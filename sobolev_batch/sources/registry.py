@@ -388,6 +388,11 @@ def source_type_of(name: object) -> type[Source]:
     return source_type
 
 
+def source_names() -> list[str]:
+    """Return the names of all sources, those of other packages among them."""
+    return sorted(_registry())
+
+
 def single_member(source: Source, folder: Path) -> Member:
     """Return the only member of a source; StudyError where it has none or several."""
     members = source.members(folder)

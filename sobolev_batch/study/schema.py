@@ -62,7 +62,7 @@ _LARGEST_FILE_BYTES = 4 << 20
 # Most refusals of one study; longer keys are not compared with others.
 _MOST_OFFENDERS, _LONGEST_KEY = 10, 40
 # Sections that are lists; keys of a family that are none of its source, and those with which its meshes are searched.
-_REPEATED, _KEYS_OF_FAMILY, _KEYS_OF_SEARCH = ("family", "object"), ("name", "order_by"), ("within", "order", "search")
+_REPEATED, KEYS_OF_FAMILY, KEYS_OF_SEARCH = ("family", "object"), ("name", "order_by"), ("within", "order", "search")
 # The place of a value in nested tables and lists.
 _Key = tuple[int | str, ...]
 # What a value must be in the words of TOML, by the type of pydantic's error or the first word of it.
@@ -264,7 +264,7 @@ def _source_of_family(table: object, info: ValidationInfo) -> Source:
     # Sources may have an order of their own, and commands a parameter named search.
     if not isinstance(table, dict) or not ("within" in table or isinstance(table.get("search"), dict)):
         return _source(table, info)
-    own = {key: table[key] for key in _KEYS_OF_SEARCH if key in table}
+    own = {key: table[key] for key in KEYS_OF_SEARCH if key in table}
     with refused_by_pydantic():
         others = with_named_meshes({key: table[key] for key in table if key not in own}, info.context or {})
         mesh = parse_source(others.pop("mesh")) if "mesh" in others else None
@@ -290,7 +290,7 @@ class Family(Section):
     def _gather_keys_of_source(cls, table: object) -> object:
         if not isinstance(table, dict):
             return table
-        own = {key: table[key] for key in _KEYS_OF_FAMILY if key in table}
+        own = {key: table[key] for key in KEYS_OF_FAMILY if key in table}
         return {**own, "source": {key: value for key, value in table.items() if key not in own}}
 
 
@@ -506,7 +506,7 @@ def _known_keys(values: Mapping[str, Any], key: _Key) -> Iterable[str]:
         return next(models_in(StudyDocument.model_fields[str(key[0])].annotation)).model_fields
     if key == ("reference",) and table["source"] == "family":
         return (*FamilyReference.model_fields, "source")
-    own = (*_KEYS_OF_FAMILY, *_KEYS_OF_SEARCH) if key[0] == "family" and len(key) == len(("family", 0)) else ()
+    own = (*KEYS_OF_FAMILY, *KEYS_OF_SEARCH) if key[0] == "family" and len(key) == len(("family", 0)) else ()
     return (*source_type_of(table["source"]).model_fields, "source", *own)
 
 
