@@ -29,6 +29,7 @@ from sobolev_batch.study.pilots import Look
 from sobolev_batch.study.plan import Plan, make_plan
 from sobolev_batch.study.study import Study, StudyLike
 from sobolev_batch.tables.pairs import PAIR_BYTES, tile_count
+from sobolev_batch.tables.rendering import printed_table
 from sobolev_batch.tables.text import beside, duration
 from sobolev_batch.transform.fourier import slowness
 from sobolev_batch.transform.lattice import Lattice
@@ -38,6 +39,8 @@ from sobolev_batch.visible import visible
 _PROCESS_SECONDS, _CLUSTER_SECONDS = 4.0, 6.0
 # Objects that a plan looks at: the choice of a lattice takes seconds.
 _MOST_OBJECTS = 16
+# Columns of several objects.
+_SUMMARY = ("object", "missing", "CPU time", "memory", "storage", "M + octaves")
 # Stored fields tell the speed if there are as many.
 _FEWEST_RECORDS = 3
 
@@ -118,6 +121,23 @@ class ObjectPlan:
         """Time that its run takes where each surface has a processor for itself."""
         return self.planning_seconds + max(self.task_seconds.values(), default=0.0)
 
+    @property
+    def processor_seconds(self) -> float:
+        """Processor time that its run takes, without that of starting processes."""
+        return self.planning_seconds + sum(self.task_seconds.values())
+
+    def summary(self, name: str) -> tuple[str, ...]:
+        """Return its row in the table of several objects."""
+        missing, memory = len(self.task_seconds), max(self.memory_bytes.values(), default=0.0)
+        return (
+            name,
+            f"{missing} of {len(self.labels)}",
+            duration(self.processor_seconds, digits=2) if missing else "",
+            format_bytes(memory) if missing else "",
+            format_bytes(self.total_bytes),
+            f"{self.lattice.M} + {self.octaves}" if self.octaves else str(self.lattice.M),
+        )
+
     def to_table(self) -> dict[str, Any]:
         """Return the numbers for programs, without what is shown."""
         return {
@@ -193,7 +213,13 @@ class StudyPlan(Shown):
             looked = f", of which {len(self.objects) + len(self.refused)} were looked at" if self.share > 1 else ""
             lines.append(_beside("objects", f"{self.count:,}{looked}; {format_bytes(self.total_bytes)} of fields"))
         lines += [beside(f"{visible(name)}: ", reason) for name, reason in self.refused.items()]
-        for name, one in self.objects.items():
+        longest_first = sorted(self.objects.items(), key=lambda named: -named[1].processor_seconds)
+        if len(longest_first) > 1:
+            rows = [one.summary(visible(name)) for name, one in longest_first]
+            lines += ["", *printed_table(rows, _SUMMARY, "text").split("\n"), ""]
+            doubts = {f"{name}/{label}": text for name, one in longest_first for label, text in one.doubtful.items()}
+            lines += starmap(_beside, reasons("doubtful", doubts))
+        for name, one in longest_first[:1]:
             lines += [*([f"{visible(name)}:"] if name else []), *starmap(_beside, one.lines)]
         return "\n".join(lines)
 
@@ -336,7 +362,7 @@ def _forecast(
         lacks_tables = any(one.lacks_tables for one in objects)
         text = "no field is missing, and tables follow from them" if lacks_tables else "nothing is missing"
         return 0.0, 0.0, (text,)
-    work = share * sum(one.planning_seconds + sum(one.task_seconds.values()) for one in objects)
+    work = share * sum(one.processor_seconds for one in objects)
     processes, start = (
         (_PROCESS_SECONDS * (1 + len(workers.members)), _CLUSTER_SECONDS) if starts_processes else (0.0, 0.0)
     )
