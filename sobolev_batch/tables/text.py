@@ -26,7 +26,7 @@ _SMALLEST_PLAIN, _LARGEST_PLAIN, _LAST_PLAIN = 1e-3, 1e5, -6
 POWER = " × 10"
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 # Surfaces whose distance, relative to the reference, is certainly smaller differ by rounding.
-_ROUNDING = 1e-10
+_ROUNDING, _OF_FILES = 1e-10, 1e-5
 # A share of area is told if its error is no larger, and to whole per cents.
 _LARGEST_SHARE_ERROR, _WHOLE_PERCENT = 0.1, 0.01
 # Area is called lost or gained if the surface really lost or gained at least this fraction of what fits best.
@@ -156,8 +156,9 @@ def answer(name: str, reference: str, result: xr.Dataset | Mapping[str, float], 
         amount = percent(numbers["relative"], numbers["relative_error"])
         return f"{name} differs from {reference} by {amount} {at_order}{_share_text(result, area_change)}."
     most = numbers["relative"] + numbers["relative_error"]
-    if most < _ROUNDING:
-        return f"{name} and {reference} are equal up to rounding {at_order}: they differ by less than {bound(most)}."
+    if most < _OF_FILES:
+        rounding = "rounding" if most < _ROUNDING else "the rounding of files"
+        return f"{name} and {reference} are equal up to {rounding} {at_order}: they differ by less than {bound(most)}."
     amount = "an unknown amount" if math.isnan(most) else f"less than {bound(most)}"
     return f"{name} differs from {reference} by {amount} {at_order}: not resolved."
 

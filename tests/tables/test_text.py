@@ -99,6 +99,8 @@ def test_distances_that_cannot_be_told_from_zero_and_unknown_errors() -> None:
     assert said(distance=2e-4, relative=1e-4) == near
     equal = "a.obj and b.obj are equal up to rounding at order -2: they differ by less than 2.1 × 10⁻¹¹ %."
     assert said(distance=1e-14, error=2e-13, relative=1e-14, relative_error=2e-13) == equal
+    finer = "a.obj and b.obj are equal up to the rounding of files at order -2: they differ by less than 0.00020 %."
+    assert said(distance=0.0, error=2e-6, relative=0.0, relative_error=2e-6) == finer
     zero = dict.fromkeys(NUMBERS, 0.0)
     assert said(**zero, **UNKNOWN) == "a.obj and b.obj are identical: they cover the same surface."
     assert "by 1.020 % ± ? at order -2" in said(relative_error=_NAN)
