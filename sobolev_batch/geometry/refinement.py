@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from sobolev_batch.arrays import Reals
@@ -14,8 +16,22 @@ _THIN = 8.0
 _DIRECTION = np.array([0.4862, -0.3817, 0.7863])
 
 
-def distance_of_refinement(fine: Mesh, coarse: Mesh, tolerance: float) -> float | None:
-    """Return how far the triangles of a mesh are at most from those of a coarser mesh in which they lie.
+@dataclass(frozen=True)
+class Refinement:
+    """How a mesh differs from a coarser one of which it has all triangles, cut into smaller ones.
+
+    Attributes:
+        distance: Largest distance of a triangle from the one in which it lies, in units of length.
+        missing: Root of the sum of squares, over the triangles of the coarser mesh, of the area that is bare or covered
+            twice, in squared units of length.
+    """
+
+    distance: float
+    missing: float
+
+
+def refinement_of(fine: Mesh, coarse: Mesh, tolerance: float) -> Refinement | None:
+    """Return how a mesh differs from a coarser one whose triangles it has, cut into smaller ones.
 
     The corners of a triangle lie within the tolerance of the other one, and those in one triangle have together its
     area, centre and moment of inertia, to what the tolerance permits along its edges. Parts that are covered twice
@@ -27,21 +43,21 @@ def distance_of_refinement(fine: Mesh, coarse: Mesh, tolerance: float) -> float 
         tolerance: Largest distance, in units of length.
 
     Returns:
-        The largest distance, in units of length; None where it is no refinement.
+        The refinement, or None where it is none.
 
     >>> from sobolev_batch.geometry.mesh import Mesh
     >>> square = Mesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
     >>> cut = Mesh([*square.vertices, [0.5, 0.5, 1e-9]], [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
-    >>> distance_of_refinement(cut, square, 1e-8)
-    1e-09
+    >>> refinement_of(cut, square, 1e-8)
+    Refinement(distance=1e-09, missing=0.0)
     """
-    whole, corners = coarse.vertices[coarse.triangles], fine.vertices[fine.triangles]
+    whole = coarse.vertices[coarse.triangles]
     centers, widths = whole.mean(axis=1), _longest(whole)
-    # Half the perimeter of a triangle is at most one and a half times its longest edge; both meshes may be off.
-    allowed = 6 * tolerance * widths
+    # Roundings along its edges change the area of a triangle by less.
+    allowed = 2 * tolerance * widths
     if abs(fine.area - coarse.area) > allowed.sum():
         return None
-    triangles = Triangles(coarse)
+    triangles, corners = Triangles(coarse), fine.vertices[fine.triangles]
     of = triangles.closest(corners.mean(axis=1))[1]
     squares = [triangles.squares(np.ascontiguousarray(corners[:, k].T / triangles.scale), of) for k in range(3)]
     distances = triangles.scale * np.sqrt(np.max(squares, axis=0))
@@ -53,7 +69,9 @@ def distance_of_refinement(fine: Mesh, coarse: Mesh, tolerance: float) -> float 
     missing = _moments(whole - centers[:, None], widths, np.asarray(coarse.areas))
     for number, moments in enumerate(_moments(corners - centers[of, None], widths[of], areas)):
         missing[number] -= np.bincount(of, moments, len(whole))
-    return min(float(distances.max()), tolerance) if np.all(np.abs(missing) <= allowed) else None
+    if np.any(np.abs(missing) > allowed):
+        return None
+    return Refinement(min(float(distances.max()), tolerance), float(np.linalg.norm(missing[0])))
 
 
 def _longest(corners: Reals) -> Reals:

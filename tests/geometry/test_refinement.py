@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.geometry.refinement import distance_of_refinement
+from sobolev_batch.geometry.refinement import refinement_of
 from sobolev_batch.geometry.subdivision import icosphere, subdivided
 
 ROUNDING = 2.0**-22
@@ -30,10 +30,10 @@ def test_cut_and_rounded_meshes_are_refinements(coarse: Mesh, times: int) -> Non
     for _ in range(times):
         fine = subdivided(fine)
     fine = rounded(fine)
-    found = distance_of_refinement(fine, coarse, ROUNDING * size)
+    found = refinement_of(fine, coarse, ROUNDING * size)
     assert found is not None
     # Half a unit in the last place along three axes, in both meshes.
-    assert found <= 2 * 3**0.5 * 2.0**-25 * size
+    assert found.distance <= 2 * 3**0.5 * 2.0**-25 * size
 
 
 def changed(fine: Mesh, how: str) -> Mesh:
@@ -56,6 +56,19 @@ def changed(fine: Mesh, how: str) -> Mesh:
     return Mesh(vertices, triangles)
 
 
+def test_a_hole_as_small_as_the_rounding_permits_is_told_by_its_area() -> None:
+    coarse = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    width = 4e-4
+    hole = np.array([[0.3, 0.3, 0], [0.3 + width, 0.3, 0], [0.3, 0.3 + width, 0]])
+    vertices = np.concatenate([coarse.vertices, hole])
+    fine = Mesh(vertices, [[0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4], [2, 0, 3], [2, 3, 5]])
+    assert fine.area == pytest.approx(0.5 - width**2 / 2, abs=1e-12)
+    found = refinement_of(fine, coarse, ROUNDING)
+    assert found is not None
+    assert found.missing == pytest.approx(width**2 / 2, rel=1e-6)
+    assert refinement_of(fine, coarse, ROUNDING / 10) is None
+
+
 @pytest.mark.parametrize(
     "how",
     ["bare", "covered twice", "bare here and twice there", "bare in the middle and twice around", "dented"],
@@ -63,6 +76,6 @@ def changed(fine: Mesh, how: str) -> Mesh:
 def test_edits_are_no_refinements(how: str) -> None:
     coarse = Mesh(np.array([[0, 0, 0], [1, 0, 0], [0.2, 0.9, 0], [1.1, 1.2, 0.4]]), [[0, 1, 2], [1, 3, 2]])
     fine = subdivided(coarse)
-    assert distance_of_refinement(fine, coarse, ROUNDING) is not None
-    assert distance_of_refinement(changed(fine, how), coarse, ROUNDING) is None
-    assert distance_of_refinement(fine, changed(coarse, "bare"), ROUNDING) is None
+    assert refinement_of(fine, coarse, ROUNDING) is not None
+    assert refinement_of(changed(fine, how), coarse, ROUNDING) is None
+    assert refinement_of(fine, changed(coarse, "bare"), ROUNDING) is None

@@ -13,7 +13,7 @@ from sobolev_batch.arrays import ComplexDtype, Complexes, Reals
 from sobolev_batch.errors import AccuracyError
 from sobolev_batch.geometry.mesh import Mesh, shared_triangles
 from sobolev_batch.geometry.overlap import rests_of
-from sobolev_batch.geometry.refinement import distance_of_refinement
+from sobolev_batch.geometry.refinement import refinement_of
 from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Similarity, Surface, centering
 from sobolev_batch.norms.accuracy.tolerance import Accuracy, first_lattice, unreachable
 from sobolev_batch.norms.budget import (
@@ -113,11 +113,12 @@ class Problem:
         if len(meshes) < _PAIR or not rounding or not self.surfaces:
             return self
         coarse, fine = sorted(meshes, key=lambda mesh: len(mesh.triangles))
-        distance = distance_of_refinement(fine, coarse, rounding)
-        if distance is None:
+        refinement = refinement_of(fine, coarse, rounding)
+        if refinement is None:
             return self
         # Moves within a plane show at folds alone.
-        moved = norm_of_rounding(fine.area, max(distance, _LEAST_MOVE * rounding), self.orders)
+        distance = max(refinement.distance, _LEAST_MOVE * rounding)
+        moved = norm_of_rounding(fine.area, distance, refinement.missing, self.orders)
         norm = replace(self, surfaces=self.pair[:1], signs=self.signs[:1])
         return replace(self, surfaces=(), moved=moved) if np.all(moved <= _ROUNDED * norm.rough_values) else self
 
