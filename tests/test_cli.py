@@ -90,7 +90,10 @@ def test_a_part_of_a_study_and_then_the_rest(folder: Path) -> None:
 
 def test_tables_as_files_of_other_programs(folder: Path, tmp_path: Path) -> None:
     whole = sb.table(folder / STORE)
-    output("export", STORE, str(tmp_path / "t.csv"), "--to", "csv", folder=folder)
+    output("export", STORE, str(tmp_path / "t.csv"), folder=folder)
+    unknown = call("export", STORE, tmp_path / "t.dat", folder=folder)
+    assert unknown.returncode == 2
+    assert "--to" in unknown.stderr
     frame = pd.read_csv(tmp_path / "t.csv")
     assert frame.columns.tolist() == whole.columns.tolist()
     assert frame["distance"].tolist() == whole["distance"].tolist()

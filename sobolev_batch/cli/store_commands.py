@@ -118,14 +118,17 @@ def prune_command(store: Location, yes: bool) -> None:
 @click.option(
     *("--to", "style"),
     type=click.Choice(["parquet", "netcdf", "csv"]),
-    required=True,
-    help="Write a long table, or with netcdf the groups of tables. The first two need the extra export.",
+    help="Write a long table, or with netcdf the groups of tables. The first two need the extra export. "
+    "[default: by the ending of OUTPUT: .parquet, .nc, .csv]",
 )
 @orders_option("Write the table of this order, for parquet and csv.", "the study's")
-def export_command(store: Location, output: Path, style: ExportFormat, orders: tuple[float, ...] | None) -> None:
+def export_command(store: Location, output: Path, style: ExportFormat | None, orders: tuple[float, ...] | None) -> None:
     """Write the tables of STORE to the file OUTPUT, with their coordinates."""
-    from sobolev_batch.tables.export import export
+    from sobolev_batch.tables.export import BY_ENDING, export
 
+    style = style or BY_ENDING.get(output.suffix.lower())
+    if style is None:
+        raise click.UsageError(f"no format has the ending {output.suffix!r}; choose one by --to parquet, netcdf or csv")
     if orders and style == "netcdf":
         raise click.UsageError("--order is for parquet and csv; netcdf has the orders of the study")
     export(store, output, style, orders)

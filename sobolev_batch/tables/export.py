@@ -15,6 +15,7 @@ from sobolev_batch.tables.rendering import machine_table
 from sobolev_batch.transform.lattice import Orders
 
 ExportFormat = Literal["parquet", "netcdf", "csv"]
+BY_ENDING: dict[str, ExportFormat] = {".parquet": "parquet", ".nc": "netcdf", ".csv": "csv"}
 _GROUPS = ("meshes", "norms", "distances", "convergence", "proximity")
 
 
