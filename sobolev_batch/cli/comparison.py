@@ -36,7 +36,7 @@ from sobolev_batch.visible import FILE_UNITS, visible
 
 # Options that every verdict knows; those of one on a fraction of the norm, which chooses the accuracy of the distance
 # itself; and those of one on a length.
-_KNOWN = {"a", "b", "below", "within", "report", "style"}
+_KNOWN = {"a", "b", "align", "below", "within", "report", "style"}
 _KNOWN_OF_FRACTIONS, _KNOWN_OF_LENGTHS = {"orders", "memory", "no_scaling"}, {"unit"}
 
 # A radius beyond it, or below its inverse, is far from the unit of length.
@@ -116,14 +116,20 @@ class CompareOptions:
 
     def verdict(self) -> tuple[str, dict[str, Any]] | None:
         """The line and the numbers of the verdict that is asked for; None without one."""
+        if self.allowed_fraction is None and self.within is None:
+            return None
         numbers: dict[str, Any] = {"a": self.a, "b": self.b}
+        a: Path | Mesh = self.a
+        if self.align:
+            a, b = read_mesh(self.a), read_mesh(self.b)
+            motion = extra(FEATURES, "align", "--align")(a, b, order=self.chosen_orders[0])
+            a, numbers["motion"] = _moved(a, motion), motion.tolist()
+            echo(f"note: {_motion_text(motion)}", err=True)
         if (tolerance := self.allowed_fraction) is not None:
             settings: dict[str, Any] = {"scaling": not self.no_scaling, "memory": self.memory}
-            same = same_surface(self.a, self.b, tolerance=tolerance, order=self.chosen_orders[0], **settings)
+            same = same_surface(a, self.b, tolerance=tolerance, order=self.chosen_orders[0], **settings)
             return f"{self.a.name}: {same}", vars(same) | numbers | {"distance": same.distance, "error": same.error}
-        if self.within is None:
-            return None
-        near = judge_deviation(self.a, self.b, self.within, self.unit)
+        near = judge_deviation(a, self.b, str(self.within), self.unit)
         numbers |= {"outcome": near.outcome, "length": near.length, "unit": near.unit, "beyond": near.beyond}
         return f"{self.a.name}: {near}", numbers | asdict(near.deviations.both) | asdict(near.deviations)
 

@@ -78,6 +78,13 @@ def test_compare_aligns_first(folder: Path) -> None:
     )
     assert found["before"] > 0.1
     assert found["orders"][0]["relative"] < 1e-9
+    # So do verdicts.
+    for question in (("--within", "0.01"), ("--within", "1%"), ("--below", "0.01")):
+        assert call("compare", "turned.off", "still.off", *question, folder=folder).returncode == 1
+        judged = json.loads(
+            output("compare", "turned.off", "still.off", *question, "--align", "--format", "json", folder=folder)
+        )
+        assert np.shape(judged["motion"]) == (4, 4)
 
 
 @pytest.mark.slow
