@@ -12,7 +12,7 @@ import sobolev_batch as sb
 from sobolev_batch.cli.program import cli
 from sobolev_batch.geometry import deviation
 from sobolev_batch.parameters import length_in
-from sobolev_batch.testing.within import deviation_text
+from sobolev_batch.testing.within import DeviationVerdict, deviation_text
 from tests.geometry.test_deviation import plate
 
 
@@ -22,7 +22,7 @@ def test_a_hole_that_was_closed_fails_and_names_its_place() -> None:
     assert 0 < found.both.lower < 3 < found.both.upper <= 3.1
     with pytest.raises(
         AssertionError,
-        match=r"^not within 2: largest deviation 2\.[89]\d*.*, at \(.*\); 0.* % ± .* % of the area is farther away$",
+        match=r"^not within 2: largest deviation .*2\.[89]\d*.*, at \(.*\); 0.* % ± .* % of the area is farther away$",
     ):
         sb.testing.assert_within(full, hole, 2)
     # A length that is reached is not exceeded.
@@ -90,3 +90,10 @@ def test_an_open_question_fails_too(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_bounds_are_rounded_outwards_and_places_of_rounding_are_zero(unit: str | None) -> None:
     found = deviation.Deviation(0.33312, 0.33519, (60.0, -1e-17, 10.25))
     assert deviation_text(found, unit) == f"0.3331 to 0.3352{' mm' if unit else ''}, at (60, 0, 10.25)"
+
+
+@pytest.mark.parametrize(("upper", "shown"), [(39.42, "≥ 3.997"), (4.0201, "3.997 to 4.021")])
+def test_an_upper_bound_that_a_no_left_far_away_is_not_told(upper: float, shown: str) -> None:
+    way = deviation.Deviation(3.9976, upper, (60.0, 0.0, 0.0))
+    verdict = DeviationVerdict(2.0, "mm", deviation.Deviations(way, way), (0.1, 0.01))
+    assert str(verdict).startswith(f"not within 2 mm: largest deviation {shown} mm, at (60, 0, 0); 10 % ± 1 % ")
