@@ -105,9 +105,9 @@ _COLUMNS = (
     _TRIANGLES,
     Column("edge_length", "edge", "{:.4g}".format),
     Column("relative", "relative", percent, "relative_error", is_marked=True),
-    Column("distance", "distance", with_error, "error"),
     Column("rate", "rate", with_error, "rate_error"),
     Column("area_fraction", "area", lambda fraction: f"{100 * fraction:.0f} %"),
+    Column("distance", "distance", with_error, "error"),
 )
 _METRIC_COLUMNS = (
     Column("hausdorff", "Hausdorff", between, "hausdorff_upper"),

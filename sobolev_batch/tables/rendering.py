@@ -7,8 +7,9 @@ import math
 import os
 import re
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import zip_longest
 from typing import Any, Literal, TypeAlias
 
 import pandas as pd
@@ -24,8 +25,8 @@ Rows: TypeAlias = pd.DataFrame | Sequence[Mapping[Any, Any]]
 _PLAIN = {ord(raised): plain for plain, raised in zip("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹", strict=True)}
 # What follows a number in a text, by the mark of its row.
 _MARKS = {"": "", "below its error": "*", "above rtol": "!"}
-_TABULATE_FORMATS = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
-# Spaces between columns, and beside headers, by tabulate.
+_TABULATE_FORMATS = {"markdown": "github", "latex": "latex_booktabs"}
+# Spaces between columns, and beside headers where there is room.
 _GAP, _PADDING = 2, 2
 # Spreadsheets take texts that begin so for formulas, and run them; those of East Asia also take the wide ones.
 _FORMULA_SIGNS = tuple("=+-@＝＋－＠")
@@ -125,68 +126,77 @@ def printed_table(
 ) -> str:
     """Return cells as a table whose columns are aligned to the right, but for the first and for those of texts.
 
-    In a text, labels of the first column and texts give way where lines would be too long: labels lose what they repeat
-    and then their middle, and texts are wrapped. Columns that still have no room follow in a table of their own,
-    without rows that have no cells there. Tabulate escapes LaTeX's special characters.
+    In a text, spaces beside headers, texts and labels of the first column give way where lines would be too long: texts
+    are wrapped, and labels lose what they repeat and then their middle. Columns that still have no room follow in a
+    table of their own, without rows that have no cells there. Tabulate escapes LaTeX's special characters.
     """
     rows, headers = (
         [[_escaped(cell, style) for cell in row] for row in rows],
         [_escaped(text, style) for text in headers],
     )
-    groups: list[list[int]] = [list(range(1, len(headers)))]
-    if style == "text":
-        rows = _with_short_texts(rows, headers, texts)
-        groups, room = [], 0
-        first, *widths = _widths(rows, headers)
-        for column, width in enumerate(widths, 1):
-            if not groups or width + _GAP > room:
-                groups.append([])
-                room = line_length() - first
-            groups[-1].append(column)
-            room -= width + _GAP
-    tables = [
-        str(
-            tabulate(
-                [
-                    [row[0], *(row[column] for column in group)]
-                    for row in rows
-                    if group is groups[0] or any(row[column] for column in group)
-                ],
-                headers=[headers[0], *(headers[column] for column in group)],
-                tablefmt=_TABULATE_FORMATS[style],
-                disable_numparse=True,
-                colalign=("left", *("left" if column in texts else "right" for column in group)),
-            )
+    if style != "text":
+        sides = ["right" if column and column not in texts else "left" for column in range(len(headers))]
+        settings = {"tablefmt": _TABULATE_FORMATS[style], "disable_numparse": True, "colalign": sides}
+        table = str(tabulate(rows, headers=headers, **settings))
+        return _LATEX_OPTIONS.sub(r"\1{}", latex_powers(table)) if style == "latex" else table
+    padding = 0 if _lacking(_widths(rows, headers, _PADDING)) > 0 else _PADDING
+    short = _with_short_texts(rows, headers, texts)
+    widths = _widths(short, headers, padding)
+    groups = [[0]]
+    for column in range(1, len(headers)):
+        if len(groups[-1]) > 1 and _lacking([widths[other] for other in (*groups[-1], column)]) > 0:
+            groups.append([0])
+        groups[-1].append(column)
+    if len(groups) == 1:
+        return "\n".join(_lines(short, headers, {0, *texts}, widths))
+    # Each by itself, in which longer labels and texts may have room.
+    parts = [
+        (
+            [[row[i] for i in group] for row in rows if group is groups[0] or any(row[i] for i in group[1:])],
+            [headers[i] for i in group],
+            style,
+            [group.index(i) for i in texts if i in group],
         )
         for group in groups
     ]
-    table = "\n\n".join(tables)
-    return _LATEX_OPTIONS.sub(r"\1{}", latex_powers(table)) if style == "latex" else table
+    return "\n\n".join(printed_table(*part) for part in parts if part[0])
 
 
-def _widths(rows: Sequence[Sequence[str]], headers: Sequence[str]) -> list[int]:
+def _lines(
+    rows: Sequence[Sequence[str]], headers: Sequence[str], lefts: Container[int], widths: Sequence[int]
+) -> Iterator[str]:
+    lines = (line for row in rows for line in zip_longest(*(cell.split("\n") for cell in row), fillvalue=""))
+    for line in (headers, ["-" * width for width in widths], *lines):
+        cells = [
+            cell.ljust(width) if column in lefts else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ]
+        yield (" " * _GAP).join(cells).rstrip()
+
+
+def _widths(rows: Sequence[Sequence[str]], headers: Sequence[str], padding: int = 0) -> list[int]:
     return [
-        max(len(header) + _PADDING, *(len(line) for cell in column for line in cell.split("\n")))
+        max(len(header) + padding, *(len(line) for cell in column for line in cell.split("\n")))
         for header, *column in zip(headers, *rows, strict=True)
     ]
+
+
+def _lacking(widths: Sequence[int]) -> int:
+    """Return by how much a line of columns is too long."""
+    return sum(widths) + _GAP * (len(widths) - 1) - line_length()
 
 
 def _with_short_texts(
     rows: Sequence[Sequence[str]], headers: Sequence[str], texts: Sequence[int]
 ) -> Sequence[Sequence[str]]:
     """Return rows whose labels and texts are shortened so that lines fit, unless two labels would then be the same."""
-
-    def missing() -> int:
-        widths = _widths(rows, headers)
-        return sum(widths) + _GAP * (len(widths) - 1) - line_length()
-
     for column in texts:
-        if (lacking := missing()) > 0:
+        if (lacking := _lacking(_widths(rows, headers))) > 0:
             width = max(_widths(rows, headers)[column] - lacking, SHORTEST_TEXT)
             cells = ["\n".join(textwrap.wrap(row[column], width, break_long_words=False)) for row in rows]
             rows = [[*row[:column], cell, *row[column + 1 :]] for row, cell in zip(rows, cells, strict=True)]
     for shorten in (_without_repeats, lambda names, longest: [middle_cut(name, longest) for name in names]):
-        if (lacking := missing()) > 0:
+        if (lacking := _lacking(_widths(rows, headers))) > 0:
             labels = [row[0] for row in rows]
             shorter = shorten(labels, max(_widths(rows, headers)[0] - lacking, SHORTEST_TEXT))
             if len(set(shorter)) == len(set(labels)):
