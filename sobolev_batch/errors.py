@@ -3,6 +3,7 @@
 import errno
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 
 from sobolev_batch.visible import visible
 
@@ -135,6 +136,16 @@ def written(place: object, what: str, kind: type[InputError] = StoreError) -> It
     except OSError as error:
         kind = SpaceError if is_for_want_of_space(error) else kind
         raise kind(f"{place}: {what} cannot be written there: {error.strerror or error}") from error
+
+
+def require_writable(path: Path, what: str) -> None:
+    """Refuse a file that cannot be written, before what it is to hold is computed; see `written`."""
+    with written(path, what):
+        if path.exists():
+            path.open("ab").close()
+        else:
+            path.touch()
+            path.unlink()
 
 
 @contextmanager

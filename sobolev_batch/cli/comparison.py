@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.cli.output import echo
+from sobolev_batch.errors import require_writable
 from sobolev_batch.geometry.deviation import Deviations, largest_deviation
 from sobolev_batch.geometry.formats.readers import read_mesh
 from sobolev_batch.geometry.mesh import Mesh
@@ -87,6 +88,8 @@ class CompareOptions:
             self._check_verdict()
         elif self.has_lattice and self.rtol is not None:
             raise click.UsageError("--rtol chooses the lattice; leave out --xi-max and --M")
+        if self.report is not None:
+            require_writable(self.report, "the report")
 
     def _check_verdict(self) -> None:
         if self.below is not None and self.within is not None:
@@ -189,9 +192,8 @@ class Comparison:
         """Read and compare two files; what may make one doubt the result is printed as a note."""
         accuracy = options.accuracy
         first, second = read_mesh(options.a), read_mesh(options.b)
-        for path in (options.witness, options.report):
-            if path is not None:
-                require_place(path)
+        if options.witness is not None:
+            require_place(options.witness)
         similarity = Similarity() if options.no_scaling else Similarity.to_unit_ball(second)
         orders, motion = options.chosen_orders, None
         if options.align:

@@ -23,7 +23,7 @@ from sobolev_batch.cli.options import PATH, Callback, location, orders_option, s
 from sobolev_batch.cli.output import echo, echo_lines, progress_bar
 from sobolev_batch.cli.program import EXIT_SOME_FAILED, Command
 from sobolev_batch.cli.table_commands import TableOptions, table_options
-from sobolev_batch.errors import InputError, MeshError, SobolevBatchError, StoreError, from_extra
+from sobolev_batch.errors import InputError, MeshError, SobolevBatchError, StoreError, from_extra, require_writable
 from sobolev_batch.extras.fitting import DEFAULT_SMOOTHING, DEFAULT_STEPS
 from sobolev_batch.norms import DEFAULT_ORDER
 
@@ -386,6 +386,7 @@ def report_command(store: Location, output: Path, folder: Path, up: Axis | None,
     """
     from sobolev_batch.extras.report.build import make_report, write_page
 
+    require_writable(output, "the report")
     page, omissions = make_report(store, folder=folder, witnesses=meshes, up=up)
     write_page(output, page)
     echo(output)

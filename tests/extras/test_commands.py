@@ -165,6 +165,12 @@ REFUSED = [
     (f"witness {STORE} --mesh scan*", "matches 'scan*'"),
     (f"witness {STORE} --output study.toml", "study.toml: no files can be written there"),
     (f"report {STORE} --mesh r*", "matches 'r*'; its labels are such as 'ico/0', 'ico/1'"),
+    # Before anything is read; what could be written is not touched.
+    (f"report {STORE}x --output none/r.html", "none/r.html: the report cannot be written there"),
+    ("compare no.ply no.ply --report none/page.html --within 1", "none/page.html: the report cannot be written there"),
+    ("compare no.ply no.ply --report . --below 1%", ".: the report cannot be written there: Is a directory"),
+    ("compare no.ply no.ply --report start.ply", "no.ply: cannot be read"),
+    ("compare no.ply no.ply --report none", "no.ply: cannot be read"),
     ("fit start.ply target.ply -o ./target.ply", "this is the target, which would be lost"),
     ("fit small.ply target.ply -o f.ply", "the start is 0.06 units wide and the target 63"),
     ("fit start.ply target.ply -o f.ply --refine-to 80", "80 triangles already"),
