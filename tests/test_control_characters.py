@@ -16,12 +16,13 @@ import unicodedata
 from pathlib import Path
 from xml.etree import ElementTree
 
+import click
 import pandas as pd
 import pytest
 from distributed import Client
 
 import sobolev_batch as sb
-from sobolev_batch.cli.output import overwrite, progress_bar
+from sobolev_batch.cli.output import overwrite, progress_bar, show_usage_error
 from sobolev_batch.sources import files
 from sobolev_batch.tables import FORMATS
 from sobolev_batch.tables.rendering import machine_table, printed_table, prose
@@ -217,6 +218,13 @@ def test_cells_are_neither_formulas_nor_markup_nor_commands() -> None:
     assert not re.search(r"^\s*[\[*]|\\input|(?<!\\)[$%#_~^]", table, re.MULTILINE)
     assert prose(["a\n\\input{x}", "b"], "latex") == "% a\\n\\input{x}\n% b"
     assert len(printed_table([[HOSTILE, "1"], ["b", HOSTILE]], ["mesh", HOSTILE], "text").splitlines()) == 4
+
+
+def test_choices_of_an_option_that_lacks_are_indented(capsys: pytest.CaptureFixture[str]) -> None:
+    option = click.Option(["--to"], type=click.Choice(["csv", "nc"]), required=True)
+    show_usage_error(click.MissingParameter(param=option))
+    show_usage_error(click.UsageError("a\tb"))
+    assert capsys.readouterr().err.splitlines()[1:] == ["  csv,", "  nc", r"Error: a\tb"]
 
 
 def test_lines_that_are_updated_in_place(capsys: pytest.CaptureFixture[str]) -> None:

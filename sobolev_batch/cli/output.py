@@ -94,7 +94,9 @@ def show_usage_error(error: click.ClickException) -> None:
     """Print what is wrong with a command, as click words it."""
     text = StringIO()
     error.show(text)
-    echo_lines(text.getvalue().removesuffix("\n").replace(error.message, visible(error.message)), err=True)
+    shown = text.getvalue().removesuffix("\n").replace(error.message, visible(error.message))
+    # Click sets lists of choices off by tabulators.
+    echo_lines(shown.expandtabs(2), err=True)
 
 
 def replace_line(text: str, before: str) -> str:
