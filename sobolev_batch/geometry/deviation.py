@@ -41,7 +41,7 @@ _EQUAL = 1e-9
 _BATCH, _MOST_PIECES = 1 << 15, 100_000_000
 # A plane that cuts off less of the sides than these fractions leaves slivers, and the piece is cut in two.
 _LEAST_CUT, _LEAST_SHORTER_CUT, _LARGEST_CUT = 0.05, 0.003, 0.97
-# Where so few pieces are left, the closest triangle to the worst corner of each is worth a search.
+# For so many pieces, the closest triangle to the worst corner of each is worth a search.
 _FEW = 4000
 
 
@@ -245,12 +245,11 @@ def _cut(pieces: _Pieces, other: Triangles, bounds: _Bounds) -> _Pieces | None:
 
 def _parts(corners: Reals, best: Indices, worst: Indices, other: Triangles, bounds: _Bounds) -> _Pieces:
     """Cut pieces: along the plane through a side of the best triangle of each, or in two."""
-    pieces = np.arange(len(best))
-    of_worst = best
-    if len(best) <= _FEW:
-        points = corners[worst, :, pieces]
-        distances, of_worst = other.closest(other.scale * points)
-        bounds.see(points.T, distances / other.scale)
+    pieces, of_worst = np.arange(len(best)), best.copy()
+    first = pieces[:_FEW]
+    points = corners[worst[first], :, first]
+    distances, of_worst[first] = other.closest(other.scale * points)
+    bounds.see(points.T, distances / other.scale)
     # How far each corner lies beyond each side, in lengths of the direction outward.
     beyond = np.stack(
         [
@@ -269,12 +268,16 @@ def _parts(corners: Reals, best: Indices, worst: Indices, other: Triangles, boun
     own, *others = (heights[corner, pieces] for corner in turned)
     with np.errstate(divide="ignore", invalid="ignore"):
         shares = np.stack([own / (own - height) for height in others])
-    is_cut = (
-        (is_beyond.any(axis=0) & ~is_beyond.all(axis=0))
-        & (shares.max(axis=0) > _LEAST_CUT)
+    fair = (
+        (shares.max(axis=0) > _LEAST_CUT)
         & (shares.min(axis=0) > _LEAST_SHORTER_CUT)
         & (shares.min(axis=0) < _LARGEST_CUT)
     )
+    # Near the plane of the best triangle, the part that is cut away from slivers needs no further look.
+    thin = np.max([other.heights(corner, best) for corner in corners], axis=0) <= bounds.enough**2
+    least = bounds.rounding * lengths[side, pieces]
+    thin &= (heights.max(axis=0) > least) & (heights.min(axis=0) < -least)
+    is_cut = is_beyond.any(axis=0) & ~is_beyond.all(axis=0) & (fair | thin)
     parts = [*_beside_plane(a[:, is_cut], b[:, is_cut], c[:, is_cut], shares[:, is_cut])]
     parts += _halves(corners[..., ~is_cut])
     close = np.stack([best, of_worst])

@@ -48,6 +48,20 @@ def plate(hole: bool) -> sb.Mesh:
     return sb.Mesh(np.column_stack([flat, np.zeros(len(flat))]), triangles)
 
 
+@pytest.fixture
+def pieces(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many pairs of a point and a triangle each step measures."""
+    counts: list[int] = []
+    squares = Triangles.squares
+
+    def counted(self: Triangles, at: Reals, triangles: Indices) -> Reals:
+        counts.append(len(triangles))
+        return squares(self, at, triangles)
+
+    monkeypatch.setattr(Triangles, "squares", counted)
+    return counts
+
+
 @pytest.mark.parametrize("seed", range(50))
 def test_bounds_hold_for_random_triangles_and_are_as_close_as_requested(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -134,23 +148,16 @@ def test_triangles_without_area_and_needles_hide_nothing() -> None:
     assert sb.largest_deviation(ball, with_line).forward.upper < 1e-12
 
 
-def test_a_clear_question_takes_fewer_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_clear_question_takes_fewer_pieces(pieces: list[int]) -> None:
     ball, egg = sb.shapes.icosphere(3), sb.shapes.Ellipsoid((1.0, 0.95, 0.9)).mesh(4)
-    points = 0
-    squares = Triangles.squares
-
-    def counted(self: Triangles, at: Reals, triangles: Indices) -> Reals:
-        nonlocal points
-        points += len(triangles)
-        return squares(self, at, triangles)
-
-    monkeypatch.setattr(Triangles, "squares", counted)
     value = sb.largest_deviation(ball, egg).both.lower
-    of_value, points = points, 0
-    for length, answer in ((2 * value, True), (value / 2, False)):
-        found, points = sb.largest_deviation(ball, egg, within=length).both, 0
+    of_value = sum(pieces)
+    # A no is known from the corners, but each piece is bounded once.
+    for length, answer, most in ((2 * value, True, of_value / 2), (value / 2, False, 1.5 * of_value)):
+        pieces.clear()
+        found = sb.largest_deviation(ball, egg, within=length).both
         assert found.is_within(length) is answer
-        assert points < of_value
+        assert sum(pieces) < most
     # A length between two bounds that are far apart.
     assert deviation.Deviation(0.1, 0.3, (0, 0, 0)).is_within(0.2) is None
 
@@ -187,24 +194,25 @@ def test_refuses_what_is_no_length(wrong: dict[str, float]) -> None:
 
 
 @pytest.mark.parametrize("is_forward", [True, False])
-def test_thin_triangles_cut_finer_in_single_precision_take_few_pieces(
-    is_forward: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_thin_triangles_cut_finer_in_single_precision_take_few_pieces(is_forward: bool, pieces: list[int]) -> None:
     ring = 2 * np.pi * np.arange(48) / 48
     points = np.concatenate([[[40.0, 25.0]], np.c_[6 * np.cos(ring) - 25, 6 * np.sin(ring) + 5]])
     coarse = sb.Mesh(np.c_[points, 0.1 * points[:, 0]].astype(np.float32), [[0, k, k % 48 + 1] for k in range(1, 49)])
     fine = subdivided(subdivided(subdivided(coarse)))
-    fine, pieces = sb.Mesh(fine.vertices.astype(np.float32), fine.triangles), 0
-    squares = Triangles.squares
-
-    def counted(self: Triangles, at: Reals, triangles: Indices) -> Reals:
-        nonlocal pieces
-        pieces += len(triangles)
-        return squares(self, at, triangles)
-
-    monkeypatch.setattr(Triangles, "squares", counted)
+    fine = sb.Mesh(fine.vertices.astype(np.float32), fine.triangles)
     pair = (fine, coarse) if is_forward else (coarse, fine)
     found = deviation.directed_deviation(pair[0], Triangles(pair[1]))
     # Rounding along the three axes, and the gap that it permits.
     assert 0 < found.lower <= found.upper <= 3 * 2.0**-22 * 40
-    assert pieces < 600 * len(fine.triangles)
+    assert sum(pieces) < 600 * len(fine.triangles)
+
+
+def test_a_flat_part_turned_by_a_millionth_takes_few_pieces(pieces: list[int]) -> None:
+    part = plate(hole=True)
+    cosine, sine = np.cos(1e-6), np.sin(1e-6)
+    turned = part.vertices @ np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
+    found = sb.largest_deviation(part, sb.Mesh(turned, part.triangles)).both
+    # A corner moves by 500e-6 along each axis: it leaves the square by that.
+    assert found.lower == pytest.approx(500e-6, rel=1e-3)
+    assert found.upper <= 1.01 * found.lower
+    assert sum(pieces) < 1000 * len(part.triangles)
