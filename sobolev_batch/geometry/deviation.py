@@ -104,7 +104,7 @@ def largest_deviation(a: MeshLike, b: MeshLike, *, gap: float = DEFAULT_GAP, wit
         gap: Largest gap between lower and upper bound, as a fraction of the distance, or what single precision may have
             moved vertices by, where that is more; below rounding there is none.
         within: A length for the question whether the largest distance exceeds it. Bounds then stay as far apart as the
-            answer permits, which is much faster where it is clear.
+            answer permits, which is faster where the answer is a clear yes.
 
     Returns:
         Bounds each way and both, in the unit of the meshes. They hold up to rounding, 7e-15 of the largest coordinate,

@@ -151,7 +151,7 @@ class Mesh:
 
     @cached_property
     def rounding(self) -> float:
-        """How far single precision, as in STL, may have moved a vertex, in units of length; zero where it did not.
+        """Largest move of a vertex by single precision, as in STL, in units of length; zero where it has more digits.
 
         Coordinates that single precision holds count as rounded, also once they are scaled and moved.
 

@@ -18,7 +18,7 @@ _DIRECTION = np.array([0.4862, -0.3817, 0.7863])
 
 @dataclass(frozen=True)
 class Refinement:
-    """How a mesh differs from a coarser one of which it has all triangles, cut into smaller ones.
+    """Differences of a mesh from a coarser one of which it has all triangles, cut into smaller ones.
 
     Attributes:
         distance: Largest distance of a triangle from the one in which it lies, in units of length.
