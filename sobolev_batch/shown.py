@@ -37,7 +37,7 @@ class ShownTables(ABC):
     @property
     @abstractmethod
     def caption(self) -> str:
-        """What the tables hold."""
+        """Title of the tables."""
 
     @property
     @abstractmethod

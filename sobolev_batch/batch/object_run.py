@@ -49,7 +49,7 @@ Sent = tuple[Workspace, Metadata]
 
 @dataclass(frozen=True)
 class Ended:
-    """How the run of an object ended.
+    """Result of the run of an object.
 
     Attributes:
         record: What its store is known to have.
@@ -152,7 +152,7 @@ def _begin(cluster: Cluster, study: Study, location: Location, workers: Workers)
 
 @dataclass(frozen=True)
 class Begun:
-    """How the run of an object ended that a worker did by itself, and the record of each surface that it computed."""
+    """Result of the run of an object that a worker did by itself, and the record of each surface that it computed."""
 
     ended: Ended
     records: tuple[tuple[str, Record], ...]

@@ -48,7 +48,7 @@ from sobolev_batch.tables.shells import (
 )
 
 # Raise it whenever tables hold something that those of older versions lack: they are then made again.
-TABLES_VERSION = 12
+TABLES_VERSION = 13
 
 Criterion = Literal["level", "triangles", "names", "time"]
 # A row, its place in its family, and what orders that.
@@ -62,7 +62,7 @@ _MOST_OF_ONE_SIZE = 10
 
 @dataclass(frozen=True)
 class Tabulated:
-    """What new tables hold: distances to the reference, and the tables that the root of a study repeats."""
+    """Content of new tables: distances to the reference, and the tables that the root of a study repeats."""
 
     distances: NormEstimate
     tables: Tables

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -123,11 +124,9 @@ class CompareOptions:
             return None
         numbers: dict[str, Any] = {"a": self.a, "b": self.b}
         a: Path | Mesh = self.a
-        if self.align:
-            a, b = read_mesh(self.a), read_mesh(self.b)
-            motion = extra(FEATURES, "align", "--align")(a, b, order=self.chosen_orders[0])
-            a, numbers["motion"] = _moved(a, motion), motion.tolist()
-            echo(f"note: {_motion_text(motion)}", err=True)
+        if self.motion is not None:
+            a, numbers["motion"] = _moved(read_mesh(self.a), self.motion), self.motion.tolist()
+            echo(f"note: {_motion_text(self.motion)}", err=True)
         if (tolerance := self.allowed_fraction) is not None:
             settings: dict[str, Any] = {"scaling": not self.no_scaling, "memory": self.memory}
             same = same_surface(a, self.b, tolerance=tolerance, order=self.chosen_orders[0], **settings)
@@ -135,6 +134,14 @@ class CompareOptions:
         near = judge_deviation(a, self.b, str(self.within), self.unit)
         numbers |= {"outcome": near.outcome, "length": near.length, "unit": near.unit, "beyond": near.beyond}
         return f"{self.a.name}: {near}", numbers | asdict(near.deviations.both) | asdict(near.deviations)
+
+    @cached_property
+    def motion(self) -> Reals | None:
+        """Rigid motion (4, 4) that brings A nearest to B; None if not asked for."""
+        if not self.align:
+            return None
+        align = extra(FEATURES, "align", "--align")
+        return np.asarray(align(read_mesh(self.a), read_mesh(self.b), order=self.chosen_orders[0]))
 
     @property
     def names(self) -> tuple[str, str]:
@@ -196,11 +203,9 @@ class Comparison:
             require_place(options.witness)
         similarity = Similarity() if options.no_scaling else Similarity.to_unit_ball(second)
         orders, motion = options.chosen_orders, None
-        if options.align:
-            align = extra(FEATURES, "align", "--align")
-            before = distance(similarity.apply(first), similarity.apply(second), orders[0], **accuracy)
-            motion = align(first, second, order=orders[0]), before
-            first = _moved(first, motion[0])
+        if options.motion is not None:
+            motion = options.motion, distance(similarity.apply(first), similarity.apply(second), orders[0], **accuracy)
+            first = _moved(first, options.motion)
         pair = similarity.apply(first), similarity.apply(second)
         doubt = placement_doubt(*(surface.extent for surface in pair))
         for line in _remarks(options, first, second, doubt):
@@ -333,7 +338,9 @@ class Comparison:
 
 def _moved(mesh: Mesh, motion: Reals) -> Mesh:
     """Return a mesh after a rigid motion (4, 4)."""
-    return Mesh(mesh.vertices @ motion[:3, :3].T + motion[:3, 3], mesh.triangles, mesh.notes)
+    turn, shift = motion[:3, :3], motion[:3, 3]
+    x, y, z = (-shift @ turn).tolist()
+    return mesh.moved(1.0, (x, y, z), turn)
 
 
 def _motion_text(motion: Reals) -> str:

@@ -34,7 +34,7 @@ class _Tables(NamedCommands):
 
 @dataclass(frozen=True)
 class TableOptions:
-    """What all tables take: the store, the format, and the orders; None for those of the study."""
+    """Options that all tables take: the store, the format, and the orders; None for those of the study."""
 
     store: Location
     style: Format

@@ -27,8 +27,8 @@ class Triangles:
     lengths within the range of doubles.
 
     Attributes:
+        mesh: The mesh.
         scale: The unit.
-        rounding: See `Mesh`.
         corners: Corner of each triangle, three arrays (3, m) of the coordinates.
         outward: For each side, from a corner to the next, the direction (3, m) in the plane that leads out of the
             triangle; of any length, and zero where the triangle has no area.
@@ -36,7 +36,7 @@ class Triangles:
 
     def __init__(self, mesh: Mesh) -> None:
         self.scale = 2.0 ** float(np.frexp(np.abs(mesh.vertices).max())[1])
-        self.rounding = mesh.rounding
+        self.mesh = mesh
         self._vertices = np.ascontiguousarray(mesh.vertices / self.scale)
         self._triangles = np.ascontiguousarray(mesh.triangles, dtype=np.int64)
         self._tree = igl.AABB()

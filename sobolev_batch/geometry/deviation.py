@@ -10,6 +10,9 @@ by too much is cut. Both bounds hold wherever it is cut, so the cut decides abou
 at right angles to the best t, through the side beyond which the worst corner lies. The part on the side of t then has
 its closest points in t, and its bound is the distance itself.
 
+Where both meshes cut one plane into long thin triangles, pieces are as many as these cross each other. What takes many
+is begun again without the parts of planes that both meshes cover (see `overlap`).
+
 Sources: M. Guthe, P. Borodin, R. Klein, "Fast and accurate Hausdorff distance calculation between meshes" (2005);
 M. Tang, M. Lee, Y. J. Kim, "Interactive Hausdorff distance computation for general polygonal models" (2009),
 doi:10.1145/1531326.1531380; L. Sacht, A. Jacobson, "Cascading upper bounds for triangle soup Pompeiu-Hausdorff
@@ -29,6 +32,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.closest import Triangles
 from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
 from sobolev_batch.geometry.mesh import Mesh, dot
+from sobolev_batch.geometry.overlap import ROUNDING, rests_of
 from sobolev_batch.geometry.surface import is_finite_number
 
 # Gap between both bounds, as a fraction of the distance.
@@ -39,6 +43,8 @@ _ROUNDING = 32 * np.finfo(float).eps
 _EQUAL = 1e-9
 # Pieces that are cut at a time, in some 2 kB each; and pieces after which bounds stay apart.
 _BATCH, _MOST_PIECES = 1 << 15, 100_000_000
+# Pieces of all triangles together, and of each, that take longer than to cut planes against each other.
+_MANY, _MANY_OF_EACH = 1 << 17, 2
 # A plane that cuts off less of the sides than these fractions leaves slivers, and the piece is cut in two.
 _LEAST_CUT, _LEAST_SHORTER_CUT, _LARGEST_CUT = 0.05, 0.003, 0.97
 # For so many pieces, the closest triangle to the worst corner of each is worth a search.
@@ -104,7 +110,7 @@ def largest_deviation(a: MeshLike, b: MeshLike, *, gap: float = DEFAULT_GAP, wit
         gap: Largest gap between lower and upper bound, as a fraction of the distance, or what single precision may have
             moved vertices by, where that is more; below rounding there is none.
         within: A length for the question whether the largest distance exceeds it. Bounds then stay as far apart as the
-            answer permits, which is faster where the answer is a clear yes.
+            answer permits, which is faster where it is clear.
 
     Returns:
         Bounds each way and both, in the unit of the meshes. They hold up to rounding, 7e-15 of the largest coordinate,
@@ -189,14 +195,30 @@ def directed_deviation(
     mesh: Mesh, other: Triangles, gap: float = DEFAULT_GAP, within: float | None = None
 ) -> Deviation:
     """Bound the largest distance of a mesh's points from triangles; see `largest_deviation`."""
+    scale, reach = other.scale, max(other.scale, float(np.abs(mesh.vertices).max()))
+    of_files = max(mesh.rounding, other.mesh.rounding)
+    bounds = _Bounds(_ROUNDING * reach / scale, gap, of_files / scale, None if within is None else within / scale)
+    cutting, many = _cut_all(mesh, other, bounds), _MANY + _MANY_OF_EACH * len(mesh.triangles)
+    if any(bounds.count > many for _ in cutting):
+        rests = rests_of(mesh, other.mesh, max(ROUNDING, of_files / reach))
+        rest = rests.meshes[0]
+        if rest is not mesh:
+            # Both were moved onto their planes.
+            bounds.upper = max(bounds.upper, bounds.rounding + 2 * float(rests.distances.max()) / scale)
+            cutting = iter(()) if rest is None else _cut_all(rest, other, bounds)
+        for _ in cutting:
+            pass
+    x, y, z = (scale * bounds.place).tolist()
+    return Deviation(scale * bounds.lower, scale * max(bounds.lower, bounds.upper), (x, y, z))
+
+
+def _cut_all(mesh: Mesh, other: Triangles, bounds: _Bounds) -> Iterator[None]:
+    """Cut triangles until both bounds are as close as they may be; pause after each batch."""
     scale, used = other.scale, mesh.used_vertices
     vertices, closest = mesh.vertices.T / scale, np.zeros(len(mesh.vertices), dtype=np.int64)
     distances = np.zeros(len(closest))
     distances[used], closest[used] = other.closest(mesh.vertices[used])
     distances /= scale
-    rounding = _ROUNDING * max(1.0, float(np.abs(vertices).max()))
-    least_gap = max(mesh.rounding, other.rounding) / scale
-    bounds = _Bounds(rounding, gap, least_gap, None if within is None else within / scale)
     bounds.see(vertices[:, used], distances[used])
     # The farthest come first: with a high lower bound, fewer of the others are cut.
     order = np.argsort(-distances[mesh.triangles].max(axis=1), kind="stable")
@@ -207,8 +229,7 @@ def directed_deviation(
             # The last ones are cut to their end before the others, so that few are in memory.
             parts = _cut(pending.pop(), other, bounds)
             pending += [] if parts is None else parts.batches()
-    x, y, z = (scale * bounds.place).tolist()
-    return Deviation(scale * bounds.lower, scale * max(bounds.lower, bounds.upper), (x, y, z))
+            yield
 
 
 def _cut(pieces: _Pieces, other: Triangles, bounds: _Bounds) -> _Pieces | None:

@@ -140,9 +140,10 @@ class Mesh:
         radius = float(np.linalg.norm(self.vertices[self.used_vertices] - center, axis=1).max())
         return (float(center[0]), float(center[1]), float(center[2])), radius
 
-    def moved(self, scale: float, origin: Point) -> Mesh:
-        """Return the mesh after x -> scale * (x - origin)."""
+    def moved(self, scale: float, origin: Point, turn: Reals | None = None) -> Mesh:
+        """Return the mesh after x -> scale * turn (x - origin), where a turn (3, 3) is a rotation."""
         vertices = self.vertices - np.asarray(origin)
+        vertices = vertices if turn is None else vertices @ turn.T
         vertices *= scale
         moved = Mesh.from_checked(vertices, self.triangles, self.notes)
         moved._require_sizes()

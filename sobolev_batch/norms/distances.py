@@ -224,7 +224,7 @@ def _estimate(weights: SobolevWeights, sums: Reals, fields: Sequence[xr.DataArra
     """Return a norm or distance from shell sums, with the errors that follow from the fields' qualities."""
     qualities = [quality for quality in map(quality_of, fields) if quality is not None]
     areas = np.array(sum(quality.area for quality in qualities))
-    errors = np.sum([quality.probe.norms(weights) for quality in qualities], axis=0)
+    errors = np.hypot.reduce([quality.probe.norms(weights) for quality in qualities])
     estimate = estimate_norms(sums_of_shells(sums, weights), weights, Support(areas, _widths(fields)), errors)
     if len(qualities) == len(fields):
         return estimate

@@ -8,8 +8,10 @@ of three terms, each of which has an error of its own:
 
 Without octaves the lattice ends sharply, and the remainder is only bounded (`truncated`): then the norm is what the
 lattice holds, and truncation can only add to it. The values m^ themselves are off by the discretisation, whose norm is
-known. By the triangle inequality the norm is off by no more. The other three are errors of the square, and change the
-root by what `change_of_root` says. The four are added: nothing is known of their signs.
+known. By the triangle inequality the norm is off by no more. Of a difference it is the root of both surfaces' squares
+added: the phases between both errors are those between the surfaces, and where these coincide, errors of rules cancel.
+The other three are errors of the square, and change the root by what `change_of_root` says. The four are added: nothing
+is known of their signs.
 
 All that computes a norm or distance calls `estimate_norms`: pairs of surfaces, studies, tables of all pairs, accessors.
 What a distance is relative to, and its parts, follow from the product of the difference with the reference, which is a
@@ -80,7 +82,7 @@ def quotients(values: tuple[Reals, Reals], norms: tuple[Reals, Reals]) -> tuple[
 
 @dataclass(frozen=True, eq=False)
 class Tail:
-    """What lies beyond the lattice in squared norms, or in products of two measures, each (orders, ...).
+    """Parts of squared norms, or of products of two measures, beyond the lattice, each (orders, ...).
 
     Attributes:
         octaves: Integral over the octaves.
@@ -120,7 +122,7 @@ def estimate_norms(
 ) -> NormEstimate:
     """Return norms (orders, ...) from sums over the lattice, and the tail beyond it where octaves measured that.
 
-    The discretisation is the norm of the values' own errors (orders, ...), that of both surfaces of a difference added.
+    The discretisation is the norm of the values' own errors (orders, ...), of a difference that of both together.
     """
     squares: Reals = np.maximum(sums.totals, 0.0)
     images = aliased(sums, weights, support.widths)

@@ -28,7 +28,7 @@ _TRIAL_BYTES, _LEAST_BYTES = 1400, 3e8
 
 @dataclass(frozen=True)
 class SearchRecord:
-    """What is known of a search, as a JSON file that is replaced as a whole after each trial.
+    """Record of a search: a JSON file that is replaced as a whole after each trial.
 
     Attributes:
         digest: Digest of the search; another one has other trials.

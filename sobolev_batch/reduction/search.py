@@ -64,7 +64,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Bracket:
-    """What a search knows: the coarsest mesh that holds, and the next coarser one that does not.
+    """State of a search: the coarsest mesh that holds, and the next coarser one that does not.
 
     Attributes:
         best: The mesh of fewest triangles within the limit; None where none is.

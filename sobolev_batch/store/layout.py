@@ -114,7 +114,7 @@ class Store:
 
     @property
     def metadata(self) -> Metadata:
-        """What is known of the metadata, which a store leaves behind when it travels to another process."""
+        """Metadata read so far, which a store leaves behind when it travels to another process."""
         return dict(self.documents), dict(self._hashes)
 
     @metadata.setter

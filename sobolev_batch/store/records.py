@@ -161,7 +161,7 @@ class Record(_Line):
 
 @dataclass(frozen=True)
 class ObjectRecord(_Line):
-    """What is known of an object once its run has ended: the record of a study's store for it.
+    """Record of an object in the store of a study, once its run has ended.
 
     Attributes:
         key: Digest of all that its tables depend on, where nothing of it is missing; else empty.

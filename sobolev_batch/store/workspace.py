@@ -23,7 +23,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Contents:
-    """What a store has of a study, and what is missing: the answer of plans, runs, status, verification and pruning.
+    """Rows that a store has of a study, and that are missing: for plans, runs, status, verification and pruning.
 
     Attributes:
         labels: Label of each row of the store.
@@ -86,7 +86,7 @@ class Contents:
 
     @property
     def unlike_tables(self) -> dict[int, str]:
-        """How the records of the study's rows differ from those that the tables were made from."""
+        """Difference of the records of the study's rows from those that the tables were made from, by row."""
         return {i: how for i, how in rows_unlike_tables(self.store, self.records).items() if i in self.rows}
 
 

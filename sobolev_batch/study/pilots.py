@@ -54,7 +54,7 @@ _Outcome = tuple[LatticeChoice | None, Mapping[str, AccuracyError]]
 
 @dataclass(frozen=True)
 class Look:
-    """What loading some surfaces of a study has shown, by their labels.
+    """Findings from loading some surfaces of a study, by their labels.
 
     Attributes:
         extents: Extents in the study's unit of length.

@@ -69,7 +69,7 @@ class Plan:
 
     @property
     def name(self) -> str:
-        """What a store remembers: the name of the study, and that of its object where it has one."""
+        """Name in the store: that of the study, and of its object where it has one."""
         return f"{self.study.name} {self.study.object.name}".rstrip()
 
     @property

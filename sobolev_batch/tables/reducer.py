@@ -190,7 +190,7 @@ class Reducer:
         of_b = self._tail(reference, lambda row, _: self.qualities[row].own, [b])
         norm_of_b = self._estimate(self._sums(reference), of_b, self.areas[[b]], self.errors[:, [b]])
         of_difference = self._tail(spectra.distance, lambda row, energies: self._remainder(row, b, energies), rows)
-        areas, errors = self.areas[rows] + self.areas[b], self.errors[:, rows] + self.errors[:, [b]]
+        areas, errors = self.areas[rows] + self.areas[b], np.hypot(self.errors[:, rows], self.errors[:, [b]])
         # The reference's distance to itself is zero, and nothing is uncertain about that.
         errors *= np.not_equal(rows, b)
         distances = self._estimate(self._sums(spectra.distance), of_difference, areas, errors)
@@ -279,7 +279,7 @@ class Reducer:
             for square in (sums.squares[..., :shared], sums.outer[..., :shared]):
                 square[...] = np.triu(square) + np.swapaxes(np.triu(square, 1), -1, -2)
         areas = self.areas[list(rows)][:, None] + self.areas[list(others)]
-        errors = self.errors[:, list(rows)][:, :, None] + self.errors[:, list(others)][:, None, :]
+        errors = np.hypot(self.errors[:, list(rows)][:, :, None], self.errors[:, list(others)][:, None, :])
         errors *= np.not_equal.outer(rows, others)
         tail = None if self.sampling is None else self._tails_of_pairs(self.sampling, rows, others, shared)
         return self._estimate(sums, tail, areas, errors)

@@ -62,7 +62,7 @@ class VertexWitness:
 
     @property
     def notes(self) -> list[str]:
-        """What the numbers of a file mean, for its comments."""
+        """Meaning of the numbers of a file, for its comments."""
         escaped = self.title.encode("unicode_escape").decode("ascii")
         notes = [
             f"witness function of the mesh {escaped[:_LONGEST_COMMENT]}",

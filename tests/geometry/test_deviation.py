@@ -216,3 +216,22 @@ def test_a_flat_part_turned_by_a_millionth_takes_few_pieces(pieces: list[int]) -
     assert found.lower == pytest.approx(500e-6, rel=1e-3)
     assert found.upper <= 1.01 * found.lower
     assert sum(pieces) < 1000 * len(part.triangles)
+
+
+def strips(count: int, axis: int, height: float) -> sb.Mesh:
+    """A square of side 1 in long thin strips along an axis, one corner of it raised."""
+    ends = np.linspace(0, 1, count + 1)
+    flat = np.stack([np.tile([0.0, 1.0], count + 1), np.repeat(ends, 2)], axis=1)
+    first = 2 * np.arange(count)[:, None]
+    triangles = np.concatenate([first + np.array(corners) for corners in ([0, 1, 2], [1, 3, 2])])
+    raised = np.where(np.all(flat == 1, axis=1), height, 0.0)
+    return sb.Mesh(np.column_stack([flat if axis == 0 else flat[:, ::-1], raised]), triangles)
+
+
+def test_planes_cut_into_strips_across_each_other_take_few_pieces(pieces: list[int]) -> None:
+    pair = strips(700, 0, 1e-5), strips(700, 1, 0.0)
+    found = sb.largest_deviation(*pair)
+    assert found.both.lower == pytest.approx(1e-5)
+    assert found.both.upper <= 1.01 * found.both.lower
+    # They cross each other half a million times.
+    assert sum(pieces) < 4_000_000

@@ -58,6 +58,8 @@ def local_client(workers: int | None = None, memory: float | str | None = None) 
                 "distributed.worker.memory.pause": 0.9,
                 # Sampling the stack of every worker a hundred times a second takes from the tasks.
                 "distributed.worker.profile.enabled": False,
+                # So does looking fifty times a second whether the loop of events answers, for as long as a run takes.
+                "distributed.admin.tick.interval": "500ms",
                 "distributed.worker.preload": [*dask.config.get("distributed.worker.preload"), workers_module.__name__],
                 "distributed.deploy.lost-worker-timeout": _LOST_WORKER_SECONDS,
                 "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": _KEPT_BYTES,

@@ -36,7 +36,7 @@ _EQUILATERAL = 4 * np.sqrt(3.0)
 
 
 class End(Enum):
-    """Why a descent ended."""
+    """Reason for which a descent ended."""
 
     STEPS = "all steps are taken"
     CONVERGED = "the distance hardly falls any more"

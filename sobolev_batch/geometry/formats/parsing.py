@@ -26,7 +26,7 @@ from sobolev_batch.parameters import format_bytes
 
 
 class Raw(NamedTuple):
-    """What a parser makes of a file: vertices (n, 3), triangles (m, 3), and notes on what it found, in sentences."""
+    """Content of a file: vertices (n, 3), triangles (m, 3), and notes on what the parser found, in sentences."""
 
     vertices: NDArray[Any]
     triangles: NDArray[Any]

@@ -112,8 +112,8 @@ class Frequencies:
         return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
 
     def errors(self, values: Sequence[SurfaceValues]) -> Reals:
-        """Return the norms of the values' own errors (orders,), added."""
-        return np.asarray(np.sum([one.error_norms(self.weights) for one in values], axis=0))
+        """Return the norms of the own errors (orders,) of all values together."""
+        return np.asarray(np.hypot.reduce([one.error_norms(self.weights) for one in values]))
 
     def norms_of(self, measure: Measure, surfaces: Sequence[Surface], errors: Reals, tail: Tail | None) -> NormEstimate:
         """Return the norms of a measure from its tail and the norms of its values' own errors (orders,)."""

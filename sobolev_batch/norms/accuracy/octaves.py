@@ -123,8 +123,8 @@ class MeasuredOctave:
         return self.values[0].sampling
 
     def error_norms(self, orders: Sequence[float]) -> Reals:
-        """Return the norms of the values' own errors (orders,), those of all surfaces added."""
-        return np.asarray(np.sum([values.error_norms(orders) for values in self.values], axis=0))
+        """Return the norms of the own errors (orders,) of all values together."""
+        return np.asarray(np.hypot.reduce([values.error_norms(orders) for values in self.values]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -257,7 +257,7 @@ def sums_on(problem: Problem, fields: Sequence[Field], weights: SobolevWeights) 
     """Return the sums of the only field, or of the difference of two, and the norms of its error (orders,)."""
     lattice, difference = weights.lattice, only_or_difference([field.values for field in fields])
     sums = sums_of_shells(shell_sums(difference, None, lattice, lattice.half), weights)
-    return sums, np.sum([field.quality.probe.norms(weights) for field in fields], axis=0) + problem.moved
+    return sums, np.hypot.reduce([field.quality.probe.norms(weights) for field in fields]) + problem.moved
 
 
 def support_of(surfaces: Sequence[Surface]) -> Support:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
 from typing import Literal, Self
 
 import numpy as np
 
+from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms.accuracy.octaves import solve_in_octaves
 from sobolev_batch.norms.accuracy.problem import Problem, error_target
@@ -84,8 +85,9 @@ def relative_distance(
     if problem.apart is not None:
         return _of_apart(problem, seed)
     of_norm = Problem.from_surfaces([reference], (order,), accuracy, "the norm of the reference", threads)
+    known = _Reference(reference.digest if isinstance(reference, Mesh) else reference, order, accuracy, of_norm)
     for norm_of in (_rough_norm, _exact_norm):
-        norm = norm_of(of_norm)
+        norm = norm_of(known)
         search = _Search(problem, Interval(threshold * norm.lower, threshold * norm.upper))
         bounds, method = search.bounds(seed)
         if search.is_decided(bounds):
@@ -173,7 +175,7 @@ def _fields(problem: Problem, lattice: Lattice, target: ErrorTarget) -> tuple[Fi
     dtype = problem.dtype(lattice, target)
     execution = Execution(threads=max(1, problem.threads // len(problem.surfaces)))
 
-    def field(surface: Surface) -> Field:
+    def computed(surface: Surface) -> Field:
         sample, settings = Sample.from_surface(surface, draws), TransformSettings(dtype=dtype)
         if needs_probe(surface, TransformSettings()):
             # Where the prediction fails, bounds are wider, and the next lattice gets a stricter target.
@@ -181,7 +183,7 @@ def _fields(problem: Problem, lattice: Lattice, target: ErrorTarget) -> tuple[Fi
         return compute_field(surface, lattice, settings, problem.orders, execution, sample=sample)
 
     with ThreadPoolExecutor(len(problem.surfaces)) as pool:
-        return tuple(pool.map(field, problem.surfaces))
+        return tuple(pool.map(computed, problem.surfaces))
 
 
 def _of_apart(problem: Problem, seed: int) -> tuple[Interval, Method]:
@@ -192,9 +194,24 @@ def _of_apart(problem: Problem, seed: int) -> tuple[Interval, Method]:
     return distance.over(norm), "lattice" if caution == 1.0 else "octaves"
 
 
-def _rough_norm(problem: Problem) -> Interval:
+@dataclass(frozen=True)
+class _Reference:
+    """A reference, told from others by its digest or, of a closed form, by itself, and by what its norm depends on.
+
+    Searches and suites of tests compare many surfaces with one, whose norm is then computed once in each process.
+    """
+
+    identity: object
+    order: float
+    accuracy: Accuracy
+    problem: Problem = field(compare=False)
+
+
+@lru_cache(maxsize=4)
+def _rough_norm(reference: _Reference) -> Interval:
     """Return bounds on the norm of a reference from a small lattice, if that is enough."""
-    (surface,), (order,) = problem.surfaces, problem.orders
+    problem, order = reference.problem, reference.order
+    (surface,) = problem.surfaces
     core = core_lattice(problem.support, problem.orders, problem.accuracy)
     lattice = lattice_of(core.xi_max, 1 / core.spacing, min(core.M, _NORM_M))
     settings = TransformSettings(_NORM_EPS, "complex64", tolerance=_NORM_EPS)
@@ -204,12 +221,14 @@ def _rough_norm(problem: Problem) -> Interval:
     # The rules keep the tolerance at every frequency, and so does the NUFFT.
     error = 2 * _NORM_EPS * surface.area * float(weights @ shell_volumes(lattice)) ** 0.5
     above = _with_beyond(problem, value, lattice) - value + error
-    return Interval.around(value, error, above) if above <= _NORM_RTOL * value else _exact_norm(problem)
+    return Interval.around(value, error, above) if above <= _NORM_RTOL * value else _exact_norm(reference)
 
 
-def _exact_norm(problem: Problem) -> Interval:
+@lru_cache(maxsize=4)
+def _exact_norm(reference: _Reference) -> Interval:
     """Return close bounds on the norm of a reference."""
-    return Interval.of(solve(replace(problem, accuracy=replace(problem.accuracy, rtol=_EXACT_NORM_RTOL))).estimate)
+    accuracy = replace(reference.accuracy, rtol=_EXACT_NORM_RTOL)
+    return Interval.of(solve(replace(reference.problem, accuracy=accuracy)).estimate)
 
 
 def _with_beyond(problem: Problem, value: float, lattice: Lattice) -> float:

@@ -90,7 +90,7 @@ def squared_moduli(values: NDArray[np.complexfloating]) -> Reals:
 
 
 class Scatter(NamedTuple):
-    """How a sum varies over the samples of one lattice, or over all drawn samples of an octave.
+    """Variance of a sum over the samples of one lattice, or over all drawn samples of an octave.
 
     The variance follows from groups of samples, each (orders, ...), of which there is one more than degrees of freedom.
     """

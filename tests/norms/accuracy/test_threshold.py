@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 import sobolev_batch as sb
 from sobolev_batch.geometry.surface import Surface
+from sobolev_batch.norms.accuracy import threshold
 from sobolev_batch.norms.accuracy.threshold import Interval, Method, relative_distance
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
+from sobolev_batch.transform.fourier import transform_block
 from tests.support.rectangles import Rectangles
 
 
@@ -57,3 +61,19 @@ def test_surfaces_that_do_not_feel_each_other_are_as_far_apart_as_their_norms_sa
     found, _ = bounded(sb.shapes.Sphere(1.0, (1e6, -2e6, 0.0)), sb.shapes.Sphere(), -4.0, 1e-3)
     assert found.lower == pytest.approx(2**0.5, rel=0.05)
     assert found.lower <= 2**0.5 <= found.upper
+
+
+def test_the_norm_of_a_reference_is_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    transformed: list[float] = []
+
+    def counted(surface: sb.Mesh, *settings: Any) -> Any:
+        transformed.append(surface.area)
+        return transform_block(surface, *settings)
+
+    monkeypatch.setattr(threshold, "transform_block", counted)
+    ball = sb.shapes.icosphere(2)
+    for scale, radius in ((0.97, 1.25), (0.96, 1.25), (0.97, 1.5)):
+        # Each time as if it were read anew.
+        reference = sb.Mesh(radius * ball.vertices, ball.triangles)
+        bounded(sb.Mesh(scale * reference.vertices, ball.triangles), reference, -4.0, 0.1)
+    assert transformed == pytest.approx([1.25**2 * ball.area, 1.5**2 * ball.area])
