@@ -21,6 +21,7 @@ from typing import Self
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
+from numpy.typing import NDArray
 from scipy.special import beta, betainc
 
 from sobolev_batch import compiled
@@ -47,6 +48,9 @@ _RULES = (12, 0.6, 1.1), (4, 0.5, 0.5), (2, 0.2, 0.1)
 _PANEL, _PANEL_WAVES, _PANEL_NODES, _LAST = 1.2, 1.5, leggauss(4), 22.0
 # Pairs that are computed at a time on arrays.
 _BATCH = 20_000
+# Where more than this share of all pairs is close, by a sample of so many points and triangles, a look at each takes a
+# tenth of the time of trees; and pairs that are looked at together, whose lists would else take gigabytes.
+_OFTEN_CLOSE, _SAMPLE, _PAIRS_AT_ONCE = 0.05, 256, 1 << 22
 
 
 def tail_nodes(cutoff: float, order: float) -> Iterator[tuple[float, Reals, Reals]]:
@@ -339,6 +343,18 @@ def _close_pairs(points: Reals, corners: Reals, reach: float) -> Iterator[tuple[
     from scipy.spatial import KDTree
 
     centers, radii = centers_and_radii(corners)
+
+    def is_close(some: Reals, which: slice) -> NDArray[np.bool_]:
+        squares = sum((some[:, None, axis] - centers[which, axis]) ** 2 for axis in range(3))
+        return np.asarray(squares < (reach + radii[which]) ** 2)
+
+    sample = is_close(points[:: -(-len(points) // _SAMPLE)], slice(None, None, -(-len(centers) // _SAMPLE)))
+    if sample.mean() > _OFTEN_CLOSE:
+        step = max(1, _PAIRS_AT_ONCE // len(centers))
+        for start in range(0, len(points), step):
+            rows, columns = np.nonzero(is_close(points[start : start + step], slice(None)))
+            yield rows + start, columns
+        return
     # Triangles of like size at a time.
     sizes = np.maximum(np.ceil(np.log2(radii / reach)), -2.0)
     tree = KDTree(points)

@@ -101,3 +101,18 @@ def test_nodes_that_are_too_few_along_edges_are_noticed(monkeypatch: pytest.Monk
     monkeypatch.setattr(potentials, "_PANEL_WAVES", 3.0)
     value, error = remainder(rods, [1, -1], 12.0, [-2.0], points=4000).at([-2.0])
     assert abs(value - truth) < error + of_truth < truth
+
+
+@pytest.mark.parametrize("cutoff", [2.0, 40.0])
+def test_a_look_at_each_pair_finds_what_trees_find(cutoff: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng, kernels = np.random.default_rng(3), Kernels.of_orders(cutoff, ORDERS)
+    points = rng.random((300, 3))
+    corners = rng.random((400, 1, 3)) + 10.0 ** rng.uniform(-3, 0, (400, 1, 1)) * rng.normal(size=(400, 3, 3))
+    found = []
+    monkeypatch.setattr(potentials, "_PAIRS_AT_ONCE", 5000)
+    for share in (0.0, 1.0):
+        monkeypatch.setattr(potentials, "_OFTEN_CLOSE", share)
+        sums = np.zeros((300, len(ORDERS)))
+        found.append((potentials.add_of_triangles(sums, points, corners, 1.0, kernels), sums))
+    assert found[0][0] == found[1][0] > 1000
+    np.testing.assert_allclose(found[0][1], found[1][1], rtol=1e-9, atol=1e-12)
