@@ -41,6 +41,8 @@ _DIGITS = "%.17g"
 _STL_HEADER_BYTES = 84
 # A text has no zero byte; a binary file of fewer than 16 million triangles has one within this many.
 _STL_START_BYTES = 1024
+# The space before a statement of a facet. Some programs write several on a line.
+_STL_STATEMENT = re.compile(rb"(?i)\s(?=(?:facet\s+normal|outer\s+loop|vertex|endloop|endfacet|endsolid)(?!\S))")
 _STL_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
@@ -151,6 +153,8 @@ def parse_stl(data: bytes) -> Raw:
     elif b"\0" not in start:
         if start.removeprefix(codecs.BOM_UTF8).lstrip()[:5].lower() != b"solid":
             raise MeshError("the file is a text that does not begin with solid, as STL files in text do")
+        if re.search(rb"(?i)normal[^\n]*\svertex\s", data):
+            data = _STL_STATEMENT.sub(b"\n", data)
         corners = _stl_text_corners(data)
     else:
         count = (len(data) - _STL_HEADER_BYTES) / _STL_RECORD.itemsize

@@ -287,6 +287,8 @@ VARIANTS: dict[str, dict[str, bytes]] = {
         "a name like a word": stl_text(BOX_VERTICES, BOX_TRIANGLES, "facet normal"),
         "capitals": STL_BOX.upper(),
         "two zeros": STL_BOX.replace(b"vertex 0.0 0.0 0.0", b"vertex -0.0 0.0 -0.0", 1),
+        "one line": STL_BOX.replace(b"\n", b" "),
+        "one line for each facet": re.sub(rb"\n(?!\s*(facet|endsolid))", b" ", STL_BOX),
         "indented": b"\n  " + STL_BOX.replace(b"\n", b"\n\t "),
         "two solids": stl_text(BOX_VERTICES, BOX_TRIANGLES[:6], "") + stl_text(BOX_VERTICES, BOX_TRIANGLES[6:], ""),
     },
