@@ -56,6 +56,9 @@ _APPENDED = re.compile(rb"<AppendedData[^>]{0,200}encoding\s{0,9}=\s{0,9}[\"'](r
 _END, _END_OF_DATA = b"</VTKFile>", b"</AppendedData>"
 # Usual bytes of a number in text.
 _WORD_BYTES = 16
+_PACKERS = "vtkZLibDataCompressor", "vtkLZMADataCompressor"
+# Memory that a block packed by LZMA may take: VTK's own take 9 MB, and a damaged one asks for gigabytes.
+_LZMA_BYTES = 1 << 27
 # The arrays of a part of a data set: "points", "ghosts", "types", and "polys offsets" and "polys connectivity" or such.
 _Arrays = dict[str, NDArray[Any]]
 _NONE = np.zeros(0, np.int64)
@@ -272,7 +275,7 @@ def _decoded(
     first, after = fetch(place, head.itemsize)
     count = int(np.frombuffer(first, head)[0])
     if packed := root.get("compressor"):
-        if packed != "vtkZLibDataCompressor":
+        if packed not in _PACKERS:
             raise MeshError(f"it is packed by {packed[:40]!r}; save it anew, as .vtp or .vtu: {_PACKED_ANEW}")
         header, after = fetch(place, head.itemsize * (3 + count))
         size, last, *lengths = np.frombuffer(header, head)[1:].tolist()
@@ -282,7 +285,7 @@ def _decoded(
         (blocks, end), ends = fetch(after, sum(lengths)), np.cumsum([0, *lengths]).tolist()
         # One byte more shows whether there are more.
         parts = [
-            zlib.decompressobj().decompress(blocks[begin:stop], expected + 1)
+            _unpacked(blocks[begin:stop], expected + 1, packed)
             for begin, stop, expected in zip(ends[:-1], ends[1:], sizes, strict=True)
         ]
         if [*map(len, parts)] != sizes:
@@ -299,6 +302,18 @@ def _decoded(
     if form == "binary" and end != len(source):
         raise MeshError(f"{owner} has more data than it announces")
     return np.frombuffer(data, dtype.newbyteorder(BYTE_ORDERS[order]))
+
+
+def _unpacked(block: bytes, most: int, packed: str) -> bytes:
+    """Return at most so many bytes of a packed block."""
+    if packed == _PACKERS[0]:
+        return zlib.decompressobj().decompress(block, most)
+    import lzma  # some builds of Python lack it
+
+    try:
+        return lzma.LZMADecompressor(memlimit=_LZMA_BYTES).decompress(block, most)
+    except lzma.LZMAError as error:
+        raise MeshError("its packed data are damaged") from error
 
 
 def _faces(kinds: Indices, corners: Indices, sizes: Indices, suffix: str) -> tuple[Indices, Indices, tuple[str, ...]]:
