@@ -201,7 +201,7 @@ def test_a_rare_packer_is_named_with_what_converts(tmp_path: Path) -> None:
     writer.SetFileName(str(tmp_path / "scan.vtp"))
     writer.SetInputData(polygons(BOX_MIXED))
     assert writer.Write()
-    with pytest.raises(MeshError, match="vtkLZ4DataCompressor.*save it anew, as .vtp or .vtu") as refusal:
+    with pytest.raises(MeshError, match=r"vtkLZ4DataCompressor.*save it anew, as .vtp or .vtu") as refusal:
         read_mesh(tmp_path / "scan.vtp")
     # The command itself, without a process of its own.
     code = str(refusal.value).partition('python -c "')[2].removesuffix('"')
