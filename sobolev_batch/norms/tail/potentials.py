@@ -348,8 +348,8 @@ def _close_pairs(points: Reals, corners: Reals, reach: float) -> Iterator[tuple[
         squares = sum((some[:, None, axis] - centers[which, axis]) ** 2 for axis in range(3))
         return np.asarray(squares < (reach + radii[which]) ** 2)
 
-    sample = is_close(points[:: -(-len(points) // _SAMPLE)], slice(None, None, -(-len(centers) // _SAMPLE)))
-    if sample.mean() > _OFTEN_CLOSE:
+    sample = is_close(points[:: len(points) // _SAMPLE + 1], slice(None, None, len(centers) // _SAMPLE + 1))
+    if sample.sum() > _OFTEN_CLOSE * sample.size:
         step = max(1, _PAIRS_AT_ONCE // len(centers))
         for start in range(0, len(points), step):
             rows, columns = np.nonzero(is_close(points[start : start + step], slice(None)))
