@@ -85,7 +85,7 @@ class RecordedSearch:
             data = self.folder.read(f"{self.name or digest}.json") or b""
             record = _RECORDS.validate_json(data, strict=True)
             # A program that was missing may be there now.
-            return record if record.digest == digest and any(one.triangles for one in record.trials) else None
+            return record if record.digest == digest and any(one.triangles for one in self._counted(record)) else None
         return None
 
     def begun(self) -> SearchRecord:
@@ -95,7 +95,7 @@ class RecordedSearch:
 
     def bracket(self, record: SearchRecord) -> Bracket:
         """Return what the trials say."""
-        return self._search(record).bracket(record.trials)
+        return self._search(record).bracket(self._counted(record))
 
     def next(self, record: SearchRecord, count: int = 1) -> tuple[float, ...]:
         """Return sizes to try now, up to a count of them; that of the best mesh where its file is gone or another."""
@@ -126,13 +126,18 @@ class RecordedSearch:
         """Return why nothing was found; empty where something was."""
         if self.bracket(record).best is not None:
             return ""
-        nearest = min(record.trials, key=lambda one: one.upper)
+        nearest = min(self._counted(record), key=lambda one: one.upper)
         found = f"{nearest.triangles:,} triangles, at most {nearest.upper:.4g} away"
         return nearest.reason or f"nothing is within the tolerance of {self.limit.value:.4g}; nearest are {found}"
 
     def mesh(self, record: SearchRecord) -> Mesh:
         """Return the best mesh, which is kept as a PLY file."""
         return Mesh(*parse_ply(self._read_mesh(record)))
+
+    def _counted(self, record: SearchRecord) -> tuple[Trial, ...]:
+        """Return the trials, without the original itself where the remesher made nothing at any other size."""
+        made = tuple(one for one in record.trials if not self.remesher.keeps(one.size, record.triangles))
+        return made if made and not any(one.triangles for one in made) else record.trials
 
     def _search(self, record: SearchRecord) -> Search:
         return self.remesher.search(self.limit, record.triangles, record.radius, self.precision)

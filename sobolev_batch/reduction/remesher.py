@@ -108,12 +108,16 @@ class Remesher:
             limit.value, low, high, self.is_whole, False, max(low, min(_FIRST / fraction, high / 2)), precision
         )
 
+    def keeps(self, size: float, triangles: float) -> bool:
+        """Tell whether the mesh of one size is the original itself, which has no more triangles."""
+        return self.parameter == _TRIANGLES and size >= triangles
+
     def member(self, original: Member, size: float, triangles: float = math.inf) -> Member:
         """Return the mesh of one size that is made of another one, or that one itself where it has no more triangles.
 
         Its triangles are infinitely many by default.
         """
-        if self.parameter == _TRIANGLES and size >= triangles:
+        if self.keeps(size, triangles):
             return original
         values = (int(size) if self.is_whole else size,)
         source = self.source.model_copy(update={self.parameter: values, "mesh": GivenSource(member=original)})

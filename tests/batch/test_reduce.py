@@ -229,6 +229,14 @@ def test_a_remesher_that_fails_at_a_size() -> None:
     assert "ZeroDivisionError" in wrong.reason
 
 
+def test_a_program_that_makes_nothing_does_not_pass_with_the_mesh_itself(tmp_path: Path) -> None:
+    search = {"triangles": (4, 320)}
+    found = found_by(lumpy(2), within=0.1, method=lambda mesh, triangles: 1 / 0, search=search, output=tmp_path)
+    assert found.bracket.best is None
+    assert "ZeroDivisionError" in found.reason
+    assert not [*tmp_path.glob("*.ply")]
+
+
 def test_results_that_are_not_monotone_are_told() -> None:
     def uneven(mesh: sb.Mesh, edge: float) -> sb.Mesh:
         return disc(mesh, 2.0 if 0.2 < edge < 0.9 else edge)
