@@ -427,7 +427,9 @@ def sizes_of(frame: pd.DataFrame, x: str) -> Reals:
     if x not in frame or not pd.api.types.is_numeric_dtype(frame[x]):
         numbers = [name for name in (EDGE_LENGTH, *_GROWING) if name in frame]
         given = [name for name in frame.attrs.get("metadata", ()) if pd.api.types.is_numeric_dtype(frame[name])]
-        raise InputError(f"no size of meshes is named {quoted(x)}; known are {', '.join([*numbers, *given])}")
+        only = " (the store has no families of commands, functions or searches, which have it)"
+        hint = only if x.startswith("make_") else ""
+        raise InputError(f"no size of meshes is named {quoted(x)}{hint}; known are {', '.join([*numbers, *given])}")
     sizes: Reals = frame[x].to_numpy(dtype=np.float64, na_value=np.nan)
     # A surface in closed form has none.
     return np.where(sizes > 0, sizes, np.nan)

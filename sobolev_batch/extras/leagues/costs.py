@@ -22,7 +22,7 @@ DEFAULT_COST = "make_seconds"
 # Members that a row of a table names, and objects whose fronts a text has.
 _MOST_MEMBERS, _MOST_OBJECTS = 4, 10
 # Costs from it on, such as bytes, are shown as integers.
-_LARGE = 1000.0
+_LARGE = 100.0
 COST_NOTE = """\
 A mesh is on the front of its object unless another one, at no more cost, is nearer to the
 reference or as near at less cost. It is undecided where the errors of the distances leave that

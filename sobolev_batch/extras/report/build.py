@@ -133,7 +133,8 @@ def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], u
     with fields_read(store):
         views, missing = make_views(tree, folder, witnesses, up=up)
     charts = {**chart_data(tree, spectra, views), "costs": cost_data(content["costs"])}
-    content["omissions"] += chart_omissions(tree, charts, omission, views, missing)
+    # Who names meshes leaves out the others.
+    content["omissions"] += chart_omissions(tree, charts, omission, () if witnesses else views, missing)
     page = filled("study", content, charts, omission=omission, views=views, missing=missing)
     require_unchanged(tree)
     return page
