@@ -192,7 +192,7 @@ class State:
 
     @property
     def expected(self) -> Reals:
-        """What lies beyond all octaves if the energy of the last one does not grow (orders,)."""
+        """Squared norm beyond all octaves if the energy of the last one does not grow (orders,)."""
         least = self.core.energy
         if self.octaves:
             least = self.octaves[-1].sums.energy - _QUANTILE * self.octaves[-1].sums.energy_deviation

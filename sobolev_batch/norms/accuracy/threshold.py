@@ -207,7 +207,7 @@ class _Reference:
     problem: Problem = field(compare=False)
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=2)  # references stay in memory
 def _rough_norm(reference: _Reference) -> Interval:
     """Return bounds on the norm of a reference from a small lattice, if that is enough."""
     problem, order = reference.problem, reference.order
@@ -224,7 +224,7 @@ def _rough_norm(reference: _Reference) -> Interval:
     return Interval.around(value, error, above) if above <= _NORM_RTOL * value else _exact_norm(reference)
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=2)  # references stay in memory
 def _exact_norm(reference: _Reference) -> Interval:
     """Return close bounds on the norm of a reference."""
     accuracy = replace(reference.accuracy, rtol=_EXACT_NORM_RTOL)
