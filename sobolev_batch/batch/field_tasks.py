@@ -230,20 +230,20 @@ def _store_octaves(job: Job, surface: Surface) -> StoredBlocks:
     quality = TailQuality(
         tuple(float(radius) for octave in values for radius in octave.radii),
         tuple(float(square) for octave in values for square in octave.squares),
-        remainder([surface], [1], cutoff, is_scale=True),
-        None if reference is None else _remainder_between(surface, reference, cutoff),
+        remainder([surface], [1], cutoff, execution=job.execution, is_scale=True),
+        None if reference is None else _remainder_between(surface, reference, cutoff, job.execution),
     )
     samples = np.concatenate([octave.values for octave in values])
     checksum = Fields(job.store).write(job.index, (slice(0, len(samples)),), samples)
     return StoredBlocks(quality=replace(Quality.from_surface(surface, Probe()), tail=quality), checksums=(checksum,))
 
 
-def _remainder_between(surface: Surface, reference: Surface, cutoff: float) -> Remainder:
+def _remainder_between(surface: Surface, reference: Surface, cutoff: float, execution: Execution) -> Remainder:
     """Return what lies beyond a cutoff between two surfaces: only what they do not have in common counts."""
     rests = without_common_parts((surface, reference))
     if not rests:
         return Remainder.between(0.0, 0.0, cutoff)
-    return remainder(list(rests.values()), list(rests), cutoff)
+    return remainder(list(rests.values()), list(rests), cutoff, execution=execution)
 
 
 def _store_whole(job: Job, surface: Surface) -> StoredBlocks:

@@ -22,9 +22,11 @@ LARGEST_LENGTH = 1e150
 
 _NEIGHBOURS = np.array([n for n in product((-1, 0, 1), repeat=3) if n > (0, 0, 0)], dtype=np.float64)
 # The axes, the diagonals of the faces and those of the cube: unit vectors (13, 3).
-DIRECTIONS: Reals = _NEIGHBOURS / np.linalg.norm(_NEIGHBOURS, axis=1, keepdims=True)
+_LENGTHS = np.linalg.norm(_NEIGHBOURS, axis=1)
+DIRECTIONS: Reals = _NEIGHBOURS / _LENGTHS[:, None]
+_PARTS = [np.flatnonzero(neighbour).tolist() for neighbour in _NEIGHBOURS]
 # Points that are measured at a time: their temporaries stay in cache.
-_BATCH = 1 << 14
+_BATCH = 1 << 15
 _AXES = [int(np.argmax(np.abs(DIRECTIONS[:, axis]))) for axis in range(3)]
 SurfaceType = TypeVar("SurfaceType", bound="Surface")
 
@@ -70,11 +72,15 @@ class Extent:
         """Return the extent of points (3, n), n > 0, one contiguous row an axis."""
         lowest, highest = np.full(len(DIRECTIONS), np.inf), np.full(len(DIRECTIONS), -np.inf)
         for start in range(0, coordinates.shape[1], _BATCH):
-            # Without a BLAS, whose threads would wait for those of a NUFFT.
-            along = np.einsum("ij,jk->ik", DIRECTIONS, coordinates[:, start : start + _BATCH])
-            np.minimum(lowest, along.min(axis=1), out=lowest)
-            np.maximum(highest, along.max(axis=1), out=highest)
-        return cls(tuple(lowest.tolist()), tuple(highest.tolist()))
+            batch = coordinates[:, start : start + _BATCH]
+            for number, neighbour in enumerate(_NEIGHBOURS):
+                # Sums and differences take a fifth of the time of products.
+                along, *others = (batch[axis] if neighbour[axis] > 0 else -batch[axis] for axis in _PARTS[number])
+                for other in others:
+                    along = along + other
+                lowest[number] = min(lowest[number], along.min())
+                highest[number] = max(highest[number], along.max())
+        return cls(tuple((lowest / _LENGTHS).tolist()), tuple((highest / _LENGTHS).tolist()))
 
     @property
     def widths(self) -> Reals:

@@ -40,7 +40,7 @@ _OUT_OF_MEMORY, _INSUFFICIENT_DRIVER, _NO_DEVICE = 2, 35, 100
 _OUTPUT_DRIVEN, _AUTOMATIC = 3, 0
 # Of the device's memory, for the plan that is kept while it is idle.
 _KEPT_FRACTION = 0.25
-_LARGE_BYTES, _PAGE_BYTES, _TOUCHING_THREADS = 1 << 25, 1 << 12, 4
+_LARGE_BYTES, _PAGE_BYTES, _TOUCHING_THREADS = 1 << 23, 1 << 12, 4
 # Two threads cannot share a plan, and each of two transforms would find half of the memory.
 _DEVICE = threading.RLock()
 
@@ -50,15 +50,18 @@ _log = logging.getLogger(__name__)
 def combine(coefficients: Reals, rows: Array, out: Array | None = None) -> Array:
     """Return the matrix product of a few coefficients (..., k), on the host, with rows (k, n) of a backend.
 
+    Of rows (a, k, n) it is the product with each of them, (a, ..., n).
+
     NumPy's own product leaves threads of the BLAS that spin for some 25 ms, in which those of FINUFFT wait for them.
     CuPy's needs cuBLAS, which takes more memory than everything else together.
     """
     if isinstance(rows, np.ndarray):
-        return np.einsum("...k,kn->...n", coefficients, rows, out=out)
+        return np.einsum("...k,kn->...n" if rows.ndim == 2 else "qk,akn->aqn", coefficients, rows, out=out)
     factors = np.asarray(coefficients, like=rows)[..., None]
-    total = factors[..., 0, :] * rows[0]
-    for index in range(1, len(rows)):
-        total += factors[..., index, :] * rows[index]
+    each = [rows[:, index, None] if rows.ndim > 2 else rows[index] for index in range(rows.shape[-2])]
+    total = factors[..., 0, :] * each[0]
+    for index in range(1, len(each)):
+        total += factors[..., index, :] * each[index]
     if out is None:
         return total
     out[...] = total
@@ -328,11 +331,14 @@ def _plan_class(cufinufft: Any) -> Any:
     return Plan
 
 
-def compute_on(backend: Backend, compute: Callable[[Backend], Result]) -> Result:
-    """Return what a function computes on a backend. The processor steps in for a GPU that fails, with a warning."""
+def compute_on(backend: Backend, compute: Callable[[Backend], Result], *, alone: bool = True) -> Result:
+    """Return what a function computes on a backend. The processor steps in for a GPU that fails, with a warning.
+
+    What makes no plan and takes little memory need not be alone on a GPU.
+    """
     if isinstance(backend, Gpu):
         try:
-            with backend.work():
+            with backend.work() if alone else nullcontext():
                 return compute(backend)
         except Exception as error:  # CUDA's errors have no common base
             _log.warning("the GPU fails: %s; the processor computes it instead", one_line(error)[:200])

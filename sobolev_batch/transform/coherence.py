@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from itertools import permutations
 
 import numpy as np
 
 from sobolev_batch.arrays import Complexes, Indices, Reals
 from sobolev_batch.compiled import pays
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.transform.backends import CPU, cosine_and_sine
+from sobolev_batch.transform.backends import CPU, combine, cosine_and_sine
+from sobolev_batch.transform.faces import FaceArrays
 from sobolev_batch.transform.nufft_costs import NufftSpec
 
 # Triangles at a time: their temporaries stay in cache.
@@ -30,42 +30,56 @@ _MEAN_SQUARE = 8 / 15
 _EXCESS = 4.0
 # Numbers without pattern, which tell points apart.
 _MIXERS = np.array([43758.5453, 12989.8, 7823.3])
+# How often each of the ten different third moments counts: xxx, yyy, zzz, six such as xxy, and half of six times 2 xyz.
+_MULTIPLES = np.array([1.0, 1.0, 1.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0, 1.5])
 
 
-def unpaired(mesh: Mesh) -> float:
+def unpaired(mesh: Mesh, faces: FaceArrays | None = None) -> float:
     """Return the fraction of odd errors that adds up: 0 where each triangle has an opposite one, 1 where all are alike.
 
     The leading odd error is that of third moments about the centroid: of products of the three corners.
     """
-    if pays(_SECONDS * len(mesh.triangles)):
+    if faces is None and pays(_SECONDS * len(mesh.triangles)):
         from sobolev_batch.compiled.triangles import third_moments
 
         norm, amount = third_moments(mesh.vertices, mesh.triangles, mesh.areas)
         return norm / amount if amount else 0.0
-    total, amount, columns = np.zeros((3, 3, 3)), 0.0, np.ascontiguousarray(mesh.vertices.T)
-    for first in range(0, len(mesh.triangles), _BATCH):
-        areas = mesh.areas[first : first + _BATCH]
-        x = np.take(columns, np.ascontiguousarray(mesh.triangles[first : first + _BATCH].T), axis=1)
-        x -= x.mean(axis=1, keepdims=True)
-        a, b, c = x[:, 0], x[:, 1], x[:, 2]
-        total += ((a[:, None] * (b * areas)).reshape(9, -1) @ c.T).reshape(3, 3, 3)
-        aa, bb, cc = (x * x).sum(axis=0)
-        # The corners add up to zero, so these are all products of two of them.
-        ab, bc, ca = (cc - aa - bb) / 2, (aa - bb - cc) / 2, (bb - cc - aa) / 2
-        squares = aa * bb * cc + 2 * ab * bc * ca + aa * bc * bc + bb * ca * ca + cc * ab * ab
-        amount += float(areas @ np.sqrt(np.maximum(squares, 0)))
-    symmetric = sum(np.transpose(total, axes) for axes in permutations(range(3)))
-    return float(np.linalg.norm(symmetric)) / math.sqrt(6) / amount if amount else 0.0
+    total, amount = np.zeros(len(_MULTIPLES)), 0.0
+    for batch in (faces or FaceArrays.of_mesh(mesh)).batches(_BATCH):
+        moments, norms = _third_moments(batch)
+        total += moments
+        amount += norms
+    return math.sqrt(float(_MULTIPLES @ total**2)) / amount if amount else 0.0
 
 
-def coherence(mesh: Mesh, highest: float) -> Reals:
+def _third_moments(faces: FaceArrays) -> tuple[Reals, float]:
+    """Return the sums of third moments, times areas (10,), and the sum of their norms, in one unit of moments."""
+    a = faces.at(0)
+    u, v = faces.at(1) - a, faces.at(2) - a
+    x = u + v
+    b, c = 3 * u - x, 3 * v - x
+    # Axes follow each other in a ring.
+    squares, mixed = b * c, b * np.roll(c, -1, axis=0) + np.roll(b, -1, axis=0) * c
+    after, before = (x * np.roll(mixed, turn, axis=0) for turn in (0, 1))
+    after += np.roll(x, -1, axis=0) * squares
+    before += np.roll(x, 1, axis=0) * squares
+    x_y_z = x * np.roll(mixed, -1, axis=0)
+    moments = np.concatenate([3 * x * squares, after, before, (x_y_z[0] + x_y_z[1] + x_y_z[2])[None]])
+    norms = np.sqrt(combine(_MULTIPLES, moments * moments))
+    sums = np.concatenate([moments, norms[None]])
+    sums *= faces.areas
+    found = faces.backend.download(sums.sum(axis=1))
+    return found[:-1], float(found[-1])
+
+
+def coherence(mesh: Mesh, highest: float, faces: FaceArrays | None = None) -> Reals:
     """Return the squares of the largest sums of errors in 32 equal ranges of |ξ| up to the highest one (32,).
 
     They are relative to the sum of triangles that are all in phase, and zero where none exceeds the sums of random
     terms. A sample of the triangles stands for all, whatever their order in the file; of meshes that are large beside
     the shortest wavelength, a sample of the box that holds most area. Frequencies fill the cube of a lattice.
     """
-    triangles, areas, noise = _sample(mesh, highest)
+    triangles, areas, noise = _sample(mesh, highest, faces or FaceArrays.of_mesh(mesh))
     corners = np.stack([mesh.vertices[triangles[:, corner]].T for corner in range(3)])
     centers = corners.mean(axis=0)
     corners -= centers
@@ -86,7 +100,7 @@ def coherence(mesh: Mesh, highest: float) -> Reals:
     return np.where(largest > noise * (math.log(len(places)) + _EXCESS), np.minimum(largest, 1), 0)
 
 
-def _sample(mesh: Mesh, highest: float) -> tuple[Indices, Reals, float]:
+def _sample(mesh: Mesh, highest: float, faces: FaceArrays) -> tuple[Indices, Reals, float]:
     """Return some triangles (k, 3), the areas that they stand for (k,), and the mean square of random sums of these.
 
     Triangles are drawn in proportion to their areas, by numbers that depend on their corners alone.
@@ -95,22 +109,22 @@ def _sample(mesh: Mesh, highest: float) -> tuple[Indices, Reals, float]:
     low, high = mesh.extent.box
     if (high - low).max() * highest > _MOST_WAVELENGTHS:
         boxes = _boxes(mesh, low, _MOST_WAVELENGTHS / highest)
-        here = boxes == np.bincount(boxes, areas).argmax()
-        triangles, areas = triangles[here], areas[here]
+        here = np.flatnonzero(boxes == np.bincount(boxes, areas).argmax())
+        triangles, areas, faces = triangles[here], areas[here], faces.part(here)
     if len(areas) <= _SAMPLE:
         return triangles, areas, 0.0
-    levels, drawn, each = np.empty(len(mesh.vertices)), [], float(areas.sum()) / _SAMPLE
-    for first in range(0, len(levels), _BATCH):
-        batch = slice(first, first + _BATCH)
-        levels[batch] = np.sin(mesh.vertices[batch] @ (highest * _MIXERS)) * _MIXERS[0]
-    for first in range(0, len(areas), _BATCH):
-        batch = slice(first, first + _BATCH)
-        a, b, c = triangles[batch].T
+    levels = combine(highest * _MIXERS, faces.columns)
+    np.sin(levels, out=levels)
+    levels *= _MIXERS[0]
+    numbers, first, each = [], 0, float(areas.sum()) / _SAMPLE
+    for batch in faces.batches(_BATCH):
+        a, b, c = batch.corners
         sums = levels[a] + levels[b] + levels[c]
-        drawn.append(first + np.flatnonzero((sums - np.floor(sums)) * each < areas[batch]))
-    numbers = np.concatenate(drawn)
-    sampled = np.maximum(areas[numbers], each)
-    return triangles[numbers], sampled, np.count_nonzero(sampled == each) * (each / float(sampled.sum())) ** 2
+        numbers.append(first + faces.backend.download(np.flatnonzero((sums - np.floor(sums)) * each < batch.areas)))
+        first += len(batch)
+    drawn = np.concatenate(numbers)
+    sampled = np.maximum(areas[drawn], each)
+    return triangles[drawn], sampled, np.count_nonzero(sampled == each) * (each / float(sampled.sum())) ** 2
 
 
 def _boxes(mesh: Mesh, low: Reals, side: float) -> Indices:

@@ -15,7 +15,7 @@ from typing import get_args
 
 import numpy as np
 
-from sobolev_batch.arrays import ComplexDtype, Complexes, Reals
+from sobolev_batch.arrays import Array, ComplexDtype, Complexes, Reals
 from sobolev_batch.errors import InputError, LatticeError, one_line
 from sobolev_batch.geometry.subdivision import icosphere
 from sobolev_batch.geometry.surface import Similarity, Surface
@@ -220,7 +220,7 @@ def transform_block(
     low, high = surface.extent.box
     fill = min(1.0, float(np.prod((high - low) / (2 * lattice.half_period))))
 
-    # Rules are chosen while other threads have the device.
+    plan.choose_points(execution.backend)
     points = plan.expected_points if isinstance(execution.backend, Gpu) else math.inf
 
     def fitting(costs: Costs, allowed_bytes: float) -> tuple[NufftSpec, int]:
@@ -231,33 +231,34 @@ def transform_block(
         spec = fastest_spec(whole, workload, costs, allowed_bytes)
         return spec, costs.projected_bytes(spec, workload)
 
-    def compute(backend: Backend, spec: NufftSpec) -> Transformed:
+    def compute(backend: Backend, spec: NufftSpec) -> tuple[Array, int]:
         values, points = transform_points(plan.batches(spec.batch, backend), lattice, block, spec, backend)
-        return Transformed(backend.download(values.astype(settings.stored, copy=False)), points, backend.library)
+        return values.astype(settings.stored, copy=False), points
 
     # Before the GPU is tried: the memory must be enough for the processor that may have to step in.
     spec = whole if execution.allowed_bytes is None else fitting(CPU.costs, execution.allowed_bytes)[0]
     if not isinstance(execution.backend, Gpu):
-        return compute(CPU, spec)
+        return Transformed(*compute(CPU, spec), CPU.library)
     gpu = execution.backend
     try:
         with gpu.work():
-            return _on_gpu(gpu, block.size * whole.item_bytes, fitting, compute)
+            computed, count = _on_gpu(gpu, block.size * whole.item_bytes, fitting, compute)
+        # Other threads have the device meanwhile.
+        return Transformed(gpu.download(computed), count, gpu.library)
     except InputError:  # nothing is small enough
         failure = _OUT_OF_MEMORY
     except Exception as error:
         failure = one_line(error)[:200]
     _log.warning("%s: %s; the processor computes it instead", gpu.library, failure)
-    transformed = compute(CPU, spec)
-    return replace(transformed, backend=f"{transformed.backend} after {gpu.library}: {failure}")
+    return Transformed(*compute(CPU, spec), f"{CPU.library} after {gpu.library}: {failure}")
 
 
 def _on_gpu(
     gpu: Gpu,
     result_bytes: int,
     fitting: Callable[[Costs, float], tuple[NufftSpec, int]],
-    compute: Callable[[Backend, NufftSpec], Transformed],
-) -> Transformed:
+    compute: Callable[[Backend, NufftSpec], tuple[Array, int]],
+) -> tuple[Array, int]:
     """Compute on a GPU, and try again with half the memory where it is too little after all; at last InputError."""
     allowed_bytes = _DEVICE_FRACTION * gpu.free_bytes - result_bytes
     for _ in range(_ATTEMPTS):

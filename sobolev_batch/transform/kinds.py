@@ -21,8 +21,9 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.closed_forms import Sphere
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.smooth import Counts, Smooth
-from sobolev_batch.transform.backends import CPU, Backend
+from sobolev_batch.transform.backends import CPU, Backend, compute_on
 from sobolev_batch.transform.exact import exact_transform, sampled_transform
+from sobolev_batch.transform.faces import FaceArrays
 from sobolev_batch.transform.lattice import Block, FrequencyLattice
 from sobolev_batch.transform.quadrature import RuleUse, WeightedPoints, assign_rules
 from sobolev_batch.transform.resolution import direct_transform, exact_counts, resolution_of
@@ -31,6 +32,8 @@ from sobolev_batch.transform.spheres import sphere_block, sphere_transform
 
 # Nodes of a parametrised surface that are made at a time: their temporaries take 4 MB.
 _NODES = 1 << 14
+# With fewer triangles a GPU takes longer to help with the choice of their rules than the processor alone.
+_MANY_TRIANGLES = 1 << 16
 # The error of a parametrised surface's nodes grows with the frequency like that of a rule of a high degree: of the
 # degrees tried on tori and ellipsoids with too few nodes, 8 and 16 drew frequencies that showed most of it.
 _SMOOTH_DEGREE = 16
@@ -102,6 +105,9 @@ class SurfaceKind(ABC):
         """Change of values when nodes are doubled, over the area, where exact values come from such nodes too."""
         return 0.0
 
+    def choose_points(self, backend: Backend) -> None:  # noqa: B027 -- most kinds need no help
+        """Choose the points with the help of the backend that is to make them."""
+
     @abstractmethod
     def batches(self, capacity: int, backend: Backend = CPU) -> Iterator[WeightedPoints]:
         """Yield the points in nearly equal batches of at most a number, 8 times that of the largest rule or more."""
@@ -127,7 +133,32 @@ class _Triangles(SurfaceKind):
     @cached_property
     def uses(self) -> tuple[RuleUse, ...]:
         """Rules of the triangles, which take four bytes for each."""
-        return assign_rules(self.surface, self.highest_frequency, self.eps, self.quadrature, self.tolerance)
+        return self._chosen()
+
+    def _chosen(self, faces: FaceArrays | None = None) -> tuple[RuleUse, ...]:
+        """Return the rules, with the help of a GPU that has the faces."""
+        settings = self.highest_frequency, self.eps, self.quadrature, self.tolerance
+        return assign_rules(self.surface, *settings, faces)
+
+    def choose_points(self, backend: Backend) -> None:
+        if backend is CPU or "uses" in self.__dict__:
+            return
+
+        def chosen(backend: Backend) -> tuple[RuleUse, ...]:
+            faces = None if backend is CPU else self.faces(backend)
+            return self._chosen(faces if self.triangles >= _MANY_TRIANGLES else None)
+
+        # Other threads have the device meanwhile.
+        self.__dict__["uses"] = compute_on(backend, chosen, alone=False)
+
+    def faces(self, backend: Backend) -> FaceArrays:
+        """Return the triangles on a backend: on a device they stay for the next block."""
+        if backend is CPU:
+            return FaceArrays.of_mesh(self.surface)
+        if "_faces" not in self.__dict__:
+            self.__dict__["_faces"] = FaceArrays.of_mesh(self.surface, backend)
+        found: FaceArrays = self.__dict__["_faces"]
+        return found
 
     @property
     def triangles(self) -> int:
@@ -162,10 +193,9 @@ class _Triangles(SurfaceKind):
         # A batch of triangles goes where its first point goes, so that each batch of points exceeds its equal
         # number by at most one batch of triangles.
         numbers = (np.concatenate([[0], ends[:-1]]) * count // total).astype(int).tolist()
-        mesh = self.surface
-        arrays = backend.upload(mesh.vertices), backend.upload(mesh.triangles), backend.upload(mesh.areas)
+        faces = self.faces(backend)
         for _, group in groupby(zip(numbers, triangles, strict=True), key=itemgetter(0)):
-            points = WeightedPoints.concatenated([batch.points(arrays, backend) for _, batch in group])
+            points = WeightedPoints.concatenated([batch.points(faces) for _, batch in group])
             # Where neighbours share fewer nodes than those of a closed mesh, there are more points than expected.
             for first in range(0, len(points.weights), capacity):
                 yield points.part(slice(first, first + capacity))

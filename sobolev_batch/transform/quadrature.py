@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Array, Indices, Reals
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.transform.backends import Backend, combine, sums_at, sums_of_runs
+from sobolev_batch.transform.backends import CPU, combine, sums_at, sums_of_runs
+from sobolev_batch.transform.faces import FaceArrays
 from sobolev_batch.transform.rule_errors import shares_vertices, tolerance_for
 from sobolev_batch.transform.rules import TriangleRule, choose_rules, fixed_rule, rule_ranges
 
 _Corners = tuple[Array, Array, Array]
-# Vertices (n, 3), triangles (m, 3) and areas (m,) of a mesh, as arrays of a backend.
-FaceArrays = tuple[Array, Array, Array]
 
 # Triangles at a time: keeps the temporaries with a mid-sized rule near 50 MB.
 _TRIANGLES = 1 << 17
@@ -85,40 +84,39 @@ class RuleUse:
         for first in range(0, len(self.members), step):
             yield RuleUse(self.rule, self.splits, self.members[first : first + step], self.path)
 
-    def points(self, mesh: FaceArrays, backend: Backend) -> WeightedPoints:
-        """Return the points, on the backend of the mesh's arrays."""
-        vertices, all_triangles, all_areas = mesh
-        triangles, areas, rule = all_triangles, all_areas, self.rule
-        if len(self.members) < len(areas):
-            members = backend.upload(self.members.astype(np.int64))
-            triangles, areas = triangles[members], areas[members]
+    def points(self, mesh: FaceArrays) -> WeightedPoints:
+        """Return the points, on the backend of the faces of the whole mesh."""
+        faces = mesh.part(self.members.astype(np.int64)) if len(self.members) < len(mesh) else mesh
         if not (self.splits or self.path):
-            return _merged_points(vertices, triangles, areas, rule)
-        corners = tuple(vertices[triangles[:, corner]] for corner in range(3))
-        areas = areas / 4 ** len(self.path)
+            return _merged_points(faces, self.rule)
+        corners, areas = (faces.at(0), faces.at(1), faces.at(2)), faces.areas / 4 ** len(self.path)
         for quarter in self.path:
             corners = _quarters(corners)[quarter]
         for _ in range(self.splits):
-            corners = tuple(np.concatenate(quarters) for quarters in zip(*_quarters(corners), strict=True))
-            areas = np.tile(areas / 4, 4)
-        coordinates = np.empty((3, rule.size * len(areas)), like=areas)
-        for axis, row in enumerate(coordinates):
-            places = np.stack([corner[:, axis] for corner in corners])
-            combine(rule.barycentric, places, out=row.reshape(rule.size, -1))
-        return WeightedPoints(coordinates, _products(rule.weights, areas))
+            a, b, c = (np.concatenate(quarters, axis=1) for quarters in zip(*_quarters(corners), strict=True))
+            corners, areas = (a, b, c), np.tile(areas / 4, 4)
+        coordinates = np.empty((3, self.rule.size * len(areas)), like=areas)
+        combine(self.rule.barycentric, np.stack(corners, axis=1), out=coordinates.reshape(3, self.rule.size, -1))
+        return WeightedPoints(coordinates, _products(self.rule.weights, areas))
 
 
 def assign_rules(
-    mesh: Mesh, highest_frequency: float, eps: float, quadrature: str | int = "auto", tolerance: float | None = None
+    mesh: Mesh,
+    highest_frequency: float,
+    eps: float,
+    quadrature: str | int = "auto",
+    tolerance: float | None = None,
+    faces: FaceArrays | None = None,
 ) -> tuple[RuleUse, ...]:
     """Return the rules of all triangles up to a frequency: the prescribed one, or those that keep an error.
 
-    That is eps, of the whole mesh relative to its area, or a tolerance of each triangle relative to its own.
+    That is eps, of the whole mesh relative to its area, or a tolerance of each triangle relative to its own. A GPU that
+    has the faces helps.
     """
     fixed = fixed_rule(quadrature)
     if fixed is not None:
         return (RuleUse(fixed, 0, np.arange(len(mesh.triangles), dtype=np.uint32)),)
-    tolerance = tolerance_for(mesh, highest_frequency, eps) if tolerance is None else tolerance
+    tolerance = tolerance_for(mesh, highest_frequency, eps, faces) if tolerance is None else tolerance
     rules, ranges = rule_ranges(tolerance, shares_vertices(mesh))
     sizes = mesh.centroid_radii
     # Meshes have tens of millions of triangles: temporaries are small, and four bytes for each are kept.
@@ -151,13 +149,14 @@ def _quarters(corners: _Corners) -> tuple[_Corners, _Corners, _Corners, _Corners
     return (a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)
 
 
-def _merged_points(vertices: Array, triangles: Array, areas: Array, rule: TriangleRule) -> WeightedPoints:
+def _merged_points(faces: FaceArrays, rule: TriangleRule) -> WeightedPoints:
     """Return the points of some triangles; a node that neighbours share has the weights of all of them."""
     (on_edges, of_edges), (inside, of_inside) = rule.edge_nodes, rule.inner_nodes
-    ends = np.ascontiguousarray(triangles.T, like=areas)
-    sums = sums_at(ends.ravel(), np.tile(areas, 3), len(vertices)) if rule.corner_weight else areas[:0]
+    columns, areas = faces.columns, faces.areas
+    ends, count = np.ascontiguousarray(faces.corners, like=areas), columns.shape[1]
+    sums = sums_at(ends.ravel(), np.tile(areas, 3), count) if rule.corner_weight else areas[:0]
     corners = np.flatnonzero(sums)
-    edges, edge_sums = merged_edges(ends, areas, len(vertices)) if len(of_edges) else (corners, sums)
+    edges, edge_sums = merged_edges(ends, areas, count) if len(of_edges) else (corners, sums)
     parts = [
         (np.ones((1, 1)), np.array([rule.corner_weight]), corners[None], sums[corners]),
         (on_edges, of_edges, edges, edge_sums),
@@ -166,11 +165,12 @@ def _merged_points(vertices: Array, triangles: Array, areas: Array, rule: Triang
     weights = [_products(node_weights, part_areas) for _, node_weights, _, part_areas in parts]
     limits = np.cumsum([0, *map(len, weights)]).tolist()
     coordinates = np.empty((3, limits[-1]), like=areas)
-    for axis, row in enumerate(coordinates):
-        column = np.ascontiguousarray(vertices[:, axis], like=areas)
-        for first, last, (nodes, _, indices, _) in zip(limits, limits[1:], parts, strict=False):
-            if last > first:
-                combine(nodes, column[indices], out=row[first:last].reshape(len(nodes), -1))
+    for first, last, (nodes, _, indices, _) in zip(limits, limits[1:], parts, strict=False):
+        if last > first:
+            # All axes at once on a device, where each call takes time.
+            for axes in (slice(axis, axis + 1) for axis in range(3)) if faces.backend is CPU else [slice(3)]:
+                block = coordinates[axes, first:last].reshape(-1, len(nodes), len(indices[0]))
+                combine(nodes, np.take(columns[axes], indices, axis=1), out=block)
     return WeightedPoints(coordinates, np.concatenate(weights))
 
 

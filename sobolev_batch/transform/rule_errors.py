@@ -11,7 +11,9 @@ import numpy as np
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.transform.backends import CPU, sums_at
 from sobolev_batch.transform.coherence import RANGES, coherence, unpaired
+from sobolev_batch.transform.faces import FaceArrays
 from sobolev_batch.transform.lattice import FrequencyLattice
 from sobolev_batch.transform.rules import FINEST_TOLERANCE, choose_rules, rule_ranges, typical_errors
 
@@ -40,15 +42,15 @@ def loosest_tolerance(mesh: Mesh, lattice: FrequencyLattice, orders: Sequence[fl
     )
 
 
-def tolerance_for(mesh: Mesh, highest_frequency: float, eps: float) -> float:
+def tolerance_for(mesh: Mesh, highest_frequency: float, eps: float, faces: FaceArrays | None = None) -> float:
     """Return the largest tolerance of triangle rules with a predicted error of eps · area at most up to a frequency.
 
     It is eps at least. The errors of triangles that are small beside the wavelength cancel, unless pieces of the mesh
     repeat. Of icospheres, scans and random triangles the largest error was measured to be at most 0.8 eps, of arrays of
-    boxes, tetrahedra and spheres 0.6, and of two layers of opposite triangles 1.5.
+    boxes, tetrahedra and spheres 0.6, and of two layers of opposite triangles 1.5. A GPU that has the faces helps.
     """
-    classes, shared = size_classes(mesh), shares_vertices(mesh)
-    radii, alike = highest_frequency * (np.arange(RANGES) + 1) / RANGES, unpaired(mesh) ** 2
+    classes, shared = size_classes(mesh, faces), shares_vertices(mesh)
+    radii, alike = highest_frequency * (np.arange(RANGES) + 1) / RANGES, unpaired(mesh, faces) ** 2
     allowed = (_TYPICAL_OF_LARGEST * eps * float(classes[2].sum())) ** 2
     mean, none, whole = _mean_coherence(radii, classes), np.zeros(RANGES), np.ones(RANGES)
 
@@ -64,7 +66,7 @@ def tolerance_for(mesh: Mesh, highest_frequency: float, eps: float) -> float:
     # Most coarse meshes keep eps even if all errors were in phase.
     if tolerance == eps or suffices(tolerance, whole):
         return tolerance
-    return _loosest(eps, partial(suffices, found=coherence(mesh, highest_frequency)))
+    return _loosest(eps, partial(suffices, found=coherence(mesh, highest_frequency, faces)))
 
 
 def _loosest(finest: float, suffices: Callable[[float], bool]) -> float:
@@ -74,23 +76,24 @@ def _loosest(finest: float, suffices: Callable[[float], bool]) -> float:
     return float(tolerances[bisect_left(tolerances[:-1], True, key=suffices)])
 
 
-def size_classes(mesh: Mesh) -> Reals:
+def size_classes(mesh: Mesh, faces: FaceArrays | None = None) -> Reals:
     """Return the triangles of a mesh in classes of similar size, (4, classes).
 
     The rows are the least and the greatest centroid radius of each class, in units of length, and the sums of the
     areas and of the squared areas in it.
     """
-    radii, areas = mesh.centroid_radii, mesh.areas
-    largest = float(radii.max())
-    smallest = max(float(radii.min()), 1e-6 * largest)
+    largest = float(mesh.centroid_radii.max())
+    smallest = max(float(mesh.centroid_radii.min()), 1e-6 * largest)
     count = max(1, min(_BINS, math.ceil(8 * math.log(largest / smallest))))
     edges = np.geomspace(smallest, largest, count + 1)
+    radii, areas, backend = mesh.centroid_radii, mesh.areas, CPU
     if count == 1:
         return np.array([[edges[0]], [edges[1]], [areas.sum()], [np.square(areas).sum()]])
-    classes = np.searchsorted(edges[1:-1], radii)
-    return np.stack(
-        [edges[:-1], edges[1:], *(np.bincount(classes, values, count) for values in (areas, areas * areas))]
-    )
+    if faces is not None:
+        radii, areas, backend = faces.radii, faces.areas, faces.backend
+    classes = np.searchsorted(np.asarray(edges[1:-1], like=radii), radii)
+    sums = (backend.download(sums_at(classes, values, count)) for values in (areas, areas * areas))
+    return np.stack([edges[:-1], edges[1:], *sums])
 
 
 def quadrature_error(

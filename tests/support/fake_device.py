@@ -17,22 +17,25 @@ from typing import Any
 
 import finufft
 import numpy as np
+import pytest
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from sobolev_batch.transform.backends import Gpu
+from sobolev_batch.errors import BackendError
+from sobolev_batch.transform.backends import Gpu, gpu_backend
 
 # What CuPy answers when NumPy's function of that name is called. `ones` and `full` are not among them:
 # with like= NumPy passes on a keyword that CuPy's do not know.
 FUNCTIONS = {
     "arange", "ascontiguousarray", "asarray", "bincount", "concatenate", "cumsum", "empty", "empty_like", "flatnonzero",
-    "nonzero", "ones_like", "repeat", "sinc", "stack", "take", "tile", "unique", "where", "zeros", "zeros_like",
+    "nonzero", "ones_like", "repeat", "roll", "searchsorted", "sinc", "stack", "take", "tile", "unique", "where",
+    "zeros", "zeros_like",
 }  # fmt: skip
 # Of its universal functions, those that the package needs. matmul is not among them, since it needs cuBLAS,
 # nor is any reduceat, since CuPy's loses digits.
 UFUNCS = {
-    "absolute", "add", "bitwise_and", "bitwise_or", "cos", "divide", "exp", "greater", "greater_equal", "invert",
-    "left_shift", "less", "maximum", "minimum", "multiply", "negative", "not_equal", "right_shift", "rint", "subtract",
-    "tan",
+    "absolute", "add", "arcsinh", "arctan2", "bitwise_and", "bitwise_or", "cos", "cosh", "divide", "equal", "exp",
+    "floor", "greater", "greater_equal", "invert", "left_shift", "less", "log", "maximum", "minimum", "multiply",
+    "negative", "not_equal", "right_shift", "rint", "sign", "sin", "sqrt", "subtract", "tan",
 }  # fmt: skip
 # The fields of the options structure of cuFINUFFT 2.5.1.
 OPTIONS = {
@@ -125,6 +128,14 @@ class Device:
         cupy = SimpleNamespace(cuda=cuda, get_default_memory_pool=lambda: pool, **calls)
         plan = SimpleNamespace(Plan=type("Plan", (_Plan,), {"device": self}))
         return Gpu(cupy, plan, SimpleNamespace(cudaGetLastError=self.forget))
+
+
+def device_of(name: str) -> Gpu:
+    """Return a "fake" GPU, or the "gpu" of this machine; the test is left out where there is none."""
+    try:
+        return Device().backend() if name == "fake" else gpu_backend()
+    except BackendError as error:
+        pytest.skip(str(error))
 
 
 def _copied(array: Array, out: Any) -> Any:

@@ -7,7 +7,6 @@ import pickle
 import subprocess
 import sys
 import textwrap
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from types import SimpleNamespace
@@ -21,7 +20,7 @@ from sobolev_batch import Lattice, Mesh, fourier_transform
 from sobolev_batch.errors import BackendError, InputError
 from sobolev_batch.norms.fields import compute_field, field_for
 from sobolev_batch.shapes import Sphere, icosphere
-from sobolev_batch.transform import backends
+from sobolev_batch.transform import backends, kinds
 from sobolev_batch.transform.backends import CPU, Gpu, backend_named, gpu_backend, try_out
 from sobolev_batch.transform.exact import exact_transform, sampled_transform
 from sobolev_batch.transform.fourier import ErrorTarget, Execution, Transformed, TransformSettings, transform_block
@@ -29,7 +28,7 @@ from sobolev_batch.transform.lattice import Block, FrequencyLattice, OctaveLatti
 from sobolev_batch.transform.nufft_costs import GPU_COSTS
 from sobolev_batch.transform.quadrature import assign_rules, merged_edges
 from sobolev_batch.transform.rules import sharing_rule
-from tests.support.fake_device import FUNCTIONS, OPTIONS, UFUNCS, Array, CUDARuntimeError, Device
+from tests.support.fake_device import FUNCTIONS, OPTIONS, UFUNCS, Array, CUDARuntimeError, Device, device_of
 
 LATTICE = Lattice(5.0, 32)
 DOUBLE = TransformSettings(1e-13)
@@ -69,20 +68,15 @@ SETTINGS = [
 
 
 @pytest.fixture(scope="module")
-def gpu() -> Iterator[Gpu]:
-    try:
-        yield gpu_backend()
-    except BackendError as error:
-        pytest.skip(str(error))
+def gpu() -> Gpu:
+    return device_of("gpu")
 
 
 @pytest.mark.parametrize("device", ["fake", "gpu"])
 @pytest.mark.parametrize("name", MESHES)
 @pytest.mark.parametrize(("settings", "tolerance"), SETTINGS)
-def test_a_gpu_agrees_with_the_processor(
-    request: pytest.FixtureRequest, device: str, name: str, settings: TransformSettings, tolerance: float
-) -> None:
-    backend = Device().backend() if device == "fake" else request.getfixturevalue("gpu")
+def test_a_gpu_agrees_with_the_processor(device: str, name: str, settings: TransformSettings, tolerance: float) -> None:
+    backend = device_of(device)
     assert_agree(on(backend, MESHES[name], settings), on(CPU, MESHES[name], settings), MESHES[name], tolerance)
 
 
@@ -206,16 +200,32 @@ def test_a_plan_serves_the_meshes_that_follow_until_memory_is_short() -> None:
 # Close to the lattice's highest frequency, and where triangles span many waves.
 @pytest.mark.parametrize("device", ["fake", "gpu"])
 @pytest.mark.parametrize("highest", [0.05, 5.0, 80.0])
-def test_exact_transforms_agree(
-    request: pytest.FixtureRequest, device: str, highest: float, caplog: pytest.LogCaptureFixture
-) -> None:
-    backend = Device().backend() if device == "fake" else request.getfixturevalue("gpu")
+def test_exact_transforms_agree(device: str, highest: float, caplog: pytest.LogCaptureFixture) -> None:
+    backend = device_of(device)
     mesh = MESHES["uneven"]
     frequencies = np.random.default_rng(0).uniform(-highest, highest, (32, 3))
     for transform in (exact_transform, partial(sampled_transform, threads=2)):
         found, expected = (transform(mesh, frequencies, backend=each) for each in (backend, CPU))
         assert np.abs(found - expected).max() < 1e-13 * mesh.area
     # Else the processor may have been compared with itself.
+    assert not caplog.records
+
+
+@pytest.mark.parametrize("device", ["fake", "gpu"])
+@pytest.mark.parametrize("name", ["uneven", "icosphere 5", "far"])
+def test_rules_are_chosen_alike(
+    device: str, name: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    # The last one is large beside the wavelength.
+    mesh = {"icosphere 5": icosphere(5), "far": icosphere(5).moved(40.0, (0, 0, 0))}.get(name) or uneven()
+    lattice, backend = OctaveLattice.random(3.0, 6.0, 16, np.random.default_rng(0)), device_of(device)
+    monkeypatch.setattr(kinds, "_MANY_TRIANGLES", 1)
+    chosen = []
+    for each in (backend, CPU):
+        plan: Any = ROUGH.plan(mesh, lattice)
+        plan.choose_points(each)
+        chosen.append([(use.rule, use.splits, use.members.tolist()) for use in plan.uses])
+    assert chosen[0] == chosen[1]
     assert not caplog.records
 
 

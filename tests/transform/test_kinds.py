@@ -15,8 +15,8 @@ from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms.fields import compute_field
 from sobolev_batch.shapes import Torus, icosphere
 from sobolev_batch.transform import kinds, quadrature
-from sobolev_batch.transform.backends import CPU
 from sobolev_batch.transform.exact import exact_transform
+from sobolev_batch.transform.faces import FaceArrays
 from sobolev_batch.transform.fourier import Execution, TransformSettings
 from sobolev_batch.transform.kinds import kind_of
 from sobolev_batch.transform.quadrature import RuleUse, assign_rules
@@ -256,7 +256,7 @@ def test_each_place_gets_the_weights_of_all_its_triangles(
 ) -> None:
     monkeypatch.setattr(quadrature, "_BITS", bits)  # few bits: vertices are numbered anew
     use = RuleUse(rule, 0, np.arange(len(mesh.triangles), dtype=np.uint32))
-    points = use.points((mesh.vertices, mesh.triangles, mesh.areas), CPU)
+    points = use.points(FaceArrays.of_mesh(mesh))
     # Each triangle on its own.
     places = np.einsum("qc,tci->tqi", rule.barycentric, mesh.vertices[mesh.triangles])
     waves = np.random.default_rng(0).normal(size=(3, 20))

@@ -35,6 +35,7 @@ from sobolev_batch.norms.tail.potentials import tail_integral
 from sobolev_batch.norms.tail.remainder import MOSTLY, Remainder, remainder
 from sobolev_batch.norms.tail.sampling import Octave, OctaveSampling
 from sobolev_batch.norms.tail.values import POINTS_PER_SQUARE, OctaveValues, SurfaceSize, octave_values
+from sobolev_batch.transform.fourier import Execution
 from sobolev_batch.transform.lattice import Lattice, OctaveLattice, SobolevWeights
 from sobolev_batch.transform.probe import estimate as estimate_from
 
@@ -474,7 +475,13 @@ def _finer_sampling(state: State, octave: MeasuredOctave, order: int, permitted:
 def _beyond(problem: Problem, cutoff: float, seed: int, points: int | None = None) -> Remainder:
     """Return what lies beyond a cutoff, from new points."""
     return remainder(
-        problem.surfaces, problem.signs, cutoff, problem.orders, points, seed=seed, threads=problem.threads
+        problem.surfaces,
+        problem.signs,
+        cutoff,
+        problem.orders,
+        points,
+        seed=seed,
+        execution=Execution(threads=problem.threads),
     )
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Self
 
@@ -25,8 +25,10 @@ from numpy.typing import NDArray
 from scipy.special import beta, betainc
 
 from sobolev_batch import compiled
-from sobolev_batch.arrays import Indices, Reals
+from sobolev_batch.arrays import Array, Indices, Reals
 from sobolev_batch.geometry.closed_forms import Sphere
+from sobolev_batch.transform.backends import CPU, Backend, combine, compute_on, sums_at
+from sobolev_batch.transform.fourier import ON_CPU, Execution
 from sobolev_batch.transform.lattice import smooth_step
 from sobolev_batch.transform.rules import symmetric_rule
 
@@ -51,6 +53,8 @@ _BATCH = 20_000
 # Where more than this share of all pairs is close, by a sample of so many points and triangles, a look at each takes a
 # tenth of the time of trees; and pairs that are looked at together, whose lists would else take gigabytes.
 _OFTEN_CLOSE, _SAMPLE, _PAIRS_AT_ONCE = 0.05, 256, 1 << 22
+# With fewer pairs, close or not, a GPU takes longer; pairs that it looks at, and computes, at a time: some 400 MB.
+_FEWEST_FOR_GPU, _PAIRS_ON_DEVICE, _BATCH_ON_DEVICE = 1 << 20, 1 << 23, 1 << 17
 
 
 def tail_nodes(cutoff: float, order: float) -> Iterator[tuple[float, Reals, Reals]]:
@@ -125,16 +129,21 @@ class Kernels:
         """The same kernels up to twice their reach, with twice the nodes."""
         return self.of_orders(self.cutoff, self.orders, 2 * self.fineness)
 
-    def looked_up(self, table: Reals, squares: Reals) -> Reals:
+    def on(self, backend: Backend) -> Kernels:
+        """The same kernels with their tables in arrays of a backend."""
+        tables = {name: backend.upload(getattr(self, name)) for name in ("totals", "drops", "values")}
+        return replace(self, **tables)
+
+    def looked_up(self, table: Array, squares: Array) -> Array:
         """Return a table's values at each d², (..., orders)."""
-        distances = np.sqrt(np.clip(squares, (_LEAST / self.cutoff) ** 2, self.reach**2))
-        places = np.minimum((_scale(distances, self.cutoff) - self.start) / self.step, len(table) - 1.0001)
+        squares = np.minimum(np.maximum(squares, (_LEAST / self.cutoff) ** 2), self.reach**2)
+        places = np.minimum((_scale(np.sqrt(squares), self.cutoff) - self.start) / self.step, len(table) - 1.0001)
         entries = np.where(places > 0, places, 0.0).astype(np.int64)  # NaN stays what it is
         low = table[entries]
-        return np.asarray(low + (places - entries)[..., None] * (table[entries + 1] - low))
+        return low + (places - entries)[..., None] * (table[entries + 1] - low)
 
 
-def _scale(distances: Reals, cutoff: float) -> Reals:
+def _scale(distances: Array, cutoff: float) -> Array:
     """Return where distances lie in the tables: in equal steps of log d at first, of d where kernels oscillate."""
     relative = distances * cutoff / _LINEAR_FROM
     return np.where(relative < 1, np.log(relative), relative - 1)
@@ -203,23 +212,59 @@ def seconds_of(pairs: float, orders: int) -> float:
 
 
 def add_of_triangles(
-    potentials: Reals, points: Reals, corners: Reals, sign: float, kernels: Kernels, threads: int = 1
+    potentials: Reals,
+    points: Reals,
+    corners: Reals,
+    sign: float,
+    kernels: Kernels,
+    execution: Execution = ON_CPU,
 ) -> int:
     """Add ∫ K(|x - y|) dy over triangles (m, 3, 3), times a sign, to potentials (n, orders) at points (n, 3).
 
     Return the number of pairs of a point and a triangle that are close enough to count.
     """
-    count = 0
+    backend = execution.backend if len(points) * len(corners) >= _FEWEST_FOR_GPU else CPU
+
+    def added(backend: Backend) -> tuple[Reals | None, int]:
+        return (None, 0) if backend is CPU else _on_device(points, corners, kernels, backend)
+
+    found, count = compute_on(backend, added)
+    if found is not None:
+        potentials += sign * found
+        return count
     for rows, columns in _close_pairs(points, corners, kernels.reach):
         count += len(rows)
         if compiled.pays(len(rows) * (_ON_ARRAYS[0] + _ON_ARRAYS[1] * len(kernels.totals))):
-            add_compiled(potentials, points, corners, (rows, columns), sign, kernels, threads)
+            add_compiled(potentials, points, corners, (rows, columns), sign, kernels, execution.threads)
             continue
         for start in range(0, len(rows), _BATCH):
             part = slice(start, start + _BATCH)
-            found = of_triangles(points[rows[part]], corners[columns[part]], kernels)
-            np.add.at(potentials, rows[part], sign * found)
+            np.add.at(potentials, rows[part], sign * of_triangles(points[rows[part]], corners[columns[part]], kernels))
     return count
+
+
+def _on_device(points: Reals, corners: Reals, kernels: Kernels, backend: Backend) -> tuple[Reals, int]:
+    """Return ∫ K(|x - y|) dy over all triangles (m, 3, 3) for points (n, 3), (n, orders), and the number of pairs.
+
+    A GPU looks at each pair in less time than it takes to upload what trees find.
+    """
+    centers, radii = centers_and_radii(corners)
+    kernels, farthest = kernels.on(backend), (kernels.reach + radii) ** 2
+    points, corners, centers, farthest = map(backend.upload, (points, corners, centers, farthest))
+    step, count = max(1, _PAIRS_ON_DEVICE // len(centers)), 0
+    totals = np.zeros((len(kernels.orders), len(points)), like=points)
+    for start in range(0, len(points), step):
+        here = points[start : start + step]
+        offsets = (here[:, axis][:, None] - centers[:, axis] for axis in range(3))
+        squares = sum(offset * offset for offset in offsets)
+        rows, columns = np.nonzero(squares < farthest)
+        count += len(rows)
+        for first in range(0, len(rows), _BATCH_ON_DEVICE):
+            part = slice(first, first + _BATCH_ON_DEVICE)
+            found = of_triangles(here[rows[part]], corners[columns[part]], kernels)
+            for order, total in enumerate(totals):
+                total[start : start + step] += sums_at(rows[part], found[:, order], len(here))
+    return np.ascontiguousarray(backend.download(totals).T), count
 
 
 def add_compiled(
@@ -260,65 +305,92 @@ def add_compiled(
         potentials += own
 
 
-def of_triangles(points: Reals, corners: Reals, kernels: Kernels) -> Reals:
-    """Return ∫ K(|x - y|) dy over a triangle for each pair of a point (n, 3) and a triangle (n, 3, 3), (n, orders)."""
-    corners = corners - points[:, None]
-    normals, doubled = doubled_normals(corners)
-    centers, radii = centers_and_radii(corners)
-    distances, fineness = np.sqrt(_squares(centers)), kernels.fineness
-    degrees = np.zeros(len(points), dtype=np.int64)
+def of_triangles(points: Array, corners: Array, kernels: Kernels) -> Array:
+    """Return ∫ K(|x - y|) dy over a triangle for each pair of a point (n, 3) and a triangle (n, 3, 3), (n, orders).
+
+    All arrays are of one backend, that of the kernels.
+    """
+    # Axes, corners, pairs.
+    rows = np.ascontiguousarray((corners - points[:, None]).T, like=points)
+    a, b, c = rows[:, 0], rows[:, 1], rows[:, 2]
+    normals, center = _crosses(b - a, c - a), (a + b + c) / 3
+    doubled, distances = np.sqrt(_dots(normals, normals)), np.sqrt(_dots(center, center))
+    arms = [corner - center for corner in (a, b, c)]
+    squares = [_dots(arm, arm) for arm in arms]
+    radii, fineness = np.sqrt(np.maximum(np.maximum(squares[0], squares[1]), squares[2])), kernels.fineness
+    degrees = np.zeros(len(points), dtype=np.int64, like=points)
     for degree, farthest, largest in _RULES:
-        is_far = radii < farthest / fineness * distances
-        degrees[is_far & (radii * kernels.cutoff < largest / fineness)] = degree
-    values, near = np.empty((len(points), len(kernels.totals))), degrees == 0
+        is_far = (radii < farthest / fineness * distances) & (radii * kernels.cutoff < largest / fineness)
+        degrees = np.where(is_far, degree, degrees)
+    values = np.empty((len(points), len(kernels.orders)), like=points)
     for degree, _, _ in _RULES:
-        here, rule = degrees == degree, symmetric_rule(degree)
-        at_nodes = kernels.looked_up(kernels.values, _squares(rule.barycentric @ corners[here]))
-        values[here] = doubled[here, None] / 2 * np.einsum("k,ikj->ij", rule.weights, at_nodes)
-    values[near] = _over_edges(corners[near], normals[near] / doubled[near, None], kernels)
+        here, rule = np.flatnonzero(degrees == degree), symmetric_rule(degree)
+        if len(here):
+            nodes = combine(rule.barycentric, np.ascontiguousarray(rows[:, :, here], like=points))
+            at_nodes = kernels.looked_up(kernels.values, _dots(nodes, nodes))
+            sums = combine(rule.weights, at_nodes.reshape(len(rule.weights), -1)).reshape(len(here), -1)
+            values[here] = (doubled[here] / 2)[:, None] * sums
+    near = np.flatnonzero(degrees == 0)
+    if len(near):
+        values[near] = _over_edges(rows[:, :, near], normals[:, near] / doubled[near], kernels)
     return values
 
 
-def _over_edges(corners: Reals, normals: Reals, kernels: Kernels) -> Reals:
-    """Return the potential at the origin of triangles (n, 3, 3) with these unit normals, by edges, (n, orders)."""
+def _over_edges(corners: Array, normals: Array, kernels: Kernels) -> Array:
+    """Return the potential at the origin of triangles (3, 3, n) with unit normals (3, n), by edges, (n, orders)."""
+    # Axes, edges, pairs.
     ends = np.roll(corners, -1, axis=1)
     along = ends - corners
-    along /= np.linalg.norm(along, axis=2, keepdims=True)
-    first, last = np.einsum("ijk,ijk->ij", corners, along), np.einsum("ijk,ijk->ij", ends, along)
-    offsets = np.einsum("ik,ijk->ij", normals, np.cross(corners, along))
-    heights = np.repeat(np.einsum("ij,ij->i", normals, corners[:, 0])[:, None], 3, axis=1)
+    along /= np.sqrt(_dots(along, along))
+    first, last = _dots(corners, along), _dots(ends, along)
+    offsets = _dots(normals[:, None], _crosses(corners, along))
+    heights = np.repeat(_dots(normals, corners[:, 0])[None], 3, axis=0)
     # From the foot on the line of an edge to both ends, or between the two where they are on one side of it.
-    one_side, lengths = first * last > 0, np.abs([first, last])
-    near = np.where(one_side, lengths.min(axis=0), 0.0)
-    spans = ((near, np.where(one_side, lengths.max(axis=0), lengths[1])), (0 * near, np.where(one_side, 0, lengths[0])))
-    parts = [_of_span(*(rows.ravel() for rows in (offsets, heights, *span)), kernels=kernels) for span in spans]
-    return np.asarray((parts[0] + parts[1]).reshape(len(corners), 3, len(kernels.totals)).sum(axis=1))
+    one_side, first, last = first * last > 0, np.abs(first), np.abs(last)
+    near = np.where(one_side, np.minimum(first, last), 0.0)
+    begins = np.concatenate([near, 0 * near])
+    far = np.concatenate([np.where(one_side, np.maximum(first, last), last), np.where(one_side, 0.0, first)])
+    offsets, heights = np.concatenate([offsets, offsets]), np.concatenate([heights, heights])
+    spans = (rows.ravel() for rows in (offsets, heights, begins, far))
+    return _of_span(*spans, kernels=kernels).reshape(6, corners.shape[2], -1).sum(axis=0)
 
 
-def _of_span(offsets: Reals, heights: Reals, near: Reals, far: Reals, *, kernels: Kernels) -> Reals:
+def _of_span(offsets: Array, heights: Array, near: Array, far: Array, *, kernels: Kernels) -> Array:
     """Return ∫ [M(h) - M(√(h² + q²/cos²θ))] dθ between two distances from the foot on an edge's line, (n, orders)."""
-    reach, squares = kernels.reach, heights**2
+    reach, squares = kernels.reach, heights * heights
     q = np.maximum(np.abs(offsets), _LEAST * reach)
     # Beyond the reach the integrand is constant.
-    farthest = np.sqrt(np.maximum(reach**2 - squares - q**2, 0.0))
+    farthest = np.sqrt(np.maximum(reach**2 - squares - q * q, 0.0))
     begin, end = np.minimum(near, farthest), np.minimum(far, farthest)
-    level, result = kernels.looked_up(kernels.drops, squares), np.zeros((len(q), len(kernels.totals)))
+    level = kernels.looked_up(kernels.drops, squares)
     outside = np.arctan2(far, q) - np.arctan2(end, q) - np.arctan2(near, q) + np.arctan2(begin, q)
-    result += outside[:, None] * (kernels.totals - level)
+    result = outside[:, None] * (kernels.totals - level)
     longest = _PANEL_WAVES / kernels.fineness / kernels.cutoff
     begun, last = (np.minimum(np.arcsinh(length / q), _LAST) for length in (begin, end))
     active = np.flatnonzero(last > begun)
     while len(active):
         low, here = begun[active], q[active]
         high = np.minimum(last[active], low + np.minimum(_PANEL / kernels.fineness, longest / (here * np.cosh(low))))
-        for node, weight in zip(*_PANEL_NODES, strict=True):
-            widening = np.cosh((low + high) / 2 + (high - low) / 2 * node)
-            distances = squares[active] + (here * widening) ** 2
-            terms = kernels.looked_up(kernels.drops, distances) - level[active]
-            result[active] += (weight / 2 * (high - low) / widening)[:, None] * terms
+        # Nodes, pairs.
+        nodes, weights = (np.asarray(row, like=q)[:, None] for row in _PANEL_NODES)
+        widening = np.cosh((low + high) / 2 + (high - low) / 2 * nodes)
+        along = here * widening
+        terms = kernels.looked_up(kernels.drops, squares[active] + along * along) - level[active]
+        result[active] += ((weights / 2 * (high - low) / widening)[..., None] * terms).sum(axis=0)
         begun[active] = high
-        active = active[high < last[active]]
-    return np.asarray(np.sign(offsets)[:, None] * result)
+        active = active[np.flatnonzero(high < last[active])]
+    return np.sign(offsets)[:, None] * result
+
+
+def _dots(first: Array, second: Array) -> Array:
+    """Return the products (...) of vectors (3, ...)."""
+    return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
+
+
+def _crosses(first: Array, second: Array) -> Array:
+    """Return the vector products (3, ...) of vectors (3, ...)."""
+    (ux, uy, uz), (vx, vy, vz) = first, second
+    return np.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx])
 
 
 def doubled_normals(corners: Reals) -> tuple[Reals, Reals]:

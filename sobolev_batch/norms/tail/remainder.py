@@ -38,6 +38,7 @@ from sobolev_batch.norms.tail.potentials import (
     tail_integral,
     tail_nodes,
 )
+from sobolev_batch.transform.fourier import ON_CPU, Execution
 
 # Random points of the first estimate: usually, at least, at most, and of a scale. Pairs of a point and a triangle that
 # they may take, and those of points from which nothing is hidden.
@@ -128,7 +129,7 @@ def remainder(
     orders: Sequence[float] = (),
     points: int | None = None,
     seed: int = 0,
-    threads: int = 1,
+    execution: Execution = ON_CPU,
     *,
     is_scale: bool = False,
 ) -> Remainder:
@@ -140,7 +141,7 @@ def remainder(
     """
     known = tuple(sorted({max(order, LOWEST_ORDER) for order in orders or _USUAL_ORDERS}, reverse=True))
     sheets = Sheets.from_surfaces(surfaces, signs, cutoff)
-    seen_by, rng = _Seen(sheets, Kernels.of_orders(cutoff, known), threads), np.random.default_rng(seed)
+    seen_by, rng = _Seen(sheets, Kernels.of_orders(cutoff, known), execution), np.random.default_rng(seed)
     if points is not None or is_scale:
         return _estimate(seen_by, points or _POINTS_OF_SCALES, rng, is_exact=not is_scale)
     found = _estimate(seen_by, seen_by.affordable(rng), rng)
@@ -198,7 +199,7 @@ class _Seen:
 
     sheets: Sheets
     kernels: Kernels
-    threads: int
+    execution: Execution
 
     @property
     def squared_reach(self) -> float:
@@ -226,7 +227,7 @@ class _Seen:
             for start in range(0, len(mesh.triangles), _HELD):
                 corners = mesh.vertices[mesh.triangles[start : start + _HELD]]
                 corners = corners[doubled_normals(corners)[1] > 0]
-                pairs += add_of_triangles(found, points, corners, sign, self.kernels, self.threads)
+                pairs += add_of_triangles(found, points, corners, sign, self.kernels, self.execution)
         for sphere, sign in self.sheets.spheres:
             found += sign * of_sphere(points, sphere, self.kernels)
         return found, pairs
@@ -238,7 +239,7 @@ class _Seen:
         """
         n, count = len(draw.points), min(_CONTROLS, len(draw.points))
         chosen = np.sort(rng.choice(n, count, replace=False))
-        finer = _Seen(self.sheets, self.kernels.finer, self.threads)
+        finer = _Seen(self.sheets, self.kernels.finer, self.execution)
         changes = finer.potentials(draw.points[chosen])[0] - potentials[chosen]
         changes *= n * (draw.weights * draw.own)[chosen, None]
         return changes.mean(axis=0), changes.std(axis=0, ddof=1) / np.sqrt(count) * quantile(count - 1)

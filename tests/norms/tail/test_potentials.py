@@ -10,6 +10,10 @@ from sobolev_batch.arrays import Reals
 from sobolev_batch.norms.tail import potentials
 from sobolev_batch.norms.tail.potentials import Kernels, add_compiled, of_triangles
 from sobolev_batch.norms.tail.remainder import remainder
+from sobolev_batch.shapes import icosphere
+from sobolev_batch.transform.backends import CPU
+from sobolev_batch.transform.fourier import Execution
+from tests.support.fake_device import device_of
 from tests.support.rectangles import Rectangles
 
 ORDERS = (-0.75, -1.0, -3.0)
@@ -48,6 +52,28 @@ def test_loops_and_arrays_agree(triangles: tuple[Reals, Reals], fineness: int) -
         found = np.zeros_like(by_arrays)
         add_compiled(found, points, corners, (rows, rows), 1.0, kernels, threads)
         assert np.allclose(found, by_arrays, rtol=0, atol=1e-11 * kernels.totals, equal_nan=True)
+
+
+@pytest.mark.parametrize("device", ["fake", "gpu"])
+def test_a_gpu_sees_what_the_processor_sees(
+    device: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    backend = device_of(device)
+    # Few of both: the batches that a device takes are small too.
+    for name, value in (("_FEWEST_FOR_GPU", 1), ("_PAIRS_ON_DEVICE", 40_000), ("_BATCH_ON_DEVICE", 5_000)):
+        monkeypatch.setattr(potentials, name, value)
+    sphere, kernels = icosphere(4), Kernels.of_orders(CUTOFF, ORDERS)
+    rng = np.random.default_rng(1)
+    points, corners = sphere.vertices[:30] + 0.01 * rng.normal(size=(30, 3)), sphere.vertices[sphere.triangles]
+    expected, found = np.zeros((2, 30, len(ORDERS)))
+    pairs = [
+        potentials.add_of_triangles(sums, points, corners, -1.0, kernels, Execution(each))
+        for sums, each in ((expected, CPU), (found, backend))
+    ]
+    assert np.allclose(found, expected, rtol=0, atol=1e-11 * kernels.totals)
+    assert pairs[0] == pairs[1] > 10_000
+    # Else the processor may have been compared with itself.
+    assert not caplog.records
 
 
 def test_the_kernel_of_an_order_does_not_depend_on_other_orders() -> None:

@@ -1,0 +1,63 @@
+"""The triangles of a mesh in arrays of a backend."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from sobolev_batch.arrays import Array, Indices
+from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.transform.backends import CPU, Backend
+
+# Triangles of a device at a time, whose temporaries take some 200 MB.
+_HELD = 1 << 19
+
+
+@dataclass(frozen=True, eq=False)
+class FaceArrays:
+    """Triangles in arrays of one backend, a row for each axis or corner.
+
+    Attributes:
+        columns: Coordinates of the vertices, float64 (3, n), in units of length.
+        corners: Indices of the vertices, int64 (3, m).
+        areas: Area of each triangle, float64 (m,), in squared units of length.
+        radii: Distance from the centroid of each triangle to its farthest corner, float64 (m,).
+    """
+
+    columns: Array
+    corners: Array
+    areas: Array
+    radii: Array
+    backend: Backend = CPU
+
+    @classmethod
+    def of_mesh(cls, mesh: Mesh, backend: Backend = CPU) -> Self:
+        """Return the triangles of a mesh on a backend."""
+        vertices, *others = (
+            backend.upload(array) for array in (mesh.vertices, mesh.triangles, mesh.areas, mesh.centroid_radii)
+        )
+        triangles, areas, radii = others
+        return cls(np.ascontiguousarray(vertices.T, like=vertices), triangles.T, areas, radii, backend)
+
+    def __len__(self) -> int:
+        return len(self.areas)
+
+    def part(self, which: slice | Indices) -> FaceArrays:
+        """Return some of the triangles, with all vertices, in contiguous rows."""
+        if not isinstance(which, slice):
+            which = self.backend.upload(which)
+        corners = np.ascontiguousarray(self.corners[:, which], like=self.corners)
+        return FaceArrays(self.columns, corners, self.areas[which], self.radii[which], self.backend)
+
+    def at(self, corner: int) -> Array:
+        """Return the coordinates (3, m) of one corner of each triangle."""
+        return np.take(self.columns, self.corners[corner], axis=1)
+
+    def batches(self, size: int) -> Iterator[FaceArrays]:
+        """Yield the triangles in batches: of a size on the processor, where temporaries stay in its cache."""
+        step = size if self.backend is CPU else _HELD
+        for start in range(0, len(self), step):
+            yield self.part(slice(start, start + step))
