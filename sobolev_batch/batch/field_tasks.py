@@ -49,6 +49,8 @@ _log = logging.getLogger(__name__)
 
 # Fraction of a field's error that each octave may have, inverted: the squares of some octaves' errors add up.
 _OCTAVES_SHARE = 5.0
+# The reference of the last task, by its fingerprint and scale: that of the next one, most likely.
+_reference: dict[tuple[str, Similarity], Surface] = {}
 
 
 @dataclass(frozen=True)
@@ -104,10 +106,17 @@ class Job:
         """Load the reference, in the study's unit; None where it is too large. See `load` for errors."""
         if self.reference is None:
             return None
+        key = self.reference.fingerprint, self.similarity
+        if (kept := _reference.get(key)) is not None:
+            return kept
+        _reference.clear()
         try:
-            return self._loaded(self.reference)
+            found = self._loaded(self.reference)
         except MeshError as error:
             raise MeshError(f"the reference: {error}") from error
+        if self.reference.fingerprint:
+            _reference[key] = found
+        return found
 
     def _loaded(self, row: Row) -> Surface:
         surface = self.similarity.apply(row.member.load())
@@ -115,17 +124,11 @@ class Job:
             raise MeshError("a file of it was changed while the study was going on; run the study again")
         return surface
 
-    def transform_settings(self, surface: Surface) -> TransformSettings:
-        """Return the settings of a field that is computed block by block, from its a priori error."""
-        if self.distance_target is None:
-            return self.transform
-        return choose_settings(surface, self.lattice, self.distance_target.error_target(surface), self.transform)
-
-    def octave_settings(self, surface: Surface) -> TransformSettings | ErrorTarget:
-        """Return the settings of a surface's transforms in octaves, or the target that they are to meet."""
-        if self.distance_target is None:
-            return self.transform
-        return self.distance_target.error_target(surface).tightened(_OCTAVES_SHARE)
+    def error_target(self, surface: Surface) -> ErrorTarget | None:
+        """Return the target for the errors of a surface's values; None where the settings alone count."""
+        if self.distance_target is None or kind_of(surface).is_closed_form:
+            return None
+        return self.distance_target.error_target(surface)
 
     def stored_record(self) -> Record | None:
         """Return the completion record of the field if it exists: Dask repeats tasks whose worker was lost."""
@@ -199,11 +202,14 @@ def compute_parts(job: Job, blocks: Sequence[Block] = (), octaves: bool = False)
         # Another worker that computes them again must write the same bytes.
         with compiled.by_itself():
             surface, stored = job.load(), []
+            target = job.error_target(surface)
             if blocks:
                 is_whole = tuple(blocks) == (job.lattice.half,)
-                stored.append(_store_whole(job, surface) if is_whole else _store_blocks(job, surface, blocks))
+                stored.append(
+                    _store_whole(job, surface, target) if is_whole else _store_blocks(job, surface, blocks, target)
+                )
             if octaves:
-                stored.append(_store_octaves(job, surface))
+                stored.append(_store_octaves(job, surface, target))
     except StoreError:
         raise
     except Exception as error:
@@ -217,14 +223,14 @@ def finish_mesh(job: Job, parts: Sequence[list[StoredBlocks] | Record]) -> Recor
     return record or _finished(job, [stored for part in parts if isinstance(part, list) for stored in part])
 
 
-def _store_octaves(job: Job, surface: Surface) -> StoredBlocks:
+def _store_octaves(job: Job, surface: Surface, target: ErrorTarget | None) -> StoredBlocks:
     """Compute and store a surface's values at all samples of octaves."""
     tail = job.tail
     if tail is None:
         raise ValueError("the study has no octaves")
     # Workers compute many of them.
     compiled.use()
-    settings = job.octave_settings(surface)
+    settings = target.tightened(_OCTAVES_SHARE) if target else job.transform
     values = [octave_values(surface, octave, job.orders, settings, job.execution) for octave in tail.octaves]
     cutoff, reference = tail.highest_frequency, job.load_reference()
     quality = TailQuality(
@@ -246,12 +252,11 @@ def _remainder_between(surface: Surface, reference: Surface, cutoff: float, exec
     return remainder(list(rests.values()), list(rests), cutoff, execution=execution)
 
 
-def _store_whole(job: Job, surface: Surface) -> StoredBlocks:
+def _store_whole(job: Job, surface: Surface, target: ErrorTarget | None) -> StoredBlocks:
     """Compute and store a field of one block."""
     lattice, transform, execution = job.lattice, job.transform, job.execution
-    if job.distance_target is not None and not kind_of(surface).is_closed_form:
-        error_target = job.distance_target.error_target(surface)
-        field = field_for(surface, lattice, error_target, transform, execution)
+    if target:
+        field = field_for(surface, lattice, target, transform, execution)
     else:
         field = compute_field(surface, lattice, transform, job.orders, execution)
     checksum = Fields(job.store).write(job.index, lattice.place(lattice.half), field.values)
@@ -259,10 +264,10 @@ def _store_whole(job: Job, surface: Surface) -> StoredBlocks:
     return StoredBlocks(facts, quality=field.quality, checksums=(checksum,), backends=(field.backend,))
 
 
-def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block]) -> StoredBlocks:
-    """Compute and store some of several blocks."""
+def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block], target: ErrorTarget | None) -> StoredBlocks:
+    """Compute and store some of several blocks, whose settings follow from their a priori error."""
     lattice, execution = job.lattice, job.execution
-    transform = job.transform_settings(surface)
+    transform = choose_settings(surface, lattice, target, job.transform) if target else job.transform
     plan = transform.plan(surface, lattice)
     draws = draws_for([surface], lattice, job.orders, plan.lowest_degree, COMMON)
     probes, backends, checksums, points = [], [], [], 0

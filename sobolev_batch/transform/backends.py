@@ -21,7 +21,6 @@ from typing import Any, ClassVar, Literal, Self, TypeVar
 
 import finufft
 import numpy as np
-from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Array, Reals
 from sobolev_batch.errors import BackendError, InputError, one_line
@@ -38,9 +37,9 @@ _OUT_OF_MEMORY, _INSUFFICIENT_DRIVER, _NO_DEVICE = 2, 35, 100
 # Methods of cuFINUFFT. Each block of threads gathers its cells of the grid in shared memory: on an H100, 3 to 15 times
 # as fast as what the library chooses by itself, which is shared memory or, for want of it, global memory.
 _OUTPUT_DRIVEN, _AUTOMATIC = 3, 0
-# Of the device's memory, for the plan that is kept while it is idle.
-_KEPT_FRACTION = 0.25
-_LARGE_BYTES, _PAGE_BYTES, _TOUCHING_THREADS = 1 << 23, 1 << 12, 4
+# Of the device's memory, for the plans that are kept while it is idle, and their number at most.
+_KEPT_FRACTION, _KEPT_PLANS = 0.25, 4
+_LARGE_BYTES, _PASSAGE_BYTES, _COPYING_THREADS = 1 << 22, 1 << 25, 4
 # Two threads cannot share a plan, and each of two transforms would find half of the memory.
 _DEVICE = threading.RLock()
 
@@ -168,9 +167,8 @@ class Gpu(Backend):
     cupy: Any
     cufinufft: Any
     runtime: Any
-    # The last plan of each type, what it is for, and the memory that it takes: the next surface of a study needs the
-    # same one.
-    _kept: dict[bool, tuple[object, Any, int]] = field(default_factory=dict, init=False, repr=False)
+    # The last plans with the memory that they take, by what they are for: the next surface of a study needs the same.
+    _kept: dict[object, tuple[Any, int]] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def load(cls) -> Self:
@@ -199,7 +197,7 @@ class Gpu(Backend):
     @property
     def free_bytes(self) -> int:
         """Device memory that a transform may take, including what is kept of freed arrays and of the last plan."""
-        kept = self.cupy.get_default_memory_pool().free_bytes() + sum(size for *_, size in self._kept.values())
+        kept = self.cupy.get_default_memory_pool().free_bytes() + sum(size for _, size in self._kept.values())
         return int(self.cupy.cuda.runtime.memGetInfo()[0] + kept)
 
     @contextmanager
@@ -227,18 +225,31 @@ class Gpu(Backend):
     def download(self, array: Array) -> Array:
         """Return a copy on the host, once everything before it is computed."""
         host = np.empty(array.shape, array.dtype)
-        _touch_pages(host)
-        return self.cupy.asnumpy(array, out=host)
+        if host.nbytes < _LARGE_BYTES:
+            return self.cupy.asnumpy(array, out=host)
+        # Through memory that a device writes to directly. Threads copy it, and touch new pages of the host, which the
+        # operating system provides only then: on an H200, half the time of a copy that waits for one after the other.
+        array = np.ascontiguousarray(array, like=array)
+        source, target = (rows.reshape(-1).view(np.uint8) for rows in (array, host))
+        passage = np.frombuffer(self.cupy.cuda.alloc_pinned_memory(_PASSAGE_BYTES), np.uint8, _PASSAGE_BYTES)
+        with ThreadPoolExecutor(_COPYING_THREADS) as pool:
+            for start in range(0, len(target), _PASSAGE_BYTES):
+                part = target[start : start + _PASSAGE_BYTES]
+                passed = self.cupy.asnumpy(source[start : start + len(part)], out=passage[: len(part)])
+                pieces = (np.array_split(rows, _COPYING_THREADS) for rows in (part, passed))
+                list(pool.map(np.copyto, *pieces))
+        return host
 
     def plan(self, spec: NufftSpec, *, adjoint: bool = False) -> Any:
         """Return a plan of cuFINUFFT with all of its options set, the last one where that will do; see `Backend.plan`.
 
         On a small lattice it takes longer to make one than to execute it.
         """
-        purpose = spec.shape, spec.eps, spec.dtype, spec.oversampling
-        if adjoint in self._kept and self._kept[adjoint][0] == purpose:
-            return self._kept[adjoint][1]
-        self._kept.pop(adjoint, None)
+        purpose = adjoint, spec.shape, spec.eps, spec.dtype, spec.oversampling
+        if purpose in self._kept:
+            return self._kept[purpose][0]
+        while len(self._kept) >= _KEPT_PLANS:
+            self._kept.pop(next(iter(self._kept)))
         memory = self.cupy.cuda.runtime.memGetInfo
         before, _ = memory()
         try:
@@ -249,8 +260,9 @@ class Gpu(Backend):
             # On some devices a wide kernel finds too little shared memory.
             made = self._new_plan(spec, adjoint, _AUTOMATIC)
         left, most = memory()
-        if before - left < _KEPT_FRACTION * most:
-            self._kept[adjoint] = purpose, made, before - left
+        taken = before - left
+        if sum(size for _, size in self._kept.values()) + taken < _KEPT_FRACTION * most:
+            self._kept[purpose] = made, taken
         return made
 
     def _new_plan(self, spec: NufftSpec, adjoint: bool, method: int) -> Any:
@@ -279,19 +291,6 @@ class Gpu(Backend):
 
     def __reduce__(self) -> tuple[object, ...]:
         return gpu_backend, ()
-
-
-def _touch_pages(array: NDArray[Any]) -> None:
-    """Have threads write to each page of new memory, which the operating system provides only then.
-
-    A copy would wait for one page after the other: on an H100, 170 ms instead of 80 for 580 MB.
-    """
-    if array.nbytes < _LARGE_BYTES:
-        return
-    parts = np.array_split(array.reshape(-1).view(np.uint8), _TOUCHING_THREADS)
-    with ThreadPoolExecutor(_TOUCHING_THREADS) as pool:
-        for part in parts:
-            pool.submit(part[::_PAGE_BYTES].fill, 0)
 
 
 def _module(name: str, title: str) -> ModuleType:

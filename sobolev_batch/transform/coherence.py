@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
 from sobolev_batch.arrays import Complexes, Indices, Reals
 from sobolev_batch.compiled import pays
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.transform.backends import CPU, combine, cosine_and_sine
+from sobolev_batch.transform.backends import CPU, Backend, combine, compute_on, cosine_and_sine
 from sobolev_batch.transform.faces import FaceArrays
 from sobolev_batch.transform.nufft_costs import NufftSpec
 
@@ -72,7 +72,7 @@ def _third_moments(faces: FaceArrays) -> tuple[Reals, float]:
     return found[:-1], float(found[-1])
 
 
-def coherence(mesh: Mesh, highest: float, faces: FaceArrays | None = None) -> Reals:
+def coherence(mesh: Mesh, highest: float, faces: FaceArrays | None = None, backend: Backend = CPU) -> Reals:
     """Return the squares of the largest sums of errors in 32 equal ranges of |ξ| up to the highest one (32,).
 
     They are relative to the sum of triangles that are all in phase, and zero where none exceeds the sums of random
@@ -92,7 +92,8 @@ def coherence(mesh: Mesh, highest: float, faces: FaceArrays | None = None) -> Re
     limit = highest / math.sqrt(3)
     count = math.ceil(2 * _PADDING * (float(np.abs(centers).max()) + length) * limit)
     points = np.concatenate([centers, *(centers + corners)], axis=1)
-    values = _transform(points * (2 * np.pi * limit / count), np.concatenate([-areas, np.tile(areas / 3, 3)]), count)
+    angles, weights = points * (2 * np.pi * limit / count), np.concatenate([-areas, np.tile(areas / 3, 3)])
+    values = compute_on(backend, partial(_transform, angles, weights, count))
     places, numbers, radii = _ranges(count)
     squares = np.square(np.abs(values.ravel()[places]) / (np.square(_PHASE * radii) / 4 * areas.sum())) / _MEAN_SQUARE
     largest = np.zeros(RANGES)
@@ -136,14 +137,16 @@ def _boxes(mesh: Mesh, low: Reals, side: float) -> Indices:
     return np.unique(numbers, return_inverse=True)[1]
 
 
-def _transform(angles: Reals, weights: Reals, count: int) -> Complexes:
+def _transform(angles: Reals, weights: Reals, count: int, backend: Backend) -> Complexes:
     """Return Σ w exp(-i k·x) of points x (3, n) for |k_x|, |k_y| and 0 <= k_z up to a count."""
     shape = 2 * count + 1, 2 * count + 1, count + 1
-    plan = CPU.plan(CPU.costs.with_oversampling(NufftSpec(shape, _EPS, "complex64"), len(weights)))
-    plan.setpts(*(np.ascontiguousarray(row, dtype=np.float32) for row in angles))
+    plan = backend.plan(backend.costs.with_oversampling(NufftSpec(shape, _EPS, "complex64"), len(weights)))
+    rows = [backend.upload(np.ascontiguousarray(row, dtype=np.float32)) for row in angles]
+    plan.setpts(*rows)
     # Modes of an axis of n samples start at -(n // 2).
     cosines, sines = cosine_and_sine((shape[2] // 2) * angles[2])
-    values: Complexes = plan.execute((weights * (cosines - 1j * sines)).astype(np.complex64))
+    strengths = (weights * (cosines - 1j * sines)).astype(np.complex64)
+    values: Complexes = backend.download(plan.execute(backend.upload(strengths)))
     return values
 
 

@@ -43,8 +43,8 @@ _FLATNESS = 1e-2
 _BATCH = {"cpu": 1 << 13, "gpu": 1 << 18}
 # Pairs of a triangle and a frequency for each pass: with fewer, calls of NumPy and CuPy take longer than their work.
 _PAIRS = {"cpu": 1 << 11, "gpu": 1 << 21}
-# With fewer pairs a GPU takes longer than the processor.
-_FEWEST_FOR_GPU = 1 << 15
+# With fewer pairs a GPU takes longer than compiled loops on the processor.
+_FEWEST_FOR_GPU = 1 << 21
 # Triangles at a time in compiled loops: the exponentials at their vertices stay in a processor's cache.
 _COMPILED_BATCH = 1 << 12
 # Compiled loops take frequencies in vectors of this many: 7 further ones would take three times as long as 8.

@@ -135,21 +135,15 @@ class _Triangles(SurfaceKind):
         """Rules of the triangles, which take four bytes for each."""
         return self._chosen()
 
-    def _chosen(self, faces: FaceArrays | None = None) -> tuple[RuleUse, ...]:
-        """Return the rules, with the help of a GPU that has the faces."""
+    def _chosen(self, backend: Backend = CPU) -> tuple[RuleUse, ...]:
         settings = self.highest_frequency, self.eps, self.quadrature, self.tolerance
-        return assign_rules(self.surface, *settings, faces)
+        faces = None if backend is CPU or self.triangles < _MANY_TRIANGLES else self.faces(backend)
+        return assign_rules(self.surface, *settings, faces, backend)
 
     def choose_points(self, backend: Backend) -> None:
-        if backend is CPU or "uses" in self.__dict__:
-            return
-
-        def chosen(backend: Backend) -> tuple[RuleUse, ...]:
-            faces = None if backend is CPU else self.faces(backend)
-            return self._chosen(faces if self.triangles >= _MANY_TRIANGLES else None)
-
-        # Other threads have the device meanwhile.
-        self.__dict__["uses"] = compute_on(backend, chosen, alone=False)
+        if backend is not CPU and "uses" not in self.__dict__:
+            # Other threads have the device meanwhile.
+            self.__dict__["uses"] = compute_on(backend, self._chosen, alone=False)
 
     def faces(self, backend: Backend) -> FaceArrays:
         """Return the triangles on a backend: on a device they stay for the next block."""

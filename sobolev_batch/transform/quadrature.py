@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Array, Indices, Reals
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.transform.backends import CPU, combine, sums_at, sums_of_runs
+from sobolev_batch.transform.backends import CPU, Backend, combine, sums_at, sums_of_runs
 from sobolev_batch.transform.faces import FaceArrays
 from sobolev_batch.transform.rule_errors import shares_vertices, tolerance_for
 from sobolev_batch.transform.rules import TriangleRule, choose_rules, fixed_rule, rule_ranges
@@ -107,16 +107,17 @@ def assign_rules(
     quadrature: str | int = "auto",
     tolerance: float | None = None,
     faces: FaceArrays | None = None,
+    backend: Backend = CPU,
 ) -> tuple[RuleUse, ...]:
     """Return the rules of all triangles up to a frequency: the prescribed one, or those that keep an error.
 
-    That is eps, of the whole mesh relative to its area, or a tolerance of each triangle relative to its own. A GPU that
-    has the faces helps.
+    That is eps, of the whole mesh relative to its area, or a tolerance of each triangle relative to its own. A GPU
+    helps, also with faces that it has.
     """
     fixed = fixed_rule(quadrature)
     if fixed is not None:
         return (RuleUse(fixed, 0, np.arange(len(mesh.triangles), dtype=np.uint32)),)
-    tolerance = tolerance_for(mesh, highest_frequency, eps, faces) if tolerance is None else tolerance
+    tolerance = tolerance_for(mesh, highest_frequency, eps, faces, backend) if tolerance is None else tolerance
     rules, ranges = rule_ranges(tolerance, shares_vertices(mesh))
     sizes = mesh.centroid_radii
     # Meshes have tens of millions of triangles: temporaries are small, and four bytes for each are kept.

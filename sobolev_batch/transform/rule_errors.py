@@ -11,7 +11,7 @@ import numpy as np
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.transform.backends import CPU, sums_at
+from sobolev_batch.transform.backends import CPU, Backend, sums_at
 from sobolev_batch.transform.coherence import RANGES, coherence, unpaired
 from sobolev_batch.transform.faces import FaceArrays
 from sobolev_batch.transform.lattice import FrequencyLattice
@@ -42,12 +42,16 @@ def loosest_tolerance(mesh: Mesh, lattice: FrequencyLattice, orders: Sequence[fl
     )
 
 
-def tolerance_for(mesh: Mesh, highest_frequency: float, eps: float, faces: FaceArrays | None = None) -> float:
+def tolerance_for(
+    mesh: Mesh, highest_frequency: float, eps: float, faces: FaceArrays | None = None, backend: Backend = CPU
+) -> float:
     """Return the largest tolerance of triangle rules with a predicted error of eps · area at most up to a frequency.
 
     It is eps at least. The errors of triangles that are small beside the wavelength cancel, unless pieces of the mesh
     repeat. Of icospheres, scans and random triangles the largest error was measured to be at most 0.8 eps, of arrays of
-    boxes, tetrahedra and spheres 0.6, and of two layers of opposite triangles 1.5. A GPU that has the faces helps.
+    boxes, tetrahedra and spheres 0.6, and of two layers of opposite triangles 1.5.
+
+    A GPU helps, also with faces that it has.
     """
     classes, shared = size_classes(mesh, faces), shares_vertices(mesh)
     radii, alike = highest_frequency * (np.arange(RANGES) + 1) / RANGES, unpaired(mesh, faces) ** 2
@@ -66,7 +70,7 @@ def tolerance_for(mesh: Mesh, highest_frequency: float, eps: float, faces: FaceA
     # Most coarse meshes keep eps even if all errors were in phase.
     if tolerance == eps or suffices(tolerance, whole):
         return tolerance
-    return _loosest(eps, partial(suffices, found=coherence(mesh, highest_frequency, faces)))
+    return _loosest(eps, partial(suffices, found=coherence(mesh, highest_frequency, faces, backend)))
 
 
 def _loosest(finest: float, suffices: Callable[[float], bool]) -> float:

@@ -75,7 +75,9 @@ def test_octaves_have_the_precision_that_their_own_accuracy_needs(store_path: Pa
             target = DistanceTarget((-2.0,), Accuracy(0.1), None, (distance,))
             both = replace(job, transform=TransformSettings(dtype=precision), distance_target=target)
             mesh = job.load()
-            assert settings_on(lattice, mesh, both.octave_settings(mesh)).dtype == expected
+            permitted = both.error_target(mesh)
+            assert permitted is not None
+            assert settings_on(lattice, mesh, permitted).dtype == expected
 
 
 def test_what_a_mesh_and_its_reference_cover_is_nothing_beyond_the_octaves(tmp_path: Path) -> None:

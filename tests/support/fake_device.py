@@ -121,6 +121,7 @@ class Device:
             ),
             memory=SimpleNamespace(OutOfMemoryError=OutOfMemoryError),
             Device=lambda number: nullcontext(),
+            alloc_pinned_memory=bytearray,
             Stream=SimpleNamespace(null=nullcontext()),
         )
         pool = SimpleNamespace(free_bytes=lambda: 0, free_all_blocks=lambda: None)
@@ -210,6 +211,9 @@ class Array(NDArrayOperatorsMixin):
 
     def ravel(self) -> Array:
         return self.reshape(-1)
+
+    def view(self, dtype: Any) -> Array:
+        return Array(self.device, self.host.view(dtype), self)
 
     def astype(self, dtype: Any, copy: bool = True) -> Array:
         return self if not copy and self.dtype == dtype else Array(self.device, self.host.astype(dtype))

@@ -20,7 +20,7 @@ from sobolev_batch import Lattice, Mesh, fourier_transform
 from sobolev_batch.errors import BackendError, InputError
 from sobolev_batch.norms.fields import compute_field, field_for
 from sobolev_batch.shapes import Sphere, icosphere
-from sobolev_batch.transform import backends, kinds
+from sobolev_batch.transform import backends, exact, kinds
 from sobolev_batch.transform.backends import CPU, Gpu, backend_named, gpu_backend, try_out
 from sobolev_batch.transform.exact import exact_transform, sampled_transform
 from sobolev_batch.transform.fourier import ErrorTarget, Execution, Transformed, TransformSettings, transform_block
@@ -186,11 +186,13 @@ def test_a_plan_serves_the_meshes_that_follow_until_memory_is_short() -> None:
         mesh = icosphere(level)
         assert_agree(on(backend, mesh), on(CPU, mesh), mesh)
     assert len(device.options) == 1
-    # Another accuracy needs another plan, and only one is kept.
-    kept = device.used
-    for settings in (ROUGH, DOUBLE):
-        on(backend, mesh, settings)
-    assert (len(device.options), device.used) == (3, kept)
+    # Other accuracies need other plans, of which the last ones are kept.
+    sizes = []
+    for eps in (1e-9, 3e-10, 1e-10, 3e-11, 1e-11, 1e-12, 1e-11, 3e-11):
+        on(backend, mesh, TransformSettings(eps))
+        sizes.append(device.used)
+    assert len(device.options) == 7
+    assert sizes[3:] == [sizes[3]] * 5
     # What is kept counts as free, and is given up for what needs the memory.
     assert backend.free_bytes > device.capacity - device.used
     backend.release_memory(device.capacity)
@@ -200,8 +202,11 @@ def test_a_plan_serves_the_meshes_that_follow_until_memory_is_short() -> None:
 # Close to the lattice's highest frequency, and where triangles span many waves.
 @pytest.mark.parametrize("device", ["fake", "gpu"])
 @pytest.mark.parametrize("highest", [0.05, 5.0, 80.0])
-def test_exact_transforms_agree(device: str, highest: float, caplog: pytest.LogCaptureFixture) -> None:
+def test_exact_transforms_agree(
+    device: str, highest: float, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     backend = device_of(device)
+    monkeypatch.setattr(exact, "_FEWEST_FOR_GPU", 1)
     mesh = MESHES["uneven"]
     frequencies = np.random.default_rng(0).uniform(-highest, highest, (32, 3))
     for transform in (exact_transform, partial(sampled_transform, threads=2)):
@@ -242,7 +247,10 @@ def test_edges_are_merged_alike(vertex_count: int) -> None:
     assert other_sums.host == pytest.approx(sums, rel=1e-14)
 
 
-def test_the_processor_computes_exact_transforms_where_a_gpu_fails(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_processor_computes_exact_transforms_where_a_gpu_fails(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(exact, "_FEWEST_FOR_GPU", 1)
     mesh, frequencies = icosphere(3), np.full((32, 3), 1.5)
     found = exact_transform(mesh, frequencies, Device(capacity=1e4).backend())
     assert np.array_equal(found, exact_transform(mesh, frequencies))

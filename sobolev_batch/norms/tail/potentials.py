@@ -53,8 +53,10 @@ _BATCH = 20_000
 # Where more than this share of all pairs is close, by a sample of so many points and triangles, a look at each takes a
 # tenth of the time of trees; and pairs that are looked at together, whose lists would else take gigabytes.
 _OFTEN_CLOSE, _SAMPLE, _PAIRS_AT_ONCE = 0.05, 256, 1 << 22
-# With fewer pairs, close or not, a GPU takes longer; pairs that it looks at, and computes, at a time: some 400 MB.
-_FEWEST_FOR_GPU, _PAIRS_ON_DEVICE, _BATCH_ON_DEVICE = 1 << 20, 1 << 23, 1 << 17
+# With fewer close pairs a GPU takes longer. Pairs that it looks at, and computes, at a time; and nodes of rules, and
+# pairs that take integrals over edges, at a time: some 300 MB each.
+_FEWEST_FOR_GPU, _PAIRS_ON_DEVICE, _BATCH_ON_DEVICE = 1 << 15, 1 << 23, 1 << 19
+_NODES_AT_ONCE, _NEAR_AT_ONCE = 1 << 20, 1 << 17
 
 
 def tail_nodes(cutoff: float, order: float) -> Iterator[tuple[float, Reals, Reals]]:
@@ -223,16 +225,18 @@ def add_of_triangles(
 
     Return the number of pairs of a point and a triangle that are close enough to count.
     """
-    backend = execution.backend if len(points) * len(corners) >= _FEWEST_FOR_GPU else CPU
+    centers, radii = centers_and_radii(corners)
+    share = _close_share(points, centers, kernels.reach + radii)
+    is_worth = share * len(points) * len(corners) >= _FEWEST_FOR_GPU
 
     def added(backend: Backend) -> tuple[Reals | None, int]:
-        return (None, 0) if backend is CPU else _on_device(points, corners, kernels, backend)
+        return (None, 0) if backend is CPU else _on_device(points, corners, centers, radii, kernels, backend)
 
-    found, count = compute_on(backend, added)
+    found, count = compute_on(execution.backend if is_worth else CPU, added)
     if found is not None:
         potentials += sign * found
         return count
-    for rows, columns in _close_pairs(points, corners, kernels.reach):
+    for rows, columns in _close_pairs(points, centers, radii, kernels.reach, share):
         count += len(rows)
         if compiled.pays(len(rows) * (_ON_ARRAYS[0] + _ON_ARRAYS[1] * len(kernels.totals))):
             add_compiled(potentials, points, corners, (rows, columns), sign, kernels, execution.threads)
@@ -243,12 +247,13 @@ def add_of_triangles(
     return count
 
 
-def _on_device(points: Reals, corners: Reals, kernels: Kernels, backend: Backend) -> tuple[Reals, int]:
+def _on_device(
+    points: Reals, corners: Reals, centers: Reals, radii: Reals, kernels: Kernels, backend: Backend
+) -> tuple[Reals, int]:
     """Return ∫ K(|x - y|) dy over all triangles (m, 3, 3) for points (n, 3), (n, orders), and the number of pairs.
 
     A GPU looks at each pair in less time than it takes to upload what trees find.
     """
-    centers, radii = centers_and_radii(corners)
     kernels, farthest = kernels.on(backend), (kernels.reach + radii) ** 2
     points, corners, centers, farthest = map(backend.upload, (points, corners, centers, farthest))
     step, count = max(1, _PAIRS_ON_DEVICE // len(centers)), 0
@@ -324,16 +329,19 @@ def of_triangles(points: Array, corners: Array, kernels: Kernels) -> Array:
         degrees = np.where(is_far, degree, degrees)
     values = np.empty((len(points), len(kernels.orders)), like=points)
     for degree, _, _ in _RULES:
-        here, rule = np.flatnonzero(degrees == degree), symmetric_rule(degree)
-        if len(here):
+        rule = symmetric_rule(degree)
+        for here in _pieces(np.flatnonzero(degrees == degree), _NODES_AT_ONCE // rule.size):
             nodes = combine(rule.barycentric, np.ascontiguousarray(rows[:, :, here], like=points))
-            at_nodes = kernels.looked_up(kernels.values, _dots(nodes, nodes))
-            sums = combine(rule.weights, at_nodes.reshape(len(rule.weights), -1)).reshape(len(here), -1)
-            values[here] = (doubled[here] / 2)[:, None] * sums
-    near = np.flatnonzero(degrees == 0)
-    if len(near):
+            at_nodes = kernels.looked_up(kernels.values, _dots(nodes, nodes)).reshape(rule.size, -1)
+            values[here] = (doubled[here] / 2)[:, None] * combine(rule.weights, at_nodes).reshape(len(here), -1)
+    for near in _pieces(np.flatnonzero(degrees == 0), _NEAR_AT_ONCE):
         values[near] = _over_edges(rows[:, :, near], normals[:, near] / doubled[near], kernels)
     return values
+
+
+def _pieces(numbers: Array, size: int) -> Iterator[Array]:
+    for start in range(0, len(numbers), size):
+        yield numbers[start : start + size]
 
 
 def _over_edges(corners: Array, normals: Array, kernels: Kernels) -> Array:
@@ -410,21 +418,27 @@ def centers_and_radii(corners: Reals) -> tuple[Reals, Reals]:
     return centers, np.sqrt(_squares(corners - centers[:, None]).max(axis=1))
 
 
-def _close_pairs(points: Reals, corners: Reals, reach: float) -> Iterator[tuple[Indices, Indices]]:
+def _close_share(points: Reals, centers: Reals, farthest: Reals) -> float:
+    """Return the share of pairs of a point and a triangle that are closer than some distances (m,), by a sample."""
+    some, which = slice(None, None, len(points) // _SAMPLE + 1), slice(None, None, len(centers) // _SAMPLE + 1)
+    return float(_are_close(points[some], centers[which], farthest[which]).mean())
+
+
+def _are_close(points: Reals, centers: Reals, farthest: Reals) -> NDArray[np.bool_]:
+    squares = sum((points[:, None, axis] - centers[:, axis]) ** 2 for axis in range(3))
+    return np.asarray(squares < farthest**2)
+
+
+def _close_pairs(
+    points: Reals, centers: Reals, radii: Reals, reach: float, share: float
+) -> Iterator[tuple[Indices, Indices]]:
     """Yield rows and columns of pairs of a point and a triangle that may be closer than a reach."""
     from scipy.spatial import KDTree
 
-    centers, radii = centers_and_radii(corners)
-
-    def is_close(some: Reals, which: slice) -> NDArray[np.bool_]:
-        squares = sum((some[:, None, axis] - centers[which, axis]) ** 2 for axis in range(3))
-        return np.asarray(squares < (reach + radii[which]) ** 2)
-
-    sample = is_close(points[:: len(points) // _SAMPLE + 1], slice(None, None, len(centers) // _SAMPLE + 1))
-    if sample.sum() > _OFTEN_CLOSE * sample.size:
+    if share > _OFTEN_CLOSE:
         step = max(1, _PAIRS_AT_ONCE // len(centers))
         for start in range(0, len(points), step):
-            rows, columns = np.nonzero(is_close(points[start : start + step], slice(None)))
+            rows, columns = np.nonzero(_are_close(points[start : start + step], centers, reach + radii))
             yield rows + start, columns
         return
     # Triangles of like size at a time.
