@@ -17,7 +17,7 @@ from scipy.special import beta, exprel, gamma, gammaln, kve, zeta
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Surface
-from sobolev_batch.transform.lattice import SobolevWeights
+from sobolev_batch.transform.lattice import STEP_MIDDLE, STEP_WIDTH, SobolevWeights
 
 # Both laws were measured on spheres, boxes, sticks and icospheres, near and far: the truncation was
 # 0.5 to 8 times, the aliasing 0.25 to 2 times the true loss.
@@ -212,7 +212,8 @@ def aliased(sums: Sums, weights: SobolevWeights, widths: Reals) -> Reals:
     """Estimate the contribution of images to the squared norm (orders, ...).
 
     A sum over a sublattice alone brings in further images, at fractions of the period. The change shows
-    their size. The kernel's decay from there to the full period gives the size of the remaining images.
+    their size. The kernel's decay from there to the full period gives the size of the remaining images. Under a step
+    the kernel has a tail in which it oscillates, and which may reach images that are not close: see `step_images`.
     """
     spacing = weights.lattice.spacing
     estimates = []
@@ -224,7 +225,22 @@ def aliased(sums: Sums, weights: SobolevWeights, widths: Reals) -> Reals:
         ]
         estimates.append(change * np.reshape(decay, (-1, *[1] * (change.ndim - 1))))
     largest: Reals = np.max(estimates, axis=0)
-    return ALIASING_CAUTION * largest
+    return ALIASING_CAUTION * largest + step_images(sums, weights, widths)
+
+
+def step_images(sums: Sums, weights: SobolevWeights, widths: Reals) -> Reals:
+    """Bound what the end of a step makes of images at the period in the squared norm (orders, ...); 0 without one.
+
+    An image at a distance d is ∫ step(r) (1 + r²)^s E(r) cos(2πrd) dr where all of the energy E belongs to faces
+    parallel to their images, and less where not. On scales above a unit of length, where the weight hardly falls, that
+    is what the fall of the step leaves: its width decides how fast it fades, and its middle how large it is.
+    """
+    if weights.cutoff is None:
+        return np.zeros_like(sums.totals)
+    distances, middle = image_distances(weights.lattice.spacing, widths), STEP_MIDDLE * weights.cutoff
+    lengths = np.exp(-((np.pi * STEP_WIDTH * weights.cutoff * distances) ** 2)) / (2 * np.pi * distances + 1 / middle)
+    factors = lengths.sum() * (1 + middle**2) ** np.array(weights.orders)
+    return np.asarray(np.multiply.outer(factors, np.abs(sums.outer[1])))
 
 
 def decay_to_period(spacing: float, order: float, widths: Reals) -> float:
@@ -238,14 +254,19 @@ def image_weight(spacing: float, order: float, widths: Reals, images: Reals = _P
 
     The spacing h is in cycles per unit length; the widths are those along `DIRECTIONS`; the images are n (..., 3).
     """
-    # The least distance of S to S + v is at least v·u - width(u), for every direction u.
-    offsets = np.abs(images @ DIRECTIONS.T) / spacing
-    distances = np.maximum((offsets - widths).max(axis=1), 0.0)
+    distances = image_distances(spacing, widths, images)
     # Above order -3/2 the kernel has no finite peak but the same decay: take the nearest order with one.
     nu = max(-order - 1.5, 0.25)
     logs = _bessel_logs(nu, distances) - gammaln(nu) - (nu - 1) * np.log(2)
     # Never exactly zero, so that ratios exist.
     return float(np.sum(np.maximum(np.exp(np.minimum(logs, 0.0)), 1e-280)))
+
+
+def image_distances(spacing: float, widths: Reals, images: Reals = _PERIOD) -> Reals:
+    """Return bounds on the least distances (n,) of surfaces to their images, from below; see `image_weight`."""
+    # The least distance of S to S + v is at least v·u - width(u), for every direction u.
+    offsets = np.abs(images @ DIRECTIONS.T) / spacing
+    return np.asarray(np.maximum((offsets - widths).max(axis=1), 0.0))
 
 
 def _bessel_logs(nu: float, distances: Reals) -> Reals:

@@ -37,6 +37,8 @@ _LOWEST_ORDER = -100.0
 STEP_START = 0.5
 # At the ends of the fall it is off by erfc(3)/2 = 1e-5, on both sides of the cut: a partition by steps stays one.
 _STEEPNESS = 3.0
+# It is erfc((|ξ| - middle)/width)/2, both as fractions of the cutoff.
+STEP_MIDDLE, STEP_WIDTH = (1 + STEP_START) / 2, (1 - STEP_START) / 2 / _STEEPNESS
 
 Axes = tuple[Reals, Reals, Reals]
 Orders = float | Sequence[float]
@@ -373,11 +375,10 @@ def smooth_step(radii: Reals, cutoff: float) -> Reals:
 
     Where a sharp cut would spoil it, the trapezoidal rule stays spectrally accurate.
     """
-    middle, width = (1 + STEP_START) / 2, (1 - STEP_START) / 2
     fractions = np.asarray(radii, dtype=np.float64) / cutoff
     steps = np.asarray(np.where(fractions <= STEP_START, 1.0, 0.0))
     on_step = (fractions > STEP_START) & (fractions < 1)
-    steps[on_step] = 0.5 * erfc(_STEEPNESS * (fractions[on_step] - middle) / width)
+    steps[on_step] = 0.5 * erfc((fractions[on_step] - STEP_MIDDLE) / STEP_WIDTH)
     return steps
 
 

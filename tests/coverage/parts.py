@@ -9,6 +9,7 @@ import numpy as np
 
 from sobolev_batch import Mesh
 from sobolev_batch.arrays import Reals
+from sobolev_batch.shapes import Sphere
 from tests.coverage.kinds import direction, rotation, small_amount
 from tests.coverage.truth import Pair
 from tests.support.rectangles import Rectangles
@@ -174,6 +175,21 @@ def _voxel_ball(count: int) -> Rectangles:
     return Rectangles.cells([np.linspace(-0.5, 0.5, count + 1)] * 3, (middles**2).sum(axis=0) <= (count / 2) ** 2)
 
 
+def large_norms(rng: np.random.Generator) -> Pair:
+    """Return a ball, a box, a square tube or two plates, turned, of 5 to 1,000 units of length, alone."""
+    scale, choice = float(np.exp(rng.uniform(*np.log([5.0, 1000.0])))), rng.random()
+    if choice < 0.4:
+        return Pair(Sphere(scale), Sphere(scale), alone=True)
+    sides = scale * (np.ones(3) if choice < 0.5 else rng.uniform(0.2, 1.0, size=3))
+    # The faces at both ends of one axis, of two, or all.
+    box, count = Rectangles.box((-sides / 2).tolist(), (sides / 2).tolist()), int(rng.choice([2, 4, 6]))
+    part, nothing = Rectangles(box.low[:count], box.high[:count]), Rectangles(box.low[:0], box.high[:0])
+    mesh = part.mesh()
+    if rng.random() < 0.7:
+        mesh = Mesh(mesh.vertices @ rotation(rng).T, mesh.triangles)
+    return Pair(mesh, mesh, (part, nothing), alone=True)
+
+
 PARTS: dict[str, Callable[[np.random.Generator], Pair]] = {
     "moved boxes": moved_boxes,
     "perforated plates": perforated_plates,
@@ -187,4 +203,5 @@ PARTS: dict[str, Callable[[np.random.Generator], Pair]] = {
     "layers": layers,
     "woven": woven,
     "corrugations": corrugations,
+    "large norms": large_norms,
 }

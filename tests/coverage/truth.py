@@ -72,7 +72,7 @@ class Pair:
     """Two surfaces.
 
     They may be made of axis-parallel `rectangles`, and `turned` and moved together; or be `equal`, one surface in
-    different triangles.
+    different triangles. Or the first one is `alone`, and its norm is asked for: of rectangles, the second are none.
     """
 
     first: Surface
@@ -80,6 +80,7 @@ class Pair:
     rectangles: tuple[Rectangles, Rectangles] | None = None
     turned: bool = False
     equal: bool = False
+    alone: bool = False
 
     @property
     def surfaces(self) -> tuple[Surface, Surface]:
@@ -95,12 +96,12 @@ class Pair:
         if self.rectangles is not None:
             return truths_of_rectangles(*self.rectangles, orders, turned=self.turned)
         if isinstance(self.first, Sphere) and isinstance(self.second, Sphere):
-            return truths_of_spheres(self.first, self.second, orders)
+            return truths_of_spheres(self.first, None if self.alone else self.second, orders)
         return truths_in_space(self.first, self.second, orders)
 
 
-def truths_of_spheres(first: Sphere, second: Sphere, orders: Sequence[float]) -> list[Truth]:
-    """Return the distance of two spheres for each order, by their heat trace; see `tests.support.rectangles`.
+def truths_of_spheres(first: Sphere, second: Sphere | None, orders: Sequence[float]) -> list[Truth]:
+    """Return the distance of two spheres, or the norm of one, by their heat trace; see `tests.support.rectangles`.
 
     At a distance r from the centre of a sphere of radius R, exp(-k²|x-y|²) has the mean
     [exp(-k²(r-R)²) - exp(-k²(r+R)²)] / (4k²rR) over it, k = π/√t. Over another sphere, r has a density in proportion
@@ -118,7 +119,8 @@ def truths_of_spheres(first: Sphere, second: Sphere, orders: Sequence[float]) ->
         return np.where(wide, outer, inner)
 
     traces, scales = np.zeros_like(TIMES), np.zeros_like(TIMES)
-    for (one, sign), (other, other_sign) in product(((first, 1.0), (second, -1.0)), repeat=2):
+    signed = [(first, 1.0)] if second is None else [(first, 1.0), (second, -1.0)]
+    for (one, sign), (other, other_sign) in product(signed, repeat=2):
         apart = math.dist(one.center, other.center)
         middle, half = max(apart, other.radius), min(apart, other.radius)
         means = mean_of_gaussian(one.radius, middle, half) - mean_of_gaussian(-one.radius, middle, half)

@@ -42,6 +42,9 @@ from sobolev_batch.transform.probe import estimate as estimate_from
 _ROUNDS, _MOST_OCTAVES = 6, 24
 # Fraction of the tail's share of the accuracy that is left to what lies beyond the last octave.
 _REMAINDER_FRACTION = 0.4
+# The same for a surface alone without octaves, which have no share then. Octaves of a large smooth one are sampled at
+# lattices whose images may all touch it at once, which their scatter tells little of.
+_ALONE_FRACTION = 0.9
 # How far off, relatively, other pairs may be beyond the octaves of a pilot: chosen, not derived.
 _OF_OTHERS = 1 / 8
 # Fraction of the permitted variance that may come from octaves that are not refined.
@@ -234,7 +237,9 @@ class State:
         values, errors = self.remainders[-1].at(self.problem.orders)
         if self.for_others:
             errors = np.maximum(errors, _OF_OTHERS * np.abs(values))
-        return float(np.max(errors / (_REMAINDER_FRACTION * self.permitted)))
+        is_alone = len(self.problem.surfaces) == 1 and not self.octaves
+        fraction = _ALONE_FRACTION if is_alone and not self.for_others else _REMAINDER_FRACTION
+        return float(np.max(errors / (fraction * self.permitted)))
 
     @property
     def rng(self) -> np.random.Generator:

@@ -25,6 +25,7 @@ from sobolev_batch.norms.budget import (
     Sums,
     Support,
     aliased,
+    image_distances,
     image_weight,
     truncated,
 )
@@ -54,6 +55,8 @@ _REACHABLE_MARGIN = 1.5
 _STEP = 1.04
 # Factor of the M of a lattice with octaves whose images are too large.
 FINER_LATTICE = 1.15
+# Wavelengths of the end of a step after which its images have faded to 3e-6 of the sum under it.
+_STEP_WAVES = 11.0
 # At this distance the kernel exp(-2πr) is below the smallest double.
 _VANISHED = 120.0
 
@@ -162,10 +165,17 @@ def first_lattice(support: Support, orders: Sequence[float], accuracy: Accuracy)
 def core_lattice(support: Support, orders: Sequence[float], accuracy: Accuracy) -> Lattice:
     """Return a small lattice whose period holds the surfaces and their images apart, for the innermost frequencies.
 
-    Octaves of larger lattices measure the rest, so that its M can be the same for every accuracy.
+    Octaves of larger lattices measure the rest, so that its M can be the same for every accuracy. In large units of
+    length not the kernel, but the step at its end decides how far apart images are to be: then it is finer.
     """
-    period, most = _first_period(support, orders, accuracy), min(_PILOT_M, accuracy.largest_intervals)
-    return lattice_of(_HIGHEST_FREQUENCY, period, most)
+    first, largest = _first_period(support, orders, accuracy), accuracy.largest_intervals
+    lattice = lattice_of(_HIGHEST_FREQUENCY, first, min(_PILOT_M, largest))
+    reach, periods = _STEP_WAVES / lattice.xi_max, accumulate(repeat(1.01), mul, initial=first)
+    period = next(period for period in periods if image_distances(1 / period, support.widths).min() >= reach)
+    if period == first:
+        return lattice
+    intervals = min(good_intervals(2 * lattice.xi_max * period), largest)
+    return Lattice(min(lattice.xi_max, intervals / (2 * period)), intervals)
 
 
 def lattice_of(highest: float, period: float, most: int) -> Lattice:

