@@ -14,23 +14,23 @@ def add_potentials(
     out: Reals,
     points: Reals,
     corners: Reals,
+    signs: Reals,
     rows: Indices,
     columns: Indices,
-    sign: float,
     tables: Any,
     panels: Any,
     limits: Reals,
     nodes: Reals,
     ends: Indices,
 ) -> None:
-    """Add the potential of each triangle, times a sign, at the point that it is paired with, to (n, orders).
+    """Add the potential of each triangle, times its sign, at the point that it is paired with, to (n, orders).
 
     The limits are those of `potentials`, farness and size for each rule, and the nodes those of all rules: barycentric
     coordinates and weight, from one of the ends to the next.
     """
     cutoff, values = tables[0], tables[6]
     for pair in range(len(rows)):
-        row, triangle = rows[pair], corners[columns[pair]]
+        row, triangle, sign = rows[pair], corners[columns[pair]], signs[columns[pair]]
         x, y, z = points[row, 0], points[row, 1], points[row, 2]
         ax, ay, az = triangle[0, 0] - x, triangle[0, 1] - y, triangle[0, 2] - z
         bx, by, bz = triangle[1, 0] - x, triangle[1, 1] - y, triangle[1, 2] - z

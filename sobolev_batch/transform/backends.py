@@ -21,6 +21,7 @@ from typing import Any, ClassVar, Literal, Self, TypeVar
 
 import finufft
 import numpy as np
+from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Array, Reals
 from sobolev_batch.errors import BackendError, InputError, one_line
@@ -39,7 +40,9 @@ _OUT_OF_MEMORY, _INSUFFICIENT_DRIVER, _NO_DEVICE = 2, 35, 100
 _OUTPUT_DRIVEN, _AUTOMATIC = 3, 0
 # Of the device's memory, for the plans that are kept while it is idle, and their number at most.
 _KEPT_FRACTION, _KEPT_PLANS = 0.25, 4
-_LARGE_BYTES, _PASSAGE_BYTES, _COPYING_THREADS = 1 << 22, 1 << 25, 4
+_LARGE_BYTES, _PAGE_BYTES, _TOUCHING_THREADS = 1 << 25, 1 << 12, 4
+# Sums among which the additions of a device are spread where there are few.
+_LANES = 1 << 14
 # Two threads cannot share a plan, and each of two transforms would find half of the memory.
 _DEVICE = threading.RLock()
 
@@ -81,9 +84,11 @@ def sums_at(places: Array, values: Array, length: int) -> Array:
     """
     if isinstance(values, np.ndarray):
         return np.bincount(places, weights=values, minlength=length)
-    sums = np.zeros(length, like=values)
-    np.add.at(sums, places, values)
-    return sums
+    # Threads that add to the same number wait for each other.
+    lanes = max(1, _LANES // length)
+    sums = np.zeros(length * lanes, like=values)
+    np.add.at(sums, places if lanes == 1 else places * lanes + np.arange(len(values), like=values) % lanes, values)
+    return sums if lanes == 1 else sums.reshape(length, lanes).sum(axis=1)
 
 
 def sums_of_runs(values: Array, starts: Array) -> Array:
@@ -225,20 +230,8 @@ class Gpu(Backend):
     def download(self, array: Array) -> Array:
         """Return a copy on the host, once everything before it is computed."""
         host = np.empty(array.shape, array.dtype)
-        if host.nbytes < _LARGE_BYTES:
-            return self.cupy.asnumpy(array, out=host)
-        # Through memory that a device writes to directly. Threads copy it, and touch new pages of the host, which the
-        # operating system provides only then: on an H200, half the time of a copy that waits for one after the other.
-        array = np.ascontiguousarray(array, like=array)
-        source, target = (rows.reshape(-1).view(np.uint8) for rows in (array, host))
-        passage = np.frombuffer(self.cupy.cuda.alloc_pinned_memory(_PASSAGE_BYTES), np.uint8, _PASSAGE_BYTES)
-        with ThreadPoolExecutor(_COPYING_THREADS) as pool:
-            for start in range(0, len(target), _PASSAGE_BYTES):
-                part = target[start : start + _PASSAGE_BYTES]
-                passed = self.cupy.asnumpy(source[start : start + len(part)], out=passage[: len(part)])
-                pieces = (np.array_split(rows, _COPYING_THREADS) for rows in (part, passed))
-                list(pool.map(np.copyto, *pieces))
-        return host
+        _touch_pages(host)
+        return self.cupy.asnumpy(array, out=host)
 
     def plan(self, spec: NufftSpec, *, adjoint: bool = False) -> Any:
         """Return a plan of cuFINUFFT with all of its options set, the last one where that will do; see `Backend.plan`.
@@ -291,6 +284,19 @@ class Gpu(Backend):
 
     def __reduce__(self) -> tuple[object, ...]:
         return gpu_backend, ()
+
+
+def _touch_pages(array: NDArray[Any]) -> None:
+    """Have threads write to each page of new memory, which the operating system provides only then.
+
+    A copy would wait for one page after the other: on an H100, 170 ms instead of 80 for 580 MB.
+    """
+    if array.nbytes < _LARGE_BYTES:
+        return
+    parts = np.array_split(array.reshape(-1).view(np.uint8), _TOUCHING_THREADS)
+    with ThreadPoolExecutor(_TOUCHING_THREADS) as pool:
+        for part in parts:
+            pool.submit(part[::_PAGE_BYTES].fill, 0)
 
 
 def _module(name: str, title: str) -> ModuleType:

@@ -120,27 +120,24 @@ def assign_rules(
     tolerance = tolerance_for(mesh, highest_frequency, eps, faces, backend) if tolerance is None else tolerance
     rules, ranges = rule_ranges(tolerance, shares_vertices(mesh))
     sizes = mesh.centroid_radii
+    factor, keys = 2 * np.pi * highest_frequency, np.empty(len(sizes), dtype=np.uint16)
+
+    def numbers(some: Reals) -> Indices:
+        """Return splits times the number of rules plus that of the rule, for radii."""
+        splits, choice = choose_rules(factor * some, ranges)
+        return splits * len(ranges) + choice
+
+    # Larger triangles have as many splits or more, and with as many the same rule or a later one.
+    low, high = numbers(np.array([sizes.min(), sizes.max()])).tolist()
+    if low == high:
+        return (RuleUse(rules[low % len(rules)], low // len(rules), np.arange(len(sizes), dtype=np.uint32)),)
     # Meshes have tens of millions of triangles: temporaries are small, and four bytes for each are kept.
-    keys = np.empty(len(sizes), dtype=np.uint16)
     for first in range(0, len(sizes), _TRIANGLES):
-        batch = slice(first, first + _TRIANGLES)
-        keys[batch] = _rule_numbers(2 * np.pi * highest_frequency * sizes[batch], ranges)
+        keys[first : first + _TRIANGLES] = numbers(sizes[first : first + _TRIANGLES])
     return tuple(
         RuleUse(rules[key % len(rules)], key // len(rules), np.flatnonzero(keys == key).astype(np.uint32))
         for key in np.flatnonzero(np.bincount(keys)).tolist()
     )
-
-
-def _rule_numbers(sizes: Reals, ranges: Reals) -> Indices:
-    """Return splits times the number of rules plus that of the rule, for sizes (n,), or (1,) where all are alike."""
-
-    def numbers(some: Reals) -> Indices:
-        splits, choice = choose_rules(some, ranges)
-        return splits * len(ranges) + choice
-
-    # Larger triangles have as many splits or more, and with as many the same rule or a later one.
-    extremes = numbers(np.array([sizes.min(), sizes.max()]))
-    return extremes[:1] if extremes[0] == extremes[1] else numbers(sizes)
 
 
 def _quarters(corners: _Corners) -> tuple[_Corners, _Corners, _Corners, _Corners]:

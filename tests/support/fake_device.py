@@ -35,7 +35,7 @@ FUNCTIONS = {
 UFUNCS = {
     "absolute", "add", "arcsinh", "arctan2", "bitwise_and", "bitwise_or", "cos", "cosh", "divide", "equal", "exp",
     "floor", "greater", "greater_equal", "invert", "left_shift", "less", "log", "maximum", "minimum", "multiply",
-    "negative", "not_equal", "right_shift", "rint", "sign", "sin", "sqrt", "subtract", "tan",
+    "negative", "not_equal", "remainder", "right_shift", "rint", "sign", "sin", "sqrt", "subtract", "tan",
 }  # fmt: skip
 # The fields of the options structure of cuFINUFFT 2.5.1.
 OPTIONS = {
@@ -121,7 +121,6 @@ class Device:
             ),
             memory=SimpleNamespace(OutOfMemoryError=OutOfMemoryError),
             Device=lambda number: nullcontext(),
-            alloc_pinned_memory=bytearray,
             Stream=SimpleNamespace(null=nullcontext()),
         )
         pool = SimpleNamespace(free_bytes=lambda: 0, free_all_blocks=lambda: None)
@@ -211,9 +210,6 @@ class Array(NDArrayOperatorsMixin):
 
     def ravel(self) -> Array:
         return self.reshape(-1)
-
-    def view(self, dtype: Any) -> Array:
-        return Array(self.device, self.host.view(dtype), self)
 
     def astype(self, dtype: Any, copy: bool = True) -> Array:
         return self if not copy and self.dtype == dtype else Array(self.device, self.host.astype(dtype))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
@@ -15,7 +15,7 @@ from sobolev_batch.geometry.closed_forms import Sphere
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.smooth import Interval, Smooth
 from sobolev_batch.geometry.surface import Surface
-from sobolev_batch.norms.tail.potentials import centers_and_radii
+from sobolev_batch.norms.tail.potentials import SignedTriangles, centers_and_radii
 from sobolev_batch.transform.resolution import resolution_of
 
 # Cells along each parameter that a smooth surface is replaced by: the most, and how many for a node of its transform.
@@ -84,6 +84,23 @@ class Sheets:
     def cancel(self) -> bool:
         """True where the sum has differences."""
         return len({sign for _, sign in (*self.meshes, *self.spheres)}) > 1
+
+    def triangles(self) -> Iterator[SignedTriangles]:
+        """Yield the triangles of the meshes: all at once, and once for all, where they are not many."""
+        if self._few is not None:
+            yield self._few
+            return
+        for mesh, sign in self.meshes:
+            for start in range(0, len(mesh.triangles), _HELD):
+                corners = mesh.vertices[mesh.triangles[start : start + _HELD]]
+                yield SignedTriangles.with_area(corners, sign)
+
+    @cached_property
+    def _few(self) -> SignedTriangles | None:
+        if not 0 < sum(len(mesh.triangles) for mesh, _ in self.meshes) <= _HELD:
+            return None
+        several = [SignedTriangles.with_area(mesh.vertices[mesh.triangles], sign) for mesh, sign in self.meshes]
+        return SignedTriangles.joined(several)
 
     @property
     def area(self) -> float:

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Self
 
 import numpy as np
@@ -213,49 +213,71 @@ def seconds_of(pairs: float, orders: int) -> float:
     return min(on_arrays, _START + loops)
 
 
+@dataclass(frozen=True, eq=False)
+class SignedTriangles:
+    """Triangles of a signed sum of surfaces: corners (m, 3, 3) in units of length, and the sign of each (m,)."""
+
+    corners: Reals
+    signs: Reals
+
+    @classmethod
+    def with_area(cls, corners: Reals, sign: float) -> Self:
+        """Return triangles of one sign, without those that have no area."""
+        corners = corners[doubled_normals(corners)[1] > 0]
+        return cls(corners, np.full(len(corners), float(sign)))
+
+    @classmethod
+    def joined(cls, several: Sequence[Self]) -> Self:
+        """Return all triangles of several."""
+        return cls(*(np.concatenate([getattr(one, name) for one in several]) for name in ("corners", "signs")))
+
+    @cached_property
+    def balls(self) -> tuple[Reals, Reals]:
+        """See `centers_and_radii`."""
+        return centers_and_radii(self.corners)
+
+
 def add_of_triangles(
-    potentials: Reals,
-    points: Reals,
-    corners: Reals,
-    sign: float,
-    kernels: Kernels,
-    execution: Execution = ON_CPU,
+    potentials: Reals, points: Reals, triangles: SignedTriangles, kernels: Kernels, execution: Execution = ON_CPU
 ) -> int:
-    """Add ∫ K(|x - y|) dy over triangles (m, 3, 3), times a sign, to potentials (n, orders) at points (n, 3).
+    """Add the integrals of K(|x - y|) over triangles, times their signs, to potentials (n, orders) at points (n, 3).
 
     Return the number of pairs of a point and a triangle that are close enough to count.
     """
-    centers, radii = centers_and_radii(corners)
-    share = _close_share(points, centers, kernels.reach + radii)
-    is_worth = share * len(points) * len(corners) >= _FEWEST_FOR_GPU
+    centers, radii = triangles.balls
+    share = _close_share(points, centers, kernels.reach + radii) if len(centers) else 0.0
+    is_worth = share * len(points) * len(centers) >= _FEWEST_FOR_GPU
 
     def added(backend: Backend) -> tuple[Reals | None, int]:
-        return (None, 0) if backend is CPU else _on_device(points, corners, centers, radii, kernels, backend)
+        return (None, 0) if backend is CPU else _on_device(points, triangles, kernels, backend)
 
     found, count = compute_on(execution.backend if is_worth else CPU, added)
     if found is not None:
-        potentials += sign * found
+        potentials += found
         return count
     for rows, columns in _close_pairs(points, centers, radii, kernels.reach, share):
         count += len(rows)
         if compiled.pays(len(rows) * (_ON_ARRAYS[0] + _ON_ARRAYS[1] * len(kernels.totals))):
-            add_compiled(potentials, points, corners, (rows, columns), sign, kernels, execution.threads)
+            add_compiled(potentials, points, triangles, (rows, columns), kernels, execution.threads)
             continue
         for start in range(0, len(rows), _BATCH):
-            part = slice(start, start + _BATCH)
-            np.add.at(potentials, rows[part], sign * of_triangles(points[rows[part]], corners[columns[part]], kernels))
+            row, column = rows[start : start + _BATCH], columns[start : start + _BATCH]
+            of_pairs = of_triangles(points[row], triangles.corners[column], kernels)
+            np.add.at(potentials, row, triangles.signs[column, None] * of_pairs)
     return count
 
 
-def _on_device(
-    points: Reals, corners: Reals, centers: Reals, radii: Reals, kernels: Kernels, backend: Backend
-) -> tuple[Reals, int]:
-    """Return ∫ K(|x - y|) dy over all triangles (m, 3, 3) for points (n, 3), (n, orders), and the number of pairs.
+def _on_device(points: Reals, triangles: SignedTriangles, kernels: Kernels, backend: Backend) -> tuple[Reals, int]:
+    """Return the integrals of K(|x - y|) over triangles for points (n, 3), (n, orders), and the number of pairs.
 
     A GPU looks at each pair in less time than it takes to upload what trees find.
     """
-    kernels, farthest = kernels.on(backend), (kernels.reach + radii) ** 2
-    points, corners, centers, farthest = map(backend.upload, (points, corners, centers, farthest))
+    centers, radii = triangles.balls
+    kernels, given = (
+        kernels.on(backend),
+        (points, triangles.corners, triangles.signs, centers, (kernels.reach + radii) ** 2),
+    )
+    points, corners, signs, centers, farthest = map(backend.upload, given)
     step, count = max(1, _PAIRS_ON_DEVICE // len(centers)), 0
     totals = np.zeros((len(kernels.orders), len(points)), like=points)
     for start in range(0, len(points), step):
@@ -265,19 +287,18 @@ def _on_device(
         rows, columns = np.nonzero(squares < farthest)
         count += len(rows)
         for first in range(0, len(rows), _BATCH_ON_DEVICE):
-            part = slice(first, first + _BATCH_ON_DEVICE)
-            found = of_triangles(here[rows[part]], corners[columns[part]], kernels)
+            row, column = rows[first : first + _BATCH_ON_DEVICE], columns[first : first + _BATCH_ON_DEVICE]
+            found = of_triangles(here[row], corners[column], kernels) * signs[column][:, None]
             for order, total in enumerate(totals):
-                total[start : start + step] += sums_at(rows[part], found[:, order], len(here))
+                total[start : start + step] += sums_at(row, found[:, order], len(here))
     return np.ascontiguousarray(backend.download(totals).T), count
 
 
 def add_compiled(
     potentials: Reals,
     points: Reals,
-    corners: Reals,
+    triangles: SignedTriangles,
     pairs: tuple[Indices, Indices],
-    sign: float,
     kernels: Kernels,
     threads: int,
 ) -> None:
@@ -298,7 +319,8 @@ def add_compiled(
     def add(part: slice) -> None:
         own = np.zeros_like(potentials) if threads > 1 else potentials
         rows, columns = pairs[0][part], pairs[1][part]
-        add_potentials(own, points, corners, rows, columns, sign, tables, panels, limits, nodes, ends)
+        faces = triangles.corners, triangles.signs
+        add_potentials(own, points, *faces, rows, columns, tables, panels, limits, nodes, ends)
         if threads > 1:
             sums.append(own)
 

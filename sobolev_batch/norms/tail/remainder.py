@@ -31,7 +31,6 @@ from sobolev_batch.norms.tail.potentials import (
     Kernels,
     add_of_triangles,
     centers_and_radii,
-    doubled_normals,
     of_sphere,
     reach_of,
     seconds_of,
@@ -58,8 +57,6 @@ _CUT, _CUT_FRACTION, _CUT_LEFT = 1e-3, 0.3, 2e-5
 # Points saw unevenly where the mean square of what they saw exceeds the square of the mean by this factor, and nothing
 # where it is this fraction of what a surface alone has.
 _UNEVEN, _NOTHING = 2.0, 1e-11
-# Triangles whose corners are held at a time.
-_HELD = 1 << 18
 # Orders between which the mean energy beyond a frequency is interpolated; those below the lowest are bounded by it, but
 # not beyond a cutoff where their weights hardly fall yet.
 _USUAL_ORDERS, LOWEST_ORDER = (-0.55, -0.7, -1.0, -1.5, -2.0, -2.5, -3.0), -4.0
@@ -228,11 +225,8 @@ class _Seen:
     def potentials(self, points: Reals) -> tuple[Reals, int]:
         """Return the potentials (n, orders) at points (n, 3), and the number of pairs of a point and a triangle."""
         found, pairs = np.zeros((len(points), len(self.kernels.totals))), 0
-        for mesh, sign in self.sheets.meshes:
-            for start in range(0, len(mesh.triangles), _HELD):
-                corners = mesh.vertices[mesh.triangles[start : start + _HELD]]
-                corners = corners[doubled_normals(corners)[1] > 0]
-                pairs += add_of_triangles(found, points, corners, sign, self.kernels, self.execution)
+        for triangles in self.sheets.triangles():
+            pairs += add_of_triangles(found, points, triangles, self.kernels, self.execution)
         for sphere, sign in self.sheets.spheres:
             found += sign * of_sphere(points, sphere, self.kernels)
         return found, pairs

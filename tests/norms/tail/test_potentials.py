@@ -8,7 +8,7 @@ import pytest
 from sobolev_batch import Mesh
 from sobolev_batch.arrays import Reals
 from sobolev_batch.norms.tail import potentials
-from sobolev_batch.norms.tail.potentials import Kernels, add_compiled, of_triangles
+from sobolev_batch.norms.tail.potentials import Kernels, SignedTriangles, add_compiled, of_triangles
 from sobolev_batch.norms.tail.remainder import remainder
 from sobolev_batch.shapes import icosphere
 from sobolev_batch.transform.backends import CPU
@@ -50,7 +50,8 @@ def test_loops_and_arrays_agree(triangles: tuple[Reals, Reals], fineness: int) -
     assert np.nanmax(np.abs(by_arrays)) > 0
     for threads in (1, 2):
         found = np.zeros_like(by_arrays)
-        add_compiled(found, points, corners, (rows, rows), 1.0, kernels, threads)
+        faces = SignedTriangles(corners, np.ones(len(corners)))
+        add_compiled(found, points, faces, (rows, rows), kernels, threads)
         assert np.allclose(found, by_arrays, rtol=0, atol=1e-11 * kernels.totals, equal_nan=True)
 
 
@@ -65,9 +66,10 @@ def test_a_gpu_sees_what_the_processor_sees(
     sphere, kernels = icosphere(4), Kernels.of_orders(CUTOFF, ORDERS)
     rng = np.random.default_rng(1)
     points, corners = sphere.vertices[:30] + 0.01 * rng.normal(size=(30, 3)), sphere.vertices[sphere.triangles]
+    triangles = SignedTriangles(corners, rng.choice([-1.0, 1.0], len(corners)))
     expected, found = np.zeros((2, 30, len(ORDERS)))
     pairs = [
-        potentials.add_of_triangles(sums, points, corners, -1.0, kernels, Execution(each))
+        potentials.add_of_triangles(sums, points, triangles, kernels, Execution(each))
         for sums, each in ((expected, CPU), (found, backend))
     ]
     assert np.allclose(found, expected, rtol=0, atol=1e-11 * kernels.totals)
@@ -134,11 +136,11 @@ def test_a_look_at_each_pair_finds_what_trees_find(cutoff: float, monkeypatch: p
     rng, kernels = np.random.default_rng(3), Kernels.of_orders(cutoff, ORDERS)
     points = rng.random((300, 3))
     corners = rng.random((400, 1, 3)) + 10.0 ** rng.uniform(-3, 0, (400, 1, 1)) * rng.normal(size=(400, 3, 3))
-    found = []
+    triangles, found = SignedTriangles(corners, np.ones(400)), []
     monkeypatch.setattr(potentials, "_PAIRS_AT_ONCE", 5000)
     for share in (0.0, 1.0):
         monkeypatch.setattr(potentials, "_OFTEN_CLOSE", share)
         sums = np.zeros((300, len(ORDERS)))
-        found.append((potentials.add_of_triangles(sums, points, corners, 1.0, kernels), sums))
+        found.append((potentials.add_of_triangles(sums, points, triangles, kernels), sums))
     assert found[0][0] == found[1][0] > 1000
     np.testing.assert_allclose(found[0][1], found[1][1], rtol=1e-9, atol=1e-12)
