@@ -174,6 +174,7 @@ class Gpu(Backend):
     runtime: Any
     # The last plans with the memory that they take, by what they are for: the next surface of a study needs the same.
     _kept: dict[object, tuple[Any, int]] = field(default_factory=dict, init=False, repr=False)
+    _own: threading.local = field(default_factory=threading.local, init=False, repr=False)
 
     @classmethod
     def load(cls) -> Self:
@@ -210,6 +211,15 @@ class Gpu(Backend):
         """Reserve the device for one thread, and select it with its default stream."""
         with _DEVICE, self.cupy.cuda.Device(0), self.cupy.cuda.Stream.null:
             yield
+
+    @contextmanager
+    def beside(self) -> Iterator[None]:
+        """Select a stream of this thread, which does not wait for what others compute; it is done in the end."""
+        if not hasattr(self._own, "stream"):
+            self._own.stream = self.cupy.cuda.Stream(non_blocking=True)
+        with self.cupy.cuda.Device(0), self._own.stream as stream:
+            yield
+            stream.synchronize()
 
     def release_memory(self, projected_bytes: float) -> None:
         """Give back what is kept if less is free: cuFINUFFT allocates outside of CuPy's pool."""
@@ -343,7 +353,7 @@ def compute_on(backend: Backend, compute: Callable[[Backend], Result], *, alone:
     """
     if isinstance(backend, Gpu):
         try:
-            with backend.work() if alone else nullcontext():
+            with backend.work() if alone else backend.beside():
                 return compute(backend)
         except Exception as error:  # CUDA's errors have no common base
             _log.warning("the GPU fails: %s; the processor computes it instead", one_line(error)[:200])

@@ -63,6 +63,22 @@ class CUDARuntimeError(RuntimeError):
         self.status = status
 
 
+class _Stream:
+    null: Any = nullcontext()
+
+    def __init__(self, non_blocking: bool) -> None:
+        assert non_blocking, "it would wait for the others"
+
+    def __enter__(self) -> _Stream:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def synchronize(self) -> None:
+        pass
+
+
 @dataclass(eq=False)
 class Device:
     """The device: its bytes of memory, the options of each plan, and what is to go wrong.
@@ -121,7 +137,7 @@ class Device:
             ),
             memory=SimpleNamespace(OutOfMemoryError=OutOfMemoryError),
             Device=lambda number: nullcontext(),
-            Stream=SimpleNamespace(null=nullcontext()),
+            Stream=_Stream,
         )
         pool = SimpleNamespace(free_bytes=lambda: 0, free_all_blocks=lambda: None)
         calls = {"asarray": self.upload, "asnumpy": _copied}
