@@ -70,7 +70,7 @@ bench: $(READY)  ## time it against the paper's pipeline, print the table of rat
 
 gpu: $(READY)  ## where there is a GPU: its tests, and its times into storage/gpu.md
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[gpu,bench]'
-	$(BIN)/python -m pytest -rs tests/transform/test_backends.py tests/batch/cluster/test_gpus.py
+	$(BIN)/python -m pytest -rs tests/transform/test_backends.py tests/norms/tail/test_potentials.py tests/batch/cluster/test_gpus.py
 	$(BIN)/python -m benchmarks --only 9 --repeats 20 --markdown storage/gpu.md
 
 docs: $(READY)  ## the API from its docstrings and the pages of docs/, as HTML in site/

@@ -201,6 +201,9 @@ def compute_parts(job: Job, blocks: Sequence[Block] = (), octaves: bool = False)
     try:
         # Another worker that computes them again must write the same bytes.
         with compiled.by_itself():
+            if job.tail is not None:
+                # Octaves take long enough for loops to pay.
+                compiled.use()
             surface, stored = job.load(), []
             target = job.error_target(surface)
             if blocks:
@@ -228,8 +231,6 @@ def _store_octaves(job: Job, surface: Surface, target: ErrorTarget | None) -> St
     tail = job.tail
     if tail is None:
         raise ValueError("the study has no octaves")
-    # Workers compute many of them.
-    compiled.use()
     settings = target.tightened(_OCTAVES_SHARE) if target else job.transform
     values = [octave_values(surface, octave, job.orders, settings, job.execution) for octave in tail.octaves]
     cutoff, reference = tail.highest_frequency, job.load_reference()

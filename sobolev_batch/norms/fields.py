@@ -18,7 +18,6 @@ from sobolev_batch.geometry.surface import Extent, Surface
 from sobolev_batch.norms.tail.remainder import Remainder
 from sobolev_batch.transform.backends import backend_named
 from sobolev_batch.transform.fourier import (
-    FINEST_EPS,
     ON_CPU,
     ErrorTarget,
     Execution,
@@ -30,6 +29,7 @@ from sobolev_batch.transform.fourier import (
 )
 from sobolev_batch.transform.kinds import kind_of
 from sobolev_batch.transform.lattice import AXES, Block, Lattice, Orders, SobolevWeights, check_orders, shell_sums
+from sobolev_batch.transform.nufft_costs import FINEST_EPS
 from sobolev_batch.transform.probe import COMMON, Probe, Sample, draws_for, needs_probe, norms_of_checks, probe_block
 
 Operand = Surface | xr.DataArray

@@ -14,7 +14,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from types import ModuleType
 from typing import Any, ClassVar, Literal, Self, TypeVar
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Array, Reals
 from sobolev_batch.errors import BackendError, InputError, one_line
-from sobolev_batch.transform.nufft_costs import CPU_COSTS, GPU_COSTS, Costs, NufftSpec
+from sobolev_batch.transform.nufft_costs import CPU_COSTS, FINEST_EPS, GPU_COSTS, Costs, NufftSpec
 
 Result = TypeVar("Result")
 
@@ -248,6 +248,8 @@ class Gpu(Backend):
 
         On a small lattice it takes longer to make one than to execute it.
         """
+        # The accuracies of the meshes of a study differ a little.
+        spec = replace(spec, eps=max(10.0 ** math.floor(math.log10(spec.eps)), FINEST_EPS[spec.dtype]))
         purpose = adjoint, spec.shape, spec.eps, spec.dtype, spec.oversampling
         if purpose in self._kept:
             return self._kept[purpose][0]

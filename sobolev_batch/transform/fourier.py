@@ -28,6 +28,7 @@ from sobolev_batch.transform.nufft import transform_points
 from sobolev_batch.transform.nufft_costs import (
     CPU_COSTS,
     DEFAULT_BATCH,
+    FINEST_EPS,
     Costs,
     NufftSpec,
     Workload,
@@ -37,8 +38,6 @@ from sobolev_batch.transform.rule_errors import weight_masses
 from sobolev_batch.transform.rules import fixed_rule
 
 DEFAULT_EPS: dict[ComplexDtype, float] = {"complex128": 1e-9, "complex64": 1e-6}
-# The limits of FINUFFT: below them 2.5 warns, and 2.6 refuses.
-FINEST_EPS: dict[ComplexDtype, float] = {"complex128": 1e-14, "complex64": 2e-7}
 COARSEST_EPS = 0.1
 # OpenMP crashes with very many.
 _MOST_THREADS = 1024

@@ -31,8 +31,9 @@ from sobolev_batch.norms.fields import (
     quality_of,
 )
 from sobolev_batch.transform.backends import backend_named
-from sobolev_batch.transform.fourier import FINEST_EPS, Execution, TransformSettings, thread_count
+from sobolev_batch.transform.fourier import Execution, TransformSettings, thread_count
 from sobolev_batch.transform.lattice import Lattice, Orders, SobolevWeights, check_orders, shell_sums, single_order
+from sobolev_batch.transform.nufft_costs import FINEST_EPS
 
 # The derivative is computed twice, the second time with an eps smaller by this factor, which is the one reported.
 _REFINEMENT = 30.0

@@ -30,8 +30,9 @@ from sobolev_batch.norms.budget import (
     truncated,
 )
 from sobolev_batch.norms.estimate import NormEstimate
-from sobolev_batch.transform.fourier import FINEST_EPS, TransformSettings, projected_bytes
+from sobolev_batch.transform.fourier import TransformSettings, projected_bytes
 from sobolev_batch.transform.lattice import LARGEST_M, Lattice, SobolevWeights
+from sobolev_batch.transform.nufft_costs import FINEST_EPS
 
 # Fraction of the accuracy for aliasing; the rest is for truncation and the fields' own errors.
 _ALIASING_FRACTION = 0.1
