@@ -49,7 +49,9 @@ _log = logging.getLogger(__name__)
 
 # Fraction of a field's error that each octave may have, inverted: the squares of some octaves' errors add up.
 _OCTAVES_SHARE = 5.0
-# The reference of the last task, by its fingerprint and scale: that of the next one, most likely.
+# The reference of the last task, by its fingerprint and scale: that of the next one, most likely. With more triangles
+# it would take much of a worker's memory.
+_KEPT_TRIANGLES = 1 << 20
 _reference: dict[tuple[str, Similarity], Surface] = {}
 
 
@@ -114,7 +116,7 @@ class Job:
             found = self._loaded(self.reference)
         except MeshError as error:
             raise MeshError(f"the reference: {error}") from error
-        if self.reference.fingerprint:
+        if self.reference.fingerprint and kind_of(found).triangles <= _KEPT_TRIANGLES:
             _reference[key] = found
         return found
 
