@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Reals
+from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms.tail.sampling import OctaveSampling
 from sobolev_batch.transform.backends import Backend
@@ -36,6 +37,8 @@ _POINT_SECONDS, _SAMPLE_SECONDS = 2e-7, 1e-7
 _LOOP_SECONDS, _ARRAY_SECONDS, _START_SECONDS = 3e-9, 4.5e-8, 0.15
 # Quadrature points for each square of half a wavelength, and for each triangle at least.
 POINTS_PER_SQUARE, _POINTS_PER_TRIANGLE = 4.0, 1.5
+# Area of an equilateral triangle over the squared distance of its corners from the centroid.
+_EQUILATERAL = 0.75 * math.sqrt(3)
 # What a frequency costs beside its triangles, in triangles.
 _OVERHEAD_TRIANGLES = 50
 # Draws of an octave, for the time that one of them takes.
@@ -142,17 +145,27 @@ def _compared(
 
 @dataclass(frozen=True)
 class SurfaceSize:
-    """Size of a surface, on which the processor time of its transforms depends: area in squared units of length."""
+    """Size of a surface, on which the processor time of its transforms depends.
+
+    Attributes:
+        triangles: Number of triangles.
+        extent: Area in squared units of length; of triangles, if they were equilateral with the same distance from
+            centroid to farthest corner, since long ones take points like those.
+        is_closed_form: True if transforms take no points.
+    """
 
     triangles: int
-    area: float
+    extent: float
     is_closed_form: bool = False
 
     @classmethod
     def from_surface(cls, surface: Surface) -> Self:
         """Return the size of a surface."""
         kind = kind_of(surface)
-        return cls(kind.triangles, surface.area, kind.is_closed_form)
+        extent = (
+            _EQUILATERAL * float(np.square(surface.centroid_radii).sum()) if isinstance(surface, Mesh) else surface.area
+        )
+        return cls(kind.triangles, extent, kind.is_closed_form)
 
     @property
     def draw_seconds(self) -> float:
@@ -182,8 +195,8 @@ class SurfaceSize:
         seconds = _SAMPLE_SECONDS * lattice.half.size
         if self.is_closed_form:
             return seconds
-        of_area = POINTS_PER_SQUARE * self.area * (2 * lattice.highest) ** 2
-        return seconds + _POINT_SECONDS * max(_POINTS_PER_TRIANGLE * self.triangles, of_area)
+        of_extent = POINTS_PER_SQUARE * self.extent * (2 * lattice.highest) ** 2
+        return seconds + _POINT_SECONDS * max(_POINTS_PER_TRIANGLE * self.triangles, of_extent)
 
     def _exact_seconds(self, lattice: OctaveLattice) -> float:
         return self._seconds_at(math.pi / 12 * lattice.M**3) if self.triangles else math.inf

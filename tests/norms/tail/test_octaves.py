@@ -14,11 +14,11 @@ from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms.tail.face_normals import FaceNormals
 from sobolev_batch.norms.tail.integrals import OctaveSums, OctaveWeights, integral_over, squared_moduli
 from sobolev_batch.norms.tail.sampling import Octave, OctaveSampling, TailSampling
-from sobolev_batch.norms.tail.values import OctaveValues, octave_values
+from sobolev_batch.norms.tail.values import OctaveValues, SurfaceSize, octave_values
 from sobolev_batch.shapes import Sphere, Torus, icosphere
 from sobolev_batch.transform.exact import exact_transform
-from sobolev_batch.transform.fourier import ErrorTarget
-from sobolev_batch.transform.lattice import smooth_step
+from sobolev_batch.transform.fourier import ErrorTarget, TransformSettings
+from sobolev_batch.transform.lattice import OctaveLattice, smooth_step
 from sobolev_batch.transform.spheres import sphere_transform
 from tests.support.oracles import torus_value
 from tests.support.rectangles import Rectangles
@@ -203,3 +203,16 @@ def test_samples_follow_from_the_seed_differ_in_each_octave_and_survive_storage(
         assert np.array_equal(same.weights, first.weights)
     offsets = [one.lattices[0].offset for one in first.octaves]
     assert offsets[0] != offsets[1]
+
+
+@pytest.mark.parametrize(("count", "is_exact"), [(1, False), (100, True)])
+def test_long_triangles_take_points_like_large_ones(count: int, is_exact: bool) -> None:
+    # A square cut into strips: each takes as many points as the whole.
+    y = np.arange(count + 1) / count
+    vertices = np.stack([np.repeat([0.0, 1.0], count + 1), np.tile(y, 2), np.zeros(2 * count + 2)], axis=1)
+    i = np.arange(count)
+    across, beyond = i + 1 + count, i + 2 + count
+    square = Mesh(vertices, np.concatenate([np.stack([i, across, beyond], 1), np.stack([i, beyond, i + 1], 1)]))
+    lattice = OctaveLattice.random(40.0, 160.0, 64, np.random.default_rng(0))
+    assert (TransformSettings(1e-3).plan(square, lattice).expected_points > 1e6) == is_exact
+    assert SurfaceSize.from_surface(square).prefers_exact(lattice) == is_exact
