@@ -161,10 +161,9 @@ class SurfaceSize:
     @classmethod
     def from_surface(cls, surface: Surface) -> Self:
         """Return the size of a surface."""
-        kind = kind_of(surface)
-        extent = (
-            _EQUILATERAL * float(np.square(surface.centroid_radii).sum()) if isinstance(surface, Mesh) else surface.area
-        )
+        kind, extent = kind_of(surface), surface.area
+        if isinstance(surface, Mesh):
+            extent = _EQUILATERAL * float(np.square(surface.centroid_radii).sum())
         return cls(kind.triangles, extent, kind.is_closed_form)
 
     @property
