@@ -66,6 +66,7 @@ class Problem:
         pair: Surfaces that a distance is between, with what they share; empty for a norm.
         signs: Signs of the surfaces in the difference.
         apart: What the product of two surfaces that are far apart does not exceed (orders,); None for others.
+        is_clipped: False where what both cover of flat faces is not left out yet.
         moved: Norm (orders,) that faces which were taken out do not exceed, as they are apart by a rounding of files.
         notify: Called with a line about each step.
     """
@@ -79,19 +80,31 @@ class Problem:
     pair: Sequence[Surface] = ()
     signs: Sequence[int] = (1, -1)
     apart: Reals | None = None
+    is_clipped: bool = True
     moved: Reals | float = 0.0
     notify: Callable[[str], object] = str
 
     @classmethod
     def from_surfaces(
-        cls, surfaces: Sequence[Surface], orders: tuple[float, ...], accuracy: Accuracy, label: str, threads: int
+        cls,
+        surfaces: Sequence[Surface],
+        orders: tuple[float, ...],
+        accuracy: Accuracy,
+        label: str,
+        threads: int,
+        *,
+        most_clipped: float = np.inf,
     ) -> Self:
         """Return the problem for surfaces, moved to the centre, without what both have; none may remain.
 
-        Those that are far apart stay where they are, since a common move would cost digits.
+        Those that are far apart stay where they are, since a common move would cost digits. Flat faces stay as they are
+        where two meshes have more triangles than are to be clipped, beside those that are the same in both.
         """
-        different, pair = without_common_parts(surfaces), tuple(surfaces) if len(surfaces) == _PAIR else ()
+        different, pair = _without_shared_triangles(surfaces), tuple(surfaces) if len(surfaces) == _PAIR else ()
         settings = orders, accuracy, label, threads
+        if _triangles_to_clip(different) > most_clipped:
+            return replace(cls._between(different, pair, *settings), is_clipped=False)
+        different = _without_common_faces(different)
         problem = cls._between(different, pair, *settings)
         meshes = [surface for surface in different.values() if isinstance(surface, Mesh)]
         rounding = _rounding(pair)
@@ -275,6 +288,10 @@ def are_equal(a: Surface, b: Surface) -> bool:
 
 def without_common_parts(surfaces: Sequence[Surface]) -> Mapping[int, Surface]:
     """Return one surface, or what two do not have in common, by their signs in the difference."""
+    return _without_common_faces(_without_shared_triangles(surfaces))
+
+
+def _without_shared_triangles(surfaces: Sequence[Surface]) -> Mapping[int, Surface]:
     meshes = [surface for surface in surfaces if isinstance(surface, Mesh)]
     if len(meshes) < _PAIR:
         return dict(zip((1, -1), surfaces, strict=False))
@@ -284,10 +301,17 @@ def without_common_parts(surfaces: Sequence[Surface]) -> Mapping[int, Surface]:
             Mesh.from_checked(mesh.vertices, np.ascontiguousarray(mesh.triangles[~in_both]))
             for mesh, in_both in zip(meshes, shared, strict=True)
         ]
-    rests = [mesh if len(mesh.triangles) and mesh.area > 0 else None for mesh in meshes]
-    if rests[0] is not None and rests[1] is not None:
-        rests = list(rests_of(rests[0], rests[1]).meshes)
-    return _signed(rests)
+    return _signed([mesh if len(mesh.triangles) and mesh.area > 0 else None for mesh in meshes])
+
+
+def _without_common_faces(different: Mapping[int, Surface]) -> Mapping[int, Surface]:
+    meshes = [surface for surface in different.values() if isinstance(surface, Mesh)]
+    return different if len(meshes) < _PAIR else _signed(rests_of(meshes[0], meshes[1]).meshes)
+
+
+def _triangles_to_clip(different: Mapping[int, Surface]) -> int:
+    counts = [len(surface.triangles) for surface in different.values() if isinstance(surface, Mesh)]
+    return sum(counts) if len(counts) == _PAIR else 0
 
 
 def _signed(rests: Sequence[Mesh | None]) -> Mapping[int, Surface]:

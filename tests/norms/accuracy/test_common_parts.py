@@ -11,9 +11,12 @@ from scipy.special import gamma
 from scipy.stats import special_ortho_group
 
 import sobolev_batch as sb
+from sobolev_batch.geometry.overlap import Rests, rests_of
 from sobolev_batch.geometry.subdivision import icosphere, subdivided
+from sobolev_batch.norms.accuracy import problem as problems
 from sobolev_batch.norms.accuracy.problem import Problem, are_equal
 from sobolev_batch.norms.accuracy.solve import solve
+from sobolev_batch.norms.accuracy.threshold import relative_distance
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
 from sobolev_batch.norms.budget import norm_of_moves
 from tests.support.rectangles import Rectangles
@@ -75,6 +78,39 @@ def test_only_what_differs_is_computed() -> None:
     assert problem.signs == (1,)
     assert boss.area == pytest.approx(BOSS.mesh().area, rel=1e-10)
     assert [surface.area for surface in problem.pair] == pytest.approx([second.area, first.area])
+
+
+def test_many_faces_are_clipped_only_where_a_lattice_leaves_a_verdict_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    clipped: list[int] = []
+
+    def counted(first: sb.Mesh, second: sb.Mesh) -> Rests:
+        clipped.append(len(first.triangles) + len(second.triangles))
+        return rests_of(first, second)
+
+    def judged(surface: sb.Mesh, reference: sb.Mesh, order: float) -> tuple[float, float, str]:
+        clipped.clear()
+        bounds, method = relative_distance(surface, reference, order, 1e-3, Accuracy(1e-3), 2, 0)
+        return bounds.lower, bounds.upper, method
+
+    monkeypatch.setattr(problems, "rests_of", counted)
+    ball = icosphere(3)
+    few, many = cut_anew(ball, 1), cut_anew(subdivided(ball), 2)
+    lower, upper, method = judged(many, few, -4.0)
+    assert (lower, method, clipped) == (0.0, "lattice", [])
+    assert 0 < upper <= 1e-3
+    # A lattice cannot tell at a high order that two surfaces are the same, nor in any unit of length.
+    assert judged(many, few, -1.0) == (0.0, 0.0, "identical")
+    assert clipped == [len(many.triangles) + len(few.triangles)]
+    huge = [sb.Mesh(1e60 * mesh.vertices, mesh.triangles) for mesh in (many, few)]
+    assert judged(huge[0], huge[1], -4.0) == (0.0, 0.0, "identical")
+    # Few are clipped at once.
+    assert judged(subdivided(ball), few, -4.0) == (0.0, 0.0, "identical")
+    # What differs is told from the whole surfaces.
+    lost, left = (sb.Mesh(ball.vertices, ball.triangles[part]) for part in (slice(13), slice(13, None)))
+    lower, upper, method = judged(cut_anew(subdivided(left), 3), few, -4.0)
+    truth = float(sb.norm(lost, -4.0, rtol=1e-3)["norm"] / sb.norm(ball, -4.0, rtol=1e-3)["norm"])
+    assert 1e-3 < lower <= truth <= upper
+    assert (method, clipped) == ("lattice", [])
 
 
 def test_edits_far_apart_on_one_part_are_no_surfaces_far_apart() -> None:
