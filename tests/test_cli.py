@@ -322,6 +322,25 @@ def test_what_mesh_files_hold(folder: Path) -> None:
     assert f"{opened['boundary_edges']} open edges" in shown
 
 
+@pytest.mark.parametrize(
+    ("turned", "doubled", "reason"),
+    [
+        (3, 0, "normals flip"),
+        (0, 1, "edges have more than two triangles"),
+        (3, 1, "edges have more than two triangles and normals flip"),
+    ],
+)
+def test_why_a_closed_mesh_has_no_volume(folder: Path, turned: int, doubled: int, reason: str) -> None:
+    whole = ball(1)
+    triangles = whole.triangles.copy()
+    triangles[:turned] = triangles[:turned, ::-1]
+    sb.write_mesh(
+        sb.Mesh(whole.vertices, np.concatenate([triangles, triangles[40 : 40 + doubled]])), folder / "odd.off"
+    )
+    shown = output("info", "odd.off", folder=folder)
+    assert re.findall(r", volume (.*)$", shown, re.M) == [f"none: {reason}"]
+
+
 def test_an_error_is_no_difference(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object, **__: object) -> None:
         raise RuntimeError("broken")
@@ -347,8 +366,10 @@ REFUSED = [
     ("run study.toml --only ico/11 --store none.zarr", "is 'ico/11'; did you mean ico/1?"),
     ("run greedy.toml", "memory of 1.0PB is more than there is"),
     ("run lacking.toml --store none.zarr", "matches no file"),
-    ("status nothing.zarr", "it holds no store of a study"),
-    ("unlock nothing.zarr", "it holds no store of a study"),
+    ("status nothing.zarr", "nothing.zarr: it does not exist"),
+    ("unlock nothing.zarr", "nothing.zarr: it does not exist"),
+    ("status taken", "taken: it holds no store of a study"),
+    ("status 1.off", "1.off: it holds no store of a study"),
     (f"table smallest {STORE} --below much", "found 'much'"),
     (f"table {STORE} --order -0.4", "below -1/2, found -0.4"),
     ("compare a.ply b.ply", "a.ply: cannot be read"),
@@ -389,7 +410,7 @@ def test_wrong_input_gives_one_line_or_the_usage_and_status_2(folder: Path, line
 def test_a_process_ends_in_the_same_way(folder: Path) -> None:
     done = command("status", "nothing.zarr", folder=folder)
     assert (done.returncode, done.stdout) == (2, "")
-    assert re.match(r"^error: .*it holds no store of a study.*\n$", done.stderr)
+    assert re.match(r"^error: nothing.zarr: it does not exist\n$", done.stderr)
     assert "Traceback" in command("--debug", "status", "nothing.zarr", folder=folder).stderr
 
 

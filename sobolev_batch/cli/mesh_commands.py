@@ -21,6 +21,12 @@ if TYPE_CHECKING:
     from sobolev_batch.geometry.mesh import Mesh
 
 # Exit statuses of a verdict; like diff, which has 1 for files that differ.
+# Why a mesh has no volume, by the edges that it has.
+_NO_VOLUME = {
+    "boundary_edges": "it is not closed",
+    "nonmanifold_edges": "edges have more than two triangles",
+    "inconsistent_edges": "normals flip",
+}
 _STATUSES = {"same": 0, "within": 0, "different": 1, "not within": 1, "undecided": 4}
 
 
@@ -154,7 +160,8 @@ def _fact_lines(facts: Mapping[str, Any]) -> Iterator[str]:
     digits = 6 + math.ceil(math.log10(max(1.0, *(max(-low, high) / size for _, low, high in ends))))
     box = ", ".join(f"{axis} {low:.{digits}g} to {high:.{digits}g}" for axis, low, high in ends)
     extents = " by ".join(f"{high - low:.6g}" for _, low, high in ends)
-    volume = "none: it is not closed" if math.isnan(facts["volume"]) else f"{facts['volume']:.6g}"
+    reasons = " and ".join(reason for key, reason in _NO_VOLUME.items() if facts[key])
+    volume = f"none: {reasons}" if math.isnan(facts["volume"]) else f"{facts['volume']:.6g}"
     yield f"{facts['file']}: {facts['triangles']:,} triangles, {facts['vertices']:,} vertices"
     yield f"  area {facts['area']:.6g}, volume {volume}"
     yield f"  box {box}: {extents}"

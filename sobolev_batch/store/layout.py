@@ -154,7 +154,8 @@ class Store:
         StoreError where it is the other one of the two, unless None allows both.
         """
         if not self.exists() or self.documents[""].get("node_type") != "group":
-            raise StoreError(f"{self.path}: it holds no store of a study")
+            problem = "it does not exist" if self.location.is_absent() else "it holds no store of a study"
+            raise StoreError(f"{self.path}: {problem}")
         attributes: dict[str, Any] = self.documents[""].get("attributes", {})
         if self.is_unfinished:
             raise StoreError(

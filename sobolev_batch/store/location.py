@@ -158,6 +158,10 @@ class Location:
         """Return whether the location is a local folder that exists."""
         return not self.scheme and Path(self.name).is_dir()
 
+    def is_absent(self) -> bool:
+        """Return whether the location is a local path at which there is nothing."""
+        return not self.scheme and not os.path.lexists(self.name)
+
     def discard(self, *keys: str) -> None:
         """Remove keys, those of them that exist."""
         with self.access("written"), suppress(NotADirectoryError):

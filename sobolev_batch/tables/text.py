@@ -75,17 +75,17 @@ def bound(fraction: float) -> str:
     return f"{_shown(rounded, _magnitude(rounded) - 1)} %"
 
 
-def between(lower: float, upper: float, unit: str = "") -> str:
-    """Return two bounds with four digits, as one number where rounding parts them; the upper one may be unknown.
+def between(lower: float, upper: float, unit: str = "", digits: int = 4) -> str:
+    """Return two bounds with some digits, as one number where rounding parts them; the upper one may be unknown.
 
     >>> between(0.33312, 0.33519, " mm"), between(0.25, 0.25), between(0.25, math.nan)
     ('0.3331 to 0.3352 mm', '0.25', '≥ 0.2500')
     """
     if math.isnan(upper):
-        return f"≥ {rounded_outwards(lower, lower, 4)[0]}{unit}"
+        return f"≥ {rounded_outwards(lower, lower, digits)[0]}{unit}"
     if math.isclose(lower, upper):
-        return f"{lower:.4g}{unit}"
-    low, high = rounded_outwards(lower, upper, 4)
+        return f"{lower:.{digits}g}{unit}"
+    low, high = rounded_outwards(lower, upper, digits)
     return f"{low} to {high}{unit}"
 
 

@@ -12,6 +12,8 @@ from sobolev_batch.geometry.proximity import share_beyond
 from sobolev_batch.parameters import length_in
 from sobolev_batch.tables.text import between, percent
 
+# Digits of bounds and of the length, at least.
+_DIGITS, _LENGTH_DIGITS = 4, 6
 # Digits of places: of their largest coordinate, or of the deviation where that is larger.
 _PLACE_DIGITS = 6
 # Fraction of the largest coordinate below which a deviation is rounding.
@@ -45,13 +47,21 @@ class DeviationVerdict:
 
     def __str__(self) -> str:
         """Return the answer with the bounds and the place, and the share of the area beyond the length."""
-        length = f"{self.length:.6g}{f' {self.unit}' if self.unit else ''}"
+        length = f"{self.length:.{max(_LENGTH_DIGITS, self._digits)}g}{f' {self.unit}' if self.unit else ''}"
         answer = f"undecided whether within {length}" if self.outcome == "undecided" else f"{self.outcome} {length}"
         beyond = "" if self.outcome == "within" else f"; {percent(*self.beyond)} of the area is farther away"
         largest = self.deviations.both
         if self.outcome == "not within" and largest.upper > _CLOSE * largest.lower:
             largest = replace(largest, upper=math.nan)
-        return f"{answer}: largest deviation {deviation_text(largest, self.unit)}{beyond}"
+        return f"{answer}: largest deviation {deviation_text(largest, self.unit, self._digits)}{beyond}"
+
+    @property
+    def _digits(self) -> int:
+        """Digits of bounds: as many as tell the lower one from a length that it is above."""
+        lower = self.deviations.both.lower
+        if self.outcome != "not within":
+            return _DIGITS
+        return max(_DIGITS, 2 + math.floor(math.log10(lower)) - math.floor(math.log10(lower - self.length)))
 
 
 def judge_deviation(a: MeshLike, b: MeshLike, length: float | str, unit: str | None = None) -> DeviationVerdict:
@@ -99,7 +109,7 @@ def assert_within(a: MeshLike, b: MeshLike, length: float | str, *, unit: str | 
     return verdict.deviations
 
 
-def deviation_text(deviation: Deviation, unit: str | None) -> str:
+def deviation_text(deviation: Deviation, unit: str | None, digits: int = _DIGITS) -> str:
     """Return the bounds of a deviation with their unit, the upper one where it is known, and the place."""
     # What rounding makes of zero is small against the deviation.
     largest = max(*map(abs, deviation.place), deviation.lower)
@@ -108,4 +118,4 @@ def deviation_text(deviation: Deviation, unit: str | None) -> str:
     place = ", ".join(f"{round(x, decimals) + 0.0:.{_PLACE_DIGITS}g}" for x in deviation.place)
     # Coordinates have no digits for less.
     bounds = (0.0, 0.0) if deviation.upper <= _ROUNDING * largest else (deviation.lower, deviation.upper)
-    return f"{between(*bounds, f' {unit}' if unit else '')}, at ({place})"
+    return f"{between(*bounds, f' {unit}' if unit else '', digits)}, at ({place})"

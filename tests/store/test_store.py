@@ -94,7 +94,7 @@ def test_new_meshes_become_new_rows(store_path: Path) -> None:
 
 
 def test_opening_what_is_no_store(store_path: Path) -> None:
-    with pytest.raises(StoreError, match="it holds no store of a study"):
+    with pytest.raises(StoreError, match="it does not exist"):
         Store.open(store_path)
     zarr.create_group(str(store_path))
     with pytest.raises(StoreError, match="not one of a study"):

@@ -92,6 +92,23 @@ def test_bounds_are_rounded_outwards_and_places_of_rounding_are_zero(unit: str |
     assert deviation_text(found, unit) == f"0.3331 to 0.3352{' mm' if unit else ''}, at (60, 0, 10.25)"
 
 
+@pytest.mark.parametrize(
+    ("length", "lower", "upper", "limit", "shown"),
+    [
+        (1e-4, 1.00001e-4, 1.00001e-4, "0.0001", "0.000100001"),
+        (1e-4, 1.000015e-4, 1.002e-4, "0.0001", "1.000015 × 10⁻⁴ to 1.002000 × 10⁻⁴"),
+        (1.2345678e-4, 1.2345699e-4, 1.0, "0.00012345678", "≥ 1.2345699 × 10⁻⁴"),
+        (2.0, 2.9, 2.9, "2", "2.9"),
+    ],
+)
+def test_a_deviation_does_not_read_as_the_length_that_it_is_above(
+    length: float, lower: float, upper: float, limit: str, shown: str
+) -> None:
+    way = deviation.Deviation(lower, upper, (0.0, 0.0, 0.0))
+    verdict = DeviationVerdict(length, None, deviation.Deviations(way, way), (0.1, 0.01))
+    assert str(verdict).startswith(f"not within {limit}: largest deviation {shown}, at ")
+
+
 @pytest.mark.parametrize(("upper", "shown"), [(39.42, "≥ 3.997"), (4.0201, "3.997 to 4.021")])
 def test_an_upper_bound_that_a_no_left_far_away_is_not_told(upper: float, shown: str) -> None:
     way = deviation.Deviation(3.9976, upper, (60.0, 0.0, 0.0))
