@@ -20,13 +20,13 @@ from sobolev_batch.visible import visible
 if TYPE_CHECKING:
     from sobolev_batch.geometry.mesh import Mesh
 
-# Exit statuses of a verdict; like diff, which has 1 for files that differ.
 # Why a mesh has no volume, by the edges that it has.
 _NO_VOLUME = {
     "boundary_edges": "it is not closed",
     "nonmanifold_edges": "edges have more than two triangles",
     "inconsistent_edges": "normals flip",
 }
+# Exit statuses of a verdict; like diff, which has 1 for files that differ.
 _STATUSES = {"same": 0, "within": 0, "different": 1, "not within": 1, "undecided": 4}
 
 
