@@ -273,11 +273,9 @@ def _on_device(points: Reals, triangles: SignedTriangles, kernels: Kernels, back
     A GPU looks at each pair in less time than it takes to upload what trees find.
     """
     centers, radii = triangles.balls
-    kernels, given = (
-        kernels.on(backend),
-        (points, triangles.corners, triangles.signs, centers, (kernels.reach + radii) ** 2),
-    )
+    given = points, triangles.corners, triangles.signs, centers, (kernels.reach + radii) ** 2
     points, corners, signs, centers, farthest = map(backend.upload, given)
+    kernels = kernels.on(backend)
     step, count = max(1, _PAIRS_ON_DEVICE // len(centers)), 0
     totals = np.zeros((len(kernels.orders), len(points)), like=points)
     for start in range(0, len(points), step):
