@@ -93,9 +93,10 @@ def test_what_a_mesh_and_its_reference_cover_is_nothing_beyond_the_octaves(tmp_p
     }
     plan = make_plan(Study.from_table(small_table(**table), folder=tmp_path))
     reference, row = (next(row for row in plan.rows if row.label == label) for label in ("reference", "plates/anew"))
-    stored = compute_parts(
-        Job.for_row(plan, row, prepare_store(tmp_path / "store.zarr", plan), 0, None, reference), octaves=True
-    )
+    job = Job.for_row(plan, row, prepare_store(tmp_path / "store.zarr", plan), 0, None, reference)
+    stored = compute_parts(job, octaves=True)
+    # The next task takes the same one.
+    assert job.load_reference() is job.load_reference()
     assert isinstance(stored, list)
     quality = stored[0].quality
     assert quality is not None
