@@ -5,9 +5,8 @@ docs/studies.md has the keys of each source.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import astuple
+from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
@@ -41,15 +40,19 @@ Level = Annotated[int, Field(ge=0, le=FINEST_LEVEL)]
 Levels = Several[Level]
 
 
-class ClosedFormSource(Source, ABC):
-    """A source of one surface in closed form, or of its triangulations where a subclass has levels."""
+class ClosedFormSource(Source):
+    """A source of one surface in closed form, or of its triangulations where a subclass has levels.
+
+    A subclass has the fields of the closed form.
+    """
 
     label: ClassVar[str]
+    form: ClassVar[type[ClosedForm]]
 
     @property
-    @abstractmethod
     def shape(self) -> ClosedForm:
         """The surface."""
+        return self.form(**{one.name: getattr(self, one.name) for one in fields(self.form)})
 
     @model_validator(mode="after")
     def _check_shape(self) -> Self:
@@ -72,30 +75,20 @@ class ClosedFormSource(Source, ABC):
 class SphereSource(ClosedFormSource):
     """A sphere in closed form."""
 
-    label = "sphere"
+    label, form = "sphere", Sphere
 
     radius: Length = 1.0
     center: Triple = (0.0, 0.0, 0.0)
-
-    @property
-    def shape(self) -> Sphere:
-        """The sphere."""
-        return Sphere(self.radius, self.center)
 
 
 class EllipsoidSource(ClosedFormSource):
     """An ellipsoid as a smooth surface, or icospheres with their vertices moved onto it."""
 
-    label = "ellipsoid"
+    label, form = "ellipsoid", Ellipsoid
 
     axes: Lengths
     center: Triple = (0.0, 0.0, 0.0)
     levels: Levels | None = None
-
-    @property
-    def shape(self) -> Ellipsoid:
-        """The ellipsoid."""
-        return Ellipsoid(self.axes, self.center)
 
     def triangulation(self, level: int, identity: Fingerprint) -> Member:
         """Return the icosphere of a level, moved onto the ellipsoid."""
@@ -109,7 +102,7 @@ class TorusSource(ClosedFormSource):
     Each level has twice as many cells each way as the one before.
     """
 
-    label = "torus"
+    label, form = "torus", Torus
 
     R: Length
     r: Length
@@ -128,11 +121,6 @@ class TorusSource(ClosedFormSource):
                 f"{MOST_TRIANGLES} are allowed"
             )
         return self
-
-    @property
-    def shape(self) -> Torus:
-        """The torus."""
-        return Torus(self.R, self.r, self.center)
 
     def triangulation(self, level: int, identity: Fingerprint) -> Member:
         """Return the grid of a level."""
