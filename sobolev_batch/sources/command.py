@@ -43,6 +43,9 @@ from sobolev_batch.sources.registry import (
 )
 
 Parameter = str | int | float | bool
+# A function that makes a mesh of another one, what a fingerprint holds of it besides its parameters and its version,
+# and files that it reads besides, by their names in a command.
+Remesher = tuple[Callable[[Mesh], Made], dict[str, Any], dict[str, Path]]
 
 # The placeholder for the folder of the study.
 _FOLDER = "folder"
@@ -120,19 +123,18 @@ class RemesherSource(NestedSource):
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member for each combination of parameters, in the order of the lists."""
         original, version = single_member(self.mesh, folder), self._found_version(folder)
-        return tuple(
-            RemeshedMember(
-                name,
-                -1,
-                metadata=tuple((key, _as_number_or_text(value)) for key, value in parameters.items()),
-                make=self._maker(parameters, folder),
-                identity={"remesher": self._settings(parameters), "version": version},
-                original=original,
-                files=self._files(folder),
-                cache=self._cache,
+        members = []
+        for name, parameters in self._swept(original.name):
+            make, settings, files = self._remesher(parameters, folder)
+            metadata = {
+                key: _as_text(value) if isinstance(value, bool | str) else float(value)
+                for key, value in parameters.items()
+            }
+            identity = {"remesher": {**settings, "parameters": parameters}, "version": version}
+            members.append(
+                RemeshedMember(name, -1, make, identity, original, files, self._cache, metadata=tuple(metadata.items()))
             )
-            for name, parameters in self._swept(original.name)
-        )
+        return tuple(members)
 
     def _swept(self, alone: str) -> Iterator[tuple[str, dict[str, Parameter]]]:
         """Yield a name and the parameters of each mesh."""
@@ -147,20 +149,12 @@ class RemesherSource(NestedSource):
             yield name, {**self.parameters, **dict(zip(lists, values, strict=True))}
 
     @abstractmethod
-    def _maker(self, parameters: dict[str, Parameter], folder: Path) -> Callable[[Mesh], Made]:
-        """Return a function that makes the mesh of some parameters."""
-
-    @abstractmethod
-    def _settings(self, parameters: dict[str, Parameter]) -> dict[str, Any]:
-        """Return what a fingerprint holds of the remesher and its parameters."""
+    def _remesher(self, parameters: dict[str, Parameter], folder: Path) -> Remesher:
+        """Return what makes the mesh of some parameters."""
 
     @abstractmethod
     def _found_version(self, folder: Path) -> str | None:
         """Return the version of the remesher."""
-
-    def _files(self, folder: Path) -> dict[str, Path]:
-        """Return files that the remesher reads besides, by their names in the command."""
-        return {}
 
 
 class CommandSource(RemesherSource):
@@ -206,21 +200,17 @@ class CommandSource(RemesherSource):
             raise ValueError("the command has no {output}, the file that it has to write")
         return self
 
-    def _maker(self, parameters: dict[str, Parameter], folder: Path) -> Callable[[Mesh], Made]:
-        return partial(
+    def _remesher(self, parameters: dict[str, Parameter], folder: Path) -> Remesher:
+        make = partial(
             run_command,
             words=[self._filled(word, parameters, folder) for word in self.command],
             suffixes=(self.input, self.output),
             timeout=self.timeout,
             largest_output=self.largest_output,
         )
-
-    def _settings(self, parameters: dict[str, Parameter]) -> dict[str, Any]:
-        return {"command": list(self.command), "parameters": parameters, "input": self.input, "output": self.output}
-
-    def _files(self, folder: Path) -> dict[str, Path]:
         found = {word: re.search(r"\{folder\}/.+", word) for word in self.command}
-        return {word: Path(self._filled(match[0], {}, folder)) for word, match in found.items() if match}
+        files = {word: Path(self._filled(match[0], {}, folder)) for word, match in found.items() if match}
+        return make, {"command": list(self.command), "input": self.input, "output": self.output}, files
 
     @staticmethod
     def _filled(word: str, parameters: Mapping[str, Parameter], folder: Path) -> str:
@@ -250,11 +240,9 @@ class FunctionSource(RemesherSource):
     function: Callable[..., Any] | str
     version: str | None = None
 
-    def _maker(self, parameters: dict[str, Parameter], folder: Path) -> Callable[[Mesh], Made]:
-        return partial(call_function, function=self.function, parameters=parameters)
-
-    def _settings(self, parameters: dict[str, Parameter]) -> dict[str, Any]:
-        return {"function": function_name(self.function), "parameters": parameters}
+    def _remesher(self, parameters: dict[str, Parameter], folder: Path) -> Remesher:
+        make = partial(call_function, function=self.function, parameters=parameters)
+        return make, {"function": function_name(self.function)}, {}
 
     def _found_version(self, folder: Path) -> str | None:
         return self.version or function_version(self.function)
@@ -354,7 +342,3 @@ def _as_text(value: Parameter) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     return number_as_text(value) if isinstance(value, float) else str(value)
-
-
-def _as_number_or_text(value: Parameter) -> float | str:
-    return _as_text(value) if isinstance(value, bool | str) else float(value)
