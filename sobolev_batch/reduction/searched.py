@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import BeforeValidator, Field, PrivateAttr, SerializeAsAny, ValidationInfo
+from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationInfo
 
 from sobolev_batch.errors import InputError, MeshError, StudyError, refused_by_pydantic
 from sobolev_batch.geometry.mesh import Mesh
@@ -17,9 +17,16 @@ from sobolev_batch.reduction.limit import Limit, tried
 from sobolev_batch.reduction.recorded import RecordedSearch
 from sobolev_batch.reduction.remesher import Remesher, searched_parameter
 from sobolev_batch.sources.files import number_as_text
-from sobolev_batch.sources.mesh_cache import InMemory, MeshCache
 from sobolev_batch.sources.programs import Cost
-from sobolev_batch.sources.registry import ExpectedSize, Fingerprint, Member, Several, Source, single_member
+from sobolev_batch.sources.registry import (
+    ExpectedSize,
+    Fingerprint,
+    KeepingSource,
+    Member,
+    Several,
+    Source,
+    single_member,
+)
 
 # One or several tolerances, as a study file gives them; and the parameter that is searched, with its ends.
 Tolerances = Annotated[
@@ -33,7 +40,7 @@ def _template(table: Any, info: ValidationInfo) -> Source:
         return Remesher.parse(table, info.data.get("search")).source
 
 
-class SearchedSource(Source):
+class SearchedSource(KeepingSource):
     """Meshes of one other mesh, of as few triangles as each of several tolerances permits.
 
     Attributes:
@@ -54,18 +61,6 @@ class SearchedSource(Source):
     reference: SerializeAsAny[Source] | None = None
     unit: str | None = None
     default_order: float = DEFAULT_ORDER
-    _cache: MeshCache = PrivateAttr(default_factory=lambda: MeshCache(InMemory()))
-
-    @property
-    def keeps_meshes(self) -> bool:
-        """True: what is found is kept, with a record of all trials."""
-        return True
-
-    def with_cache(self, cache: MeshCache) -> Self:
-        """Return the source with the place of meshes and records."""
-        source = super().with_cache(cache)
-        source._cache = cache
-        return source
 
     def with_reference(self, reference: Source) -> Source:
         """Return the source for a study with a reference."""

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Annotated, Any, Self
 
 import pandas as pd
-from pydantic import BeforeValidator, ConfigDict, Field, PrivateAttr, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
 from sobolev_batch.errors import MeshError, StudyError, one_line, refused_by_pydantic
 from sobolev_batch.geometry.formats.conversion import as_mesh
@@ -36,6 +36,7 @@ from sobolev_batch.sources.registry import (
     MOST_ENTRIES,
     ExpectedSize,
     Fingerprint,
+    KeepingSource,
     Member,
     NestedSource,
     load_mesh,
@@ -77,7 +78,7 @@ FileSuffix = Annotated[str, BeforeValidator(_file_suffix)]
 Words = Annotated[tuple[str, ...], Field(min_length=1, strict=False)]
 
 
-class RemesherSource(NestedSource):
+class RemesherSource(NestedSource, KeepingSource):
     """Meshes that something of yours makes of one other mesh.
 
     Keys that are not listed here are its parameters: numbers, texts or truth values. A list of them is swept: each
@@ -88,12 +89,6 @@ class RemesherSource(NestedSource):
     """
 
     model_config = ConfigDict(frozen=True, extra="allow", strict=True)
-    _cache: MeshCache | None = PrivateAttr(None)
-
-    @property
-    def keeps_meshes(self) -> bool:
-        """True: every mesh is kept."""
-        return True
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -113,12 +108,6 @@ class RemesherSource(NestedSource):
         if count > MOST_ENTRIES:
             raise ValueError(f"at most {MOST_ENTRIES} meshes are allowed, and its lists make {count}")
         return self
-
-    def with_cache(self, cache: MeshCache) -> Self:
-        """Return the source with the place where its meshes are kept."""
-        source = super().with_cache(cache)
-        source._cache = cache
-        return source
 
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member for each combination of parameters, in the order of the lists."""
@@ -220,9 +209,8 @@ class CommandSource(RemesherSource):
 
     def _found_version(self, folder: Path) -> str | None:
         """Return what the version's command prints; see `MeshCache.version`."""
-        if self.version is None or self._cache is None:
-            return None
-        return self._cache.version(self.version, [self._filled(word, {}, folder) for word in self.version])
+        words = [self._filled(word, {}, folder) for word in self.version or ()]
+        return self._cache.version(self.version, words) if self.version else None
 
 
 class FunctionSource(RemesherSource):
@@ -255,14 +243,14 @@ class RemeshedMember(Member):
     Attributes:
         identity: The remesher, its parameters and its version.
         files: Files that the remesher reads besides, by their names in the command.
-        cache: Where it is kept; None if nothing may run.
+        cache: Where it is kept.
     """
 
     make: Callable[[Mesh], Made]
     identity: Fingerprint
     original: Member
     files: Mapping[str, Path]
-    cache: MeshCache | None
+    cache: MeshCache
 
     @property
     def names_wishes(self) -> bool:
@@ -271,8 +259,6 @@ class RemeshedMember(Member):
 
     def load(self) -> Mesh:
         """Return the mesh that is kept, or make it and keep it; MeshError where that failed, or is not permitted."""
-        if self.cache is None:
-            raise MeshError("no remesher may run here, and none of its meshes is kept; run a study with it")
         digest = self.fingerprint_digest()
         mesh = self.cache.read(digest)
         if mesh is not None:
@@ -293,7 +279,7 @@ class RemeshedMember(Member):
     def cost(self) -> Cost | None:
         """Return what making it took the last time."""
         with suppress(MeshError):
-            return None if self.cache is None else self.cache.cost(self.fingerprint_digest())
+            return self.cache.cost(self.fingerprint_digest())
         return None
 
     def fingerprint(self) -> Fingerprint:

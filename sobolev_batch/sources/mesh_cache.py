@@ -30,6 +30,9 @@ class InMemory(dict[str, bytes]):
 
     read, write = dict.get, dict.update
 
+    def __str__(self) -> str:
+        return "memory"
+
 
 @dataclass(frozen=True)
 class MeshCache:

@@ -20,13 +20,13 @@ from importlib.metadata import EntryPoint, PackageNotFoundError, version
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, SerializeAsAny
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr, SerializeAsAny
 
 from sobolev_batch.errors import MeshError, StudyError
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Surface, is_finite_number
 from sobolev_batch.plugins import SOURCES, registered
-from sobolev_batch.sources.mesh_cache import MeshCache
+from sobolev_batch.sources.mesh_cache import InMemory, MeshCache
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.sources.programs import Cost
 
@@ -370,6 +370,23 @@ class NestedSource(Source):
     """A source that works on the surfaces of another one; its key ``mesh`` has the table of that."""
 
     mesh: OtherSource
+
+
+class KeepingSource(Source):
+    """A source whose meshes take long to make, so that they are kept; in memory until it is given a place for them."""
+
+    _cache: MeshCache = PrivateAttr(default_factory=lambda: MeshCache(InMemory()))
+
+    @property
+    def keeps_meshes(self) -> bool:
+        """True: all of its meshes are kept."""
+        return True
+
+    def with_cache(self, cache: MeshCache) -> Self:
+        """Return the source with the place of its meshes."""
+        source = super().with_cache(cache)
+        source._cache = cache
+        return source
 
 
 def source_type_of(name: object) -> type[Source]:
