@@ -30,11 +30,8 @@ _TRIAL_BYTES, _LEAST_BYTES = 1400, 3e8
 class SearchRecord:
     """Record of a search: a JSON file that is replaced as a whole after each trial.
 
-    Attributes:
-        digest: Digest of the search; another one has other trials.
-        triangles: Triangles of the original.
-        radius: Radius of its bounding sphere.
-        mesh_digest: Digest of the file of the best mesh.
+    Triangles and the radius of the bounding sphere are those of the original. The digests are those of the search,
+    since another one has other trials, and of the file of the best mesh.
     """
 
     digest: str

@@ -45,8 +45,7 @@ class Trial:
         size: Parameter of the remesher.
         triangles: Triangles of the mesh; 0 where there is none.
         estimate: Estimate of its distance, which guides the search.
-        lower: Lower bound of the distance.
-        upper: Upper bound of it.
+        lower, upper: Bounds of the distance.
         is_within: True where the distance is certainly within the limit. An open question counts as not within.
         seconds: Time of making and judging it.
         reason: Why there is no mesh, or no distance.
@@ -84,8 +83,7 @@ class Search:
 
     Attributes:
         limit: Largest distance.
-        low: Smallest size to try.
-        high: Largest size to try.
+        low, high: Smallest and largest size to try.
         is_whole: True where sizes are whole numbers.
         first: Size to try first; None for the middle.
         larger_is_coarser: Whether a larger size makes a coarser mesh; None to find out by the triangles of trials.

@@ -83,9 +83,6 @@ class RemesherSource(NestedSource, KeepingSource):
 
     Keys that are not listed here are its parameters: numbers, texts or truth values. A list of them is swept: each
     value makes a mesh, and several lists make one for each combination.
-
-    Attributes:
-        mesh: Table of a source with one member, or the name of a mesh: the mesh to start from.
     """
 
     model_config = ConfigDict(frozen=True, extra="allow", strict=True)
@@ -150,15 +147,7 @@ class CommandSource(RemesherSource):
     """Meshes that a program makes of one other mesh.
 
     The program gets a folder of its own, and no shell. ``{input}`` and ``{output}`` in the command stand for its files,
-    ``{folder}`` for the folder of the study, and ``{NAME}`` for a parameter.
-
-    Attributes:
-        command: Program and arguments.
-        input, output: Suffixes of the files that it reads and writes; formats that this package lacks, such as Medit's
-            .mesh, go through the library meshio.
-        timeout: Time after which the program is ended, in seconds or as a text such as "10 min".
-        largest_output: Bytes that it may write, such as "2 GB".
-        version: Command that prints the program's version. It is part of the fingerprint.
+    ``{folder}`` for the folder of the study, and ``{NAME}`` for a parameter. docs/remeshers.md has the keys.
     """
 
     command: Words
@@ -240,10 +229,7 @@ class FunctionSource(RemesherSource):
 class RemeshedMember(Member):
     """A mesh that a remesher makes, unless it is kept.
 
-    Attributes:
-        identity: The remesher, its parameters and its version.
-        files: Files that the remesher reads besides, by their names in the command.
-        cache: Where it is kept.
+    The identity has the remesher, its parameters and its version; files are those that it reads besides.
     """
 
     make: Callable[[Mesh], Made]

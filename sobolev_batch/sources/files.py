@@ -7,7 +7,6 @@ may have a ``name`` and a ``time``. All else are its metadata, numbers or texts,
 from __future__ import annotations
 
 import hashlib
-import math
 import os
 import time
 from collections import Counter
@@ -122,7 +121,7 @@ def _listed(tables: Any) -> tuple[MeshTable, ...]:
 
 def _checked_table(table: Mapping[str, Any]) -> MeshTable:
     """Return the table of a mesh without what says nothing: empty texts and NaN."""
-    known = {key: value for key, value in table.items() if not _is_nothing(value)}
+    known = {key: value for key, value in table.items() if value not in (None, "") and value == value}
     path, name, time = known.pop("path", None), known.pop("name", None), known.pop("time", None)
     if not isinstance(path, str):
         raise ValueError(f"each mesh needs a path, as in {_EXAMPLE}; found {quoted(dict(table))}")
@@ -155,10 +154,6 @@ def _checked_path(path: str) -> str:
     if "://" in path:
         raise ValueError(f"{quoted(path)} is a URL, and meshes are read from files; fetch it, and give its path")
     return path
-
-
-def _is_nothing(value: object) -> bool:
-    return value is None or value == "" or (isinstance(value, float) and math.isnan(value))
 
 
 def _checked_times(value: Any) -> Any:
@@ -203,16 +198,15 @@ class FileSource(Source):
         """Return one member per file, sorted by path or time, or as listed, named by the stem where that is unique."""
         if self.meshes is not None:
             return _listed_members(self.meshes, folder)
-        given = self.paths or ()
         if self.distribution is not None:
-            paths = sorted({_recorded_file(self.distribution, path) for path in given})
+            found = [_recorded_file(self.distribution, path) for path in self.paths or ()]
         else:
-            paths = sorted({match for path in given for match in matching_files(folder, path)})
+            found = [match for path in self.paths or () for match in matching_files(folder, path)]
+        paths = sorted(set(found))
         times = dict.fromkeys(paths) if self.times is None else _times(paths, self.times)
         names = dict(zip(paths, names_of_files(paths), strict=True))
         # Absolute, since a worker may have been started in another folder.
-        here = Path.cwd()
-        return tuple(FileMember(names[path], -1, here / path, time=time) for path, time in times.items())
+        return tuple(FileMember(names[path], -1, path.absolute(), time=time) for path, time in times.items())
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.sources.registry import ExpectedSize
+from sobolev_batch.sources.registry import Member
 from sobolev_batch.study.schema import REFERENCE_LABEL
 from sobolev_batch.study.study import Members, Study
 
@@ -70,27 +70,26 @@ def _gap_in_sizes(members: Members, *, alone: bool) -> str:
 
     Where an object is alone, only families of several sizes count: others need not be meant for a comparison by size.
     """
-    families: dict[str, list[ExpectedSize]] = {}
-    listed = [(family, member) for family, member in members.values() if family != REFERENCE_LABEL]
-    if len({family for family, _ in listed}) < 2:
+    families: dict[str, list[Member]] = {}
+    for family, member in members.values():
+        if family != REFERENCE_LABEL and member.time is None:
+            families.setdefault(family, []).append(member)
+    if len(families) < 2:
         return ""
-    for family, member in listed:
-        if member.time is None:
-            families.setdefault(family, []).append(member.expected_size())
-    known = {
-        family: [(size.triangles, size.factor) for size in sizes]
-        for family, sizes in families.items()
-        if all(size.triangles > 0 and math.isfinite(size.factor) for size in sizes)
-        and len({size.triangles for size in sizes}) > alone
-    }
-    likely = {family: _range_of(count for count, _ in sizes) for family, sizes in known.items()}
-    largest = [_range_of(end for count, by in sizes for end in (count / by, count * by)) for sizes in known.values()]
-    return gap_of(likely) if known and common_range(largest) is None else ""
+    likely: dict[str, Range] = {}
+    largest: list[Range] = []
+    for family, listed in families.items():
+        sizes = [member.expected_size() for member in listed]
+        counts = [size.triangles for size in sizes]
+        if all(size.triangles > 0 and math.isfinite(size.factor) for size in sizes) and len({*counts}) > alone:
+            likely[family] = _range_of(counts)
+            ends = [size.triangles * by for size in sizes for by in (1 / size.factor, size.factor)]
+            largest.append(_range_of(ends))
+    return gap_of(likely) if likely and common_range(largest) is None else ""
 
 
-def _range_of(sizes: Iterable[float]) -> Range:
-    listed = list(sizes)
-    return math.log(min(listed)), math.log(max(listed))
+def _range_of(sizes: Sequence[float]) -> Range:
+    return math.log(min(sizes)), math.log(max(sizes))
 
 
 def _test_warnings(study: Study, objects: int) -> Iterator[str]:

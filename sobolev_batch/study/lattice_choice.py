@@ -32,11 +32,6 @@ _LEAST_REFINEMENT, _LARGEST_REFINEMENT = 1.5, 8.0
 # Most samples of a mesh; their values take 160 MB in double precision.
 _MOST_SAMPLES = 10_000_000
 
-_DTYPES = ("dtype", "transform_dtype")
-
-# More frequencies: a lattice, and octaves if there were any; None where more do not help or do not fit.
-_More = tuple[Lattice, TailSampling | None] | None
-
 
 @dataclass(frozen=True)
 class LatticeChoice:
@@ -66,17 +61,21 @@ class LatticeChoice:
 
     def to_table(self) -> dict[str, Any]:
         """Return the choice as a table, without the octaves."""
-        others = {name: getattr(self, name) for name in (*_DTYPES, "closest", "reasons", "basis")}
+        others = {name: getattr(self, name) for name in ("dtype", "transform_dtype", "closest", "reasons", "basis")}
         return {"xi_max": self.lattice.xi_max, "M": self.lattice.M, **others}
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any], octaves: Mapping[str, Any] | None) -> Self:
         """Return the choice that a table holds, with its `octaves`."""
-        lattice = Lattice(table["xi_max"], table["M"])
-        tail = None if octaves is None else TailSampling.from_table(octaves)
-        dtype, transform_dtype = (table[name] for name in _DTYPES)
-        closest, reasons = tuple(table["closest"]), tuple(table["reasons"])
-        return cls(lattice, dtype, transform_dtype, closest, reasons, table["basis"], tail)
+        return cls(
+            Lattice(table["xi_max"], table["M"]),
+            table["dtype"],
+            table["transform_dtype"],
+            tuple(table["closest"]),
+            tuple(table["reasons"]),
+            table["basis"],
+            None if octaves is None else TailSampling.from_table(octaves),
+        )
 
     def grown(self, distances: NormEstimate, orders: Sequence[float], accuracy: Accuracy) -> LatticeChoice | None:
         """Return a choice of more frequencies for distances (orders, meshes) that miss an accuracy; NaN do not count.
@@ -91,6 +90,7 @@ class LatticeChoice:
         values = np.where(short, distances.values, 1.0)
         parts = (distances.truncation, distances.aliasing, distances.statistical)
         truncation, aliasing, statistical = (np.max(np.where(short, part, 0.0) / values, axis=1) for part in parts)
+        more: tuple[Lattice, TailSampling | None] | None
         if self.tail is None:
             more = _larger_lattice(self.lattice, truncation, aliasing, orders, accuracy)
             before = f"xi_max {self.lattice.xi_max:.4g}, M {self.lattice.M}"
@@ -107,8 +107,8 @@ class LatticeChoice:
 
 def _larger_lattice(
     lattice: Lattice, truncation: Reals, aliasing: Reals, orders: Sequence[float], accuracy: Accuracy
-) -> _More:
-    """Return a larger or finer lattice for errors (orders,) relative to distances."""
+) -> tuple[Lattice, None] | None:
+    """Return a larger or finer lattice for errors (orders,) relative to distances, if that helps and fits."""
     highest, period = lattice.xi_max, 1 / lattice.spacing
     tails, folded = truncation / accuracy.truncation_parts(orders), aliasing / accuracy.aliasing_part
     for order, tail, images in zip(orders, tails.tolist(), folded.tolist(), strict=True):
@@ -126,8 +126,8 @@ def _larger_lattice(
 
 def _finer_octaves(
     lattice: Lattice, tail: TailSampling, truncation: float, aliasing: float, statistical: float, accuracy: Accuracy
-) -> _More:
-    """Return a finer lattice and more octaves or samples for errors relative to distances."""
+) -> tuple[Lattice, TailSampling] | None:
+    """Return a finer lattice and more octaves or samples for errors relative to distances, if that helps and fits."""
     factor, chance = 1.0, float(statistical) / accuracy.rtol
     if chance > _STATISTICAL_PART:
         factor = min(max((chance / _STATISTICAL_PART) ** 2, _LEAST_REFINEMENT), _LARGEST_REFINEMENT)

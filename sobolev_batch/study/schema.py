@@ -13,6 +13,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import date
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args
 
@@ -199,13 +201,7 @@ class _ScalingSection(Section):
 
 
 class ProximitySection(Section):
-    """The usual distances of meshes from the reference.
-
-    Attributes:
-        points: Number of points that are drawn on each mesh.
-        threshold: Threshold of the F-score, in the unit of length of the files; None for 1 % of the reference's radius.
-        metrics: What tables show.
-    """
+    """The usual distances of meshes from the reference; docs/studies.md has the keys."""
 
     points: Annotated[int, Field(ge=2, le=MOST_POINTS)] = DEFAULT_POINTS
     threshold: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
@@ -272,13 +268,9 @@ def _source_of_family(table: object, info: ValidationInfo) -> Source:
 
 
 class Family(Section):
-    """A named source of surfaces.
+    """A named source of surfaces, or search for meshes within tolerances; a study file has its keys beside the others.
 
-    Attributes:
-        source: Source of its surfaces, or the search for meshes within tolerances. In a study file its keys are beside
-            the others.
-        order_by: What orders its meshes in tables, if the study says so: their triangles, or the natural order of their
-            names, in which they are no sequence from coarse to fine and have no rates.
+    Ordered by names, meshes are no sequence from coarse to fine and have no rates.
     """
 
     name: Name
@@ -492,9 +484,7 @@ def _key_in(values: object, item: ErrorDetails) -> _Key:
 
 
 def _value_at(values: Any, key: _Key) -> Any:
-    for part in key:
-        values = values[part]
-    return values
+    return reduce(getitem, key, values)
 
 
 def _known_keys(values: Mapping[str, Any], key: _Key) -> Iterable[str]:
