@@ -5,8 +5,6 @@ Whoever drives the run computes nothing itself: it hands out tasks, and keeps wh
 
 from __future__ import annotations
 
-import hashlib
-import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -23,6 +21,7 @@ from sobolev_batch.batch.proximity_stage import have_proximities, measure_proxim
 from sobolev_batch.batch.table_stage import TABLES_VERSION, Tabulated, are_tabulated, tabulate_fields
 from sobolev_batch.errors import DamageError, InputError
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
+from sobolev_batch.sources.registry import digest_of
 from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.store.layout import Metadata, stored_choice
 from sobolev_batch.store.location import Location
@@ -100,7 +99,7 @@ def object_key(one: StudyObject, members: Members, fingerprints: Mapping[str, st
         for label, (family, member) in members.items()
     ]
     inputs = [SCHEMA_VERSION, NUMERICS_VERSION, TABLES_VERSION, one.table, surfaces]
-    return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
+    return digest_of(inputs)
 
 
 def run_object(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import PurePath
@@ -18,7 +17,7 @@ from sobolev_batch.reduction.limit import Limit
 from sobolev_batch.reduction.remesher import Remesher
 from sobolev_batch.reduction.search import PRECISION, Bracket, Search, Trial
 from sobolev_batch.sources.mesh_cache import Folder
-from sobolev_batch.sources.registry import Member, load_mesh
+from sobolev_batch.sources.registry import Member, digest_of, load_mesh
 
 # Raise it whenever a mesh of one size is judged in another way: trials of another version are made again.
 _VERSION = 3
@@ -69,7 +68,7 @@ class RecordedSearch:
     def digest(self) -> str:
         """SHA-256 of all that trials depend on; MeshError where a file of it cannot be read."""
         about = [self.remesher.fingerprint(self.original), self.reference.fingerprint(), repr(self.limit)]
-        return _digest(json.dumps([_VERSION, *about], sort_keys=True).encode())
+        return digest_of([_VERSION, *about])
 
     def projected_bytes(self, triangles: int) -> float:
         """Return the memory that a trial takes with an original of some triangles; without any, that to read it."""

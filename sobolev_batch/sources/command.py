@@ -72,8 +72,6 @@ def _file_suffix(value: object) -> str:
     return value.lower()
 
 
-Seconds = Annotated[float, BeforeValidator(_seconds)]
-Bytes = Annotated[int, BeforeValidator(_bytes)]
 FileSuffix = Annotated[str, BeforeValidator(_file_suffix)]
 Words = Annotated[tuple[str, ...], Field(min_length=1, strict=False)]
 
@@ -153,8 +151,8 @@ class CommandSource(RemesherSource):
     command: Words
     input: FileSuffix = ".ply"
     output: FileSuffix = ".ply"
-    timeout: Seconds = 3600.0
-    largest_output: Bytes = 4_000_000_000
+    timeout: Annotated[float, BeforeValidator(_seconds)] = 3600.0
+    largest_output: Annotated[int, BeforeValidator(_bytes)] = 4_000_000_000
     version: Words | None = None
 
     @property

@@ -36,8 +36,7 @@ Length = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Triple = Annotated[tuple[Number, Number, Number], Field(strict=False)]
 Lengths = Annotated[tuple[Length, Length, Length], Field(strict=False)]
 Cells = Annotated[int, Field(ge=3, le=MOST_TRIANGLES)]
-Level = Annotated[int, Field(ge=0, le=FINEST_LEVEL)]
-Levels = Several[Level]
+Levels = Several[Annotated[int, Field(ge=0, le=FINEST_LEVEL)]]
 
 
 class ClosedFormSource(Source):

@@ -221,7 +221,7 @@ class Member(ABC):
         Raises:
             MeshError: As for `fingerprint`.
         """
-        return hashlib.sha256(json.dumps(self.fingerprint(), sort_keys=True).encode()).hexdigest()
+        return digest_of(self.fingerprint())
 
     def expected_size(self) -> ExpectedSize:
         """Predict the size of the surface and the memory that `load` takes, without making it.
@@ -307,6 +307,11 @@ class MadeMember(Member):
             size.seconds,
             size.factor if self.triangles is None else 1.0,
         )
+
+
+def digest_of(values: Any) -> str:
+    """Return the SHA-256 of JSON-able values; their order in mappings does not matter."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
 def at_most(count: int) -> BeforeValidator:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import logging
 import math
 from collections.abc import Mapping, Sequence
@@ -17,6 +15,7 @@ from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms.accuracy.tolerance import FINER_LATTICE, Accuracy, good_intervals, lattice_of
 from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.norms.tail.sampling import TailSampling
+from sobolev_batch.sources.registry import digest_of
 from sobolev_batch.study.schema import MOST_OCTAVES
 from sobolev_batch.study.study import Study
 from sobolev_batch.transform.lattice import Lattice
@@ -150,4 +149,4 @@ def choice_basis(study: Study, accuracy: Accuracy, similarity: Similarity, refer
         "similarity": [similarity.scale, *similarity.origin],
         "reference": dict(reference),
     }
-    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
+    return digest_of(data)

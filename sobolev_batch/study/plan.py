@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import logging
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -18,7 +16,7 @@ from sobolev_batch.norms.accuracy.solve import DistanceTarget
 from sobolev_batch.norms.fields import USUAL_DEGREE
 from sobolev_batch.norms.tail.sampling import TailSampling
 from sobolev_batch.sources.names import quoted
-from sobolev_batch.sources.registry import Member
+from sobolev_batch.sources.registry import Member, digest_of
 from sobolev_batch.study.lattice_choice import LatticeChoice, choice_basis
 from sobolev_batch.study.pilots import Look, choose_lattice
 from sobolev_batch.study.schema import REFERENCE_LABEL, FamilyReference
@@ -214,4 +212,4 @@ def _key(study: Study, similarity: Similarity, choice: LatticeChoice, fingerprin
     }
     if choice.tail is not None:
         dependencies["octaves"] = choice.tail.digest
-    return hashlib.sha256(json.dumps(dependencies, sort_keys=True).encode()).hexdigest()
+    return digest_of(dependencies)
