@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import cache, partial
+from functools import cache
 from glob import has_magic
 from itertools import islice
 from pathlib import Path
@@ -116,8 +116,7 @@ def _names_in_reference(values: Mapping[str, Any], folder: Path) -> list[str]:
     names: set[str] = set()
     for template in templates:
         match = re.compile(_pattern(template)).fullmatch
-        texts = map(partial(_text, folder), matching_files(folder, _glob(template)))
-        found = {matched["object"] for matched in map(match, texts) if matched}
+        found = {matched["object"] for matched in map(match, _matching(template, folder)) if matched}
         if not found:
             raise StudyError(
                 f"no file gives {OBJECT} of {template!r} one name; it stands for a part of a path, without /"
@@ -172,13 +171,13 @@ def _families(family: Mapping[str, Any], names: Sequence[str], folder: Path) -> 
 
 def _files(template: str, names: Sequence[str], folder: Path) -> Iterator[tuple[str, str, str]]:
     """Yield object, method and path of the files that match a template; the longest names that fit count."""
-    if not has_magic(_glob(template.replace(OBJECT, ""))):
+    if METHOD not in template and not has_magic(template.replace(OBJECT, "")):
         # The files need not exist yet.
         yield from ((name, "", template.replace(OBJECT, name)) for name in names)
         return
     known, lengths = set(names), sorted({len(name) for name in names}, reverse=True)
     pattern_of = cache(lambda name: re.compile(_pattern(template.replace(OBJECT, name))).fullmatch)
-    for path in map(partial(_text, folder), matching_files(folder, _glob(template))):
+    for path in _matching(template, folder):
         # Thousands of names are not tried one by one.
         parts = (path[i : i + length] for length in lengths for i in range(len(path) - length + 1))
         candidates = names if OBJECT not in template else (part for part in parts if part in known)
@@ -196,13 +195,10 @@ def _filled(value: Any, placeholder: str, name: str) -> Any:
     return [_filled(entry, placeholder, name) for entry in value] if isinstance(value, list) else value
 
 
-def _glob(template: str) -> str:
-    return template.replace(OBJECT, "*").replace(METHOD, "*")
-
-
-def _text(folder: Path, path: Path) -> str:
-    """Return a path as a template of the study would have it."""
-    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.as_posix()
+def _matching(template: str, folder: Path) -> list[str]:
+    """Return the files that a template may name, as it would have them."""
+    found = matching_files(folder, template.replace(OBJECT, "*").replace(METHOD, "*"))
+    return [(path.relative_to(folder) if path.is_relative_to(folder) else path).as_posix() for path in found]
 
 
 def _pattern(template: str) -> str:
