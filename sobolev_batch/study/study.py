@@ -78,28 +78,24 @@ class StudyObject:
     @classmethod
     def from_sections(cls, name: str, sections: SurfaceSections, table: Mapping[str, Any], folder: Path) -> Self:
         """Check that the families of an object and its reference fit together; StudyError where they do not."""
-        families, reference = sections.family, sections.reference
-        if not families:
+        reference, names = sections.reference, [family.name for family in sections.family]
+        if not names:
             raise StudyError("[[family]] must have at least 1 item, found []")
         if reference is None:
             raise StudyError("[reference] must be a table, found None")
-        names = [family.name for family in families]
         _require_distinct(names)
-        if isinstance(reference, FamilyReference):
-            if reference.family not in names:
-                hint = known_names(reference.family, names)
-                raise StudyError(f"[reference]: no family is named {quoted(reference.family)}; {hint}")
-        else:
-            sources = [family.source.with_reference(reference) for family in families]
-            families = [one.model_copy(update={"source": s}) for one, s in zip(families, sources, strict=True)]
-        header, scaling = table["study"], sections.scaling.settings()
+        if isinstance(reference, FamilyReference) and reference.family not in names:
+            hint = known_names(reference.family, names)
+            raise StudyError(f"[reference]: no family is named {quoted(reference.family)}; {hint}")
+        header, families = table["study"], []
         orders = table.get("norm", {}).get("orders") or [DEFAULT_ORDER]
-        for number, family in enumerate(families):
-            if isinstance(family.source, SearchedSource):
+        for family in sections.family:
+            source = family.source.with_reference(reference) if isinstance(reference, Source) else family.source
+            if isinstance(source, SearchedSource):
                 with within(f"family {family.name!r}"):
-                    source = family.source.in_study(header.get("length_unit"), orders[0])
-                families[number] = family.model_copy(update={"source": source})
-        title = header.get("title") or header["name"]
+                    source = source.in_study(header.get("length_unit"), orders[0])
+            families.append(family.model_copy(update={"source": source}))
+        title, scaling = header.get("title") or header["name"], sections.scaling.settings()
         return cls(name, title, tuple(families), reference, scaling, folder, _as_written(table))
 
     @cached_property
