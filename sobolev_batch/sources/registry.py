@@ -14,7 +14,7 @@ import json
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib.metadata import EntryPoint, PackageNotFoundError, version
 from pathlib import Path
@@ -301,12 +301,8 @@ class MadeMember(Member):
         """Return the number of triangles and the memory that it takes to make them, the first original included."""
         first = next(iter(self.originals.values()), None)
         size = ExpectedSize(self.triangles or 0) if first is None else first.expected_size()
-        return ExpectedSize(
-            size.triangles if self.triangles is None else self.triangles,
-            max(size.projected_bytes, float(self.triangle_bytes * size.triangles)),
-            size.seconds,
-            size.factor if self.triangles is None else 1.0,
-        )
+        size = replace(size, projected_bytes=max(size.projected_bytes, float(self.triangle_bytes * size.triangles)))
+        return size if self.triangles is None else replace(size, triangles=self.triangles, factor=1.0)
 
 
 def digest_of(values: Any) -> str:
