@@ -41,7 +41,7 @@ _VERSION = 1
 _DISPLACING_BYTES, _CARRYING_BYTES = 400, 200
 
 # Lengths as fractions of the radius of the mesh's bounding sphere.
-Fractions = Several[Annotated[float, Field(gt=0, allow_inf_nan=False, strict=False)]]
+Fractions = Several[Annotated[float, Field(gt=0, allow_inf_nan=False)]]
 
 
 def decimated(mesh: Mesh, triangles: int) -> Mesh:
@@ -82,7 +82,7 @@ class DecimateSource(NestedSource):
     """
 
     triangles: Several[Annotated[int, Field(ge=4, le=_MOST_TRIANGLES)]]
-    radius: Annotated[float, Field(gt=0, allow_inf_nan=False, strict=False)] | None = None
+    radius: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
 
     kind: ClassVar[str] = "decimate"
     library: ClassVar[str] = "fast-simplification"
@@ -231,8 +231,8 @@ class FlowSource(NestedSource):
     """
 
     times: Times
-    period: Annotated[float, Field(gt=0, allow_inf_nan=False, strict=False)] = 5.0
-    strength: Annotated[float, Field(allow_inf_nan=False, strict=False)] = 2.0
+    period: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 5.0
+    strength: Annotated[float, Field(allow_inf_nan=False)] = 2.0
 
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member for each time, in their order."""

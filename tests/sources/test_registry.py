@@ -114,16 +114,20 @@ BAD: list[tuple[str, dict[str, Any], dict[str, list[Any]]]] = [
         {"paths": ["a.ply"]},
         {"paths": [[], "a.ply"], "paths.0": [[""]], "distribution": [7], "path": ["a.ply"]},
     ),
-    ("decimate", COUNTS, NO_COUNTS),
+    ("decimate", COUNTS, {**NO_COUNTS, "radius": [0.0, "1", True]}),
     ("remesh", COUNTS, NO_COUNTS),
     ("spherical-levels", {"mesh": BALL, "sphere": BALL, "levels": [1]}, {"sphere": [None, "a.ply"], **NO_LEVELS}),
     (
         "moved",
         {"mesh": BALL, "distances": [0.1]},
-        {"distances": [[]], "distances.0": [[0.0]], "direction": [[0, 0, 0]]},
+        {"distances": [[]], "distances.0": [[0.0], ["0.1"], [True]], "direction": [[0, 0, 0]]},
     ),
-    ("noisy", {"mesh": BALL, "amplitudes": [0.1]}, {"amplitudes.0": [[-0.1]], "seed": [-1, 0.5]}),
-    ("flow", {"mesh": BALL, "times": [0.0]}, {"times": [[], [0.0, True], [1.0, 1.0]], "period": [0.0]}),
+    ("noisy", {"mesh": BALL, "amplitudes": [0.1]}, {"amplitudes.0": [[-0.1], ["0.1"]], "seed": [-1, 0.5]}),
+    (
+        "flow",
+        {"mesh": BALL, "times": [0.0]},
+        {"times": [[], [0.0, True], [1.0, 1.0]], "period": [0.0, "5"], "strength": [True]},
+    ),
 ]
 
 

@@ -52,9 +52,9 @@ class FitSource(NestedSource):
     """
 
     target: OtherSource | None = None
-    order: Annotated[float, Field(lt=-0.5, ge=-100.0, strict=False)] = DEFAULT_ORDER
+    order: Annotated[float, Field(lt=-0.5, ge=-100.0)] = DEFAULT_ORDER
     steps: Annotated[int, Field(ge=1, le=100_000)] = DEFAULT_STEPS
-    smoothing: Annotated[float, Field(ge=0.0, le=MOST_SMOOTHING, strict=False)] = DEFAULT_SMOOTHING
+    smoothing: Annotated[float, Field(ge=0.0, le=MOST_SMOOTHING)] = DEFAULT_SMOOTHING
     keep_boundary: bool = False
 
     def with_reference(self, reference: Source) -> Source:

@@ -163,7 +163,15 @@ def test_a_mesh_that_cannot_be_fitted_is_named() -> None:
     [
         *(
             ({key: value}, key)
-            for key, value in (("order", -0.5), ("steps", 0), ("smoothing", -1), ("smoothing", 1e300), ("speed", 1))
+            for key, value in (
+                ("order", -0.5),
+                ("order", "-2"),
+                ("steps", 0),
+                ("smoothing", -1),
+                ("smoothing", 1e300),
+                ("smoothing", True),
+                ("speed", 1),
+            )
         ),
         ({"target": 3}, "must be a table that names a source"),
         ({"mesh": "ball.ply"}, "no mesh is named 'ball.ply'"),
