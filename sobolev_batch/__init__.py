@@ -2,22 +2,7 @@
 
 A study file names objects, each with a reference, families of meshes for all of them, and an accuracy or a frequency
 lattice. Dask's workers plan the objects and transform their meshes; a reduction over the stored fields makes the
-tables. Data flows one way through the folders:
-
-    geometry   meshes and surfaces by formula, and their files
-    sources    the tables of a study file become families of surfaces
-    transform  surface -> weighted points, in batches -> NUFFT -> a block of the Fourier field
-    norms      fields -> norms and distances with their errors
-    reduction  the fewest triangles within a tolerance
-    study      study file -> Study -> its objects -> a Plan of each
-    store      the zarr hierarchy of a study: a root, and a group for each object
-    tables     stored fields -> norms, distances, convergence; a lazy DataTree; the rows of all objects
-    batch      the objects of a study as tasks on a cluster
-    testing    verdicts on two surfaces, for test suites
-    cli        the commands
-    extras     plots, reports, leagues, fitting: the rest works without them
-
-No folder imports one below it; the first four import neither dask nor zarr. See docs/design.md.
+tables. Data flows one way through the folders, which docs/design.md lists.
 
 The public names by subject:
 
