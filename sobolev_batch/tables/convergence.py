@@ -15,7 +15,6 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.proximity import METRICS, OF_ONE_MESH
 from sobolev_batch.norms.columns import parts_as_variables
 from sobolev_batch.norms.estimate import AREA_AND_SHAPE, PARTS
-from sobolev_batch.norms.rates import observed_rates
 from sobolev_batch.parameters import fraction
 from sobolev_batch.sources.programs import Cost
 from sobolev_batch.tables import Format
@@ -26,7 +25,6 @@ from sobolev_batch.tables.open import (
     finished_group,
     has_objects,
     has_proximity,
-    is_sequence,
     metadata_of,
     placement_doubts,
     reference_of,
@@ -37,6 +35,7 @@ from sobolev_batch.tables.open import (
     unit_of,
 )
 from sobolev_batch.tables.rendering import Column, Section, rendered
+from sobolev_batch.tables.results import rates_in_families
 from sobolev_batch.tables.store_accessor import convergence_at, order_note
 from sobolev_batch.tables.text import between, count, percent, with_error, wrapped
 from sobolev_batch.transform.lattice import Orders
@@ -390,15 +389,12 @@ def remarks(tree: xr.DataTree, frame: pd.DataFrame) -> list[str]:
 
 def _with_rates(frame: pd.DataFrame, x: str) -> pd.DataFrame:
     """Return rows of `table` with rates in another size, in place of those in the edge length; see `sizes_of`."""
-    sizes = 1 / sizes_of(frame, x)
-    rates, errors = np.full(len(frame), np.nan), np.full(len(frame), np.nan)
-    numbered = frame.reset_index(drop=True)
-    for _, rows in numbered.groupby(["order", "family"], sort=False):
-        if is_sequence(rows):
-            places = rows.index.to_numpy()
-            distances, bounds = rows["distance"].to_numpy(), rows["error"].to_numpy()
-            rates[places], errors[places] = observed_rates(distances, bounds, sizes[places])
-    return numbered.assign(rate=rates, rate_error=errors)
+    # All orders have the same meshes.
+    distances, errors = (frame[name].to_numpy().reshape(frame["order"].nunique(), -1) for name in ("distance", "error"))
+    count = distances.shape[1]
+    families, ordered_by = (frame[name].to_numpy()[:count] for name in ("family", "ordered_by"))
+    rates, rate_errors = rates_in_families(families, ordered_by, distances, errors, 1 / sizes_of(frame, x)[:count])
+    return frame.assign(rate=rates.ravel(), rate_error=rate_errors.ravel())
 
 
 def smallest_below(store: AnyStore, relative: float | str, order: Orders | None = None) -> pd.DataFrame:

@@ -82,13 +82,8 @@ class Results:
         sizes = self.meshes["edge_length_mean"].to_numpy()
         reference = self.meshes.indexes["mesh"].get_loc(self.reference)
         distances, errors = to_reference.values, to_reference.errors
-        rates, rate_errors = (np.full_like(distances, np.nan) for _ in range(2))
-        for family in self._sequences():
-            members = [place for place in family if place != reference]
-            for k in range(len(self.orders)):
-                rates[k, members], rate_errors[k, members] = observed_rates(
-                    distances[k, members], errors[k, members], sizes[members]
-                )
+        families, ordered_by = (self.meshes[name].values for name in ("family", "ordered_by"))
+        rates, rate_errors = rates_in_families(families, ordered_by, distances, errors, sizes)
         relative, relative_errors = to_reference.relative_to(NormEstimate(*self.norms[..., [reference]]))
         columns = {
             **to_reference.named("distance"),
@@ -104,14 +99,17 @@ class Results:
         attributes = {"reference": self.reference, **({} if accuracy is None else {"rtol": accuracy.rtol})}
         return table_of(columns, self.meshes, self.orders).assign_attrs(attributes)
 
-    def _sequences(self) -> list[list[int]]:
-        """Return the places of the meshes of each family that goes from coarse to fine."""
-        families: dict[str, list[int]] = {}
-        criteria = self.meshes["ordered_by"].values.tolist()
-        for place, (family, criterion) in enumerate(zip(self.meshes["family"].values.tolist(), criteria, strict=True)):
-            if criterion in FROM_COARSE_TO_FINE:
-                families.setdefault(family, []).append(place)
-        return list(families.values())
+
+def rates_in_families(
+    families: NDArray[Any], ordered_by: NDArray[Any], distances: Reals, errors: Reals, sizes: Reals
+) -> Reals:
+    """Return observed rates and their errors (2, orders, meshes); NaN in families that are not from coarse to fine."""
+    rates, is_ordered = np.full((2, *distances.shape), np.nan), np.isin(ordered_by, FROM_COARSE_TO_FINE)
+    for family in dict.fromkeys(families[is_ordered].tolist()):
+        members = is_ordered & (families == family)
+        for k in range(len(distances)):
+            rates[:, k, members] = observed_rates(distances[k, members], errors[k, members], sizes[members])
+    return rates
 
 
 def table_of(
