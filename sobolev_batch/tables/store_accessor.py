@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import xarray as xr
@@ -12,7 +12,7 @@ from sobolev_batch.errors import DamageError, InputError
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
 from sobolev_batch.norms.causes import band_coordinates
-from sobolev_batch.norms.columns import AREA, KERNEL, LENGTH, NUMBER, described, order_axis
+from sobolev_batch.norms.columns import AREA, KERNEL, LENGTH, NUMBER, describe, described, order_axis
 from sobolev_batch.norms.estimate import AREA_AND_SHAPE, NormEstimate
 from sobolev_batch.norms.fields import Quality
 from sobolev_batch.sources.names import quoted
@@ -155,19 +155,19 @@ class StoreAccessor:
         _require_fields(self._tree, meshes, [mesh])
         row = int(meshes["row"].sel(mesh=mesh).item())
         bounds = lower_bounds(reducer, row, {one for one in reducer.complete if one in labels and one != row})
-        found: list[tuple[float, int, list[float]]] = []
         candidates = sorted(bounds, key=bounds.__getitem__)
+        # Values and the parts of their errors, and their rows, nearest first.
+        found, rows = np.empty((5, 0)), np.empty(0, dtype=np.int64)
         for start in range(0, len(candidates), _CANDIDATES):
-            if len(found) >= count and found[count - 1][0] <= bounds[candidates[start]]:
+            if len(rows) >= count and found[0, -1] <= bounds[candidates[start]]:
                 break
             group = candidates[start : start + _CANDIDATES]
-            columns = np.stack([*pair_distances(reducer, [row], group)])[:, 0, 0]
-            found += zip(columns[0].tolist(), group, columns.T.tolist(), strict=True)
-            found.sort(key=lambda entry: entry[:2])
-        chosen = found[:count]
-        # Values and the parts of their errors, over one order.
-        estimate = NormEstimate(*np.array([entry[2] for entry in chosen]).reshape(-1, 5).T[:, None])
-        table = table_of(estimate.named("distance"), meshes.sel(mesh=[labels[one] for _, one, _ in chosen]), orders)
+            found = np.hstack([found, np.stack([*pair_distances(reducer, [row], group)])[:, 0, 0]])
+            rows = np.append(rows, group)
+            nearest = np.lexsort((rows, found[0]))[:count]
+            found, rows = found[:, nearest], rows[nearest]
+        estimate = NormEstimate(*found[:, None])
+        table = table_of(estimate.named("distance"), meshes.sel(mesh=[labels[one] for one in rows.tolist()]), orders)
         return table.sel(order=orders[0])
 
     def _chosen(self, table: xr.Dataset, order: Orders, mesh: Meshes) -> xr.Dataset:
@@ -288,27 +288,24 @@ def convergence_at(tree: xr.DataTree, order: Orders | None, meshes: Meshes = Non
     than those that are needed. DamageError where a field is not what was stored.
     """
     stored = finished_group(tree, "convergence", load=False)
-    chosen, others = _divided(stored, order)
-    if not others:
-        return stored.sel(order=chosen).load()
-    results = _computed(tree, others, meshes)
     accuracy = Accuracy(stored.attrs["rtol"]) if "rtol" in stored.attrs else None
-    return _joined(tree, stored, results.convergence_table(accuracy), chosen)
+    return _at_orders(
+        tree, stored, order, lambda others: _computed(tree, others, meshes).convergence_table(accuracy)
+    ).load()
 
 
 def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
     """Return the distances of a store's meshes, in the order of tables; lazily if it has all orders."""
     meshes = finished_group(tree, "meshes", load=False)
-    labels, stored = meshes["mesh"].values, finished_group(tree, "distances", load=False)
-    has_every_pair = stored.sizes["other"] == stored.sizes["mesh"]
-    stored = stored.drop_vars("key", errors="ignore").sel(mesh=labels)
-    if has_every_pair:
-        stored = stored.sel(other=labels)
-    chosen, others = _divided(stored, order)
-    if not others:
-        return stored.sel(order=chosen)
-    if not has_every_pair:
-        return _joined(tree, stored, _computed(tree, others).distances_table(), chosen)
+    labels = meshes["mesh"].values
+    stored = finished_group(tree, "distances", load=False).drop_vars("key", errors="ignore").sel(mesh=labels)
+    if stored.sizes["other"] != stored.sizes["mesh"]:
+        return _at_orders(tree, stored, order, lambda others: _computed(tree, others).distances_table())
+    return _at_orders(tree, stored.sel(other=labels), order, lambda others: _pairs_at(tree, meshes, others))
+
+
+def _pairs_at(tree: xr.DataTree, meshes: xr.Dataset, others: tuple[float, ...]) -> xr.Dataset:
+    """Return the distances of all pairs of meshes from their fields."""
     reducer, _ = stored_reducer(tree, others)
     rows: list[int] = meshes["row"].values.tolist()
     place_of = {row: place for place, row in enumerate(rows)}
@@ -319,17 +316,14 @@ def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
     for name, values in found.items():
         columns[name] = np.full((len(others), len(rows), len(rows), *values.shape[3:]), np.nan)
         columns[name][:, first, second] = values
-    computed = table_of(columns, meshes, others, "mesh", "other").assign_coords(other=stored["other"])
-    return _joined(tree, stored, computed, chosen)
+    table = table_of(columns, meshes, others, "mesh", "other")
+    return describe(table.assign_coords(other=meshes["mesh"].values))
 
 
 def norms_at(tree: xr.DataTree, order: Orders | None, meshes: Meshes = None) -> xr.Dataset:
     """Return the norms of an open store's meshes at some orders, in memory; see `convergence_at`."""
     stored = finished_group(tree, "norms", load=False)
-    chosen, others = _divided(stored, order)
-    if not others:
-        return stored.sel(order=chosen).load()
-    return _joined(tree, stored, _computed(tree, others, meshes).norms_table(), chosen)
+    return _at_orders(tree, stored, order, lambda others: _computed(tree, others, meshes).norms_table()).load()
 
 
 def _require_fields(tree: xr.DataTree, table: xr.Dataset, meshes: Sequence[str]) -> None:
@@ -354,22 +348,23 @@ def order_note(tree: xr.DataTree, orders: Sequence[float]) -> list[str]:
     ]
 
 
-def _divided(stored: xr.Dataset, order: Orders | None) -> tuple[list[float], tuple[float, ...]]:
-    """Return the orders that are requested, and those of them that the store lacks."""
+def _at_orders(
+    tree: xr.DataTree, stored: xr.Dataset, order: Orders | None, compute: Callable[[tuple[float, ...]], xr.Dataset]
+) -> xr.Dataset:
+    """Return a table of an open store at some orders, or all of its own; those that it lacks are computed."""
     own: list[float] = stored["order"].values.tolist()
     chosen = own if order is None else list(check_orders(order))
-    return chosen, tuple(dict.fromkeys(s for s in chosen if s not in own))
-
-
-def _joined(tree: xr.DataTree, stored: xr.Dataset, computed: xr.Dataset, chosen: list[float]) -> xr.Dataset:
-    """Return the chosen orders of two tables of an open store, which no run has changed since it was opened."""
-    own = [s for s in stored["order"].values.tolist() if s in chosen]
+    others = tuple(dict.fromkeys(s for s in chosen if s not in own))
+    if not others:
+        return stored.sel(order=chosen)
+    computed, own = compute(others), [s for s in own if s in chosen]
     table = xr.concat(
         [*([stored.sel(mesh=computed["mesh"], order=own)] if own else []), computed],
         "order", data_vars="minimal", coords="minimal", compat="override", join="exact", combine_attrs="override",
     ).sel(order=chosen).load()  # fmt: skip
+    # Both are of one state of the store.
     require_unchanged(tree)
-    return table.assign_attrs({**stored.attrs, "computed": computed["order"].values.tolist()})
+    return table.assign_attrs({**stored.attrs, "computed": list(others)})
 
 
 def _inner_bands(reducer: Reducer, rows: list[int]) -> list[Band]:
