@@ -47,12 +47,10 @@ _log = logging.getLogger(__name__)
 # Names of families, or globs of names; None is all of them.
 Families = str | Sequence[str] | None
 
-# Columns of a table that are sizes: the finer a mesh is, the smaller is the first, and the larger are the others.
 EDGE_LENGTH = "edge_length"
-_GROWING = ("triangles", "vertices", "seconds", "make_seconds", "make_cpu_seconds", "make_peak_bytes")
 # What orders families that go from coarse to fine.
 FROM_COARSE_TO_FINE = ("level", "triangles")
-
+# Columns of a table that are sizes: the finer a mesh is, the smaller is the first, and the larger are the others.
 _LABELS = {
     EDGE_LENGTH: "mean edge length in {unit}",
     "triangles": "number of triangles",
@@ -211,14 +209,14 @@ def _part(tree: xr.DataTree, group: str, names: Mapping[str, str], first: int, o
 def _concatenated(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     """Return parts one after the other, with NaN or empty texts where only others have a coordinate."""
     known = {name: column for part in parts for name, column in part.coords.items() if column.dims == ("mesh",)}
-    absent = {name: np.array(np.nan if column.dtype.kind in "fiu" else "", object) for name, column in known.items()}
     filled = []
     for part in parts:
         lacking = {
-            name: ("mesh", np.full(part.sizes["mesh"], absent[name])) for name in known.keys() - part.coords.keys()
+            name: np.nan if known[name].dtype.kind in "fiu" else "" for name in known.keys() - part.coords.keys()
         }
+        columns = {name: ("mesh", np.full(part.sizes["mesh"], absent, object)) for name, absent in lacking.items()}
         same = {"other": parts[0]["other"]} if "other" in part.dims else {}
-        filled.append(part.assign_coords({**lacking, **same}))
+        filled.append(part.assign_coords({**columns, **same}))
     return describe(
         xr.concat(
             filled, "mesh", data_vars="minimal", coords="minimal", compat="override", join="exact",
@@ -229,11 +227,11 @@ def _concatenated(parts: Sequence[xr.Dataset]) -> xr.Dataset:
 
 def store_of(tree: xr.DataTree) -> Store:
     """Return the store of an open tree, or those of several as one."""
-    parts = tree.encoding.get(_PARTS)
-    if parts is None:
+    if _PARTS not in tree.encoding:
         return Store.open(location_of(tree))
-    stores = [store_of(part) for part, _ in parts]
-    labels = [names.get(label, "") for store, (_, names) in zip(stores, parts, strict=True) for label in store.labels()]
+    stores = [Store.open(location_of(part)) for part, _ in tree.encoding[_PARTS]]
+    names = [own for _, own in tree.encoding[_PARTS]]
+    labels = [own.get(label, "") for store, own in zip(stores, names, strict=True) for label in store.labels()]
     return JoinedStore(stores, labels)
 
 
@@ -261,18 +259,15 @@ def source_of(tree: xr.DataTree) -> str | None:
 
 def require_unchanged(tree: xr.DataTree) -> None:
     """Check that all that was read of a store is one state of it; StoreError where a run has changed it since."""
-    for part, _ in tree.encoding.get(_PARTS, ()):
-        require_unchanged(part)
-    if _PARTS in tree.encoding:
-        return
-    source = source_of(tree)
-    # One that xarray itself has opened says so among its attributes.
-    state = tree.encoding.get(_STATE, tree.attrs.get(DIGEST))
-    if source is not None and Store.open(source).attributes().get(DIGEST) != state:
-        raise StoreError(
-            f"{source}: a run has changed the store while it was read; once that run has ended, open the store again, "
-            "or give the same command again"
-        )
+    for part, _ in tree.encoding.get(_PARTS, [(tree, {})]):
+        source = source_of(part)
+        # One that xarray itself has opened says so among its attributes.
+        state = part.encoding.get(_STATE, part.attrs.get(DIGEST))
+        if source is not None and Store.open(source).attributes().get(DIGEST) != state:
+            raise StoreError(
+                f"{source}: a run has changed the store while it was read; once that run has ended, open the store "
+                "again, or give the same command again"
+            )
 
 
 def location_of(store: AnyStore) -> str | Path | Location:
@@ -299,13 +294,10 @@ def fields_read(store: AnyStore) -> Iterator[None]:
         # zarr's codec has no exception of its own.
         if "checksum" not in str(error):
             raise
-        place = (
-            (store.encoding.get(_SOURCE) or "the store") if isinstance(store, xr.DataTree) else Location.parse(store)
-        )
+        place = store.encoding.get(_SOURCE, "the store") if isinstance(store, xr.DataTree) else Location.parse(store)
+        problem = "its bytes are not those that were stored"
         raise DamageError(
-            f"{place}: a field is damaged: its bytes are not those that were stored; "
-            "sobolev-batch verify names it, and run computes it again",
-            "its bytes are not those that were stored",
+            f"{place}: a field is damaged: {problem}; sobolev-batch verify names it, and run computes it again", problem
         ) from error
 
 
@@ -425,7 +417,7 @@ def label_of(x: str, unit: str = "each object's unit") -> str:
 def sizes_of(frame: pd.DataFrame, x: str) -> Reals:
     """Return a column of `table`, NaN where sizes are not known; InputError where it has no such numbers."""
     if x not in frame or not pd.api.types.is_numeric_dtype(frame[x]):
-        numbers = [name for name in (EDGE_LENGTH, *_GROWING) if name in frame]
+        numbers = [name for name in _LABELS if name in frame]
         given = [name for name in frame.attrs.get("metadata", ()) if pd.api.types.is_numeric_dtype(frame[name])]
         only = " (the store has no families of commands, functions or searches, which have it)"
         hint = only if x.startswith("make_") else ""
