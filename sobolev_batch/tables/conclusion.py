@@ -52,28 +52,17 @@ def study_verdict(frame: pd.DataFrame, failed: Mapping[str, str]) -> tuple[tuple
     It is a sentence for each order; rows of nearest meshes, smallest meshes below bounds, and meshes that are missing
     or imprecise, with their order; and a note on the sizes and families that are left out, empty where none is.
     """
-    groups = [(float(order), rows) for order, rows in frame.groupby("order", sort=False)]
-    sizes = _sizes(groups[0][1])
+    sizes = _sizes(frame[frame["order"] == frame["order"].iloc[0]])
     shown_sizes = spread(sizes, _MOST_SIZES)
     sized = frame[frame["triangles"] > 0]["family"].unique().tolist()
-    lines: list[Row] = []
-    for order, rows in groups:
-        at_sizes = [rows[rows["mesh"].isin(labels)] for labels in shown_sizes]
-        nearest_rows, smallest_rows = _nearest_rows(rows, at_sizes), _smallest_rows(rows, sized[:_MOST_FAMILIES])
-        of_order = (*nearest_rows, *smallest_rows, *_doubtful_rows(rows, failed))
-        lines += [{**line, "order": order} for line in of_order]
-    omitted = [
-        f"{shown} of {total} {things}"
-        for shown, total, things in (
-            (len(shown_sizes), len(sizes), "sizes"),
-            (min(len(sized), _MOST_FAMILIES), len(sized), "families"),
-        )
-        if shown < total
-    ]
-    sentences = []
-    for order, rows in groups:
-        at_sizes = [rows[rows["mesh"].isin(labels)] for labels in sizes]
+    families, sentences, lines = sized[:_MOST_FAMILIES], [], list[Row]()
+    for order, rows in frame.groupby("order", sort=False):
+        at_sizes, at_shown = ([rows[rows["mesh"].isin(labels)] for labels in some] for some in (sizes, shown_sizes))
         sentences.append(f"{_of_sizes(order, at_sizes)}{_sentence(order, rows, frame.attrs['reference'])}")
+        of_order = (*_nearest_rows(rows, at_shown), *_smallest_rows(rows, families), *_doubtful_rows(rows, failed))
+        lines += [{**line, "order": order} for line in of_order]
+    shown = {"sizes": (len(shown_sizes), len(sizes)), "families": (len(families), len(sized))}
+    omitted = [f"{few} of {total} {things}" for things, (few, total) in shown.items() if few < total]
     return tuple(sentences), lines, " and ".join(omitted)
 
 
@@ -241,10 +230,9 @@ def format_objects(
     for name, frame in tables_of(store, orders).items():
         for order, of_order in frame.groupby("order", sort=False):
             known = of_order[of_order["distance"].notna()]
-            best = None if known.empty else known.loc[known["relative"].idxmin()]
-            numbers = (
-                {"mesh": "", "relative": math.nan} if best is None else best[["mesh", "relative", "relative_error"]]
-            )
+            numbers: Row = {"mesh": "", "relative": math.nan}
+            if len(known):
+                numbers = known.loc[known["relative"].idxmin(), ["mesh", "relative", "relative_error"]].to_dict()
             totals = {"meshes": len(known), "missing": len(of_order) - len(known)}
             imprecise = int((known["resolved"].astype(bool) & ~known["within"].astype(bool)).sum())
             rows.append({"order": order, "object": name, **numbers, **totals, "above_rtol": imprecise})
