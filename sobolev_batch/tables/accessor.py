@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import xarray as xr
 from numpy.typing import ArrayLike
@@ -53,11 +54,11 @@ class SobolevAccessor:
 
     def norm(self, order: Orders = DEFAULT_ORDER) -> xr.Dataset:
         """Return the norm ||a||_s of one order or several, with its error; see `sobolev_batch.norm`."""
-        return self._each(lambda field: norm(field, order))
+        return self._each(partial(norm, order=order))
 
     def distance(self, other: OperandLike, order: Orders = DEFAULT_ORDER) -> xr.Dataset:
         """Return the distance from another field or a surface, with its error; see `sobolev_batch.distance`."""
-        return self._each_with(other, order, lambda field, common: distance(field, common, order))
+        return self._each(partial(distance, order=order), self._transformed(other, order))
 
     def spectrum(
         self,
@@ -71,13 +72,8 @@ class SobolevAccessor:
 
         See `sobolev_batch.spectrum`.
         """
-
-        def one(field: xr.DataArray, common: xr.DataArray | None) -> xr.Dataset:
-            return spectrum(field, common, order, bands=bands, similarity=similarity)
-
-        if other is None:
-            return self._each(lambda field: one(field, None))
-        return self._each_with(other, order, one)
+        common = None if other is None else self._transformed(other, order)
+        return self._each(partial(spectrum, order=order, bands=bands, similarity=similarity), common)
 
     def witness(
         self,
@@ -93,21 +89,18 @@ class SobolevAccessor:
         """
         return witness(self._field, other, order, points, eps=eps)
 
-    def _each_with(
-        self, other: OperandLike, order: Orders, one: Callable[[xr.DataArray, xr.DataArray], xr.Dataset]
-    ) -> xr.Dataset:
-        """Apply a function to each field and one other, which is transformed once if it is a surface."""
+    def _transformed(self, other: OperandLike, order: Orders) -> xr.DataArray:
+        """Return the field of another surface on the same lattice."""
         stacked = self._stacked()
         first = self._field if stacked is None else self._field.isel({stacked: 0})
-        _, common = pair_of(first, other, None, check_orders(order))
-        return self._each(lambda field: one(field, common))
+        return pair_of(first, other, None, check_orders(order))[1]
 
-    def _each(self, one: Callable[[xr.DataArray], xr.Dataset]) -> xr.Dataset:
-        """Apply a function to each field and join the results along the dimension of the stack."""
+    def _each(self, one: Callable[..., xr.Dataset], *others: xr.DataArray | None) -> xr.Dataset:
+        """Apply a function to each field, and the same others, and join results along the dimension of the stack."""
         stacked = self._stacked()
         if stacked is None:
-            return one(self._field)
-        results = [one(self._field.isel({stacked: i})) for i in range(self._field.sizes[stacked])]
+            return one(self._field, *others)
+        results = [one(self._field.isel({stacked: i}), *others) for i in range(self._field.sizes[stacked])]
         joined = xr.concat(results, dim=stacked, coords="minimal", compat="equals", join="exact", data_vars="all")
         return joined.assign_coords({stacked: self._field[stacked]} if stacked in self._field.coords else {})
 
