@@ -22,7 +22,7 @@ import pytest
 from distributed import Client
 
 import sobolev_batch as sb
-from sobolev_batch.cli.output import overwrite, progress_bar, show_usage_error
+from sobolev_batch.cli.output import progress_bar, replace_line, show_usage_error
 from sobolev_batch.sources import files
 from sobolev_batch.tables import FORMATS
 from sobolev_batch.tables.rendering import machine_table, printed_table, prose
@@ -227,10 +227,11 @@ def test_choices_of_an_option_that_lacks_are_indented(capsys: pytest.CaptureFixt
     assert capsys.readouterr().err.splitlines()[1:] == ["  csv,", "  nc", r"Error: a\tb"]
 
 
-def test_lines_that_are_updated_in_place(capsys: pytest.CaptureFixture[str]) -> None:
-    overwrite(f"1 done, {HOSTILE}")
-    # Elsewhere than on a terminal, click leaves out the sequence that clears the line.
-    assert capsys.readouterr().out == f"\r1 done, {SHOWN}"
+def test_lines_that_are_updated_in_place(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    replace_line(f"1 done, {HOSTILE}", "")
+    monkeypatch.undo()
+    assert capsys.readouterr().out == f"\r\x1b[K1 done, {SHOWN}"
     with progress_bar(1, HOSTILE) as bar:
         bar.update(1)
     assert not harmful(capsys.readouterr().err)

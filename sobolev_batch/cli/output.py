@@ -80,11 +80,6 @@ def echo_result(style: str, text: object, document: Mapping[str, Any]) -> None:
     echo_lines(json_text(document) if style == "json" else text)
 
 
-def overwrite(line: str = "") -> None:
-    """Replace the last line of the terminal; a longer one would wrap, and stay."""
-    click.echo(_CLEAR_LINE + visible(line)[: shutil.get_terminal_size().columns - 1], nl=False)
-
-
 def progress_bar(length: int, label: str, *, show_count: bool = True) -> Any:
     """Return a bar on standard error."""
     return click.progressbar(length=length, label=visible(label), file=sys.stderr, show_pos=show_count)
@@ -103,7 +98,8 @@ def replace_line(text: str, before: str) -> str:
     """Show a text in the place of the one before on a terminal, elsewhere on a new line; return the text."""
     if sys.stdout.isatty():
         if text or before:
-            overwrite(text)
+            # A longer line would wrap, and stay.
+            click.echo(_CLEAR_LINE + visible(text)[: shutil.get_terminal_size().columns - 1], nl=False)
     elif text not in ("", before):
         echo(text)
     return text
