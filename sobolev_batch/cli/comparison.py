@@ -128,8 +128,8 @@ class CompareOptions:
             a, numbers["motion"] = _moved(read_mesh(self.a), self.motion), self.motion.tolist()
             echo(f"note: {_motion_text(self.motion)}", err=True)
         if (tolerance := self.allowed_fraction) is not None:
-            settings: dict[str, Any] = {"scaling": not self.no_scaling, "memory": self.memory}
-            same = same_surface(a, self.b, tolerance=tolerance, order=self.chosen_orders[0], **settings)
+            (order,), scaling = self.chosen_orders, not self.no_scaling
+            same = same_surface(a, self.b, tolerance=tolerance, order=order, scaling=scaling, memory=self.memory)
             return f"{self.a.name}: {same}", vars(same) | numbers | {"distance": same.distance, "error": same.error}
         near = judge_deviation(a, self.b, str(self.within), self.unit)
         numbers |= {"outcome": near.outcome, "length": near.length, "unit": near.unit, "beyond": near.beyond}
@@ -180,7 +180,7 @@ class Comparison:
         results: What `yardsticks` returns, of moves alone if no others were asked for.
         nearness: What `proximity` returns, in the unit of the files; None if not asked for.
         deviations: Largest deviations in this unit; None if it has no name and `proximity` was not asked for.
-        motion: Rigid motion (4, 4) of A, and the distance before; None if not asked for.
+        before: The distance before A was moved; None if that was not asked for.
         doubt: Question whether both are in one unit and place; None where they look it.
     """
 
@@ -191,7 +191,7 @@ class Comparison:
     results: xr.Dataset
     nearness: dict[str, float] | None
     deviations: Deviations | None
-    motion: tuple[Reals, xr.Dataset] | None
+    before: xr.Dataset | None
     doubt: str | None
 
     @classmethod
@@ -202,9 +202,9 @@ class Comparison:
         if options.witness is not None:
             require_place(options.witness)
         similarity = Similarity() if options.no_scaling else Similarity.to_unit_ball(second)
-        orders, motion = options.chosen_orders, None
+        orders, before = options.chosen_orders, None
         if options.motion is not None:
-            motion = options.motion, distance(similarity.apply(first), similarity.apply(second), orders[0], **accuracy)
+            before = distance(similarity.apply(first), similarity.apply(second), orders[0], **accuracy)
             first = _moved(first, options.motion)
         pair = similarity.apply(first), similarity.apply(second)
         doubt = placement_doubt(*(surface.extent for surface in pair))
@@ -218,7 +218,7 @@ class Comparison:
             deviations = largest_deviation(first, second)
         changes = CHANGES if options.yardsticks else ("moved",)
         results = yardsticks(*pair, orders, **accuracy, changes=changes)
-        return cls(options, first, second, similarity, results, nearness, deviations, motion, doubt)
+        return cls(options, first, second, similarity, results, nearness, deviations, before, doubt)
 
     @property
     def area_change(self) -> float:
@@ -228,7 +228,7 @@ class Comparison:
     @property
     def document(self) -> dict[str, Any]:
         """All numbers, for programs."""
-        motion, before = self.motion or (None, None)
+        motion = self.options.motion
         return {
             "a": self.options.a,
             "b": self.options.b,
@@ -236,7 +236,7 @@ class Comparison:
             **vars(self.similarity),
             "orders": parts_as_variables(self.results).to_dataframe().reset_index().to_dict(orient="records"),
             "motion": None if motion is None else motion.tolist(),
-            "before": None if before is None else before["relative"].item(),
+            "before": None if self.before is None else self.before["relative"].item(),
             "settings": self.results.attrs,
             "proximity": self.nearness,
             "deviation": None if self.deviations is None else asdict(self.deviations),
@@ -271,10 +271,10 @@ class Comparison:
             largest = deviation_text(self.deviations.both, self.unit)
             both = " and ".join(self.options.names)
             yield f"The largest deviation of {both} from each other is {largest}."
-        if self.motion is not None:
-            motion, before = self.motion
-            yield f"where it is in the file: {percent(before['relative'].item(), before['relative_error'].item())}"
-            yield _motion_text(motion)
+        if self.options.motion is not None and self.before is not None:
+            relative, error = (self.before[name].item() for name in ("relative", "relative_error"))
+            yield f"where it is in the file: {percent(relative, error)}"
+            yield _motion_text(self.options.motion)
         yield from dict.fromkeys(answer(*self.options.names, result, self.area_change) for result in by_order)
         # Of equal meshes there is no more to tell.
         unequal = [result for result in by_order if result["distance"] > 0]
@@ -328,12 +328,8 @@ class Comparison:
     def write_witness(self, path: Path) -> str:
         """Write or draw where the meshes differ, and return a line about it; see `write_difference`."""
         unit, order = self.unit if self.options.proximity else None, self.options.chosen_orders[0]
-        settings: dict[str, Any] = {
-            "scaling": not self.options.no_scaling,
-            "names": self.options.names,
-            "distances": unit,
-        }
-        return write_difference(self.first, self.second, path, order, **settings)
+        names, scaling = self.options.names, not self.options.no_scaling
+        return write_difference(self.first, self.second, path, order, scaling=scaling, names=names, distances=unit)
 
 
 def _moved(mesh: Mesh, motion: Reals) -> Mesh:
