@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -18,7 +19,6 @@ Callback = TypeVar("Callback", bound=Callable[..., Any])
 
 
 def _numbers(value: Any) -> tuple[float, ...]:
-    """Return one number, or several with commas between them."""
     try:
         # A default was converted already.
         return value if isinstance(value, tuple) else tuple(float(part) for part in str(value).split(","))
@@ -57,19 +57,12 @@ def memory_size(value: Any) -> int:
 
 
 store_argument = click.argument("store", type=location, metavar="STORE")
-format_option = click.option(
-    *("--format", "style"),
-    type=click.Choice(FORMATS),
-    default="text",
-    show_default=True,
-    help="Print text, markdown or latex for people, csv or json for programs.",
+_in_format = partial(click.option, "--format", "style", default="text", show_default=True)
+format_option = _in_format(
+    type=click.Choice(FORMATS), help="Print text, markdown or latex for people, csv or json for programs."
 )
-json_option = click.option(
-    *("--format", "style"),
-    type=click.Choice(["text", "json"]),
-    default="text",
-    show_default=True,
-    help="Print text for people, or one JSON document for programs.",
+json_option = _in_format(
+    type=click.Choice(["text", "json"]), help="Print text for people, or one JSON document for programs."
 )
 
 
