@@ -39,15 +39,14 @@ def export(store: AnyStore, path: Path, style: ExportFormat, order: Orders | Non
 
 
 def _groups_of(store: AnyStore) -> xr.DataTree:
-    groups = {}
+    groups = {"/": xr.Dataset()}
     for name, place in stores_of(store).items():
         tree = as_tree(place)
         # Without tables it says so.
         finished_group(tree, "meshes", load=False)
-        root = xr.Dataset(attrs=tree.attrs)
-        for group, one in (("", root), *((g, tree[g].to_dataset().load()) for g in _GROUPS if g in tree.children)):
-            groups["/".join(filter(None, ("", name, group))) or "/"] = _in_known_units(one)
-    groups.setdefault("/", xr.Dataset())
+        groups[name or "/"] = xr.Dataset(attrs=tree.attrs)
+        for group in [one for one in _GROUPS if one in tree.children]:
+            groups[f"{name}/{group}".lstrip("/")] = _in_known_units(tree[group].to_dataset().load())
     groups["/"].attrs |= {"Conventions": "CF-1.11", "history": f"{utc_now()} sobolev-batch export"}
     return xr.DataTree.from_dict(groups)
 
