@@ -7,14 +7,13 @@ from: an interrupted run goes on with the tiles that are missing, and new meshes
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
 import xarray as xr
 
-from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import DamageError
 from sobolev_batch.norms.columns import VARIABLES, describe
 from sobolev_batch.norms.estimate import PARTS, NormEstimate
@@ -130,16 +129,9 @@ class Pairs:
 def fill_tile(reducer: Reducer, pairs: Pairs, tile: tuple[int, int]) -> None:
     """Compute a tile of distances, and write it with its mirror image; DamageError where a field was changed."""
     sides = [pairs.tile_rows(number) for number in tile]
-    complete = [[row for row in side if row in pairs.keys] for side in sides]
-    places = np.ix_(*([place for place, row in enumerate(side) if row in pairs.keys] for side in sides))
-    unknown = np.full((1 + len(PARTS), len(pairs.orders), *map(len, complete)), np.nan)
-    estimate = pair_distances(reducer, *complete) if all(complete) else NormEstimate(*unknown)
+    estimate = known_distances(reducer, *sides, pairs.keys.keys())
     spans = [slice(k * pairs.side, k * pairs.side + len(side)) for k, side in zip(tile, sides, strict=True)]
-    arrays: dict[str, Reals] = {}
-    for name, values in sorted(estimate.named("distance").items()):
-        moved = np.moveaxis(values, 0, 2)
-        arrays[name] = np.full((*map(len, sides), *moved.shape[2:]), np.nan)
-        arrays[name][places] = moved
+    arrays = {name: np.moveaxis(values, 0, 2) for name, values in sorted(estimate.named("distance").items())}
     mirrored = {name: np.swapaxes(values, 0, 1) for name, values in arrays.items()}
     both = [(tile, spans, arrays), (tile[::-1], spans[::-1], mirrored)][: len({*tile})]
     # Should this be interrupted, no old key may stand for new values.
@@ -154,6 +146,16 @@ def fill_tile(reducer: Reducer, pairs: Pairs, tile: tuple[int, int]) -> None:
 
 def _write_key(store: Store, tile: tuple[int, ...], text: str) -> None:
     store.write(PAIRS_KEYS, tuple(slice(k, k + 1) for k in tile), np.array([[text]], dtype=object))
+
+
+def known_distances(reducer: Reducer, rows: Sequence[int], others: Sequence[int], complete: Set[int]) -> NormEstimate:
+    """Return distances over (orders, rows, others), of complete rows as `pair_distances`, else NaN."""
+    known = [[row for row in side if row in complete] for side in (rows, others)]
+    places = np.ix_(*([place for place, row in enumerate(side) if row in complete] for side in (rows, others)))
+    values = np.full((1 + len(PARTS), len(reducer.orders), len(rows), len(others)), np.nan)
+    if all(known):
+        values[(..., *places)] = np.stack([*pair_distances(reducer, *known)])
+    return NormEstimate(*values)
 
 
 def pair_distances(reducer: Reducer, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:

@@ -27,7 +27,7 @@ from sobolev_batch.tables.open import (
     source_of,
     store_of,
 )
-from sobolev_batch.tables.pairs import pair_distances
+from sobolev_batch.tables.pairs import known_distances, pair_distances
 from sobolev_batch.tables.reducer import Reducer
 from sobolev_batch.tables.results import Results, table_of
 from sobolev_batch.tables.shells import lower_bounds, spectrum_keys, stale_chunks
@@ -308,16 +308,8 @@ def _pairs_at(tree: xr.DataTree, meshes: xr.Dataset, others: tuple[float, ...]) 
     """Return the distances of all pairs of meshes from their fields."""
     reducer, _ = stored_reducer(tree, others)
     rows: list[int] = meshes["row"].values.tolist()
-    place_of = {row: place for place, row in enumerate(rows)}
-    complete = [row for row in reducer.complete if row in place_of]
-    first, second = np.ix_(*[[place_of[row] for row in complete]] * 2)
-    found = pair_distances(reducer, complete, complete).named("distance")
-    columns = {}
-    for name, values in found.items():
-        columns[name] = np.full((len(others), len(rows), len(rows), *values.shape[3:]), np.nan)
-        columns[name][:, first, second] = values
-    table = table_of(columns, meshes, others, "mesh", "other")
-    return describe(table.assign_coords(other=meshes["mesh"].values))
+    found = known_distances(reducer, rows, rows, set(reducer.complete)).named("distance")
+    return describe(table_of(found, meshes, others, "mesh", "other").assign_coords(other=meshes["mesh"].values))
 
 
 def norms_at(tree: xr.DataTree, order: Orders | None, meshes: Meshes = None) -> xr.Dataset:
