@@ -146,14 +146,13 @@ def _set_up_logging(debug: bool) -> None:
     )
     for handler in logging.root.handlers:
         handler.addFilter(_with_kind)
+        if not debug:
+            # Not by the level of its logger, which the cluster sets itself when it is imported.
+            handler.addFilter(_is_shown)
     if debug:
         # At debug level they log requests with their signatures and session tokens.
         for driver in _DRIVERS:
             logging.getLogger(driver).setLevel(logging.INFO)
-    else:
-        # Not by the level of its logger, which the cluster sets itself when it is imported.
-        for handler in logging.root.handlers:
-            handler.addFilter(_is_shown)
 
 
 def _with_kind(record: logging.LogRecord) -> bool:

@@ -6,6 +6,7 @@ import json
 import shlex
 from collections.abc import Callable
 from contextlib import nullcontext, suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,6 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.norms import DEFAULT_ORDER
 
 if TYPE_CHECKING:
-    from sobolev_batch.batch.reduce import Reduction
     from sobolev_batch.store.location import Location
     from sobolev_batch.tables import Format
 
@@ -273,11 +273,7 @@ def reduce_command(
     if suffix:
         words = shlex.split(settings["method"])
         settings["method"] = {"source": "command", "command": words, "input": suffix, "output": suffix}
-
-    def tell(one: Reduction) -> None:
-        if len(files) > 1:
-            echo(one, err=True)
-
+    tell = partial(echo, err=True) if len(files) > 1 else None
     with remote_client(scheduler, trust_network) if scheduler else nullcontext() as client:
         found = reduce(files, client=client, on_progress=tell, **settings)
     echo_lines(format_reductions(found, style, settings["unit"]))
