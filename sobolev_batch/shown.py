@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import sys
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from html import escape
 from typing import TYPE_CHECKING, Any
@@ -31,23 +30,11 @@ class Shown:
         return _below(caption, f"<table>{rows}</table>")
 
 
-class ShownTables(ABC):
-    """A value that notebooks show as tables below a caption."""
-
-    @property
-    @abstractmethod
-    def caption(self) -> str:
-        """Title of the tables."""
-
-    @property
-    @abstractmethod
-    def _tables(self) -> Sequence[pd.DataFrame]:
-        """The tables."""
-
-    def _repr_html_(self) -> str:
-        # pandas escapes names.
-        tables = (table.to_html(index=False, float_format="{:.3g}".format) for table in self._tables if len(table))
-        return _below(self.caption, "".join(tables))
+def shown_tables(caption: str, *tables: pd.DataFrame) -> str:
+    """Return tables below a caption, as notebooks show them."""
+    # pandas escapes names.
+    texts = (table.to_html(index=False, float_format="{:.3g}".format) for table in tables if len(table))
+    return _below(caption, "".join(texts))
 
 
 @contextmanager

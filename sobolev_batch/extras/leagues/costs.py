@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
-from sobolev_batch.shown import ShownTables
+from sobolev_batch.shown import shown_tables
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.open import EDGE_LENGTH, sizes_of
 from sobolev_batch.tables.rendering import Column, Section, rendered
@@ -38,7 +38,7 @@ METHOD_COLUMNS = (
 
 
 @dataclass(frozen=True, eq=False)
-class CostLeague(ShownTables):
+class CostLeague:
     """The meshes of a study by distance and cost, at one order. Make it by `league` with ``by="cost"``.
 
     Attributes:
@@ -120,10 +120,8 @@ class CostLeague(ShownTables):
         means = self.means[self.means["front"]]
         return means.assign(member=means["method"] + "/" + means["member"], objects=len(self.objects))
 
-    @property
-    def _tables(self) -> tuple[pd.DataFrame, ...]:
-        """`table` and `means`, which notebooks show."""
-        return self.table, self.means
+    def _repr_html_(self) -> str:
+        return shown_tables(self.caption, self.table, self.means)
 
 
 def cost_leagues_of(

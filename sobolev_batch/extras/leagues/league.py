@@ -28,7 +28,7 @@ from sobolev_batch.extras.leagues.statistics import (
     within_objects,
 )
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
-from sobolev_batch.shown import ShownTables
+from sobolev_batch.shown import shown_tables
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.objects import Objects
@@ -96,7 +96,7 @@ PAIR_COLUMNS = (
 
 
 @dataclass(frozen=True, eq=False)
-class League(ShownTables):
+class League:
     """The methods of a study, compared over its objects at one order. Make it by `league`.
 
     Attributes:
@@ -203,10 +203,8 @@ class League(ShownTables):
         frame["nearer"] = np.where(frame["p"] < SIGNIFICANCE, nearer, "")
         return frame
 
-    @property
-    def _tables(self) -> tuple[pd.DataFrame, ...]:
-        """`table` and `pairs`, which notebooks show."""
-        return self.table, self.pairs
+    def _repr_html_(self) -> str:
+        return shown_tables(self.caption, self.table, self.pairs)
 
 
 @overload
