@@ -286,9 +286,8 @@ def format_table(
     frames = tables_of(store, orders, x=x)
     stores = stores_of(store)
     trees = {name: as_tree(stores[name]) for name in frames}
-    rows = _joined(frames)
     sections = (part for name, frame in frames.items() for part in _sections(name, trees[name], frame, x))
-    return rendered(style, rows, sections, _notes([*trees.values()], list(frames.values()), x))
+    return rendered(style, _joined(frames), sections, _notes([*trees.values()], list(frames.values()), x))
 
 
 def _sections(name: str, tree: xr.DataTree, frame: pd.DataFrame, x: str) -> Iterator[Section]:

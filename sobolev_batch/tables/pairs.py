@@ -129,7 +129,7 @@ class Pairs:
 def fill_tile(reducer: Reducer, pairs: Pairs, tile: tuple[int, int]) -> None:
     """Compute a tile of distances, and write it with its mirror image; DamageError where a field was changed."""
     sides = [pairs.tile_rows(number) for number in tile]
-    estimate = known_distances(reducer, *sides, pairs.keys.keys())
+    estimate = known_distances(reducer, sides[0], sides[1], pairs.keys.keys())
     spans = [slice(k * pairs.side, k * pairs.side + len(side)) for k, side in zip(tile, sides, strict=True)]
     arrays = {name: np.moveaxis(values, 0, 2) for name, values in sorted(estimate.named("distance").items())}
     mirrored = {name: np.swapaxes(values, 0, 1) for name, values in arrays.items()}
@@ -151,10 +151,10 @@ def _write_key(store: Store, tile: tuple[int, ...], text: str) -> None:
 def known_distances(reducer: Reducer, rows: Sequence[int], others: Sequence[int], complete: Set[int]) -> NormEstimate:
     """Return distances over (orders, rows, others), of complete rows as `pair_distances`, else NaN."""
     known = [[row for row in side if row in complete] for side in (rows, others)]
-    places = np.ix_(*([place for place, row in enumerate(side) if row in complete] for side in (rows, others)))
+    first, second = np.ix_(*([place for place, row in enumerate(side) if row in complete] for side in (rows, others)))
     values = np.full((1 + len(PARTS), len(reducer.orders), len(rows), len(others)), np.nan)
     if all(known):
-        values[(..., *places)] = np.stack([*pair_distances(reducer, *known)])
+        values[..., first, second] = np.stack([*pair_distances(reducer, *known)])
     return NormEstimate(*values)
 
 
