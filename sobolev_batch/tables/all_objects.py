@@ -82,7 +82,6 @@ def write_all(root: Store, names: Sequence[str], changed: Iterable[bytes], kept:
 
 
 def _joined(parts: Sequence[Tables]) -> dict[str, xr.Dataset]:
-    """Return the tables of several parts as one each."""
     of_groups = {
         group: [part[group] for part in parts if group in part and part[group].sizes["mesh"]] for group in TABLES_OF_ALL
     }

@@ -92,7 +92,6 @@ def _of_sizes(order: float, at_sizes: Sequence[pd.DataFrame]) -> str:
 
 
 def _sentence(order: float, rows: pd.DataFrame, reference: str) -> str:
-    """Return a sentence on one order."""
     name, at_order = "the reference" if reference == "reference" else reference, minus(f"at order {order:g}")
     closest, compared = nearest(rows), int(rows["distance"].notna().sum())
     if compared == 0:
@@ -188,7 +187,6 @@ def _row(label: str, mesh: Mapping[str, Any] | pd.Series, remark: str) -> Row:
 
 
 def _absent(label: str, text: str) -> Row:
-    """Return a row with a text in place of numbers."""
     return {"verdict": label, "absent": text}
 
 

@@ -300,13 +300,11 @@ def _sections(name: str, tree: xr.DataTree, frame: pd.DataFrame, x: str) -> Iter
         columns.insert(2, Column(x, x, "{:.4g}".format))
     for order, rows in marked.groupby("order", sort=False):
         yield Section(f"Sobolev distance of order {order:g} to {frame.attrs['reference']}", [(columns, rows)])
+    once = marked[marked["order"] == marked["order"].iloc[0]]
     if has_proximity(tree):
-        once = marked[marked["order"] == marked["order"].iloc[0]]
-        others = (_MESH, *_metric_columns(tree)), once
-        yield Section("Other distances, the same at all orders", [others])
+        yield Section("Other distances, the same at all orders", [((_MESH, *_metric_columns(tree)), once)])
     connection = [column for column in CONNECTION_COLUMNS if column.name in frame]
-    if frame[[column.name for column in connection]].nunique().gt(1).any():
-        once = marked[marked["order"] == marked["order"].iloc[0]]
+    if once[[column.name for column in connection]].nunique().gt(1).any():
         yield Section("How triangles are connected", [((_MESH, *connection), once)])
     if "computed" in frame.attrs:
         yield Section(sentences=order_note(tree, frame.attrs["computed"]))
@@ -460,7 +458,6 @@ def format_smallest(
 
 
 def _smallest(members: pd.DataFrame, most: float) -> dict[str, Any]:
-    """Return the row of one family at one order."""
     lowest, highest = (members["relative"] + sign * members["relative_error"] for sign in (-1, 1))
     below = members[highest < most].sort_values(["triangles", "relative"])
     best = _UNKNOWN if below.empty else below.iloc[0]
@@ -480,6 +477,8 @@ def _remark(row: Mapping[Any, Any]) -> str:
     """Return the nearest mesh of a family without one below the bound, and the undecided ones."""
     remarks = []
     if not row["mesh"]:
-        nearest_text = f"nearest: {row['nearest']}, {percent(row['nearest_relative'], row['nearest_relative_error'])}"
-        remarks.append(nearest_text if row["nearest"] else "no distance is known")
-    return "; ".join([*remarks, *([f"undecided: {row['undecided']}"] if row["undecided"] else [])])
+        amount = percent(row["nearest_relative"], row["nearest_relative_error"])
+        remarks.append(f"nearest: {row['nearest']}, {amount}" if row["nearest"] else "no distance is known")
+    if row["undecided"]:
+        remarks.append(f"undecided: {row['undecided']}")
+    return "; ".join(remarks)

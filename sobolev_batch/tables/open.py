@@ -137,7 +137,6 @@ def open_store(store: str | Path | Location | Sequence[str | Path | Location]) -
 
 
 def _joined(trees: Sequence[xr.DataTree]) -> xr.DataTree:
-    """Return open stores as one."""
     if not trees:
         raise InputError("no store is named")
     for tree in trees[1:]:

@@ -130,10 +130,8 @@ def printed_table(
     are wrapped, and labels lose what they repeat and then their middle. Columns that still have no room follow in a
     table of their own, without rows that have no cells there. Tabulate escapes LaTeX's special characters.
     """
-    rows, headers = (
-        [[_escaped(cell, style) for cell in row] for row in rows],
-        [_escaped(text, style) for text in headers],
-    )
+    rows = [[_escaped(cell, style) for cell in row] for row in rows]
+    headers = [_escaped(text, style) for text in headers]
     if style != "text":
         sides = ["right" if column and column not in texts else "left" for column in range(len(headers))]
         settings = {"tablefmt": _TABULATE_FORMATS[style], "disable_numparse": True, "colalign": sides}
@@ -182,7 +180,6 @@ def _widths(rows: Sequence[Sequence[str]], headers: Sequence[str], padding: int 
 
 
 def _lacking(widths: Sequence[int]) -> int:
-    """Return by how much a line of columns is too long."""
     return sum(widths) + _GAP * (len(widths) - 1) - line_length()
 
 

@@ -265,13 +265,13 @@ def _computed(tree: xr.DataTree, orders: tuple[float, ...], meshes: Meshes = Non
         chosen = [meshes] if isinstance(meshes, str) else list(meshes)
         _require_fields(tree, table, chosen)
         table = table.sel(mesh=list(dict.fromkeys([*chosen, reference])))
-    columns = (table[name].values.tolist() for name in ("mesh", "row", "status", "key"))
-    complete = {row: (label, key) for label, row, status, key in zip(*columns, strict=True) if status == "complete"}
-    row_of_reference = next((row for row, (label, _) in complete.items() if label == reference), -1)
-    keys = spectrum_keys({row: key for row, (_, key) in complete.items()}, row_of_reference)
+    complete = table.isel(mesh=table["status"].values == "complete")
+    labels, complete_rows, own_keys = (complete[name].values.tolist() for name in ("mesh", "row", "key"))
+    row_of_reference = dict(zip(labels, complete_rows, strict=True)).get(reference, -1)
+    keys = spectrum_keys(dict(zip(complete_rows, own_keys, strict=True)), row_of_reference)
     qualities: dict[int, Quality] = {}
     for first, part in store.parts:
-        rows = [row for row in sorted(complete) if first <= row < first + part.row_count]
+        rows = [row for row in sorted(keys) if first <= row < first + part.row_count]
         if stale_chunks(part, {row - first: keys[row] for row in rows}):
             problem = "they are not those of the stored fields"
             raise DamageError(f"{part.path}: radial spectra are damaged ({problem}); run the study again", problem)
@@ -360,7 +360,6 @@ def _at_orders(
 
 
 def _inner_bands(reducer: Reducer, rows: list[int]) -> list[Band]:
-    """Return the octaves within the lattice."""
     lattice, orders = reducer.lattice, reducer.orders
     sums = np.zeros(lattice.shell_count)
     for number, block in enumerate(reducer.blocks):
@@ -381,7 +380,6 @@ def _inner_bands(reducer: Reducer, rows: list[int]) -> list[Band]:
 
 
 def _octaves(reducer: Reducer, rows: list[int]) -> list[Band]:
-    """Return the octaves beyond the lattice."""
     if reducer.sampling is None:
         return []
     values = [reducer.read_octaves(row) for row in rows]
