@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,6 +36,16 @@ _SECONDS = 6e-8
 _AREA_RESOLUTION = 8 * np.finfo(np.float64).eps
 # Rounding to single precision along all axes, relative to the largest coordinate, with some margin.
 _SINGLE_ROUNDING = 2.0**-22
+
+
+class _Sizes(NamedTuple):
+    """Of triangles: areas, centroid radii, both lengths of edges, and how many have no area to double precision."""
+
+    areas: Reals
+    radii: Reals
+    mean_edge: float
+    longest_edge: float
+    without_area: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +91,7 @@ class Mesh:
                 "the mesh has coordinates so large that areas or squared lengths overflow double precision: "
                 f"largest absolute coordinate {largest:.3g}; rescale it"
             )
-        if not any(np.any(self.areas[batch] > zero_areas) for batch, zero_areas in self._zero_areas()):
+        if self._sizes.without_area == len(self.triangles):
             raise MeshError(
                 f"the total area of the {len(self.triangles)} triangles is zero: every one is "
                 "degenerate, so there is no surface measure to compare"
@@ -104,7 +114,7 @@ class Mesh:
     @property
     def areas(self) -> Reals:
         """Area of each triangle (m,), in squared units of length."""
-        return self._sizes[0]
+        return self._sizes.areas
 
     @cached_property
     def area(self) -> float:
@@ -120,12 +130,12 @@ class Mesh:
     @property
     def edge_length_range(self) -> tuple[float, float]:
         """Mean and maximum of the `edge_lengths`."""
-        return self._sizes[2]
+        return self._sizes.mean_edge, self._sizes.longest_edge
 
     @property
     def centroid_radii(self) -> Reals:
         """Distance from the centroid of each triangle to its farthest corner (m,)."""
-        return self._sizes[1]
+        return self._sizes.radii
 
     @cached_property
     def extent(self) -> Extent:
@@ -137,8 +147,8 @@ class Mesh:
         """Centre of the bounding box, and distance from it to the farthest of the `used_vertices`."""
         lower, upper = self.extent.box
         center = lower + (upper - lower) / 2
-        radius = float(np.linalg.norm(self.vertices[self.used_vertices] - center, axis=1).max())
-        return (float(center[0]), float(center[1]), float(center[2])), radius
+        x, y, z = center.tolist()
+        return (x, y, z), float(np.linalg.norm(self.vertices[self.used_vertices] - center, axis=1).max())
 
     def moved(self, scale: float, origin: Point, turn: Reals | None = None) -> Mesh:
         """Return the mesh after x -> scale * turn (x - origin), where a turn (3, 3) is a rotation."""
@@ -193,9 +203,8 @@ class Mesh:
         """
         unused = len(self.vertices) - len(self.used_vertices)
         edges, components, boundary, nonmanifold, inconsistent = _edges_of(self.triangles, len(self.vertices))
-        zero_area = sum(int(np.count_nonzero(self.areas[batch] <= limit)) for batch, limit in self._zero_areas())
         return {
-            "zero_area_triangles": zero_area,
+            "zero_area_triangles": self._sizes.without_area,
             "duplicate_triangles": _duplicate_triangles(self.triangles),
             "boundary_edges": boundary,
             "nonmanifold_edges": nonmanifold,
@@ -315,26 +324,20 @@ class Mesh:
             import pyvista
         return pyvista.PolyData.from_regular_faces(np.array(self.vertices), np.array(self.triangles))
 
-    def _zero_areas(self) -> Iterator[tuple[slice, Reals]]:
-        """Yield, for each batch of triangles, the areas below which rounding hides whether they are zero."""
-        for number, edges in enumerate(self._edges()):
-            with np.errstate(over="ignore"):
-                longest: Reals = _side_lengths(edges).max(axis=1)
-                areas = _AREA_RESOLUTION * longest**2
-            # Outside: whoever reads on may be another thread, to which a setting of NumPy does not belong.
-            yield slice(number * _BATCH, (number + 1) * _BATCH), areas
-
     @cached_property
-    def _sizes(self) -> tuple[Reals, Reals, tuple[float, float]]:
-        """Areas, centroid radii, and mean and maximum of the edge lengths: one pass reads the corners for all."""
-        areas, radii, total, longest = np.empty(len(self.triangles)), np.empty(len(self.triangles)), 0.0, 0.0
+    def _sizes(self) -> _Sizes:
+        """One pass reads the corners for all sizes."""
+        areas, radii = np.empty((2, len(self.triangles)))
+        total, longest, without_area = 0.0, 0.0, 0
         with np.errstate(over="ignore", invalid="ignore"):
             for number, squares in enumerate(self._squared_sizes()):
                 batch = slice(number * _BATCH, (number + 1) * _BATCH)
-                roots = np.sqrt(squares, out=squares)
-                areas[batch], radii[batch] = roots[0] / 2, roots[1] / 3
-                total, longest = total + float(roots[2:].sum()), max(longest, float(roots[2:].max()))
-        return _frozen(areas), _frozen(radii), (total / (3 * len(areas)), longest)
+                twice_areas, thrice_radii, *sides = np.sqrt(squares, out=squares)
+                areas[batch], radii[batch] = twice_areas / 2, thrice_radii / 3
+                longest_sides = np.maximum.reduce(sides)
+                without_area += int(np.count_nonzero(areas[batch] <= _AREA_RESOLUTION * longest_sides**2))
+                total, longest = total + float(squares[2:].sum()), max(longest, float(longest_sides.max()))
+        return _Sizes(_frozen(areas), _frozen(radii), total / (3 * len(areas)), longest, without_area)
 
     def _squared_sizes(self) -> Iterator[Reals]:
         """Yield the `_squared_sizes` of each batch of triangles."""
@@ -350,25 +353,14 @@ class Mesh:
 
     def _per_triangle(self, measure: Callable[[_Edges], Reals]) -> Reals:
         """Return a measure of all triangles, taken batch by batch: edges of millions at once take gigabytes."""
-        batches = self._edges()
-        first = measure(next(batches))
-        values = np.empty((len(self.triangles), *first.shape[1:]))
-        values[: len(first)] = first
-        for number, edges in enumerate(batches, 1):
-            values[number * _BATCH : (number + 1) * _BATCH] = measure(edges)
-        return _frozen(values)
+        return _frozen(np.concatenate([measure(edges) for edges in self._edges()]))
 
     def _edges(self) -> Iterator[_Edges]:
         """Yield the edges of each batch of triangles."""
-        columns = [np.ascontiguousarray(column) for column in self.vertices.T]
+        axes = np.ascontiguousarray(self.vertices.T)
         for start in range(0, len(self.triangles), _BATCH):
-            a, b, c = np.ascontiguousarray(self.triangles[start : start + _BATCH].T)
-            first, second = np.empty((3, len(a))), np.empty((3, len(a)))
-            for axis, column in enumerate(columns):
-                origins = column[a]
-                np.subtract(column[b], origins, out=first[axis])
-                np.subtract(column[c], origins, out=second[axis])
-            yield first, second
+            a, b, c = (axes.take(corner, axis=1) for corner in self.triangles[start : start + _BATCH].T)
+            yield b - a, c - a
 
     def __repr__(self) -> str:
         return f"Mesh({len(self.vertices)} vertices, {len(self.triangles)} triangles)"
