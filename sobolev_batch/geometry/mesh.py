@@ -539,12 +539,11 @@ def shared_triangles(first: Reals, second: Reals) -> tuple[NDArray[np.bool_], ND
 
 def _matched(hashes: NDArray[np.uint64], others: NDArray[np.uint64]) -> NDArray[np.bool_]:
     """Return which hashes occur among others; of equal ones, only as many as the others have."""
-    order, others = np.argsort(hashes, kind="stable"), np.sort(others)
-    ordered = hashes[order]
-    rank = np.arange(len(ordered)) - np.searchsorted(ordered, ordered)
-    matched = np.empty(len(ordered), dtype=bool)
-    matched[order] = rank < np.searchsorted(others, ordered, "right") - np.searchsorted(others, ordered)
-    return matched
+    from pandas import Series
+
+    own = Series(hashes)
+    times = own.map(Series(others).value_counts()).fillna(0)
+    return np.asarray(own.groupby(own).cumcount() < times)
 
 
 def _triangle_hashes(corners: Reals) -> NDArray[np.uint64]:
