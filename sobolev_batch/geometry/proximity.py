@@ -18,17 +18,18 @@ MOST_POINTS = 10_000_000
 # The threshold of the F-score, in radii of the bounding sphere of the reference.
 DEFAULT_THRESHOLD = 0.01
 _PERCENTILES = (50, 95, 99)
+_WAYS = ("_forward", "_backward")
 
 _SYMMETRIC = ("hausdorff", "hausdorff_upper", "mean", "rms", *(f"p{percent}" for percent in _PERCENTILES))
 _BOTH_WAYS = (*_SYMMETRIC, "normal_mean", "normal_max")
 LENGTHS = (
-    *(f"{name}{way}" for name in _SYMMETRIC for way in ("", "_forward", "_backward")),
+    *(f"{name}{way}" for name in _SYMMETRIC for way in ("", *_WAYS)),
     *("mean_error", "rms_error", "bias", "bias_error", "chamfer", "chamfer_error", "threshold"),
 )
 NUMBERS = (
     *LENGTHS,
     *("fscore", "precision", "recall"),
-    *(f"{name}{way}" for name in ("normal_mean", "normal_max") for way in ("", "_forward", "_backward")),
+    *(f"{name}{way}" for name in ("normal_mean", "normal_max") for way in ("", *_WAYS)),
 )
 # What a study may show in its tables, with the numbers of `proximity` that belong to it.
 METRICS = {
@@ -115,50 +116,48 @@ def proximity_and_deviations(
     meshes = as_mesh(a), as_mesh(b)
     limit = DEFAULT_THRESHOLD * meshes[1].bounding_sphere[1] if threshold is None else float(threshold)
     searches = [Triangles(mesh) for mesh in meshes]
-    found: dict[str, float] = {}
-    means, matched, deviations = [], [], []
-    for way, own, seeds in zip((0, 1), meshes, np.random.SeedSequence(seed).spawn(2), strict=True):
-        drawn, triangles = _drawn(own, points, np.random.default_rng(seeds))
-        distances, closest = searches[1 - way].closest(drawn)
-        deviations.append(directed_deviation(own, searches[1 - way]))
+    seeds = np.random.SeedSequence(seed).spawn(2)
+    numbers: dict[str, float] = {"threshold": limit}
+    deviations = []
+    ways = zip(_WAYS, meshes, meshes[::-1], searches[::-1], seeds, strict=True)
+    for way, own, other, search, own_seed in ways:
+        drawn, triangles = _drawn(own, points, np.random.default_rng(own_seed))
+        distances, closest = search.closest(drawn)
+        deviations.append(directed_deviation(own, search))
         # Powers of two lose no digit, and keep squares of lengths within the range of doubles.
         scale = 2.0 ** np.frexp(distances.max(initial=np.finfo(float).tiny))[1]
         squares = (distances / scale) ** 2
         rms = float(np.sqrt(squares.mean()))
-        across, other = _normals(own, triangles), _normals(meshes[1 - way], closest)
-        angles = np.degrees(np.arctan2(cross_lengths(across, other), np.abs(dot(across, other))))
-        error = float(distances.std(ddof=1)) / np.sqrt(points)
-        numbers = {
-            "hausdorff": deviations[way].lower,
-            "hausdorff_upper": deviations[way].upper,
+        across, facing = _normals(own, triangles), _normals(other, closest)
+        angles = np.degrees(np.arctan2(cross_lengths(across, facing), np.abs(dot(across, facing))))
+        of_way = {
+            "hausdorff": deviations[-1].lower,
+            "hausdorff_upper": deviations[-1].upper,
             "mean": distances.mean(),
+            "mean_error": distances.std(ddof=1) / np.sqrt(points),
             "rms": scale * rms,
+            "rms_error": scale * squares.std(ddof=1) / (2 * rms * np.sqrt(points)) if rms else 0.0,
             **{f"p{percent}": np.percentile(distances, percent) for percent in _PERCENTILES},
             "normal_mean": angles.mean(),
             "normal_max": angles.max(),
+            "matched": np.mean(distances <= limit),
         }
-        found |= {f"{name}{('_forward', '_backward')[way]}": float(value) for name, value in numbers.items()}
-        means.append((float(distances.mean()), error))
-        rms_error = scale * float(squares.std(ddof=1)) / (2 * rms * np.sqrt(points)) if rms else 0.0
+        numbers |= {f"{name}{way}": float(value) for name, value in of_way.items()}
         if own is meshes[0]:
-            sides = signs(meshes[1], drawn)
+            sides = signs(other, drawn)
             signed = distances * (np.nan if sides is None else sides)
-            found |= {"bias": float(signed.mean()), "bias_error": float(signed.std(ddof=1)) / np.sqrt(points)}
-        found["rms_error"] = max(found.get("rms_error", 0.0), rms_error)
-        matched.append(float(np.mean(distances <= limit)))
-    precision, recall = matched
-    numbers = {
-        **found,
-        **{name: max(found[f"{name}_forward"], found[f"{name}_backward"]) for name in _BOTH_WAYS},
-        "mean_error": max(error for _, error in means),
-        "chamfer": means[0][0] + means[1][0],
-        "chamfer_error": float(np.hypot(means[0][1], means[1][1])),
+            numbers |= {"bias": float(signed.mean()), "bias_error": float(signed.std(ddof=1)) / np.sqrt(points)}
+    for name in (*_BOTH_WAYS, "mean_error", "rms_error"):
+        numbers[name] = max(numbers[f"{name}{way}"] for way in _WAYS)
+    precision, recall = (numbers[f"matched{way}"] for way in _WAYS)
+    numbers |= {
+        "chamfer": numbers["mean_forward"] + numbers["mean_backward"],
+        "chamfer_error": float(np.hypot(numbers["mean_error_forward"], numbers["mean_error_backward"])),
         "fscore": 2 * precision * recall / (precision + recall) if precision + recall else 0.0,
         "precision": precision,
         "recall": recall,
-        "threshold": limit,
     }
-    return numbers, Deviations(*deviations)
+    return {name: numbers[name] for name in NUMBERS}, Deviations(*deviations)
 
 
 def share_beyond(a: MeshLike, b: MeshLike, length: float, points: int = DEFAULT_POINTS) -> tuple[float, float]:
@@ -231,6 +230,6 @@ def _normals(mesh: Mesh, triangles: Indices) -> Vectors:
     """Return vectors (3, n) across triangles, of a length that no product overflows."""
     a, b, c = (corner.T for corner in mesh.corners(triangles))
     sides = b - a, c - a
-    longest = np.maximum(*(np.abs(side).max(axis=0) for side in sides))
+    longest = np.abs(sides).max(axis=(0, 1))
     longest[longest == 0] = 1.0
     return cross(sides[0] / longest, sides[1] / longest)
