@@ -31,19 +31,11 @@ class Refinement:
 
 
 def refinement_of(fine: Mesh, coarse: Mesh, tolerance: float) -> Refinement | None:
-    """Return how a mesh differs from a coarser one whose triangles it has, cut into smaller ones.
+    """Return how a mesh differs from a coarser one whose triangles it has, cut into smaller ones; None if it has not.
 
     The corners of a triangle lie within the tolerance of the other one, and those in one triangle have together its
-    area, centre and moment of inertia, to what the tolerance permits along its edges. Parts that are covered twice
-    while others are bare change these.
-
-    Args:
-        fine: The finer mesh.
-        coarse: The coarser mesh.
-        tolerance: Largest distance, in units of length.
-
-    Returns:
-        The refinement, or None where it is none.
+    area, centre and moment of inertia, to what the tolerance, a length, permits along its edges. Parts that are covered
+    twice while others are bare change these.
 
     >>> from sobolev_batch.geometry.mesh import Mesh
     >>> square = Mesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])

@@ -99,14 +99,8 @@ class Interval:
 
         The interpolant is a trigonometric polynomial where periodic, which needs an odd number of nodes,
         and a polynomial otherwise (H. Wang, S. Xiang 2012, doi:10.1090/S0025-5718-2011-02549-4). For
-        functions that the nodes resolve, the error is about n or n² roundings of the largest value.
-
-        Args:
-            values: Values at the nodes, float64, of any shape.
-            axis: Axis of ``values`` that runs over the nodes.
-
-        Returns:
-            Derivatives, float64, in the shape of ``values``.
+        functions that the nodes resolve, the error is about n or n² roundings of the largest value. The values may
+        have any shape, in which one axis runs over the nodes.
         """
         count = values.shape[axis]
         if self.periodic:
@@ -212,12 +206,12 @@ class Smooth(ABC):
     def bounding_sphere(self) -> tuple[Point, float]:
         """Centre of the bounding box, and radius of the smallest sphere around it that holds the surface."""
         lower, upper = self.extent.box
-        center = lower + (upper - lower) / 2
+        x, y, z = (lower + (upper - lower) / 2).tolist()
 
         def distances(points: Reals) -> Reals:
-            return np.asarray(np.sqrt(sum((points[axis] - center[axis]) ** 2 for axis in range(3))))
+            return np.asarray(np.sqrt((points[0] - x) ** 2 + (points[1] - y) ** 2 + (points[2] - z) ** 2))
 
-        return (float(center[0]), float(center[1]), float(center[2])), float(self._greatest(distances, 1)[0])
+        return (x, y, z), float(self._greatest(distances, 1)[0])
 
     def _greatest(self, heights: Callable[[Reals], Reals], count: int) -> Reals:
         """Return the maxima over the surface (count,) of as many functions of position."""
