@@ -13,7 +13,9 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
+from shapely.errors import GEOSException
 
 from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.geometry.mesh import Mesh
@@ -199,8 +201,6 @@ def _cut(sides: Sequence[_Side], of: Sequence[Indices], planes: Reals, rounding:
     """Cut planes, whose numbers triangles have, or -1 (m,); those that GEOS refuses are left out."""
     if not len(planes):
         return []
-    from shapely.errors import GEOSException
-
     batches, cuts = [np.arange(len(planes))], []
     while batches:
         numbers = batches.pop()
@@ -216,8 +216,6 @@ def _cut(sides: Sequence[_Side], of: Sequence[Indices], planes: Reals, rounding:
 def _cut_together(
     sides: Sequence[_Side], of: Sequence[Indices], planes: Reals, numbers: Indices, rounding: float
 ) -> _Cut:
-    import shapely
-
     count, grid = len(planes), 2.0 ** np.floor(np.log2(_GRID * rounding))
     normals = planes[:, :3]
     # Along an axis where the plane is across one: then no coordinate is rounded.
@@ -226,7 +224,10 @@ def _cut_together(
     frames = np.stack([first, np.cross(normals, first)], axis=1)
     sheets = [_Sheet.of(side, plane, planes, frames, grid) for side, plane in zip(sides, of, strict=True)]
     depth = max(sheet.layers.shape[1] for sheet in sheets)
-    mine, others = (sheet.padded(depth) for sheet in sheets)
+    mine, others = (
+        np.pad(layers, ((0, 0), (0, depth - layers.shape[1])), constant_values=shapely.Polygon())
+        for layers in (sheets[0].layers, sheets[1].layers)
+    )
     # Without corners on straight sides there are fewer triangles.
     rests = [
         shapely.simplify(shapely.difference(*pair, grid_size=grid), rounding)
@@ -278,8 +279,6 @@ class _Sheet:
     @classmethod
     def of(cls, side: _Side, of: Indices, planes: Reals, frames: Reals, grid: float) -> Self:
         """Return the sheet of the triangles of a mesh, from the number of the plane of each, or -1 (m,)."""
-        import shapely
-
         which = np.flatnonzero(of >= 0)
         which = which[np.argsort(of[which], kind="stable")]
         plane, corners, count = of[which], side.corners(which), len(planes)
@@ -288,9 +287,9 @@ class _Sheet:
         gaps = np.zeros(count)
         np.maximum.at(gaps, plane, _heights_above(corners, planes[plane]))
         unions = shapely.union_all(shapely.multipolygons(polygons, indices=plane)[:, None], axis=1)
-        ends = np.cumsum(np.bincount(plane, minlength=count))
+        of_planes = np.split(polygons, np.cumsum(np.bincount(plane, minlength=count))[:-1])
         stacks = {
-            row: _stack(polygons[ends[row - 1] if row else 0 : ends[row]], float(_BALANCE * areas[row]), grid)
+            row: _stack(of_planes[row], float(_BALANCE * areas[row]), grid)
             for row in np.flatnonzero(np.abs(shapely.area(unions) - areas) > _BALANCE * areas).tolist()
         }
         layers = np.full((count, max([1, *map(len, stacks.values())])), shapely.Polygon(), dtype=object)
@@ -299,17 +298,9 @@ class _Sheet:
             layers[row, : len(stack)] = stack
         return cls(plane, areas, gaps, layers)
 
-    def padded(self, depth: int) -> _Objects:
-        """Return the layers (planes, depth), further ones empty."""
-        import shapely
-
-        return np.pad(self.layers, ((0, 0), (0, depth - self.layers.shape[1])), constant_values=shapely.Polygon())
-
 
 def _stack(polygons: _Objects, slack: float, grid: float) -> list[Any]:
     """Return the parts of a plane that polygons cover at least once, twice and so on; none where these are many."""
-    import shapely
-
     union = shapely.union_all(polygons, grid_size=grid)
     if len(polygons) == 1 or abs(float(shapely.area(polygons).sum()) - union.area) <= slack:
         return [union]
