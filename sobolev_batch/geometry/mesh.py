@@ -509,19 +509,13 @@ def _edges_of(triangles: Indices, vertex_count: int) -> tuple[int, int, int, int
         keys[3 * start : 3 * start + batch_keys.size] = batch_keys.ravel()
     keys.sort()
     keys = keys[np.searchsorted(keys, 0) :]
-    if not keys.size:
-        return 0, vertex_count, 0, 0, 0
-    is_alike = (keys[1:] == keys[:-1]) & (keys[1:] % 3 < 2)
-    keys //= 3
-    repeats = np.concatenate([[False], keys[1:] == keys[:-1], [False, False]])
-    first, second, third = ~repeats[:-2], repeats[1:-1], repeats[2:]
-    inconsistent = first[:-1] & (second & ~third)[:-1] & is_alike
-    boundary, nonmanifold = first & ~second, first & second & third
-    pairs = np.divmod(keys[first], vertex_count)
-    links = coo_array((np.ones(len(pairs[0]), dtype=np.int8), pairs), shape=(vertex_count, vertex_count))
+    edges, starts, numbers = np.unique(keys // 3, return_index=True, return_counts=True)
+    links = coo_array((np.ones(len(edges), dtype=np.int8), np.divmod(edges, vertex_count)), (vertex_count, vertex_count))
     components, _ = connected_components(links, directed=False)
-    numbers = [int(np.count_nonzero(edges)) for edges in (boundary, nonmanifold, inconsistent)]
-    return len(pairs[0]), int(components), numbers[0], numbers[1], numbers[2]
+    pairs = starts[numbers == 2]
+    is_alike = (keys[pairs] == keys[pairs + 1]) & (keys[pairs] % 3 < 2)
+    boundary, nonmanifold, alike = (int(np.count_nonzero(one)) for one in (numbers == 1, numbers > 2, is_alike))
+    return len(edges), int(components), boundary, nonmanifold, alike
 
 
 def _duplicate_triangles(triangles: Indices) -> int:
