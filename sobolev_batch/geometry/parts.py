@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import igl
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from sobolev_batch.geometry.mesh import Mesh
 
@@ -24,11 +22,7 @@ def nested_parts(mesh: Mesh) -> int:
     >>> nested_parts(sb.Mesh(vertices, triangles))
     1
     """
-    a, b, c = mesh.triangles.T
-    links = coo_array(
-        (np.ones(2 * len(a), np.int8), (np.tile(a, 2), np.concatenate([b, c]))), (len(mesh.vertices),) * 2
-    )
-    parts = connected_components(links, directed=False)[1][a]
+    parts = igl.vertex_components(mesh.triangles)[mesh.triangles[:, 0]]
     order = np.argsort(parts, kind="stable")
     starts = np.flatnonzero(np.diff(parts[order], prepend=-1))
     if not 1 < len(starts) <= _MOST_PARTS:
