@@ -1,4 +1,4 @@
-"""Loops over the triangles of a mesh: their sizes, what their errors have in common, and distances from them."""
+"""Loops over the triangles of a mesh: what their errors have in common, and distances from them."""
 
 from __future__ import annotations
 
@@ -13,25 +13,6 @@ def _edges(vertices: Reals, triangle: Indices) -> tuple[float, float, float, flo
     """Return the edges from the first corner to the second and to the third."""
     a, b, c = vertices[triangle[0]], vertices[triangle[1]], vertices[triangle[2]]
     return b[0] - a[0], b[1] - a[1], b[2] - a[2], c[0] - a[0], c[1] - a[1], c[2] - a[2]
-
-
-@loop
-def measure(vertices: Reals, triangles: Indices, squares: Reals) -> None:
-    """Fill in the squares of twice the area, of three times the centroid radius, and of the three sides (5, k)."""
-    for i in range(len(triangles)):
-        ux, uy, uz, vx, vy, vz = _edges(vertices, triangles[i])
-        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-        squares[0, i] = nx * nx + ny * ny + nz * nz
-        x, y, z = ux + vx, uy + vy, uz + vz
-        largest = x * x + y * y + z * z
-        x, y, z = ux + ux - vx, uy + uy - vy, uz + uz - vz
-        largest = max(largest, x * x + y * y + z * z)
-        x, y, z = vx + vx - ux, vy + vy - uy, vz + vz - uz
-        squares[1, i] = max(largest, x * x + y * y + z * z)
-        x, y, z = vx - ux, vy - uy, vz - uz
-        squares[2, i] = ux * ux + uy * uy + uz * uz
-        squares[3, i] = x * x + y * y + z * z
-        squares[4, i] = vx * vx + vy * vy + vz * vz
 
 
 @loop

@@ -15,7 +15,6 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from sobolev_batch.arrays import Indices, Reals
-from sobolev_batch.compiled import pays
 from sobolev_batch.errors import MeshError, from_extra
 from sobolev_batch.geometry.surface import LARGEST_LENGTH, Extent, Point
 
@@ -29,8 +28,6 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 _ALL = slice(None)
 # Triangles that are measured or sorted at a time: their edges and temporaries stay in cache.
 _BATCH = 1 << 14
-# Processor time on arrays of measuring a triangle.
-_SECONDS = 6e-8
 # Twice the rounding error of a cross product, relative to the squared longest edge: a smaller area is not
 # distinguishable from zero in double precision.
 _AREA_RESOLUTION = 8 * np.finfo(np.float64).eps
@@ -330,7 +327,7 @@ class Mesh:
         areas, radii = np.empty((2, len(self.triangles)))
         total, longest, without_area = 0.0, 0.0, 0
         with np.errstate(over="ignore", invalid="ignore"):
-            for number, squares in enumerate(self._squared_sizes()):
+            for number, squares in enumerate(map(_squared_sizes, self._edges())):
                 batch = slice(number * _BATCH, (number + 1) * _BATCH)
                 twice_areas, thrice_radii, *sides = np.sqrt(squares, out=squares)
                 areas[batch], radii[batch] = twice_areas / 2, thrice_radii / 3
@@ -338,18 +335,6 @@ class Mesh:
                 without_area += int(np.count_nonzero(areas[batch] <= _AREA_RESOLUTION * longest_sides**2))
                 total, longest = total + float(squares[2:].sum()), max(longest, float(longest_sides.max()))
         return _Sizes(_frozen(areas), _frozen(radii), total / (3 * len(areas)), longest, without_area)
-
-    def _squared_sizes(self) -> Iterator[Reals]:
-        """Yield the `_squared_sizes` of each batch of triangles."""
-        if not pays(_SECONDS * len(self.triangles)):
-            yield from map(_squared_sizes, self._edges())
-            return
-        from sobolev_batch.compiled.triangles import measure
-
-        for start in range(0, len(self.triangles), _BATCH):
-            triangles = self.triangles[start : start + _BATCH]
-            measure(self.vertices, triangles, squares := np.empty((5, len(triangles))))
-            yield squares
 
     def _per_triangle(self, measure: Callable[[_Edges], Reals]) -> Reals:
         """Return a measure of all triangles, taken batch by batch: edges of millions at once take gigabytes."""
