@@ -495,7 +495,7 @@ def _edges_of(triangles: Indices, vertex_count: int) -> tuple[int, int, int, int
     keys.sort()
     keys = keys[np.searchsorted(keys, 0) :]
     edges, starts, numbers = np.unique(keys // 3, return_index=True, return_counts=True)
-    links = coo_array((np.ones(len(edges), dtype=np.int8), np.divmod(edges, vertex_count)), (vertex_count, vertex_count))
+    links = coo_array((np.ones(len(edges), np.int8), np.divmod(edges, vertex_count)), (vertex_count, vertex_count))
     components, _ = connected_components(links, directed=False)
     pairs = starts[numbers == 2]
     is_alike = (keys[pairs] == keys[pairs + 1]) & (keys[pairs] % 3 < 2)
