@@ -136,8 +136,8 @@ class Mesh:
 
     @cached_property
     def extent(self) -> Extent:
-        """Extent of the `used_coordinates` along `DIRECTIONS`."""
-        return Extent.of_points(self.used_coordinates)
+        """Extent of the `used_vertices` along `DIRECTIONS`."""
+        return Extent.of_points(self.vertices[self.used_vertices].T)
 
     @property
     def bounding_sphere(self) -> tuple[Point, float]:
@@ -175,13 +175,6 @@ class Mesh:
     def used_vertices(self) -> Indices:
         """Indices of the vertices that triangles use, in ascending order."""
         return _frozen(_used(self.triangles, len(self.vertices)))
-
-    @property
-    def used_coordinates(self) -> Reals:
-        """Coordinates of the `used_vertices`, one contiguous row an axis (3, n), in units of length."""
-        used = self.used_vertices
-        rows = self.vertices if len(used) == len(self.vertices) else self.vertices[used]
-        return np.ascontiguousarray(rows.T)
 
     @cached_property
     def counts(self) -> dict[str, int]:

@@ -126,23 +126,21 @@ def read_mesh_by(path: Path, read: Read) -> Mesh:
             "lh.pial, each also with .gz. docs/formats.md shows how to convert others"
         )
     form, start = BY_SUFFIX[suffix], b""
+    factor = form.memory_bytes / form.file_bytes
     try:
         # The header of a PLY file tells more than its length.
         require_memory_to_read(expected_size(path)[1])
-        data = [read_unpacked(path, form.memory_bytes / form.file_bytes, read)]
+        data = [read_unpacked(path, factor, read)]
         start = data[0][:_START_BYTES]
         # Numbers that overflow become infinite, which the mesh refuses.
         with np.errstate(all="ignore"):
-            # Only the parser holds the bytes, so that it can free them early.
-            if form.files_beside is None:
-                raw = Raw(*form.parse(data.pop()))
-            else:
-                factor = form.memory_bytes / form.file_bytes
+            beside = []
+            if form.files_beside is not None:
                 parts = _files_beside(path, form.files_beside(data[0]))
                 require_memory_to_read(factor * (len(data[0]) + sum(part.stat().st_size for part in parts.values())))
-                beside = {name: read_unpacked(part, factor, read) for name, part in parts.items()}
-                raw = Raw(*form.parse(data.pop(), beside))
-            raw = _without_unused(raw)
+                beside = [{name: read_unpacked(part, factor, read) for name, part in parts.items()}]
+            # Only the parser holds the bytes, so that it can free them early.
+            raw = _without_unused(Raw(*form.parse(data.pop(), *beside)))
             for array in (raw.vertices, raw.triangles):
                 array.setflags(write=False)
             mesh = Mesh(*raw)
@@ -197,7 +195,7 @@ def _without_unused(raw: Raw) -> Raw:
 
 def _with_lost_digits(mesh: Mesh) -> Mesh:
     """Note it where a mesh in single precision is far from the origin for its size."""
-    lower, upper = np.array([(axis.min(), axis.max()) for axis in mesh.used_coordinates]).T
+    lower, upper = mesh.extent.box
     times = np.abs([lower, upper]).max() / np.linalg.norm(upper - lower)
     if times <= _FAR:
         return mesh
