@@ -74,23 +74,23 @@ def _decoded(text: str, attributes: Mapping[str, str], number: int, most_bytes: 
     encoding = attributes.get("Encoding", "")
     if attributes.get("ExternalFileName") or "External" in encoding:
         raise MeshError("its data lie in another file; write it with them inside")
+    owner = f"array {number} of the file"
     dtype = _GIFTI_TYPES.get(kind := attributes.get("DataType", ""))
     if dtype is None:
-        raise MeshError(f"array {number} of the file is of the type {kind[:40]!r}, expected {', '.join(_GIFTI_TYPES)}")
-    owner = f"array {number} of the file"
+        raise MeshError(f"{owner} is of the type {kind[:40]!r}, expected {', '.join(_GIFTI_TYPES)}")
     count = whole(attributes.get("Dimensionality", ""), owner)
     if not 1 <= count <= _MOST_DIMENSIONS:
-        raise MeshError(f"array {number} of the file has {count} dimensions, expected 1 to {_MOST_DIMENSIONS}")
+        raise MeshError(f"{owner} has {count} dimensions, expected 1 to {_MOST_DIMENSIONS}")
     shape = [whole(attributes.get(f"Dim{axis}", ""), owner) for axis in range(count)]
     if min(shape) < 0:
-        raise MeshError(f"array {number} of the file has a negative dimension: {shape}")
+        raise MeshError(f"{owner} has a negative dimension: {shape}")
     size = math.prod(shape) * dtype.itemsize
     order, endian = attributes.get("ArrayIndexingOrder", ""), attributes.get("Endian", "")
     if order not in _INDEXING or endian not in BYTE_ORDERS:
         raise MeshError(f"{owner} has the orders {order[:40]!r} and {endian[:40]!r}, which GIFTI does not have")
     if encoding == "ASCII":
         if not text.strip():
-            raise MeshError(f"array {number} of the file is empty")
+            raise MeshError(f"{owner} is empty")
         values = typed(text.split(), dtype, owner)
     else:
         decoded = base64.b64decode(text)
@@ -100,10 +100,10 @@ def _decoded(text: str, attributes: Mapping[str, str], number: int, most_bytes: 
             # One byte more shows whether there are more.
             decoded = zlib.decompressobj().decompress(decoded, size + 1)
         elif encoding != "Base64Binary":
-            raise MeshError(f"array {number} of the file has the encoding {encoding[:40]!r}, which GIFTI does not have")
+            raise MeshError(f"{owner} has the encoding {encoding[:40]!r}, which GIFTI does not have")
         if len(decoded) != size:
             wrong = "more" if len(decoded) > size else "fewer"
-            raise MeshError(f"array {number} of the file unpacks to {wrong} than the {size} bytes announced")
+            raise MeshError(f"{owner} unpacks to {wrong} than the {size} bytes announced")
         values = np.frombuffer(decoded, dtype.newbyteorder(BYTE_ORDERS[endian]))
     return np.asarray(values.reshape(shape, order=_INDEXING[order]))
 

@@ -132,11 +132,11 @@ def _of_second_format(nodes: _Numbers, cells: _Numbers) -> _Read:
     count, numbers, place = cells.count(), cells.values.tolist(), 1
     for _ in range(count):
         # Its number, its kind, and a count of tags, which come before its corners.
-        _, kind, tags = numbers[place : place + 3]
-        end = place + 3 + int(tags) + _corners(int(kind))
-        if not place + 3 <= end - _corners(int(kind)) <= end <= len(numbers):
+        _, kind, tags = map(int, numbers[place : place + 3])
+        begin, end = place + 3 + tags, place + 3 + tags + _corners(kind)
+        if tags < 0 or end > len(numbers):
             raise MeshError("a section breaks off, or has wrong counts before")
-        rows[int(kind)].append(numbers[end - _corners(int(kind)) : end])
+        rows[kind].append(numbers[begin:end])
         place = end
     cells.place = place
     return numbered, [(kind, np.array(found)) for kind, found in rows.items() if found]

@@ -244,11 +244,8 @@ def _decoded(
     attributes: Mapping[str, str], text: str, behind: tuple[bytes, bool], root: Mapping[str, str], most: int
 ) -> NDArray[Any]:
     """Return the values of a DataArray, from its text or from what lies behind the XML, as at most so many bytes."""
-    kind, form, owner = (
-        attributes.get("type", ""),
-        attributes.get("format", ""),
-        f"its array {attributes.get('Name')!r}",
-    )
+    kind, form = attributes.get("type", ""), attributes.get("format", "")
+    owner = f"its array {attributes.get('Name')!r}"
     if kind.lower() not in _TYPES or form not in ("ascii", "binary", "appended"):
         raise MeshError(f"{owner} has the type {kind[:40]!r} and the format {form[:40]!r}, which VTK does not have")
     order, head_kind = root.get("byte_order", "LittleEndian"), root.get("header_type", "UInt32").lower()

@@ -66,9 +66,8 @@ def open_regular(path: Path) -> BufferedReader:
     Pipes could keep a reader waiting for ever, devices could never end.
     """
     mode = path.stat().st_mode
-    if stat.S_ISDIR(mode):
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-    if not stat.S_ISREG(mode):
+    # A folder is refused when it is opened.
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise OSError(errno.EINVAL, "it is a pipe, a socket or a device, and no regular file")
     return path.open("rb")
 
