@@ -95,8 +95,11 @@ class Edges:
         doi:10.1002/nme.1620200412.
         """
         order = np.argsort(-scores, kind="stable")
-        numbers = range(1, len(order) + 1)
-        most = bisect_right(numbers, triangles, key=lambda number: self._count(self._completed(order[:number])))
+
+        def triangles_after(number: int) -> int:
+            return len(self.sides) + int(np.count_nonzero(self._completed(order[:number])[self.sides]))
+
+        most = bisect_right(range(1, len(order) + 1), triangles, key=triangles_after)
         return self._completed(order[:most])
 
     def split(self, marks: Marks) -> Mesh:
@@ -135,10 +138,6 @@ class Edges:
             touched = longest[marks[self.sides].any(axis=1)]
             added = touched[~marks[touched]]
         return marks
-
-    def _count(self, marks: Marks) -> int:
-        """Return the number of triangles after a split."""
-        return len(self.sides) + int(np.count_nonzero(marks[self.sides]))
 
 
 def _icosahedron() -> Mesh:
