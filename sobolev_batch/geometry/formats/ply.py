@@ -51,8 +51,8 @@ _CORNER_BYTES = 4
 # each vertex beyond one for two triangles.
 _TRIANGLE_MEMORY, _POLYGON_MEMORY, _TEXT_MEMORY, _VERTEX_MEMORY = 110, 150, 330, 70
 
-# The values of a property in all rows, one after the other, and the lengths of its lists; None where it has none.
-_Column = tuple[NDArray[Any], Indices | None]
+# By the names of properties: values in all rows, one after the other; and the lengths of lists.
+_Values, _Sizes = dict[str, NDArray[Any]], dict[str, Indices]
 
 
 @dataclass(frozen=True)
@@ -90,22 +90,24 @@ def parse_ply(data: bytes) -> Raw:
         raise MeshError(f"the PLY header announces {counts}, but only {left} bytes follow")
     numbers, lines = _numbers(data, start, sum(counts.values())) if is_text else (data, array("I"))
     body, place = memoryview(numbers).cast("B"), 0 if is_text else start
-    columns, rows = dict[str, dict[str, _Column]](), [np.zeros(0, np.int64)]
+    columns, rows = dict[str, tuple[_Values, _Sizes]](), [np.zeros(0, np.int64)]
     for name, element in elements.items():
-        columns[name], sizes, place = _columns(element, _WANTED.get(name, ()), body, place)
+        values, sizes, place = _columns(element, _WANTED.get(name, ()), body, place)
+        columns[name] = values, sizes
         rows.append(np.broadcast_to(len(element.properties) + sum(sizes.values()), element.count))
     if is_text:
         _require_aligned(np.frombuffer(lines, np.uintc), rows)
     if body[place : place + 3].tobytes() not in _LAST_LINE:
         more = f"{(len(body) - place) // 8} numbers" if is_text else f"{len(body) - place} bytes"
         raise MeshError(f"the PLY header announces {counts}, but {more} more follow")
-    axes = [values for values, sizes in columns.get("vertex", {}).values() if sizes is None]
+    values, sizes = columns.get("vertex", ({}, {}))
+    axes = [values[name] for name in values if name not in sizes]
     if len(axes) < 3:
         raise MeshError("the PLY header declares no vertices with the numbers x, y and z")
     vertices = np.stack(axes, axis=1)
-    found = [cut_polygons(vertices, *_corners("face", columns["face"]))] if counts.get("face") else []
+    found = [cut_polygons(vertices, *_corners("face", *columns["face"]))] if counts.get("face") else []
     if counts.get("tristrips"):
-        found.append(Raw(vertices, triangle_strips(*_corners("tristrips", columns["tristrips"]))))
+        found.append(Raw(vertices, triangle_strips(*_corners("tristrips", *columns["tristrips"]))))
     if not found:
         found.append(cut_polygons(vertices, *np.zeros((2, 0), np.int64)))
     return found[0]._replace(triangles=np.concatenate([one.triangles for one in found])) if found[1:] else found[0]
@@ -170,15 +172,12 @@ def _parsed_header(data: bytes) -> tuple[dict[str, _Element], int, bool]:
                 if element.count < 0:
                     raise MeshError(f"the PLY header announces {count} entries of {name[:40]!r}")
             case ["property", *words, name] if elements and name not in element.properties:
-                match [_CODES.get(word, word) for word in words]:
-                    case [code] if code in _CODES.values():
-                        declared, length = code, ""
-                    case ["list", length, code] if {code, length} <= {*_CODES.values()}:
-                        declared = code
-                    case _:
-                        raise MeshError(f"the PLY header declares {name[:40]!r} by {line[:80]!r}, of no type of PLY")
-                stored = [_TEXT if order == "=" else order + code for code in (declared, length) if code]
-                element.properties[name] = _Property(declared, stored[0], stored[1] if length else None)
+                is_list = words[:1] == ["list"]
+                codes = [_CODES.get(word, "") for word in words[is_list:]]
+                if "" in codes or len(codes) != 1 + is_list:
+                    raise MeshError(f"the PLY header declares {name[:40]!r} by {line[:80]!r}, of no type of PLY")
+                stored = [_TEXT if order == "=" else order + code for code in codes]
+                element.properties[name] = _Property(codes[-1], stored[-1], stored[0] if is_list else None)
             case _:
                 raise MeshError(f"the PLY header has the line {line[:80]!r}, which the format does not have there")
     return elements, header.end(), order == "="
@@ -218,10 +217,8 @@ def _require_aligned(lines: NDArray[np.uintc], rows: Sequence[Indices]) -> None:
         )
 
 
-def _columns(
-    element: _Element, wanted: Sequence[str], body: memoryview, start: int
-) -> tuple[dict[str, _Column], dict[str, Indices], int]:
-    """Return the columns of an element that are wanted, the lengths of all its lists, and the place where it ends."""
+def _columns(element: _Element, wanted: Sequence[str], body: memoryview, start: int) -> tuple[_Values, _Sizes, int]:
+    """Return the values of an element that are wanted, the lengths of all its lists, and the place where it ends."""
     count, wanted = element.count, [name for name in wanted if name in element.properties]
     _, sizes, end = _walked(element, (), min(count, 1), body, start)
     # All rows are read at once if their lists are as long as those of the first one.
@@ -242,12 +239,12 @@ def _columns(
         values[name] = as_declared(
             values[name], element.properties[name].declared, f"the PLY property {element.name} {name}"
         )
-    return {name: (values[name], sizes.get(name)) for name in wanted}, sizes, end
+    return values, sizes, end
 
 
 def _walked(
     element: _Element, wanted: Sequence[str], count: int, body: memoryview, place: int
-) -> tuple[dict[str, NDArray[Any]], dict[str, Indices], int]:
+) -> tuple[_Values, _Sizes, int]:
     """Read rows one by one, and return the values of properties, the lengths of lists, and the place of the end."""
     steps = [
         (one.length and struct.Struct(one.length), struct.calcsize(one.stored), array("q"), bytearray(), name in wanted)
@@ -273,10 +270,10 @@ def _walked(
     return {name: np.frombuffer(found[name][3], element.properties[name].stored) for name in wanted}, of_lists, place
 
 
-def _corners(element: str, columns: Mapping[str, _Column]) -> tuple[Indices, Indices]:
+def _corners(element: str, values: _Values, sizes: _Sizes) -> tuple[Indices, Indices]:
     """Return the vertex indices of all lists of an element, and the lengths of these."""
-    values, sizes = next(iter(columns.values()), (np.zeros(0), None))
-    if sizes is None or values.dtype.kind == "f":
-        wrong = f"no list {_CORNERS[0]}" if sizes is None else "indices that are not integers"
+    name = next(iter(values), "")
+    if name not in sizes or values[name].dtype.kind == "f":
+        wrong = f"no list {_CORNERS[0]}" if name not in sizes else "indices that are not integers"
         raise MeshError(f"the PLY element {element} has {wrong}")
-    return values.astype(np.int64), sizes
+    return values[name].astype(np.int64), sizes[name]
