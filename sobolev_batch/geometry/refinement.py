@@ -44,7 +44,7 @@ def refinement_of(fine: Mesh, coarse: Mesh, tolerance: float) -> Refinement | No
     Refinement(distance=1e-09, missing=0.0)
     """
     whole = coarse.vertices[coarse.triangles]
-    centers, widths = whole.mean(axis=1), _longest(whole)
+    centers, widths = whole.mean(axis=1), coarse.edge_lengths.max(axis=1)
     # Roundings along its edges change the area of a triangle by less.
     allowed = 2 * tolerance * widths
     if abs(fine.area - coarse.area) > allowed.sum():
@@ -53,7 +53,7 @@ def refinement_of(fine: Mesh, coarse: Mesh, tolerance: float) -> Refinement | No
     of = triangles.closest(corners.mean(axis=1))[1]
     squares = [triangles.squares(np.ascontiguousarray(corners[:, k].T / triangles.scale), of) for k in range(3)]
     distances = triangles.scale * np.sqrt(np.max(squares, axis=0))
-    longest, areas = _longest(corners), np.asarray(fine.areas)
+    longest, areas = fine.edge_lengths.max(axis=1), np.asarray(fine.areas)
     # The centre of one about as thin as the tolerance may lie in a neighbour of the triangle in which it does.
     is_thin = 2 * areas <= _THIN * tolerance * longest
     if np.any((distances > tolerance) & ~is_thin):
@@ -64,11 +64,6 @@ def refinement_of(fine: Mesh, coarse: Mesh, tolerance: float) -> Refinement | No
     if np.any(np.abs(missing) > allowed):
         return None
     return Refinement(min(float(distances.max()), tolerance), float(np.linalg.norm(missing[0])))
-
-
-def _longest(corners: Reals) -> Reals:
-    """Return the longest edge (m,) of triangles (m, 3, 3)."""
-    return np.asarray(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1))
 
 
 def _moments(corners: Reals, widths: Reals, areas: Reals) -> Reals:
