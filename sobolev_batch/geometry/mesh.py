@@ -81,7 +81,6 @@ class Mesh:
         self._require_sizes()
 
     def _require_sizes(self) -> None:
-        """Refuse coordinates that overflow, and triangles that are all degenerate."""
         largest = float(np.abs(self.vertices).max(initial=0.0))
         if largest > LARGEST_LENGTH or not np.isfinite(self.area):
             raise MeshError(
@@ -192,10 +191,12 @@ class Mesh:
         (1, 0)
         """
         unused = len(self.vertices) - len(self.used_vertices)
+        ordered = np.sort(self.triangles, axis=1)
+        ordered = ordered[np.lexsort(ordered.T)]
         edges, components, boundary, nonmanifold, inconsistent = _edges_of(self.triangles, len(self.vertices))
         return {
             "zero_area_triangles": self._sizes.without_area,
-            "duplicate_triangles": _duplicate_triangles(self.triangles),
+            "duplicate_triangles": int(np.count_nonzero((ordered[1:] == ordered[:-1]).all(axis=1))),
             "boundary_edges": boundary,
             "nonmanifold_edges": nonmanifold,
             "inconsistent_edges": inconsistent,
@@ -494,13 +495,6 @@ def _edges_of(triangles: Indices, vertex_count: int) -> tuple[int, int, int, int
     is_alike = (keys[pairs] == keys[pairs + 1]) & (keys[pairs] % 3 < 2)
     boundary, nonmanifold, alike = (int(np.count_nonzero(one)) for one in (numbers == 1, numbers > 2, is_alike))
     return len(edges), int(components), boundary, nonmanifold, alike
-
-
-def _duplicate_triangles(triangles: Indices) -> int:
-    """Return the number of triangles that repeat the three vertices of an earlier one."""
-    ordered = np.sort(triangles, axis=1)
-    ordered = ordered[np.lexsort(ordered.T)]
-    return int(np.count_nonzero((ordered[1:] == ordered[:-1]).all(axis=1)))
 
 
 def shared_triangles(first: Reals, second: Reals) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
