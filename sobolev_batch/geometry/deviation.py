@@ -129,10 +129,8 @@ def largest_deviation(a: MeshLike, b: MeshLike, *, gap: float = DEFAULT_GAP, wit
         if value is not None and not (is_finite_number(value) and value > 0):
             raise InputError(f"{name} must be a positive number, found {value!r}")
     meshes = as_mesh(a), as_mesh(b)
-    forward, backward = (
-        directed_deviation(mesh, Triangles(other), gap, within) for mesh, other in (meshes, meshes[::-1])
-    )
-    return Deviations(forward, backward)
+    ways = (meshes, meshes[::-1])
+    return Deviations(*(directed_deviation(mesh, Triangles(other), gap, within) for mesh, other in ways))
 
 
 @dataclass

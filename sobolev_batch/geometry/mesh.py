@@ -73,10 +73,8 @@ class Mesh:
     notes: tuple[str, ...] = ()
 
     def __init__(self, vertices: ArrayLike, triangles: ArrayLike, notes: tuple[str, ...] = ()) -> None:
-        checked_vertices = _checked_vertices(vertices)
-        checked_triangles = _checked_triangles(triangles, len(checked_vertices))
-        object.__setattr__(self, "vertices", checked_vertices)
-        object.__setattr__(self, "triangles", checked_triangles)
+        object.__setattr__(self, "vertices", _checked_vertices(vertices))
+        object.__setattr__(self, "triangles", _checked_triangles(triangles, len(self.vertices)))
         object.__setattr__(self, "notes", tuple(notes))
         self._require_sizes()
 
