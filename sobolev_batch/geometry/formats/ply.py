@@ -52,7 +52,8 @@ _CORNER_BYTES = 4
 _TRIANGLE_MEMORY, _POLYGON_MEMORY, _TEXT_MEMORY, _VERTEX_MEMORY = 110, 150, 330, 70
 
 # By the names of properties: values in all rows, one after the other; and the lengths of lists.
-_Values, _Sizes = dict[str, NDArray[Any]], dict[str, Indices]
+_Values = dict[str, NDArray[Any]]
+_Sizes = dict[str, Indices]
 
 
 @dataclass(frozen=True)
