@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Complexes, Indices, Reals
 from sobolev_batch.compiled import loop, part
@@ -136,18 +135,6 @@ def _gaps(
     ab = -_TURN * (u * edges[0] + v * edges[1] + w * edges[2])
     bc = -_TURN * (u * edges[3] + v * edges[4] + w * edges[5])
     return ab, bc, ab + bc
-
-
-@loop
-def plain_doubled_areas(vertices: Reals, triangles: Indices, flatness: float) -> tuple[Reals, NDArray[np.bool_]]:
-    """Return twice the area of each triangle (k,), and whether that is a smaller fraction of its squared edges."""
-    doubled, is_flat = np.empty(len(triangles)), np.empty(len(triangles), dtype=np.bool_)
-    for i in range(len(triangles)):
-        px, py, pz, qx, qy, qz = _edges(vertices, triangles[i])
-        x, y, z = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
-        doubled[i] = np.sqrt(x * x + y * y + z * z)
-        is_flat[i] = doubled[i] < flatness * (px * px + py * py + pz * pz + qx * qx + qy * qy + qz * qz)
-    return doubled, is_flat
 
 
 @loop

@@ -18,13 +18,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache, partial
+from functools import cache
 
 import numpy as np
 
 from sobolev_batch.arrays import Array, Complexes, Reals
 from sobolev_batch.compiled import pays
-from sobolev_batch.geometry.mesh import Corners, Mesh, cross_lengths
+from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.transform.backends import CPU, Backend, combine, compute_on, cosine_and_sine, row_dots, sums_at
 
 # A number as a rounded value and what it lacks.
@@ -37,8 +37,8 @@ _Faces = tuple[Array, Array, Array, Array]
 _SERIES_GAP = 2.0
 # Below this many cycles a plain dot product keeps the phase of exp to 5e-14 radians.
 _PLAIN_CYCLES = 16.0
-# Triangles whose area is a smaller fraction of a squared edge lose digits in a plain cross product.
-_FLATNESS = 1e-2
+# Triangles whose area is a smaller fraction of their squared centroid radius lose digits in a plain cross product.
+_FLATNESS = 2.5e-2
 # Triangles at a time: their temporaries stay in a processor's cache.
 _BATCH = {"cpu": 1 << 13, "gpu": 1 << 18}
 # Pairs of a triangle and a frequency for each pass: with fewer, calls of NumPy and CuPy take longer than their work.
@@ -77,12 +77,11 @@ def exact_transform(mesh: Mesh, frequencies: Reals, backend: Backend = CPU, thre
     def sums(backend: Backend) -> Complexes:
         if backend is CPU and pays(_PAIR_SECONDS * len(mesh.triangles) * len(frequencies)):
             return _compiled_exact_transform(mesh, frequencies, threads)
-        batch = _BATCH[backend.name]
-        parts = []
-        for start in range(0, len(mesh.triangles), batch):
-            rows = np.ascontiguousarray(mesh.triangles[start : start + batch].T)
+        doubled, parts = doubled_areas(mesh), []
+        for batch in _slices(mesh, _BATCH[backend.name]):
+            rows = np.ascontiguousarray(mesh.triangles[batch].T)
             corners = np.stack([[column[index] for column in columns] for index in rows])
-            parts.append(_sums(corners, frequencies, backend))
+            parts.append(_sums(corners, doubled[batch], frequencies, backend))
         return np.asarray(np.sum(parts, axis=0, dtype=np.complex128))
 
     return compute_on(_faster(backend, mesh, frequencies), sums)
@@ -91,31 +90,24 @@ def exact_transform(mesh: Mesh, frequencies: Reals, backend: Backend = CPU, thre
 def _compiled_exact_transform(mesh: Mesh, frequencies: Reals, threads: int) -> Complexes:
     from sobolev_batch.compiled.divided_differences import exact_sums
 
-    doubled = _compiled_doubled_areas(mesh)
+    doubled = doubled_areas(mesh)
     # Sums of sums round less often.
-    batches = [slice(start, start + _COMPILED_BATCH) for start in range(0, len(doubled), _COMPILED_BATCH)]
-    faces = [(mesh.vertices, mesh.triangles[batch], doubled[batch]) for batch in batches]
+    faces = [(mesh.vertices, mesh.triangles[batch], doubled[batch]) for batch in _slices(mesh, _COMPILED_BATCH)]
     return _by_threads(exact_sums, faces, frequencies, threads)
 
 
 def _compiled_sampled_transform(mesh: Mesh, frequencies: Reals, threads: int) -> Complexes:
     from sobolev_batch.compiled.divided_differences import sampled_sums
 
-    total = np.zeros(len(frequencies), dtype=np.complex128)
-    for _, batch in mesh.batches(_COMPILED_BATCH):
-        doubled = _compiled_doubled_areas(batch)
-        total += _by_threads(sampled_sums, [(batch.vertices, batch.triangles, doubled)], frequencies, threads)
+    doubled, total = doubled_areas(mesh), np.zeros(len(frequencies), dtype=np.complex128)
+    for number, batch in mesh.batches(_COMPILED_BATCH):
+        faces = batch.vertices, batch.triangles, doubled[number * _COMPILED_BATCH :][: len(batch.triangles)]
+        total += _by_threads(sampled_sums, [faces], frequencies, threads)
     return total
 
 
-def _compiled_doubled_areas(mesh: Mesh) -> Reals:
-    from sobolev_batch.compiled.divided_differences import plain_doubled_areas
-
-    doubled, is_flat = plain_doubled_areas(mesh.vertices, mesh.triangles, _FLATNESS)
-    if np.any(is_flat):
-        a, b, c = (np.ascontiguousarray(corner.T) for corner in mesh.corners(np.flatnonzero(is_flat)))
-        doubled[is_flat] = _doubled_areas_of_flat((a, b, c))
-    return np.asarray(doubled)
+def _slices(mesh: Mesh, size: int) -> list[slice]:
+    return [slice(start, start + size) for start in range(0, len(mesh.triangles), size)]
 
 
 def _by_threads(
@@ -163,39 +155,34 @@ def second_difference(ab: Array, ac: Array) -> Array:
     return values
 
 
-def doubled_areas(corners: Corners) -> Reals:
-    """Return twice the area of each triangle (m,), to rounding even if its corners (3, m) are nearly collinear.
+def doubled_areas(mesh: Mesh) -> Reals:
+    """Return twice the area of each triangle (m,), to rounding even if its corners are nearly collinear.
 
     On flat triangles the edge vectors and their cross product are formed in double-double arithmetic: in doubles, an
     aspect ratio of 1e6 costs six digits.
     """
-    a, b, c = corners
-    (ux, uy, uz), (vx, vy, vz) = edges = b - a, c - a
-    doubled = cross_lengths(*edges)
-    flat = np.flatnonzero(doubled < _FLATNESS * (ux * ux + uy * uy + uz * uz + vx * vx + vy * vy + vz * vz))
-    doubled[flat] = _doubled_areas_of_flat((a[:, flat], b[:, flat], c[:, flat]))
-    return np.asarray(doubled)
+    doubled = 2 * mesh.areas
+    flat = np.flatnonzero(mesh.areas < _FLATNESS * mesh.centroid_radii**2)
+    a, b, c = (corner.T for corner in mesh.corners(flat))
+    (p, p_low), (q, q_low) = _two_sum(b, -a), _two_sum(c, -a)
+    y, z = [1, 2, 0], [2, 0, 1]
+    forward, backward = _multiply((p[y], p_low[y]), (q[z], q_low[z])), _multiply((p[z], p_low[z]), (q[y], q_low[y]))
+    high, low = _subtract(forward, backward)
+    doubled[flat] = np.sqrt(((high + low) ** 2).sum(axis=0))
+    return doubled
 
 
-def _doubled_areas_of_flat(corners: Corners) -> Reals:
-    a, b, c = corners
-    p = [_two_sum(b[i], -a[i]) for i in range(3)]
-    q = [_two_sum(c[i], -a[i]) for i in range(3)]
-    normal = []
-    for i, j in ((1, 2), (2, 0), (0, 1)):
-        high, low = _subtract(_multiply(p[i], q[j]), _multiply(p[j], q[i]))
-        normal.append(high + low)
-    return np.asarray(np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2))
+def _sums(corners: Reals, doubled: Reals, frequencies: Reals, backend: Backend) -> Complexes:
+    """Return the transform (P,) of a batch of triangles.
 
-
-def _sums(corners: Reals, frequencies: Reals, backend: Backend) -> Complexes:
-    """Return the transform (P,) of a batch of triangles, from their corners (3, 3, k): corner, axis, triangle."""
+    They are given by their corners (3, 3, k), corner, axis, triangle, and twice their areas (k,).
+    """
     a, b, c = corners
     ab, ac = b - a, c - a
     longest = np.sqrt(max(float(np.einsum("ij,ij->j", side, side).max()) for side in (ab, ac, c - b)))
     centroids = a + (ab + ac) / 3
     farthest = float(np.abs(centroids).max()) + longest
-    doubled = backend.upload(doubled_areas((a, b, c)))
+    doubled = backend.upload(doubled)
     points, edges = (backend.upload(np.stack(rows)) for rows in ((centroids, a, b, c), (ab, ac)))
     parts = []
     # For few triangles, take several frequencies at a time.
@@ -375,29 +362,25 @@ def sampled_transform(mesh: Mesh, frequencies: Reals, threads: int = 1, backend:
         return values
     fine = gaps < _FINE_MESH
     values[fine] = exact_transform(mesh, frequencies[fine], backend, threads)
-    others = frequencies[~fine]
+    others, doubled = frequencies[~fine], doubled_areas(mesh)
 
     def sums(backend: Backend) -> Complexes:
-        # The threads are the processor's.
-        parts = np.array_split(others, threads if backend is CPU else 1)
-        total = np.zeros(len(others), dtype=np.complex128)
-        with ThreadPoolExecutor(len(parts)) as pool:
-            # A thread takes longer to start than few sums.
-            each = pool.map if len(parts) > 1 else map
-            for _, batch in mesh.batches(_SAMPLED_PAIRS[backend.name]):
-                total += np.concatenate(list(each(partial(_plain_sums, _faces(batch, backend), backend), parts)))
+        total, size = np.zeros(len(others), dtype=np.complex128), _SAMPLED_PAIRS[backend.name]
+        for number, batch in mesh.batches(size):
+            faces = _faces(batch, doubled[number * size :][: len(batch.triangles)], backend)
+            total += _plain_sums(faces, backend, others)
         return total
 
     values[~fine] = compute_on(_faster(backend, mesh, others), sums) if len(others) else 0
     return values
 
 
-def _faces(mesh: Mesh, backend: Backend) -> _Faces:
+def _faces(mesh: Mesh, doubled: Reals, backend: Backend) -> _Faces:
     corners = np.ascontiguousarray(mesh.triangles.T)
     a, b, c = np.moveaxis(mesh.vertices.T[:, corners], 1, 0)
-    arrays = np.ascontiguousarray(mesh.vertices.T), corners, doubled_areas((a, b, c)), np.stack([b - a, c - b])
-    vertices, indices, doubled, edges = map(backend.upload, arrays)
-    return vertices, indices, doubled, edges
+    arrays = np.ascontiguousarray(mesh.vertices.T), corners, doubled, np.stack([b - a, c - b])
+    vertices, indices, areas, edges = map(backend.upload, arrays)
+    return vertices, indices, areas, edges
 
 
 def _plain_sums(faces: _Faces, backend: Backend, frequencies: Reals) -> Complexes:
