@@ -98,11 +98,7 @@ class TransformSettings:
         if not FINEST_EPS[dtype] <= eps <= COARSEST_EPS:
             raise InputError(f"eps must lie between {FINEST_EPS[dtype]:g} and {COARSEST_EPS:g} in {dtype}, found {eps}")
         fixed_rule(quadrature)
-        object.__setattr__(self, "eps", eps)
-        object.__setattr__(self, "dtype", dtype)
-        object.__setattr__(self, "quadrature", quadrature)
-        object.__setattr__(self, "tolerance", tolerance)
-        object.__setattr__(self, "stored", stored or dtype)
+        vars(self).update(eps=eps, dtype=dtype, quadrature=quadrature, tolerance=tolerance, stored=stored or dtype)
 
     def plan(self, surface: Surface, lattice: FrequencyLattice) -> SurfaceKind:
         """Return a surface with quadrature points for a lattice."""
@@ -168,19 +164,12 @@ def choose_settings(
     kind = kind_of(surface)
     if kind.is_closed_form:
         return settings
-    tolerance = kind.loosest_tolerance(lattice, target.orders, (1 - _NUFFT_FRACTION) * np.array(target.norms))
-    eps = _nufft_eps(surface.area, kind.fewest_points, lattice, target, settings)
-    return replace(settings, eps=eps, tolerance=tolerance)
-
-
-def _nufft_eps(
-    area: float, points: float, lattice: FrequencyLattice, target: ErrorTarget, settings: TransformSettings
-) -> float:
-    """Return the largest eps with which the NUFFT of this many points keeps to its fraction of a target."""
-    masses = weight_masses(lattice, target.orders)
-    spread = _NUFFT_ERROR + 1 / math.sqrt(points)
-    eps = float(np.min(_NUFFT_FRACTION * np.array(target.norms) / (area * spread * np.sqrt(masses))))
-    return min(max(eps, FINEST_EPS[settings.dtype]), COARSEST_EPS)
+    norms, masses = np.array(target.norms), weight_masses(lattice, target.orders)
+    tolerance = kind.loosest_tolerance(lattice, target.orders, (1 - _NUFFT_FRACTION) * norms)
+    # The largest eps with which the NUFFT of that many points keeps to its fraction.
+    spread = _NUFFT_ERROR + 1 / math.sqrt(kind.fewest_points)
+    eps = float(np.min(_NUFFT_FRACTION * norms / (surface.area * spread * np.sqrt(masses))))
+    return replace(settings, eps=min(max(eps, FINEST_EPS[settings.dtype]), COARSEST_EPS), tolerance=tolerance)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,6 @@ from sobolev_batch.transform.rules import FINEST_TOLERANCE, choose_rules, rule_r
 
 # Parts of squared errors at some frequencies (n,): of even errors in phase, of odd ones in phase, and the rest.
 _ErrorParts = tuple[Reals, Reals, Reals]
-
 # Fraction of the odd errors that was seen to remain between neighbouring triangles.
 _ODD_REMAINDER = 0.2
 # Classes of triangles of similar size at most.
@@ -35,11 +34,14 @@ def loosest_tolerance(mesh: Mesh, lattice: FrequencyLattice, orders: Sequence[fl
 
     On fine meshes the prediction was measured to be one to ten times the true error, on coarse ones down to a fifth.
     """
-    classes, shared = size_classes(mesh), shares_vertices(mesh)
-    return _loosest(
-        FINEST_TOLERANCE,
-        lambda tolerance: bool(np.all(quadrature_error(classes, lattice, orders, tolerance, shared) <= norms)),
-    )
+    classes, shared, radii = size_classes(mesh), shares_vertices(mesh), _radii(lattice)
+    mean = _mean_coherence(radii, classes)
+
+    def suffices(tolerance: float) -> bool:
+        even, _, rest = _error_parts(classes, lattice.highest_frequency, radii, tolerance, shared)
+        return bool(np.all(np.sqrt(_radial_integrals(even * mean + rest, radii, orders)) <= norms))
+
+    return _loosest(FINEST_TOLERANCE, suffices)
 
 
 def tolerance_for(
@@ -100,15 +102,6 @@ def size_classes(mesh: Mesh, faces: FaceArrays | None = None) -> Reals:
     return np.stack([edges[:-1], edges[1:], *sums])
 
 
-def quadrature_error(
-    classes: Reals, lattice: FrequencyLattice, orders: Sequence[float], tolerance: float, shared: bool
-) -> Reals:
-    """Predict the norm of the quadrature's part of a field's error (orders,), from the `size_classes` of a mesh."""
-    radii = _radii(lattice)
-    even, _, rest = _error_parts(classes, lattice.highest_frequency, radii, tolerance, shared)
-    return np.asarray(np.sqrt(_radial_integrals(even * _mean_coherence(radii, classes) + rest, radii, orders)))
-
-
 def _mean_coherence(radii: Reals, classes: Reals) -> Reals:
     """Return the mean energy of a surface's transform on |ξ| = r over area² (n,): 1 near zero, and 1 / (2π r² area)."""
     return np.asarray(np.minimum(1.0, 1 / (2 * np.pi * radii**2 * classes[2].sum())))
@@ -120,10 +113,9 @@ def _error_parts(
     """Predict parts of the squared error of a mesh's points at frequencies |ξ| (n,), from its `size_classes`.
 
     They are those of the even and of the odd errors of triangles, if all were in phase, and that of errors which add up
-    like random numbers, or in any case.
-    The even parts of the triangles' errors add up like the surface's transform itself. The odd parts add up like random
-    numbers, but for those without an opposite one. Triangles that are larger than a phase may repeat with the
-    wavelength: there both parts add up.
+    like random numbers, or in any case. The even errors add up like the surface's transform itself; the odd ones like
+    random numbers, but for those without an opposite one. Triangles that are larger than a phase may repeat with the
+    wavelength: there both add up.
     """
     smallest, largest, areas, squares = classes
     rules, ranges = rule_ranges(tolerance, shared)
