@@ -376,10 +376,8 @@ def smooth_step(radii: Reals, cutoff: float) -> Reals:
     Where a sharp cut would spoil it, the trapezoidal rule stays spectrally accurate.
     """
     fractions = np.asarray(radii, dtype=np.float64) / cutoff
-    steps = np.asarray(np.where(fractions <= STEP_START, 1.0, 0.0))
-    on_step = (fractions > STEP_START) & (fractions < 1)
-    steps[on_step] = 0.5 * erfc((fractions[on_step] - STEP_MIDDLE) / STEP_WIDTH)
-    return steps
+    falling = 0.5 * erfc((fractions - STEP_MIDDLE) / STEP_WIDTH)
+    return np.select([fractions <= STEP_START, fractions < 1], [1.0, falling], 0.0)
 
 
 def check_orders(order: Orders) -> tuple[float, ...]:
