@@ -76,8 +76,8 @@ def coherence(mesh: Mesh, highest: float, faces: FaceArrays | None = None, backe
     """Return the squares of the largest sums of errors in 32 equal ranges of |ξ| up to the highest one (32,).
 
     They are relative to the sum of triangles that are all in phase, and zero where none exceeds the sums of random
-    terms. A sample of the triangles stands for all, whatever their order in the file; of meshes that are large beside
-    the shortest wavelength, a sample of the box that holds most area. Frequencies fill the cube of a lattice.
+    terms. A sample of the triangles stands for all; of meshes that are large beside the shortest wavelength, a sample
+    of the box that holds most area. Frequencies fill the cube of a lattice.
     """
     triangles, areas, noise = _sample(mesh, highest, faces or FaceArrays.of_mesh(mesh))
     corners = np.stack([mesh.vertices[triangles[:, corner]].T for corner in range(3)])

@@ -36,10 +36,8 @@ class FaceArrays:
     @classmethod
     def of_mesh(cls, mesh: Mesh, backend: Backend = CPU) -> Self:
         """Return the triangles of a mesh on a backend."""
-        vertices, *others = (
-            backend.upload(array) for array in (mesh.vertices, mesh.triangles, mesh.areas, mesh.centroid_radii)
-        )
-        triangles, areas, radii = others
+        arrays = mesh.vertices, mesh.triangles, mesh.areas, mesh.centroid_radii
+        vertices, triangles, areas, radii = map(backend.upload, arrays)
         return cls(np.ascontiguousarray(vertices.T, like=vertices), triangles.T, areas, radii, backend)
 
     def __len__(self) -> int:

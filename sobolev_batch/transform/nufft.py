@@ -22,17 +22,11 @@ def transform_points(
 ) -> tuple[Array, int]:
     """Return Σ_j w_j exp(-2πi ξ·x_j) at the frequencies ξ of a block, by a type-1 nonuniform FFT.
 
-    Args:
-        batches: Points in units of length, as arrays of the backend; the sum runs over all batches. Points with a
-            |coordinate| of ``lattice.half_period`` or more are folded back without an error.
-        lattice: Lattice of the frequencies.
-        block: Block to compute; memory and time are those of the block alone.
-        spec: NUFFT to use, whose shape is the block's or that of sub-blocks. Its eps is relative to Σ|w_j|; the
-            error is a small multiple of it. The values depend on its threads by rounding.
-        backend: Backend to compute on.
-
-    Returns:
-        Complex array (block.shape) of the backend, and the number of points.
+    The values are a complex array (block.shape) of the backend; the number of points comes with them. The sum runs over
+    all batches, whose points are in units of length and in arrays of the backend. Points with a |coordinate| of
+    ``lattice.half_period`` or more are folded back without an error. The shape of the NUFFT is the block's or that of
+    sub-blocks. Its eps is relative to Σ|w_j|; the error is a small multiple of it. The values depend on its threads by
+    rounding.
 
     Source: A. Barnett, J. Magland, L. af Klinteberg, "A parallel non-uniform fast Fourier transform library based
     on an exponential of semicircle kernel" (2019), doi:10.1137/18M120885X.
@@ -79,18 +73,8 @@ def _folded(angles: Array) -> Array:
 def evaluate_at(coordinates: Reals, coefficients: Complexes, lattice: Lattice, block: Block, spec: NufftSpec) -> Reals:
     """Return Re Σ_ξ c(ξ) exp(+2πi ξ·x_j) over the frequencies ξ of a block, by a type-2 nonuniform FFT.
 
-    Args:
-        coordinates: Points x_j (3, n) in units of length. Points with a |coordinate| of ``lattice.half_period`` or
-            more are folded back without an error.
-        coefficients: c, complex (m, *block.shape), for m sums over the same frequencies.
-        lattice: Lattice of the frequencies.
-        block: Block of the coefficients; sums over several blocks add up.
-        spec: NUFFT to use, as for `transform_points`. Its eps is relative to Σ|c|; the error is a small multiple of it.
-
-    Returns:
-        float64 (m, n).
-
-    Source: see `transform_points`.
+    For points (3, n) and coefficients (m, *block.shape) of m sums it is float64 (m, n). Sums over several blocks add
+    up. Points, NUFFT and source are as for `transform_points`; here eps is relative to Σ|c|.
     """
     count = coordinates.shape[1]
     values = np.zeros((len(coefficients), count))
@@ -115,10 +99,7 @@ def evaluate_at(coordinates: Reals, coefficients: Complexes, lattice: Lattice, b
 
 
 def _first_mode(block: Block, lattice: FrequencyLattice) -> Reals:
-    """Return the shift (3,), in spacings, that moves FINUFFT's modes to a block.
-
-    FINUFFT's modes of an axis of n samples start at -(n // 2).
-    """
+    """Return the shift (3,), in spacings, of FINUFFT's modes to a block: those of n samples start at -(n // 2)."""
     corner = [start + count // 2 for start, count in zip(block.start, block.shape, strict=True)]
     return np.array(corner, dtype=np.float64) + lattice.shift
 
