@@ -7,7 +7,6 @@ a field to its sums over shells.
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -93,40 +92,25 @@ class Block:
             yield Block((i, j, k), shape), (x, y, z)
 
 
-class FrequencyLattice(ABC):
+class FrequencyLattice:
     """Equally spaced frequencies along three orthogonal axes.
 
     Attributes:
         tolerates_images: True if the images of surfaces at the period 1/h cancel on average over many lattices; else
             surfaces must lie within the period.
+        spacing: Distance h between neighbouring frequencies, in cycles per unit length.
+        half: Block of all samples.
+        highest_frequency: Largest |ξ| at which samples count, in cycles per unit length.
+        radial_range: Range of |ξ| over which errors of samples count, for predictions.
+        shift: Shift of all samples along the lattice's axes, in units of the spacing.
     """
 
     tolerates_images: ClassVar[bool] = False
-
-    @property
-    @abstractmethod
-    def spacing(self) -> float:
-        """Distance h between neighbouring frequencies, in cycles per unit length."""
-
-    @property
-    @abstractmethod
-    def half(self) -> Block:
-        """Block of all samples."""
-
-    @property
-    @abstractmethod
-    def highest_frequency(self) -> float:
-        """Largest |ξ| at which samples count, in cycles per unit length."""
-
-    @property
-    @abstractmethod
-    def radial_range(self) -> tuple[float, float]:
-        """Range of |ξ| over which errors of samples count, for predictions."""
-
-    @property
-    def shift(self) -> tuple[float, float, float]:
-        """Shift of all samples along the lattice's axes, in units of the spacing."""
-        return 0.0, 0.0, 0.0
+    spacing: float
+    half: Block
+    highest_frequency: float
+    radial_range: tuple[float, float]
+    shift: tuple[float, float, float] = 0.0, 0.0, 0.0
 
     @property
     def rotation(self) -> Reals | None:
@@ -162,6 +146,9 @@ class Lattice(FrequencyLattice):
     Attributes:
         xi_max: Half the side of the frequency cube, in cycles per unit length.
         M: Number of intervals along each axis, even.
+        spacing: Distance h between neighbouring frequencies, in cycles per unit length.
+        half: Half lattice xi_z >= 0 as one block.
+        highest_frequency: Length |xi| of the cube's corners, in cycles per unit length.
 
     Raises:
         LatticeError: xi_max is not positive and finite, or M is not an even integer from 2 to 2048.
@@ -186,33 +173,19 @@ class Lattice(FrequencyLattice):
             )
         if not is_whole_number(self.M) or self.M % 2 or not 2 <= self.M <= LARGEST_M:
             raise LatticeError(f"M must be an even integer from 2 to {LARGEST_M}, found {self.M!r}")
-        # Not NumPy's, whose products may overflow.
-        object.__setattr__(self, "M", int(self.M))
-
-    @property
-    def spacing(self) -> float:
-        """Distance h between neighbouring frequencies, in cycles per unit length."""
-        return 2 * self.xi_max / self.M
-
-    @property
-    def highest_frequency(self) -> float:
-        """Length |xi| of the cube's corners, in cycles per unit length."""
-        return math.sqrt(3) * self.xi_max
-
-    @property
-    def radial_range(self) -> tuple[float, float]:
-        """Range of |xi| of a ball with the volume of the cube."""
-        return 0.0, _BALL * self.xi_max
+        M = int(self.M)  # not NumPy's, whose products may overflow
+        vars(self).update(
+            M=M,
+            spacing=2 * self.xi_max / M,
+            half=Block((-M // 2, -M // 2, 0), (M + 1, M + 1, M // 2 + 1)),
+            highest_frequency=math.sqrt(3) * self.xi_max,
+            radial_range=(0.0, _BALL * self.xi_max),
+        )
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Number of samples along xi_x, xi_y, xi_z of the half lattice."""
-        return self.M + 1, self.M + 1, self.M // 2 + 1
-
-    @property
-    def half(self) -> Block:
-        """Half lattice xi_z >= 0 as one block."""
-        return Block((-self.M // 2, -self.M // 2, 0), self.shape)
+        return self.half.shape
 
     @cached_property
     def axes(self) -> Axes:
@@ -279,8 +252,9 @@ class OctaveLattice(FrequencyLattice):
 
     Attributes:
         lowest: Least |ξ| at which samples count, in cycles per unit length.
-        highest: Largest |ξ| at which samples count.
-        M: Samples along the x and y axis, even; the z axis has half as many and three more.
+        highest: Largest |ξ| at which samples count; those beyond it are computed with a larger error.
+        M: Samples along the x and y axis, even; the z axis has half as many, with ξ_z > 0 along the lattice's axis, and
+            three layers below that fade out.
         quaternion: Rotation R as a unit quaternion (x, y, z, w).
         offset: Shift o in units of the spacing, each from 0 to 1.
     """
@@ -302,26 +276,15 @@ class OctaveLattice(FrequencyLattice):
         i, j, k = rng.random(3).tolist()
         return cls(lowest, highest, M, (x, y, z, w), (i, j, k))
 
-    @property
-    def spacing(self) -> float:
-        """Distance h between neighbouring frequencies, in cycles per unit length."""
-        return 2 * self.highest / self.M
-
-    @property
-    def half(self) -> Block:
-        """Samples with ξ_z > 0 along the lattice's axis, and the layers below that fade out."""
-        start, faded = -self.M // 2, _FADED_LAYERS
-        return Block((start, start, -faded), (self.M, self.M, self.M // 2 + faded))
-
-    @property
-    def highest_frequency(self) -> float:
-        """Largest |ξ| at which samples count; those beyond it are computed with a larger error."""
-        return self.highest
-
-    @property
-    def radial_range(self) -> tuple[float, float]:
-        """Range of |ξ| in which samples count."""
-        return self.lowest, self.highest
+    def __post_init__(self) -> None:
+        M, faded = self.M, _FADED_LAYERS
+        vars(self).update(
+            spacing=2 * self.highest / M,
+            half=Block((-M // 2, -M // 2, -faded), (M, M, M // 2 + faded)),
+            highest_frequency=self.highest,
+            radial_range=(self.lowest, self.highest),
+            shift=self.offset,
+        )
 
     @cached_property
     def rotation(self) -> Reals:
@@ -330,11 +293,6 @@ class OctaveLattice(FrequencyLattice):
 
         matrix: Reals = Rotation.from_quat(self.quaternion).as_matrix()
         return matrix
-
-    @property
-    def shift(self) -> tuple[float, float, float]:
-        """Shift of all samples along the lattice's axes, in units of the spacing."""
-        return self.offset
 
     def half_weights(self) -> Reals:
         """Return the weight of each layer of samples along the z axis, float64: 2 inside, fading to 0 across ξ_z = 0.
