@@ -121,8 +121,7 @@ class Execution:
     Attributes:
         backend: Backend to compute on. The processor steps in for a GPU that fails.
         allowed_bytes: Memory that a transform may take on the processor, without the mesh and the result; None
-            for no limit. To stay within it, a transform uses smaller batches, sub-blocks and less oversampling,
-            whichever is predicted to be the fastest. On a GPU the limit is its free memory.
+            for no limit. On a GPU the limit is its free memory. See `fastest_spec`.
         batch: Largest number of points of one NUFFT.
     """
 
@@ -174,9 +173,9 @@ def choose_settings(
 
 @dataclass(frozen=True, eq=False)
 class Transformed:
-    """A block of a field: its values, the number of quadrature points (0 for a closed form), and the library.
+    """A block of a field: its values, the number of quadrature points, and the library or "closed form".
 
-    The library is "closed form" if none was needed, and comes with the reason if another one failed before.
+    The library comes with the reason if another one failed before.
     """
 
     values: Complexes
@@ -194,15 +193,18 @@ def transform_block(
 ) -> Transformed:
     """Return the transform of a surface on one block of the lattice.
 
-    Pass the quadrature plan of the surface by the same settings to transform several blocks with one choice of rules.
-    LatticeError where the surface extends beyond the lattice's half period, InputError where the allowed memory is too
-    little, or the quadrature of a parametrised surface does not converge.
+    Several blocks take one choice of rules with the plan of the surface by the same settings. LatticeError where the
+    surface extends beyond the lattice's half period, InputError where the allowed memory is too little, or the
+    quadrature of a parametrised surface does not converge.
     """
     kind = kind_of(surface)
     if isinstance(lattice, Lattice):
         require_inside(surface, lattice)
     if kind.is_closed_form:
-        return Transformed(_closed_form(kind, lattice, block, settings.stored), 0, "closed form")
+        values: Complexes = np.empty(block.shape, dtype=settings.stored)
+        for part in block.split(_SAMPLES):
+            values[part.place_in(block)] = kind.block_values(lattice, part)
+        return Transformed(values, 0, "closed form")
     plan = plan or settings.plan(surface, lattice)
     whole = NufftSpec(block.shape, settings.eps, settings.dtype, threads=execution.threads, batch=execution.batch)
     low, high = surface.extent.box
@@ -266,23 +268,13 @@ def _on_gpu(
 
 
 def projected_bytes(block: Block, settings: TransformSettings, *, triangles: int = 0) -> int:
-    """Return an upper estimate of the peak memory of `transform_block`, with its result and without the mesh.
-
-    Each triangle of the mesh counts for some bytes while its rule is chosen.
-    """
+    """Return an upper estimate of the peak memory of `transform_block`, with its result and without the mesh."""
     whole = NufftSpec(block.shape, settings.eps, settings.dtype)
     return block.size * whole.item_bytes + CPU.costs.projected_bytes(whole, Workload(triangles=triangles))
 
 
-def _closed_form(kind: SurfaceKind, lattice: FrequencyLattice, block: Block, dtype: ComplexDtype) -> Complexes:
-    values: Complexes = np.empty(block.shape, dtype=dtype)
-    for part in block.split(_SAMPLES):
-        values[part.place_in(block)] = kind.block_values(lattice, part)
-    return values
-
-
 def require_inside(surface: Surface, lattice: Lattice) -> None:
-    """Check that a surface lies within the lattice's period, and would not be folded back; LatticeError otherwise."""
+    """Check that a surface lies within the lattice's period, and would not be folded back."""
     kind = "mesh" if kind_of(surface).triangles else "surface"
     require_points_inside(np.stack(surface.extent.box), lattice, f"the {kind} reaches", "it")
 
@@ -290,7 +282,7 @@ def require_inside(surface: Surface, lattice: Lattice) -> None:
 def require_points_inside(
     coordinates: Reals, lattice: Lattice, subject: str = "the points reach", pronoun: str = "them"
 ) -> None:
-    """Check that coordinates lie within the lattice's period; see `require_inside`."""
+    """Check that coordinates lie within the lattice's period; LatticeError otherwise."""
     reach = float(np.abs(coordinates).max(initial=0.0))
     if not reach < lattice.half_period:
         intervals = 2 * math.floor(2 * lattice.xi_max * reach) + 2

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby
 from operator import itemgetter
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -63,17 +63,14 @@ class SurfaceKind(ABC):
     eps: float = 0.0
     quadrature: str | int = "auto"
     tolerance: float | None = None
+    # True if the transform is a formula at every frequency.
+    is_closed_form: ClassVar[bool] = False
 
     def plan(
         self, highest_frequency: float, eps: float, quadrature: str | int = "auto", tolerance: float | None = None
     ) -> Self:
         """Return the surface with points up to a frequency; see the attributes."""
         return replace(self, highest_frequency=highest_frequency, eps=eps, quadrature=quadrature, tolerance=tolerance)
-
-    @property
-    def is_closed_form(self) -> bool:
-        """True if the transform is a formula at every frequency."""
-        return False
 
     @property
     def triangles(self) -> int:
@@ -237,8 +234,7 @@ class _Parametrised(SurfaceKind):
         yield WeightedPoints.concatenated(gathered)
 
     def exact_values(self, frequencies: Reals, threads: int = 1, backend: Backend = CPU) -> Complexes:
-        # With twice the nodes along each parameter at which it converges, the error is about 1e-14 of the area. If half
-        # a million nodes do not suffice, it is that of twice as many along each parameter.
+        # With twice the nodes at which it converges, the error is about 1e-14 of the area, if half a million suffice.
         highest = float(np.linalg.norm(frequencies, axis=1).max(initial=0.0))
         return direct_transform(self.surface, exact_counts(self.surface, highest), frequencies)
 

@@ -43,7 +43,7 @@ class Draws:
     """Random frequencies ξ = h k of the half lattice, float64 (P, 3), and the lattice indices k, int64 (P, 3).
 
     The scales (P,) are trapezoidal weight / (P p), the factor of a squared error. They follow from the orders, the
-    degree and the number of all draws; these may be some of them.
+    degree and the count of all draws, of which these may be some.
     """
 
     indices: Indices
@@ -249,10 +249,8 @@ def probe_block(
 ) -> Probe:
     """Compare one block of a field with the exact transform, at the draws that fall into the block and some of its own.
 
-    A sample at these draws saves time.
-
-    The exact values of a parametrised surface come from twice its nodes. Its probe therefore also holds the change
-    that the last doubling made, once for the whole field.
+    A sample at these draws saves time. The exact values of a parametrised surface come from twice its nodes, so its
+    probe also holds the change that the last doubling made, once for the whole field.
     """
     if not needs_probe(surface, settings):
         return Probe()
@@ -267,7 +265,6 @@ def probe_block(
         exact = np.concatenate([sample.exact[common], own])
     probe = measure(pooled, values[pooled.places(block)], exact)
     change = settings.plan(surface, lattice).change
-    # Once for the whole field.
     if change and block.start == lattice.half.start:
         return join([probe, uniform_probe(lattice, change * surface.area)])
     return probe
