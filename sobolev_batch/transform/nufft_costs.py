@@ -235,14 +235,12 @@ def fastest_spec(whole: NufftSpec, workload: Workload, costs: Costs, allowed_byt
 
 def sub_shapes(shape: Shape, sigma: float) -> Iterator[Shape]:
     """Yield shapes of sub-blocks, from the whole block down to where smaller ones save nothing."""
-    counts = [1, 1, 1]
     lengths = list(shape)
     while True:
         yield lengths[0], lengths[1], lengths[2]
         axis = max(range(3), key=lengths.__getitem__)
         if lengths[axis] * sigma <= 2 * _WIDEST_KERNEL:
             return
-        before = lengths[axis]
-        while lengths[axis] == before:
-            counts[axis] += 1
-            lengths[axis] = math.ceil(shape[axis] / counts[axis])
+        # The fewest parts that are shorter.
+        count = math.ceil(shape[axis] / (lengths[axis] - 1))
+        lengths[axis] = math.ceil(shape[axis] / count)
