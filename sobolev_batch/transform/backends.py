@@ -50,9 +50,7 @@ _log = logging.getLogger(__name__)
 
 
 def combine(coefficients: Reals, rows: Array, out: Array | None = None) -> Array:
-    """Return the matrix product of a few coefficients (..., k), on the host, with rows (k, n) of a backend.
-
-    Of rows (a, k, n) it is the product with each of them, (a, ..., n).
+    """Return the matrix product of few coefficients (..., k), on the host, with rows (k, n) or (a, k, n) of a backend.
 
     NumPy's own product leaves threads of the BLAS that spin for some 25 ms, in which those of FINUFFT wait for them.
     CuPy's needs cuBLAS, which takes more memory than everything else together.

@@ -1,7 +1,6 @@
 """Exact Fourier transforms of flat triangles, evaluated without loss of digits.
 
-They cost O(triangles) for each frequency, so they do not replace the NUFFT: this is the independent formula
-that rates quadrature rules and checks computed fields.
+They cost O(triangles) for each frequency: they do not replace the NUFFT, but rate quadrature rules and check fields.
 
 The transform of a triangle of area A is 2A times the second divided difference of exp at the nodes -2πi ξ·p_j of its
 corners p_j (Hermite-Genocchi; C. de Boor, "Divided differences", 2005, arXiv:math/0502036). The explicit quotient of
@@ -32,8 +31,7 @@ Pair = tuple[Array, Array]
 # Vertices (3, n), indices of corners (3, m), twice the areas (m,), and the first two edges (2, 3, m).
 _Faces = tuple[Array, Array, Array, Array]
 
-# Gaps below this (radians) go through the series, which then needs at most 19 terms and a fraction of the time of the
-# quotient.
+# Gaps below this (radians) go through the series: at most 19 terms, and a fraction of the time of the quotient.
 _SERIES_GAP = 2.0
 # Below this many cycles a plain dot product keeps the phase of exp to 5e-14 radians.
 _PLAIN_CYCLES = 16.0
@@ -55,8 +53,7 @@ _FEWEST_PER_THREAD = 32
 _LEAST_PRODUCT = 2e-3
 # If the longest edge is below this many radians, most triangles would go through the stable form.
 _FINE_MESH = 0.5
-# Most pairs of a triangle and a frequency at a time in `sampled_transform`, and most triangles: their temporaries stay
-# in a processor's cache. Those of all triangles of a fine mesh, on every thread, would take gigabytes.
+# Most pairs of a triangle and a frequency at a time in `sampled_transform`, and most triangles: temporaries stay small.
 _SAMPLED_PAIRS = {"cpu": 1 << 14, "gpu": 1 << 22}
 # Processor time of a pair of a triangle and a frequency on arrays, at least.
 _PAIR_SECONDS = 4e-8
@@ -173,10 +170,7 @@ def doubled_areas(mesh: Mesh) -> Reals:
 
 
 def _sums(corners: Reals, doubled: Reals, frequencies: Reals, backend: Backend) -> Complexes:
-    """Return the transform (P,) of a batch of triangles.
-
-    They are given by their corners (3, 3, k), corner, axis, triangle, and twice their areas (k,).
-    """
+    """Return the transform (P,) of triangles, from their corners (3, 3, k), axis by axis, and twice their areas (k,)."""
     a, b, c = corners
     ab, ac = b - a, c - a
     longest = np.sqrt(max(float(np.einsum("ij,ij->j", side, side).max()) for side in (ab, ac, c - b)))
@@ -368,7 +362,9 @@ def sampled_transform(mesh: Mesh, frequencies: Reals, threads: int = 1, backend:
         total, size = np.zeros(len(others), dtype=np.complex128), _SAMPLED_PAIRS[backend.name]
         for number, batch in mesh.batches(size):
             faces = _faces(batch, doubled[number * size :][: len(batch.triangles)], backend)
-            total += _plain_sums(faces, backend, others)
+            step = max(1, size // len(batch.triangles))
+            groups = (others[first : first + step] for first in range(0, len(others), step))
+            total += np.concatenate([backend.download(_group_sums(faces, group)) for group in groups])
         return total
 
     values[~fine] = compute_on(_faster(backend, mesh, others), sums) if len(others) else 0
@@ -381,14 +377,6 @@ def _faces(mesh: Mesh, doubled: Reals, backend: Backend) -> _Faces:
     arrays = np.ascontiguousarray(mesh.vertices.T), corners, doubled, np.stack([b - a, c - b])
     vertices, indices, areas, edges = map(backend.upload, arrays)
     return vertices, indices, areas, edges
-
-
-def _plain_sums(faces: _Faces, backend: Backend, frequencies: Reals) -> Complexes:
-    """Return the transform (P,) of some faces, a few frequencies at a time."""
-    step = max(1, _SAMPLED_PAIRS[backend.name] // len(faces[2]))
-    groups = [frequencies[first : first + step] for first in range(0, len(frequencies), step)]
-    sums = [backend.download(_group_sums(faces, group)) for group in groups]
-    return np.concatenate(sums or [np.empty(0, complex)])
 
 
 def _group_sums(faces: _Faces, frequencies: Reals) -> Array:

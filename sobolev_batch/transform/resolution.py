@@ -53,10 +53,7 @@ def resolution_of(surface: Smooth, highest_frequency: float, tolerance: float) -
 
 
 def direct_transform(surface: Smooth, counts: Counts, frequencies: Reals) -> Complexes:
-    """Return the transform Σ w exp(-2πi ξ·x) over the nodes of a rule (P,), summed one by one.
-
-    The frequencies are float64 (P, 3), in cycles per unit length. The values have a few rounding errors of the area.
-    """
+    """Return Σ w exp(-2πi ξ·x) over the nodes of a rule at frequencies (P, 3), to a few rounding errors of the area."""
     wave_vectors = -2 * np.pi * np.asarray(frequencies, dtype=np.float64)
     values = np.zeros(len(wave_vectors), dtype=np.complex128)
     for points, weights in surface.nodes(counts, max(1, _PAIRS // max(len(wave_vectors), 1))):

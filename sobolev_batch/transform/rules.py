@@ -155,10 +155,9 @@ def fixed_rule(quadrature: str | int) -> TriangleRule | None:
 def rule_ranges(tolerance: float, shared: bool = True) -> tuple[tuple[TriangleRule, ...], Reals]:
     """Return the rules of increasing cost that are worth using at a tolerance, and the range of each.
 
-    The tolerance is the largest error on one triangle, relative to its area, at every frequency. The range is the
-    largest 2π|ξ|ρ (radians; ρ is the distance from a triangle's centroid to its farthest corner) up to which a rule
-    keeps it for every shape of triangle and direction of ξ. Rules with a smaller range than a cheaper one are left out,
-    and those with shared nodes where triangles share none.
+    The tolerance is the largest error on one triangle, relative to its area. The range is the largest 2π|ξ|ρ (radians;
+    ρ is the distance from a triangle's centroid to its farthest corner) up to which a rule keeps it for every shape and
+    direction. Rules that reach no farther than a cheaper one are left out, as are shared nodes where there are none.
     """
     tolerance = max(tolerance, FINEST_TOLERANCE)
     rules: list[TriangleRule] = []
@@ -203,9 +202,9 @@ def candidate_rules() -> tuple[TriangleRule, ...]:
 def tabulated() -> dict[str, Reals]:
     """Return the symmetric rules and what was measured of each candidate, float64.
 
-    The "nodes" (n, 3) and "weights" (n,) of all degrees follow each other; "sizes" (50,) has the number of each. The
-    errors "largest" (55, 160), "even" and "odd" (55, 64) depend on the rules alone, and measuring takes a second of
-    each process, so the package carries them. `python -m benchmarks.rule_errors` measures them anew.
+    The "nodes" (n, 3) and "weights" (n,) of all degrees follow each other; "sizes" (50,) has the number of each. To
+    measure the errors "largest" (55, 160), "even" and "odd" (55, 64), as `python -m benchmarks.rule_errors` does, takes
+    a second.
     """
     with np.load(TABULATED, allow_pickle=False) as stored:  # noqa: TID251
         return {name: stored[name] for name in stored.files}
