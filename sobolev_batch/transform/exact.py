@@ -170,7 +170,7 @@ def doubled_areas(mesh: Mesh) -> Reals:
 
 
 def _sums(corners: Reals, doubled: Reals, frequencies: Reals, backend: Backend) -> Complexes:
-    """Return the transform (P,) of triangles, from their corners (3, 3, k), axis by axis, and twice their areas (k,)."""
+    """Return the transform (P,) of triangles by their corners (3, 3, k), axis by axis, and twice their areas (k,)."""
     a, b, c = corners
     ab, ac = b - a, c - a
     longest = np.sqrt(max(float(np.einsum("ij,ij->j", side, side).max()) for side in (ab, ac, c - b)))

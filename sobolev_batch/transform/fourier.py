@@ -156,10 +156,7 @@ def cheapest_dtype(surfaces: Sequence[Surface], lattice: FrequencyLattice, targe
 def choose_settings(
     surface: Surface, lattice: FrequencyLattice, target: ErrorTarget, settings: TransformSettings
 ) -> TransformSettings:
-    """Return the cheapest settings that are predicted to meet a target, or the finest possible ones.
-
-    The dtype and quadrature are kept, and all settings for a closed form, which depends on none.
-    """
+    """Return the cheapest eps and tolerance that are predicted to meet a target, or the finest possible ones."""
     kind = kind_of(surface)
     if kind.is_closed_form:
         return settings

@@ -45,17 +45,14 @@ _FEWEST_NODES = 500
 class SurfaceKind(ABC):
     """A surface as transforms see it: exact values anywhere, and points that stand for it up to a frequency.
 
-    `kind_of` makes it for exact values, and `plan` for points. These are chosen when first needed, and made batch by
-    batch.
+    `kind_of` makes it for exact values, and `plan` for points, which are chosen when first needed.
 
     Attributes:
         surface: Surface in units of length.
         highest_frequency: Largest |ξ| at which the points stand for the surface, in cycles per unit length.
         eps: Largest quadrature error at any such frequency, relative to the area. Only "auto" and parametrised
             surfaces observe it.
-        quadrature: Method to choose the rules of triangles: see `fixed_rule`.
-        tolerance: Largest error of the rule on any one triangle, relative to its area, or of the nodes of a
-            parametrised surface, relative to the whole area; None for what eps needs.
+        quadrature: As in `TransformSettings`, like the tolerance.
     """
 
     surface: Any
@@ -181,8 +178,8 @@ class _Triangles(SurfaceKind):
         total = float(ends[-1])
         margin = 0 if fits else max(expected)
         count = math.ceil(total / (capacity - margin))
-        # A batch of triangles goes where its first point goes, so that each batch of points exceeds its equal
-        # number by at most one batch of triangles.
+        # A batch of triangles goes where its first point goes, so that each batch of points exceeds its equal number by
+        # at most one of these.
         numbers = (np.concatenate([[0], ends[:-1]]) * count // total).astype(int).tolist()
         faces = self.faces(backend)
         for _, group in groupby(zip(numbers, triangles, strict=True), key=itemgetter(0)):

@@ -1,9 +1,9 @@
 """Distance of a computed field from the exact transform, measured at a few random frequencies.
 
-The mean of weight · |computed - exact|² / p over frequencies drawn with probability p estimates the
-squared norm of a field's error without bias (importance sampling). The exact values of a mesh are the
-closed form of its triangles, which shares neither the quadrature nor the NUFFT with the field, so every
-field is checked end to end. Those of a parametrised surface are a direct sum over twice the nodes.
+The mean of weight · |computed - exact|² / p over frequencies drawn with probability p estimates the squared norm of a
+field's error without bias (importance sampling). The exact values of a mesh are the closed form of its triangles, which
+shares neither the quadrature nor the NUFFT with the field. Those of a parametrised surface are a direct sum over twice
+the nodes.
 """
 
 from __future__ import annotations

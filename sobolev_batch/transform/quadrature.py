@@ -111,7 +111,7 @@ def assign_rules(
 ) -> tuple[RuleUse, ...]:
     """Return the rules of all triangles up to a frequency: the prescribed one, or those that keep an error.
 
-    That is eps, of the whole mesh relative to its area, or a tolerance of each triangle relative to its own. A GPU
+    That is eps, of the whole mesh relative to its area, or a tolerance of each triangle relative to its own. A backend
     helps, also with faces that it has.
     """
     fixed = fixed_rule(quadrature)
@@ -122,8 +122,8 @@ def assign_rules(
     sizes = mesh.centroid_radii
     factor, keys = 2 * np.pi * highest_frequency, np.empty(len(sizes), dtype=np.uint16)
 
+    # A key is splits times the number of rules plus that of the rule.
     def numbers(some: Reals) -> Indices:
-        """Return splits times the number of rules plus that of the rule, for radii."""
         splits, choice = choose_rules(factor * some, ranges)
         return splits * len(ranges) + choice
 

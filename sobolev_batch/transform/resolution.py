@@ -70,12 +70,9 @@ def exact_counts(surface: Smooth, highest: float) -> Counts:
 
 
 def _refined(surface: Smooth, highest: float, tolerance: float, most: int) -> tuple[Counts, float]:
-    """Double the nodes along each parameter that needs it, until the change is small or the nodes are too many.
-
-    Returns what `resolution_of` does; the change is infinite if even the first nodes are too many.
-    """
+    """Double the nodes along each parameter that needs it, until the change is small or the nodes are too many."""
     counts = _first_counts(surface, highest)
-    if _too_many(surface, counts, most):
+    if _too_many(surface, counts, most):  # even the first
         return counts, math.inf
     frequencies = highest * _unit_frequencies()
     values = direct_transform(surface, counts, frequencies)

@@ -52,8 +52,6 @@ def tolerance_for(
     It is eps at least. The errors of triangles that are small beside the wavelength cancel, unless pieces of the mesh
     repeat. Of icospheres, scans and random triangles the largest error was measured to be at most 0.8 eps, of arrays of
     boxes, tetrahedra and spheres 0.6, and of two layers of opposite triangles 1.5.
-
-    A GPU helps, also with faces that it has.
     """
     classes, shared = size_classes(mesh, faces), shares_vertices(mesh)
     radii, alike = highest_frequency * (np.arange(RANGES) + 1) / RANGES, unpaired(mesh, faces) ** 2
@@ -85,8 +83,7 @@ def _loosest(finest: float, suffices: Callable[[float], bool]) -> float:
 def size_classes(mesh: Mesh, faces: FaceArrays | None = None) -> Reals:
     """Return the triangles of a mesh in classes of similar size, (4, classes).
 
-    The rows are the least and the greatest centroid radius of each class, in units of length, and the sums of the
-    areas and of the squared areas in it.
+    The rows are the least and greatest centroid radius of each class, and its sums of areas and of squared areas.
     """
     largest = float(mesh.centroid_radii.max())
     smallest = max(float(mesh.centroid_radii.min()), 1e-6 * largest)
