@@ -111,7 +111,7 @@ def assign_rules(
 ) -> tuple[RuleUse, ...]:
     """Return the rules of all triangles up to a frequency: the prescribed one, or those that keep an error.
 
-    That is eps, of the whole mesh relative to its area, or a tolerance of each triangle relative to its own. A backend
+    That is eps, of the whole mesh relative to its area, or a tolerance of each triangle relative to its own. A GPU
     helps, also with faces that it has.
     """
     fixed = fixed_rule(quadrature)
