@@ -138,8 +138,9 @@ def _field_task(job: Job, groups: _Groups, projected_bytes: float) -> Task:
     if len(groups) == 1:
         return Task(compute_mesh, (job, *groups), projected_bytes, needs_gpu, job.index, job.row.label, stage="field")
     parts = [(blocks, False) for blocks in groups] + [((), True)] * (job.tail is not None)
-    tasks = [Task(compute_parts, (job, *part), projected_bytes, needs_gpu, stage="part of field") for part in parts]
-    return Task(finish_mesh, (job, tasks), row=job.index, label=job.row.label, stage="field")
+    label, stage = job.row.label, "part of field"
+    tasks = [Task(compute_parts, (job, *part), projected_bytes, needs_gpu, label=label, stage=stage) for part in parts]
+    return Task(finish_mesh, (job, tasks), row=job.index, label=label, stage="field")
 
 
 def size_rows(plan: Plan, rows: Sequence[Row], workers: Workers) -> tuple[dict[str, Sizes], dict[str, str]]:

@@ -26,6 +26,8 @@ Stage = Literal["cluster", "lattice", "fields", "reduction", "proximity"]
 # Runs that have begun and not ended: at least so many, and so many for each thread of the workers, whose first task may
 # be their only one. Each has its plan and its records in memory.
 _FEWEST_RUNS, _RUNS_PER_THREAD = 64, 4
+# Tasks that the scheduler knows of at a time keep its workers busy, while each costs it memory.
+_FEWEST_IN_FLIGHT, _IN_FLIGHT_PER_THREAD = 2000, 20
 # What was done in a step of a stage, for people.
 _DONE: Mapping[Stage, str] = {
     "lattice": "lattices chosen",
@@ -110,24 +112,19 @@ class Cluster:
         client: Client of the cluster; None where one task does all the work itself, see `in_place`.
         workers: Workers that the cluster had when the study began.
         notify: Callback for each step of progress.
-        in_flight: Number of small tasks that the scheduler knows of at a time, at least: enough to keep workers
-            busy, while each costs the scheduler memory.
-        in_flight_per_thread: The same for each thread of the workers.
         study, part: Name of the study, and of its object where it names any, for the names of tasks.
     """
 
-    client: Client | None
+    client: Client
     workers: Workers
     notify: Notify = lambda progress: None
-    in_flight: int = 2000
-    in_flight_per_thread: int = 20
     study: str = ""
     part: str = ""
 
     @property
     def most_in_flight(self) -> int:
         """Number of tasks that the scheduler knows of at a time."""
-        return max(self.in_flight, self.in_flight_per_thread * self.workers.threads)
+        return max(_FEWEST_IN_FLIGHT, _IN_FLIGHT_PER_THREAD * self.workers.threads)
 
     def count_steps(self, stage: Stage, total: int) -> Callable[[str, Record | None], None]:
         """Report the start of a stage with its number of steps, and return a function that reports each by label."""
@@ -135,27 +132,23 @@ class Cluster:
         self.notify(Progress(stage, 0, total))
         return lambda label, record: self.notify(Progress(stage, next(done), total, label, record))
 
-    def submit(self, task: Task, claims_memory: bool, futures: dict[int, Future], label: str) -> Future:
-        """Submit a task after those among its arguments, each of these once."""
+    def submit(self, task: Task, claims_memory: bool) -> Future:
+        """Submit a task after those among its arguments."""
 
         def submitted(argument: Any) -> Any:
             if isinstance(argument, list):
                 return [submitted(item) for item in argument]
-            return self.submit(argument, claims_memory, futures, label) if isinstance(argument, Task) else argument
+            return self.submit(argument, claims_memory) if isinstance(argument, Task) else argument
 
-        if self.client is None:
-            raise ValueError("there is no cluster to submit tasks to")
-        if id(task) not in futures:
-            resources = {MEMORY: task.projected_bytes} if claims_memory and task.projected_bytes else {}
-            if task.needs_gpu:
-                resources[GPU] = 1.0
-            futures[id(task)] = self.client.submit(
-                task.function,
-                *map(submitted, task.arguments),
-                key=task_key(task.stage or task.function.__name__, self.study, self.part, label),
-                resources=resources or None,
-            )
-        return futures[id(task)]
+        resources = {MEMORY: task.projected_bytes} if claims_memory and task.projected_bytes else {}
+        if task.needs_gpu:
+            resources[GPU] = 1.0
+        return self.client.submit(
+            task.function,
+            *map(submitted, task.arguments),
+            key=task_key(task.stage or task.function.__name__, self.study, self.part, task.label),
+            resources=resources or None,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,22 +246,16 @@ def side_by_side(
 
 
 class _Run(Generic[Result]):
-    """A run that has begun: where it is, and the tasks of its wave."""
+    """A run that has begun: the wave that it waits for, tasks of this to hand out, and their number on the cluster."""
+
+    wave: Wave
+    tasks: Iterator[Task]
 
     def __init__(self, name: str, stages: Stages[Result]) -> None:
         self.name, self.stages = name, stages
-        self.wave: Wave | None = None
-        self.tasks: Iterator[Task] = iter(())
-        self.in_flight, self.has_more = 0, False
+        self.in_flight = 0
+        # Their workers died.
         self.suspects: list[Task] = []
-
-    def advance(self, error: BaseException | None = None) -> None:
-        """Go on to the next wave, or raise StopIteration with the result. An error is raised where the run waits."""
-        # A run that ends waits for no wave, whose other tasks may still come back.
-        self.wave = None
-        self.suspects.clear()
-        self.wave = next(self.stages) if error is None else self.stages.throw(error)
-        self.tasks, self.has_more = iter(self.wave.tasks), True
 
 
 class _Loop(Generic[Result]):
@@ -280,9 +267,9 @@ class _Loop(Generic[Result]):
         self._most_runs = _FEWEST_RUNS
         # Those with tasks to hand out, which they do in turn.
         self._ready = deque[_Run[Result]]()
-        self._running: dict[Future, tuple[_Run[Result], Wave, Task]] = {}
-        self._client: Client | None = None
-        self._completed: as_completed | None = None
+        self._running: dict[Future, tuple[_Run[Result], Task]] = {}
+        # Made for the client of the first task.
+        self._completed: as_completed = None
         self._alone: Task | None = None
         self._ended = deque[tuple[str, Result | Exception]]()
 
@@ -311,14 +298,11 @@ class _Loop(Generic[Result]):
 
     def _hand_out(self) -> None:
         """Submit tasks of all runs in turn, up to what the scheduler should know of; begin runs where none has any."""
-        while self._alone is None:
-            if not self._ready and not self._begin():
-                return
+        while self._alone is None and (self._ready or self._begin()):
             if not self._ready:
                 continue
             run = self._ready[0]
-            wave = run.wave
-            if wave is None or len(self._running) >= wave.cluster.most_in_flight:
+            if len(self._running) >= run.wave.cluster.most_in_flight:
                 return
             self._ready.rotate(-1)
             try:
@@ -326,74 +310,66 @@ class _Loop(Generic[Result]):
             except Exception as error:
                 self._end_wave(run, error)
                 continue
-            if task is None:
-                run.has_more = False
+            if task is not None:
+                self._submit(run, task)
+            else:
                 self._ready.remove(run)
                 self._go_on(run)
-                continue
-            try:
-                wave.cluster.workers.require_memory(task.projected_bytes)
-            except ClusterError as error:
-                self._give(run, task, error)
-                continue
-            self._submit(run, task)
 
     def _begin(self) -> bool:
         """Begin the next run; False where none is waiting, or enough have begun."""
         if len(self._begun) >= self._most_runs:
             return False
-        name, stages = next(self._waiting, ("", None))
-        if stages is None:
-            return False
-        run = _Run(name, stages)
-        self._begun.append(run)
-        self._advance(run)
-        return True
+        for name, stages in self._waiting:
+            self._begun.append(_Run(name, stages))
+            self._advance(self._begun[-1])
+            return True
+        return False
 
     def _submit(self, run: _Run[Result], task: Task) -> None:
-        wave = run.wave
-        if wave is None:
-            raise ValueError("the run waits for nothing")
-        if self._completed is None and wave.cluster.client is not None:
-            self._client = wave.cluster.client
-            self._completed = as_completed(loop=self._client.loop)
-            self._most_runs = max(_FEWEST_RUNS, _RUNS_PER_THREAD * wave.cluster.workers.threads)
-        future = wave.cluster.submit(task, wave.claims_memory, {}, task.label)
-        self._running[future] = run, wave, task
+        cluster = run.wave.cluster
+        try:
+            cluster.workers.require_memory(task.projected_bytes)
+        except ClusterError as error:
+            self._give(run, task, error)
+            return
+        if self._completed is None:
+            self._completed = as_completed(loop=cluster.client.loop)
+            self._most_runs = max(_FEWEST_RUNS, _RUNS_PER_THREAD * cluster.workers.threads)
+        future = cluster.submit(task, run.wave.claims_memory)
+        self._running[future] = run, task
         run.in_flight += 1
-        if self._completed is not None:
-            self._completed.add(future)
+        self._completed.add(future)
 
     def _take_back(self) -> None:
         """Wait for tasks that end, and give their outcomes to their runs."""
-        if self._completed is None or self._client is None:
-            return
         # Others were given up.
         batch = [future for future in self._completed.next_batch() if future in self._running]
-        outcomes = _outcomes(self._client, batch)
-        ended = [self._running.pop(future) for future in batch]
-        for run, _, _ in ended:
-            run.in_flight -= 1
-        for (run, wave, task), outcome in zip(ended, outcomes, strict=True):
-            if run.wave is not wave:
+        runs: dict[_Run[Result], None] = {}
+        for future, outcome in zip(batch, _outcomes(batch), strict=True):
+            if future not in self._running:
                 continue  # An outcome before this one ended the wave.
-            if isinstance(outcome, KilledWorker) and task.divided:
-                run.tasks, run.has_more = chain(task.divided, run.tasks), True
+            run, task = self._running.pop(future)
+            run.in_flight -= 1
+            runs[run] = None
+            was_alone = task is self._alone
+            if was_alone:
+                self._alone = None
+            if not isinstance(outcome, KilledWorker):
+                self._give(run, task, outcome)
+            elif task.divided:
+                run.tasks = chain(task.divided, run.tasks)
                 if run not in self._ready:
                     self._ready.append(run)
-            elif isinstance(outcome, KilledWorker) and task is not self._alone:
-                run.suspects.append(task)
+            elif was_alone:
+                self._give(run, task, _deadly(outcome))
             else:
-                self._give(run, task, _deadly(outcome) if isinstance(outcome, KilledWorker) else outcome)
-        if any(task is self._alone for _, _, task in ended):
-            self._alone = None
-        for run in dict.fromkeys(run for run, _, _ in ended):
+                run.suspects.append(task)
+        for run in runs:
             self._go_on(run)
 
     def _give(self, run: _Run[Result], task: Task, outcome: Any) -> None:
         """Give the outcome of a task to its run."""
-        if run.wave is None:
-            raise ValueError("the run waits for nothing")
         try:
             if type(outcome) in (StoreError, SpaceError):
                 raise type(outcome)(f"{outcome}; then the same command goes on from what is stored") from outcome
@@ -405,22 +381,24 @@ class _Loop(Generic[Result]):
 
     def _end_wave(self, run: _Run[Result], error: Exception) -> None:
         """Give the other tasks of a run up, and raise an error where it waits."""
-        for future in [future for future, (owner, _, _) in self._running.items() if owner is run]:
+        for future in [future for future, (owner, _) in self._running.items() if owner is run]:
             del self._running[future]
             future.release()
-        run.in_flight, run.has_more = 0, False
+        run.in_flight = 0
+        run.suspects.clear()
         if run in self._ready:
             self._ready.remove(run)
         self._advance(run, error)
 
     def _go_on(self, run: _Run[Result]) -> None:
         """Let a run go on whose wave is done."""
-        if run in self._begun and not (run.has_more or run.in_flight or run.suspects):
+        if run in self._begun and not (run in self._ready or run.in_flight or run.suspects):
             self._advance(run)
 
     def _advance(self, run: _Run[Result], error: Exception | None = None) -> None:
+        """Have a run yield its next wave, or end. An error is raised where it waits."""
         try:
-            run.advance(error)
+            run.wave = next(run.stages) if error is None else run.stages.throw(error)
         except StopIteration as end:
             self._begun.remove(run)
             self._ended.append((run.name, end.value))
@@ -430,6 +408,7 @@ class _Loop(Generic[Result]):
                 raise
             self._ended.append((run.name, failure))
         else:
+            run.tasks = iter(run.wave.tasks)
             self._ready.append(run)
 
     def _try_alone(self) -> bool:
@@ -443,8 +422,11 @@ class _Loop(Generic[Result]):
         return True
 
 
-def _outcomes(client: Client, futures: Sequence[Future]) -> list[Any]:
+def _outcomes(futures: Sequence[Future]) -> list[Any]:
     """Fetch the results of futures that have ended, or their exceptions, all at once."""
+    if not futures:
+        return []
+    client = futures[0].client
     lost = (
         f"the scheduler at {client.scheduler.address} was lost; the same command goes on from what is stored, "
         "after `sobolev-batch unlock` where it was submit"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -67,31 +66,27 @@ def test_each_task_comes_back_with_its_outcome(cluster: Cluster) -> None:
         result_of(outcomes[0])
 
 
-def few_at_a_time(cluster: Cluster, count: int) -> Cluster:
-    return replace(cluster, in_flight=count, in_flight_per_thread=0)
-
-
-def _append(path: Path) -> int:
-    with path.open("a") as file:
-        file.write("called\n")
-    return 3
+def few_at_a_time(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+    monkeypatch.setattr(execution, "_FEWEST_IN_FLIGHT", count)
+    monkeypatch.setattr(execution, "_IN_FLIGHT_PER_THREAD", 0)
 
 
 def _total(number: int, others: list[int]) -> int:
     return number + sum(others)
 
 
-def test_a_task_among_the_arguments_of_others_is_done_once(cluster: Cluster, tmp_path: Path) -> None:
-    first = Task(_append, (tmp_path / "calls",))
-    ((_, total),) = outcomes_of(cluster, [Task(_total, (first, [first, Task(abs, (-4,)), 5]))])
-    assert total == 3 + 3 + 4 + 5
-    assert (tmp_path / "calls").read_text() == "called\n"
+def test_the_results_of_tasks_are_arguments_of_others(cluster: Cluster) -> None:
+    ((_, total),) = outcomes_of(cluster, [Task(_total, (Task(abs, (-3,)), [Task(abs, (-4,)), 5]))])
+    assert total == 3 + 4 + 5
 
 
-def test_tasks_that_fit_into_no_worker_are_not_tried(cluster: Cluster, tmp_path: Path) -> None:
-    large = [Task(_append, (tmp_path / "calls",), 3e9) for _ in range(5)]
+def test_tasks_that_fit_into_no_worker_are_not_tried(
+    cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few_at_a_time(monkeypatch, 1)
+    large = [Task(Path.touch, (tmp_path / "calls",), 3e9) for _ in range(5)]
     tasks = [*large, Task(abs, (-4,), 1e6)]
-    outcomes = [outcome for _, outcome in outcomes_of(few_at_a_time(cluster, 1), tasks, 3e9)]
+    outcomes = [outcome for _, outcome in outcomes_of(cluster, tasks, 3e9)]
     assert outcomes.pop() == 4
     assert all(isinstance(outcome, ClusterError) for outcome in outcomes)
     assert describe_failure(outcomes[0]).startswith(
@@ -101,7 +96,8 @@ def test_tasks_that_fit_into_no_worker_are_not_tried(cluster: Cluster, tmp_path:
     assert not (tmp_path / "calls").exists()
 
 
-def test_tasks_are_read_as_they_are_handed_out(cluster: Cluster) -> None:
+def test_tasks_are_read_as_they_are_handed_out(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    few_at_a_time(monkeypatch, 2)
     read: list[int] = []
 
     def tasks() -> Iterator[Task]:
@@ -117,7 +113,7 @@ def test_tasks_are_read_as_they_are_handed_out(cluster: Cluster) -> None:
         assert len(read) <= done + 2
 
     def stages() -> Stages[None]:
-        yield Wave(few_at_a_time(cluster, 2), tasks(), take)
+        yield Wave(cluster, tasks(), take)
 
     assert list(side_by_side([("", stages())])) == [("", None)]
     assert (done, read) == (9, list(range(9)))
@@ -133,8 +129,8 @@ def test_tasks_whose_workers_died_are_tried_alone(cluster: Cluster, monkeypatch:
         tried.append((task.row, len(outcomes)))
         return submit_task(self, task, *arguments)
 
-    def died(client: Client, futures: Sequence[Future]) -> list[Any]:
-        rows = fetched(client, futures)
+    def died(futures: Sequence[Future]) -> list[Any]:
+        rows = fetched(futures)
         dies = {3, 1} if len(tried) <= 4 else {3}
         return [KilledWorker(f"task-{row}", worker, 1) if row in dies else row for row in rows]
 
@@ -158,8 +154,8 @@ def test_a_group_whose_worker_died_is_divided(cluster: Cluster, monkeypatch: pyt
     worker: Any = SimpleNamespace(address="tcp://127.0.0.1:1")
     fetched, outcomes = execution._outcomes, list[tuple[int, Any]]()
 
-    def died(client: Client, futures: Sequence[Future]) -> list[Any]:
-        return [KilledWorker("group", worker, 1) if isinstance(one, int) else one for one in fetched(client, futures)]
+    def died(futures: Sequence[Future]) -> list[Any]:
+        return [KilledWorker("group", worker, 1) if isinstance(one, int) else one for one in fetched(futures)]
 
     def stages() -> Stages[str]:
         pieces = tuple(Task(str, (row,), row=row) for row in (1, 2))
