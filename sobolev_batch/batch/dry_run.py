@@ -330,7 +330,7 @@ def plan(
     bases: set[str] = set()
     names, share = _looked_at(study, location)
     part = replace(study, objects={name: study.objects[name] for name in names})
-    plans, refused = for_each_object(part, location, lambda _, one, place: _plan(one, place, workers, client, bases))
+    plans, refused = for_each_object(part, location, lambda one, place: _plan(one, place, workers, client, bases))
     seconds, processor_seconds, time = _forecast(plans.values(), share, workers, client is None, bases)
     warnings, count = warnings_of(study, location), len(study.objects)
     return StudyPlan(

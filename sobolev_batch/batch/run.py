@@ -25,7 +25,6 @@ from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, locked, utc_now
 from sobolev_batch.store.objects import Objects, labelled
 from sobolev_batch.store.records import ObjectRecord
-from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.study import Study, StudyLike
 from sobolev_batch.tables.all_objects import write_all
 from sobolev_batch.visible import visible
@@ -139,19 +138,12 @@ def run(
             watch = stack.enter_context(Watch(started, study.backend == "gpu").kept())
             return started, watch
 
-        @cache
-        def announce() -> None:
+        def equip() -> tuple[Cluster, Watch]:
+            started, watch = start()
             # Without bokeh, a cluster of this process has a page that says no more than that.
             if client is not None or find_spec("bokeh"):
-                notify(Progress("cluster", 0, 0, start()[0].dashboard_link))
-
-        known_workers = cache(lambda libraries: prepare_workers(start()[0], libraries))
-
-        def equip(study: Study) -> tuple[Cluster, Watch]:
-            started, watch = start()
-            announce()
-            workers = known_workers(study.libraries)
-            return Cluster(started, workers, study=study.name, part=study.object.name), watch
+                notify(Progress("cluster", 0, 0, started.dashboard_link))
+            return Cluster(started, prepare_workers(started, study.libraries), study=study.name), watch
 
         with locked(location, lock):
             if client is not None:
@@ -167,34 +159,31 @@ def carry_out(
     study: Study,
     location: Location,
     lock: Lock,
-    equip: Callable[[Study], tuple[Cluster, Watch]],
+    equip: Callable[[], tuple[Cluster, Watch]],
     notify: Notify = lambda progress: None,
 ) -> Summary:
-    """Run a study in a store that this process has locked; a cluster is asked for if anything is missing.
+    """Run a study in a store that this process has locked; a cluster is asked for once, if anything is missing.
 
     What ends the run of an only object without a name is raised. Of others, a StoreError ends all: the stores of the
     next ones would not fare better.
     """
     place = lock.of_run(location)
-    places, objects = {name: n for n, name in enumerate(study.objects, 1)}, None
-    at_hand: Workspace | None = None
-    if "" in study.objects:
-        at_hand = workspace_at_hand(study, place)
-        if at_hand is None:
-            reserve(place, study.title)
-    else:
-        objects = Objects.prepared(place, study)
+    numbers, equip = {name: n for n, name in enumerate(study.objects, 1)}, cache(equip)
+    objects = None if "" in study.objects else Objects.prepared(place, study)
+    at_hand = workspace_at_hand(study, place) if objects is None else None
+    if objects is None and at_hand is None:
+        reserve(place, study.title)
     with Heartbeat(location, lock).kept() as heartbeat:
 
         def beat(name: str, progress: Progress) -> None:
-            part = f"{name}, {places[name]} of {len(places)}" if name else ""
+            part = f"{name}, {numbers[name]} of {len(numbers)}" if name else ""
             begin = f"{name}: " if name else ""
             heartbeat.advance(f"{begin}{progress.stage}, {progress.done} of {progress.total}")
             notify(replace(progress, part=part))
 
-        def equipped(study: Study) -> Cluster:
-            cluster, heartbeat.watch = equip(study)
-            return replace(cluster, notify=partial(beat, study.object.name))
+        def equipped(name: str) -> Cluster:
+            cluster, heartbeat.watch = equip()
+            return replace(cluster, notify=partial(beat, name), part=name)
 
         recorded = {} if objects is None else objects.recorded()
         present = place.names() if recorded else frozenset()
@@ -210,7 +199,7 @@ def carry_out(
                 if before is not None and name in present & tabulated:
                     ended[name] = before
                 else:
-                    yield name, run_object(one, place.below(name) if name else place, partial(equipped, one), at_hand)
+                    yield name, run_object(one, place.below(name) if name else place, partial(equipped, name), at_hand)
 
         def is_fatal(error: Exception) -> bool:
             is_of_all = isinstance(error, StoreError) and not isinstance(error, DamageError)
@@ -238,7 +227,7 @@ def _own_cluster(
     if study.accuracy is not None and study.accuracy.asks_for_memory:
         require_machine_memory(study.accuracy.allowed_bytes, "[accuracy]: memory")
     if memory is not None:
-        # Otherwise a store would be made before the cluster refuses it.
+        # Threads have no limit, and a wrong one is refused all the same.
         memory_limit(memory, workers or available_cores())
     # In threads, where no other process would see the store.
     return thread_client(workers) if location.is_in_memory else local_client(workers, memory)

@@ -7,7 +7,6 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cache
 
 from distributed import Client, Future, Status, fire_and_forget, get_worker, worker_client
 
@@ -115,7 +114,7 @@ def _prepared(study: Study, location: Location) -> Submission:
         workspace = Workspace.of_study(study, location)
         return Submission(location.name, len(workspace.rows), len(workspace.pending))
     recorded = Objects.prepared(location, study).recorded()
-    listed, refused = for_each_object(study, location, lambda _, one, place: one.object.members)
+    listed, refused = for_each_object(study, location, lambda one, _: one.object.members)
     complete = sum(recorded[name].complete for name in listed if name in recorded)
     surfaces = sum(map(len, listed.values()))
     return Submission(location.name, surfaces, surfaces - complete, refused)
@@ -138,11 +137,9 @@ def drive(study: Study, store: str, run: str) -> None:
             return
         acquire(location, lock)
         with worker_client() as client, Watch(client, study.backend == "gpu").kept() as watch:
-            known_workers = cache(lambda libraries: prepare_workers(client, libraries))
 
-            def equip(study: Study) -> tuple[Cluster, Watch]:
-                workers = known_workers(study.libraries)
-                return Cluster(client, workers, study=study.name, part=study.object.name), watch
+            def equip() -> tuple[Cluster, Watch]:
+                return Cluster(client, prepare_workers(client, study.libraries), study=study.name), watch
 
             carry_out(study, location, lock, equip)
     except Exception as error:

@@ -158,9 +158,9 @@ def root_of(location: Location) -> Location:
 
 
 def for_each_object(
-    study: Study, location: Location, act: Callable[[str, Study, Location], Result]
+    study: Study, location: Location, act: Callable[[Study, Location], Result]
 ) -> tuple[dict[str, Result], dict[str, str]]:
-    """Act on the name, the study and the store of each object; return results, and why others have none, by name.
+    """Act on the study and the store of each object; return results, and why others have none, by name.
 
     Errors of an only object without a name are raised. Of others, a StoreError ends it: the store of the next one would
     not fare better.
@@ -169,7 +169,7 @@ def for_each_object(
     refused: dict[str, str] = {}
     for name in study.objects:
         try:
-            results[name] = act(name, study.of_object(name), location.below(name) if name else location)
+            results[name] = act(study.of_object(name), location.below(name) if name else location)
         except StoreError:
             raise
         except InputError as error:
