@@ -23,12 +23,12 @@ from sobolev_batch.errors import DamageError, InputError
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.sources.registry import digest_of
 from sobolev_batch.store.field_arrays import Fields
-from sobolev_batch.store.layout import Metadata, stored_choice
+from sobolev_batch.store.layout import stored_choice
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.metadata import SCHEMA_VERSION
 from sobolev_batch.store.records import ObjectRecord, Record, Records
 from sobolev_batch.store.workspace import Workspace
-from sobolev_batch.study.plan import Plan, fingerprint_of
+from sobolev_batch.study.plan import fingerprint_of
 from sobolev_batch.study.study import Members, Study, StudyObject
 from sobolev_batch.tables.all_objects import Tables, packed_tables, tables_in
 from sobolev_batch.transform.fourier import NUMERICS_VERSION
@@ -42,8 +42,6 @@ _MOST_REPAIRS = 3
 # The worker that plans an object does all its work where that is predicted to take less: a task costs the scheduler and
 # the driver some milliseconds.
 _SMALL_SECONDS = 2.0
-# A workspace that travels, with the metadata of its store.
-Sent = tuple[Workspace, Metadata]
 
 
 @dataclass(frozen=True)
@@ -76,6 +74,10 @@ class Ended:
             tuple(labels[i] for i in workspace.rows if i not in computed and i in complete),
             _rows_of_all(workspace, tables),
         )
+
+
+# How an object ended whose run a worker did by itself, and the record of each surface that was computed, by label.
+Begun = tuple[Ended, Mapping[str, Record | None]]
 
 
 def ended_before(study: Study, record: ObjectRecord | None) -> Ended | None:
@@ -138,26 +140,19 @@ def _begin(cluster: Cluster, study: Study, location: Location, workers: Workers)
     # Should the worker die, another one leaves the work to tasks.
     careful = Task(begin, (study, location, None), stage="plan")
     first = Task(begin, (study, location, workers.smallest), stage="object", divided=(careful,))
-    begun: Begun | Sent = yield from result_from(cluster, first)
+    begun: Begun | Workspace = yield from result_from(cluster, first)
     advance("", None)
-    if not isinstance(begun, Begun):
-        return _received(begun)
-    if begun.records:
-        advance = cluster.count_steps("fields", len(begun.records))
-        for label, record in begun.records:
+    if isinstance(begun, Workspace):
+        return begun
+    ended, records = begun
+    if records:
+        advance = cluster.count_steps("fields", len(records))
+        for label, record in records.items():
             advance(label, record)
-    return begun.ended
+    return ended
 
 
-@dataclass(frozen=True)
-class Begun:
-    """Result of the run of an object that a worker did by itself, and the record of each surface that it computed."""
-
-    ended: Ended
-    records: tuple[tuple[str, Record], ...]
-
-
-def begin(study: Study, location: Location, workers: Workers | None) -> Begun | Sent:
+def begin(study: Study, location: Location, workers: Workers | None) -> Begun | Workspace:
     """Plan a study of one object and prepare its store; compute what is missing where that is small.
 
     Digits do not depend on what else the process computes. Without workers, of which this one has no more memory than
@@ -169,12 +164,12 @@ def begin(study: Study, location: Location, workers: Workers | None) -> Begun | 
         workspace = Workspace.of_study(study, location)
     if lacks_nothing(workspace):
         workspace.put_in_order()
-        return Begun(Ended.of(workspace, set()), ())
+        return Ended.of(workspace, set()), {}
     if workers is None or not _is_small(workspace, workers):
-        return _sent(workspace)
+        return workspace
     ended = in_place(_compute(Cluster(None, workers), workspace))
     records = dict(zip(workspace.labels, Records(workspace.store).read(), strict=True))
-    return Begun(ended, tuple((label, one) for label in ended.computed if (one := records[label]) is not None))
+    return ended, {label: records[label] for label in ended.computed}
 
 
 def _is_small(workspace: Workspace, workers: Workers) -> bool:
@@ -186,16 +181,6 @@ def _is_small(workspace: Workspace, workers: Workers) -> bool:
     sizes, refused = size_rows(plan, rows, workers)
     is_little = all(task_bytes <= workers.allowed_bytes_per_task for *_, task_bytes in sizes.values())
     return not refused and is_little and sum(row_seconds(plan, row) for row in rows) < _SMALL_SECONDS
-
-
-def _sent(workspace: Workspace) -> Sent:
-    """Return a workspace for another process: a store travels without its metadata, which go beside it."""
-    return workspace, workspace.store.metadata
-
-
-def _received(sent: Sent) -> Workspace:
-    workspace, workspace.store.metadata = sent[0], sent[1]
-    return workspace
 
 
 def _compute(cluster: Cluster, workspace: Workspace) -> Stages[Ended]:
@@ -212,16 +197,11 @@ def _compute(cluster: Cluster, workspace: Workspace) -> Stages[Ended]:
         if choice is None:
             break
         arguments = workspace.store.location, workspace.plan.with_choice(choice)
-        workspace = _received((yield from result_from(cluster, Task(lay_out_again, arguments, stage="layout"))))
+        workspace = yield from result_from(cluster, Task(Workspace.prepared, arguments, stage="layout"))
         rows = workspace.pending
     yield from measure_proximities(cluster, workspace)
     workspace.put_in_order()
     return Ended.of(workspace, computed, None if tabulated is None else tabulated.tables)
-
-
-def lay_out_again(location: Location, plan: Plan) -> Sent:
-    """Lay the store of an object out for another plan of it, on a worker."""
-    return _sent(Workspace.prepared(location, plan))
 
 
 def _compute_repairing(

@@ -112,26 +112,19 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> Stages[Tabulated 
 
     for tasks in (of_spectra, of_pairs):
         yield Wave(cluster, tasks, take, projected_bytes)
-    arguments = workspace, workspace.store.metadata, reducer, meshes, digest, replaced
-    last = Task(write_results, arguments, projected_bytes, stage="tables")
+    last = Task(write_results, (workspace, reducer, meshes, digest, replaced), projected_bytes, stage="tables")
     tabulated: Tabulated
     tabulated, workspace.store.metadata = yield from result_from(cluster, last)
     return tabulated
 
 
 def write_results(
-    workspace: Workspace,
-    metadata: Metadata,
-    reducer: Reducer,
-    meshes: xr.Dataset,
-    digest: str,
-    replaced: Sequence[str],
+    workspace: Workspace, reducer: Reducer, meshes: xr.Dataset, digest: str, replaced: Sequence[str]
 ) -> tuple[Tabulated, Metadata]:
-    """Write the tables that follow from stored spectra, on a worker.
+    """Write the tables that follow from stored spectra, on a worker, and return also the metadata of the store then.
 
-    A store travels without its metadata, which go there and back beside it. Done again, the task writes the same.
+    Done again, the task writes the same.
     """
-    workspace.store.metadata = metadata
     results = Results.from_spectra(reducer, meshes, workspace.plan.reference)
     numerics = sorted({record.numerics for record in workspace.complete.values()})
     convergence = results.convergence_table(workspace.plan.study.accuracy)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -96,6 +96,15 @@ class Workspace(Contents):
 
     rows: Mapping[int, Row]
     plan: Plan
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A store travels to other processes without its metadata, which a workspace needs there.
+        return {**vars(self), "metadata": self.store.metadata}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        metadata = state.pop("metadata")
+        vars(self).update(state)
+        self.store.metadata = metadata
 
     @classmethod
     def for_plan(cls, store: Store, plan: Plan) -> Self:
