@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import pairwise
+from dataclasses import replace
+from itertools import pairwise, repeat
 from typing import Any
 
 import numpy as np
@@ -62,29 +63,26 @@ def compute_fields(cluster: Cluster, workspace: Workspace, pending: Sequence[int
         Records(store).write(i, record)
         take(i, record)
 
-    for i in pending:
-        if rows[i].label in refused:
-            give_up(i, refused[rows[i].label])
     reference = _reference_in_tasks(plan)
 
     def tasks() -> Iterator[Task]:
         for i in pending:
             row = rows[i]
-            if row.label in sizes:
-                groups, allowed_bytes, task_bytes = sizes[row.label]
-                yield _field_task(Job.for_row(plan, row, store, i, allowed_bytes, reference), groups, task_bytes)
+            if row.label in refused:
+                give_up(i, refused[row.label])
+                continue
+            groups, allowed_bytes, task_bytes = sizes[row.label]
+            yield _field_task(Job.for_row(plan, row, store, i, allowed_bytes, reference), groups, task_bytes)
 
     projected_bytes = max((task_bytes for *_, task_bytes in sizes.values()), default=0.0)
     seconds = {rows[i].label: row_seconds(plan, rows[i]) for i in pending if is_predictable(rows[i])}
     most = max(1, len(sizes) // (2 * workers.threads))
 
     def take_outcome(task: Task, outcome: Any) -> None:
-        if isinstance(outcome, dict):
-            for one in task.divided:
-                take_outcome(one, outcome[one.row])
-        elif task.divided:
-            for one in task.divided:
-                take_outcome(one, outcome)
+        if task.divided:
+            outcomes = outcome if isinstance(outcome, list) else repeat(outcome)
+            for one, its_outcome in zip(task.divided, outcomes, strict=False):
+                take_outcome(one, its_outcome)
         elif isinstance(outcome, Record) and outcome.numerics != NUMERICS_VERSION:
             give_up(
                 task.row,
@@ -124,11 +122,13 @@ def _grouped(tasks: Sequence[Task]) -> Task:
     first, *others = tasks
     if not others:
         return first
-    jobs, (_, blocks) = [task.arguments[0] for task in tasks], first.arguments
-    label = f"{first.label} and {len(others)} more"
-    largest = max(task.projected_bytes for task in tasks)
-    return Task(
-        compute_group, (jobs, blocks), largest, first.needs_gpu, first.row, label, stage="field", divided=tuple(tasks)
+    return replace(
+        first,
+        function=compute_group,
+        arguments=([task.arguments for task in tasks],),
+        projected_bytes=max(task.projected_bytes for task in tasks),
+        label=f"{first.label} and {len(others)} more",
+        divided=tuple(tasks),
     )
 
 

@@ -179,16 +179,16 @@ def compute_mesh(job: Job, blocks: Sequence[Block]) -> Record:
     return stored if isinstance(stored, Record) else _finished(job, stored)
 
 
-def compute_group(jobs: Sequence[Job], blocks: Sequence[Block]) -> dict[int, Record | Exception]:
-    """Do `compute_mesh` for several small meshes; return the record of each, or its exception, by its row."""
-    outcomes: dict[int, Record | Exception] = {}
-    for job in jobs:
+def compute_group(meshes: Sequence[tuple[Job, Sequence[Block]]]) -> list[Record | Exception]:
+    """Do `compute_mesh` for several small meshes; return the record of each, or its exception."""
+    outcomes: list[Record | Exception] = []
+    for job, blocks in meshes:
         try:
-            outcomes[job.index] = compute_mesh(job, blocks)
+            outcomes.append(compute_mesh(job, blocks))
         except StoreError:
             raise
         except Exception as error:
-            outcomes[job.index] = error
+            outcomes.append(error)
     return outcomes
 
 
