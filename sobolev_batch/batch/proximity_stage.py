@@ -22,20 +22,14 @@ from sobolev_batch.batch.field_stage import MESH_BYTES
 from sobolev_batch.batch.table_stage import table_order
 from sobolev_batch.errors import InputError, MeshError, StoreError, one_line
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.geometry.proximity import (
-    LENGTHS,
-    NUMBERS,
-    POINT_BYTES,
-    TRIANGLE_BYTES,
-    WORKING_BYTES,
-    proximity,
-)
+from sobolev_batch.geometry.proximity import LENGTHS, NUMBERS, POINT_BYTES, TRIANGLE_BYTES, WORKING_BYTES, proximity
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms.columns import describe
 from sobolev_batch.store.layout import Store, table_attributes, write_table
 from sobolev_batch.store.records import ProximityRecord, Record, Records
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.plan import Row
+from sobolev_batch.study.schema import ProximitySection
 
 _log = logging.getLogger(__name__)
 
@@ -46,51 +40,45 @@ _GROUP = "proximity"
 
 def have_proximities(workspace: Workspace) -> bool:
     """Return True where the store has all distances that the study requests, and readers find them."""
-    attributes = table_attributes(workspace.store, _GROUP)
-    if workspace.plan.study.proximity is None:
+    attributes, requested = table_attributes(workspace.store, _GROUP), workspace.plan.study.proximity
+    if requested is None:
         return attributes is None
-    is_listed = attributes is not None and attributes.get("digest") == _digest(workspace)
+    is_listed = attributes is not None and attributes.get("digest") == _digest(workspace, requested)
     return is_listed and not _pending(workspace)
 
 
 def measure_proximities(cluster: Cluster, workspace: Workspace) -> Stages[None]:
     """Measure the distances that the records lack, and write their table, or remove one that nobody requests."""
-    pending = _pending(workspace)
-    if pending:
-        yield from _measure(cluster, workspace, pending)
+    requested, pending = workspace.plan.study.proximity, _pending(workspace)
+    if requested is not None and pending:
+        yield from _measure(cluster, workspace, requested, pending)
     if have_proximities(workspace):
         return
     workspace.store.remove(_GROUP)
-    if workspace.plan.study.proximity is not None:
-        write_table(workspace.store, _GROUP, _dataset(workspace))
+    if requested is not None:
+        write_table(workspace.store, _GROUP, _dataset(workspace, requested))
         workspace.store.consolidate()
 
 
-def _measure(cluster: Cluster, workspace: Workspace, keys: Mapping[int, str]) -> Stages[None]:
-    plan, complete, reference = workspace.plan, workspace.complete, workspace.reference
-    requested = plan.study.proximity
-    if requested is None:
-        return
-    loading_bytes = {
-        i: max(workspace.rows[i].member.expected_size().projected_bytes, MESH_BYTES * complete[i].facts.triangles)
-        for i in (reference, *keys)
-    }
+def _measure(
+    cluster: Cluster, workspace: Workspace, requested: ProximitySection, keys: Mapping[int, str]
+) -> Stages[None]:
+    similarity, complete, reference = workspace.plan.similarity, workspace.complete, workspace.reference
     tasks = []
     for i, key in keys.items():
-        triangles = complete[i].facts.triangles + complete[reference].facts.triangles
-        search_bytes = TRIANGLE_BYTES * triangles + 2 * POINT_BYTES * requested.points + WORKING_BYTES
+        projected_bytes = 2 * POINT_BYTES * requested.points + WORKING_BYTES
+        for row in (i, reference):
+            triangles, size = complete[row].facts.triangles, workspace.rows[row].member.expected_size()
+            projected_bytes += TRIANGLE_BYTES * triangles + max(size.projected_bytes, MESH_BYTES * triangles)
         pair = tuple((workspace.rows[row], complete[row].facts.digest) for row in (i, reference))
-        arguments = workspace.store, i, complete[i], key, pair, plan.similarity, requested.points, requested.threshold
-        projected_bytes = loading_bytes[i] + loading_bytes[reference] + search_bytes
-        tasks.append(
-            Task(measure_proximity, arguments, projected_bytes, row=i, label=workspace.labels[i], stage="proximity")
-        )
+        arguments = workspace.store, i, complete[i], key, pair, similarity, requested.points, requested.threshold
+        label = workspace.labels[i]
+        tasks.append(Task(measure_proximity, arguments, projected_bytes, row=i, label=label, stage="proximity"))
     advance = cluster.count_steps("proximity", len(tasks))
 
-    def take(task: Task, outcome: Any) -> None:
-        record = outcome
-        if not isinstance(outcome, Record):
-            reason = describe_failure(outcome)
+    def take(task: Task, record: Any) -> None:
+        if not isinstance(record, Record):
+            reason = describe_failure(record)
             _log.error("%s: no proximity: %s", task.label, reason)
             record = replace(complete[task.row], proximity=ProximityRecord(keys[task.row], reason))
             Records(workspace.store).write(task.row, record)
@@ -170,34 +158,32 @@ def _pending(workspace: Workspace) -> dict[int, str]:
     }
 
 
-def _dataset(workspace: Workspace) -> xr.Dataset:
+def _current(workspace: Workspace) -> list[tuple[str, ProximityRecord | None]]:
+    """Return the labels of the meshes in the order of tables, and the distances that belong to what they are now."""
+    keys, complete = _keys(workspace), workspace.complete
+    measured = {i: complete[i].proximity for i in keys}
+    current = {i: record for i, record in measured.items() if record and record.key == keys[i]}
+    return [(workspace.labels[i], current.get(i)) for i, _, _ in table_order(workspace)]
+
+
+def _dataset(workspace: Workspace, requested: ProximitySection) -> xr.Dataset:
     """Return the numbers of `proximity` (mesh), and `reason` where they are NaN, in the order of tables."""
-    labels, records = _current(workspace)
+    labels, records = zip(*_current(workspace), strict=True)
     columns: dict[str, Any] = {
-        name: [np.nan if record is None else record.numbers.get(name, np.nan) for record in records] for name in NUMBERS
+        name: [record.numbers.get(name, np.nan) if record else np.nan for record in records] for name in NUMBERS
     }
     columns["reason"] = np.array([record.reason if record else "" for record in records], dtype=object)
-    requested = workspace.plan.study.proximity
     attributes = {
         "reference": workspace.plan.reference,
-        **({} if requested is None else {"points": requested.points, "metrics": list(requested.metrics)}),
-        "digest": _digest(workspace),
+        "points": requested.points,
+        "metrics": list(requested.metrics),
+        "digest": _digest(workspace, requested),
     }
     variables = {name: ("mesh", values) for name, values in columns.items()}
     table = xr.Dataset(variables, coords={"mesh": np.array(labels, dtype=object)}, attrs=attributes)
     return describe(table.set_coords("reason"))
 
 
-def _current(workspace: Workspace) -> tuple[list[str], list[ProximityRecord | None]]:
-    """Return the labels of the meshes in the order of tables, and the distances that belong to what they are now."""
-    keys, rows = _keys(workspace), [i for i, _, _ in table_order(workspace)]
-    measured = {i: record.proximity for i, record in workspace.complete.items() if i in keys}
-    records = [record if (record := measured.get(i)) and record.key == keys[i] else None for i in rows]
-    return [workspace.labels[i] for i in rows], records
-
-
-def _digest(workspace: Workspace) -> str:
-    lines = [[label, record and asdict(record)] for label, record in zip(*_current(workspace), strict=True)]
-    requested = workspace.plan.study.proximity
-    shown = [] if requested is None else requested.metrics
-    return hashlib.sha256(json.dumps([shown, lines]).encode()).hexdigest()
+def _digest(workspace: Workspace, requested: ProximitySection) -> str:
+    lines = [[label, record and asdict(record)] for label, record in _current(workspace)]
+    return hashlib.sha256(json.dumps([requested.metrics, lines]).encode()).hexdigest()
