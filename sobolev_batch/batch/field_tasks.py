@@ -13,10 +13,9 @@ from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
-from distributed import get_worker
 
 from sobolev_batch import compiled
-from sobolev_batch.batch.cluster.workers import worker_backend, worker_limit
+from sobolev_batch.batch.cluster.workers import this_worker, worker_backend
 from sobolev_batch.errors import InputError, LatticeError, MemoryLimitError, MeshError, StoreError, one_line
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Similarity, Surface
@@ -146,7 +145,8 @@ class Job:
                 "If it is, name another store, for which the lattice is chosen anew"
             )
         if isinstance(error, MemoryLimitError):
-            limit = worker_limit()
+            worker = this_worker()
+            limit = worker.memory_manager.memory_limit if worker else None
             told = f" of {format_bytes(limit)}" if limit else ""
             reason = (
                 f"{reason}. That is what the limit{told} of its worker leaves; raise that limit by --worker-memory of "
@@ -287,13 +287,13 @@ def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block], target: E
 
 
 def _finished(job: Job, stored: Sequence[StoredBlocks]) -> Record:
-    backends = dict.fromkeys(backend for blocks in stored for backend in blocks.backends)
+    worker, backends = this_worker(), dict.fromkeys(backend for blocks in stored for backend in blocks.backends)
     record = Record(
         key=job.key,
         numerics=NUMERICS_VERSION,
         status="complete",
         seconds=sum(blocks.seconds for blocks in stored),
-        worker=_worker_address(),
+        worker=worker.address if worker else "local",
         backend=", ".join(backends),
         finished=utc_now(),
         cost=job.row.member.cost(),
@@ -329,10 +329,3 @@ def _facts_of(surface: Surface, points: int) -> Facts:
         points=points,
         **surface.counts,
     )
-
-
-def _worker_address() -> str:
-    try:
-        return str(get_worker().address)
-    except ValueError:  # called outside a cluster
-        return "local"

@@ -14,11 +14,11 @@ import socket
 import sys
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import takewhile
 from threading import Lock as ThreadLock
-from typing import Any
 
 from distributed import Client, Worker, WorkerPlugin, get_worker
 from distributed.core import Status
@@ -58,7 +58,7 @@ _own: dict[str, socket.socket] = {}
 _locking = ThreadLock()
 
 _OF_DASK = ("dask", "distributed")
-_OF_NUMBERS = (*("cloudpickle", "sobolev-batch", "numpy", "scipy", "finufft", "zarr", "xarray"),)
+_OF_NUMBERS = ("cloudpickle", "sobolev-batch", "numpy", "scipy", "finufft", "zarr", "xarray")
 # Not every study needs these. Processes that have them must have the same.
 _OF_EXTRAS = ("fast-simplification", "pyacvd", "vtk")
 
@@ -156,10 +156,8 @@ class BackendPlugin(WorkerPlugin):  # type: ignore[misc]  # distributed has no t
 
     def __init__(self) -> None:
         self.backend: Backend = CPU
-        self.note = ""
-        self.allowed_bytes = 0.0
+        self.info: WorkerInfo | None = None
         self._device: str | None = None
-        self._ready: asyncio.Event | None = None
 
     def __reduce__(self) -> tuple[type[BackendPlugin], tuple[()]]:
         # It travels to workers before it has found anything.
@@ -167,42 +165,34 @@ class BackendPlugin(WorkerPlugin):  # type: ignore[misc]  # distributed has no t
 
     async def setup(self, worker: Worker) -> None:
         """Find the backend; in a thread, since loading CUDA takes seconds."""
-        self._ready = asyncio.Event()
-        self.allowed_bytes = allowed_bytes(worker.memory_manager.memory_limit)
-        await asyncio.to_thread(self._find_backend)
-        has_gpu = self.backend.name == "gpu"
-        await worker.set_resources(**{MEMORY: self.allowed_bytes}, **({GPU: 1} if has_gpu else {}))
+        allowed = allowed_bytes(worker.memory_manager.memory_limit)
+        note = await asyncio.to_thread(self._find_backend, worker)
+        name = self.backend.name
+        await worker.set_resources(**{MEMORY: allowed}, **({GPU: 1} if name == "gpu" else {}))
         if worker.status == Status.running:
             # The scheduler looks for tasks that wait for resources only when a worker begins to run.
             worker.status = Status.paused
             worker.status = Status.running
-        self._ready.set()
-
-    async def describe(self, worker: Worker) -> WorkerInfo:
-        """Return what the worker offers, once that is known."""
-        while self._ready is None:
-            await asyncio.sleep(_SETUP_SECONDS)
-        await self._ready.wait()
-        return WorkerInfo(worker.address, worker.state.nthreads, self.allowed_bytes, self.backend.name, self.note)
+        self.info = WorkerInfo(worker.address, worker.state.nthreads, allowed, name, note)
 
     def teardown(self, worker: Worker) -> None:
         """Release the GPU."""
         if self._device is not None:
             release_gpu(self._device)
+            self._device = None
 
-    def _find_backend(self) -> None:
-        device = None
+    def _find_backend(self, worker: Worker) -> str:
+        """Find the backend, and return the name of its GPU, or why there is none."""
         try:
             devices = visible_devices()
-            device = lock_gpu(devices)
-            if device is None:
+            self._device = lock_gpu(devices)
+            if self._device is None:
                 raise BackendError(f"no GPU left: other workers have all of the {len(devices)} that it may use")
-            backend = gpu_backend()
-            self.backend, self.note, self._device = backend, backend.description, device
+            self.backend = gpu_backend()
         except BackendError as error:
-            self.note = str(error)
-            if device is not None:
-                release_gpu(device)
+            self.teardown(worker)
+            return str(error)
+        return self.backend.description
 
 
 class VersionPlugin(WorkerPlugin):  # type: ignore[misc]  # distributed has no types
@@ -264,28 +254,27 @@ def worker_slowness(client: Client, address: str) -> float:
     return float(client.run(_slowness, workers=[address])[address])
 
 
+def this_worker() -> Worker | None:
+    """Return the worker that runs this task; None outside a cluster."""
+    with suppress(ValueError):
+        return get_worker()
+    return None
+
+
 def worker_backend(choice: str) -> Backend:
     """Return the backend of the worker that runs this task; the CPU where the study chose that."""
-    if choice == "cpu":
-        return CPU
-    try:
-        plugins: dict[str, Any] = get_worker().plugins
-    except ValueError:  # called outside a cluster
-        return CPU
-    return plugins[_NAME].backend if _NAME in plugins else CPU
-
-
-def worker_limit() -> int:
-    """Return the limit of the memory of the worker that runs this task, in bytes; 0 without one."""
-    try:
-        return int(get_worker().memory_manager.memory_limit or 0)
-    except ValueError:  # called outside a cluster
-        return 0
+    worker = this_worker()
+    plugin = None if worker is None or choice == "cpu" else worker.plugins.get(_NAME)
+    return CPU if plugin is None else plugin.backend
 
 
 async def _describe(dask_worker: Worker) -> WorkerInfo | None:
+    """Return what a worker offers, once that is known; None where it is just leaving or joining."""
     plugin = dask_worker.plugins.get(_NAME)
-    return None if plugin is None else await plugin.describe(dask_worker)
+    while plugin is not None and plugin.info is None:
+        await asyncio.sleep(_SETUP_SECONDS)
+    info: WorkerInfo | None = plugin and plugin.info
+    return info
 
 
 async def _slowness(dask_worker: Worker) -> float:
