@@ -41,11 +41,7 @@ from sobolev_batch.tables.all_objects import Tables
 from sobolev_batch.tables.pairs import Pairs, fill_tile
 from sobolev_batch.tables.reducer import Reducer
 from sobolev_batch.tables.results import COORDINATES, SOME_COORDINATES, Results, coordinates_of
-from sobolev_batch.tables.shells import (
-    fill_chunk,
-    spectrum_keys,
-    stale_chunks,
-)
+from sobolev_batch.tables.shells import fill_chunk, spectrum_keys, stale_chunks
 
 # Raise it whenever tables hold something that those of older versions lack: they are then made again.
 TABLES_VERSION = 14
@@ -100,18 +96,20 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> Stages[Tabulated 
         )
         for number, rows in chunks.items()
     )
-    # After all spectra, where their row of the reference comes from.
-    of_pairs = (
-        Task(fill_tile, (reducer.only(part.keys), part, tile), projected_bytes, stage="pairs")
-        for part, tile in ((pairs.only(tile), tile) for tile in tiles if pairs is not None)
-    )
 
     def take(task: Task, outcome: Any) -> None:
         result_of(outcome)
         advance("", None)
 
-    for tasks in (of_spectra, of_pairs):
-        yield Wave(cluster, tasks, take, projected_bytes)
+    yield Wave(cluster, of_spectra, take, projected_bytes)
+    if pairs is not None:
+        # After all spectra, where their row of the reference comes from.
+        parts = ((pairs.only(tile), tile) for tile in tiles)
+        of_pairs = (
+            Task(fill_tile, (reducer.only(part.keys), part, tile), projected_bytes, stage="pairs")
+            for part, tile in parts
+        )
+        yield Wave(cluster, of_pairs, take, projected_bytes)
     last = Task(write_results, (workspace, reducer, meshes, digest, replaced), projected_bytes, stage="tables")
     tabulated: Tabulated
     tabulated, workspace.store.metadata = yield from result_from(cluster, last)
@@ -125,13 +123,25 @@ def write_results(
 
     Done again, the task writes the same.
     """
-    results = Results.from_spectra(reducer, meshes, workspace.plan.reference)
+    store, results = workspace.store, Results.from_spectra(reducer, meshes, workspace.plan.reference)
     numerics = sorted({record.numerics for record in workspace.complete.values()})
     convergence = results.convergence_table(workspace.plan.study.accuracy)
     convergence.attrs |= {"digest": digest, NUMERICS: numerics}
-    _write_tables(workspace, results, convergence, replaced)
+    replaced = [*replaced, *(hide_tables(store) if _pairs(workspace) is None else ())]
+    store.write(QUALITY, ..., np.array(_qualities(workspace), dtype=object))
+    write_table(store, "meshes", results.meshes)
+    write_table(store, "norms", results.norms_table())
+    if PAIRS_KEYS not in store.documents:
+        if store.stored_document(PAIRS_KEYS) is not None:
+            store.location.remove(DISTANCES)
+        write_table(store, DISTANCES, results.distances_table())
+    # Written last: its digest says that all tables belong to the fields that are stored.
+    write_table(store, "convergence", convergence)
+    for name in set(replaced) - store.documents.keys():
+        store.location.remove(name)
+    store.consolidate()
     tables = {"meshes": results.meshes, "convergence": convergence}
-    return Tabulated(NormEstimate(*results.to_reference), tables), workspace.store.metadata
+    return Tabulated(NormEstimate(*results.to_reference), tables), store.metadata
 
 
 def _pairs(workspace: Workspace) -> Pairs | None:
@@ -149,23 +159,6 @@ def _record_keys(workspace: Workspace) -> dict[int, str]:
 
 def _spectrum_keys(workspace: Workspace) -> dict[int, str]:
     return spectrum_keys(_record_keys(workspace), workspace.reference)
-
-
-def _write_tables(workspace: Workspace, results: Results, convergence: xr.Dataset, replaced: Sequence[str]) -> None:
-    store = workspace.store
-    replaced = [*replaced, *(hide_tables(store) if _pairs(workspace) is None else ())]
-    store.write(QUALITY, ..., np.array(_qualities(workspace), dtype=object))
-    write_table(store, "meshes", results.meshes)
-    write_table(store, "norms", results.norms_table())
-    if PAIRS_KEYS not in store.documents:
-        if store.stored_document(PAIRS_KEYS) is not None:
-            store.location.remove(DISTANCES)
-        write_table(store, DISTANCES, results.distances_table())
-    # Written last: its digest says that all tables belong to the fields that are stored.
-    write_table(store, "convergence", convergence)
-    for name in set(replaced) - store.documents.keys():
-        store.location.remove(name)
-    store.consolidate()
 
 
 def are_tabulated(workspace: Workspace, digest: str = "") -> bool:
@@ -212,14 +205,15 @@ def _digest(workspace: Workspace, placed: Sequence[Placed]) -> str:
 
 def table_order(workspace: Workspace) -> list[Placed]:
     """Return the rows of the study in the order of tables, each with its place in its family and what orders that."""
-    families: dict[str, list[int]] = {row.family: [] for row in workspace.plan.rows}
+    complete, families = workspace.complete, {row.family: list[int]() for row in workspace.plan.rows}
     for i, row in workspace.rows.items():
         families[row.family].append(i)
     placed: list[Placed] = []
     for family, numbers in families.items():
-        rows, records = [workspace.rows[i] for i in numbers], [workspace.records[i] for i in numbers]
-        criterion = _criterion(workspace.plan.study, family, rows, records)
-        keys = {i: _key(criterion, row, record) for i, row, record in zip(numbers, rows, records, strict=True)}
+        rows = [workspace.rows[i] for i in numbers]
+        counts = {i: complete[i].facts.triangles for i in numbers if i in complete}
+        criterion = _criterion(workspace.plan.study, family, rows, list(counts.values()))
+        keys = {i: _key(criterion, workspace.rows[i], counts.get(i)) for i in numbers}
         placed += ((i, rank, criterion) for rank, i in enumerate(sorted(keys, key=keys.__getitem__)))
     return placed
 
@@ -288,7 +282,8 @@ def _strings(values: Sequence[str]) -> NDArray[np.generic]:
     return np.array(values, dtype=object)
 
 
-def _criterion(study: Study, family: str, rows: Sequence[Row], records: Sequence[Record | None]) -> Criterion:
+def _criterion(study: Study, family: str, rows: Sequence[Row], counts: Sequence[int]) -> Criterion:
+    """Return what orders a family, of whose complete meshes the numbers of triangles are given."""
     chosen = next((one.order_by for one in study.object.families if one.name == family), None)
     if chosen is not None:
         return chosen
@@ -296,7 +291,6 @@ def _criterion(study: Study, family: str, rows: Sequence[Row], records: Sequence
         return "time"
     if all(row.member.level >= 0 for row in rows):
         return "level"
-    counts = [one.facts.triangles for one in records if one is not None and one.status == "complete"]
     return "names" if len(counts) > 1 and not _are_graded(counts) else "triangles"
 
 
@@ -310,15 +304,13 @@ def _are_graded(counts: Sequence[int]) -> bool:
     return steps > 1 and _MOST_OF_ONE_SIZE * steps >= len(counts)
 
 
-def _key(criterion: Criterion, row: Row, record: Record | None) -> tuple[Any, ...]:
-    """Return what a row is sorted by; where it is equal, names decide."""
+def _key(criterion: Criterion, row: Row, triangles: int | None) -> tuple[Any, ...]:
+    """Return what a row is sorted by; where it is equal, names decide. A mesh that failed has no known triangles."""
     name = natural_key(row.member.name)
     if criterion == "time":
         return math.inf if row.member.time is None else row.member.time, name
     if criterion == "level":
         return row.member.level, name
     if criterion == "triangles":
-        # A mesh that failed has no triangles that are known.
-        is_known = record is not None and record.status == "complete"
-        return record.facts.triangles if record is not None and is_known else math.inf, name
+        return math.inf if triangles is None else triangles, name
     return (name,)
