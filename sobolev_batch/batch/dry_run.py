@@ -22,7 +22,7 @@ from sobolev_batch.parameters import format_bytes
 from sobolev_batch.shown import Shown, reasons
 from sobolev_batch.store.layout import stored_choice
 from sobolev_batch.store.location import Location
-from sobolev_batch.store.objects import Objects, for_each_object
+from sobolev_batch.store.objects import Objects, for_each_object, labelled
 from sobolev_batch.store.records import Record
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.pilots import Look
@@ -140,10 +140,8 @@ class ObjectPlan:
 
     def to_table(self) -> dict[str, Any]:
         """Return the numbers for programs, without what is shown."""
-        return {
-            **{name: value for name, value in vars(self).items() if name != "lines"},
-            "total_bytes": self.total_bytes,
-        }
+        numbers = {name: value for name, value in vars(self).items() if name != "lines"}
+        return {**numbers, "total_bytes": self.total_bytes}
 
 
 @dataclass(frozen=True)
@@ -190,9 +188,7 @@ class StudyPlan(Shown):
     @property
     def missing(self) -> tuple[str, ...]:
         """Labels of the surfaces of these objects whose fields are to be computed, below the names of the objects."""
-        return tuple(
-            "/".join(filter(None, (name, label))) for name, one in self.objects.items() for label in one.task_seconds
-        )
+        return tuple(labelled({name: one.task_seconds for name, one in self.objects.items()}))
 
     @property
     def total_bytes(self) -> int:
@@ -217,7 +213,7 @@ class StudyPlan(Shown):
         if len(longest_first) > 1:
             rows = [one.summary(visible(name)) for name, one in longest_first]
             lines += ["", *printed_table(rows, _SUMMARY, "text").split("\n"), ""]
-            doubts = {f"{name}/{label}": text for name, one in longest_first for label, text in one.doubtful.items()}
+            doubts = labelled({name: one.doubtful for name, one in longest_first})
             lines += starmap(_beside, reasons("doubtful", doubts))
         for name, one in longest_first[:1]:
             lines += [*([f"{visible(name)}:"] if name else []), *starmap(_beside, one.lines)]
@@ -363,18 +359,17 @@ def _forecast(
         text = "no field is missing, and tables follow from them" if lacks_tables else "nothing is missing"
         return 0.0, 0.0, (text,)
     work = share * sum(one.processor_seconds for one in objects)
-    processes, start = (
-        (_PROCESS_SECONDS * (1 + len(workers.members)), _CLUSTER_SECONDS) if starts_processes else (0.0, 0.0)
-    )
+    processes, start = (1 + len(workers.members), _CLUSTER_SECONDS) if starts_processes else (0, 0.0)
     alone = sum(one.planning_seconds for one in objects) if len(objects) == share == 1 else 0.0
     seconds = start + max(alone + (work - alone) / workers.threads, *(one.shortest_seconds for one in objects))
+    all_work = _PROCESS_SECONDS * processes + work
     fields = f"{missing:,} missing field{'s' * (missing != 1)}"
     tasks = f"{workers.threads} task{'s' * (workers.threads != 1)} at once"
     lines = (
         f"about {duration(seconds, digits=2)} for {fields}, with {tasks}",
-        f"{duration(processes + work, digits=2)} of processor time; the speed is that of {' and '.join(sorted(bases))}",
+        f"{duration(all_work, digits=2)} of processor time; the speed is that of {' and '.join(sorted(bases))}",
     )
-    return seconds, processes + work, lines
+    return seconds, all_work, lines
 
 
 def _plan(study: Study, location: Location, workers: Workers, client: Client | None, bases: set[str]) -> ObjectPlan:

@@ -19,8 +19,8 @@ from sobolev_batch.tables.open import AnyStore, location_of
 from sobolev_batch.tables.text import duration
 from sobolev_batch.visible import visible
 
-# A run that waits for a busy cluster has no heartbeat. It counts as lost after this time.
-_PATIENCE_SECONDS = 600.0
+# Runs count as lost after this time. One that waits for a busy cluster has no heartbeat.
+_PATIENCE_SECONDS = {"running": LOST_AFTER_SECONDS, "submitted": 600.0}
 # Finished surfaces from which a rate can be told.
 _FEWEST_FOR_RATE = 3
 
@@ -88,7 +88,7 @@ class Status(Shown):
             labelled({name: one.not_compared for name, one in tallies.items()}),
             run,
             bool(tallies) and all(one.reduced for one in tallies.values()),
-            age_seconds(run.seen) if run is not None and run.state in ("submitted", "running") else 0.0,
+            age_seconds(run.seen) if run is not None and run.state in _PATIENCE_SECONDS else 0.0,
             math.nan if run is None else _rate(moments, run),
             tuple(labelled({name: dict.fromkeys(one.lost_records) for name, one in tallies.items()})),
             () if objects is None else tuple(name for name in objects.names if name not in tallies),
@@ -125,7 +125,7 @@ class Status(Shown):
     @property
     def going_on(self) -> bool:
         """True while a run was submitted or is running, and shows signs of life."""
-        return self.run is not None and self.run.state in ("submitted", "running") and not self.lost
+        return self.run is not None and self.run.state in _PATIENCE_SECONDS and not self.lost
 
     @property
     def is_incomplete(self) -> bool:
@@ -135,9 +135,7 @@ class Status(Shown):
     @property
     def lost(self) -> bool:
         """True if a run began and shows no signs of life any more."""
-        if self.run is None or self.run.state not in ("submitted", "running"):
-            return False
-        return self.silence_seconds > (LOST_AFTER_SECONDS if self.run.state == "running" else _PATIENCE_SECONDS)
+        return self.run is not None and self.silence_seconds > _PATIENCE_SECONDS.get(self.run.state, math.inf)
 
     def __str__(self) -> str:
         return "\n".join(map(visible, self.lines()))

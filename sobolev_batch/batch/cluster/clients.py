@@ -12,6 +12,7 @@ import socket
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from functools import partial
 from ipaddress import IPv6Address, ip_address
 from multiprocessing import resource_tracker
 from typing import Any
@@ -100,7 +101,7 @@ def _ending_at_once(cluster: LocalCluster) -> Iterator[None]:
 
 
 @contextmanager
-def _shielded_from_interrupts() -> Iterator[Callable[[], None]]:
+def _shielded_from_interrupts() -> Iterator[Callable[[], object]]:
     """Keep Ctrl-C from processes that are started from now on, until the yielded function is called.
 
     A terminal sends it to all processes at once. The driver ends, and its cluster with it; workers would only print
@@ -112,10 +113,7 @@ def _shielded_from_interrupts() -> Iterator[Callable[[], None]]:
     # It starts with the first process otherwise, and unblocks the signal in the thread that does that.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-
-    def restore() -> None:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
+    restore = partial(signal.pthread_sigmask, signal.SIG_SETMASK, before)
     try:
         yield restore
     finally:

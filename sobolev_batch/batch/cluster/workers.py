@@ -284,19 +284,19 @@ async def _slowness(dask_worker: Worker) -> float:
 
 def require_same_versions(client: Client, libraries: Iterable[str] = ()) -> tuple[tuple[str, ...], dict[str, str]]:
     """Check that the scheduler and all workers have installed what this process has; return the names and versions."""
-    required = ("python", *_OF_DASK, *_OF_NUMBERS, *libraries)
+    required = ("python", *_OF_DASK, *_OF_NUMBERS, *libraries, *_checkout())
     # Dask answers this itself: code of ours would not run where the package is missing.
     answers = client.get_versions(packages=[*required[1:], *_OF_EXTRAS])
     # One checkout may follow another without a new version.
     checkouts = client.run(_checkout, on_error="return")
     ours = _packages(answers["client"]) | _checkout()
-    scheduler = _packages(answers["scheduler"])
-    processes = {f"scheduler {client.scheduler.address}": _differing(scheduler, ours, _OF_DASK)}
+    of_scheduler = _differing(_packages(answers["scheduler"]), ours, _OF_DASK)
+    processes = {f"scheduler {client.scheduler.address}": of_scheduler}
     for address, answer in answers["workers"].items():
         if answer:  # a worker that is just leaving answers nothing
             checkout = checkouts.get(address)
             found = _packages(answer) | (checkout if isinstance(checkout, dict) else _checkout())
-            processes[f"worker {address}"] = _differing(found, ours, (*required, *_checkout()))
+            processes[f"worker {address}"] = _differing(found, ours, required)
     differing = defaultdict(list)
     for process in sorted(processes):
         for name, version in processes[process].items():
@@ -311,7 +311,7 @@ def require_same_versions(client: Client, libraries: Iterable[str] = ()) -> tupl
             f"versions differ, and results would mix what they compute: {'; '.join(differences)}. "
             "Install the same ones everywhere and start those processes again"
         )
-    return (*required, *_checkout()), ours
+    return required, ours
 
 
 def _differing(found: Mapping[str, str], ours: Mapping[str, str], required: Iterable[str]) -> dict[str, str]:
