@@ -83,15 +83,12 @@ def compute_fields(cluster: Cluster, workspace: Workspace, pending: Sequence[int
             outcomes = outcome if isinstance(outcome, list) else repeat(outcome)
             for one, its_outcome in zip(task.divided, outcomes, strict=False):
                 take_outcome(one, its_outcome)
-        elif isinstance(outcome, Record) and outcome.numerics != NUMERICS_VERSION:
-            give_up(
-                task.row,
-                f"{outcome.worker} computed it by numerics of version {outcome.numerics}, not {NUMERICS_VERSION}",
-            )
-        elif isinstance(outcome, Record):
-            take(task.row, outcome)
-        else:
+        elif not isinstance(outcome, Record):
             give_up(task.row, describe_failure(outcome))
+        elif (found := outcome.numerics) != NUMERICS_VERSION:
+            give_up(task.row, f"{outcome.worker} computed it by numerics of version {found}, not {NUMERICS_VERSION}")
+        else:
+            take(task.row, outcome)
 
     yield Wave(cluster, _in_groups(tasks(), seconds, most), take_outcome, projected_bytes)
 

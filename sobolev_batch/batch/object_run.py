@@ -107,9 +107,9 @@ def object_key(one: StudyObject, members: Members, fingerprints: Mapping[str, st
 def run_object(
     study: Study, location: Location, equip: Callable[[], Cluster], workspace: Workspace | None = None
 ) -> Stages[Ended]:
-    """Run a study of one object in a locked store, and in a workspace that is at hand.
+    """Run a study of one object in a locked store, in its workspace where that is at hand, else as a worker plans it.
 
-    A cluster is asked for if anything is missing.
+    A cluster is asked for if anything is missing. The worker that plans does small work at once.
     """
     if workspace is not None and lacks_nothing(workspace):
         # The last run may have been killed before it did.
@@ -120,9 +120,19 @@ def run_object(
     workers = cluster.workers.with_backend(study.backend)
     workers.require_accuracy(study.accuracy)
     if workspace is None:
-        begun = yield from _begin(cluster, study, location, workers)
-        if isinstance(begun, Ended):
-            return begun
+        advance = cluster.count_steps("lattice", 1)
+        # Should the worker die, another one leaves the work to tasks.
+        careful = Task(begin, (study, location, None), stage="plan")
+        first = Task(begin, (study, location, workers.smallest), stage="object", divided=(careful,))
+        begun: Begun | Workspace = yield from result_from(cluster, first)
+        advance("", None)
+        if not isinstance(begun, Workspace):
+            ended, records = begun
+            if records:
+                advance = cluster.count_steps("fields", len(records))
+            for label, record in records.items():
+                advance(label, record)
+            return ended
         workspace = begun
     return (yield from _compute(cluster, workspace))
 
@@ -132,24 +142,6 @@ def workspace_at_hand(study: Study, location: Location) -> Workspace | None:
     if study.object.name or (study.accuracy is not None and stored_choice(location) is None):
         return None
     return Workspace.of_study(study, location)
-
-
-def _begin(cluster: Cluster, study: Study, location: Location, workers: Workers) -> Stages[Ended | Workspace]:
-    """Have a worker plan an object and do its small work; return how that ended, or the workspace for what is left."""
-    advance = cluster.count_steps("lattice", 1)
-    # Should the worker die, another one leaves the work to tasks.
-    careful = Task(begin, (study, location, None), stage="plan")
-    first = Task(begin, (study, location, workers.smallest), stage="object", divided=(careful,))
-    begun: Begun | Workspace = yield from result_from(cluster, first)
-    advance("", None)
-    if isinstance(begun, Workspace):
-        return begun
-    ended, records = begun
-    if records:
-        advance = cluster.count_steps("fields", len(records))
-        for label, record in records.items():
-            advance(label, record)
-    return ended
 
 
 def begin(study: Study, location: Location, workers: Workers | None) -> Begun | Workspace:

@@ -203,8 +203,7 @@ def in_place(stages: Stages[Result]) -> Result:
             error = None
             try:
                 for task in wave.tasks:
-                    outcome = _outcome_here(task)
-                    wave.take(task, outcome if not isinstance(outcome, StoreError) else result_of(outcome))
+                    wave.take(task, _outcome_here(task))
             except Exception as failure:
                 error = failure
     except StopIteration as end:
@@ -212,14 +211,18 @@ def in_place(stages: Stages[Result]) -> Result:
         return result
 
 
-def _outcome_here(argument: Any) -> Any:
-    """Return the result of a task, or its exception; other arguments as they are."""
-    if isinstance(argument, list):
-        return [result_of(_outcome_here(one)) for one in argument]
-    if not isinstance(argument, Task):
-        return argument
+def _outcome_here(task: Task) -> Any:
+    """Return the result of a task, or its exception."""
+
+    def done(argument: Any) -> Any:
+        if isinstance(argument, list):
+            return [done(one) for one in argument]
+        return argument.function(*map(done, argument.arguments)) if isinstance(argument, Task) else argument
+
     try:
-        return argument.function(*(result_of(_outcome_here(one)) for one in argument.arguments))
+        return done(task)
+    except StoreError:
+        raise
     except Exception as error:
         return error
 
