@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, vstack
 
 from sobolev_batch.arrays import Complexes, Indices, Reals
@@ -21,8 +19,6 @@ from sobolev_batch.transform.nufft import transform_points
 from sobolev_batch.transform.nufft_costs import NufftSpec
 from sobolev_batch.transform.quadrature import RuleUse, WeightedPoints, assign_rules
 
-# Fraction of eps that the coefficients which are left out may carry together.
-_NEGLIGIBLE = 0.1
 # The corners of the four similar triangles of a triangle, in its barycentric coordinates.
 _QUARTERS: Reals = np.array(
     [
@@ -119,10 +115,8 @@ class MeshTransform:
         lattice are F + i G with those of f and g.
         """
         lattice, backend = self.lattice, self.execution.backend
-        most = _highest_that_counts(coefficients, lattice, _NEGLIGIBLE * self.eps)
-        middle, axis = lattice.M // 2, 2 * np.pi * lattice.spacing * np.arange(-most, most + 1)
-        inner = slice(middle - most, middle + most + 1)
-        whole = _whole(coefficients[inner, inner, : most + 1])
+        whole = _whole(coefficients)
+        axis = 2 * np.pi * lattice.spacing * np.arange(-(lattice.M // 2), lattice.M // 2 + 1)
         x, y, z = np.ix_(axis, axis, axis)
         spec = NufftSpec(whole.shape, self.eps, threads=self.execution.threads)
         points = nodes.coordinates
@@ -149,26 +143,6 @@ def area_derivatives(vertices: Reals, triangles: Indices) -> list[Reals]:
     units, corners = normals(vertices, triangles), [vertices[corner] for corner in triangles.T]
     units /= np.maximum(np.linalg.norm(units, axis=1), np.finfo(np.float64).tiny)[:, None]
     return [np.cross(units, corners[corner - 1] - corners[corner - 2]) / 2 for corner in range(3)]
-
-
-def _highest_that_counts(coefficients: Complexes, lattice: Lattice, fraction: float) -> int:
-    """Return the largest |k| along an axis beyond which coefficients carry a negligible fraction of a gradient.
-
-    The weight (1 + |ξ|²)^s of a very negative order leaves few of them, and a small NUFFT.
-    """
-    cubes = _cubes(lattice)
-    amounts = np.bincount(cubes.ravel(), np.abs(coefficients).ravel()) * (
-        1 + 2 * np.pi * lattice.spacing * np.arange(cubes.max() + 1)
-    )
-    beyond = amounts.sum() - np.cumsum(amounts)
-    return max(int(np.argmax(beyond <= fraction * amounts.sum())), 1)
-
-
-@lru_cache(maxsize=4)
-def _cubes(lattice: Lattice) -> NDArray[np.intp]:
-    """Return the largest |k| along an axis of each sample of a half lattice."""
-    x, y, z = (np.abs(lattice.half.indices(axis)) for axis in range(3))
-    return np.maximum(np.maximum(x[:, None, None], y[:, None]), z)
 
 
 def _whole(half: Complexes) -> Complexes:
