@@ -128,8 +128,7 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
     # Links are followed, as the system follows them from the study file on.
     base = output.parent.resolve()
     below = PurePosixPath(Path(os.path.relpath(folder.resolve(), base)).as_posix())
-    problem = _path_problem(str(below))
-    if problem is not None:
+    if problem := _path_problem(str(below)):
         raise StudyError(f"{folder}: its path cannot be in a study file: {problem}; rename it")
     sizes, extents, left_out = _look_at(folder)
     references = _references(sizes) or {"": _reference(folder, sizes, left_out)}
@@ -142,15 +141,14 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
         if {path, references[name]} <= extents.keys()
     }
     left_out |= {str(path): "its name is that of no object" for path in sizes if path not in used}
-    is_single = "" in references
-    if is_single:
+    if "" in references:
         sections, summary = _one_object(references[""], families, sizes, below)
     else:
         sections, summary = _several_objects(references, families, below)
     name = _json(_free_name(folder.resolve().name, fallback="study"))
     text = _filled("study", name=name, sections="".join(f"\n{section}" for section in sections))
     study = Study.from_table(tomllib.loads(text), folder=base)
-    if is_single:
+    if "" in references:
         # A study that cannot list its meshes is none to write down.
         len(study.object.members)
     with written(output, "the study", StudyError), output.open("x", encoding="utf-8", newline="\n") as file:
@@ -183,8 +181,7 @@ def _look_at(folder: Path) -> tuple[dict[PurePosixPath, int], dict[PurePosixPath
         try:
             if other != below:
                 raise MeshError(f"its name differs from that of {quoted(other)} only in case or accents; rename one")
-            problem = _path_problem(below)
-            if problem is not None:
+            if problem := _path_problem(below):
                 raise MeshError(f"its name cannot be in a study file: {problem}; rename it")
             (triangles, _), size = expected_size(folder / below), (folder / below).stat().st_size
             # A file without an expected size is of another format, damaged or empty.
@@ -241,11 +238,9 @@ def _references(sizes: Mapping[PurePosixPath, int]) -> dict[str, PurePosixPath]:
     called = [path for path in sizes if _is_called_reference(path)] or _continued(sizes)
     references = {_object_of(path): path for path in called}
     owners = {_owner(path, references) for path in sizes if path not in called}
-    are_names = all(
-        name_problem(name, _LONGEST_NAME, RESERVED) is None and not name.startswith((".", "__")) for name in references
-    )
     are_different = 2 <= len({*map(caseless_key, references)}) == len(called)
-    return references if are_names and are_different and references.keys() <= owners else {}
+    is_refused = any(name_problem(name, _LONGEST_NAME, RESERVED) or name.startswith((".", "__")) for name in references)
+    return references if are_different and not is_refused and references.keys() <= owners else {}
 
 
 def _continued(sizes: Mapping[PurePosixPath, int]) -> list[PurePosixPath]:
@@ -315,10 +310,8 @@ def _one_object(
             "meshes to compare with it"
         )
     remark = "its name says so" if _is_called_reference(reference) else "the mesh with the most triangles"
-    sections, summary = (
-        [_filled("reference", remark=remark, path=_json(path))],
-        [f"reference {path}, {triangles:,} triangles"],
-    )
+    sections = [_filled("reference", remark=remark, path=_json(path))]
+    summary = [f"reference {path}, {triangles:,} triangles"]
     for (_, family), members in families.items():
         ends = dict.fromkeys(f"{end(sizes[member] for member in members):,}" for end in (min, max))
         size = f"{_count(len(members))}, {' to '.join(ends)} triangles"

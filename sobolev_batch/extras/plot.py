@@ -15,14 +15,7 @@ import xarray as xr
 from sobolev_batch.errors import InputError, from_extra
 from sobolev_batch.extras.leagues.costs import CostLeague
 from sobolev_batch.extras.leagues.league import League
-from sobolev_batch.tables.open import (
-    EDGE_LENGTH,
-    AnyStore,
-    Families,
-    as_tree,
-    fields_read,
-    finished_group,
-)
+from sobolev_batch.tables.open import EDGE_LENGTH, AnyStore, Families, as_tree, fields_read, finished_group
 
 with from_extra("plot", "a plot needs"):
     from matplotlib.axes import Axes
@@ -189,9 +182,9 @@ def witness(
     >>> ax = sb.plot.witness("storage/icosphere.zarr", "icosphere/1", order=-4)  # doctest: +SKIP
     """
     tree = as_tree(store)
-    order = finished_group(tree, "convergence")["order"].values.tolist()[0] if order is None else order
+    orders = finished_group(tree, "convergence")["order"].values[:1].tolist() if order is None else [order]
     with fields_read(store):
-        views, missing = make_views(tree, folder, [mesh], PICTURE_LIMITS, up, [order])
+        views, missing = make_views(tree, folder, [mesh], PICTURE_LIMITS, up, orders)
     if len(views) + len(missing) > 1:
         raise InputError(f"{mesh!r} stands for several meshes, and one is plotted; give its label")
     for label, reason in missing.items():

@@ -38,7 +38,6 @@ from sobolev_batch.tables.open import (
 from sobolev_batch.testing.difference import VertexWitness, named_distances, order_text, witness_at_vertices
 from sobolev_batch.transform.lattice import Orders, check_orders
 
-SUFFIXES = (".ply", ".vtp")
 # Labels that a message lists as examples.
 _MOST_LISTED = 3
 
@@ -132,19 +131,16 @@ def matching_labels(tree: xr.DataTree, names: Sequence[str]) -> tuple[str, ...]:
     for name in names:
         if name in labels:
             chosen.append(name)
-            continue
-        is_pattern = any(character in name for character in "*?[")
-        matches = [label for label in candidates if fnmatchcase(label, name)] if is_pattern else []
-        if not matches:
+        elif any(character in name for character in "*?["):
+            matches = [label for label in candidates if fnmatchcase(label, name)]
+            if not matches:
+                such = f"its labels are such as {_listed(candidates or known)}"
+                raise InputError(f"the store has no computed mesh with triangles that matches {name!r}; {such}")
+            chosen += matches
+        else:
             similar = difflib.get_close_matches(name, known, n=1)
             remedy = f"did you mean {similar[0]!r}?" if similar else f"its labels are such as {_listed(known)}"
-            raise InputError(
-                f"the store has no computed mesh with triangles that matches {name!r}; "
-                f"its labels are such as {_listed(candidates or known)}"
-                if is_pattern
-                else f"the store has no mesh {name!r}, {remedy}"
-            )
-        chosen += matches
+            raise InputError(f"the store has no mesh {name!r}, {remedy}")
     return tuple(dict.fromkeys(chosen))
 
 
@@ -218,8 +214,8 @@ def write_witness(
     (162, 3)
     """
     path = Path(path)
-    if path.suffix not in SUFFIXES:
-        raise InputError(f"{path}: a witness is written as {' or '.join(SUFFIXES)}, found {path.suffix!r}")
+    if path.suffix not in (".ply", ".vtp"):
+        raise InputError(f"{path}: a witness is written as .ply or .vtp, found {path.suffix!r}")
     made, labels, orders = exported(store, [mesh], order, folder)
     if len(labels) > 1:
         raise InputError(f"{mesh!r} stands for several meshes, and one is written; give its label")
@@ -229,10 +225,7 @@ def write_witness(
 
 
 def write_vertex_witness(path: Path, found: VertexWitness) -> None:
-    """Write a mesh with its witness function, in the format of the path's suffix, one of `SUFFIXES`.
-
-    StoreError where the file cannot be written.
-    """
+    """Write a mesh with its witness function as .ply or .vtp; StoreError where the file cannot be written."""
     data = found.to_ply() if path.suffix == ".ply" else _vtp(found)
     with written(path, "the witness"):
         path.write_bytes(data)

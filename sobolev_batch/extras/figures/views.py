@@ -44,11 +44,7 @@ from sobolev_batch.geometry.surface import normals
 from sobolev_batch.norms.causes import witness
 from sobolev_batch.sources.names import file_stem
 from sobolev_batch.tables.convergence import table
-from sobolev_batch.tables.open import (
-    Families,
-    chosen_families,
-    finished_group,
-)
+from sobolev_batch.tables.open import Families, chosen_families, finished_group
 from sobolev_batch.testing.difference import witness_at_vertices
 
 Triangles = NDArray[np.int32]

@@ -53,16 +53,9 @@ class MeshTransform:
     ) -> Self:
         """Return the transform of a mesh, with the triangle rules that its present shape needs."""
         uses = assign_rules(mesh, lattice.highest_frequency, settings.eps, settings.quadrature, settings.tolerance)
-        of_vertices, of_areas = zip(*(pair for use in uses for pair in _node_matrices(mesh, use)), strict=True)
-        triangles = np.asarray(mesh.triangles, dtype=np.int64)
-        return cls(
-            triangles,
-            vstack(of_vertices, format="csr"),
-            vstack(of_areas, format="csr"),
-            lattice,
-            settings.eps,
-            execution,
-        )
+        pairs = [pair for use in uses for pair in _node_matrices(mesh, use)]
+        of_vertices, of_areas = (vstack(parts, format="csr") for parts in zip(*pairs, strict=True))
+        return cls(np.asarray(mesh.triangles, dtype=np.int64), of_vertices, of_areas, lattice, settings.eps, execution)
 
     @property
     def count(self) -> int:
@@ -155,6 +148,15 @@ def _node_matrices(mesh: Mesh, use: RuleUse) -> Iterator[tuple[csr_array, csr_ar
     """Yield the rows of both matrices for the nodes of some triangles; nodes that triangles share are merged."""
     triangles, rule = np.asarray(mesh.triangles[use.members], dtype=np.int64), use.rule
     members, inner, inner_weights = use.members.astype(np.int64), *rule.inner_nodes
+
+    def matrices(
+        corners: Indices, coefficients: Reals, nodes: Indices, owners: Indices, weights: Reals
+    ) -> tuple[csr_array, csr_array]:
+        rows = np.repeat(np.arange(len(corners)), corners.shape[1])
+        of_vertices = coo_array((coefficients.ravel(), (rows, corners.ravel())), (len(corners), len(mesh.vertices)))
+        of_areas = coo_array((weights, (nodes, owners)), (len(corners), len(mesh.triangles)))
+        return of_vertices.tocsr(), of_areas.tocsr()
+
     if use.splits:
         inner, inner_weights = rule.barycentric, rule.weights
         for _ in range(use.splits):
@@ -165,24 +167,13 @@ def _node_matrices(mesh: Mesh, use: RuleUse) -> Iterator[tuple[csr_array, csr_ar
         corner = [(np.ones(1), rule.corner_weight)] if rule.corner_weight else []
         on_edge = list(zip(*rule.edge_nodes, strict=True))
         for ends, shared in ((triangles[:, :, None], corner), (edges, on_edge)):
-            if not shared:
-                continue
-            used, nodes = np.unique(ends.reshape(-1, ends.shape[2]), axis=0, return_inverse=True)
-            rows = np.repeat(np.arange(len(used)), used.shape[1])
-            for coefficients, weight in shared:
-                of_vertices = rows, used.ravel(), np.tile(coefficients, len(used))
-                of_areas = nodes.ravel(), np.repeat(members, 3), np.full(nodes.size, weight)
-                yield _matrix(*of_vertices, len(mesh.vertices)), _matrix(*of_areas, len(mesh.triangles))
-    if len(inner):
-        nodes = np.arange(len(inner) * len(triangles), dtype=np.int64)
-        of_vertices = (
-            np.repeat(nodes, 3),
-            np.repeat(triangles, len(inner), axis=0).ravel(),
-            np.tile(inner, (len(triangles), 1)).ravel(),
-        )
-        of_areas = nodes, np.repeat(members, len(inner)), np.tile(inner_weights, len(triangles))
-        yield _matrix(*of_vertices, len(mesh.vertices)), _matrix(*of_areas, len(mesh.triangles))
-
-
-def _matrix(rows: Indices, columns: Indices, values: Reals, width: int) -> csr_array:
-    return coo_array((values, (rows, columns)), shape=(int(rows.max()) + 1, width)).tocsr()
+            if shared:
+                used, nodes = np.unique(ends.reshape(-1, ends.shape[2]), axis=0, return_inverse=True)
+                shares = nodes.ravel(), np.repeat(members, 3)
+                for coefficients, weight in shared:
+                    of_each = np.tile(coefficients, (len(used), 1))
+                    yield matrices(used, of_each, *shares, np.full(nodes.size, weight))
+    if count := len(inner):
+        corners, coefficients = np.repeat(triangles, count, axis=0), np.tile(inner, (len(triangles), 1))
+        shares = np.arange(len(corners)), np.repeat(members, count)
+        yield matrices(corners, coefficients, *shares, np.tile(inner_weights, len(triangles)))

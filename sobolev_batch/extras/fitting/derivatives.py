@@ -91,15 +91,12 @@ class SquaredDistance:
         backend: Literal["cpu", "gpu", "auto"] = "cpu",
     ) -> Self:
         """Return the function for a mesh whose vertices will move, with the parameters of `gradient`."""
-        mesh = as_mesh(mesh)
-        orders = (single_order(order),)
+        mesh, orders = as_mesh(mesh), (single_order(order),)
         field = field_of(target, common_lattice((target,), lattice), orders)
-        own = Lattice.from_field(field)
-        values = field_values(field)
-        execution = Execution(backend_named(backend), thread_count(threads))
+        own, execution = Lattice.from_field(field), Execution(backend_named(backend), thread_count(threads))
         transform = MeshTransform.from_mesh(mesh, own, TransformSettings(eps), execution)
-        transform.nodes(np.asarray(mesh.vertices))
-        return cls(transform, values, factors_of(SobolevWeights(own, orders))[0])
+        transform.nodes(mesh.vertices)
+        return cls(transform, field_values(field), factors_of(SobolevWeights(own, orders))[0])
 
     def __call__(self, vertices: ArrayLike) -> tuple[float, Reals]:
         """Return the squared distance, in units of length, and its derivative in the shape of the vertices.

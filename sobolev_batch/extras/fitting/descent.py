@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import Enum
-from functools import cached_property
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from scipy.optimize import OptimizeResult, minimize
@@ -136,50 +134,33 @@ class Descent:
         raise StopIteration
 
 
-@dataclass(frozen=True, eq=False)
 class Smoothing:
     """The map (I + λ L)⁻¹ from steps u of the free vertices to movements of all, with the graph Laplacian L.
 
-    An optimiser that takes its steps in u moves neighbouring vertices together, the farther the larger λ is.
+    An optimiser that takes its steps in u moves neighbouring vertices together, the farther the larger λ is; zero does
+    not smooth. The others of the vertices stay.
 
     Source: B. Nicolet, A. Jacobson, W. Jakob, "Large steps in inverse rendering of geometry" (2021),
     doi:10.1145/3478513.3480501.
-
-    Attributes:
-        free: Indices of the vertices that may move.
-        amount: λ; zero for steps without smoothing.
     """
 
-    graph: csc_array
-    free: Indices
-    amount: float
-
-    @classmethod
-    def from_mesh(cls, mesh: Mesh, free: Indices, amount: float) -> Self:
-        """Return the smoothing for a mesh."""
-        count, (one, other) = len(mesh.vertices), Edges.from_mesh(mesh).ends.T
+    def __init__(self, mesh: Mesh, free: Indices, amount: float) -> None:
+        self.free, self.amount, self._count = free, amount, len(mesh.vertices)
+        one, other = Edges.from_mesh(mesh).ends.T
         both = np.concatenate([one, other]), np.concatenate([other, one])
-        neighbours = coo_array((np.ones(len(both[0])), both), shape=(count, count)).tocsr()
-        graph: Any = laplacian(neighbours)
-        return cls(csc_array(graph), free, amount)
+        neighbours = coo_array((np.ones(len(both[0])), both), shape=(self._count, self._count)).tocsr()
+        graph: Any = csc_array(laplacian(neighbours))
+        self._factors = splu(csc_array(eye_array(len(free)) + amount * graph[free][:, free]))
 
     def movement(self, steps: Reals) -> Reals:
-        """Return the movement of all vertices (n, 3) for steps of the free ones (k, 3); the others stay."""
-        movement = np.zeros((self.graph.shape[0], 3))
-        movement[self.free] = self._solved(steps)
+        """Return the movement of all vertices (n, 3) for steps of the free ones (k, 3)."""
+        movement = np.zeros((self._count, 3))
+        movement[self.free] = self._factors.solve(np.ascontiguousarray(steps))
         return movement
 
     def pulled_back(self, gradient: Reals) -> Reals:
         """Return the derivative with respect to the steps (k, 3) from that with respect to all vertices (n, 3)."""
-        return self._solved(gradient[self.free])
-
-    def _solved(self, values: Reals) -> Reals:
-        return values if self.amount == 0 else np.asarray(self._factors.solve(np.ascontiguousarray(values)))
-
-    @cached_property
-    def _factors(self) -> Any:
-        among_free = self.graph[self.free][:, self.free]
-        return splu(csc_array(eye_array(len(self.free)) + self.amount * among_free))
+        return np.asarray(self._factors.solve(np.ascontiguousarray(gradient[self.free])))
 
 
 def triangle_qualities(vertices: Reals, triangles: Indices) -> Reals:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -198,7 +199,7 @@ def fitted_mesh(
 class FitRun:
     """A fit that is under way: its positions (n, 3) in units of length, steps taken, and why the last descent ended."""
 
-    def __init__(self, problem: FitProblem, notify: Notify | None = None) -> None:
+    def __init__(self, problem: FitProblem, notify: Notify) -> None:
         self.problem, self.notify, self.free = problem, notify, problem.free_vertices
         self.taken, self.end = 0, End.CONVERGED
         self.vertices = np.asarray(problem.start.vertices)
@@ -240,7 +241,7 @@ class FitRun:
         """Go through a stage: descents with ever finer fields, and smoother steps where needed."""
         problem = self.problem
         weights = problem.relative_to(self.vertices, shares)
-        smoothing = Smoothing.from_mesh(problem.start, self.free, amount)
+        smoothing = Smoothing(problem.start, self.free, amount)
         unit, retreats = problem.start.edge_length_range[0], 0
         left = min(steps, problem.settings.steps - self.taken)
         while left > 0:
@@ -250,7 +251,7 @@ class FitRun:
             self.vertices, left, self.end = descent.vertices, left - descent.steps, descent.end or End.CONVERGED
             if descent.end in (End.TURNED, End.LEFT) and retreats < _MOST_RETREATS:
                 retreats += 1
-                smoothing = replace(smoothing, amount=max(_SMOOTHER * smoothing.amount, 1.0))
+                smoothing = Smoothing(problem.start, self.free, max(_SMOOTHER * smoothing.amount, 1.0))
             # Finer fields may show the way on, unless they are as fine as they can be.
             elif descent.end is not End.ERROR or not descent.steps:
                 break
@@ -258,8 +259,7 @@ class FitRun:
     def _count(self, vertices: Reals, objective: float) -> None:
         self.vertices = vertices
         self.taken += 1
-        if self.notify is not None:
-            self.notify(FitProgress(self.taken, self.problem.settings.steps, float(np.sqrt(objective))))
+        self.notify(FitProgress(self.taken, self.problem.settings.steps, float(np.sqrt(objective))))
 
 
 def measure_quality(problem: FitProblem, mesh: Mesh) -> FitQuality:
@@ -268,14 +268,11 @@ def measure_quality(problem: FitProblem, mesh: Mesh) -> FitQuality:
     The Sobolev distance has a relative accuracy where the target is a surface; from a field it is that on the lattice.
     """
     target, order = problem.target, problem.settings.order
-    result = None
     for rtol in () if isinstance(target, xr.DataArray) else _RTOLS:
-        try:
+        with suppress(AccuracyError):
             result = distance(mesh, target, order, rtol=rtol)
             break
-        except AccuracyError:
-            continue
-    if result is None:
+    else:
         result = distance(mesh, target, order, lattice=problem.lattice)
     numbers = {name: result[name].item() for name in ("distance", "error", "relative", "relative_error")}
     quality = FitQuality(**numbers, smallest_angle=float(mesh.smallest_angles.min()))
@@ -286,10 +283,7 @@ def measure_quality(problem: FitProblem, mesh: Mesh) -> FitQuality:
 
 
 def _measured(given: Mesh, problem: FitProblem, goals: Sequence[int], on_progress: Notify | None) -> Fit:
-    """Carry a fit out and measure it: return its mesh, or the given one if that is nearer.
-
-    Refuse a field that cannot serve the order.
-    """
+    """Return the mesh of a fit with its distances, or the given one if that is nearer."""
     before = measure_quality(problem, problem.start)
     if before.error >= before.distance > 0 and isinstance(problem.target, xr.DataArray):
         raise InputError(
@@ -379,15 +373,14 @@ def refine(
     return replace(refined, remarks=(*refined.remarks, remark))
 
 
-def _finished(problem: FitProblem, goals: Sequence[int], notify: Notify | None = None) -> FitRun:
+def _finished(problem: FitProblem, goals: Sequence[int], notify: Notify = str) -> FitRun:
     """Return the last run, with the steps of all rounds: one before each split and one after the last."""
     settings, taken = problem.settings, 0
     between = replace(settings, steps=min(_STEPS_BETWEEN, settings.steps))
     total = between.steps * len(goals) + settings.steps
 
     def count(progress: FitProgress) -> None:
-        if notify is not None:
-            notify(FitProgress(taken + progress.step, total, progress.relative))
+        notify(FitProgress(taken + progress.step, total, progress.relative))
 
     for goal in (*goals, None):
         run = FitRun(problem if goal is None else replace(problem, settings=between), count).finish()

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
@@ -130,13 +130,16 @@ def cost_leagues_of(
     """Return the league by cost of each order, from the rows of `table` of each object that has some; see `league`."""
     if x == EDGE_LENGTH:
         raise InputError("edge_length falls where meshes get finer, so it is no cost; take triangles")
-    known = {name: frame.assign(cost=_costs(frame, x)) for name, frame in tables.items()}
+    known = {}
+    for name, table in tables.items():
+        with suppress(InputError):
+            known[name] = table.assign(cost=sizes_of(table, x))
+    if not known:
+        # Names what could be taken instead.
+        sizes_of(next(iter(tables.values())), x)
     frame = pd.concat(known, names=["object", "row"]).reset_index(level="object").reset_index(drop=True)
     frame = frame[frame["family"].isin(methods) & (frame["cost"] > 0) & frame["relative"].notna()]
     if frame.empty:
-        # Names what could be taken instead.
-        for table in tables.values():
-            sizes_of(table, x)
         raise InputError(f"no mesh has both a distance and {x}; name another cost, such as triangles")
     left_out = {name: "it has no tables yet" for name in objects if name not in tables}
     left_out |= {name: f"no mesh has a distance and {x}" for name in tables if name not in set(frame["object"])}
@@ -145,24 +148,14 @@ def cost_leagues_of(
     return tuple(_cost_league(frame[frame["order"] == s], s, x, methods, left_out) for s in orders)
 
 
-def _costs(frame: pd.DataFrame, x: str) -> pd.Series | float:
-    """Return the costs of the meshes of an object, NaN where it has none."""
-    try:
-        return pd.Series(sizes_of(frame, x), frame.index)
-    except InputError:
-        return np.nan
-
-
 def _cost_league(
     frame: pd.DataFrame, order: float, x: str, methods: Sequence[str], left_out: Mapping[str, str]
 ) -> CostLeague:
     # A name that objects do not share may hold that of its object.
     is_own = (frame.groupby("mesh")["object"].transform("nunique") == 1) & (frame["object"].nunique() > 1)
     names = [mesh.removeprefix(f"{family}/") for mesh, family in zip(frame["mesh"], frame["family"], strict=True)]
-    members = [
-        name.replace(owner, "{object}") if own else name
-        for name, owner, own in zip(names, frame["object"], is_own, strict=True)
-    ]
+    triples = zip(names, frame["object"], is_own, strict=True)
+    members = [name.replace(owner, "{object}") if own else name for name, owner, own in triples]
     # What is next to equal tells of rounding.
     relative = frame["relative"].clip(lower=NEXT_TO_EQUAL)
     meshes = frame.assign(method=frame["family"], member=members, relative=relative, **{x: frame["cost"]})
@@ -173,7 +166,7 @@ def _cost_league(
         front = _is_unbeaten(costs, own["relative"], own["relative"])
         # At worst it has the largest distance that its error allows, and others the smallest; at best the reverse.
         at_worst, at_best = _is_unbeaten(costs, high, low), _is_unbeaten(costs, low, high)
-        parts.append(own.assign(front=front, undecided=at_worst != at_best))
+        parts.append(own.assign(front=front, undecided=np.not_equal(at_worst, at_best)))
     columns = ["object", "method", "member", "mesh", x, "relative", "relative_error", "front", "undecided"]
     made = pd.concat(parts, ignore_index=True)[columns]
     return CostLeague(order, x, tuple(dict.fromkeys(made["object"])), tuple(methods), left_out, made)
@@ -184,20 +177,16 @@ def objects_text(count: int) -> str:
     return f"{count} object{'s' if count > 1 else ''}"
 
 
-def _is_unbeaten(costs: pd.Series, own: pd.Series, others: pd.Series) -> NDArray[np.bool_]:
-    """Return which of some meshes no other one beats: at no more cost and nearer, or as near at less cost.
+def _is_unbeaten(costs: pd.Series, own: pd.Series, others: pd.Series) -> list[bool]:
+    """Tell of each of some meshes whether no other one beats it: nearer at no more cost, or as near at less cost.
 
-    Distances and costs are (meshes,); a mesh may have another distance where others are compared with it.
+    A mesh may have another distance, its own, than where others are compared with it.
     """
-    order = np.lexsort([others, costs])
-    cost, rival, place = costs.to_numpy()[order], others.to_numpy()[order], np.arange(len(order))
-    first, end = (np.searchsorted(cost, cost, side) for side in ("left", "right"))
-    padded = np.append(rival, np.inf)
-    cheaper = np.append(np.inf, np.minimum.accumulate(rival))[first]
-    # Among those of the same cost, the first is the nearest.
-    alike = np.where(place > first, padded[first], np.where(first + 1 < end, padded[first + 1], np.inf))
-    distance, result = own.to_numpy()[order], np.empty(len(order), dtype=bool)
-    result[order] = (np.minimum(cheaper, alike) >= distance) & (cheaper > distance)
+    prices, rivals, result = costs.to_numpy(), others.to_numpy(), []
+    for number, (price, distance) in enumerate(zip(prices, own, strict=True)):
+        beats = ((prices <= price) & (rivals < distance)) | ((prices < price) & (rivals <= distance))
+        beats[number] = False
+        result.append(not beats.any())
     return result
 
 

@@ -145,11 +145,11 @@ class League:
 
     def mean_curve(self, method: str) -> tuple[Reals, Reals]:
         """Return sizes (n,), and means over the objects with the ends of their intervals (n, 3), as in the table."""
-        number, count = self.methods.index(method), len(self.objects)
-        means = []
-        for values, errors in zip(self.values_at.transpose(2, 0, 1), self.errors_at.transpose(2, 0, 1), strict=True):
-            spread = within_objects(values)[number] if count > 1 else np.nan
-            means.append(interval(values[:, number], errors[:, number], spread))
+        number, at_sizes = self.methods.index(method), np.moveaxis([self.values_at, self.errors_at], -1, 0)
+        means = [
+            interval(values[:, number], errors[:, number], within_objects(values)[number])
+            for values, errors in at_sizes
+        ]
         return np.exp(self.sizes.mean(axis=0)), np.exp(means)
 
     @property
@@ -167,8 +167,7 @@ class League:
         equal sizes, with the ends low and high of its interval; rate, the mean observed order of convergence in the
         edge length, with rate_low and rate_high.
         """
-        count = len(self.objects)
-        spreads = within_objects(self.values) if count > 1 else np.full(len(self.methods), np.nan)
+        spreads = within_objects(self.values)
         slopes = [of_method[np.isfinite(of_method[:, 0])] for of_method in self.slopes.swapaxes(0, 1)]
         frame = pd.DataFrame({"method": self.methods, "objects": self.known.sum(axis=0)})
         frame[[self.y, *ENDS]] = np.exp(list(map(interval, self.values.T, self.errors.T, spreads)))
@@ -308,10 +307,9 @@ def leagues_of(
     methods: Sequence[str] | None = None,
 ) -> tuple[League, ...]:
     """Rank methods by the rows of `table` of each object that has some, among all objects; see `league`."""
-    orders = orders_of(tables.values(), y)
     chosen = _chosen(tables, methods)
     unfinished = dict.fromkeys((name for name in objects if name not in tables), "it has no tables yet")
-    return tuple(_league(tables, s, x, y, chosen, unfinished) for s in orders)
+    return tuple(_league(tables, s, x, y, chosen, unfinished) for s in orders_of(tables.values(), y))
 
 
 def orders_of(frames: Iterable[pd.DataFrame], y: str) -> list[float]:
@@ -325,9 +323,9 @@ def _chosen(tables: Mapping[str, pd.DataFrame], methods: Sequence[str] | None) -
     """Return the methods to compare, default all; InputError where one is unknown."""
     families = list(dict.fromkeys(family for frame in tables.values() for family in frame["family"]))
     chosen = families if methods is None else list(methods)
-    unknown = next((method for method in chosen if method not in families), None)
-    if unknown is not None:
-        raise InputError(f"no method is named {quoted(unknown)}; known are {', '.join(families)}")
+    for method in chosen:
+        if method not in families:
+            raise InputError(f"no method is named {quoted(method)}; known are {', '.join(families)}")
     return chosen
 
 
@@ -350,9 +348,8 @@ def _league(
         lacking = [method for method in methods if method not in in_common]
         why = {method: f"no {y if y != RELATIVE else 'distance'} of {method}" for method in methods}
         why |= {method: f"{method} reproduced it, up to rounding" for method in found}
-        why |= dict.fromkeys(
-            curves, gap_of({method: curve.range for method, curve in curves.items()}) if curves else ""
-        )
+        if curves:
+            why |= dict.fromkeys(curves, gap_of({method: curve.range for method, curve in curves.items()}))
         common = common_sizes([*in_common.values()]) if in_common else None
         if common is None or len(in_common) < min(2, len(methods)):
             left_out[name] = "; ".join(dict.fromkeys(why[method] for method in lacking or methods))

@@ -139,12 +139,14 @@ def interval(values: Reals, errors: Reals, spread: float | None = None) -> Reals
 
 
 def within_objects(values: Reals) -> Reals:
-    """Return the standard deviation of each method over values (objects, methods), without that of the objects.
+    """Return the standard deviation of each method over values (objects, methods), without that of the objects; or NaN.
 
     Each object's mean over the methods is taken off, and the variance scaled by m / (m - 1) for m methods: Morey,
     Confidence intervals from normalized data, Tutorials in Quantitative Methods for Psychology 4(2), 2008.
     """
     methods = values.shape[1]
+    if len(values) < 2:
+        return np.full(methods, np.nan)
     if methods == 1:
         return np.asarray(np.std(values, axis=0, ddof=1))
     centred = values - values.mean(axis=1, keepdims=True)

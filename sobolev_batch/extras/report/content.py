@@ -299,9 +299,5 @@ def _best(league: League, number: int) -> Row:
         return {**row, "next": "", "ratio": None}
     second = others[0]
     is_open = values[second] - errors[second] < values[first] + errors[first]
-    return {
-        **row,
-        "next": league.methods[second],
-        "ratio": float(np.exp(values[second] - values[first])),
-        "mark": "within errors" if is_open else "",
-    }
+    ratio, mark = float(np.exp(values[second] - values[first])), "within errors" if is_open else ""
+    return {**row, "next": league.methods[second], "ratio": ratio, "mark": mark}

@@ -184,7 +184,7 @@ def test_no_triangle_is_turned_over_on_the_way(distance: float) -> None:
             return self.value(vertices), gradient
 
     objective: Any = Drawn()
-    smoothing = Smoothing.from_mesh(sb.Mesh(fan, triangles), np.arange(7), 0.0)
+    smoothing = Smoothing(sb.Mesh(fan, triangles), np.arange(7), 0.0)
     found = Descent(objective, fan, smoothing, 0.0, 1.0, lambda vertices, value: None)
     found.run(20)
     assert found.end is End.TURNED
@@ -266,7 +266,7 @@ def test_smoothing_solves_with_the_graph_laplacian() -> None:
         np.random.default_rng(2),
     )
     free = np.array([0, 2, 3, 5, 8, 13, 21])
-    smoothing = Smoothing.from_mesh(mesh, free, 3.0)
+    smoothing = Smoothing(mesh, free, 3.0)
     steps, slopes = rng.normal(size=(7, 3)), rng.normal(size=mesh.vertices.shape)
     graph = np.zeros((len(mesh.vertices),) * 2)
     for a, b in ((0, 1), (1, 2), (2, 0)):
@@ -276,5 +276,5 @@ def test_smoothing_solves_with_the_graph_laplacian() -> None:
     np.testing.assert_allclose(movement[free], np.linalg.solve(matrix, steps), rtol=1e-10)
     assert not np.delete(movement, free, axis=0).any()
     assert np.sum(smoothing.pulled_back(slopes) * steps) == pytest.approx(np.sum(slopes * movement), rel=1e-10)
-    without = Smoothing.from_mesh(mesh, free, 0.0)
+    without = Smoothing(mesh, free, 0.0)
     np.testing.assert_array_equal(without.movement(steps)[free], steps)
