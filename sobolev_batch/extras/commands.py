@@ -187,12 +187,11 @@ def _text(quality: FitQuality, scale: float) -> str:
 
     if not math.isfinite(quality.distance):
         return "not measured"
-    relative = percent(quality.relative, quality.relative_error)
-    parts = [f"differs by {relative}, distance {with_error(quality.distance, quality.error)}"]
+    text = f"differs by {percent(quality.relative, quality.relative_error)}, "
+    text += f"distance {with_error(quality.distance, quality.error)}"
     if math.isfinite(quality.hausdorff):
-        parts.append(f"Hausdorff ≥ {quality.hausdorff / scale:.3g}")
-        parts.append(f"Chamfer {quality.chamfer / scale:.3g}")
-    return ", ".join([*parts, f"smallest angle {quality.smallest_angle:.3g} degrees"])
+        text += f", Hausdorff ≥ {quality.hausdorff / scale:.3g}, Chamfer {quality.chamfer / scale:.3g}"
+    return f"{text}, smallest angle {quality.smallest_angle:.3g} degrees"
 
 
 @click.command("plot", cls=Command)

@@ -98,8 +98,11 @@ class MeshTransform:
         """
         nodes = self.nodes(vertices)
         values, slopes = self._evaluated(nodes, coefficients)
-        gradient = self.of_vertices.T @ (nodes.weights[:, None] * slopes)
-        return np.asarray(gradient + self._from_areas(vertices, self.of_areas.T @ values))
+        gradient, of_areas = self.of_vertices.T @ (nodes.weights[:, None] * slopes), self.of_areas.T @ values
+        for ends, derivatives in zip(self.triangles.T, area_derivatives(vertices, self.triangles), strict=True):
+            for axis in range(3):
+                gradient[:, axis] += np.bincount(ends, of_areas * derivatives[:, axis], self.count)
+        return np.asarray(gradient)
 
     def _evaluated(self, nodes: WeightedPoints, coefficients: Complexes) -> tuple[Reals, Reals]:
         """Return the function of the coefficients (k,) and its gradient (k, 3) at the nodes.
@@ -108,7 +111,9 @@ class MeshTransform:
         lattice are F + i G with those of f and g.
         """
         lattice, backend = self.lattice, self.execution.backend
-        whole = _whole(coefficients)
+        # Samples of the half lattice stand for two of the whole one.
+        inner = coefficients[:, :, 1:] / 2
+        whole = np.concatenate([inner[::-1, ::-1, ::-1].conj(), coefficients[:, :, :1], inner], axis=2)
         axis = 2 * np.pi * lattice.spacing * np.arange(-(lattice.M // 2), lattice.M // 2 + 1)
         x, y, z = np.ix_(axis, axis, axis)
         spec = NufftSpec(whole.shape, self.eps, threads=self.execution.threads)
@@ -122,26 +127,12 @@ class MeshTransform:
             first, second = (backend.download(plan.execute(backend.upload(pair))) for pair in pairs)
         return first.real, np.stack([first.imag, second.real, second.imag], axis=1)
 
-    def _from_areas(self, vertices: Reals, slopes: Reals) -> Reals:
-        """Return Σ slope · ∂area/∂vertex over the triangles for each vertex (n, 3)."""
-        gradient = np.zeros((self.count, 3))
-        for ends, derivatives in zip(self.triangles.T, area_derivatives(vertices, self.triangles), strict=True):
-            for axis in range(3):
-                gradient[:, axis] += np.bincount(ends, slopes * derivatives[:, axis], self.count)
-        return gradient
-
 
 def area_derivatives(vertices: Reals, triangles: Indices) -> list[Reals]:
     """Return derivatives of the areas of triangles by each corner, (m, 3) each; zero for those without an area."""
     units, corners = normals(vertices, triangles), [vertices[corner] for corner in triangles.T]
     units /= np.maximum(np.linalg.norm(units, axis=1), np.finfo(np.float64).tiny)[:, None]
     return [np.cross(units, corners[corner - 1] - corners[corner - 2]) / 2 for corner in range(3)]
-
-
-def _whole(half: Complexes) -> Complexes:
-    """Return the coefficients of a real function on the whole lattice, from those on its half that count twice."""
-    inner = half[:, :, 1:] / 2
-    return np.concatenate([inner[::-1, ::-1, ::-1].conj(), half[:, :, :1], inner], axis=2)
 
 
 def _node_matrices(mesh: Mesh, use: RuleUse) -> Iterator[tuple[csr_array, csr_array]]:

@@ -94,9 +94,8 @@ class FitProblem:
         start: The same mesh, prepared: moved to the centre, in units of length; no two of its vertices coincide.
         place: Vertex of the prepared mesh for each vertex of the given one.
         target: Target, moved with the mesh.
-        given: Target and lattice as they were given.
         values: Transform of the target on the half lattice.
-        quality: Quality of this field, from which its errors follow; None if unknown.
+        given: Target and lattice as they were given.
     """
 
     mesh: Mesh
@@ -123,8 +122,7 @@ class FitProblem:
             given = field_of(target, common_lattice((target,), lattice), (settings.order,))
             own, values, quality = Lattice.from_field(given), field_values(given), quality_of(given)
         else:
-            if lattice is None:
-                move = centering([start, target])
+            move = centering([start, target]) if lattice is None else move
             start, target = move.apply(start), move.apply(target)
             orders = tuple(dict.fromkeys((settings.order, settings.coarse_order)))
             own = lattice or fit_lattice(start, target, orders)

@@ -224,17 +224,14 @@ def league_data(leagues: Sequence[League], name: str, orders: Sequence[str]) -> 
         "orders": list(orders),
         "families": list(leagues[0].methods) if leagues else [],
         "size": label_of(leagues[0].x) if leagues else "",
-        "league": [
-            [
-                _line(
-                    method, sizes, means[:, 0], means[:, 2] - means[:, 0], lower=numbers(means[:, 0] - means[:, 1], 2)
-                )
-                for method in league.methods
-                for sizes, means in [league.mean_curve(method)]
-            ]
-            for league in leagues
-        ],
+        "league": [[_mean_line(league, method) for method in league.methods] for league in leagues],
     }
+
+
+def _mean_line(league: League, method: str) -> Json:
+    sizes, means = league.mean_curve(method)
+    middle, low, high = means.T
+    return _line(method, sizes, middle, high - middle, lower=numbers(middle - low, 2))
 
 
 def cost_data(leagues: Sequence[CostLeague]) -> list[Json] | None:
@@ -279,21 +276,14 @@ def chart_omissions(
 def _convergence(tree: xr.DataTree, orders: list[float], most: int) -> list[list[Json]]:
     """Return for each order and family the points with their errors."""
     frame = _drawable(tree)
-    return [
-        [
-            _line(
-                str(family),
-                rows["edge_length"],
-                rows["relative"],
-                rows["relative_error"],
-                joined=is_sequence(rows),
-                labels=rows["mesh"].tolist(),
-                triangles=rows["triangles"].tolist(),
-            )
-            for family, rows in frame[frame["order"] == order][:most].groupby("family", sort=False)
-        ]
-        for order in orders
-    ]
+    found: list[list[Json]] = []
+    for order in orders:
+        found.append([])
+        for family, rows in frame[frame["order"] == order][:most].groupby("family", sort=False):
+            line = _line(str(family), rows["edge_length"], rows["relative"], rows["relative_error"])
+            labels, triangles = rows["mesh"].tolist(), rows["triangles"].tolist()
+            found[-1].append({**line, "joined": is_sequence(rows), "labels": labels, "triangles": triangles})
+    return found
 
 
 def _drawable(tree: xr.DataTree) -> pd.DataFrame:
