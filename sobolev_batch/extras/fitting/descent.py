@@ -149,8 +149,8 @@ class Smoothing:
         one, other = Edges.from_mesh(mesh).ends.T
         both = np.concatenate([one, other]), np.concatenate([other, one])
         neighbours = coo_array((np.ones(len(both[0])), both), shape=(self._count, self._count)).tocsr()
-        graph: Any = csc_array(laplacian(neighbours))
-        self._factors = splu(csc_array(eye_array(len(free)) + amount * graph[free][:, free]))
+        graph: Any = laplacian(neighbours)
+        self._factors = splu(csc_array(eye_array(len(free)) + amount * csc_array(graph)[free][:, free]))
 
     def movement(self, steps: Reals) -> Reals:
         """Return the movement of all vertices (n, 3) for steps of the free ones (k, 3)."""

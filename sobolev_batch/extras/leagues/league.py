@@ -145,7 +145,7 @@ class League:
 
     def mean_curve(self, method: str) -> tuple[Reals, Reals]:
         """Return sizes (n,), and means over the objects with the ends of their intervals (n, 3), as in the table."""
-        number, at_sizes = self.methods.index(method), np.moveaxis([self.values_at, self.errors_at], -1, 0)
+        number, at_sizes = self.methods.index(method), np.stack([self.values_at, self.errors_at]).transpose(3, 0, 1, 2)
         means = [
             interval(values[:, number], errors[:, number], within_objects(values)[number])
             for values, errors in at_sizes
