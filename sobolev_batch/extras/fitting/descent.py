@@ -71,7 +71,7 @@ class Descent:
     ) -> None:
         self.objective, self.smoothing, self.floor, self.unit, self.notify = objective, smoothing, floor, unit, notify
         self.start = self.vertices = vertices
-        self.first = self.value = objective.value(vertices)
+        self.first = objective.value(vertices)
         self.steps = 0
         self.end: End | None = None
         self._history = [self.first]
@@ -81,7 +81,7 @@ class Descent:
 
     def run(self, steps: int) -> None:
         """Take this many steps at most. One that leaves the lattice's period ends the descent before it."""
-        if self.value <= self.floor:
+        if self.first <= self.floor:
             self.end = End.ERROR
             return
         try:
@@ -119,14 +119,13 @@ class Descent:
         if np.any(np.einsum("ij,ij->i", turned, self._normals)[had_area] <= 0):
             self._stop(End.TURNED)
         self.vertices, self._normals = vertices, turned
-        self.value = float(intermediate_result.fun) * self.first
+        value = float(intermediate_result.fun) * self.first
+        self._history.append(value)
         self.steps += 1
-        self._history.append(self.value)
-        self.notify(vertices, self.value)
-        if self.value <= self.floor:
+        self.notify(vertices, value)
+        if value <= self.floor:
             self._stop(End.ERROR)
-        before = self._history[-_PATIENCE - 1] if len(self._history) > _PATIENCE else np.inf
-        if self.value > (1 - _LEAST_PROGRESS) ** 2 * before:
+        if self.steps >= _PATIENCE and value > (1 - _LEAST_PROGRESS) ** 2 * self._history[-_PATIENCE - 1]:
             self._stop(End.CONVERGED)
 
     def _stop(self, end: End) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -199,8 +200,8 @@ def fitted_mesh(
 class FitRun:
     """A fit that is under way: its positions (n, 3) in units of length, steps taken, and why the last descent ended."""
 
-    def __init__(self, problem: FitProblem, notify: Notify) -> None:
-        self.problem, self.notify, self.free = problem, notify, problem.free_vertices
+    def __init__(self, problem: FitProblem, tell: Callable[[float], None]) -> None:
+        self.problem, self.tell, self.free = problem, tell, problem.free_vertices
         self.taken, self.end = 0, End.CONVERGED
         self.vertices = np.asarray(problem.start.vertices)
 
@@ -259,7 +260,7 @@ class FitRun:
     def _count(self, vertices: Reals, objective: float) -> None:
         self.vertices = vertices
         self.taken += 1
-        self.notify(FitProgress(self.taken, self.problem.settings.steps, float(np.sqrt(objective))))
+        self.tell(float(np.sqrt(objective)))
 
 
 def measure_quality(problem: FitProblem, mesh: Mesh) -> FitQuality:
@@ -375,17 +376,15 @@ def refine(
 
 def _finished(problem: FitProblem, goals: Sequence[int], notify: Notify = str) -> FitRun:
     """Return the last run, with the steps of all rounds: one before each split and one after the last."""
-    settings, taken = problem.settings, 0
+    settings, steps = problem.settings, itertools.count(1)
     between = replace(settings, steps=min(_STEPS_BETWEEN, settings.steps))
     total = between.steps * len(goals) + settings.steps
 
-    def count(progress: FitProgress) -> None:
-        notify(FitProgress(taken + progress.step, total, progress.relative))
+    def tell(relative: float) -> None:
+        notify(FitProgress(next(steps), total, relative))
 
     for goal in (*goals, None):
-        run = FitRun(problem if goal is None else replace(problem, settings=between), count).finish()
-        taken += run.taken
-        run.taken = taken
+        run = FitRun(problem if goal is None else replace(problem, settings=between), tell).finish()
         if goal is None or run.end is End.INTERRUPTED:
             break
         try:
@@ -393,6 +392,7 @@ def _finished(problem: FitProblem, goals: Sequence[int], notify: Notify = str) -
         except KeyboardInterrupt:
             run.end = End.INTERRUPTED
             break
+    run.taken = next(steps) - 1
     return run
 
 
