@@ -246,15 +246,27 @@ def _view(label: str, fields: Fields, mesh: Mesh, orders: tuple[float, ...], mos
 
 
 def _shown(label: str, mesh: Mesh, most: int, enough: int = _ENOUGH_TRIANGLES) -> MeshView:
-    """Return a view of a mesh without values: its own vertices that are in use, in their order, or others."""
+    """Return a view of a mesh without values: its own vertices that are in use, in their order, or others.
+
+    One of more triangles than the most is simplified, and a small one subdivided up to enough of them: values then vary
+    within its triangles.
+    """
     used = mesh.used_vertices
     number = np.empty(len(mesh.vertices), dtype=np.int32)
     number[used] = np.arange(len(used))
-    own, corners = mesh.vertices[used], number[mesh.triangles]
-    vertices, triangles = _for_display(own, corners, most, enough)
-    # Collapsed edges may leave the period by a hair where the mesh fills it.
-    vertices = vertices if vertices is own else np.clip(vertices, own.min(axis=0), own.max(axis=0))
-    return MeshView(label, vertices, triangles, np.zeros((0, len(vertices))), (), len(corners))
+    vertices, triangles = mesh.vertices[used], number[mesh.triangles]
+    # Without this extra, large meshes take longer to draw.
+    if len(triangles) > most and find_spec("fast_simplification"):
+        import fast_simplification
+
+        simplified = fast_simplification.simplify(vertices, triangles, target_count=most)
+        # Collapsed edges may leave the period by a hair where the mesh fills it.
+        vertices = np.clip(simplified[0].astype(np.float64), vertices.min(axis=0), vertices.max(axis=0))
+        triangles = simplified[1].astype(np.int32)
+    while 4 * len(triangles) <= enough:
+        finer = subdivided(Mesh(vertices, triangles))
+        vertices, triangles = finer.vertices, finer.triangles.astype(np.int32)
+    return MeshView(label, vertices, triangles, np.zeros((0, len(vertices))), (), len(mesh.triangles))
 
 
 def distance_view(
@@ -287,23 +299,6 @@ def distance_view(
         # Of those at one place, the last one stays: the largest.
         distances[places[order]] = values[order]
     return replace(view, values=distances[None] / scale, unit=unit)
-
-
-def _for_display(vertices: Reals, triangles: Triangles, most: int, enough: int) -> tuple[Reals, Triangles]:
-    """Simplify a mesh of more triangles than the most, and subdivide a small one up to enough of them.
-
-    Values then vary within the triangles of a small one.
-    """
-    # Without this extra, large meshes take longer to draw.
-    if len(triangles) > most and find_spec("fast_simplification"):
-        import fast_simplification
-
-        simplified = fast_simplification.simplify(vertices, triangles, target_count=most)
-        return np.asarray(simplified[0], dtype=np.float64), np.asarray(simplified[1], dtype=np.int32)
-    while 4 * len(triangles) <= enough:
-        finer = subdivided(Mesh(vertices, triangles))
-        vertices, triangles = finer.vertices, finer.triangles.astype(np.int32)
-    return vertices, triangles
 
 
 def draw_mesh(axes: Axes, view: MeshView, index: int = 0, limit: float | None = None) -> None:
@@ -466,11 +461,8 @@ def _add_colorbar(
     figure: Figure, panels: Axes | Sequence[Axes], views: Sequence[MeshView], limit: float, index: int
 ) -> None:
     """Add the colours of some meshes at one of their orders, with arrows where values lie beyond them."""
-    ends = (
-        min(view.values[index].min() for view in views) < -limit,
-        max(view.values[index].max() for view in views) > limit,
-    )
-    unit = views[0].unit
+    values, unit = np.concatenate([view.values[index] for view in views]), views[0].unit
+    ends = bool(values.min() < -limit), bool(values.max() > limit)
     bar = figure.colorbar(
         _mapping(views[0], limit),
         ax=panels,
