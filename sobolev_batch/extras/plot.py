@@ -134,9 +134,10 @@ def energy(store: AnyStore, ax: Axes | None = None, *, family: Families = None) 
 def league(league: League | CostLeague, ax: Axes | None = None) -> Axes:
     """Plot the mean relative distance of each method of a league against the mean size of its meshes.
 
-    The points are geometric means over the objects, at the sizes at which the table compares the methods. Bars show
-    the errors of the distances. Both axes are logarithmic. In a league by cost the points are the members that all
-    objects have, at their mean costs; a dotted line joins those that no other one beats in both means.
+    The points are geometric means over the objects, at the sizes at which the table compares the methods. Bands show
+    their 95 % intervals, and dots all meshes. Both axes are logarithmic. In a league by cost the points are the members
+    that all objects have, at their mean costs, with the errors of the distances; a dotted line joins those that no
+    other one beats in both means.
 
     Args:
         league: League at one order, see `sobolev_batch.league`.
