@@ -27,14 +27,7 @@ from sobolev_batch import open_store
 from sobolev_batch.extras.figures import views
 from sobolev_batch.extras.figures.remade import StudyMeshes, fields_of
 from sobolev_batch.extras.figures.selection import Selection
-from sobolev_batch.extras.figures.views import (
-    FRONT,
-    MeshView,
-    draw_mesh,
-    make_views,
-    up_axis,
-    write_witness_plots,
-)
+from sobolev_batch.extras.figures.views import FRONT, MeshView, draw_mesh, make_views, up_axis, write_witness_plots
 from sobolev_batch.shapes import icosphere
 from sobolev_batch.testing.difference import witness_at_vertices
 from tests.support.commands import call

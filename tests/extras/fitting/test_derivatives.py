@@ -131,11 +131,8 @@ def test_it_is_exact_for_the_value_whatever_the_quadrature(tolerance: float) -> 
 
 
 def test_its_points_are_those_of_a_field_whatever_the_rules() -> None:
-    mesh, waves, degrees = (
-        sb.Mesh(BALL.vertices, BALL.triangles[:-7]),
-        np.random.default_rng(3).normal(size=(3, 20)),
-        set(),
-    )
+    mesh, degrees = sb.Mesh(BALL.vertices, BALL.triangles[:-7]), set()
+    waves = np.random.default_rng(3).normal(size=(3, 20))
     for tolerance in 10.0 ** -np.arange(0, 7):
         settings = TransformSettings(tolerance=float(tolerance))
         plan = settings.plan(mesh, SMALL)

@@ -261,10 +261,8 @@ def test_its_derivative_is_that_of_differences() -> None:
 
 
 def test_smoothing_solves_with_the_graph_laplacian() -> None:
-    mesh, rng = (
-        sb.Mesh(sb.shapes.icosphere(1).vertices, sb.shapes.icosphere(1).triangles[:60]),
-        np.random.default_rng(2),
-    )
+    ball, rng = sb.shapes.icosphere(1), np.random.default_rng(2)
+    mesh = sb.Mesh(ball.vertices, ball.triangles[:60])
     free = np.array([0, 2, 3, 5, 8, 13, 21])
     smoothing = Smoothing(mesh, free, 3.0)
     steps, slopes = rng.normal(size=(7, 3)), rng.normal(size=mesh.vertices.shape)
