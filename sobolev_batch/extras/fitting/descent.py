@@ -20,8 +20,6 @@ from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.subdivision import Edges
 from sobolev_batch.geometry.surface import normals
 
-Notify = Callable[[Reals, float], None]
-
 # Pairs of steps and gradients that L-BFGS remembers.
 _MEMORY = 20
 # Cost of a triangle that loses its area, relative to the squared distance at the start.
@@ -67,7 +65,7 @@ class Descent:
         smoothing: Smoothing,
         floor: float,
         unit: float,
-        notify: Notify,
+        notify: Callable[[Reals, float], None],
     ) -> None:
         self.objective, self.smoothing, self.floor, self.unit, self.notify = objective, smoothing, floor, unit, notify
         self.start = self.vertices = vertices

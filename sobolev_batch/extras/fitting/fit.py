@@ -194,7 +194,7 @@ def fitted_mesh(
     if run.end is End.INTERRUPTED:
         # A mesh of a study is the whole fit.
         raise KeyboardInterrupt
-    return run.problem.given_mesh(run.mesh)
+    return run.problem.given_mesh(run.vertices)
 
 
 class FitRun:
@@ -204,11 +204,6 @@ class FitRun:
         self.problem, self.tell, self.free = problem, tell, problem.free_vertices
         self.taken, self.end = 0, End.CONVERGED
         self.vertices = np.asarray(problem.start.vertices)
-
-    @property
-    def mesh(self) -> Mesh:
-        """The prepared mesh after the last step."""
-        return Mesh(self.vertices, self.problem.start.triangles)
 
     def finish(self) -> Self:
         """Carry the fit out, go back to the start if that is nearer, and return the run."""
@@ -295,9 +290,9 @@ def _measured(given: Mesh, problem: FitProblem, goals: Sequence[int], on_progres
     with progress_line(on_progress) as notify:
         run = _finished(problem, goals, notify)
     problem = run.problem
-    mesh, remarks, end = problem.given_mesh(run.mesh), [], run.end
+    mesh, remarks, end = problem.given_mesh(run.vertices), [], run.end
     try:
-        after = measure_quality(problem, run.mesh)
+        after = measure_quality(problem, Mesh(run.vertices, problem.start.triangles))
     except KeyboardInterrupt:
         after, end = FitQuality(np.nan, np.nan), End.INTERRUPTED
         remarks.append("it was interrupted before the mesh was measured")
@@ -388,7 +383,7 @@ def _finished(problem: FitProblem, goals: Sequence[int], notify: Notify = str) -
         if goal is None or run.end is End.INTERRUPTED:
             break
         try:
-            problem = problem.remade(_split(problem, problem.given_mesh(run.mesh), goal))
+            problem = problem.remade(_split(problem, problem.given_mesh(run.vertices), goal))
         except KeyboardInterrupt:
             run.end = End.INTERRUPTED
             break

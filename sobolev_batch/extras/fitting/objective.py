@@ -149,10 +149,9 @@ class FitProblem:
             raise InputError("all vertices lie on the boundary: there is nothing to move")
         return free
 
-    def given_mesh(self, mesh: Mesh) -> Mesh:
-        """Return the prepared start, with its vertices moved, at the place and with the triangles of the given mesh."""
-        vertices = np.asarray(mesh.vertices)[self.place] + np.asarray(self.move.origin)
-        return Mesh(vertices, self.mesh.triangles)
+    def given_mesh(self, vertices: Reals) -> Mesh:
+        """Return the given mesh with positions of the prepared one, at its own place."""
+        return Mesh(vertices[self.place] + np.asarray(self.move.origin), self.mesh.triangles)
 
     def squares(self, vertices: Reals, orders: Sequence[float]) -> Reals:
         """Return the squared distances with vertices at some positions, (orders,), from coarse settings."""
