@@ -263,9 +263,10 @@ def _shown(label: str, mesh: Mesh, most: int, enough: int = _ENOUGH_TRIANGLES) -
         # Collapsed edges may leave the period by a hair where the mesh fills it.
         vertices = np.clip(simplified[0].astype(np.float64), vertices.min(axis=0), vertices.max(axis=0))
         triangles = simplified[1].astype(np.int32)
-    while 4 * len(triangles) <= enough:
-        finer = subdivided(Mesh(vertices, triangles))
-        vertices, triangles = finer.vertices, finer.triangles.astype(np.int32)
+    else:
+        while 4 * len(triangles) <= enough:
+            finer = subdivided(Mesh(vertices, triangles))
+            vertices, triangles = finer.vertices, finer.triangles.astype(np.int32)
     return MeshView(label, vertices, triangles, np.zeros((0, len(vertices))), (), len(mesh.triangles))
 
 
