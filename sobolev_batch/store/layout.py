@@ -14,6 +14,7 @@ import hashlib
 import json
 import logging
 import math
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -154,7 +155,8 @@ class Store:
         StoreError where it is the other one of the two, unless None allows both.
         """
         if not self.exists() or self.documents[""].get("node_type") != "group":
-            problem = "it does not exist" if self.location.is_absent() else "it holds no store of a study"
+            is_absent = not self.location.scheme and not os.path.lexists(self.path)
+            problem = "it does not exist" if is_absent else "it holds no store of a study"
             raise StoreError(f"{self.path}: {problem}")
         attributes: dict[str, Any] = self.documents[""].get("attributes", {})
         if self.is_unfinished:

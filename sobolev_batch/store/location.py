@@ -24,6 +24,7 @@ from uuid import uuid4
 
 from fsspec import available_protocols
 from zarr.abc.store import ByteRequest
+from zarr.buffer.cpu import Buffer as CpuBuffer
 from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
 from zarr.core.common import AccessModeLiteral
 from zarr.core.sync import sync
@@ -33,7 +34,7 @@ from sobolev_batch.errors import DamageError, SobolevBatchError, SpaceError, Sto
 
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)(://|::)(.*)", re.DOTALL)
 _FOLDER_SCHEMES = ("file", "local")
-_BUCKET_SCHEMES = ("s3", "s3a", "gs", "gcs")
+# The extra of this package that has the driver of each scheme with buckets.
 _EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs"}
 # zarr gives such names to files until they are complete.
 PARTIAL_FILE = re.compile(r"\.[0-9a-f]{32}\.partial")
@@ -72,7 +73,7 @@ class Location:
         if scheme in _FOLDER_SCHEMES:
             return cls(str(Path(rest)))
         _require_no_credentials(scheme, rest)
-        if scheme in _BUCKET_SCHEMES and not all(rest.rstrip("/").partition("/")):
+        if scheme in _EXTRAS and not all(rest.rstrip("/").partition("/")):
             raise StoreError(f"{store}: names no place in a bucket; a store lies at {scheme}://bucket/name.zarr")
         return cls(f"{scheme}://{rest.rstrip('/')}")
 
@@ -94,10 +95,6 @@ class Location:
         """Return the same location for processes that were started in another folder."""
         return self if self.scheme else replace(self, name=str(Path(self.name).absolute()))
 
-    def fenced(self, fence: Callable[[], None]) -> Location:
-        """Return the same location for writers that have to stop once a condition fails."""
-        return replace(self, fence=fence)
-
     def below(self, name: str) -> Location:
         """Return the location of a name below this one."""
         return replace(self, name=f"{self.name}/{name}" if self.scheme else str(Path(self.name) / name))
@@ -115,12 +112,10 @@ class Location:
 
     def read(self, key: str, most_bytes: int | None = None) -> bytes | None:
         """Return the bytes of a key, or None if it does not exist."""
+        store = self.zarr_store()
         with self.access("read"):
-            if most_bytes is not None and not self.scheme:
-                self._require_size(key, most_bytes)
-            store = self.zarr_store()
             if isinstance(store, FolderStore):
-                return store.content(key)
+                return store.content(key, most_bytes)
             content = sync(store.get(key, default_buffer_prototype()))
             return None if content is None else content.to_bytes()
 
@@ -134,7 +129,7 @@ class Location:
             return
 
         async def write_all() -> None:
-            writes = (store.set(key, _buffer(document)) for key, document in documents.items())
+            writes = (store.set(key, CpuBuffer.from_bytes(document)) for key, document in documents.items())
             # All are awaited, since asyncio logs failures that nobody retrieved.
             for outcome in await asyncio.gather(*writes, return_exceptions=True):
                 if isinstance(outcome, BaseException):
@@ -150,17 +145,9 @@ class Location:
         read the key again later.
         """
         with self.access("written"):
-            sync(self.zarr_store().set_if_not_exists(key, _buffer(document)))
+            sync(self.zarr_store().set_if_not_exists(key, CpuBuffer.from_bytes(document)))
         # After a request whose answer was lost, a driver is told that its own key exists.
         return self.read(key) == document
-
-    def is_folder(self) -> bool:
-        """Return whether the location is a local folder that exists."""
-        return not self.scheme and Path(self.name).is_dir()
-
-    def is_absent(self) -> bool:
-        """Return whether the location is a local path at which there is nothing."""
-        return not self.scheme and not os.path.lexists(self.name)
 
     def discard(self, *keys: str) -> None:
         """Remove keys, those of them that exist."""
@@ -172,12 +159,6 @@ class Location:
         store = self.zarr_store()
         with self.access("written"), suppress(NotADirectoryError):
             sync(store.delete(prefix) if isinstance(store, FolderStore) else store.delete_dir(prefix))
-
-    def remove_empty_folder(self) -> None:
-        """Remove the local folder if nothing is in it."""
-        if not self.scheme:
-            with suppress(OSError):  # It holds a store.
-                Path(self.name).rmdir()
 
     def remove_partial_files(self) -> None:
         """Remove what writers left behind that were killed in the middle of a key. No other run may be writing."""
@@ -251,7 +232,7 @@ class Location:
 
     def _explain(self, error: Exception, text: str) -> str:
         """Return the reason of a failure of object storage, and its remedy."""
-        if _lacks_bucket(error) or (self.scheme in _BUCKET_SCHEMES and isinstance(error, FileNotFoundError)):
+        if _lacks_bucket(error) or (self.scheme in _EXTRAS and isinstance(error, FileNotFoundError)):
             return f"there is no bucket {self.name.split('/')[2]!r} ({text})"
         if isinstance(error, TimeoutError):
             return f"nothing answers there within {_ANSWER_SECONDS:g} s"
@@ -260,12 +241,6 @@ class Location:
         if isinstance(error, PermissionError):
             return f"access is denied ({text}); check the credentials in the environment and what they allow"
         return text
-
-    def _require_size(self, key: str, most_bytes: int) -> None:
-        with suppress(*_ABSENT):
-            if path_in(self.name, key).stat().st_size > most_bytes:
-                problem = f"{key} has more than {most_bytes} bytes"
-                raise DamageError(f"{self}: {problem}", problem)
 
 
 def _folder_name(store: str | Path) -> str:
@@ -290,7 +265,7 @@ def _require_no_credentials(scheme: str, rest: str) -> None:
         raise StoreError(f"a {scheme}:// URL of a store with a query in it; {advice}")
     # A secret may hold slashes, so all of it is searched. An Azure URL has an @, but no colon before it.
     before, at, _ = rest.partition("@")
-    if at and (":" in before or (scheme in _BUCKET_SCHEMES and "/" not in before)):
+    if at and (":" in before or (scheme in _EXTRAS and "/" not in before)):
         raise StoreError(f"a {scheme}:// URL of a store with credentials in it; {advice}")
 
 
@@ -330,10 +305,15 @@ class FolderStore(LocalStore):
         # That of zarr makes the folder, also of a store that is only read.
         self._is_open = True
 
-    def content(self, key: str) -> bytes | None:
+    def content(self, key: str, most_bytes: int | None = None) -> bytes | None:
         """Return what a file holds, None where there is none: `get` takes milliseconds to go to another thread."""
+        path = self.root / key
         try:
-            return (self.root / key).read_bytes()
+            # A file may be sparse, and larger than the memory.
+            if most_bytes is not None and path.stat().st_size > most_bytes:
+                problem = f"{key} has more than {most_bytes} bytes"
+                raise DamageError(f"{self.root}: {problem}", problem)
+            return path.read_bytes()
         except (*_ABSENT, IsADirectoryError):
             return None
 
@@ -472,16 +452,15 @@ def _remote_store(url: str, scheme: str, largest_bytes: int) -> RemoteStore:
         # Otherwise s3fs requests the size of each key first, and does not repeat a range that breaks off.
         options["max_concurrency"] = 1
     try:
-        store = RemoteStore.from_url(url, options, allowed_exceptions=())
+        store = cast(RemoteStore, RemoteStore.from_url(url, options, allowed_exceptions=()))
     except ImportError as error:
         extra = _EXTRAS.get(scheme)
         remedy = f"pip install 'sobolev-batch[{extra}]'" if extra else "install it"
         raise StoreError(f"{url}: the driver of {scheme}:// is missing here ({error}): {remedy}") from error
     except ValueError as error:
         raise StoreError(f"{url}: no store can lie there ({error}); name a folder or an s3:// URL") from error
-    remote = cast(RemoteStore, store)
-    remote.largest_bytes = largest_bytes
-    return remote
+    store.largest_bytes = largest_bytes
+    return store
 
 
 if hasattr(os, "register_at_fork"):  # Windows has no fork.
@@ -504,7 +483,3 @@ def _lacks_bucket(error: Exception) -> bool:
     """Return whether the bucket is missing, for drivers that report a missing key in the same way."""
     response: Any = getattr(error.__cause__, "response", None)
     return isinstance(response, dict) and response.get("Error", {}).get("Code") == "NoSuchBucket"
-
-
-def _buffer(document: bytes) -> Buffer:
-    return default_buffer_prototype().buffer.from_bytes(document)

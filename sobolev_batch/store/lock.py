@@ -17,7 +17,7 @@ import os
 import socket
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -111,11 +111,11 @@ class Lock:
 
     def of_run(self, location: Location) -> Location:
         """Return a location for tasks: it may be written, with all below, as long as the lock's run has it."""
-        return location.fenced(partial(self._require, location, "run"))
+        return replace(location, fence=partial(self._require, location, "run"))
 
     def of_holder(self, location: Location) -> Location:
         """Return a location for the process that has the lock, in whose place another one may come."""
-        return location.fenced(partial(self._require, location, "holder"))
+        return replace(location, fence=partial(self._require, location, "holder"))
 
     def _require(self, location: Location, part: Literal["run", "holder"]) -> None:
         current = Lock.read(location)
@@ -140,7 +140,7 @@ def locked(location: Location, lock: Lock) -> Iterator[None]:
 
 def acquire(location: Location, lock: Lock) -> None:
     """Acquire the lock on a store, or take over the one of the same run; LockError where another run has it."""
-    lock = replace(lock, folder="" if location.is_folder() else "made")
+    lock = replace(lock, folder="" if Path(location.name).is_dir() else "made")
     current = None
     # The current lock may be released between two attempts.
     while current is None:
@@ -181,7 +181,8 @@ def release(location: Location, lock: Lock) -> None:
         if current is not None and current.holder == lock.holder:
             location.discard(LOCK_KEY)
             if current.folder == "made":
-                location.remove_empty_folder()
+                with suppress(OSError):  # It holds a store, or is no folder.
+                    Path(location.name).rmdir()
     except StoreError as error:
         _log.warning("the store stays locked, unlock it with: sobolev-batch unlock %s (%s)", location, error)
 
