@@ -76,9 +76,8 @@ TABLES_OF_ALL = ("meshes", "convergence", "proximity")
 _OF_ROWS = frozenset({FIELD, OCTAVES, RECORD, PAGE})
 # Most of the time of a request is spent waiting.
 _REQUESTS_AT_ONCE = 64
-# Hashes of keys, each with what the storage says of the content when it lists the key, if anything.
-Hashes = dict[str, tuple[str, str]]
-Metadata = tuple[dict[str, Document], Hashes]
+# Documents of nodes, and the SHA-256 of keys below the digest.
+Metadata = tuple[dict[str, Document], dict[str, str]]
 # Tasks write into the chunks of these groups; all others are tables, written, listed and hidden as a whole.
 GROUPS_OF_TASKS = ("fourier", OCTAVES_GROUP, SPECTRA_GROUP, RECORDS)
 
@@ -97,9 +96,9 @@ class Store:
     def __init__(self, store: str | Path | Location) -> None:
         self.location = Location.parse(store)
         self.documents: dict[str, Document] = {}
-        # These are the SHA-256 of keys below the digest that this process knows, with their tags; see `remember`.
-        self._hashes: Hashes = {}
-        self._remembered: Hashes = {}
+        # The SHA-256 of keys below the digest that this process knows, and those of them that are in `TAGS`.
+        self._hashes: dict[str, str] = {}
+        self._remembered: dict[str, str] = {}
         self.lacks_tables = False
 
     def __getstate__(self) -> dict[str, Any]:
@@ -316,9 +315,8 @@ class Store:
     def publish(self, keys: Mapping[str, bytes]) -> None:
         """Write keys of new nodes. Readers find the nodes after `consolidate`."""
         self.location.write(keys)
-        tags = self._tags({key.split("/")[0] for key in keys})
         for key, content in keys.items():
-            self._hashes[key] = hashlib.sha256(content).hexdigest(), tags.get(key, "")
+            self._hashes[key] = hashlib.sha256(content).hexdigest()
             if key.endswith(f"/{ROOT}"):
                 self.documents[key.removesuffix(f"/{ROOT}")] = json.loads(content)
 
@@ -366,32 +364,34 @@ class Store:
         for name in self.whole_arrays():
             keys |= dict.fromkeys(self.chunk_keys(name), largest_chunk_bytes(self.documents[name]))
         unknown = {key: keys[key] for key in sorted(keys.keys() - self._hashes.keys())}
-        tags = self._tags({key.split("/")[0] for key in unknown})
         with ThreadPoolExecutor(_REQUESTS_AT_ONCE) as pool:
             # A thread takes longer to start than a file to be read.
             each = pool.map if self.location.scheme else map
             contents = each(self.location.read, unknown, unknown.values())
             for key, content in zip(unknown, contents, strict=True):
-                self._hashes[key] = hashlib.sha256(content or b"").hexdigest(), tags.get(key, "")
-        return digest_of([root, {key: self._hashes[key][0] for key in keys}])
+                self._hashes[key] = hashlib.sha256(content or b"").hexdigest()
+        return digest_of([root, {key: self._hashes[key] for key in keys}])
 
     def remember(self) -> None:
         """Write down the hashes of keys that have tags, so that later runs read only those that have changed since."""
-        tagged = {key: known for key, known in self._hashes.items() if known[1]}
-        if not tagged.items() <= self._remembered.items():
-            self.location.write({TAGS: json.dumps(tagged).encode()})
-            self._remembered = tagged
+        if self.location.scheme and not self._hashes.items() <= self._remembered.items():
+            tags = self._tags(self._hashes)
+            tagged = {key: (known, tags[key]) for key, known in self._hashes.items() if key in tags}
+            if tagged:
+                self.location.write({TAGS: json.dumps(tagged).encode()})
+                self._remembered = dict(self._hashes)
 
     def _recall(self) -> None:
         """Take the hashes over that were remembered of keys whose tags are the same."""
         text = self.location.read(TAGS) if self.location.scheme else None
         with suppress(ValueError, TypeError, AttributeError, RecursionError):  # Other texts are worth nothing.
-            known = {str(key): (str(one), str(tag)) for key, (one, tag) in json.loads(text or "{}").items()}
-            tags = self._tags({key.split("/")[0] for key in known})
-            self._remembered = {key: one for key, one in known.items() if tags.get(key) == one[1]}
+            known = {str(key): (str(one), tag) for key, (one, tag) in json.loads(text or "{}").items()}
+            tags = self._tags(known)
+            self._remembered = {key: one for key, (one, tag) in known.items() if tags.get(key) == tag}
             self._hashes = self._remembered | self._hashes
 
-    def _tags(self, groups: Iterable[str]) -> dict[str, str]:
+    def _tags(self, keys: Iterable[str]) -> dict[str, str]:
+        groups = {key.split("/")[0] for key in keys}
         return {key: tag for group in sorted(groups) for key, tag in self.location.tags(group).items()}
 
     def _forget(self, name: str) -> None:
