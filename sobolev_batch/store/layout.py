@@ -100,6 +100,8 @@ class Store:
         self._hashes: dict[str, str] = {}
         self._remembered: dict[str, str] = {}
         self.lacks_tables = False
+        # The stores that this one is made of, each with the number of rows before its own; see `JoinedStore`.
+        self.parts: tuple[tuple[int, Store], ...] = ((0, self),)
 
     def __getstate__(self) -> dict[str, Any]:
         carried = {name: self.documents[name] for name in self._arrays_in_progress if name in self.documents}
@@ -196,11 +198,6 @@ class Store:
     def removed(self) -> frozenset[str]:
         """Labels of the meshes that the study has lost; their fields stay, in case they come back."""
         return frozenset(self.attributes().get(REMOVED, ()))
-
-    @property
-    def parts(self) -> tuple[tuple[int, Store], ...]:
-        """The stores that this one is made of, each with the number of rows before its own; see `JoinedStore`."""
-        return ((0, self),)
 
     @property
     def row_count(self) -> int:
@@ -424,13 +421,8 @@ class JoinedStore(Store):
     def __init__(self, stores: Sequence[Store], labels: Sequence[str]) -> None:
         super().__init__(stores[0].location)
         self.documents = stores[0].documents
-        self._stores, self._labels = tuple(stores), tuple(labels)
-
-    @property
-    def parts(self) -> tuple[tuple[int, Store], ...]:
-        """The stores, each with the number of rows before its own."""
-        firsts = accumulate((store.row_count for store in self._stores), initial=0)
-        return tuple(zip(firsts, self._stores, strict=False))
+        self._labels = tuple(labels)
+        self.parts = tuple(zip(accumulate((store.row_count for store in stores), initial=0), stores, strict=False))
 
     def labels(self) -> tuple[str, ...]:
         """Return the label of each row; empty for rows that are left out."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Collection, Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache
@@ -37,7 +37,7 @@ _RUN = "run"
 # This JSON takes the place of a record that a page holds and that counts no more.
 _WITHDRAWN = "null"
 Kind = TypeVar("Kind")
-_adapter = cache(TypeAdapter)
+_adapter: Any = cache(TypeAdapter)
 
 
 @dataclass(frozen=True)
@@ -214,8 +214,6 @@ class RunRecord:
 
 
 RecordType = TypeVar("RecordType", Record, ObjectRecord)
-
-
 # A record for each surface, unless others are asked for.
 _SURFACES: Any = Record
 
@@ -331,33 +329,28 @@ class Records(Generic[RecordType]):
         self.store.location.write({f"{RECORDS}/{ROOT}": json.dumps(group).encode()})
 
 
-def rows_unlike_tables(
-    store: Store, records: Sequence[Record | None], among: Collection[int] | None = None
-) -> dict[int, str]:
-    """Return how records differ from those that the tables were made from, by their rows; of some rows, or of all."""
+def rows_unlike_tables(store: Store, records: Sequence[Record | None]) -> dict[int, str]:
+    """Return how records differ from those that the tables were made from, by their rows."""
     if table_attributes(store, "convergence") is None:
         return {}
     columns = (np.asarray(store.read(f"meshes/{name}")).tolist() for name in ("row", "status", "key"))
-    tabulated = {row: entry for row, *entry in zip(*columns, strict=True) if among is None or row in among}
     unlike = {}
-    for row, entry in tabulated.items():
+    for row, status, key in zip(*columns, strict=True):
         record = records[row] if row < len(records) else None
-        if record is None and entry[0] != "missing":
+        if record is None and status != "missing":
             unlike[row] = "its completion record is missing"
-        elif record is not None and [record.status, record.key] != entry:
+        elif record is not None and (record.status, record.key) != (status, key):
             unlike[row] = "its completion record is not the one that the tables were made from"
     return unlike
 
 
 def _from_table(kind: type[Kind], table: Any, name: str) -> Kind:
-    """Return the record that a table holds."""
     try:
-        record: Kind = _adapter(cast(Hashable, kind)).validate_python(table)
+        return cast(Kind, _adapter(kind).validate_python(table))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         problem = ": ".join(filter(None, (".".join(map(str, first["loc"])), first["msg"])))
         raise _damage(name, problem, table) from error
-    return record
 
 
 def _damage(name: str, problem: str, content: object) -> DamageError:

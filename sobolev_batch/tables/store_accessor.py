@@ -241,10 +241,9 @@ def stored_reducer(tree: xr.DataTree, order: Orders, *meshes: str) -> tuple[Redu
         wanted = {i for i, label in known if not chosen or label in chosen}
         read = {i: Records(part).read_one(i) for i in wanted} if meshes else dict(enumerate(Records(part).read()))
         records = [read[i] if i in wanted else None for i in range(len(own))]
-        for i, problem in (rows_unlike_tables(part, records, wanted) if wanted else {}).items():
-            raise DamageError(
-                f"{part.path}: the field of {own[i]} is damaged ({problem}); run the study again", problem, i
-            )
+        for i, problem in (rows_unlike_tables(part, records) if wanted else {}).items():
+            if i in wanted:
+                raise part.damage(f"the field of {own[i]}", problem, i)
         complete |= {first + row: record for row, record in complete_records(records).items()}
     places = {label: row for row, label in enumerate(labels)}
     for mesh in meshes:
