@@ -98,7 +98,7 @@ def _array_document(
     attributes: dict[Any, Any],
 ) -> bytes:
     is_text = dtype.kind in "OU"
-    codec = {"name": "vlen-utf8", "configuration": {}} if is_text else {"name": "bytes"}
+    codec: dict[str, Any] = {"name": "vlen-utf8", "configuration": {}} if is_text else {"name": "bytes"}
     if not is_text and dtype.itemsize > 1:
         codec["configuration"] = {"endian": "little"}
     return _json(
