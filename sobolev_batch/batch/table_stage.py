@@ -128,7 +128,7 @@ def write_results(
     convergence = results.convergence_table(workspace.plan.study.accuracy)
     convergence.attrs |= {"digest": digest, NUMERICS: numerics}
     replaced = [*replaced, *(hide_tables(store) if _pairs(workspace) is None else ())]
-    store.write(QUALITY, ..., np.array(_qualities(workspace), dtype=object))
+    store.write(QUALITY, [0], _qualities(workspace))
     write_table(store, "meshes", results.meshes)
     write_table(store, "norms", results.norms_table())
     if PAIRS_KEYS not in store.documents:

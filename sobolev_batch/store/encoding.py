@@ -7,7 +7,7 @@ have a hundred each.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import google_crc32c
@@ -22,6 +22,8 @@ LARGEST_CHUNK_BYTES = 64 << 20
 # What missing chunks would read as, by the kind of a dtype. Arrays that tasks fill have NaN also for complex numbers.
 _FILL_VALUES: dict[str, Any] = {"O": "", "U": "", "b": False, "i": 0, "f": "NaN", "c": [0.0, 0.0]}
 _MISSING = {**_FILL_VALUES, "c": ["NaN", "NaN"]}
+# What fills chunks that reach beyond their array.
+_PADDING: dict[str, Any] = {"O": "", "f": np.nan, "c": complex(np.nan, np.nan)}
 # NaN as xarray writes it in attributes: its bytes in base64.
 _NAN = "AAAAAAAA+H8="
 
@@ -58,12 +60,7 @@ def dataset_keys(group: str, dataset: xr.Dataset) -> dict[str, bytes]:
         attributes = {key: _NAN if key == "_FillValue" else value for key, value in encoded.attrs.items()}
         document = _array_document(values.dtype, values.shape, chunks, encoded.dims, _FILL_VALUES, attributes)
         keys[f"{group}/{name}/{ROOT}"] = document
-        padding = {"O": "", "f": np.nan}.get(values.dtype.kind, 0)
-        for index in np.ndindex(*(-(-length // step) for length, step in zip(values.shape, chunks, strict=True))):
-            chunk = values[tuple(slice(i * step, (i + 1) * step) for i, step in zip(index, chunks, strict=True))]
-            whole = np.full(chunks, padding, dtype=values.dtype)
-            whole[tuple(map(slice, chunk.shape))] = chunk
-            keys["/".join([group, str(name), "c", *map(str, index)])] = chunk_of(whole)
+        keys |= {chunk_key(f"{group}/{name}", index): chunk for index, chunk in chunks_of(values, chunks)}
     return keys
 
 
@@ -72,16 +69,24 @@ def with_coordinates(dataset: xr.Dataset) -> xr.Dataset:
     return dataset.set_coords([name for name in dataset.data_vars if " " in str(name)])
 
 
-def chunk_of(values: NDArray[Any]) -> bytes:
-    """Return the bytes of a chunk of texts or numbers, as the codecs of its array encode it, with their checksum."""
-    values = np.ascontiguousarray(values)
-    is_text = values.dtype.kind in "OTU"
-    data = (
-        bytes(_strings.encode(values.astype(object).ravel()))
-        if is_text
-        else values.astype(values.dtype.newbyteorder("<"), copy=False).tobytes()
-    )
-    return data + int(google_crc32c.value(data)).to_bytes(4, "little")
+def chunk_key(name: str, index: Iterable[int]) -> str:
+    """Return the key of a chunk of an array."""
+    return "/".join([name, "c", *map(str, index)])
+
+
+def chunks_of(values: NDArray[Any], steps: Sequence[int]) -> Iterator[tuple[tuple[int, ...], bytes]]:
+    """Yield the indices of chunks of texts or numbers, and their bytes as the codecs of an array encode them."""
+    for index in np.ndindex(*(-(-length // step) for length, step in zip(values.shape, steps, strict=True))):
+        chunk = values[tuple(slice(i * step, (i + 1) * step) for i, step in zip(index, steps, strict=True))]
+        if chunk.shape != tuple(steps):
+            whole = np.full(steps, _PADDING.get(values.dtype.kind, 0), dtype=values.dtype)
+            whole[tuple(map(slice, chunk.shape))] = chunk
+            chunk = whole
+        if chunk.dtype == object:
+            data = bytes(_strings.encode(np.ascontiguousarray(chunk).ravel()))
+        else:
+            data = chunk.astype(chunk.dtype.newbyteorder("<"), copy=False).tobytes()
+        yield index, data + int(google_crc32c.value(data)).to_bytes(4, "little")
 
 
 def _steps(variable: xr.Variable) -> int:

@@ -53,15 +53,10 @@ class Fields:
         """Write a row's values at a place, made of whole chunks, and return their checksum for `read`."""
         name = _array_at(place)
         document = self.store.document(name)
-        step = chunk_shape(document)[1:]
         values = np.ascontiguousarray(values, dtype=document["data_type"])
-        if list(values.shape) == step:
-            index = [row, *(axis.start // length for axis, length in zip(place, step, strict=True))]
-            self.store.write_chunk(name, index, values)
-        else:
-            array = self.store.array(name)
-            with self.store.location.access("written"):
-                array.set_basic_selection((row, *place), values)
+        steps = chunk_shape(document)[1:]
+        index = [row, *(axis.start // step for axis, step in zip(place, steps, strict=True))]
+        self.store.write(name, index, values[None])
         return checksum_of(values)
 
     def read(self, rows: Sequence[int], place: Place, checksums: Sequence[int] | None = None) -> NDArray[Any]:

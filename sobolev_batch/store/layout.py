@@ -18,20 +18,20 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from itertools import accumulate
+from itertools import accumulate, zip_longest
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 import xarray as xr
 import zarr
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 from zarr.abc.store import Store as ZarrStore
 from zarr.storage import StorePath
 
 from sobolev_batch.errors import DamageError, StoreError
 from sobolev_batch.store.checked import CheckedStore, largest_chunk_bytes
-from sobolev_batch.store.encoding import LARGEST_CHUNK_BYTES, ROOT, chunk_of, dataset_keys
+from sobolev_batch.store.encoding import LARGEST_CHUNK_BYTES, ROOT, chunk_key, chunks_of, dataset_keys
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.metadata import (
     MOST_BYTES,
@@ -268,12 +268,10 @@ class Store:
         return _OF_ROWS.union(self.keyed_arrays())
 
     def array(self, name: str) -> zarr.Array[Any]:
-        """Return an array, for reading and writing."""
+        """Return an array, for reading."""
         # The values of fields are compared with their records, which does more.
         path = StorePath(self._keys(name) if name in (FIELD, OCTAVES) else self.checked_keys(name), name)
-        metadata = zarr.AsyncArray.from_dict(path, self.document(name)).metadata
-        # Chunks of zeros are data too: they must exist, or they would read as never computed.
-        return zarr.Array(zarr.AsyncArray(metadata, path, config={"write_empty_chunks": True}))
+        return zarr.Array(zarr.AsyncArray.from_dict(path, self.document(name)))
 
     def checked_keys(self, largest: str = FIELD, *, has_tables: bool = False) -> ZarrStore:
         """Return the store that zarr and xarray take to read arrays up to the largest, whose chunks are checked.
@@ -297,17 +295,18 @@ class Store:
         """Return all elements of an array of strings; see `read`."""
         return tuple(map(str, np.asarray(self.read(name)).tolist()))
 
-    def write(self, name: str, selection: Any, values: Any) -> None:
-        """Write a selection of an array, made of whole chunks."""
-        array = self.array(name)
+    def write(self, name: str, index: Sequence[int], values: ArrayLike) -> None:
+        """Write values of an array, made of whole chunks, from the chunk of an index on, whose last zeros may lack."""
+        document = self.document(name)
+        dtype = object if document["data_type"] == "string" else document["data_type"]
+        chunks = chunks_of(np.asarray(values, dtype=dtype), chunk_shape(document))
         self._forget(f"{name}/c")
-        with self.location.access("written"):
-            array[selection] = values
-
-    def write_chunk(self, name: str, index: Sequence[int], values: NDArray[Any]) -> None:
-        """Write one whole chunk of an array."""
-        self._forget(f"{name}/c")
-        self.location.write({"/".join([name, "c", *map(str, index)]): chunk_of(values)})
+        self.location.write(
+            {
+                chunk_key(name, [start + i for start, i in zip_longest(index, own, fillvalue=0)]): chunk
+                for own, chunk in chunks
+            }
+        )
 
     def publish(self, keys: Mapping[str, bytes]) -> None:
         """Write keys of new nodes. Readers find the nodes after `consolidate`."""
@@ -398,7 +397,7 @@ class Store:
         """Return the keys of all chunks of an array, with their indices."""
         document = self.document(name)
         counts = [-(-length // step) for length, step in zip(document["shape"], chunk_shape(document), strict=True)]
-        return {"/".join([f"{name}/c", *map(str, index)]): index for index in np.ndindex(*counts)}
+        return {chunk_key(name, index): index for index in np.ndindex(*counts)}
 
     def stored_chunks(self, name: str) -> list[int]:
         """Return the numbers of the stored chunks of an array along its only axis. Its metadata need not be there."""

@@ -279,7 +279,7 @@ class Records(Generic[RecordType]):
     def write(self, row: int, record: RecordType | None) -> None:
         """Write the completion record of a row, or withdraw it: one chunk, replaced as a whole."""
         line = _WITHDRAWN if record is None else record.to_json(row)
-        self.store.write_chunk(RECORD, [row], np.array([line], dtype=object))
+        self.store.write(RECORD, [row], [line])
 
     def collect(self, records: Sequence[RecordType | None]) -> None:
         """Collect the records of rows in pages, each of rows that all have one, and remove their own chunks.
@@ -298,9 +298,7 @@ class Records(Generic[RecordType]):
             # In a folder, few records are as quick to read, and less is lost with one of them.
             fewest = 1 if self.store.location.scheme else step
             if fewest <= len(of_page) == len(lines) and sum(map(len, lines)) < most_bytes // 2:
-                # A chunk is whole, also where rows end before it.
-                lines += [""] * (step - len(lines))
-                self.store.write_chunk(PAGE, [page], np.array(lines, dtype=object))
+                self.store.write(PAGE, [page], lines)
                 self.store.location.discard(*(f"{RECORD}/c/{row}" for row in own))
 
     @property

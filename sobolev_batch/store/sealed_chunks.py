@@ -79,9 +79,7 @@ def key_in(text: str) -> str:
 
 def withdraw_chunk(store: Store, keys: str, index: Index) -> None:
     """Erase the keys of a damaged chunk: the next run computes it again."""
-    region = _region(store, keys, index)
-    shape = [axis.stop - axis.start for axis in region]
-    store.write(keys, region, np.full(shape, "", dtype=object))
+    store.write(keys, index, np.full(chunk_shape(store.document(keys)), ""))
 
 
 def _region(store: Store, name: str, index: Index) -> tuple[slice, ...]:

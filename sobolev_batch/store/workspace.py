@@ -7,8 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
-import numpy as np
-
 from sobolev_batch.store.create import prepare_store
 from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.store.layout import QUALITY, Store, hide_tables, stored_choice, table_attributes
@@ -181,7 +179,7 @@ class Workspace(Contents):
             qualities = [
                 record.quality if record and i not in replaced else "" for i, record in enumerate(self.records)
             ]
-            self.store.write(QUALITY, ..., np.array(qualities, dtype=object))
+            self.store.write(QUALITY, [0], qualities)
 
 
 def complete_records(records: Sequence[Record | None]) -> dict[int, Record]:

@@ -130,22 +130,17 @@ def fill_tile(reducer: Reducer, pairs: Pairs, tile: tuple[int, int]) -> None:
     """Compute a tile of distances, and write it with its mirror image; DamageError where a field was changed."""
     sides = [pairs.tile_rows(number) for number in tile]
     estimate = known_distances(reducer, sides[0], sides[1], pairs.keys.keys())
-    spans = [slice(k * pairs.side, k * pairs.side + len(side)) for k, side in zip(tile, sides, strict=True)]
     arrays = {name: np.moveaxis(values, 0, 2) for name, values in sorted(estimate.named("distance").items())}
     mirrored = {name: np.swapaxes(values, 0, 1) for name, values in arrays.items()}
-    both = [(tile, spans, arrays), (tile[::-1], spans[::-1], mirrored)][: len({*tile})]
+    both = {tile: arrays, tile[::-1]: mirrored} if tile[0] != tile[1] else {tile: arrays}
     # Should this be interrupted, no old key may stand for new values.
-    for place, *_ in both:
-        _write_key(pairs.store, place, "")
-    for _, region, values_by_name in both:
+    for place in both:
+        pairs.store.write(PAIRS_KEYS, place, [[""]])
+    for place, values_by_name in both.items():
         for name, values in values_by_name.items():
-            pairs.store.write(f"{DISTANCES}/{name}", tuple(region), values)
-    for place, _, values_by_name in both:
-        _write_key(pairs.store, place, seal(pairs.key_of_tile(tile), values_by_name.values()))
-
-
-def _write_key(store: Store, tile: tuple[int, ...], text: str) -> None:
-    store.write(PAIRS_KEYS, tuple(slice(k, k + 1) for k in tile), np.array([[text]], dtype=object))
+            pairs.store.write(f"{DISTANCES}/{name}", place, values)
+    for place, values_by_name in both.items():
+        pairs.store.write(PAIRS_KEYS, place, [[seal(pairs.key_of_tile(tile), values_by_name.values())]])
 
 
 def known_distances(reducer: Reducer, rows: Sequence[int], others: Sequence[int], complete: Set[int]) -> NormEstimate:

@@ -72,12 +72,12 @@ def fill_chunk(reducer: Reducer, number: int, keys: Mapping[int, str]) -> None:
             seal(keys[row], [values[place] for values in arrays.values()]) if row in of else ""
             for place, row in enumerate(rows)
         ]
-        store.write(SPECTRA_KEYS, slice(rows.start, rows.stop), np.array(texts, dtype=object))
+        store.write(SPECTRA_KEYS, [number], texts)
 
     # Should this be interrupted, no old key may stand for new values.
     write_keys(kept)
     for name, values in arrays.items():
-        store.write(name, slice(rows.start, rows.stop), values)
+        store.write(name, [number], values)
     write_keys(kept | missing)
 
 

@@ -70,7 +70,7 @@ def restore(*names: str) -> Change:
 def relabel(store: Path, earlier: Path) -> None:
     """Write labels in another order. The keys in the records say which field is whose."""
     there = Store.open(store)
-    there.write("fourier/mesh", ..., np.array(there.labels()[::-1], dtype=object))
+    there.write("fourier/mesh", [0], there.labels()[::-1])
 
 
 def trade(store: Path, earlier: Path) -> None:
