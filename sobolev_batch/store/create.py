@@ -122,7 +122,7 @@ def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
             "%s: another lattice follows from the study now; all of %d fields are computed again", store.path, done
         )
         _create(store, plan)
-    _require_same_samples(store, plan, is_trusted=True)
+    _require_same_samples(store, plan)
     stored = store.labels()
     # Only a row whose mesh the study has lost may serve another one.
     is_kept = set(stored) <= {row.label for row in plan.rows}
@@ -153,8 +153,7 @@ def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:
     records, damaged = Records(fresh).examine()
     # Rows end before the last page does.
     count = max([len(stored), 1 + last, *(1 + row for row, record in enumerate(records) if record is not None)])
-    fresh.documents |= _documents_of(record_keys(count))
-    records, damaged = records[:count], {row: what for row, what in damaged.items() if row < count}
+    records = records[:count]
     keys = {row.key for row in plan.rows}
     if damage is not None and not any(record is not None and record.key in keys for record in records):
         raise DamageError(
@@ -166,12 +165,13 @@ def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:
     store.location.remove_partial_files()
     if plan.tail is not None:
         fresh.documents |= _documents_of(dataset_keys(OCTAVES_GROUP, xr.Dataset(coords=_sample_columns(plan.tail))))
-    _require_same_samples(fresh, plan, is_trusted=False)
+    _require_same_samples(fresh, plan)
     labels = _labels_for(plan, (stored + ("",) * count)[:count], records, is_trusted=False)
     _lay_out(fresh, plan, labels, ())
     # Nothing else replaces the record of a row that has lost its label.
     for row in damaged:
-        Records(fresh).write(row, None)
+        if row < count:
+            Records(fresh).write(row, None)
     fresh.consolidate()
     return fresh
 
@@ -181,9 +181,7 @@ def _create(store: Store, plan: Plan) -> None:
     # This process may be killed before all of them exist: until then the content is declared invalid.
     store.location.write({ROOT: json.dumps(_unfinished(plan.study.object.title)).encode()})
     store.location.remove_partial_files()
-    present = store.location.names()
-    others = present - {*LOCK_KEYS, ROOT, RECORDS}
-    for name in (*sorted(others), *((RECORD, PAGE) if RECORDS in present else ())):
+    for name in (*sorted(store.location.names() - {*LOCK_KEYS, ROOT, RECORDS}), RECORD, PAGE):
         store.location.remove(name)
     store.documents = {}
     _lay_out(store, plan, [row.label for row in plan.rows], ())
@@ -195,7 +193,7 @@ def _lay_out(store: Store, plan: Plan, labels: Sequence[str], qualities: Sequenc
     rows, mesh = len(labels), np.array(labels, dtype=object)
     padded = np.array([*qualities, *[""] * (rows - len(qualities))], dtype=object)
     # Whoever reads the field of one mesh reads the qualities of few.
-    chunks = {"chunks": (min(rows, _MOST_SPECTRA),)}
+    quality = "mesh", padded, {}, {"chunks": (min(rows, _MOST_SPECTRA),)}
     units = {"units": "cycles per unit length"}
     axes = {name: (name, axis, units) for name, axis in zip(AXES, plan.lattice.axes, strict=True)}
     keys = {
@@ -211,9 +209,7 @@ def _lay_out(store: Store, plan: Plan, labels: Sequence[str], qualities: Sequenc
         ),
         **dataset_keys(
             "fourier",
-            xr.Dataset(
-                {"quality": ("mesh", padded, {}, chunks)}, coords={**axes, "mesh": mesh, **_weight_columns(plan)}
-            ),
+            xr.Dataset({"quality": quality}, coords={**axes, "mesh": mesh, **_weight_columns(plan)}),
         ),
         **record_keys(rows),
     }
@@ -307,14 +303,14 @@ def _root(attributes: dict[str, Any]) -> dict[str, Any]:
     return {"zarr_format": 3, "node_type": "group", "attributes": attributes}
 
 
-def _require_same_samples(store: Store, plan: Plan, *, is_trusted: bool) -> None:
-    """Check that octaves have the frequencies that are drawn here; of coordinates not trusted, one axis is enough."""
+def _require_same_samples(store: Store, plan: Plan) -> None:
+    """Check that octaves have the frequencies that are drawn here; one axis is enough, since others may be damaged."""
     agree = []
     for name, expected in zip(AXES, () if plan.tail is None else plan.tail.frequencies.T, strict=False):
         with suppress(StoreError, ValueError, TypeError, KeyError):
             stored = np.asarray(store.read(f"{OCTAVES_GROUP}/{name}"))
             agree.append(stored.shape == expected.shape and np.allclose(stored, expected, rtol=1e-9, atol=1e-12))
-    if agree and not (all if is_trusted else any)(agree):
+    if agree and not any(agree):
         raise StoreError(
             f"{store.path}: its octaves were sampled at other frequencies than this version of NumPy draws; use "
             "the versions that the attributes of the store name, or name another store"
@@ -390,13 +386,13 @@ def _attributes(plan: Plan, labels: Sequence[str]) -> dict[str, Any]:
         },
         REMOVED: [label for label in labels if label not in planned],
         "similarity": _similarity_entry(plan.similarity),
-        "versions": {**dict(_versions()), NUMERICS: NUMERICS_VERSION},
+        "versions": {**_versions(), NUMERICS: NUMERICS_VERSION},
     }
 
 
 @cache
-def _versions() -> tuple[tuple[str, str], ...]:
-    return tuple((name, version(name)) for name in _RECORDED_VERSIONS)
+def _versions() -> dict[str, str]:
+    return {name: version(name) for name in _RECORDED_VERSIONS}
 
 
 def _lattice_entry(plan: Plan) -> dict[str, Any]:

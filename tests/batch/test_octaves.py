@@ -137,7 +137,8 @@ def test_damaged_octaves_frequencies_and_labels_are_named_and_made_again(
 
 def test_octaves_at_other_frequencies_are_not_mixed(store: Path, client: Client) -> None:
     stored = Store.open(store)
-    stored.write("octaves/xi_x", [0], np.asarray(stored.read("octaves/xi_x", ...)) + 1.0)
+    for name in ("octaves/xi_x", "octaves/xi_y", "octaves/xi_z"):
+        stored.write(name, [0], np.asarray(stored.read(name)) + 1.0)
     stored.consolidate()
     with pytest.raises(sb.errors.StoreError, match="sampled at other frequencies"):
         sb.run(sb.Study.from_table(asking()), store, client)
