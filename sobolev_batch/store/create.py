@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
@@ -21,7 +21,7 @@ from sobolev_batch.errors import DamageError, StoreError
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms.spectrum import RadialAxis
 from sobolev_batch.norms.tail.sampling import TailSampling
-from sobolev_batch.store.encoding import ROOT, array_keys, dataset_keys
+from sobolev_batch.store.encoding import ROOT, array_keys, dataset_keys, documents_in
 from sobolev_batch.store.layout import (
     DESCRIPTION,
     FIELD,
@@ -149,7 +149,7 @@ def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:
     last, last_page = (max(store.stored_chunks(name), default=-1) for name in (RECORD, PAGE))
     count = max(1 + last, ROWS_PER_PAGE * (1 + last_page))
     fresh = Store(store.location)
-    fresh.documents = _documents_of(record_keys(count))
+    fresh.documents = documents_in(record_keys(count))
     records, damaged = Records(fresh).examine()
     # Rows end before the last page does.
     count = max([len(stored), 1 + last, *(1 + row for row, record in enumerate(records) if record is not None)])
@@ -164,7 +164,7 @@ def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:
     _log.warning("%s: tables or metadata are not what was written, and are made again", store.path)
     store.location.remove_partial_files()
     if plan.tail is not None:
-        fresh.documents |= _documents_of(dataset_keys(OCTAVES_GROUP, xr.Dataset(coords=_sample_columns(plan.tail))))
+        fresh.documents |= documents_in(dataset_keys(OCTAVES_GROUP, xr.Dataset(coords=_sample_columns(plan.tail))))
     _require_same_samples(fresh, plan)
     labels = _labels_for(plan, (stored + ("",) * count)[:count], records, is_trusted=False)
     _lay_out(fresh, plan, labels, ())
@@ -226,7 +226,7 @@ def _lay_out(store: Store, plan: Plan, labels: Sequence[str], qualities: Sequenc
         keys |= dataset_keys(OCTAVES_GROUP, xr.Dataset(coords={**_sample_columns(plan.tail), "mesh": mesh}))
     list_records(store)
     spectra, before = _spectra_keys(plan, mesh), store.documents.get(SPECTRA_KEYS)
-    if before is not None and chunk_shape(before) != chunk_shape(_documents_of(spectra)[SPECTRA_KEYS]):
+    if before is not None and chunk_shape(before) != chunk_shape(documents_in(spectra)[SPECTRA_KEYS]):
         # They are summed up from the fields again.
         store.location.remove(SPECTRA_GROUP)
     store.publish(keys | spectra)
@@ -274,11 +274,6 @@ def _weight_columns(plan: Plan) -> dict[str, tuple[str, Reals, dict[str, str]]]:
     }
     meaning = {"long_name": "factor of the weight of a sample, by the shell |k|² of xi = spacing k"}
     return {**columns, "weight_shell": ("shell", step, meaning)}
-
-
-def _documents_of(keys: dict[str, bytes]) -> dict[str, Any]:
-    ending = f"/{ROOT}"
-    return {key.removesuffix(ending): json.loads(content) for key, content in keys.items() if key.endswith(ending)}
 
 
 def _sample_columns(tail: TailSampling) -> dict[str, tuple[str, NDArray[Any], dict[str, str]]]:
@@ -352,12 +347,12 @@ def _labels_for(plan: Plan, stored: Sequence[str], records: Sequence[Record | No
         label if label in planned and (is_trusted or (record is not None and record.completes(planned[label]))) else ""
         for label, record in zip(stored, records, strict=True)
     ]
-    taken, by_key = set(labels), dict[str, deque[str]]()
+    taken, by_key = set(labels), defaultdict[str, deque[str]](deque)
     for label, key in planned.items():
         if key and label not in taken:
-            by_key.setdefault(key, deque()).append(label)
+            by_key[key].append(label)
     for row, record in enumerate(records):
-        if not labels[row] and record is not None and record.status == "complete" and by_key.get(record.key):
+        if not labels[row] and record is not None and record.status == "complete" and by_key[record.key]:
             labels[row] = by_key[record.key].popleft()
     taken = set(labels)
     for row, label in enumerate(stored):

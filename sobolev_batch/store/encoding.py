@@ -7,7 +7,7 @@ have a hundred each.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import google_crc32c
@@ -62,6 +62,12 @@ def dataset_keys(group: str, dataset: xr.Dataset) -> dict[str, bytes]:
         keys[f"{group}/{name}/{ROOT}"] = document
         keys |= {chunk_key(f"{group}/{name}", index): chunk for index, chunk in chunks_of(values, chunks)}
     return keys
+
+
+def documents_in(keys: Mapping[str, bytes]) -> dict[str, dict[str, Any]]:
+    """Return the metadata documents among keys, by their nodes."""
+    ending = f"/{ROOT}"
+    return {key.removesuffix(ending): json.loads(content) for key, content in keys.items() if key.endswith(ending)}
 
 
 def with_coordinates(dataset: xr.Dataset) -> xr.Dataset:

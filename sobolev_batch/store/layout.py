@@ -31,7 +31,7 @@ from zarr.storage import StorePath
 
 from sobolev_batch.errors import DamageError, StoreError
 from sobolev_batch.store.checked import CheckedStore, largest_chunk_bytes
-from sobolev_batch.store.encoding import LARGEST_CHUNK_BYTES, ROOT, chunk_key, chunks_of, dataset_keys
+from sobolev_batch.store.encoding import LARGEST_CHUNK_BYTES, ROOT, chunk_key, chunks_of, dataset_keys, documents_in
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.metadata import (
     MOST_BYTES,
@@ -311,10 +311,8 @@ class Store:
     def publish(self, keys: Mapping[str, bytes]) -> None:
         """Write keys of new nodes. Readers find the nodes after `consolidate`."""
         self.location.write(keys)
-        for key, content in keys.items():
-            self._hashes[key] = hashlib.sha256(content).hexdigest()
-            if key.endswith(f"/{ROOT}"):
-                self.documents[key.removesuffix(f"/{ROOT}")] = json.loads(content)
+        self._hashes |= {key: hashlib.sha256(content).hexdigest() for key, content in keys.items()}
+        self.documents |= documents_in(keys)
 
     def remove(self, group: str) -> None:
         """Remove a group and everything in it, first from what readers find."""

@@ -320,14 +320,10 @@ class FolderStore(LocalStore):
     def put(self, key: str, content: bytes) -> None:
         """Replace a file as a whole, as `set` does."""
         path = self.root / key
+        path.parent.mkdir(parents=True, exist_ok=True)
         partial = path.with_suffix(f".{uuid4().hex}.partial")
         try:
-            try:
-                partial.write_bytes(content)
-            except FileNotFoundError:
-                # Most folders are there.
-                path.parent.mkdir(parents=True, exist_ok=True)
-                partial.write_bytes(content)
+            partial.write_bytes(content)
             partial.replace(path)
         except Exception:
             partial.unlink(missing_ok=True)

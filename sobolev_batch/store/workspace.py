@@ -124,7 +124,10 @@ class Workspace(Contents):
     def prepared(cls, location: Location, plan: Plan) -> Self:
         """Create or open the store of a plan, and withdraw the records of lost fields; see `prepare_store`."""
         workspace = cls.for_plan(prepare_store(location, plan), plan)
-        workspace._withdraw_lost_fields()
+        complete = workspace.complete
+        if complete:
+            whole = Fields(workspace.store).complete_rows()
+            workspace.withdraw((i for i in complete if i not in whole), "it is not there, or not all of it")
         return workspace
 
     @classmethod
@@ -156,13 +159,6 @@ class Workspace(Contents):
         """Collect records in pages, and remember what tables hold: later runs take fewer requests."""
         Records(self.store).collect(self.records)
         self.store.remember()
-
-    def _withdraw_lost_fields(self) -> None:
-        """Withdraw the records of fields that are not in the store, or not as a whole."""
-        complete = self.complete
-        if complete:
-            whole = Fields(self.store).complete_rows()
-            self.withdraw((i for i in complete if i not in whole), "it is not there, or not all of it")
 
     def withdraw(self, rows: Iterable[int], reason: str) -> None:
         """Withdraw the records of damaged fields, which makes them pending."""
