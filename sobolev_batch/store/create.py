@@ -193,7 +193,7 @@ def _lay_out(store: Store, plan: Plan, labels: Sequence[str], qualities: Sequenc
     rows, mesh = len(labels), np.array(labels, dtype=object)
     padded = np.array([*qualities, *[""] * (rows - len(qualities))], dtype=object)
     # Whoever reads the field of one mesh reads the qualities of few.
-    quality = "mesh", padded, {}, {"chunks": (min(rows, _MOST_SPECTRA),)}
+    quality: Any = "mesh", padded, {}, {"chunks": (min(rows, _MOST_SPECTRA),)}
     units = {"units": "cycles per unit length"}
     axes = {name: (name, axis, units) for name, axis in zip(AXES, plan.lattice.axes, strict=True)}
     keys = {

@@ -56,7 +56,8 @@ def dataset_keys(group: str, dataset: xr.Dataset) -> dict[str, bytes]:
     for name, variable in variables.items():
         chunks = variable.encoding.get("chunks", (_steps(variable), *variable.shape[1:]))
         encoded = variable if variable.dtype == bool else xr.conventions.encode_cf_variable(variable)
-        values = encoded.values
+        # What xarray has read from a store has another type of texts.
+        values = encoded.values.astype(object) if encoded.dtype.kind in "TU" else encoded.values
         attributes = {key: _NAN if key == "_FillValue" else value for key, value in encoded.attrs.items()}
         document = _array_document(values.dtype, values.shape, chunks, encoded.dims, _FILL_VALUES, attributes)
         keys[f"{group}/{name}/{ROOT}"] = document
