@@ -181,7 +181,9 @@ def _create(store: Store, plan: Plan) -> None:
     # This process may be killed before all of them exist: until then the content is declared invalid.
     store.location.write({ROOT: json.dumps(_unfinished(plan.study.object.title)).encode()})
     store.location.remove_partial_files()
-    for name in (*sorted(store.location.names() - {*LOCK_KEYS, ROOT, RECORDS}), RECORD, PAGE):
+    present = store.location.names()
+    others = present - {*LOCK_KEYS, ROOT, RECORDS}
+    for name in (*sorted(others), *((RECORD, PAGE) if RECORDS in present else ())):
         store.location.remove(name)
     store.documents = {}
     _lay_out(store, plan, [row.label for row in plan.rows], ())
