@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -31,25 +31,17 @@ _AXIS_BITS = 20
 _NEIGHBOURS, _EVEN_SHARE, _UNSEEN = 8, 0.25, 1e-6
 
 
-@dataclass(frozen=True, eq=False)
-class Draw:
+class Draw(NamedTuple):
     """Random points on a signed sum of surfaces.
 
     Attributes:
         points: Float64 (n, 3).
-        own: Sign of the surface of each point (n,).
-        weights: Inverse density (n,): Σ weights · f is the integral of f over all surfaces, in expectation.
+        weights: Inverse density times the sign of the surface of each point (n,): Σ weights · f is the integral of f
+            over the signed sum, in expectation.
     """
 
     points: Reals
-    own: Reals
     weights: Reals
-
-    def joined(self, other: Draw) -> Draw:
-        """Return the points of two draws of one density."""
-        share = len(self.points) / (len(self.points) + len(other.points))
-        weights = np.concatenate([share * self.weights, (1 - share) * other.weights])
-        return Draw(np.concatenate([self.points, other.points]), np.concatenate([self.own, other.own]), weights)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +50,6 @@ class Sheets:
 
     Attributes:
         meshes: Meshes, and those that stand for smooth surfaces.
-        spheres: Spheres.
         spacing: Triangles are in the order of cells of this width, and long ones are cut into pieces no longer.
     """
 
@@ -83,7 +74,16 @@ class Sheets:
     @property
     def cancel(self) -> bool:
         """True where the sum has differences."""
-        return len({sign for _, sign in (*self.meshes, *self.spheres)}) > 1
+        return len(set(self._signs)) > 1
+
+    @property
+    def _signs(self) -> list[int]:
+        return [sign for _, sign in (*self.meshes, *self.spheres)]
+
+    @property
+    def area(self) -> float:
+        """Area of all surfaces together."""
+        return sum(surface.area for surface, _ in (*self.meshes, *self.spheres))
 
     def triangles(self) -> Iterator[SignedTriangles]:
         """Yield the triangles of the meshes: all at once, and once for all, where they are not many."""
@@ -102,32 +102,30 @@ class Sheets:
         several = [SignedTriangles.with_area(mesh.vertices[mesh.triangles], sign) for mesh, sign in self.meshes]
         return SignedTriangles.joined(several)
 
-    @property
-    def area(self) -> float:
-        """Area of all surfaces together."""
-        return sum(mesh.area for mesh, _ in self.meshes) + sum(sphere.area for sphere, _ in self.spheres)
+    @cached_property
+    def _parts(self) -> list[Mesh | Sphere]:
+        """Meshes whose triangles follow space, the long ones in pieces, and spheres."""
+        return [*(_ordered(mesh, self.spacing) for mesh, _ in self.meshes), *(sphere for sphere, _ in self.spheres)]
 
     @cached_property
-    def _pieces(self) -> list[Mesh]:
-        """Meshes whose triangles follow space, the long ones in pieces."""
-        return [_ordered(mesh, self.spacing) for mesh, _ in self.meshes]
+    def _areas(self) -> list[Reals]:
+        """Area of each triangle or piece of each mesh, and of each sphere."""
+        return [part.areas if isinstance(part, Mesh) else np.array([part.area]) for part in self._parts]
 
     @cached_property
-    def _levels(self) -> tuple[Reals, Indices]:
-        """Area up to the end of each triangle or sphere, and where those of each surface begin."""
-        areas = [np.asarray(mesh.areas) for mesh in self._pieces] + [np.array([it.area]) for it, _ in self.spheres]
-        return np.cumsum(np.concatenate(areas)), np.cumsum([0, *map(len, areas)])
-
-    def even(self, count: int, rng: np.random.Generator) -> Draw:
-        """Draw points evenly by area, one on each of equal parts."""
-        levels, _ = self._levels
-        return self._drawn(count, levels, np.broadcast_to(levels[-1] / count, levels.shape), rng)
+    def _levels(self) -> Reals:
+        """Area up to the end of each triangle, piece or sphere (m,)."""
+        return np.cumsum(np.concatenate(self._areas))
 
     @cached_property
     def centers(self) -> Reals:
         """Centroid of each triangle, piece or sphere (m, 3)."""
-        centers = [centers_and_radii(piece.vertices[piece.triangles])[0] for piece in self._pieces]
-        return np.concatenate([*centers, *(np.array([sphere.center]) for sphere, _ in self.spheres)])
+        return np.concatenate(
+            [
+                centers_and_radii(part.vertices[part.triangles])[0] if isinstance(part, Mesh) else [part.center]
+                for part in self._parts
+            ]
+        )
 
     def around(self, points: Reals, seen: Reals) -> Reals:
         """Return the most that points (n,) nearby saw, for each triangle, piece or sphere (m,)."""
@@ -138,39 +136,42 @@ class Sheets:
 
     def largest(self, densities: Reals, count: int) -> Indices:
         """Return the triangles, pieces or spheres on which densities (m,) put the most points, at most a number."""
-        shares = np.diff(self._levels[0], prepend=0.0) * densities
+        shares = np.diff(self._levels, prepend=0.0) * densities
         return np.argsort(-shares)[: min(count, np.count_nonzero(shares > _UNSEEN * shares.max()))]
+
+    def even(self, count: int, rng: np.random.Generator) -> Draw:
+        """Draw points evenly by area, one on each of equal parts."""
+        return self._drawn(count, self._levels, np.broadcast_to(self._levels[-1] / count, self._levels.shape), rng)
 
     def in_proportion(self, densities: Reals, count: int, rng: np.random.Generator) -> Draw:
         """Draw points in proportion to densities (m,), most of them, and evenly by area for the others."""
-        areas = np.diff(self._levels[0], prepend=0.0)
+        areas = np.diff(self._levels, prepend=0.0)
         shares = areas * (_EVEN_SHARE / areas.sum() + (1 - _EVEN_SHARE) * densities / (areas @ densities))
         weights = np.divide(areas, count * shares, out=np.zeros_like(areas), where=shares > 0)
         return self._drawn(count, np.cumsum(shares), weights, rng)
 
     def _drawn(self, count: int, levels: Reals, weights: Reals, rng: np.random.Generator) -> Draw:
-        """Draw points in triangles, pieces and on spheres, one for each of equal parts of their cumulative shares (m,).
+        """Draw one point for each of equal parts of the cumulative shares (m,) of triangles, pieces and spheres.
 
         The weights (m,) are those of a point on each of them.
         """
-        starts = self._levels[1]
         places = (np.arange(count) + rng.random(count)) / count * levels[-1]
         chosen = np.minimum(np.searchsorted(levels, places), len(levels) - 1)
-        signs = np.repeat([float(sign) for _, sign in (*self.meshes, *self.spheres)], np.diff(starts))[chosen]
         first, second = np.sqrt(rng.random((count, 1))), rng.random((count, 1))
         directions = rng.normal(size=(count, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        points = np.empty((count, 3))
-        surfaces: list[Mesh | Sphere] = [*self._pieces, *(sphere for sphere, _ in self.spheres)]
-        for number, surface in enumerate(surfaces):
-            here = (chosen >= starts[number]) & (chosen < starts[number + 1])
-            if isinstance(surface, Sphere):
-                points[here] = surface.center + surface.radius * directions[here]
-                continue
-            a, b, c = np.moveaxis(surface.vertices[surface.triangles[chosen[here] - starts[number]]], 1, 0)
-            r, t = first[here], second[here]
-            points[here] = (1 - r) * a + r * (1 - t) * b + r * t * c
-        return Draw(points, signs, weights[chosen])
+        points, signed, start = np.empty((count, 3)), weights[chosen], 0
+        for part, areas, sign in zip(self._parts, self._areas, self._signs, strict=True):
+            here = (chosen >= start) & (chosen < start + len(areas))
+            signed[here] *= sign
+            if isinstance(part, Sphere):
+                points[here] = part.center + part.radius * directions[here]
+            else:
+                a, b, c = part.corners(chosen[here] - start)
+                r, t = first[here], second[here]
+                points[here] = (1 - r) * a + r * (1 - t) * b + r * t * c
+            start += len(areas)
+        return Draw(points, signed)
 
 
 def _ordered(mesh: Mesh, spacing: float) -> Mesh:
@@ -197,33 +198,23 @@ def _pieces_of_long(mesh: Mesh, spacing: float) -> tuple[Reals, Indices]:
     """Return pieces (n, 3, 3) of triangles with edges longer than a spacing, and the triangles that have none."""
     if mesh.edge_length_range[1] <= spacing:
         return np.zeros((0, 3, 3)), np.arange(len(mesh.triangles))
-    rows = np.arange(len(mesh.triangles))
-    is_long = np.zeros(len(rows), dtype=bool)
-    for start in range(0, len(rows), _HELD):
-        corners = mesh.vertices[mesh.triangles[start : start + _HELD]]
-        # A triangle of less area than one in some points has would not get another point.
-        is_large = mesh.areas[start : start + _HELD] > spacing**2 / _POINTLESS
-        is_long[start : start + _HELD] = is_large & (_edges(corners).max(axis=1) > spacing)
+    # A triangle of less area than one in some points has would not get another point.
+    is_long = (mesh.areas > spacing**2 / _POINTLESS) & (mesh.edge_lengths.max(axis=1) > spacing)
     done, pieces = [], mesh.vertices[mesh.triangles[is_long]]
     while len(pieces):
-        lengths = _edges(pieces)
+        # Of the edge behind each corner.
+        lengths = np.linalg.norm(np.roll(pieces, -1, axis=1) - pieces, axis=2)
         short = lengths.max(axis=1) <= spacing
         done.append(pieces[short])
         pieces, longest = pieces[~short], lengths[~short].argmax(axis=1)
         if sum(map(len, done)) + 2 * len(pieces) > _MOST_PIECES:
             done.append(pieces)
             break
-        turn = np.arange(len(pieces))[:, None], (longest[:, None] + np.arange(3)) % 3
-        pieces = pieces[turn]
-        middle = (pieces[:, 0] + pieces[:, 1]) / 2
-        a, b, c = np.moveaxis(pieces, 1, 0)
+        turned = (longest[:, None] + np.arange(3)) % 3
+        a, b, c = np.moveaxis(pieces[np.arange(len(pieces))[:, None], turned], 1, 0)
+        middle = (a + b) / 2
         pieces = np.concatenate([np.stack([a, middle, c], 1), np.stack([middle, b, c], 1)])
-    return np.concatenate([np.zeros((0, 3, 3)), *done]), rows[~is_long]
-
-
-def _edges(corners: Reals) -> Reals:
-    """Return the length of the edge behind each corner (n, 3, 3), (n, 3)."""
-    return np.asarray(np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2))
+    return np.concatenate([np.zeros((0, 3, 3)), *done]), np.flatnonzero(~is_long)
 
 
 def _triangulated(surface: Smooth, cutoff: float) -> Mesh:

@@ -174,14 +174,17 @@ def _estimate(seen_by: _Seen, count: int, rng: np.random.Generator, *, is_exact:
     elif count > total:
         further = sheets.even(count - total, rng)
         found, more = seen_by.potentials(further.points)
-        draw, potentials = draw.joined(further), np.concatenate([potentials, found])
+        points, weights = map(np.concatenate, zip(draw, further, strict=True))
+        # Both have the same density.
+        weights *= np.repeat([total / count, (count - total) / count], [total, count - total])
+        draw, potentials = Draw(points, weights), np.concatenate([potentials, found])
         total, pairs = count, pairs + more
     n = len(draw.points)
-    terms = n * (draw.weights * draw.own)[:, None] * potentials
+    terms = n * draw.weights[:, None] * potentials
     means = terms.mean(axis=0)
     # A single point may stand for others like it that were not met.
     variances = terms.var(axis=0, ddof=1) / n + (np.abs(terms - means).max(axis=0) / n) ** 2
-    missed = (draw.weights.max() * seen_by.alone) ** 2 * float(total < covering)
+    missed = (np.abs(draw.weights).max() * seen_by.alone) ** 2 * float(total < covering)
     variances += missed
     hidden = float((missed / np.maximum(variances, np.finfo(np.float64).tiny)).max())
     errors = np.sqrt(variances) * quantile(n - 1)
@@ -240,7 +243,7 @@ class _Seen:
         chosen = np.sort(rng.choice(n, count, replace=False))
         finer = _Seen(self.sheets, self.kernels.finer, self.execution)
         changes = finer.potentials(draw.points[chosen])[0] - potentials[chosen]
-        changes *= n * (draw.weights * draw.own)[chosen, None]
+        changes *= n * draw.weights[chosen, None]
         return changes.mean(axis=0), changes.std(axis=0, ddof=1) / np.sqrt(count) * quantile(count - 1)
 
     def affordable(self, rng: np.random.Generator) -> int:
