@@ -21,7 +21,6 @@ from typing import Self
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
-from numpy.typing import NDArray
 from scipy.special import beta, betainc
 
 from sobolev_batch import compiled
@@ -77,8 +76,7 @@ def tail_integral(cutoff: float, order: float) -> float:
 
 
 def _power_integral(lowest: float, order: float) -> float:
-    """Return ∫ (1+r²)^s dr from a radius on."""
-    # With p = 1/(1+r²) it is half an incomplete beta integral.
+    """Return ∫ (1+r²)^s dr from a radius on, with p = 1/(1+r²) half an incomplete beta integral."""
     exponent = -order - 0.5
     return 0.5 * float(beta(exponent, 0.5) * betainc(exponent, 0.5, 1 / (1 + lowest**2)))
 
@@ -121,20 +119,13 @@ class Kernels:
             np.stack(rows, axis=-1)
             for rows in zip(*(_tables(cutoff, order, fineness) for order in orders), strict=True)
         )
-        reach = fineness * max(map(reach_of, orders)) / cutoff
-        return cls(
-            cutoff, tuple(orders), fineness, reach, start, (end - start) / (len(drops) - 1), totals, drops, values
-        )
+        reach, step = fineness * max(map(reach_of, orders)) / cutoff, (end - start) / (len(drops) - 1)
+        return cls(cutoff, tuple(orders), fineness, reach, start, step, totals, drops, values)
 
     @property
     def finer(self) -> Kernels:
         """The same kernels up to twice their reach, with twice the nodes."""
         return self.of_orders(self.cutoff, self.orders, 2 * self.fineness)
-
-    def on(self, backend: Backend) -> Kernels:
-        """The same kernels with their tables in arrays of a backend."""
-        tables = {name: backend.upload(getattr(self, name)) for name in ("totals", "drops", "values")}
-        return replace(self, **tables)
 
     def looked_up(self, table: Array, squares: Array) -> Array:
         """Return a table's values at each d², (..., orders)."""
@@ -223,7 +214,8 @@ class SignedTriangles:
     @classmethod
     def with_area(cls, corners: Reals, sign: float) -> Self:
         """Return triangles of one sign, without those that have no area."""
-        corners = corners[doubled_normals(corners)[1] > 0]
+        doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        corners = corners[doubled > 0]
         return cls(corners, np.full(len(corners), float(sign)))
 
     @classmethod
@@ -273,16 +265,15 @@ def _on_device(points: Reals, triangles: SignedTriangles, kernels: Kernels, back
     A GPU looks at each pair in less time than it takes to upload what trees find.
     """
     centers, radii = triangles.balls
-    given = points, triangles.corners, triangles.signs, centers, (kernels.reach + radii) ** 2
+    given = points, triangles.corners, triangles.signs, centers, kernels.reach + radii
     points, corners, signs, centers, farthest = map(backend.upload, given)
-    kernels = kernels.on(backend)
+    tables = {name: backend.upload(getattr(kernels, name)) for name in ("totals", "drops", "values")}
+    kernels = replace(kernels, **tables)
     step, count = max(1, _PAIRS_ON_DEVICE // len(centers)), 0
     totals = np.zeros((len(kernels.orders), len(points)), like=points)
     for start in range(0, len(points), step):
         here = points[start : start + step]
-        offsets = (here[:, axis][:, None] - centers[:, axis] for axis in range(3))
-        squares = sum(offset * offset for offset in offsets)
-        rows, columns = np.nonzero(squares < farthest)
+        rows, columns = np.nonzero(_are_close(here, centers, farthest))
         count += len(rows)
         for first in range(0, len(rows), _BATCH_ON_DEVICE):
             row, column = rows[first : first + _BATCH_ON_DEVICE], columns[first : first + _BATCH_ON_DEVICE]
@@ -314,20 +305,16 @@ def add_compiled(
     longest = _PANEL / kernels.fineness, _PANEL_WAVES / kernels.fineness / kernels.cutoff
     panels = *longest, _LAST, np.stack(_PANEL_NODES)
 
-    def add(part: slice) -> None:
-        own = np.zeros_like(potentials) if threads > 1 else potentials
-        rows, columns = pairs[0][part], pairs[1][part]
-        faces = triangles.corners, triangles.signs
-        add_potentials(own, points, *faces, rows, columns, tables, panels, limits, nodes, ends)
-        if threads > 1:
-            sums.append(own)
+    faces = triangles.corners, triangles.signs
 
-    sums: list[Reals] = []
-    bounds = np.linspace(0, len(pairs[0]), threads + 1).astype(int)
+    def sums_of(rows: Indices, columns: Indices) -> Reals:
+        sums = np.zeros_like(potentials)
+        add_potentials(sums, points, *faces, rows, columns, tables, panels, limits, nodes, ends)
+        return sums
+
     with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(add, map(slice, bounds[:-1], bounds[1:])))
-    for own in sums:
-        potentials += own
+        for sums in pool.map(sums_of, *(np.array_split(side, threads) for side in pairs)):
+            potentials += sums
 
 
 def of_triangles(points: Array, corners: Array, kernels: Kernels) -> Array:
@@ -421,21 +408,10 @@ def _crosses(first: Array, second: Array) -> Array:
     return np.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx])
 
 
-def doubled_normals(corners: Reals) -> tuple[Reals, Reals]:
-    """Return normals (n, 3) of triangles and their lengths (n,), twice the areas."""
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return normals, np.sqrt(_squares(normals))
-
-
-def _squares(vectors: Reals) -> Reals:
-    """Return the squared lengths of vectors (..., 3)."""
-    return np.asarray(vectors[..., 0] ** 2 + vectors[..., 1] ** 2 + vectors[..., 2] ** 2)
-
-
 def centers_and_radii(corners: Reals) -> tuple[Reals, Reals]:
     """Return the centroids (n, 3) of triangles, and the distance of the farthest corner (n,)."""
     centers = (corners[:, 0] + corners[:, 1] + corners[:, 2]) / 3
-    return centers, np.sqrt(_squares(corners - centers[:, None]).max(axis=1))
+    return centers, np.linalg.norm(corners - centers[:, None], axis=2).max(axis=1)
 
 
 def _close_share(points: Reals, centers: Reals, farthest: Reals) -> float:
@@ -444,9 +420,9 @@ def _close_share(points: Reals, centers: Reals, farthest: Reals) -> float:
     return float(_are_close(points[some], centers[which], farthest[which]).mean())
 
 
-def _are_close(points: Reals, centers: Reals, farthest: Reals) -> NDArray[np.bool_]:
-    squares = sum((points[:, None, axis] - centers[:, axis]) ** 2 for axis in range(3))
-    return np.asarray(squares < farthest**2)
+def _are_close(points: Array, centers: Array, farthest: Array) -> Array:
+    offsets = (points[:, axis, None] - centers[:, axis] for axis in range(3))
+    return sum(offset * offset for offset in offsets) < farthest * farthest
 
 
 def _close_pairs(
