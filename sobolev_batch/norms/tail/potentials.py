@@ -26,6 +26,7 @@ from scipy.special import beta, betainc
 from sobolev_batch import compiled
 from sobolev_batch.arrays import Array, Indices, Reals
 from sobolev_batch.geometry.closed_forms import Sphere
+from sobolev_batch.geometry.mesh import cross
 from sobolev_batch.transform.backends import CPU, Backend, combine, compute_on, sums_at
 from sobolev_batch.transform.fourier import ON_CPU, Execution
 from sobolev_batch.transform.lattice import smooth_step
@@ -325,7 +326,7 @@ def of_triangles(points: Array, corners: Array, kernels: Kernels) -> Array:
     # Axes, corners, pairs.
     rows = np.ascontiguousarray((corners - points[:, None]).T, like=points)
     a, b, c = rows[:, 0], rows[:, 1], rows[:, 2]
-    normals, center = _crosses(b - a, c - a), (a + b + c) / 3
+    normals, center = np.stack(cross(b - a, c - a)), (a + b + c) / 3
     doubled, distances = np.sqrt(_dots(normals, normals)), np.sqrt(_dots(center, center))
     arms = [corner - center for corner in (a, b, c)]
     squares = [_dots(arm, arm) for arm in arms]
@@ -358,7 +359,7 @@ def _over_edges(corners: Array, normals: Array, kernels: Kernels) -> Array:
     along = ends - corners
     along /= np.sqrt(_dots(along, along))
     first, last = _dots(corners, along), _dots(ends, along)
-    offsets = _dots(normals[:, None], _crosses(corners, along))
+    offsets = _dots(normals[:, None], cross(corners, along))
     heights = np.repeat(_dots(normals, corners[:, 0])[None], 3, axis=0)
     # From the foot on the line of an edge to both ends, or between the two where they are on one side of it.
     one_side, first, last = first * last > 0, np.abs(first), np.abs(last)
@@ -400,12 +401,6 @@ def _of_span(offsets: Array, heights: Array, near: Array, far: Array, *, kernels
 def _dots(first: Array, second: Array) -> Array:
     """Return the products (...) of vectors (3, ...)."""
     return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
-
-
-def _crosses(first: Array, second: Array) -> Array:
-    """Return the vector products (3, ...) of vectors (3, ...)."""
-    (ux, uy, uz), (vx, vy, vz) = first, second
-    return np.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx])
 
 
 def centers_and_radii(corners: Reals) -> tuple[Reals, Reals]:

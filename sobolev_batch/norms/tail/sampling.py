@@ -125,41 +125,39 @@ class OctaveSampling:
         # Tasks make the samples anew: it is cheaper than sending them.
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
-    @property
-    def frequencies(self) -> Reals:
-        """ξ along the axes of the surfaces, float64 (n, 3), in cycles per unit length; drawn ones come last."""
-        return self._samples[0]
-
-    @property
-    def weights(self) -> Reals:
-        """Weight of each sample in the integral over all of frequency space (n,), the octave's window included."""
-        return self._samples[1]
-
-    @property
+    @cached_property
     def sample_sets(self) -> tuple[SampleSet, ...]:
         """The samples of each lattice, and the drawn ones last."""
-        return self._samples[2]
-
-    @property
-    def radii(self) -> Reals:
-        """|ξ| of each sample (n,)."""
-        return self._samples[3]
-
-    @cached_property
-    def _samples(self) -> tuple[Reals, Reals, tuple[SampleSet, ...], Reals]:
-        found = [_lattice_samples(lattice) for lattice in self.lattices]
-        frequencies = np.concatenate([*(samples[0] for samples in found), self._drawn()])
-        multiples = np.concatenate([*(samples[1] for samples in found), np.ones(self.draws)])
-        # NumPy's own norm of short rows takes three times as long.
-        radii = np.sqrt(sum(np.square(frequencies[:, axis]) for axis in range(3)))
-        density = sum(lattice.spacing**-3 for lattice in self.lattices) + self._density(frequencies, radii)
-        weights = multiples * self.octave.window(radii) / density
         sets, first = [], 0
-        for places, starts in (samples[2:] for samples in found):
+        for places, starts in map(_places_and_starts, self.lattices):
             sets.append(SampleSet(slice(first, first + len(places)), starts, places))
             first += len(places)
-        sets.append(SampleSet(slice(first, len(weights)), None, _NOWHERE))
-        return frequencies, weights, tuple(sets), radii
+        return (*sets, SampleSet(slice(first, first + self.draws), None, _NOWHERE))
+
+    @cached_property
+    def frequencies(self) -> Reals:
+        """ξ along the axes of the surfaces, float64 (n, 3), in cycles per unit length; drawn ones come last."""
+        found = []
+        for lattice, sample_set in zip(self.lattices, self.sample_sets, strict=False):
+            indices = np.unravel_index(sample_set.places, lattice.half.shape)
+            own = np.stack([axis[i] for axis, i in zip(lattice.frequencies(lattice.half), indices, strict=True)])
+            found.append(combine(lattice.rotation.T, own).T)
+        return np.concatenate([*found, self._drawn()])
+
+    @cached_property
+    def radii(self) -> Reals:
+        """|ξ| of each sample (n,)."""
+        # NumPy's own norm of short rows takes three times as long.
+        return np.asarray(np.sqrt(sum(np.square(self.frequencies[:, axis]) for axis in range(3))))
+
+    @cached_property
+    def weights(self) -> Reals:
+        """Weight of each sample in the integral over all of frequency space (n,), the octave's window included."""
+        weights = self.octave.window(self.radii)
+        for lattice, sample_set in zip(self.lattices, self.sample_sets, strict=False):
+            weights[sample_set.samples] *= lattice.half_weights()[sample_set.places % lattice.half.shape[2]]
+        density = sum(lattice.spacing**-3 for lattice in self.lattices) + self._density(self.frequencies, self.radii)
+        return np.asarray(weights / density)
 
     def _drawn(self) -> Reals:
         """Draw frequencies, float64 (draws, 3)."""
@@ -191,19 +189,16 @@ class OctaveSampling:
         return {"draws": self.draws, "seed": self.seed, "uniform_fraction": self.uniform_fraction}
 
 
-def _lattice_samples(lattice: OctaveLattice) -> tuple[Reals, Reals, Indices, Indices]:
-    """Return the frequencies in the lattice's range by sublattice, how often each counts, places, and starts."""
-    block = lattice.half
-    x, y, z = lattice.frequencies(block)
+def _places_and_starts(lattice: OctaveLattice) -> tuple[Indices, Indices]:
+    """Return the places of the samples in a lattice's range, by sublattice, and the first sample of each of these."""
+    x, y, z = lattice.frequencies(lattice.half)
     squares = (x**2)[:, None, None] + (y**2)[:, None] + z**2
-    i, j, k = np.nonzero((squares > lattice.lowest**2) & (squares < lattice.highest**2))
+    indices = np.nonzero((squares > lattice.lowest**2) & (squares < lattice.highest**2))
+    i, j, k = indices
     sublattices = (4 * (i % 2) + 2 * (j % 2) + k % 2).astype(np.int8)
     order = np.argsort(sublattices, kind="stable")
-    i, j, k = i[order], j[order], k[order]
     starts = np.searchsorted(sublattices[order], np.arange(_SUBLATTICES)).astype(np.int64)
-    own = np.stack([x[i], y[j], z[k]])
-    places = np.ravel_multi_index((i, j, k), block.shape).astype(np.int64)
-    return combine(lattice.rotation.T, own).T, lattice.half_weights()[k], places, starts
+    return np.ravel_multi_index(indices, lattice.half.shape)[order].astype(np.int64), starts
 
 
 @dataclass(frozen=True, eq=False)
