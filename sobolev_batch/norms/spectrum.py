@@ -23,6 +23,9 @@ from sobolev_batch.transform.lattice import Lattice, smooth_step
 
 # Radii for a group of samples of an octave: the weights of orders down to -12 are exact to 1e-13 of the largest one.
 _NODES = 40
+# Chebyshev points and their barycentric weights.
+_ANGLES = np.pi * (np.arange(_NODES) + 0.5) / _NODES
+_POINTS, _POINT_WEIGHTS = -np.cos(_ANGLES), np.where(np.arange(_NODES) % 2, -1.0, 1.0) * np.sin(_ANGLES)
 # Orders at which the largest sample is known. Between them its logarithm is convex in the order, and below the chord.
 _PEAK_ORDERS = np.array([-0.5, -1, -1.5, -2, -2.5, -3, -3.5, -4, -5, -6, -8, -10, -14, -20, -100])
 
@@ -79,12 +82,8 @@ class ComparedSpectra:
 
     def product(self, reference: Spectra) -> Spectra:
         """Return the spectra of the products, whose moments and peaks are bounded by Schwarz's inequality."""
-        difference = self.distance
-        moments, peaks = (
-            np.sqrt(np.maximum(one, 0.0) * np.maximum(other, 0.0))
-            for one, other in ((difference.moments, reference.moments), (difference.peaks, reference.peaks))
-        )
-        return Spectra(self.arrays["product"], moments, peaks)
+        moments = _geometric_means(self.distance.moments, reference.moments)
+        return Spectra(self.arrays["product"], moments, _geometric_means(self.distance.peaks, reference.peaks))
 
     def _spectra(self, name: str) -> Spectra:
         sums = self.arrays[name]
@@ -125,7 +124,7 @@ class _Segment:
     def node_lengths(self) -> Reals:
         """1 + r² of the radii r of one group (_NODES,): Chebyshev points in the logarithm."""
         low, high = np.log1p(np.array([self.sampling.octave.lowest, self.sampling.octave.highest]) ** 2)
-        return np.asarray(np.exp((low + high) / 2 + (high - low) / 2 * _chebyshev_points()))
+        return np.asarray(np.exp((low + high) / 2 + (high - low) / 2 * _POINTS))
 
     @cached_property
     def lengths(self) -> Reals:
@@ -142,14 +141,13 @@ class _Segment:
 
     def _interpolation(self, samples: slice) -> Reals:
         """Return the matrix (n, _NODES) that interpolates from the nodes to samples, in the logarithm of 1 + |ξ|²."""
-        nodes, scale = np.log(self.node_lengths[[0, -1]]), _chebyshev_points()
+        first, last = np.log(self.node_lengths[[0, -1]])
         places = np.log(self.lengths[samples])
-        positions = scale[0] + (places - nodes[0]) * (scale[-1] - scale[0]) / (nodes[1] - nodes[0])
-        differences = positions[:, None] - scale
+        positions = _POINTS[0] + (places - first) * (_POINTS[-1] - _POINTS[0]) / (last - first)
+        differences = positions[:, None] - _POINTS
         # A sample on a node takes that node's value: any tiny difference says so.
         differences[differences == 0] = np.finfo(np.float64).tiny
-        signs = np.where(np.arange(_NODES) % 2, -1.0, 1.0)
-        matrix = signs * np.sin(np.pi * (np.arange(_NODES) + 0.5) / _NODES) / differences
+        matrix = _POINT_WEIGHTS / differences
         matrix /= matrix.sum(axis=1, keepdims=True)
         return np.asarray(matrix)
 
@@ -189,8 +187,8 @@ class _Segment:
         return Scatter(True, spread * count / max(count - 1, 1), largest, count - 1)
 
 
-def _chebyshev_points() -> Reals:
-    return -np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
+def _geometric_means(first: Reals, second: Reals) -> Reals:
+    return np.asarray(np.sqrt(np.maximum(first, 0.0) * np.maximum(second, 0.0)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -306,14 +306,14 @@ class TailSampling:
 
     def labels(self) -> dict[str, Indices]:
         """Return the octave of each sample, the number of its lattice in it and of its sublattice; -1 if drawn."""
-        octaves, lattices, sublattices = [], [], []
-        for number, octave in enumerate(self.octaves, 1):
-            octaves.append(np.full(len(octave), number))
-            for lattice, sample_set in enumerate(octave.sample_sets):
+        columns = []
+        for octave in self.octaves:
+            for number, sample_set in enumerate(octave.sample_sets):
                 count = sample_set.samples.stop - sample_set.samples.start
-                lattices.append(np.full(count, -1 if sample_set.starts is None else lattice))
-                counts = [count] if sample_set.starts is None else np.diff([*sample_set.starts, count])
-                names = [-1] if sample_set.starts is None else range(_SUBLATTICES)
-                sublattices.append(np.repeat(names, counts))
-        columns = {"octave": octaves, "lattice": lattices, "sublattice": sublattices}
-        return {name: np.concatenate(values).astype(np.int64) for name, values in columns.items()}
+                labels = np.full((3, count), -1, dtype=np.int64)
+                labels[0] = octave.octave.index
+                if sample_set.starts is not None:
+                    labels[1] = number
+                    labels[2] = np.repeat(np.arange(_SUBLATTICES), np.diff([*sample_set.starts, count]))
+                columns.append(labels)
+        return dict(zip(("octave", "lattice", "sublattice"), np.concatenate(columns, axis=1), strict=True))
