@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import beta, exprel, gamma, gammaln, kve, zeta
 
 from sobolev_batch.arrays import Reals
-from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Surface
+from sobolev_batch.geometry.surface import DIRECTIONS, Surface
 from sobolev_batch.transform.lattice import STEP_MIDDLE, STEP_WIDTH, SobolevWeights
 
 # Both laws were measured on spheres, boxes, sticks and icospheres, near and far: the truncation was
@@ -152,8 +152,7 @@ def area_bound(area: float, order: float, highest: float) -> float:
     repeat, it comes in pulses at the odd multiples of a frequency; the first may lie just beyond. Besides, no
     value of the transform is larger than the area.
     """
-    factor, power = min(area_bounds(area, order), key=lambda bound: bound[0] * highest ** -bound[1])
-    return float(factor * highest**-power)
+    return min(factor * highest**-power for factor, power in area_bounds(area, order))
 
 
 def area_bounds(area: float, order: float) -> list[tuple[float, float]]:
@@ -219,13 +218,9 @@ def aliased(sums: Sums, weights: SobolevWeights, widths: Reals) -> Reals:
     estimates = []
     for residues, index, fractions in _SUBLATTICES:
         change = np.abs(index * sums.squares[:, residues].sum(axis=1) - sums.totals)
-        decay = [
-            image_weight(spacing, order, widths) / image_weight(spacing, order, widths, fractions)
-            for order in weights.orders
-        ]
+        decay = [decay_to_period(spacing, order, widths, fractions) for order in weights.orders]
         estimates.append(change * np.reshape(decay, (-1, *[1] * (change.ndim - 1))))
-    largest: Reals = np.max(estimates, axis=0)
-    return ALIASING_CAUTION * largest + step_images(sums, weights, widths)
+    return np.asarray(ALIASING_CAUTION * np.max(estimates, axis=0) + step_images(sums, weights, widths))
 
 
 def step_images(sums: Sums, weights: SobolevWeights, widths: Reals) -> Reals:
@@ -243,10 +238,9 @@ def step_images(sums: Sums, weights: SobolevWeights, widths: Reals) -> Reals:
     return np.asarray(np.multiply.outer(factors, np.abs(sums.outer[1])))
 
 
-def decay_to_period(spacing: float, order: float, widths: Reals) -> float:
-    """Return the size of images at the period over that at half of it, which even indices alone bring."""
-    (_, _, halves) = _SUBLATTICES[-1]
-    return image_weight(spacing, order, widths) / image_weight(spacing, order, widths, halves)
+def decay_to_period(spacing: float, order: float, widths: Reals, fractions: Reals = _SUBLATTICES[-1][2]) -> float:
+    """Return the size of images at the period over that at fractions of it, by default halves (even indices alone)."""
+    return image_weight(spacing, order, widths) / image_weight(spacing, order, widths, fractions)
 
 
 def image_weight(spacing: float, order: float, widths: Reals, images: Reals = _PERIOD) -> float:
@@ -291,15 +285,10 @@ def product_apart(surfaces: Sequence[Surface], orders: Sequence[float], rtol: fl
     gap = float(np.linalg.norm(np.maximum(np.maximum(low - other_high, other_low - high), 0.0)))
     if gap <= _EDGE:
         return None
-    cubes = math.sqrt(_cubes(a.extent) * _cubes(b.extent))
+    sides = np.stack([high - low, other_high - other_low])
+    cubes = math.sqrt(np.prod(np.maximum(np.ceil(sides / _EDGE), 1.0)))
     at_gap, within = np.array([_kernel(order, np.array([gap, math.sqrt(3) * _EDGE])) for order in orders]).T
     return a.area * b.area * at_gap if np.all(at_gap * cubes <= 2 * APART_FRACTION * rtol * within) else None
-
-
-def _cubes(extent: Extent) -> float:
-    """Return the number of cubes that hold a box."""
-    low, high = extent.box
-    return float(np.prod(np.maximum(np.ceil((high - low) / _EDGE), 1.0)))
 
 
 def _kernel(order: float, distances: Reals) -> Reals:

@@ -7,7 +7,6 @@ the accuracy is met, octaves get more samples, or more points are drawn, or an o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
@@ -104,11 +103,6 @@ class Core:
         return cls(weights, fields, *sums_on(problem, fields, weights))
 
     @property
-    def squares(self) -> Reals:
-        """Squared norm of the difference under the step (orders,)."""
-        return np.maximum(self.sums.totals, 0.0)
-
-    @property
     def energy(self) -> float:
         """Energy ∫_{|ξ|=r} |field|² dS in the last octave below ξ_max."""
         return float(self.sums.outer[1])
@@ -125,10 +119,6 @@ class MeasuredOctave:
     def sampling(self) -> OctaveSampling:
         """Samples of the octave, common to all surfaces."""
         return self.values[0].sampling
-
-    def error_norms(self, orders: Sequence[float]) -> Reals:
-        """Return the norms of the own errors (orders,) of all values together."""
-        return np.asarray(np.hypot.reduce([values.error_norms(orders) for values in self.values]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +197,7 @@ class State:
     def squares(self) -> Reals:
         """Squared norms (orders,): what has been measured, and what lies beyond it for certain."""
         certain = np.maximum(self.tail.remainder - self.tail.remainder_error, 0.0)
-        return np.asarray(self.core.squares + self.tail.octaves + certain)
+        return np.asarray(np.maximum(self.core.sums.totals, 0.0) + self.tail.octaves + certain)
 
     @cached_property
     def permitted(self) -> Reals:
@@ -216,8 +206,7 @@ class State:
 
     def _permitted_of(self, squares: Reals) -> Reals:
         accuracy = self.problem.accuracy
-        parts = accuracy.truncation_parts(self.problem.orders)
-        return np.asarray(2 * parts * np.maximum(squares, accuracy.floor**2))
+        return 2 * accuracy.truncation_parts(self.problem.orders) * np.maximum(squares, accuracy.floor**2)
 
     @property
     def permitted_variances(self) -> Reals:
@@ -290,7 +279,7 @@ def solve_in_octaves(problem: Problem, seed: int, aim: float = 1.0, for_others: 
     for others: pairs whose part beyond the octaves is known less well. Return the first solution that meets the aim;
     else the last one that can be sampled in some minutes. AccuracyError where the accuracy lies below rounding.
     """
-    aimed = replace(problem, accuracy=replace(problem.accuracy, rtol=aim * problem.accuracy.rtol))
+    aimed = problem.with_rtol(aim * problem.accuracy.rtol)
     problem.notify(f"{problem.label}: octaves beyond a lattice")
     state = State.first(aimed, seed, for_others)
     for _ in range(_ROUNDS):
@@ -310,8 +299,9 @@ def solve_in_octaves(problem: Problem, seed: int, aim: float = 1.0, for_others: 
 def solution_of(state: State) -> Solution:
     """Return the numbers by what is known so far."""
     core, support = state.core, state.problem.support
-    errors = core.errors**2 + np.sum([octave.error_norms(core.weights.orders) ** 2 for octave in state.octaves], axis=0)
-    found = estimate_norms(core.sums, core.weights, support, np.sqrt(errors), state.tail)
+    of_octaves = [values.error_norms(core.weights.orders) for octave in state.octaves for values in octave.values]
+    errors = np.asarray(np.hypot.reduce([core.errors, *of_octaves]))
+    found = estimate_norms(core.sums, core.weights, support, errors, state.tail)
     values = tuple(
         SurfaceValues(field, tuple(octave.values[number] for octave in state.octaves))
         for number, field in enumerate(core.fields)
@@ -399,7 +389,7 @@ def _measured(state: State, sampling: OctaveSampling, known: MeasuredOctave | No
         octave_values(surface, sampling, problem.orders, target, problem.execution, known=values)
         for surface, values in zip(problem.surfaces, known_values, strict=True)
     )
-    squares = squared_moduli(only_or_difference([values.values for values in of_surfaces]))
+    squares = squared_moduli(only_or_difference([one.values for one in of_surfaces]))
     return MeasuredOctave(of_surfaces, OctaveWeights(sampling, problem.orders).sums(squares))
 
 
@@ -412,13 +402,14 @@ def _first_sampling(state: State, octave: Octave) -> OctaveSampling:
     seconds = sum(size.lattice_seconds(lattice) for size in state.sizes)
     alone = max(count, _FEWEST_FLAT_DRAWS) if normals else count
     alone = min(alone, max(_FEWEST_DRAWS, int(_OCTAVE_SECONDS / state.draw_seconds)))
+    seed = int(rng.integers(2**53))
     if state.can_draw and alone * state.draw_seconds < seconds:
-        return OctaveSampling(octave, (), alone, _seed(rng), normals, _UNIFORM_ALONE)
+        return OctaveSampling(octave, (), alone, seed, normals, _UNIFORM_ALONE)
     beside = 0
     if normals and state.can_draw:
         affordable = _DRAWS_FRACTION * seconds / state.draw_seconds
         beside = int(np.clip(min(count, affordable), _FEWEST_DRAWS, _MOST_DRAWS))
-    return OctaveSampling(octave, (lattice,), beside, _seed(rng), normals, _UNIFORM_BESIDE_LATTICE)
+    return OctaveSampling(octave, (lattice,), beside, seed, normals, _UNIFORM_BESIDE_LATTICE)
 
 
 def _draws_needed(state: State, octave: Octave) -> int:
@@ -467,12 +458,11 @@ def _finer_sampling(state: State, octave: MeasuredOctave, order: int, permitted:
     seconds = sum(size.lattice_seconds(first) for size in state.sizes)
     if not sampling.lattices and count * state.draw_seconds > seconds:
         beside = sampling.draws if state.normals else 0
-        return replace(
-            sampling, lattices=(first,), draws=beside, seed=_seed(rng), uniform_fraction=_UNIFORM_BESIDE_LATTICE
-        )
+        seed = int(rng.integers(2**53))
+        return OctaveSampling(sampling.octave, (first,), beside, seed, sampling.normals, _UNIFORM_BESIDE_LATTICE)
     of_lattices, of_draws = sums.variances_by_origin[:, order]
     if of_draws > of_lattices:
-        return replace(sampling, draws=count, seed=_seed(rng))
+        return replace(sampling, draws=count, seed=int(rng.integers(2**53)))
     intervals = 2 * round(sampling.lattices[-1].M * np.clip(excess**0.5, 1.25, 2.0) / 2)
     return replace(sampling, lattices=(*sampling.lattices, _lattice(state, sampling.octave, intervals, rng)))
 
@@ -493,10 +483,6 @@ def _beyond(problem: Problem, cutoff: float, seed: int, points: int | None = Non
 def _lattice(state: State, octave: Octave, intervals: int, rng: np.random.Generator) -> OctaveLattice:
     largest = min(_LARGEST_M, state.problem.accuracy.largest_intervals)
     return OctaveLattice.random(octave.lowest, octave.highest, min(intervals, largest), rng)
-
-
-def _seed(rng: np.random.Generator) -> int:
-    return int(rng.integers(2**53))
 
 
 def _resolvable_frequency(problem: Problem) -> float:

@@ -150,13 +150,16 @@ class Problem:
         pair = surfaces if is_whole else tuple(move.apply(surface) for surface in pair)
         return cls(surfaces, orders, accuracy, support_of(surfaces), label, threads, pair, tuple(different), apart)
 
+    def with_rtol(self, rtol: float) -> Self:
+        """Return the same problem to another accuracy."""
+        return replace(self, accuracy=replace(self.accuracy, rtol=rtol))
+
     @property
     def alone(self) -> tuple[Self, ...]:
         """Norms of the surfaces, each at the centre, for those that are far apart."""
-        accuracy = replace(self.accuracy, rtol=(1 - APART_FRACTION) * self.accuracy.rtol)
-        return tuple(
-            self.from_surfaces((surface,), self.orders, accuracy, self.label, self.threads) for surface in self.surfaces
-        )
+        settings = self.orders, self.accuracy, self.label, self.threads
+        alone = (self.from_surfaces((surface,), *settings) for surface in self.surfaces)
+        return tuple(norm.with_rtol((1 - APART_FRACTION) * self.accuracy.rtol) for norm in alone)
 
     @property
     def area(self) -> float:

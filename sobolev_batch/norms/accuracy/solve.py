@@ -156,7 +156,7 @@ def _in_coarser_octaves(problem: Problem, seed: int) -> list[Solution]:
     found = []
     for rtol in coarser_than(problem.accuracy.rtol):
         try:
-            solution = solve_in_octaves(replace(problem, accuracy=replace(problem.accuracy, rtol=rtol)), seed)
+            solution = solve_in_octaves(problem.with_rtol(rtol), seed)
         except AccuracyError:
             break
         limits = "with as many frequencies as can be sampled in some minutes"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -158,13 +159,12 @@ class _Search:
 
     def _on_lattice(self, lattice: Lattice, rtol: float) -> tuple[float, Interval]:
         """Return the part of the distance on a lattice, and bounds on all of it."""
-        problem = self.problem
-        accuracy = replace(problem.accuracy, rtol=rtol)
-        target = error_target(np.array([self.threshold.lower]), problem.orders, accuracy, problem.area)
+        problem = self.problem.with_rtol(rtol)
+        target = error_target(np.array([self.threshold.lower]), problem.orders, problem.accuracy, problem.area)
         fields = _fields(problem, lattice, target.tightened(problem.inexact_count))
         found = difference_on(problem, lattice, fields)[0]
         value, error = float(found.values[0]), float((found.aliasing + found.discretisation)[0])
-        return value, Interval.around(value, error, _with_beyond(problem, value, lattice) - value + error)
+        return value, _with_beyond(problem, value, error, lattice)
 
     def _in_octaves(self, seed: int) -> Interval:
         """Return bounds on the distance from what octaves measure."""
@@ -213,7 +213,7 @@ def _fields(problem: Problem, lattice: Lattice, target: ErrorTarget) -> tuple[Fi
 
 def _of_apart(problem: Problem, seed: int) -> tuple[Interval, Method]:
     """Return bounds on the relative distance of surfaces far apart, which exceeds one, and what they follow from."""
-    solution = solve(replace(problem, accuracy=replace(problem.accuracy, rtol=_APART_RTOL)), seed)
+    solution = solve(problem.with_rtol(_APART_RTOL), seed)
     caution = _OCTAVES_CAUTION if any(one.has_tail for one in solution.alone) else 1.0
     distance, norm = (Interval.of(one.estimate, caution) for one in (solution, solution.alone[1]))
     return distance.over(norm), "lattice" if caution == 1.0 else "octaves"
@@ -251,17 +251,16 @@ def _norm_on_lattice(reference: _Reference) -> tuple[float, Interval]:
     value = float(weights @ shell_sums(field, None, lattice, lattice.half)) ** 0.5
     # The rules keep the tolerance at every frequency, and so does the NUFFT.
     error = 2 * _NORM_EPS * surface.area * float(weights @ shell_volumes(lattice)) ** 0.5
-    return value, Interval.around(value, error, _with_beyond(problem, value, lattice) - value + error)
+    return value, _with_beyond(problem, value, error, lattice)
 
 
 @lru_cache(maxsize=2)  # references stay in memory
 def _exact_norm(reference: _Reference) -> Interval:
-    """Return close bounds on the norm of a reference."""
-    accuracy = replace(reference.accuracy, rtol=_EXACT_NORM_RTOL)
-    return Interval.of(solve(replace(reference.problem, accuracy=accuracy)).estimate)
+    return Interval.of(solve(reference.problem.with_rtol(_EXACT_NORM_RTOL)).estimate)
 
 
-def _with_beyond(problem: Problem, value: float, lattice: Lattice) -> float:
-    """Return a norm on a lattice with all that may lie beyond the lattice."""
+def _with_beyond(problem: Problem, value: float, error: float, lattice: Lattice) -> Interval:
+    """Return bounds on a norm by its part on a lattice, and all that may lie beyond it."""
     (order,) = problem.orders
-    return float(np.sqrt(value**2 + area_bound(problem.area, order, lattice.xi_max)))
+    highest = math.sqrt(value**2 + area_bound(problem.area, order, lattice.xi_max))
+    return Interval.around(value, error, highest - value + error)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, repeat, takewhile
 from operator import mul
@@ -128,13 +128,14 @@ class Accuracy:
 
 def unreachable(problem: str, rtol: float, reachable: float) -> AccuracyError:
     """Return the error for an rtol that is out of reach, with advice by the smallest one that is not."""
-    if not reachable < 1:
-        advice = "not even one digit can be reached; take a more negative order, or a best effort"
-        return AccuracyError(f"{problem}; {advice}", rtol, reachable)
-    # An estimate has two digits; up, so that it is met.
-    unit = 10.0 ** (math.floor(math.log10(reachable)) - 1)
-    reachable = min(math.ceil(reachable / unit) * unit, 1.0)
-    advice = f"about {reachable:.2g} can be reached; ask for that or for a best effort, or take a more negative order"
+    advice = "not even one digit can be reached; take a more negative order, or a best effort"
+    if reachable < 1:
+        # An estimate has two digits; up, so that it is met.
+        unit = 10.0 ** (math.floor(math.log10(reachable)) - 1)
+        reachable = min(math.ceil(reachable / unit) * unit, 1.0)
+        advice = (
+            f"about {reachable:.2g} can be reached; ask for that or for a best effort, or take a more negative order"
+        )
     return AccuracyError(f"{problem}; {advice}", rtol, reachable)
 
 
@@ -171,8 +172,8 @@ def core_lattice(support: Support, orders: Sequence[float], accuracy: Accuracy) 
     """
     first, largest = _first_period(support, orders, accuracy), accuracy.largest_intervals
     lattice = lattice_of(_HIGHEST_FREQUENCY, first, min(_PILOT_M, largest))
-    reach, periods = _STEP_WAVES / lattice.xi_max, accumulate(repeat(1.01), mul, initial=first)
-    period = next(period for period in periods if image_distances(1 / period, support.widths).min() >= reach)
+    reach = _STEP_WAVES / lattice.xi_max
+    period = next(it for it in _growing(first) if image_distances(1 / it, support.widths).min() >= reach)
     if period == first:
         return lattice
     intervals = min(good_intervals(2 * lattice.xi_max * period), largest)
@@ -202,9 +203,8 @@ def refined(sums: Sums, weights: SobolevWeights, support: Support, accuracy: Acc
             tails = np.nan_to_num(truncated(sums, weights, support, highest) / (2 * sums.totals), posinf=0.0)
         return np.asarray(tails.reshape(len(orders), -1).max(axis=1))
 
-    most = accuracy.largest_intervals
-    allowed = accuracy.truncation_parts(orders)
-    larger = accumulate(repeat(_STEP), mul, initial=lattice.xi_max)
+    most, allowed = accuracy.largest_intervals, accuracy.truncation_parts(orders)
+    larger = _growing(lattice.xi_max, _STEP)
     candidates = [next(larger), *takewhile(lambda highest: 2 * highest * period <= most, larger)]
     highest = next((highest for highest in candidates if not np.any(tail(highest) > allowed)), None)
     if highest is None and accuracy.best_effort:
@@ -258,5 +258,8 @@ def _first_period(support: Support, orders: Sequence[float], accuracy: Accuracy)
         farthest = period > widest + _VANISHED
         return farthest or all(image_weight(1 / period, order, widths) <= allowed for order in orders)
 
-    periods = accumulate(repeat(1.01), mul, initial=max(widest, _LEAST_WIDTH))
-    return max(next(filter(suffices, periods)), LEAST_CLEARANCE * 2 * support.reach)
+    return max(next(filter(suffices, _growing(max(widest, _LEAST_WIDTH)))), LEAST_CLEARANCE * 2 * support.reach)
+
+
+def _growing(first: float, factor: float = 1.01) -> Iterator[float]:
+    return accumulate(repeat(factor), mul, initial=first)
