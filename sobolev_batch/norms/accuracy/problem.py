@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Self, cast
@@ -102,15 +102,14 @@ class Problem:
         """
         different, pair = _without_shared_triangles(surfaces), tuple(surfaces) if len(surfaces) == _PAIR else ()
         settings = orders, accuracy, label, threads
-        if _triangles_to_clip(different) > most_clipped:
+        if sum(len(mesh.triangles) for mesh in _two_meshes(different.values())) > most_clipped:
             return replace(cls._between(different, pair, *settings), is_clipped=False)
         different = _without_common_faces(different)
         problem = cls._between(different, pair, *settings)
-        meshes = [surface for surface in different.values() if isinstance(surface, Mesh)]
-        rounding = _rounding(pair)
-        if len(meshes) < _PAIR or not rounding:
+        meshes, rounding = _two_meshes(different.values()), _rounding(pair)
+        if not meshes or not rounding:
             return problem
-        rests = rests_of(meshes[0], meshes[1], rounding / max(mesh.extent.reach for mesh in meshes))
+        rests = rests_of(*meshes, rounding / max(mesh.extent.reach for mesh in meshes))
         closer = cls._between(_signed(rests.meshes), pair, *settings)
         moved = norm_of_moves(rests.areas, rests.distances, orders)
         if closer.surfaces and np.all(moved <= _MOVED_FRACTION * accuracy.rtol * closer.rough_values):
@@ -122,8 +121,8 @@ class Problem:
 
         It stays as it is where that may be more than a small part of the norm. The surfaces are those it was made from.
         """
-        rounding, meshes = _rounding(surfaces), [it for it in surfaces if isinstance(it, Mesh)]
-        if len(meshes) < _PAIR or not rounding or not self.surfaces:
+        rounding, meshes = _rounding(surfaces), _two_meshes(surfaces)
+        if not meshes or not rounding or not self.surfaces:
             return self
         coarse, fine = sorted(meshes, key=lambda mesh: len(mesh.triangles))
         refinement = refinement_of(fine, coarse, rounding)
@@ -284,9 +283,8 @@ def support_of(surfaces: Sequence[Surface]) -> Support:
 
 def are_equal(a: Surface, b: Surface) -> bool:
     """Return whether two meshes are equal as area measures, to rounding."""
-    if isinstance(a, Mesh) and isinstance(b, Mesh) and abs(a.area - b.area) > _ROUNDING * (a.area + b.area):
-        return False
-    return not without_common_parts((a, b))
+    have_equal_areas = abs(a.area - b.area) <= _ROUNDING * (a.area + b.area)
+    return have_equal_areas and not without_common_parts((a, b))
 
 
 def without_common_parts(surfaces: Sequence[Surface]) -> Mapping[int, Surface]:
@@ -295,8 +293,8 @@ def without_common_parts(surfaces: Sequence[Surface]) -> Mapping[int, Surface]:
 
 
 def _without_shared_triangles(surfaces: Sequence[Surface]) -> Mapping[int, Surface]:
-    meshes = [surface for surface in surfaces if isinstance(surface, Mesh)]
-    if len(meshes) < _PAIR:
+    meshes = _two_meshes(surfaces)
+    if not meshes:
         return dict(zip((1, -1), surfaces, strict=False))
     shared = shared_triangles(*(mesh.vertices[mesh.triangles] for mesh in meshes))
     if shared[0].any():
@@ -308,13 +306,14 @@ def _without_shared_triangles(surfaces: Sequence[Surface]) -> Mapping[int, Surfa
 
 
 def _without_common_faces(different: Mapping[int, Surface]) -> Mapping[int, Surface]:
-    meshes = [surface for surface in different.values() if isinstance(surface, Mesh)]
-    return different if len(meshes) < _PAIR else _signed(rests_of(meshes[0], meshes[1]).meshes)
+    meshes = _two_meshes(different.values())
+    return _signed(rests_of(*meshes).meshes) if meshes else different
 
 
-def _triangles_to_clip(different: Mapping[int, Surface]) -> int:
-    counts = [len(surface.triangles) for surface in different.values() if isinstance(surface, Mesh)]
-    return sum(counts) if len(counts) == _PAIR else 0
+def _two_meshes(surfaces: Iterable[Surface]) -> list[Mesh]:
+    """Return the meshes among surfaces if there are two, else nothing: then there is nothing to leave out."""
+    meshes = [surface for surface in surfaces if isinstance(surface, Mesh)]
+    return meshes if len(meshes) == _PAIR else []
 
 
 def _signed(rests: Sequence[Mesh | None]) -> Mapping[int, Surface]:

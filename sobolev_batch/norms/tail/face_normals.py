@@ -89,18 +89,17 @@ class FaceNormals:
 
 def _main_normals(mesh: Mesh) -> tuple[Reals, Reals, Reals]:
     """Return the normals, areas and face sizes of the directions that hold much of a mesh's area."""
-    count = len(mesh.triangles)
-    normals, areas, keys = np.empty((count, 3)), np.empty(count), np.empty(count, dtype=np.int32)
+    count, areas = len(mesh.triangles), mesh.areas
+    normals, keys = np.empty((count, 3)), np.empty(count, dtype=np.int32)
     # The corners and temporaries of all triangles of a fine mesh would take gigabytes.
     for start in range(0, count, _BATCH):
         part = slice(start, start + _BATCH)
         a, b, c = mesh.corners(part)
         crosses = np.cross(b - a, c - a)
-        doubled = np.linalg.norm(crosses, axis=1)
-        areas[part] = doubled / 2
         # A normal and its opposite are one direction. Triangles without area have none.
         crosses[combine(_UPWARDS, crosses.T) < 0] *= -1
-        normals[part] = crosses / np.where(doubled > 0, doubled, 1.0)[:, None]
+        lengths = 2 * areas[part]
+        normals[part] = crosses / np.where(lengths > 0, lengths, 1.0)[:, None]
         # A number for each normal, the same for those that count as one direction.
         x, y, z = np.round(normals[part] * _DIRECTION_PARTS).astype(np.int32).T
         keys[part] = (x * _KEYS_PER_AXIS + y) * _KEYS_PER_AXIS + z
