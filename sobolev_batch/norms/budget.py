@@ -152,7 +152,7 @@ def area_bound(area: float, order: float, highest: float) -> float:
     repeat, it comes in pulses at the odd multiples of a frequency; the first may lie just beyond. Besides, no
     value of the transform is larger than the area.
     """
-    return min(factor * highest**-power for factor, power in area_bounds(area, order))
+    return float(min(factor * highest**-power for factor, power in area_bounds(area, order)))
 
 
 def area_bounds(area: float, order: float) -> list[tuple[float, float]]:

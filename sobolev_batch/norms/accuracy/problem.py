@@ -109,7 +109,7 @@ class Problem:
         meshes, rounding = _two_meshes(different.values()), _rounding(pair)
         if not meshes or not rounding:
             return problem
-        rests = rests_of(*meshes, rounding / max(mesh.extent.reach for mesh in meshes))
+        rests = rests_of(meshes[0], meshes[1], rounding / max(mesh.extent.reach for mesh in meshes))
         closer = cls._between(_signed(rests.meshes), pair, *settings)
         moved = norm_of_moves(rests.areas, rests.distances, orders)
         if closer.surfaces and np.all(moved <= _MOVED_FRACTION * accuracy.rtol * closer.rough_values):
@@ -307,7 +307,7 @@ def _without_shared_triangles(surfaces: Sequence[Surface]) -> Mapping[int, Surfa
 
 def _without_common_faces(different: Mapping[int, Surface]) -> Mapping[int, Surface]:
     meshes = _two_meshes(different.values())
-    return _signed(rests_of(*meshes).meshes) if meshes else different
+    return _signed(rests_of(meshes[0], meshes[1]).meshes) if meshes else different
 
 
 def _two_meshes(surfaces: Iterable[Surface]) -> list[Mesh]:

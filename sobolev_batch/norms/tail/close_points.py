@@ -83,7 +83,7 @@ class Sheets:
     @property
     def area(self) -> float:
         """Area of all surfaces together."""
-        return sum(surface.area for surface, _ in (*self.meshes, *self.spheres))
+        return sum(mesh.area for mesh, _ in self.meshes) + sum(sphere.area for sphere, _ in self.spheres)
 
     def triangles(self) -> Iterator[SignedTriangles]:
         """Yield the triangles of the meshes: all at once, and once for all, where they are not many."""
