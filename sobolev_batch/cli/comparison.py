@@ -123,17 +123,22 @@ class CompareOptions:
         if self.allowed_fraction is None and self.within is None:
             return None
         numbers: dict[str, Any] = {"a": self.a, "b": self.b}
-        a: Path | Mesh = self.a
+        a, b = self.meshes
         if self.motion is not None:
-            a, numbers["motion"] = _moved(read_mesh(self.a), self.motion), self.motion.tolist()
+            a, numbers["motion"] = _moved(a, self.motion), self.motion.tolist()
             echo(f"note: {_motion_text(self.motion)}", err=True)
         if (tolerance := self.allowed_fraction) is not None:
             (order,), scaling = self.chosen_orders, not self.no_scaling
-            same = same_surface(a, self.b, tolerance=tolerance, order=order, scaling=scaling, memory=self.memory)
+            same = same_surface(a, b, tolerance=tolerance, order=order, scaling=scaling, memory=self.memory)
             return f"{self.a.name}: {same}", vars(same) | numbers | {"distance": same.distance, "error": same.error}
-        near = judge_deviation(a, self.b, str(self.within), self.unit)
+        near = judge_deviation(a, b, str(self.within), self.unit)
         numbers |= {"outcome": near.outcome, "length": near.length, "unit": near.unit, "beyond": near.beyond}
         return f"{self.a.name}: {near}", numbers | asdict(near.deviations.both) | asdict(near.deviations)
+
+    @cached_property
+    def meshes(self) -> tuple[Mesh, Mesh]:
+        """The meshes in both files, each read once."""
+        return read_mesh(self.a), read_mesh(self.b)
 
     @cached_property
     def motion(self) -> Reals | None:
@@ -141,7 +146,7 @@ class CompareOptions:
         if not self.align:
             return None
         align = extra(FEATURES, "align", "--align")
-        return np.asarray(align(read_mesh(self.a), read_mesh(self.b), order=self.chosen_orders[0]))
+        return np.asarray(align(*self.meshes, order=self.chosen_orders[0]))
 
     @property
     def names(self) -> tuple[str, str]:
@@ -198,7 +203,7 @@ class Comparison:
     def of_files(cls, options: CompareOptions) -> Comparison:
         """Read and compare two files; what may make one doubt the result is printed as a note."""
         accuracy = options.accuracy
-        first, second = read_mesh(options.a), read_mesh(options.b)
+        first, second = options.meshes
         if options.witness is not None:
             require_place(options.witness)
         similarity = Similarity() if options.no_scaling else Similarity.to_unit_ball(second)

@@ -93,8 +93,8 @@ def unlock_command(store: Location, force: bool) -> None:
 def prune_command(store: Location, yes: bool) -> None:
     """Remove what STORE keeps and no record needs.
 
-    These are fields of meshes that are no longer in the study, leftovers of killed runs, and tables that are not
-    listed, and objects that are no longer in the study. Meshes that commands made are kept: other stores may use them.
+    These are fields of meshes and objects that are no longer in the study, leftovers of killed runs, and tables that
+    are not listed. Meshes that commands made are kept: other stores may use them.
     """
     from sobolev_batch.batch.prune import prune, prune_lost_objects
     from sobolev_batch.parameters import format_bytes

@@ -120,7 +120,7 @@ def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan
     """Plan a study of one object: list its surfaces, choose its similarity and lattice, identify every field.
 
     Only the reference is loaded, and a few pilots for an accuracy. MeshError where the reference cannot be read,
-    LatticeError where it does not fit into the period; see also `Study.members` and `choose_lattice`.
+    LatticeError where it does not fit into the period; see also `StudyObject.members` and `choose_lattice`.
     """
     members = study.object.members
     reference = _reference_label(study, members)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.norms.columns import describe
 from sobolev_batch.store.encoding import with_coordinates
-from sobolev_batch.store.layout import NUMERICS, RECORD, TABLES_OF_ALL, Store, hide_tables, table_names, write_table
+from sobolev_batch.store.layout import NUMERICS, RECORD, TABLES_OF_ALL, Store, hide_tables, write_table
 
 # A table for each of these groups that an object has.
 Tables = Mapping[str, xr.Dataset]
@@ -73,7 +73,7 @@ def write_all(root: Store, names: Sequence[str], changed: Iterable[bytes], kept:
     for group, table in _joined(parts).items():
         order = np.argsort([rank[name] for name in table["object"].values.tolist()], kind="stable")
         tables[group] = table.isel(mesh=order)
-    replaced = hide_tables(root) if table_names(root) else []
+    replaced = hide_tables(root)
     for group, table in tables.items():
         write_table(root, group, table)
     for name in set(replaced) - root.documents.keys():

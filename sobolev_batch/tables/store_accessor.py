@@ -248,7 +248,7 @@ def stored_reducer(tree: xr.DataTree, order: Orders, *meshes: str) -> tuple[Redu
     places = {label: row for row, label in enumerate(labels)}
     for mesh in meshes:
         if places.get(mesh) not in complete:
-            raise InputError(f"{source_of(tree)}: no mesh {quoted(mesh)} with a field; its labels begin {labels[:3]}")
+            raise _no_field(tree, mesh, labels[:3])
     rows, reference = [places[mesh] for mesh in meshes], places[store.attributes()["study"]["reference"]]
     qualities = {row: Quality.from_json(record.quality) for row, record in complete.items()}
     checksums = {row: record.checksums for row, record in complete.items()}
@@ -322,8 +322,11 @@ def _require_fields(tree: xr.DataTree, table: xr.Dataset, meshes: Sequence[str])
     labels, is_complete = table.indexes["mesh"], table["status"].values == "complete"
     for mesh, place in zip(meshes, labels.get_indexer(list(meshes)).tolist(), strict=True):
         if place < 0 or not is_complete[place]:
-            known = labels[:3].tolist()
-            raise InputError(f"{source_of(tree)}: no mesh {quoted(mesh)} with a field; its labels begin {known}")
+            raise _no_field(tree, mesh, labels[:3])
+
+
+def _no_field(tree: xr.DataTree, mesh: str, known: Sequence[str]) -> InputError:
+    return InputError(f"{source_of(tree)}: no mesh {quoted(mesh)} with a field; its labels begin {[*known]}")
 
 
 def order_note(tree: xr.DataTree, orders: Sequence[float]) -> list[str]:

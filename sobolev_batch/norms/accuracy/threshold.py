@@ -108,12 +108,12 @@ def relative_distance(
         first = first if problem.area == whole.area else None
     if not problem.surfaces:
         return Interval(0.0, 0.0), "identical"
-    for norm_of in (_rough_norm, _exact_norm):
-        norm = norm_of(known)
-        search = _Search(problem, norm.times(threshold))
-        bounds, method = search.bounds(seed, first)
-        if search.is_decided(bounds):
-            break
+    norm = _rough_norm(known)
+    search = _Search(problem, norm.times(threshold))
+    bounds, method = search.bounds(seed, first)
+    if not search.is_decided(bounds) and (exact := _exact_norm(known)) != norm:
+        norm = exact
+        bounds, method = _Search(problem, norm.times(threshold)).bounds(seed, first)
     return bounds.over(norm), method
 
 
