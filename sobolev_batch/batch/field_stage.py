@@ -141,12 +141,13 @@ def _field_task(job: Job, groups: _Groups, projected_bytes: float) -> Task:
 
 
 def size_rows(plan: Plan, rows: Sequence[Row], workers: Workers) -> tuple[dict[str, Sizes], dict[str, str]]:
-    """Return the tasks of rows by their labels, and the reason for each row that fits into no worker."""
+    """Return what the tasks of rows take, by their labels, and the reason for each row that fits into no worker."""
     octaves = _octave_memory(plan)
 
     def sizes_for(size: ExpectedSize) -> Sizes:
         return size_tasks(plan.blocks, plan.transform, size, workers, len(rows), octaves)
 
+    # Where not even a mesh without triangles fits, the lattice is too large: a ClusterError for all rows.
     sizes_for(ExpectedSize())
     sizes, refused = {}, {}
     for row in rows:

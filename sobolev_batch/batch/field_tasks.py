@@ -47,7 +47,7 @@ from sobolev_batch.transform.probe import COMMON, Probe, draws_for, join, probe_
 _log = logging.getLogger(__name__)
 
 # Fraction of a field's error that each octave may have, inverted: the squares of some octaves' errors add up.
-_OCTAVES_SHARE = 5.0
+_OCTAVES_TIGHTENING = 5.0
 # The reference of the last task, by its fingerprint and scale: that of the next one, most likely. With more triangles
 # it would take much of a worker's memory.
 _KEPT_TRIANGLES = 1 << 20
@@ -233,7 +233,7 @@ def _store_octaves(job: Job, surface: Surface, target: ErrorTarget | None) -> St
     tail = job.tail
     if tail is None:
         raise ValueError("the study has no octaves")
-    settings = target.tightened(_OCTAVES_SHARE) if target else job.transform
+    settings = target.tightened(_OCTAVES_TIGHTENING) if target else job.transform
     values = [octave_values(surface, octave, job.orders, settings, job.execution) for octave in tail.octaves]
     cutoff, reference = tail.highest_frequency, job.load_reference()
     quality = TailQuality(

@@ -78,10 +78,9 @@ class Triangles:
             rest = arms - np.clip(dot(arms, along) * inverse[triangles], 0.0, 1.0) * along
             least = np.minimum(least, dot(rest, rest))
             is_above &= dot(arms, outward[:, triangles]) <= 0
-        heights = self.heights(points, triangles)
-        return np.where(is_above, np.minimum(least, heights), least)
+        return np.where(is_above, np.minimum(least, self.squared_heights(points, triangles)), least)
 
-    def heights(self, points: Reals, triangles: Indices) -> Reals:
+    def squared_heights(self, points: Reals, triangles: Indices) -> Reals:
         """Return the squared distance of points (3, n) from the planes of triangles (n,)."""
         arms = points - self.corners[0][:, triangles]
         return dot(arms, self._normals[:, triangles]) ** 2 * self._inverse_sizes[triangles]

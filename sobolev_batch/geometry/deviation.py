@@ -38,7 +38,7 @@ from sobolev_batch.geometry.surface import is_finite_number
 # Gap between both bounds, as a fraction of the distance.
 DEFAULT_GAP = 0.01
 # Bounds are not closer than rounding permits: units in the last place of the largest coordinate.
-_ROUNDING = 32 * np.finfo(float).eps
+_BOUND_ROUNDING = 32 * np.finfo(float).eps
 # Lengths that people write down are met up to this fraction.
 _EQUAL = 1e-9
 # Pieces that are cut at a time, in some 2 kB each; and pieces after which bounds stay apart.
@@ -195,13 +195,15 @@ def directed_deviation(
     """Bound the largest distance of a mesh's points from triangles; see `largest_deviation`."""
     scale, reach = other.scale, max(other.scale, float(np.abs(mesh.vertices).max()))
     of_files = max(mesh.rounding, other.mesh.rounding)
-    bounds = _Bounds(_ROUNDING * reach / scale, gap, of_files / scale, None if within is None else within / scale)
+    length = None if within is None else within / scale
+    bounds = _Bounds(_BOUND_ROUNDING * reach / scale, gap, of_files / scale, length)
     cutting, many = _cut_all(mesh, other, bounds), _MANY + _MANY_OF_EACH * len(mesh.triangles)
+    # The pieces are cut as this goes on.
     if any(bounds.count > many for _ in cutting):
         rests = rests_of(mesh, other.mesh, max(ROUNDING, of_files / reach))
         rest = rests.meshes[0]
         if rest is not mesh:
-            # Both were moved onto their planes.
+            # Both were moved onto common planes, and the bound grows by both moves.
             bounds.upper = max(bounds.upper, bounds.rounding + 2 * float(rests.distances.max()) / scale)
             cutting = iter(()) if rest is None else _cut_all(rest, other, bounds)
         for _ in cutting:
@@ -293,7 +295,7 @@ def _parts(corners: Reals, best: Indices, worst: Indices, other: Triangles, boun
         & (shares.min(axis=0) < _LARGEST_CUT)
     )
     # Near the plane of the best triangle, the part that is cut away from slivers needs no further look.
-    thin = np.max([other.heights(corner, best) for corner in corners], axis=0) <= bounds.enough**2
+    thin = np.max([other.squared_heights(corner, best) for corner in corners], axis=0) <= bounds.enough**2
     least = bounds.rounding * lengths[side, pieces]
     thin &= (heights.max(axis=0) > least) & (heights.min(axis=0) < -least)
     is_cut = is_beyond.any(axis=0) & ~is_beyond.all(axis=0) & (fair | thin)

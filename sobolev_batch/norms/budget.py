@@ -1,7 +1,7 @@
-"""Errors of a norm or distance: truncation, aliasing and discretisation, and what surfaces far apart leave out.
+"""Errors of a norm or distance: truncation, aliasing, moves by rounding, and what surfaces far apart leave out.
 
 Truncation (frequencies beyond the cube) and aliasing (images of the surfaces at the lattice's period)
-follow from the same sums as the number itself; discretisation comes from the probes of the fields.
+follow from the same sums as the number itself; discretisation comes from the fields (`transform/probe`).
 docs/numerics.md says how well these estimates hold.
 """
 

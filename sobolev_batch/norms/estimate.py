@@ -59,7 +59,7 @@ class NormEstimate:
 
     @property
     def errors(self) -> Reals:
-        """Total error: the true value differs from the reported one by no more."""
+        """Total error: the true value differs from the reported one by no more, as far as the parts hold."""
         return self.truncation + self.aliasing + self.discretisation + self.statistical
 
     def relative_to(self, norms: NormEstimate) -> tuple[Reals, Reals]:

@@ -57,7 +57,8 @@ class Lock:
     Attributes:
         run: Run that it belongs to. A process that knows it may take the lock over, as a worker does from the
             process that submitted the run, or from a worker that was lost.
-        driver: Description of the holder: its process and host.
+        holder: Random name of the holder, which tells it from other processes of its run.
+        driver: Description of the holder, see `this_process`; that of its heartbeats begins with it.
         since: Time at which it was acquired, in UTC.
         process: Mark of the holder's process, see `_process_mark`; empty if the lock outlives it.
         folder: "made" if the store's folder was created for the lock.
@@ -140,7 +141,7 @@ def locked(location: Location, lock: Lock) -> Iterator[None]:
 
 def acquire(location: Location, lock: Lock) -> None:
     """Acquire the lock on a store, or take over the one of the same run; LockError where another run has it."""
-    lock = replace(lock, folder="" if Path(location.name).is_dir() else "made")
+    lock = replace(lock, folder="" if location.scheme or Path(location.name).is_dir() else "made")
     current = None
     # The current lock may be released between two attempts.
     while current is None:
@@ -175,7 +176,7 @@ def _take_over(location: Location, lock: Lock, current: Lock) -> None:
 
 
 def release(location: Location, lock: Lock) -> None:
-    """Release a store unless another run has taken it over. A failure is only reported."""
+    """Release a store unless another process has taken it over. A failure is only reported."""
     try:
         current = Lock.read(location)
         if current is not None and current.holder == lock.holder:

@@ -48,7 +48,7 @@ _MOST_RETRIES = 2
 
 # The pair of each pilot with the reference, by label. All have the same orders, accuracy and sizes.
 _Problems = Mapping[str, Problem]
-# A choice, if there is one for any pair, and why each pair misses the accuracy that does, by the label of its surface.
+# A choice or None, and why pairs miss the accuracy, by the labels of their surfaces.
 _Outcome = tuple[LatticeChoice | None, Mapping[str, AccuracyError]]
 
 

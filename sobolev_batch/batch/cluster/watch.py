@@ -215,7 +215,7 @@ class Heartbeat:
         self.stage = stage
 
     def write(self, state: RunState, error: str = "") -> None:
-        """Replace the record."""
+        """Replace the record, whose driver begins as that of the lock: `unlock` tells by it whose heartbeat it is."""
         driver = f"{this_process()}, cluster {self.watch.address}" if self.watch else this_process()
         self._records.write_run(RunRecord(state, driver, self._started, utc_now(), self.stage, error))
 
