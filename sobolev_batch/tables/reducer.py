@@ -256,16 +256,14 @@ class Reducer:
         distances, is_square = np.zeros((5, len(self.orders), len(rows), len(others))), tuple(rows) == tuple(others)
         for batch in _slices(len(rows), max(1, self._capacity - self._group - self._read_at_once)):
             first = batch.start if is_square else 0
-            distances[..., batch, first:] = np.stack(list(self.tile(rows[batch], others[first:])))
-        if is_square:
-            distances = np.triu(distances) + np.swapaxes(np.triu(distances, 1), -1, -2)
+            found = np.stack(list(self.tile(rows[batch], others[first:])))
+            distances[..., batch, first:] = found
+            if is_square:
+                distances[..., first:, batch] = np.swapaxes(found, -1, -2)
         return NormEstimate(*distances)
 
     def tile(self, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
-        """Return distances over (orders, rows, others); the others begin with all of the rows, or have none of them.
-
-        Those below the diagonal, which repeat others, are not measured.
-        """
+        """Return distances over (orders, rows, others); the others begin with all of the rows, or have none of them."""
         shared = len(rows) if tuple(others[: len(rows)]) == tuple(rows) else 0
         if self._capacity < _FEWEST_ROWS:
             sums = Sums.zeros(len(self.orders), len(rows), len(others))
@@ -274,9 +272,12 @@ class Reducer:
             by_block = [self._block_sums(rows, others, number, shared) for number in range(len(self.blocks))]
             products, left, right = (add_sums(sums) for sums in zip(*by_block, strict=True))
             sums, direct_pairs = differences(products, left, right)
-        for i, j in np.argwhere(direct_pairs).tolist():
+        for i, j in np.argwhere(np.triu(direct_pairs) if shared else direct_pairs).tolist():
             direct = self._direct(rows[i], others[j])
             sums.squares[:, :, i, j], sums.outer[:, i, j] = direct.squares, direct.outer
+        if shared:
+            for square in (sums.squares[..., :shared], sums.outer[..., :shared]):
+                square[...] = np.triu(square) + np.swapaxes(np.triu(square, 1), -1, -2)
         areas = self.areas[list(rows)][:, None] + self.areas[list(others)]
         errors = np.hypot(self.errors[:, list(rows)][:, :, None], self.errors[:, list(others)][:, None, :])
         errors *= np.not_equal.outer(rows, others)
@@ -310,13 +311,16 @@ class Reducer:
         left = arrangement.squares(held)
         products, right = arrangement.zeros(len(rows), len(others)), arrangement.zeros(len(others))
 
-        buffer = np.empty((min(self._group, len(others) - shared), block.size), dtype=np.complex128)
-        for group in (*_slices(shared, self._group), *_slices(len(others), self._group, shared)):
-            is_shared = group.stop <= shared
-            values, above = (held[group], group.stop) if is_shared else (read(others[group], buffer), len(rows))
-            sums, squares = arrangement.products(held[:above], values), arrangement.squares(values)
+        def multiply(group: slice, fields: Complexes, above: int) -> None:
+            sums, squares = arrangement.products(held[:above], fields), arrangement.squares(fields)
             products.squares[:, :, :above, group], products.outer[:, :above, group] = sums.squares, sums.outer
             right.squares[..., group], right.outer[..., group] = squares.squares, squares.outer
+
+        for group in _slices(shared, self._group):
+            multiply(group, held[group], group.stop)
+        buffer = np.empty((min(self._group, len(others) - shared), block.size), dtype=np.complex128)
+        for group in _slices(len(others), self._group, shared):
+            multiply(group, read(others[group], buffer), len(rows))
         return products, left, right
 
     def read(self, rows: Sequence[int], number: int) -> Complexes:
@@ -349,6 +353,8 @@ class Reducer:
                         sums = self.octave_sums(own - values)
                         beyond = self._remainder(rows[i], others[j], [octave.energy for octave in sums])
                         parts[..., i, j] = astuple(Tail(*integral_over(sums), *beyond.at(self.orders)))
+        if shared:
+            parts[..., :shared] += np.swapaxes(np.triu(parts[..., :shared], 1), -1, -2)
         return Tail(*parts)
 
     def _remainder(self, row: int, other: int, measured: Sequence[float]) -> Remainder:
