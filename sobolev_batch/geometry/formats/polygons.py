@@ -55,15 +55,22 @@ def cut_polygons(vertices: NDArray[Any], corners: Indices, sizes: Indices) -> Ra
     is_used[corners] = True
     size = float(np.linalg.norm([np.ptp(axis[is_used]) for axis in axes]))
     found: _Measures = [(*np.zeros((3, 0)), np.zeros(0, bool))]
-    of_three, of_four, of_more = (corners[np.repeat(chosen, sizes)] for chosen in (sizes == 3, sizes == 4, sizes > 4))
-    cut = [of_three.reshape(-1, 3), _cut_quads(axes, of_four.reshape(-1, 4), found)]
-    owners = [np.flatnonzero(sizes == 3), np.flatnonzero(sizes == 4).repeat(2)]
-    if of_more.size:
-        triangles, own = _cut_others(axes, of_more, sizes[sizes > 4], found)
-        cut.append(triangles)
-        owners.append(np.flatnonzero(sizes > 4)[own])
+    if (sizes == 4).all():
+        return Raw(vertices, _cut_quads(axes, corners.reshape(-1, 4), found), _notes(found, size, len(sizes)))
+    starts, parts, owners = np.cumsum(sizes) - sizes, [], []
+    for faces in (np.flatnonzero(sizes == 3), np.flatnonzero(sizes == 4), np.flatnonzero(sizes > 4)):
+        if not faces.size:
+            continue
+        number = sizes[faces[0]]
+        if number > 4:
+            triangles, own = _cut_others(axes, corners[np.repeat(sizes > 4, sizes)], sizes[faces], found)
+        else:
+            triangles, own = corners[starts[faces, None] + np.arange(number)], np.arange(len(faces)).repeat(number - 2)
+            triangles = triangles if number == 3 else _cut_quads(axes, triangles, found)
+        parts.append(triangles)
+        owners.append(faces[own])
     order = np.argsort(np.concatenate(owners), kind="stable")
-    return Raw(vertices, np.concatenate(cut)[order], _notes(found, size, len(sizes)))
+    return Raw(vertices, np.concatenate(parts)[order], _notes(found, size, len(sizes)))
 
 
 def _notes(found: _Measures, size: float, faces: int) -> tuple[str, ...]:
