@@ -22,6 +22,7 @@ import pytest
 from distributed import Client
 
 import sobolev_batch as sb
+from sobolev_batch.cli import cli
 from sobolev_batch.cli.output import progress_bar, replace_line, show_usage_error
 from sobolev_batch.sources import files
 from sobolev_batch.tables import FORMATS
@@ -225,6 +226,16 @@ def test_choices_of_an_option_that_lacks_are_indented(capsys: pytest.CaptureFixt
     show_usage_error(click.MissingParameter(param=option))
     show_usage_error(click.UsageError("a\tb"))
     assert capsys.readouterr().err.splitlines()[1:] == ["  csv,", "  nc", r"Error: a\tb"]
+
+
+@pytest.mark.parametrize("words", [[], ["table"]])
+def test_help_in_place_of_arguments_has_its_lines(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(click.ClickException) as caught:
+        cli.main([*words], standalone_mode=False)
+    show_usage_error(caught.value)
+    shown = capsys.readouterr().err
+    assert shown.startswith("Usage: ")
+    assert "\\n" not in shown
 
 
 def test_lines_that_are_updated_in_place(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -46,7 +46,7 @@ def summary() -> sb.result_types.Summary:
             sb.result_types.Status(HOSTILE, 3, 5, {HOSTILE: HOSTILE}, {}, None, False, 0.0),
             ["3 of 5 complete, 1 failed, 1 to go"],
         ),
-        (sb.testing.Verdict("same", 9e-5, 1.1e-4, 1e-3, -2.0, 0.0, "lattice"), ["relative distance 0.00010 ± 0.00001"]),
+        (sb.testing.Verdict("same", 9e-5, 1.1e-4, 1e-3, -2.0, 0.0, "lattice"), ["relative distance 0.010 % ± 0.001 %"]),
     ],
 )
 def test_texts_are_shown_and_never_run(value: Any, texts: list[str]) -> None:

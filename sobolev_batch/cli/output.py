@@ -87,6 +87,10 @@ def progress_bar(length: int, label: str, *, show_count: bool = True) -> Any:
 
 def show_usage_error(error: click.ClickException) -> None:
     """Print what is wrong with a command, as click words it."""
+    if isinstance(error, click.exceptions.NoArgsIsHelpError):
+        # Its message is the help.
+        echo_lines(error.message, err=True)
+        return
     text = StringIO()
     error.show(text)
     shown = text.getvalue().removesuffix("\n").replace(error.message, visible(error.message))

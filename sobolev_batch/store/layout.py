@@ -76,8 +76,9 @@ TABLES_OF_ALL = ("meshes", "convergence", "proximity")
 _OF_ROWS = frozenset({FIELD, OCTAVES, RECORD, PAGE})
 # Most of the time of a request is spent waiting.
 _REQUESTS_AT_ONCE = 64
-# Documents of nodes, and the SHA-256 of keys below the digest.
-Metadata = tuple[dict[str, Document], dict[str, str]]
+# Hashes of keys, each with what the storage says of the content when it lists the key, if anything.
+Hashes = dict[str, tuple[str, str]]
+Metadata = tuple[dict[str, Document], Hashes]
 # Tasks write into the chunks of these groups; all others are tables, written, listed and hidden as a whole.
 GROUPS_OF_TASKS = ("fourier", OCTAVES_GROUP, SPECTRA_GROUP, RECORDS)
 
@@ -96,12 +97,10 @@ class Store:
     def __init__(self, store: str | Path | Location) -> None:
         self.location = Location.parse(store)
         self.documents: dict[str, Document] = {}
-        # The SHA-256 of keys below the digest that this process knows, and those of them that are in `TAGS`.
-        self._hashes: dict[str, str] = {}
-        self._remembered: dict[str, str] = {}
+        # These are the SHA-256 of keys below the digest that this process knows, with their tags; see `remember`.
+        self._hashes: Hashes = {}
+        self._remembered: Hashes = {}
         self.lacks_tables = False
-        # The stores that this one is made of, each with the number of rows before its own; see `JoinedStore`.
-        self.parts: tuple[tuple[int, Store], ...] = ((0, self),)
 
     def __getstate__(self) -> dict[str, Any]:
         carried = {name: self.documents[name] for name in self._arrays_in_progress if name in self.documents}
@@ -198,6 +197,11 @@ class Store:
     def removed(self) -> frozenset[str]:
         """Labels of the meshes that the study has lost; their fields stay, in case they come back."""
         return frozenset(self.attributes().get(REMOVED, ()))
+
+    @property
+    def parts(self) -> tuple[tuple[int, Store], ...]:
+        """The stores that this one is made of, each with the number of rows before its own; see `JoinedStore`."""
+        return ((0, self),)
 
     @property
     def row_count(self) -> int:
@@ -311,7 +315,8 @@ class Store:
     def publish(self, keys: Mapping[str, bytes]) -> None:
         """Write keys of new nodes. Readers find the nodes after `consolidate`."""
         self.location.write(keys)
-        self._hashes |= {key: hashlib.sha256(content).hexdigest() for key, content in keys.items()}
+        tags = self._tags(keys)
+        self._hashes |= {key: (hashlib.sha256(content).hexdigest(), tags.get(key, "")) for key, content in keys.items()}
         self.documents |= documents_in(keys)
 
     def remove(self, group: str) -> None:
@@ -358,30 +363,30 @@ class Store:
         for name in self.whole_arrays():
             keys |= dict.fromkeys(self.chunk_keys(name), largest_chunk_bytes(self.documents[name]))
         unknown = {key: keys[key] for key in sorted(keys.keys() - self._hashes.keys())}
+        # A tag that is older than the content is found to have changed; a newer one would hide what happens meanwhile.
+        tags = self._tags(unknown)
         with ThreadPoolExecutor(_REQUESTS_AT_ONCE) as pool:
             # A thread takes longer to start than a file to be read.
             each = pool.map if self.location.scheme else map
             contents = each(self.location.read, unknown, unknown.values())
             for key, content in zip(unknown, contents, strict=True):
-                self._hashes[key] = hashlib.sha256(content or b"").hexdigest()
-        return digest_of([root, {key: self._hashes[key] for key in keys}])
+                self._hashes[key] = hashlib.sha256(content or b"").hexdigest(), tags.get(key, "")
+        return digest_of([root, {key: self._hashes[key][0] for key in keys}])
 
     def remember(self) -> None:
         """Write down the hashes of keys that have tags, so that later runs read only those that have changed since."""
-        if self.location.scheme and not self._hashes.items() <= self._remembered.items():
-            tags = self._tags(self._hashes)
-            tagged = {key: (known, tags[key]) for key, known in self._hashes.items() if key in tags}
-            if tagged:
-                self.location.write({TAGS: json.dumps(tagged).encode()})
-                self._remembered = dict(self._hashes)
+        tagged = {key: known for key, known in self._hashes.items() if known[1]}
+        if not tagged.items() <= self._remembered.items():
+            self.location.write({TAGS: json.dumps(tagged).encode()})
+            self._remembered = tagged
 
     def _recall(self) -> None:
         """Take the hashes over that were remembered of keys whose tags are the same."""
         text = self.location.read(TAGS) if self.location.scheme else None
         with suppress(ValueError, TypeError, AttributeError, RecursionError):  # Other texts are worth nothing.
-            known = {str(key): (str(one), tag) for key, (one, tag) in json.loads(text or "{}").items()}
+            known = {str(key): (str(one), str(tag)) for key, (one, tag) in json.loads(text or "{}").items()}
             tags = self._tags(known)
-            self._remembered = {key: one for key, (one, tag) in known.items() if tags.get(key) == tag}
+            self._remembered = {key: one for key, one in known.items() if tags.get(key) == one[1]}
             self._hashes = self._remembered | self._hashes
 
     def _tags(self, keys: Iterable[str]) -> dict[str, str]:
@@ -418,8 +423,13 @@ class JoinedStore(Store):
     def __init__(self, stores: Sequence[Store], labels: Sequence[str]) -> None:
         super().__init__(stores[0].location)
         self.documents = stores[0].documents
-        self._labels = tuple(labels)
-        self.parts = tuple(zip(accumulate((store.row_count for store in stores), initial=0), stores, strict=False))
+        self._stores, self._labels = tuple(stores), tuple(labels)
+
+    @property
+    def parts(self) -> tuple[tuple[int, Store], ...]:
+        """The stores, each with the number of rows before its own."""
+        firsts = accumulate((store.row_count for store in self._stores), initial=0)
+        return tuple(zip(firsts, self._stores, strict=False))
 
     def labels(self) -> tuple[str, ...]:
         """Return the label of each row; empty for rows that are left out."""

@@ -112,8 +112,8 @@ class Location:
 
     def read(self, key: str, most_bytes: int | None = None) -> bytes | None:
         """Return the bytes of a key, or None if it does not exist."""
-        store = self.zarr_store()
         with self.access("read"):
+            store = self.zarr_store()
             if isinstance(store, FolderStore):
                 return store.content(key, most_bytes)
             content = sync(store.get(key, default_buffer_prototype()))

@@ -16,7 +16,7 @@ from sobolev_batch.norms.accuracy.threshold import Method, relative_distance
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
 from sobolev_batch.parameters import check_seed
 from sobolev_batch.shown import Shown
-from sobolev_batch.tables.text import rounded_outwards, with_error
+from sobolev_batch.tables.text import percent, rounded_outwards
 from sobolev_batch.testing.difference import write_difference
 from sobolev_batch.transform.lattice import single_order
 
@@ -82,22 +82,22 @@ class Verdict(Shown):
         number = f"relative distance {self._number} at order {self.order:g}"
         change = 100 * self.area_change
         area = f"area {change:+,.0f} %" if abs(change) >= _WHOLE else f"area {change:+.2g} %"
-        doubt = f"; {self.doubt}" if self.doubt else ""
+        doubt, tolerance = f"; {self.doubt}" if self.doubt else "", f"tolerance {100 * self.tolerance:g} %"
         match self.outcome:
             case "same":
-                return f"same surface: {number}, within tolerance {self.tolerance:g}"
+                return f"same surface: {number}, within {tolerance}"
             case "different":
-                return f"different surfaces: {number}, above tolerance {self.tolerance:g}; {area}{doubt}"
+                return f"different surfaces: {number}, above {tolerance}; {area}{doubt}"
             case "undecided":
-                return f"undecided: {number}, which does not tell it from tolerance {self.tolerance:g}; take another"
+                return f"undecided: {number}, which does not tell it from {tolerance}; take another"
 
     @property
     def _number(self) -> str:
-        """The distance with its error, or its bounds where these are far apart."""
+        """The distance in per cent with its error, or its bounds where these are far apart."""
         if self.error <= _WIDEST * self.distance:
-            return with_error(self.distance, self.error)
-        lower, upper = rounded_outwards(self.lower, self.upper)
-        return f"at most {upper}" if self.outcome == "same" else f"from {lower} to {upper}"
+            return percent(self.distance, self.error)
+        lower, upper = rounded_outwards(100 * self.lower, 100 * self.upper)
+        return f"at most {upper} %" if self.outcome == "same" else f"from {lower} to {upper} %"
 
 
 def same_surface(
@@ -139,7 +139,7 @@ def same_surface(
     >>> import sobolev_batch as sb
     >>> fine, coarse = sb.shapes.icosphere(4), sb.shapes.icosphere(3)
     >>> print(sb.testing.same_surface(coarse, fine, tolerance=0.01, order=-4))
-    same surface: relative distance 0.00...
+    same surface: relative distance 0.7 % ...
     >>> sb.testing.same_surface(coarse, fine).outcome
     'different'
     """
@@ -194,7 +194,7 @@ def assert_same_surface(
     >>> sb.testing.assert_same_surface((sphere.vertices, sphere.triangles[100:]), sphere, order=-4)
     Traceback (most recent call last):
         ...
-    AssertionError: different surfaces: relative distance 0.05... at order -4, above tolerance 0.001; area -1.9 %;
+    AssertionError: different surfaces: relative distance 5...% at order -4, above tolerance 0.1 %; area -1.9 %;
     a has less area near (...); witness: ...-a.ply ...-b.ply
     """
     __tracebackhide__ = True

@@ -159,13 +159,14 @@ def doubled_areas(mesh: Mesh) -> Reals:
     aspect ratio of 1e6 costs six digits.
     """
     doubled = 2 * mesh.areas
-    flat = np.flatnonzero(mesh.areas < _FLATNESS * mesh.centroid_radii**2)
-    a, b, c = (corner.T for corner in mesh.corners(flat))
-    (p, p_low), (q, q_low) = _two_sum(b, -a), _two_sum(c, -a)
-    y, z = [1, 2, 0], [2, 0, 1]
-    forward, backward = _multiply((p[y], p_low[y]), (q[z], q_low[z])), _multiply((p[z], p_low[z]), (q[y], q_low[y]))
-    high, low = _subtract(forward, backward)
-    doubled[flat] = np.sqrt(((high + low) ** 2).sum(axis=0))
+    is_flat, y, z = mesh.areas < _FLATNESS * mesh.centroid_radii**2, [1, 2, 0], [2, 0, 1]
+    for batch in _slices(mesh, _BATCH["cpu"]):
+        flat = batch.start + np.flatnonzero(is_flat[batch])
+        a, b, c = (corner.T for corner in mesh.corners(flat))
+        (p, p_low), (q, q_low) = _two_sum(b, -a), _two_sum(c, -a)
+        forward, backward = _multiply((p[y], p_low[y]), (q[z], q_low[z])), _multiply((p[z], p_low[z]), (q[y], q_low[y]))
+        high, low = _subtract(forward, backward)
+        doubled[flat] = np.sqrt(((high + low) ** 2).sum(axis=0))
     return doubled
 
 

@@ -127,6 +127,26 @@ def test_what_changed_in_object_storage_is_read_again_and_mended(
     assert len(server.requests()) - requests <= 45
 
 
+def test_what_changes_in_object_storage_during_a_run_is_mended_by_the_next_one(
+    server: Server, threads: Client, url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(Study.from_table(small_table()), url, threads)
+    place, client = {"Bucket": BUCKET, "Key": f"{key_of(url)}/fourier/xi_x/c/0"}, server.client()
+    content = client.get_object(**place)["Body"].read()
+    remember = Store.remember
+
+    def remember_too_late(store: Store) -> None:
+        client.put_object(**place, Body=bytes([content[0] ^ 1]) + content[1:])
+        remember(store)
+
+    more = Study.from_table(small_table(family=[{"name": "more", "source": "sphere", "radius": 0.5}]))
+    monkeypatch.setattr(Store, "remember", remember_too_late)
+    run(more, url, threads)
+    monkeypatch.undo()
+    run(more, url, threads)
+    assert client.get_object(**place)["Body"].read() == content
+
+
 def test_verify_reads_what_object_storage_lists_unchanged(
     server: Server, threads: Client, url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
@@ -166,7 +167,7 @@ def _cost_league(
         front = _is_unbeaten(costs, own["relative"], own["relative"])
         # At worst it has the largest distance that its error allows, and others the smallest; at best the reverse.
         at_worst, at_best = _is_unbeaten(costs, high, low), _is_unbeaten(costs, low, high)
-        parts.append(own.assign(front=front, undecided=np.not_equal(at_worst, at_best)))
+        parts.append(own.assign(front=front, undecided=at_worst != at_best))
     columns = ["object", "method", "member", "mesh", x, "relative", "relative_error", "front", "undecided"]
     made = pd.concat(parts, ignore_index=True)[columns]
     return CostLeague(order, x, tuple(dict.fromkeys(made["object"])), tuple(methods), left_out, made)
@@ -177,16 +178,20 @@ def objects_text(count: int) -> str:
     return f"{count} object{'s' if count > 1 else ''}"
 
 
-def _is_unbeaten(costs: pd.Series, own: pd.Series, others: pd.Series) -> list[bool]:
-    """Tell of each of some meshes whether no other one beats it: nearer at no more cost, or as near at less cost.
+def _is_unbeaten(costs: pd.Series, own: pd.Series, others: pd.Series) -> NDArray[np.bool_]:
+    """Return which of some meshes no other one beats: at no more cost and nearer, or as near at less cost.
 
-    A mesh may have another distance, its own, than where others are compared with it.
+    Distances and costs are (meshes,); a mesh may have another distance where others are compared with it.
     """
-    prices, rivals, result = costs.to_numpy(), others.to_numpy(), []
-    for number, (price, distance) in enumerate(zip(prices, own, strict=True)):
-        beats = ((prices <= price) & (rivals < distance)) | ((prices < price) & (rivals <= distance))
-        beats[number] = False
-        result.append(not beats.any())
+    order = np.lexsort([others, costs])
+    cost, rival, place = costs.to_numpy()[order], others.to_numpy()[order], np.arange(len(order))
+    first, end = (np.searchsorted(cost, cost, side) for side in ("left", "right"))
+    padded = np.append(rival, np.inf)
+    cheaper = np.append(np.inf, np.minimum.accumulate(rival))[first]
+    # Among those of the same cost, the first is the nearest.
+    alike = np.where(place > first, padded[first], np.where(first + 1 < end, padded[first + 1], np.inf))
+    distance, result = own.to_numpy()[order], np.empty(len(order), dtype=bool)
+    result[order] = (np.minimum(cheaper, alike) >= distance) & (cheaper > distance)
     return result
 
 

@@ -416,8 +416,13 @@ def _close_share(points: Reals, centers: Reals, farthest: Reals) -> float:
 
 
 def _are_close(points: Array, centers: Array, farthest: Array) -> Array:
-    offsets = (points[:, axis, None] - centers[:, axis] for axis in range(3))
-    return sum(offset * offset for offset in offsets) < farthest * farthest
+    squares = 0.0
+    for axis in range(3):
+        offsets = points[:, axis, None] - centers[:, axis]
+        # In place: these are the largest arrays of all.
+        offsets *= offsets
+        squares += offsets
+    return squares < farthest * farthest
 
 
 def _close_pairs(
