@@ -12,7 +12,7 @@ import pandas as pd
 import xarray as xr
 
 from sobolev_batch.tables import Format
-from sobolev_batch.tables.convergence import nearest, remarks, smallest_of, table, tables_of
+from sobolev_batch.tables.convergence import ALONE, nearest, remarks, smallest_of, table, tables_of
 from sobolev_batch.tables.open import AnyStore, require_one_object
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.text import count, minus, percent, spread, wrapped
@@ -36,13 +36,12 @@ VERDICT_COLUMNS = (
     Column("triangles", "triangles", count),
     Column("remark", "remark", kind="text"),
 )
+_TOTALS = ("meshes", "missing", "above_rtol")
 _OBJECT_COLUMNS = (
     Column("object", "object", kind="label"),
     Column("mesh", "nearest mesh", kind="text"),
     Column("relative", "relative", percent, "relative_error"),
-    Column("meshes", "meshes", count),
-    Column("missing", "missing", count),
-    Column("above_rtol", "above rtol", count),
+    *(Column(name, name.replace("_", " "), count) for name in _TOTALS),
 )
 
 
@@ -52,7 +51,9 @@ def study_verdict(frame: pd.DataFrame, failed: Mapping[str, str]) -> tuple[tuple
     It is a sentence for each order; rows of nearest meshes, smallest meshes below bounds, and meshes that are missing
     or imprecise, with their order; and a note on the sizes and families that are left out, empty where none is.
     """
-    sizes = _sizes(frame[frame["order"] == frame["order"].iloc[0]])
+    if frame.empty:
+        return (ALONE,), [], ""
+    sizes = _sizes(frame.drop_duplicates("mesh"))
     shown_sizes = spread(sizes, _MOST_SIZES)
     sized = frame[frame["triangles"] > 0]["family"].unique().tolist()
     families, sentences, lines = sized[:_MOST_FAMILIES], [], list[Row]()
@@ -234,8 +235,9 @@ def format_objects(
             totals = {"meshes": len(known), "missing": len(of_order) - len(known)}
             imprecise = int((known["resolved"].astype(bool) & ~known["within"].astype(bool)).sum())
             rows.append({"order": order, "object": name, **numbers, **totals, "above_rtol": imprecise})
-    frame = pd.DataFrame(rows).sort_values(["missing", "relative"], ascending=False, kind="stable")
-    sections, notes = [], []
+    names = ["order", "object", "mesh", "relative", "relative_error", *_TOTALS]
+    frame = pd.DataFrame(rows, columns=names).sort_values(["missing", "relative"], ascending=False, kind="stable")
+    sections, notes = [] if rows else [Section(sentences=[ALONE])], []
     for order, of_order in frame.groupby("order", sort=False):
         shown = of_order.to_dict(orient="records")[:most]
         columns = [one for one in _OBJECT_COLUMNS if one.format is not count or any(row[one.name] for row in shown)]

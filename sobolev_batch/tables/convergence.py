@@ -41,6 +41,7 @@ from sobolev_batch.tables.text import between, count, percent, with_error, wrapp
 from sobolev_batch.transform.lattice import Orders
 
 # What a remesher may break.
+ALONE = "The study has its reference alone: there is nothing to compare."
 CONNECTION_COLUMNS = (
     Column("components", "components", "{:,.0f}".format),
     Column("euler_characteristic", "Euler", "{:,.0f}".format),
@@ -300,7 +301,7 @@ def _sections(name: str, tree: xr.DataTree, frame: pd.DataFrame, x: str) -> Iter
         columns.insert(2, Column(x, x, "{:.4g}".format))
     for order, rows in marked.groupby("order", sort=False):
         yield Section(f"Sobolev distance of order {order:g} to {frame.attrs['reference']}", [(columns, rows)])
-    once = marked[marked["order"] == marked["order"].iloc[0]]
+    once = marked.drop_duplicates("mesh")
     if has_proximity(tree):
         yield Section("Other distances, the same at all orders", [((_MESH, *_metric_columns(tree)), once)])
     connection = [column for column in CONNECTION_COLUMNS if column.name in frame]
@@ -308,7 +309,7 @@ def _sections(name: str, tree: xr.DataTree, frame: pd.DataFrame, x: str) -> Iter
         yield Section("How triangles are connected", [((_MESH, *connection), once)])
     if "computed" in frame.attrs:
         yield Section(sentences=order_note(tree, frame.attrs["computed"]))
-    yield Section(sentences=remarks(tree, frame))
+    yield Section(sentences=[ALONE] if frame.empty else remarks(tree, frame))
 
 
 def nearest(frame: pd.DataFrame) -> tuple[pd.Series, tuple[str, ...]] | None:

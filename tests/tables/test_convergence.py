@@ -6,19 +6,21 @@ import json
 import re
 from io import StringIO
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
+from distributed import Client
 
 import sobolev_batch as sb
 from sobolev_batch import smallest_below, table
 from sobolev_batch.errors import InputError
 from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.store.records import Records
-from sobolev_batch.tables.conclusion import format_verdict
+from sobolev_batch.tables.conclusion import format_objects, format_verdict
 from sobolev_batch.tables.convergence import format_smallest, format_table
 from sobolev_batch.tables.matrix import format_matrix
 from sobolev_batch.tables.rendering import printed_table
@@ -277,3 +279,12 @@ def test_other_orders_are_refused(stores: tuple[str, str]) -> None:
     for ask, order in product((sb.table, sb.matrix), (-0.5, 1.0, [], "all")):
         with pytest.raises(sb.errors.OrderError):
             ask(stores[0], order)
+
+
+def test_a_study_of_its_reference_alone_has_nothing_to_compare(store_path: Path, threads: Client) -> None:
+    family, reference = [{"name": "ico", "source": "icosphere", "levels": [1]}], {"source": "family", "family": "ico"}
+    sb.run(sb.Study.from_table(small_table(reference=reference, family=family)), store_path, threads)
+    assert sb.table(store_path).empty
+    for text in (format_table(store_path), format_verdict(sb.open_store(store_path)), format_objects(store_path)):
+        assert "there is nothing to compare" in text
+    assert format_table(store_path, "csv").startswith("order,mesh,")

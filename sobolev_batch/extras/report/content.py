@@ -144,7 +144,7 @@ def common_content(
         "name": study["study"]["name"],
         "orders": [minus(f"{order:g}") for order in rows["order"].drop_duplicates()],
         "objects_in_all": len(frames) if "object" in study else 0,
-        "meshes_in_all": rows[rows["order"] == rows["order"].iloc[0]],
+        "meshes_in_all": rows[rows["order"].isin(rows["order"].head(1))],
         "failed": reasons_table("failed", "mesh", failed),
         "not_compared": reasons_table("lacking", "mesh", status.not_compared),
         "status": status,
@@ -194,7 +194,7 @@ def study_content(tree: xr.DataTree, status: Status) -> dict[str, Any]:
 def convergence_table(tree: xr.DataTree, frame: pd.DataFrame, families: Sequence[str], most: int) -> PageTable:
     """Return the convergence table of an open store, from the rows of `table`, with a limited number of each order."""
     orders, most = frame["order"].drop_duplicates().tolist(), max(1, most)
-    longest = int(frame.groupby("order").size().max())
+    longest = int(frame.groupby("order").size().max()) if len(frame) else 0
     rows = with_remarks(frame).groupby("order", sort=False).head(most)
     rows = rows.assign(color=rows["family"].map(families.index), reasons="failed")
     return PageTable(

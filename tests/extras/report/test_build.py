@@ -445,3 +445,12 @@ def test_a_forged_store_makes_nothing_live_and_opens_no_place_that_it_names(tmp_
             sb.write_witness(forged.location.name, "ico/2", write)
         with pytest.raises(BlockingIOError):
             server.accept()
+
+
+def test_a_report_of_a_reference_alone_says_that_there_is_nothing_to_compare(
+    store_path: Path, threads: Client, tmp_path: Path
+) -> None:
+    family, reference = [{"name": "ico", "source": "icosphere", "levels": [1]}], {"source": "family", "family": "ico"}
+    sb.run(Study.from_table(small_table(reference=reference, family=family)), store_path, threads)
+    sb.report(store_path, tmp_path / "page.html")
+    assert "there is nothing to compare" in (tmp_path / "page.html").read_text(encoding="utf-8")
