@@ -416,12 +416,15 @@ def _close_share(points: Reals, centers: Reals, farthest: Reals) -> float:
 
 
 def _are_close(points: Array, centers: Array, farthest: Array) -> Array:
-    squares = 0.0
-    for axis in range(3):
+    def squared_offsets(axis: int) -> Array:
         offsets = points[:, axis, None] - centers[:, axis]
-        # In place: these are the largest arrays of all.
+        # In place, as below: these are the largest arrays of all.
         offsets *= offsets
-        squares += offsets
+        return offsets
+
+    squares = squared_offsets(0)
+    for axis in (1, 2):
+        squares += squared_offsets(axis)
     return squares < farthest * farthest
 
 
