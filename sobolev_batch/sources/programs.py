@@ -91,6 +91,8 @@ def printed(words: Sequence[str]) -> str:
             timeout=_VERSION_SECONDS,
             check=True,
         )
+    except FileNotFoundError as error:
+        raise StudyError(f"version: {shlex.join(words)}: {words[0]} is not installed, or not on the PATH") from error
     except (OSError, subprocess.SubprocessError) as error:
         raise StudyError(f"version: {shlex.join(words)}: {one_line(error)}") from error
     return done.stdout.decode(errors="replace").strip()
