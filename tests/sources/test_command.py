@@ -192,7 +192,7 @@ def test_a_program_without_a_scratch_folder_says_so(tmp_path: Path, monkeypatch:
 def test_a_program_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(sb.errors.MeshError, match="no-such-remesher cannot be started on this machine"):
         made({**COPY, "command": ["no-such-remesher", "{output}"]}, tmp_path)[0].load()
-    with pytest.raises(sb.errors.StudyError, match="version: no-such-remesher: no-such-remesher is not installed, or not on the PATH"):
+    with pytest.raises(sb.errors.StudyError, match="no-such-remesher is not installed, or not on the PATH"):
         made({**COPY, "version": ["no-such-remesher"]}, tmp_path)
 
 
