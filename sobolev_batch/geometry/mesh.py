@@ -36,7 +36,7 @@ _SINGLE_ROUNDING = 2.0**-22
 
 
 class _Sizes(NamedTuple):
-    """Of triangles: areas, centroid radii, both lengths of edges, and how many have no area to double precision."""
+    """Areas and centroid radii of triangles, lengths of edges, and how many have no area to double precision."""
 
     areas: Reals
     radii: Reals

@@ -8,6 +8,7 @@ import pickle
 import shutil
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from zarr.core.buffer import default_buffer_prototype
@@ -197,3 +198,10 @@ def test_the_store_itself_may_be_reached_by_a_link(copy: Path, tmp_path: Path) -
     (tmp_path / "link.zarr").symlink_to(copy)
     assert Status.from_store(tmp_path / "link.zarr").complete == 5
     assert Store.open(tmp_path / "link.zarr").labels() == Store.open(copy).labels()
+
+
+def test_a_driver_that_cannot_connect_ends_in_a_store_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Some connect as soon as they are made.
+    monkeypatch.setattr(Location, "zarr_store", Mock(side_effect=ConnectionRefusedError("refused")))
+    with pytest.raises(StoreError, match=r"cannot be read: .*refused"):
+        Location.parse("memory://away.zarr").read("zarr.json")

@@ -22,6 +22,7 @@ from sobolev_batch.extras.fitting.descent import (
     shape_penalty,
     triangle_qualities,
 )
+from sobolev_batch.extras.fitting.objective import FitSettings
 from sobolev_batch.geometry.subdivision import Edges
 from sobolev_batch.sources.derived import decimated
 
@@ -276,3 +277,11 @@ def test_smoothing_solves_with_the_graph_laplacian() -> None:
     assert np.sum(smoothing.pulled_back(slopes) * steps) == pytest.approx(np.sum(slopes * movement), rel=1e-10)
     without = Smoothing(mesh, free, 0.0)
     np.testing.assert_array_equal(without.movement(steps)[free], steps)
+
+
+def test_narrow_integers_of_numpy_do_not_overflow() -> None:
+    steps: Any = np.int8(100)
+    smoothing: Any = np.float32(0.5)
+    settings = FitSettings(steps=steps, smoothing=smoothing)
+    assert 3 * settings.steps == 300
+    assert type(settings.smoothing) is float
