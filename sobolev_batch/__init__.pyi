@@ -33,7 +33,7 @@ from .norms.distances import norm as norm
 from .norms.fields import fourier_transform as fourier_transform
 from .norms.rates import convergence as convergence
 from .norms.yardsticks import yardsticks as yardsticks
-from .store.unlock import unlock as unlock
+from .store.latest_run import unlock as unlock
 from .study.study import Study as Study
 from .tables.convergence import smallest_below as smallest_below
 from .tables.convergence import table as table

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 from sobolev_batch.errors import DamageError
 from sobolev_batch.shown import Shown
+from sobolev_batch.store.latest_run import LOST_AFTER_SECONDS, RunRecord
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import age_seconds
 from sobolev_batch.store.objects import Objects, labelled
-from sobolev_batch.store.records import ObjectRecord, Records, RunRecord
-from sobolev_batch.store.unlock import LOST_AFTER_SECONDS
+from sobolev_batch.store.records import ObjectRecord
 from sobolev_batch.store.workspace import Contents
 from sobolev_batch.tables.open import AnyStore, location_of
 from sobolev_batch.tables.text import duration
@@ -68,15 +68,15 @@ class Status(Shown):
         location = Location.parse(location_of(store))
         objects = Objects.read(location)
         if objects is not None:
-            run = objects.records.read_run()
+            run = RunRecord.read(objects.records.store)
             tallies = dict(_tallies(objects))
             moments = [one.finished for one in tallies.values() for _ in range(one.complete)]
         elif Store(location).is_unfinished:
             # Its run plans, or was ended while it did.
-            run, moments, tallies = Records(Store(location)).read_run(), [], {"": ObjectRecord()}
+            run, moments, tallies = RunRecord.read(Store(location)), [], {"": ObjectRecord()}
         else:
             opened = Store.open(location)
-            run, contents = Records(opened).read_run(), Contents.of_store(opened)
+            run, contents = RunRecord.read(opened), Contents.of_store(opened)
             tallies = {"": contents.tally()}
             moments = [record.finished for record in contents.records if record is not None]
         refused = {name: one.reason for name, one in tallies.items() if one.reason}

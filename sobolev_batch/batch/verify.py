@@ -13,6 +13,7 @@ from sobolev_batch.machine import available_cores
 from sobolev_batch.shown import Shown
 from sobolev_batch.store.encoding import ROOT
 from sobolev_batch.store.field_arrays import Fields
+from sobolev_batch.store.latest_run import RunRecord
 from sobolev_batch.store.layout import (
     GROUPS_OF_TASKS,
     LABELS,
@@ -165,7 +166,7 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, *, may
     if not tables and not store.has_digest(is_thorough=True):
         tables[ROOT] = "tables, coordinates or metadata are not what was written together"
     try:
-        Records(store).read_run()
+        RunRecord.read(store)
     except StoreError as error:
         tables[RECORDS] = error.what if isinstance(error, DamageError) else str(error)
     labels = store.labels() if LABELS not in tables else tuple(f"row {row}" for row in range(len(records)))

@@ -78,7 +78,7 @@ def verify_command(context: click.Context, store: Location, style: str) -> None:
 @click.option("--force", is_flag=True, help="Unlock it even if its run was active a moment ago.")
 def unlock_command(store: Location, force: bool) -> None:
     """Remove the lock that a killed run left on STORE."""
-    from sobolev_batch.store.unlock import unlock
+    from sobolev_batch.store.latest_run import unlock
 
     lock = unlock(store, force=force)
     if lock is None:

@@ -1,4 +1,4 @@
-"""Records in a store: of the computation of each surface, and of the latest run.
+"""Records in a store: of the computation of each surface, and of the objects of a study.
 
 A record is one chunk, which its task writes. Once a run has ended, records lie together in pages, since on object
 storage each chunk is a request.
@@ -14,14 +14,12 @@ from dataclasses import asdict, dataclass, field
 from functools import cache
 from typing import Any, ClassVar, Generic, Literal, Self, TypeVar, cast
 
-import numpy as np
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from sobolev_batch.errors import DamageError
 from sobolev_batch.sources.programs import Cost
-from sobolev_batch.store.checked import CHANGED, largest_chunk_bytes
-from sobolev_batch.store.encoding import ROOT
-from sobolev_batch.store.layout import DIGEST, PAGE, RECORD, RECORDS, Store, digest_of, table_attributes
+from sobolev_batch.store.checked import largest_chunk_bytes
+from sobolev_batch.store.layout import PAGE, RECORD, Store
 from sobolev_batch.store.lock import Time
 from sobolev_batch.store.metadata import chunk_shape
 from sobolev_batch.transform.fourier import NUMERICS_VERSION
@@ -29,11 +27,8 @@ from sobolev_batch.transform.fourier import NUMERICS_VERSION
 _log = logging.getLogger(__name__)
 
 Status = Literal["complete", "failed"]
-RunState = Literal["submitted", "running", "done", "failed"]
 
 _ROW = "row"
-# The attribute of the group of records that holds the record of the latest run.
-_RUN = "run"
 # This JSON takes the place of a record that a page holds and that counts no more.
 _WITHDRAWN = "null"
 Kind = TypeVar("Kind")
@@ -112,11 +107,11 @@ class _Line:
         try:
             table = dict(json.loads(text))
         except (ValueError, TypeError, RecursionError) as error:
-            raise _damage(name, f"no table: {error}", text) from error
+            raise damaged_record(name, f"no table: {error}", text) from error
         stored_row = table.pop(_ROW, None)
-        record = _from_table(cls, table, name)
+        record = record_in(cls, table, name)
         if stored_row != row:
-            raise _damage(name, f"it is that of row {stored_row!r}", text)
+            raise damaged_record(name, f"it is that of row {stored_row!r}", text)
         return record
 
 
@@ -193,26 +188,6 @@ class ObjectRecord(_Line):
         return bool(key) and self.key == key
 
 
-@dataclass(frozen=True)
-class RunRecord:
-    """State of the latest run of a study.
-
-    Attributes:
-        state: "submitted" until a worker starts it, then "running", "done" or "failed".
-        driver: Description of the driver: its process and host, and its cluster.
-        started: Time of the start, in UTC.
-        seen: Time of the driver's latest heartbeat, in UTC.
-        error: Reason of the failure, or obstacle to the run; empty otherwise.
-    """
-
-    state: RunState
-    driver: str
-    started: Time
-    seen: Time
-    stage: str = ""
-    error: str = ""
-
-
 RecordType = TypeVar("RecordType", Record, ObjectRecord)
 # A record for each surface, unless others are asked for.
 _SURFACES: Any = Record
@@ -220,10 +195,7 @@ _SURFACES: Any = Record
 
 @dataclass(frozen=True)
 class Records(Generic[RecordType]):
-    """The records of a store: those of its rows, alone and in pages, and that of the latest run.
-
-    Rows are surfaces, or the objects of a study at its root.
-    """
+    """The records of the rows of a store, alone and in pages: of surfaces, or of the objects of a study at its root."""
 
     store: Store
     type: type[RecordType] = _SURFACES
@@ -306,50 +278,17 @@ class Records(Generic[RecordType]):
         """Number of rows of a page; the last page may have fewer."""
         return chunk_shape(self.store.document(PAGE))[0]
 
-    def read_run(self) -> RunRecord | None:
-        """Return the record of the latest run, or None before the first one."""
-        document = self.store.stored_document(RECORDS)
-        if document is None:
-            raise self.store.damage(f"{RECORDS}/{ROOT}", "it is not there")
-        table = document.get("attributes", {}).get(_RUN)
-        if table is None:
-            return None
-        digest, name = table.pop(DIGEST, ""), f"{self.store.path}: {RECORDS}/{ROOT}, the record of the latest run,"
-        if digest != digest_of(table):
-            raise _damage(name, CHANGED, table)
-        return _from_table(RunRecord, table, name)
 
-    def write_run(self, record: RunRecord) -> None:
-        """Replace the record of the latest run: an attribute of the group of records, in one key."""
-        # The store does not remember it: consolidated metadata would tell readers of a run that ended long ago.
-        attributes = {_RUN: {**asdict(record), DIGEST: digest_of(asdict(record))}}
-        group = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
-        self.store.location.write({f"{RECORDS}/{ROOT}": json.dumps(group).encode()})
-
-
-def rows_unlike_tables(store: Store, records: Sequence[Record | None]) -> dict[int, str]:
-    """Return how records differ from those that the tables were made from, by their rows."""
-    if table_attributes(store, "convergence") is None:
-        return {}
-    columns = (np.asarray(store.read(f"meshes/{name}")).tolist() for name in ("row", "status", "key"))
-    unlike = {}
-    for row, status, key in zip(*columns, strict=True):
-        record = records[row] if row < len(records) else None
-        if record is None and status != "missing":
-            unlike[row] = "its completion record is missing"
-        elif record is not None and (record.status, record.key) != (status, key):
-            unlike[row] = "its completion record is not the one that the tables were made from"
-    return unlike
-
-
-def _from_table(kind: type[Kind], table: Any, name: str) -> Kind:
+def record_in(kind: type[Kind], table: Any, name: str) -> Kind:
+    """Return the record that a table of JSON holds; DamageError where it holds something else."""
     try:
         return cast(Kind, _adapter(kind).validate_python(table))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         problem = ": ".join(filter(None, (".".join(map(str, first["loc"])), first["msg"])))
-        raise _damage(name, problem, table) from error
+        raise damaged_record(name, problem, table) from error
 
 
-def _damage(name: str, problem: str, content: object) -> DamageError:
+def damaged_record(name: str, problem: str, content: object) -> DamageError:
+    """Return the error for a record, by its name, whose content is not what was written."""
     return DamageError(f"{name} is damaged ({problem}): {str(content)[:80]!r}; run the study again", problem)

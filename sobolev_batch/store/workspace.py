@@ -7,12 +7,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
+import numpy as np
+
 from sobolev_batch.store.create import prepare_store
 from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.store.layout import QUALITY, Store, hide_tables, stored_choice, table_attributes
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import utc_now
-from sobolev_batch.store.records import ObjectRecord, Record, Records, rows_unlike_tables
+from sobolev_batch.store.records import ObjectRecord, Record, Records
 from sobolev_batch.study.plan import Plan, Row, make_plan
 from sobolev_batch.study.study import Study
 
@@ -181,3 +183,18 @@ class Workspace(Contents):
 def complete_records(records: Sequence[Record | None]) -> dict[int, Record]:
     """Return the records that are complete, by their rows."""
     return {row: record for row, record in enumerate(records) if record is not None and record.status == "complete"}
+
+
+def rows_unlike_tables(store: Store, records: Sequence[Record | None]) -> dict[int, str]:
+    """Return how records differ from those that the tables were made from, by their rows."""
+    if table_attributes(store, "convergence") is None:
+        return {}
+    columns = (np.asarray(store.read(f"meshes/{name}")).tolist() for name in ("row", "status", "key"))
+    unlike = {}
+    for row, status, key in zip(*columns, strict=True):
+        record = records[row] if row < len(records) else None
+        if record is None and status != "missing":
+            unlike[row] = "its completion record is missing"
+        elif record is not None and (record.status, record.key) != (status, key):
+            unlike[row] = "its completion record is not the one that the tables were made from"
+    return unlike

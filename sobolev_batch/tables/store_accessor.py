@@ -17,8 +17,8 @@ from sobolev_batch.norms.estimate import AREA_AND_SHAPE, NormEstimate
 from sobolev_batch.norms.fields import Quality
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.store.layout import QUALITY
-from sobolev_batch.store.records import Record, Records, rows_unlike_tables
-from sobolev_batch.store.workspace import complete_records
+from sobolev_batch.store.records import Record, Records
+from sobolev_batch.store.workspace import complete_records, rows_unlike_tables
 from sobolev_batch.tables.open import (
     finished_group,
     reference_of,

@@ -18,11 +18,11 @@ import zarr
 from distributed import Client
 
 import sobolev_batch as sb
+from sobolev_batch.store.latest_run import RunRecord
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, locked
 from sobolev_batch.store.objects import Objects
-from sobolev_batch.store.records import Records
 from sobolev_batch.study.plan import Plan, make_plan
 from sobolev_batch.tables.conclusion import format_objects
 from tests.support.commands import call
@@ -199,15 +199,15 @@ def test_one_lock_keeps_all_objects(changeable: Path) -> None:
 
 
 def test_the_status_is_that_of_the_run(changeable: Path) -> None:
-    records = Records(Store(changeable))
-    ended = records.read_run()
+    store = Store(changeable)
+    ended = RunRecord.read(store)
     assert ended is not None
     ended = replace(ended, started="2020-01-01T00:00:00Z", seen="2020-01-01T00:00:00Z", error="no disk")
-    records.write_run(replace(ended, state="failed"))
+    replace(ended, state="failed").write(store)
     failed = sb.status(changeable)
     assert not failed.lost
     assert "the latest run failed: no disk" in str(failed)
-    records.write_run(replace(ended, state="running"))
+    replace(ended, state="running").write(store)
     lost = sb.status(changeable)
     assert lost.lost
     assert f"unlock {changeable}" in str(lost)

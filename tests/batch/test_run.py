@@ -19,6 +19,7 @@ from sobolev_batch.batch.cluster.clients import remote_client
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.status import Status
 from sobolev_batch.store import workspace
+from sobolev_batch.store.latest_run import RunRecord
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.records import Record, Records
 from tests.support.commands import call, command, finished
@@ -267,13 +268,11 @@ def test_the_worker_that_drives_is_lost_and_another_takes_over(study_path: Path,
     with tcp_cluster([], []) as (address, workers):
         assert command("submit", study_path, "--scheduler", address, "--store", store_path).returncode == 0
         store = Store.open(store_path)
-        begun = wait_until(lambda: (record := Records(store).read_run()) and record.state != "submitted" and record)
+        begun = wait_until(lambda: (record := RunRecord.read(store)) and record.state != "submitted" and record)
         assert begun
         driver = next(worker for worker in workers if f"process {worker.pid} " in begun.driver)
         driver.kill()
-        done = wait_until(
-            lambda: (record := Records(store).read_run()) and record.state in ("done", "failed") and record
-        )
+        done = wait_until(lambda: (record := RunRecord.read(store)) and record.state in ("done", "failed") and record)
         assert done
         assert done.state == "done"
     status = Status.from_store(store_path)

@@ -18,8 +18,9 @@ import sobolev_batch as sb
 from sobolev_batch.batch.status import Status
 from sobolev_batch.cli import cli
 from sobolev_batch.cli.output import replace_line
+from sobolev_batch.store.latest_run import RunRecord
 from sobolev_batch.store.layout import Store, hide_tables
-from sobolev_batch.store.records import Record, Records, RunRecord
+from sobolev_batch.store.records import Record, Records
 from tests.support.studies import small_table
 
 # One instant for all moments of a test: records have whole seconds, and two readings of the clock may differ by one.
@@ -44,7 +45,7 @@ def running(store: Store, *finished: float, begun: float = 0.0, state: str = "ru
         record = Record(key="k", status="complete" if row else "failed", finished=moment(end or 0.0))
         Records(store).write(row, None if end is None else record)
     now = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-    Records(store).write_run(RunRecord(state, "process 1", moment(begun), now, "fields, 3 of 5"))  # type: ignore[arg-type]
+    RunRecord(state, "process 1", moment(begun), now, "fields, 3 of 5").write(store)  # type: ignore[arg-type]
     return Status.from_store(store.path)
 
 

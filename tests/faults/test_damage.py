@@ -18,9 +18,9 @@ from distributed import Client
 from sobolev_batch import Study, matrix, norm, open_store, run, status, verify
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.errors import DamageError, StoreError
+from sobolev_batch.store.latest_run import RunRecord
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.lock import utc_now
-from sobolev_batch.store.records import Records, RunRecord
 from sobolev_batch.tables.store_accessor import StoreAccessor
 from tests.faults.conftest import LABELS
 from tests.support.commands import call, write_toml
@@ -354,7 +354,7 @@ def test_the_record_of_a_run_that_was_altered(store: Path, study: Study, threads
     ):
         status(store)
     assert list(verify(store).tables) == ["records"]
-    Records(Store.open(store)).write_run(RunRecord("running", "process 1", utc_now(), "25:00 o'clock"))
+    RunRecord("running", "process 1", utc_now(), "25:00 o'clock").write(Store.open(store))
     with pytest.raises(DamageError, match=r"records/zarr.json, .* is damaged \(seen: .*o'clock"):
         status(store)
     assert list(verify(store).tables) == ["records"]

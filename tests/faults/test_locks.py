@@ -24,10 +24,10 @@ from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.errors import LockError, StoreError
 from sobolev_batch.result_types import Summary
 from sobolev_batch.store import workspace
+from sobolev_batch.store.latest_run import RunRecord
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import LOCK_KEY, Lock, acquire, locked, utc_now
-from sobolev_batch.store.records import Records
 from sobolev_batch.study.plan import Plan, make_plan
 from tests.support.commands import call, write_toml
 from tests.support.processes import PATIENCE_SECONDS
@@ -133,17 +133,14 @@ def test_the_lock_of_another_machine_is_unlocked_by_hand_unless_its_run_gave_a_s
     assert (unlock(store_path), unlock(store_path)) == (ELSEWHERE, None)
     assert len(run(study, store_path, threads).reused) == 5
     there = Store.open(store_path)
-    latest = Records(there).read_run()
+    latest = RunRecord.read(there)
     assert latest is not None
     location.create(LOCK_KEY, ELSEWHERE.to_json())
-    Records(there).write_run(
-        replace(latest, driver="process 12 on far.example, cluster c", state="running", seen=utc_now())
-    )
+    far = "process 12 on far.example, cluster c"
+    replace(latest, driver=far, state="running", seen=utc_now()).write(there)
     with pytest.raises(LockError, match=r"process 12 on far\.example was alive \d+ s ago"):
         unlock(store_path)
-    Records(there).write_run(
-        replace(latest, state="running", started="2999-01-01T00:00:00Z", seen="2999-01-01T00:00:00Z")
-    )
+    replace(latest, state="running", started="2999-01-01T00:00:00Z", seen="2999-01-01T00:00:00Z").write(there)
     assert "ahead of the clock here" in str(status(store_path))
     assert "whether it goes on is unknown" in str(status(store_path))
     assert unlock(store_path, force=True) == ELSEWHERE

@@ -24,11 +24,10 @@ from distributed.comm import CommClosedError
 
 from sobolev_batch.batch.cluster.workers import GPU
 from sobolev_batch.errors import ClusterError, LockError, StoreError, one_line
+from sobolev_batch.store.latest_run import LOST_AFTER_SECONDS, RunRecord, RunState
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, this_process, utc_now
-from sobolev_batch.store.records import Records, RunRecord, RunState
-from sobolev_batch.store.unlock import LOST_AFTER_SECONDS
 
 _log = logging.getLogger(__name__)
 
@@ -185,7 +184,7 @@ class Heartbeat:
     def __init__(self, location: Location, lock: Lock, watch: Watch | None = None) -> None:
         self.stage, self.watch = "", watch
         # Another driver of the same run may take its lock over, as when this one's worker was retired.
-        self._records = Records(Store(lock.of_holder(location)))
+        self._store = Store(lock.of_holder(location))
         self._lost: LockError | None = None
         self._started = utc_now()
 
@@ -217,7 +216,7 @@ class Heartbeat:
     def write(self, state: RunState, error: str = "") -> None:
         """Replace the record, whose driver begins as that of the lock: `unlock` tells by it whose heartbeat it is."""
         driver = f"{this_process()}, cluster {self.watch.address}" if self.watch else this_process()
-        self._records.write_run(RunRecord(state, driver, self._started, utc_now(), self.stage, error))
+        RunRecord(state, driver, self._started, utc_now(), self.stage, error).write(self._store)
 
     def _beat(self) -> bool:
         try:

@@ -1,20 +1,69 @@
-"""Unlocking a store whose run is gone, as far as its record tells."""
+"""The latest run of a store: its record with signs of life, by which a store whose run is gone can be unlocked."""
 
 from __future__ import annotations
 
+import json
 import math
 from contextlib import suppress
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Literal, Self
 
 from sobolev_batch.errors import LockError, StoreError
-from sobolev_batch.store.layout import Store
+from sobolev_batch.store.checked import CHANGED
+from sobolev_batch.store.encoding import ROOT
+from sobolev_batch.store.layout import DIGEST, RECORDS, Store, digest_of
 from sobolev_batch.store.location import Location
-from sobolev_batch.store.lock import LOCK_KEYS, Lock, age_seconds
+from sobolev_batch.store.lock import LOCK_KEYS, Lock, Time, age_seconds
 from sobolev_batch.store.objects import Objects, root_of
-from sobolev_batch.store.records import Records
+from sobolev_batch.store.records import damaged_record, record_in
 
 # A run counts as lost if its record was not renewed for this time.
 LOST_AFTER_SECONDS = 60.0
+# The attribute of the group of records that holds the record.
+_RUN = "run"
+RunState = Literal["submitted", "running", "done", "failed"]
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """State of the latest run of a study.
+
+    Attributes:
+        state: "submitted" until a worker starts it, then "running", "done" or "failed".
+        driver: Description of the driver: its process and host, and its cluster.
+        started: Time of the start, in UTC.
+        seen: Time of the driver's latest heartbeat, in UTC.
+        error: Reason of the failure, or obstacle to the run; empty otherwise.
+    """
+
+    state: RunState
+    driver: str
+    started: Time
+    seen: Time
+    stage: str = ""
+    error: str = ""
+
+    @classmethod
+    def read(cls, store: Store) -> Self | None:
+        """Return the record in a store, or None before the first run."""
+        document = store.stored_document(RECORDS)
+        if document is None:
+            raise store.damage(f"{RECORDS}/{ROOT}", "it is not there")
+        table = document.get("attributes", {}).get(_RUN)
+        if table is None:
+            return None
+        digest, name = table.pop(DIGEST, ""), f"{store.path}: {RECORDS}/{ROOT}, the record of the latest run,"
+        if digest != digest_of(table):
+            raise damaged_record(name, CHANGED, table)
+        return record_in(cls, table, name)
+
+    def write(self, store: Store) -> None:
+        """Replace the record in a store: an attribute of the group of records, in one key."""
+        # The store does not remember it: consolidated metadata would tell readers of a run that ended long ago.
+        attributes = {_RUN: {**asdict(self), DIGEST: digest_of(asdict(self))}}
+        group = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
+        store.location.write({f"{RECORDS}/{ROOT}": json.dumps(group).encode()})
 
 
 def unlock(store: str | Path | Location, *, force: bool = False) -> Lock | None:
@@ -69,7 +118,7 @@ def _silence_seconds(location: Location, lock: Lock) -> float:
     # If the store cannot be read, only the lock itself is known.
     with suppress(StoreError):
         store = Store(location)
-        run = Records(store).read_run() if store.exists() else None
+        run = RunRecord.read(store) if store.exists() else None
         if run is not None and run.driver.startswith(lock.driver):
             moments.append(run.seen)
     return min(map(age_seconds, moments), default=math.inf)
