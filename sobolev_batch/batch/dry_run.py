@@ -12,7 +12,7 @@ from distributed import Client
 
 from sobolev_batch.batch.cluster.clients import require_blocking
 from sobolev_batch.batch.cluster.workers import Workers, prepare_workers, worker_slowness
-from sobolev_batch.batch.field_stage import Sizes, row_seconds, size_rows
+from sobolev_batch.batch.field_costs import Sizes, row_seconds, size_rows
 from sobolev_batch.batch.object_run import ended_before, lacks_nothing
 from sobolev_batch.batch.start import StoreLike, require_permission, settled, warnings_of
 from sobolev_batch.geometry.surface import Similarity, placement_doubt

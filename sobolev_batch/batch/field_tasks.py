@@ -17,7 +17,6 @@ import numpy as np
 from sobolev_batch import compiled
 from sobolev_batch.batch.cluster.workers import this_worker, worker_backend
 from sobolev_batch.errors import InputError, LatticeError, MemoryLimitError, MeshError, StoreError, one_line
-from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Similarity, Surface
 from sobolev_batch.norms.accuracy.problem import without_common_parts
 from sobolev_batch.norms.accuracy.solve import DistanceTarget
@@ -263,7 +262,7 @@ def _store_whole(job: Job, surface: Surface, target: ErrorTarget | None) -> Stor
     else:
         field = compute_field(surface, lattice, transform, job.orders, execution)
     checksum = Fields(job.store).write(job.index, lattice.place(lattice.half), field.values)
-    facts = _facts_of(surface, field.points)
+    facts = Facts.of_surface(surface, field.points)
     return StoredBlocks(facts, quality=field.quality, checksums=(checksum,), backends=(field.backend,))
 
 
@@ -282,7 +281,7 @@ def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block], target: E
         points = result.points
     quality = Quality.from_surface(surface, join(probes))
     return StoredBlocks(
-        _facts_of(surface, points), quality=quality, checksums=tuple(checksums), backends=tuple(backends)
+        Facts.of_surface(surface, points), quality=quality, checksums=tuple(checksums), backends=tuple(backends)
     )
 
 
@@ -309,23 +308,3 @@ def _finished(job: Job, stored: Sequence[StoredBlocks]) -> Record:
     Records(job.store).write(job.index, record)
     _log.info("%s: %s in %.2f s by %s", job.row.label, record.status, record.seconds, record.backend)
     return record
-
-
-def _facts_of(surface: Surface, points: int) -> Facts:
-    """Return what is recorded of a surface and its quadrature points."""
-    if not isinstance(surface, Mesh):
-        return Facts(area=surface.area, points=points)
-    mean_length, longest = surface.edge_length_range
-    return Facts(
-        vertices=len(surface.vertices),
-        triangles=len(surface.triangles),
-        area=surface.area,
-        edge_length_mean=mean_length,
-        edge_length_max=longest,
-        volume=surface.volume,
-        smallest_angle=float(surface.smallest_angles.min()),
-        aspect_ratio=float(surface.aspect_ratios.max()),
-        digest=surface.digest,
-        points=points,
-        **surface.counts,
-    )

@@ -16,7 +16,8 @@ import numpy as np
 from sobolev_batch import compiled
 from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, in_place, result_from, result_of
 from sobolev_batch.batch.cluster.workers import Workers
-from sobolev_batch.batch.field_stage import compute_fields, is_predictable, row_seconds, size_rows
+from sobolev_batch.batch.field_costs import is_predictable, row_seconds, size_rows
+from sobolev_batch.batch.field_stage import compute_fields
 from sobolev_batch.batch.proximity_stage import have_proximities, measure_proximities
 from sobolev_batch.batch.table_stage import TABLES_VERSION, Tabulated, are_tabulated, tabulate_fields
 from sobolev_batch.errors import DamageError, InputError

@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 
 from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, describe_failure
-from sobolev_batch.batch.field_stage import MESH_BYTES
+from sobolev_batch.batch.field_costs import MESH_BYTES
 from sobolev_batch.batch.table_stage import table_order
 from sobolev_batch.errors import InputError, MeshError, StoreError, one_line
 from sobolev_batch.geometry.mesh import Mesh

@@ -17,6 +17,8 @@ from typing import Any, ClassVar, Generic, Literal, Self, TypeVar, cast
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from sobolev_batch.errors import DamageError
+from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.sources.programs import Cost
 from sobolev_batch.store.checked import largest_chunk_bytes
 from sobolev_batch.store.layout import PAGE, RECORD, Store
@@ -69,6 +71,26 @@ class Facts:
     aspect_ratio: float = float("nan")
     digest: str = ""
     points: int = 0
+
+    @classmethod
+    def of_surface(cls, surface: Surface, points: int) -> Self:
+        """Return the facts of a surface and its quadrature points."""
+        if not isinstance(surface, Mesh):
+            return cls(area=surface.area, points=points)
+        mean_length, longest = surface.edge_length_range
+        return cls(
+            vertices=len(surface.vertices),
+            triangles=len(surface.triangles),
+            area=surface.area,
+            edge_length_mean=mean_length,
+            edge_length_max=longest,
+            volume=surface.volume,
+            smallest_angle=float(surface.smallest_angles.min()),
+            aspect_ratio=float(surface.aspect_ratios.max()),
+            digest=surface.digest,
+            points=points,
+            **surface.counts,
+        )
 
 
 @dataclass(frozen=True)

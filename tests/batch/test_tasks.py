@@ -20,7 +20,7 @@ from sobolev_batch import Lattice, Mesh, Study, open_store, run
 from sobolev_batch.arrays import ComplexDtype
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers
-from sobolev_batch.batch.field_stage import size_tasks
+from sobolev_batch.batch.field_costs import size_tasks
 from sobolev_batch.batch.field_tasks import Job, compute_mesh, compute_parts, finish_mesh
 from sobolev_batch.errors import ClusterError
 from sobolev_batch.norms.accuracy.solve import DistanceTarget
