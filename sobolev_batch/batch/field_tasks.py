@@ -17,8 +17,8 @@ import numpy as np
 from sobolev_batch import compiled
 from sobolev_batch.batch.cluster.workers import this_worker, worker_backend
 from sobolev_batch.errors import InputError, LatticeError, MemoryLimitError, MeshError, StoreError, one_line
+from sobolev_batch.geometry.overlap import without_common_parts
 from sobolev_batch.geometry.surface import Similarity, Surface
-from sobolev_batch.norms.accuracy.problem import without_common_parts
 from sobolev_batch.norms.accuracy.solve import DistanceTarget
 from sobolev_batch.norms.fields import Quality, TailQuality, compute_field, field_for
 from sobolev_batch.norms.tail.remainder import Remainder, remainder

@@ -1,4 +1,4 @@
-"""Triangle meshes, checked once and then frozen; counts of what is unusual in them, and what two of them share."""
+"""Triangle meshes, checked once and then frozen; and counts of what is unusual in them."""
 
 from __future__ import annotations
 
@@ -493,33 +493,3 @@ def _edges_of(triangles: Indices, vertex_count: int) -> tuple[int, int, int, int
     is_alike = (keys[pairs] == keys[pairs + 1]) & (keys[pairs] % 3 < 2)
     boundary, nonmanifold, alike = (int(np.count_nonzero(one)) for one in (numbers == 1, numbers > 2, is_alike))
     return len(edges), int(components), boundary, nonmanifold, alike
-
-
-def shared_triangles(first: Reals, second: Reals) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which triangles (m, 3, 3) and (n, 3, 3) occur in both, as often, by hashes of their corners of 64 bits."""
-    hashes, other_hashes = _triangle_hashes(first), _triangle_hashes(second)
-    return _matched(hashes, other_hashes), _matched(other_hashes, hashes)
-
-
-def _matched(hashes: NDArray[np.uint64], others: NDArray[np.uint64]) -> NDArray[np.bool_]:
-    """Return which hashes occur among others; of equal ones, only as many as the others have."""
-    from pandas import Series
-
-    own = Series(hashes)
-    times = own.map(Series(others).value_counts()).fillna(0)
-    return np.asarray(own.groupby(own).cumcount() < times)
-
-
-def _triangle_hashes(corners: Reals) -> NDArray[np.uint64]:
-    """Return the sum of the hashes of the corners of each triangle (m,), which does not depend on their order."""
-    from pandas.util import hash_array
-
-    sums = np.empty(len(corners), dtype=np.uint64)
-    for start in range(0, len(corners), _BATCH):
-        # Zero has two signs.
-        columns = np.ascontiguousarray((corners[start : start + _BATCH] + 0.0).reshape(-1, 3).T).view(np.uint64)
-        mixed = np.zeros(columns.shape[1], dtype=np.uint64)
-        for column in columns:
-            mixed = hash_array(mixed ^ column)
-        sums[start : start + _BATCH] = mixed.reshape(-1, 3).sum(axis=1)
-    return sums

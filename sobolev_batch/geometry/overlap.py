@@ -1,14 +1,15 @@
-"""What each of two meshes has that the other lacks: flat faces are cut against each other, plane by plane.
+"""What each of two meshes has that the other lacks: triangles that both have are left out, and flat faces are cut.
 
-Triangles lie in one plane where all their corners are within a tolerance of it. There each mesh is a set of polygons,
-one for each layer where it lies on itself; orientation does not matter, as area measures have none. A plane stays as it
-is where GEOS (https://libgeos.org) refuses it, where areas do not balance, where the meshes hardly cover each other,
-and where cutting would multiply the number of triangles by more than it divides the area, as between combs.
+Faces are cut against each other plane by plane. Triangles lie in one plane where all their corners are within a
+tolerance of it. There each mesh is a set of polygons, one for each layer where it lies on itself; orientation does not
+matter, as area measures have none. A plane stays as it is where GEOS (https://libgeos.org) refuses it, where areas do
+not balance, where the meshes hardly cover each other, and where cutting would multiply the number of triangles by more
+than it divides the area, as between combs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -19,7 +20,7 @@ from shapely.errors import GEOSException
 
 from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.geometry.surface import Extent
+from sobolev_batch.geometry.surface import Extent, Surface
 
 # Rounding, relative to the largest coordinate.
 ROUNDING = 2.0**-47
@@ -321,3 +322,69 @@ def _stack(polygons: _Objects, slack: float, grid: float) -> list[Any]:
         polygons = shapely.get_parts(parts)
         stack.append(shapely.union_all(polygons[shapely.get_dimensions(polygons) == _FLAT], grid_size=grid))
     return [polygon for polygon in stack if polygon.area > slack]
+
+
+def without_common_parts(surfaces: Sequence[Surface]) -> Mapping[int, Surface]:
+    """Return one surface, or what two do not have in common, by their signs in the difference."""
+    return without_common_faces(without_shared_triangles(surfaces))
+
+
+def without_shared_triangles(surfaces: Sequence[Surface]) -> Mapping[int, Surface]:
+    """Return one surface, or two without the triangles that both have, by their signs in the difference."""
+    meshes = two_meshes(surfaces)
+    if not meshes:
+        return dict(zip((1, -1), surfaces, strict=False))
+    shared = shared_triangles(*(mesh.vertices[mesh.triangles] for mesh in meshes))
+    if shared[0].any():
+        meshes = [
+            Mesh.from_checked(mesh.vertices, np.ascontiguousarray(mesh.triangles[~in_both]))
+            for mesh, in_both in zip(meshes, shared, strict=True)
+        ]
+    return signed([mesh if len(mesh.triangles) and mesh.area > 0 else None for mesh in meshes])
+
+
+def without_common_faces(different: Mapping[int, Surface]) -> Mapping[int, Surface]:
+    """Return surfaces by their signs, two meshes without what `rests_of` finds in both."""
+    meshes = two_meshes(different.values())
+    return signed(rests_of(meshes[0], meshes[1]).meshes) if meshes else different
+
+
+def two_meshes(surfaces: Iterable[Surface]) -> list[Mesh]:
+    """Return the meshes among surfaces if there are two, else nothing: then there is nothing to leave out."""
+    meshes = [surface for surface in surfaces if isinstance(surface, Mesh)]
+    return meshes if len(meshes) == 2 else []
+
+
+def signed(rests: Sequence[Mesh | None]) -> Mapping[int, Surface]:
+    """Return what is left of two meshes by their signs in the difference."""
+    return {sign: rest for sign, rest in zip((1, -1), rests, strict=True) if rest is not None}
+
+
+def shared_triangles(first: Reals, second: Reals) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which triangles (m, 3, 3) and (n, 3, 3) occur in both, as often, by hashes of their corners of 64 bits."""
+    hashes, other_hashes = _triangle_hashes(first), _triangle_hashes(second)
+    return _matched(hashes, other_hashes), _matched(other_hashes, hashes)
+
+
+def _matched(hashes: NDArray[np.uint64], others: NDArray[np.uint64]) -> NDArray[np.bool_]:
+    """Return which hashes occur among others; of equal ones, only as many as the others have."""
+    from pandas import Series
+
+    own = Series(hashes)
+    times = own.map(Series(others).value_counts()).fillna(0)
+    return np.asarray(own.groupby(own).cumcount() < times)
+
+
+def _triangle_hashes(corners: Reals) -> NDArray[np.uint64]:
+    """Return the sum of the hashes of the corners of each triangle (m,), which does not depend on their order."""
+    from pandas.util import hash_array
+
+    sums = np.empty(len(corners), dtype=np.uint64)
+    for start in range(0, len(corners), _BATCH):
+        # Zero has two signs.
+        columns = np.ascontiguousarray((corners[start : start + _BATCH] + 0.0).reshape(-1, 3).T).view(np.uint64)
+        mixed = np.zeros(columns.shape[1], dtype=np.uint64)
+        for column in columns:
+            mixed = hash_array(mixed ^ column)
+        sums[start : start + _BATCH] = mixed.reshape(-1, 3).sum(axis=1)
+    return sums

@@ -14,7 +14,7 @@ import pytest
 from sobolev_batch import Mesh
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import MeshError
-from sobolev_batch.geometry.mesh import shared_triangles
+from sobolev_batch.geometry.overlap import shared_triangles
 from tests.support.shapes import (
     AWKWARD_VERTICES,
     BOX_AREA,

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from sobolev_batch import Mesh
-from sobolev_batch.geometry.mesh import shared_triangles
+from sobolev_batch.geometry.overlap import shared_triangles
 from sobolev_batch.norms.tail.face_normals import FaceNormals
 from sobolev_batch.shapes import Similarity, icosphere
 from sobolev_batch.transform.exact import exact_transform, sampled_transform

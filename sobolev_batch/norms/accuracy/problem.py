@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Self, cast
@@ -11,20 +11,20 @@ import numpy as np
 
 from sobolev_batch.arrays import ComplexDtype, Complexes, Reals
 from sobolev_batch.errors import AccuracyError
-from sobolev_batch.geometry.mesh import Mesh, shared_triangles
-from sobolev_batch.geometry.overlap import rests_of
+from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.geometry.overlap import (
+    rests_of,
+    signed,
+    two_meshes,
+    without_common_faces,
+    without_common_parts,
+    without_shared_triangles,
+)
 from sobolev_batch.geometry.refinement import refinement_of
 from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Similarity, Surface, centering
 from sobolev_batch.norms.accuracy.tolerance import Accuracy, first_lattice, unreachable
-from sobolev_batch.norms.budget import (
-    APART_FRACTION,
-    Sums,
-    Support,
-    norm_of_moves,
-    norm_of_rounding,
-    product_apart,
-    sums_of_shells,
-)
+from sobolev_batch.norms.bounds import APART_FRACTION, norm_of_moves, norm_of_rounding, product_apart
+from sobolev_batch.norms.budget import Sums, Support, sums_of_shells
 from sobolev_batch.norms.estimate import NormEstimate, change_of_root
 from sobolev_batch.norms.fields import USUAL_DEGREE, Field, field_for
 from sobolev_batch.norms.tail.sampling import OctaveSampling
@@ -42,7 +42,6 @@ _ROUNDING = 1e-13
 _STORED_ROUNDING, _STORED_FRACTION = 6e-8, 0.1
 # Surfaces whose common centre is no further from the origin, relative to their extent, stay where they are.
 OFF_CENTER = 1e-3
-_PAIR = 2
 # Fraction of an error that faces may take that are apart by a rounding of files.
 _MOVED_FRACTION = 0.1
 # A rounding along one axis, as a part of what counts as one.
@@ -100,17 +99,17 @@ class Problem:
         Those that are far apart stay where they are, since a common move would cost digits. Flat faces stay as they are
         where two meshes have more triangles than are to be clipped, beside those that are the same in both.
         """
-        different, pair = _without_shared_triangles(surfaces), tuple(surfaces) if len(surfaces) == _PAIR else ()
+        different, pair = without_shared_triangles(surfaces), tuple(surfaces) if len(surfaces) == 2 else ()
         settings = orders, accuracy, label, threads
-        if sum(len(mesh.triangles) for mesh in _two_meshes(different.values())) > most_clipped:
+        if sum(len(mesh.triangles) for mesh in two_meshes(different.values())) > most_clipped:
             return replace(cls._between(different, pair, *settings), is_clipped=False)
-        different = _without_common_faces(different)
+        different = without_common_faces(different)
         problem = cls._between(different, pair, *settings)
-        meshes, rounding = _two_meshes(different.values()), _rounding(pair)
+        meshes, rounding = two_meshes(different.values()), _rounding(pair)
         if not meshes or not rounding:
             return problem
         rests = rests_of(meshes[0], meshes[1], rounding / max(mesh.extent.reach for mesh in meshes))
-        closer = cls._between(_signed(rests.meshes), pair, *settings)
+        closer = cls._between(signed(rests.meshes), pair, *settings)
         moved = norm_of_moves(rests.areas, rests.distances, orders)
         if closer.surfaces and np.all(moved <= _MOVED_FRACTION * accuracy.rtol * closer.rough_values):
             return replace(closer, moved=moved)
@@ -121,7 +120,7 @@ class Problem:
 
         It stays as it is where that may be more than a small part of the norm. The surfaces are those it was made from.
         """
-        rounding, meshes = _rounding(surfaces), _two_meshes(surfaces)
+        rounding, meshes = _rounding(surfaces), two_meshes(surfaces)
         if not meshes or not rounding or not self.surfaces:
             return self
         coarse, fine = sorted(meshes, key=lambda mesh: len(mesh.triangles))
@@ -285,39 +284,6 @@ def are_equal(a: Surface, b: Surface) -> bool:
     """Return whether two meshes are equal as area measures, to rounding."""
     have_equal_areas = abs(a.area - b.area) <= _ROUNDING * (a.area + b.area)
     return have_equal_areas and not without_common_parts((a, b))
-
-
-def without_common_parts(surfaces: Sequence[Surface]) -> Mapping[int, Surface]:
-    """Return one surface, or what two do not have in common, by their signs in the difference."""
-    return _without_common_faces(_without_shared_triangles(surfaces))
-
-
-def _without_shared_triangles(surfaces: Sequence[Surface]) -> Mapping[int, Surface]:
-    meshes = _two_meshes(surfaces)
-    if not meshes:
-        return dict(zip((1, -1), surfaces, strict=False))
-    shared = shared_triangles(*(mesh.vertices[mesh.triangles] for mesh in meshes))
-    if shared[0].any():
-        meshes = [
-            Mesh.from_checked(mesh.vertices, np.ascontiguousarray(mesh.triangles[~in_both]))
-            for mesh, in_both in zip(meshes, shared, strict=True)
-        ]
-    return _signed([mesh if len(mesh.triangles) and mesh.area > 0 else None for mesh in meshes])
-
-
-def _without_common_faces(different: Mapping[int, Surface]) -> Mapping[int, Surface]:
-    meshes = _two_meshes(different.values())
-    return _signed(rests_of(meshes[0], meshes[1]).meshes) if meshes else different
-
-
-def _two_meshes(surfaces: Iterable[Surface]) -> list[Mesh]:
-    """Return the meshes among surfaces if there are two, else nothing: then there is nothing to leave out."""
-    meshes = [surface for surface in surfaces if isinstance(surface, Mesh)]
-    return meshes if len(meshes) == _PAIR else []
-
-
-def _signed(rests: Sequence[Mesh | None]) -> Mapping[int, Surface]:
-    return {sign: rest for sign, rest in zip((1, -1), rests, strict=True) if rest is not None}
 
 
 def _rounding(surfaces: Sequence[Surface]) -> float:

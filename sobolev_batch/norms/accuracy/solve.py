@@ -32,7 +32,8 @@ from sobolev_batch.norms.accuracy.tolerance import (
     lattice_of,
     refined,
 )
-from sobolev_batch.norms.budget import Sums, Support, modulus_bound
+from sobolev_batch.norms.bounds import modulus_bound
+from sobolev_batch.norms.budget import Sums, Support
 from sobolev_batch.norms.estimate import NormEstimate, estimate_norms
 from sobolev_batch.norms.fields import Field
 from sobolev_batch.norms.tail.face_normals import FaceNormals

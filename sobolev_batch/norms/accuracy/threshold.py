@@ -18,7 +18,7 @@ from sobolev_batch.norms.accuracy.octaves import solve_in_octaves
 from sobolev_batch.norms.accuracy.problem import Problem, error_target
 from sobolev_batch.norms.accuracy.solve import difference_on, solve
 from sobolev_batch.norms.accuracy.tolerance import Accuracy, core_lattice, lattice_of
-from sobolev_batch.norms.budget import area_bound, area_bounds
+from sobolev_batch.norms.bounds import area_bound, area_bounds
 from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.norms.fields import USUAL_DEGREE, Field, compute_field
 from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, choose_settings, transform_block

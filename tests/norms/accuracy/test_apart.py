@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import sobolev_batch as sb
-from sobolev_batch.norms.budget import product_apart
+from sobolev_batch.norms.bounds import product_apart
 from sobolev_batch.transform.spheres import sphere_inner_product, sphere_norm
 from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES
 

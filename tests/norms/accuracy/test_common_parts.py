@@ -11,14 +11,14 @@ from scipy.special import gamma
 from scipy.stats import special_ortho_group
 
 import sobolev_batch as sb
+from sobolev_batch.geometry import overlap
 from sobolev_batch.geometry.overlap import Rests, rests_of
 from sobolev_batch.geometry.subdivision import icosphere, subdivided
-from sobolev_batch.norms.accuracy import problem as problems
 from sobolev_batch.norms.accuracy.problem import Problem, are_equal
 from sobolev_batch.norms.accuracy.solve import solve
 from sobolev_batch.norms.accuracy.threshold import relative_distance
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
-from sobolev_batch.norms.budget import norm_of_moves
+from sobolev_batch.norms.bounds import norm_of_moves
 from tests.support.rectangles import Rectangles
 
 BOX = Rectangles.box([0.0, 0.0, 0.0], [1.0, 0.8, 0.5])
@@ -92,7 +92,7 @@ def test_many_faces_are_clipped_only_where_a_lattice_leaves_a_verdict_open(monke
         bounds, method = relative_distance(surface, reference, order, 1e-3, Accuracy(1e-3), 2, 0)
         return bounds.lower, bounds.upper, method
 
-    monkeypatch.setattr(problems, "rests_of", counted)
+    monkeypatch.setattr(overlap, "rests_of", counted)
     ball = icosphere(3)
     few, many = cut_anew(ball, 1), cut_anew(subdivided(ball), 2)
     lower, upper, method = judged(many, few, -4.0)
