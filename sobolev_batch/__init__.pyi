@@ -35,10 +35,10 @@ from .norms.rates import convergence as convergence
 from .norms.yardsticks import yardsticks as yardsticks
 from .store.latest_run import unlock as unlock
 from .study.study import Study as Study
-from .tables.convergence import smallest_below as smallest_below
 from .tables.convergence import table as table
 from .tables.matrix import matrix as matrix
 from .tables.open import open_store as open_store
+from .tables.smallest import smallest_below as smallest_below
 from .transform.lattice import Lattice as Lattice
 
 __all__: list[str]

@@ -21,7 +21,7 @@ import sobolev_batch as sb
 from sobolev_batch.geometry.formats import parsing, readers
 from sobolev_batch.sources import files
 from sobolev_batch.sources.command import CommandSource
-from sobolev_batch.tables.store_accessor import convergence_at
+from sobolev_batch.tables.other_orders import convergence_at
 from sobolev_batch.transform import kinds
 from tests.support.commands import call, write_toml
 from tests.support.studies import SMALL_LATTICE, small_table

@@ -1,17 +1,29 @@
-"""Commands on mesh files: compare, with a verdict as exit status where asked, and info."""
+"""Commands on mesh files: compare, with a verdict as exit status where asked, info, and reduce."""
 
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from sobolev_batch.cli.options import PATH, below_option, json_option, memory_size, orders_option
-from sobolev_batch.cli.output import echo, echo_result
-from sobolev_batch.cli.program import ERROR_STATUS, EXIT_INPUT, cli
+from sobolev_batch.cli.options import (
+    PATH,
+    below_option,
+    client_of,
+    format_option,
+    json_option,
+    memory_size,
+    orders_option,
+    scheduler_options,
+    workers_option,
+)
+from sobolev_batch.cli.output import echo, echo_lines, echo_result
+from sobolev_batch.cli.program import ERROR_STATUS, EXIT_INPUT, EXIT_SOME_FAILED, cli
 from sobolev_batch.errors import MeshError
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.plugins import FEATURES, extra
@@ -19,6 +31,7 @@ from sobolev_batch.visible import visible
 
 if TYPE_CHECKING:
     from sobolev_batch.geometry.mesh import Mesh
+    from sobolev_batch.tables import Format
 
 # Why a mesh has no volume, by the edges that it has.
 _NO_VOLUME = {
@@ -203,3 +216,78 @@ def _facts(path: Path, mesh: Mesh) -> dict[str, Any]:
         "defects": mesh.defects,
         "notes": mesh.notes,
     }
+
+
+def _range(context: click.Context, param: click.Parameter, value: str | None) -> dict[str, tuple[float, float]] | None:
+    """Return the parameter that is searched with its ends, from NAME=LOW:HIGH."""
+    if value is None:
+        return None
+    name, _, ends = value.partition("=")
+    try:
+        low, high = ((float if set(end) & set(".eE") else int)(end) for end in ends.split(":"))
+    except ValueError as error:
+        raise click.BadParameter(f"{value!r} is no range such as hausd=0.001:1.0 or triangles=100:5000") from error
+    return {name: (low, high)}
+
+
+@cli.command("reduce", remark="; the same command goes on from its last trial")
+@click.argument("files", nargs=-1, required=True, type=PATH)
+@click.option(
+    "--within",
+    required=True,
+    metavar="TOLERANCE",
+    help="Keep the largest deviation within a length, such as 0.1mm, or the distance within 1% of the norm.",
+)
+@click.option("--order", type=float, help=f"Measure this fraction at an order below -1/2. [default: {DEFAULT_ORDER:g}]")
+@click.option("--unit", metavar="NAME", help="Name the unit of length of the files, such as mm.")
+@click.option(
+    *("--with", "method"),
+    default="decimate",
+    show_default=True,
+    metavar="METHOD",
+    help="Take 'mmgs_O3 -in {input} -out {output} -hausd {hausd}' or another command, or the source remesh.",
+)
+@click.option(
+    "--search",
+    callback=_range,
+    metavar="NAME=LOW:HIGH",
+    help="Search a parameter between two values; whole numbers try those alone. [default: triangles]",
+)
+@click.option("--suffix", metavar="SUFFIX", help="Give a command files of this format, such as .mesh. [default: .ply]")
+@click.option("--output", required=True, metavar="FOLDER|URL", help="Write meshes and records of trials there.")
+@workers_option
+@scheduler_options()
+@format_option
+@click.pass_context
+def reduce_command(
+    context: click.Context,
+    /,
+    files: tuple[Path, ...],
+    style: Format,
+    scheduler: str | None,
+    trust_network: bool,
+    suffix: str | None,
+    **settings: Any,
+) -> None:
+    """Find the fewest triangles of each mesh within a tolerance.
+
+    Each mesh is made with more or fewer triangles and compared with its file, until the coarsest one within the
+    tolerance is known. Bounds decide. The same command goes on where it was ended. A command in METHOD runs here, or
+    on the workers.
+
+    The exit status is 3 if nothing within the tolerance was found for some.
+    """
+    from sobolev_batch.batch.reduce import format_reductions, reduce
+
+    if scheduler and settings["workers"]:
+        raise click.UsageError("--workers is for processes on this machine; a scheduler has its own")
+
+    if suffix:
+        words = shlex.split(settings["method"])
+        settings["method"] = {"source": "command", "command": words, "input": suffix, "output": suffix}
+    tell = partial(echo, err=True) if len(files) > 1 else None
+    with client_of(scheduler, trust_network) as client:
+        found = reduce(files, client=client, on_progress=tell, **settings)
+    echo_lines(format_reductions(found, style, settings["unit"]))
+    if any(one.reason for one in found.values()):
+        context.exit(EXIT_SOME_FAILED)

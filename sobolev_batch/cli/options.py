@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -12,6 +13,8 @@ import click
 from sobolev_batch.tables import FORMATS
 
 if TYPE_CHECKING:
+    from distributed import Client
+
     from sobolev_batch.store.location import Location
 
 PATH = click.Path(path_type=Path)
@@ -75,3 +78,35 @@ def below_option(text: str, *, required: bool = False) -> Callable[[Callback], C
         return fraction(value)
 
     return click.option("--below", type=fraction_of_norm, metavar="FRACTION", required=required, help=text)
+
+
+def scheduler_options(*, required: bool = False) -> Callable[[Callback], Callback]:
+    """Return the options of a command that may compute on a cluster, whose client is that of `client_of`."""
+    scheduler = click.option(
+        "--scheduler",
+        metavar="ADDRESS",
+        required=required,
+        help="Take the workers of this Dask scheduler, such as tls://host:8786.",
+    )
+    trust = click.option(
+        "--trust-network",
+        is_flag=True,
+        help="Use a scheduler that is neither encrypted (tls://) nor on loopback. Everyone who reaches its ports or "
+        "those of its workers can then run programs on these machines and read the meshes.",
+    )
+    return lambda command: scheduler(trust(command))
+
+
+def client_of(scheduler: str | None, trust_network: bool) -> AbstractContextManager[Client | None]:
+    """Return the client of a scheduler for a block, or none where none is named."""
+    from sobolev_batch.batch.cluster.clients import remote_client
+
+    return remote_client(scheduler, trust_network) if scheduler else nullcontext()
+
+
+workers_option = click.option(
+    "--workers",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Start N processes on this machine. [default: one per core]",
+)

@@ -1,27 +1,31 @@
-"""Commands that may compute on a cluster: run, submit, plan, which take a study, and reduce."""
+"""Commands that take a study file: run, submit, plan; and its schema."""
 
 from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Callable
-from contextlib import nullcontext, suppress
-from functools import partial
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from sobolev_batch.cli.options import PATH, Callback, format_option, json_option, location, memory_size
+from sobolev_batch.cli.options import (
+    PATH,
+    client_of,
+    json_option,
+    location,
+    memory_size,
+    scheduler_options,
+    workers_option,
+)
 from sobolev_batch.cli.output import echo, echo_lines, echo_result, progress_reports
 from sobolev_batch.cli.program import EXIT_SOME_FAILED, cli
 from sobolev_batch.cli.table_commands import table_command
 from sobolev_batch.errors import InputError
-from sobolev_batch.norms import DEFAULT_ORDER
 
 if TYPE_CHECKING:
     from sobolev_batch.store.location import Location
-    from sobolev_batch.tables import Format
 
 # Lines about distances that are less accurate than requested, and about objects.
 _MOST_IMPRECISE, _MOST_OBJECTS = 10, 10
@@ -33,25 +37,6 @@ _store_option = click.option(
 )
 _allow_commands_option = click.option(
     "--allow-commands", is_flag=True, help="Let the commands of STUDY run, which make its meshes: you trust its file."
-)
-_trust_option = click.option(
-    "--trust-network",
-    is_flag=True,
-    help="Use a scheduler that is neither encrypted (tls://) nor on loopback. Everyone who reaches its ports or "
-    "those of its workers can then run programs on these machines and read the meshes.",
-)
-
-
-def _scheduler_option(*, required: bool = False) -> Callable[[Callback], Callback]:
-    text = "Take the workers of this Dask scheduler, such as tls://host:8786."
-    return click.option("--scheduler", metavar="ADDRESS", required=required, help=text)
-
-
-_workers_option = click.option(
-    "--workers",
-    type=click.IntRange(min=1),
-    metavar="N",
-    help="Start N processes on this machine. [default: one per core]",
 )
 _only_option = click.option(
     "--only",
@@ -65,9 +50,8 @@ _only_option = click.option(
 @cli.command("run", shows_progress=True, locks=True, remark="; the same command continues from the store")
 @_study_argument
 @_store_option
-@_scheduler_option()
-@_trust_option
-@_workers_option
+@scheduler_options()
+@workers_option
 @click.option(
     *("--worker-memory", "memory"),
     type=memory_size,
@@ -95,7 +79,6 @@ def run_command(
 
     The exit status is 3 if a mesh failed, or if a distance is less accurate than the study requires.
     """
-    from sobolev_batch.batch.cluster.clients import remote_client
     from sobolev_batch.batch.run import run
     from sobolev_batch.study.study import as_study
     from sobolev_batch.tables.conclusion import format_objects, format_verdict
@@ -107,8 +90,7 @@ def run_command(
             "--workers and --worker-memory are for a cluster on this machine; the workers of a scheduler have their own"
         )
     parsed = as_study(study)
-    connected = remote_client(scheduler, trust_network) if scheduler else nullcontext()
-    with progress_reports() as show, connected as client:
+    with progress_reports() as show, client_of(scheduler, trust_network) as client:
         summary = run(parsed, store, client, on_progress=show, **settings)
     if "" in parsed.objects:
         echo_lines(format_verdict(open_store(summary.store)))
@@ -138,8 +120,7 @@ def run_command(
 
 @cli.command("submit", locks=True)
 @_study_argument
-@_scheduler_option(required=True)
-@_trust_option
+@scheduler_options(required=True)
 @_store_option
 @_allow_commands_option
 @_only_option
@@ -174,8 +155,7 @@ def submit_command(
 @cli.command("plan")
 @_study_argument
 @_store_option
-@_scheduler_option()
-@_trust_option
+@scheduler_options()
 @_allow_commands_option
 @json_option
 @click.pass_context
@@ -194,90 +174,12 @@ def plan_command(
     plan has the lattice and the reasons for it, the tasks and their memory, the bytes to be stored, and the number of
     surfaces that the store has already.
     """
-    from sobolev_batch.batch.cluster.clients import remote_client
     from sobolev_batch.batch.dry_run import plan
 
-    with remote_client(scheduler, trust_network) if scheduler else nullcontext() as client:
+    with client_of(scheduler, trust_network) as client:
         made = plan(study, store, client, allow_commands=allow_commands)
     echo_result(style, made, made.to_table())
     if made.refused:
-        context.exit(EXIT_SOME_FAILED)
-
-
-def _range(context: click.Context, param: click.Parameter, value: str | None) -> dict[str, tuple[float, float]] | None:
-    """Return the parameter that is searched with its ends, from NAME=LOW:HIGH."""
-    if value is None:
-        return None
-    name, _, ends = value.partition("=")
-    try:
-        low, high = ((float if set(end) & set(".eE") else int)(end) for end in ends.split(":"))
-    except ValueError as error:
-        raise click.BadParameter(f"{value!r} is no range such as hausd=0.001:1.0 or triangles=100:5000") from error
-    return {name: (low, high)}
-
-
-@cli.command("reduce", remark="; the same command goes on from its last trial")
-@click.argument("files", nargs=-1, required=True, type=PATH)
-@click.option(
-    "--within",
-    required=True,
-    metavar="TOLERANCE",
-    help="Keep the largest deviation within a length, such as 0.1mm, or the distance within 1% of the norm.",
-)
-@click.option("--order", type=float, help=f"Measure this fraction at an order below -1/2. [default: {DEFAULT_ORDER:g}]")
-@click.option("--unit", metavar="NAME", help="Name the unit of length of the files, such as mm.")
-@click.option(
-    *("--with", "method"),
-    default="decimate",
-    show_default=True,
-    metavar="METHOD",
-    help="Take 'mmgs_O3 -in {input} -out {output} -hausd {hausd}' or another command, or the source remesh.",
-)
-@click.option(
-    "--search",
-    callback=_range,
-    metavar="NAME=LOW:HIGH",
-    help="Search a parameter between two values; whole numbers try those alone. [default: triangles]",
-)
-@click.option("--suffix", metavar="SUFFIX", help="Give a command files of this format, such as .mesh. [default: .ply]")
-@click.option("--output", required=True, metavar="FOLDER|URL", help="Write meshes and records of trials there.")
-@_workers_option
-@_scheduler_option()
-@_trust_option
-@format_option
-@click.pass_context
-def reduce_command(
-    context: click.Context,
-    /,
-    files: tuple[Path, ...],
-    style: Format,
-    scheduler: str | None,
-    trust_network: bool,
-    suffix: str | None,
-    **settings: Any,
-) -> None:
-    """Find the fewest triangles of each mesh within a tolerance.
-
-    Each mesh is made with more or fewer triangles and compared with its file, until the coarsest one within the
-    tolerance is known. Bounds decide. The same command goes on where it was ended. A command in METHOD runs here, or
-    on the workers.
-
-    The exit status is 3 if nothing within the tolerance was found for some.
-    """
-    from sobolev_batch.batch.cluster.clients import remote_client
-    from sobolev_batch.batch.reduce import format_reductions, reduce
-
-    if scheduler and settings["workers"]:
-        raise click.UsageError("--workers is for processes on this machine; a scheduler has its own")
-
-    if suffix:
-        words = shlex.split(settings["method"])
-        settings["method"] = {"source": "command", "command": words, "input": suffix, "output": suffix}
-    tell = partial(echo, err=True) if len(files) > 1 else None
-    with remote_client(scheduler, trust_network) if scheduler else nullcontext() as client:
-        found = reduce(files, client=client, on_progress=tell, **settings)
-    echo_lines(format_reductions(found, style, settings["unit"]))
-    if any(one.reason for one in found.values()):
         context.exit(EXIT_SOME_FAILED)
 
 

@@ -117,6 +117,6 @@ def objects_command(table: TableOptions) -> None:
 @below_option("Take what is below FRACTION, such as 1%, of the norm of the reference.", required=True)
 def smallest_command(table: TableOptions, below: float) -> None:
     """Print the smallest mesh below a bound."""
-    from sobolev_batch.tables.convergence import format_smallest
+    from sobolev_batch.tables.smallest import format_smallest
 
     echo_lines(format_smallest(table.tree, table.style, table.orders, below=below))

@@ -12,14 +12,15 @@ import pandas as pd
 import xarray as xr
 
 from sobolev_batch.tables import Format
-from sobolev_batch.tables.convergence import ALONE, nearest, remarks, smallest_of, table, tables_of
+from sobolev_batch.tables.convergence import ALONE, remarks, table, tables_of
 from sobolev_batch.tables.open import AnyStore, require_one_object
 from sobolev_batch.tables.rendering import Column, Section, rendered
+from sobolev_batch.tables.smallest import smallest_of
 from sobolev_batch.tables.text import count, minus, percent, spread, wrapped
 
 # A row of a table: a record of a frame. It may also have its "order"; a "mark", a short remark about its marked number;
 # the number of its "color"; and the text "absent" in place of all numbers, with the section "reasons" that explains it.
-Row = Mapping[Any, Any]
+TableRow = Mapping[Any, Any]
 
 _BOUNDS = (0.05, 0.01)
 # Meshes whose numbers of triangles differ by no more than this factor are of one size.
@@ -45,7 +46,7 @@ _OBJECT_COLUMNS = (
 )
 
 
-def study_verdict(frame: pd.DataFrame, failed: Mapping[str, str]) -> tuple[tuple[str, ...], list[Row], str]:
+def study_verdict(frame: pd.DataFrame, failed: Mapping[str, str]) -> tuple[tuple[str, ...], list[TableRow], str]:
     """Return the verdict on a study at each order, from the rows of `table` and the reasons of meshes that are missing.
 
     It is a sentence for each order; rows of nearest meshes, smallest meshes below bounds, and meshes that are missing
@@ -56,7 +57,7 @@ def study_verdict(frame: pd.DataFrame, failed: Mapping[str, str]) -> tuple[tuple
     sizes = _sizes(frame.drop_duplicates("mesh"))
     shown_sizes = spread(sizes, _MOST_SIZES)
     sized = frame[frame["triangles"] > 0]["family"].unique().tolist()
-    families, sentences, lines = sized[:_MOST_FAMILIES], [], list[Row]()
+    families, sentences, lines = sized[:_MOST_FAMILIES], [], list[TableRow]()
     for order, rows in frame.groupby("order", sort=False):
         at_sizes, at_shown = ([rows[rows["mesh"].isin(labels)] for labels in some] for some in (sizes, shown_sizes))
         sentences.append(f"{_of_sizes(order, at_sizes)}{_sentence(order, rows, frame.attrs['reference'])}")
@@ -71,7 +72,7 @@ def _of_sizes(order: float, at_sizes: Sequence[pd.DataFrame]) -> str:
     """Return a sentence on which family is nearest where meshes of several families have about as many triangles."""
     wins, leads = Counter[str](), []
     for members in at_sizes:
-        if (closest := nearest(members)) is not None:
+        if (closest := _nearest(members)) is not None:
             best, rivals = closest
             families = members["family"]
             if not any(members["mesh"].isin(rivals) & (families != best["family"])):
@@ -94,7 +95,7 @@ def _of_sizes(order: float, at_sizes: Sequence[pd.DataFrame]) -> str:
 
 def _sentence(order: float, rows: pd.DataFrame, reference: str) -> str:
     name, at_order = "the reference" if reference == "reference" else reference, minus(f"at order {order:g}")
-    closest, compared = nearest(rows), int(rows["distance"].notna().sum())
+    closest, compared = _nearest(rows), int(rows["distance"].notna().sum())
     if compared == 0:
         return f"No mesh could be compared with {name}."
     if closest is None:
@@ -120,7 +121,7 @@ def _sizes(rows: pd.DataFrame) -> list[list[str]]:
     return [size["mesh"].tolist() for size in sizes if size["family"].nunique() > 1]
 
 
-def _nearest_rows(rows: pd.DataFrame, at_sizes: Sequence[pd.DataFrame]) -> Iterator[Row]:
+def _nearest_rows(rows: pd.DataFrame, at_sizes: Sequence[pd.DataFrame]) -> Iterator[TableRow]:
     """Yield the nearest mesh of all, and those of each size."""
     yield _nearest_row("nearest of all", rows)
     for members in at_sizes:
@@ -129,13 +130,27 @@ def _nearest_rows(rows: pd.DataFrame, at_sizes: Sequence[pd.DataFrame]) -> Itera
         yield _nearest_row(f"{counts} triangles", members)
 
 
-def _nearest_row(label: str, members: pd.DataFrame) -> Row:
-    closest = nearest(members)
+def _nearest_row(label: str, members: pd.DataFrame) -> TableRow:
+    closest = _nearest(members)
     if closest is None:
         is_known = members["distance"].notna().any()
         return _absent(label, "no distance is above its error" if is_known else "no distance is known")
     best, rivals = closest
     return _row(label, best, f"errors leave open {_names(rivals)}" if rivals else _lead(best, members))
+
+
+def _nearest(frame: pd.DataFrame) -> tuple[pd.Series, tuple[str, ...]] | None:
+    """Return the nearest mesh of one order, and labels that may be nearer; None if all are below their errors.
+
+    None may be nearer if the distance with its error is below those of all others less their errors, resolved or not.
+    """
+    rows = frame[frame["distance"].notna()].sort_values("distance", kind="stable")
+    if not rows["resolved"].any():
+        return None
+    best, others = rows.iloc[0], rows.iloc[1:]
+    # An unknown error leaves everything open.
+    is_farther = (others["distance"] - others["error"]).clip(lower=0) > best["distance"] + best["error"]
+    return best, tuple(others["mesh"][~is_farther])
 
 
 def _lead(best: pd.Series, members: pd.DataFrame) -> str:
@@ -158,7 +173,7 @@ def _lead(best: pd.Series, members: pd.DataFrame) -> str:
     return f"{ratio:.3g} times {nearer}" if ratio < 100 else f"far {nearer}"
 
 
-def _smallest_rows(rows: pd.DataFrame, families: Sequence[str]) -> Iterator[Row]:
+def _smallest_rows(rows: pd.DataFrame, families: Sequence[str]) -> Iterator[TableRow]:
     """Yield the smallest mesh of each family below each bound."""
     for bound in _BOUNDS:
         frame = smallest_of(rows, bound)
@@ -173,7 +188,7 @@ def _smallest_rows(rows: pd.DataFrame, families: Sequence[str]) -> Iterator[Row]
                 yield _absent(label, "; ".join(filter(None, ("none", closest, open_ones))))
 
 
-def _doubtful_rows(rows: pd.DataFrame, failed: Mapping[str, str]) -> Iterator[Row]:
+def _doubtful_rows(rows: pd.DataFrame, failed: Mapping[str, str]) -> Iterator[TableRow]:
     """Yield the meshes whose distances have larger errors than the study requests, and those that failed."""
     short = rows[rows["resolved"].astype(bool) & ~rows["within"].astype(bool) & rows["distance"].notna()]
     if len(short):
@@ -182,12 +197,12 @@ def _doubtful_rows(rows: pd.DataFrame, failed: Mapping[str, str]) -> Iterator[Ro
         yield {**_absent("missing", _names(list(failed))), "reasons": "failed"}
 
 
-def _row(label: str, mesh: Mapping[str, Any] | pd.Series, remark: str) -> Row:
+def _row(label: str, mesh: Mapping[str, Any] | pd.Series, remark: str) -> TableRow:
     numbers = {name: mesh[name] for name in ("mesh", "relative", "relative_error", "triangles")}
     return {"verdict": label, **numbers, "remark": remark}
 
 
-def _absent(label: str, text: str) -> Row:
+def _absent(label: str, text: str) -> TableRow:
     return {"verdict": label, "absent": text}
 
 
@@ -225,11 +240,11 @@ def format_objects(
 
     Those are first that lack most meshes, and then those whose nearest mesh is farthest from its reference.
     """
-    rows: list[Row] = []
+    rows: list[TableRow] = []
     for name, frame in tables_of(store, orders).items():
         for order, of_order in frame.groupby("order", sort=False):
             known = of_order[of_order["distance"].notna()]
-            numbers: Row = {"mesh": "", "relative": math.nan}
+            numbers: TableRow = {"mesh": "", "relative": math.nan}
             if len(known):
                 numbers = known.loc[known["relative"].idxmin(), ["mesh", "relative", "relative_error"]].to_dict()
             totals = {"meshes": len(known), "missing": len(of_order) - len(known)}

@@ -1,11 +1,9 @@
-"""Tables of distances to the reference, with observed rates; and the smallest mesh of each family near enough."""
+"""Tables of distances to the reference, with observed rates."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -15,7 +13,6 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.proximity import METRICS, OF_ONE_MESH
 from sobolev_batch.norms.columns import parts_as_variables
 from sobolev_batch.norms.estimate import AREA_AND_SHAPE, PARTS
-from sobolev_batch.parameters import fraction
 from sobolev_batch.sources.programs import Cost
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.open import (
@@ -28,20 +25,19 @@ from sobolev_batch.tables.open import (
     metadata_of,
     placement_doubts,
     reference_of,
-    require_one_object,
     sizes_of,
     stores_of,
     study_unit,
     unit_of,
 )
+from sobolev_batch.tables.other_orders import convergence_at, order_note
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.results import rates_in_families
-from sobolev_batch.tables.store_accessor import convergence_at, order_note
 from sobolev_batch.tables.text import between, count, percent, with_error, wrapped
 from sobolev_batch.transform.lattice import Orders
 
-# What a remesher may break.
 ALONE = "The study has its reference alone: there is nothing to compare."
+# What a remesher may break.
 CONNECTION_COLUMNS = (
     Column("components", "components", "{:,.0f}".format),
     Column("euler_characteristic", "Euler", "{:,.0f}".format),
@@ -90,19 +86,11 @@ _ACCURACY_NOTE = """\
 The study requests an error of at most {rtol:g} of each distance; a distance
 marked ! has a larger one."""
 
-
-_RELATIVE = ["relative", "relative_error"]
-_SMALLEST = ["mesh", "triangles", *_RELATIVE, "nearest", *(f"nearest_{name}" for name in _RELATIVE), "undecided"]
-_SMALLEST_NOTE = """\
-A mesh is below the bound if its relative distance and the error of that are together.
-Meshes that are smaller, and that the errors leave open, are named as undecided."""
-
-_UNKNOWN: dict[str, Any] = {"mesh": "", "triangles": pd.NA, "relative": math.nan, "relative_error": math.nan}
-_MESH = Column("mesh", "mesh", kind="label")
-_TRIANGLES = Column("triangles", "triangles", count)
+MESH = Column("mesh", "mesh", kind="label")
+TRIANGLES = Column("triangles", "triangles", count)
 _COLUMNS = (
-    _MESH,
-    _TRIANGLES,
+    MESH,
+    TRIANGLES,
     Column("edge_length", "edge", "{:.4g}".format),
     Column("relative", "relative", percent, "relative_error", is_marked=True),
     Column("rate", "rate", with_error, "rate_error"),
@@ -122,13 +110,6 @@ _METRIC_COLUMNS = (
     Column("volume", "volume", "{:.4g}".format),
     Column("smallest_angle", "angles ≥", "{:.2g}°".format),
     Column("aspect_ratio", "aspect ≤", "{:.3g}".format),
-)
-_SMALLEST_COLUMNS = (
-    Column("family", "family"),
-    _MESH,
-    _TRIANGLES,
-    Column("relative", "relative", percent, "relative_error"),
-    Column("remark", "remark", kind="text"),
 )
 
 
@@ -303,27 +284,13 @@ def _sections(name: str, tree: xr.DataTree, frame: pd.DataFrame, x: str) -> Iter
         yield Section(f"Sobolev distance of order {order:g} to {frame.attrs['reference']}", [(columns, rows)])
     once = marked.drop_duplicates("mesh")
     if has_proximity(tree):
-        yield Section("Other distances, the same at all orders", [((_MESH, *_metric_columns(tree)), once)])
+        yield Section("Other distances, the same at all orders", [((MESH, *_metric_columns(tree)), once)])
     connection = [column for column in CONNECTION_COLUMNS if column.name in frame]
     if once[[column.name for column in connection]].nunique().gt(1).any():
-        yield Section("How triangles are connected", [((_MESH, *connection), once)])
+        yield Section("How triangles are connected", [((MESH, *connection), once)])
     if "computed" in frame.attrs:
         yield Section(sentences=order_note(tree, frame.attrs["computed"]))
     yield Section(sentences=[ALONE] if frame.empty else remarks(tree, frame))
-
-
-def nearest(frame: pd.DataFrame) -> tuple[pd.Series, tuple[str, ...]] | None:
-    """Return the nearest mesh of one order, and labels that may be nearer; None if all are below their errors.
-
-    None may be nearer if the distance with its error is below those of all others less their errors, resolved or not.
-    """
-    rows = frame[frame["distance"].notna()].sort_values("distance", kind="stable")
-    if not rows["resolved"].any():
-        return None
-    best, others = rows.iloc[0], rows.iloc[1:]
-    # An unknown error leaves everything open.
-    is_farther = (others["distance"] - others["error"]).clip(lower=0) > best["distance"] + best["error"]
-    return best, tuple(others["mesh"][~is_farther])
 
 
 def _metrics_of(tree: xr.DataTree) -> list[str]:
@@ -340,7 +307,7 @@ def _metric_columns(tree: xr.DataTree) -> list[Column]:
 def page_columns(tree: xr.DataTree) -> tuple[Column, ...]:
     """Return the columns whose numbers an open store has, for a page, which may be narrow."""
     columns = [*_COLUMNS, *_metric_columns(tree)]
-    return tuple(sorted(columns, key=lambda column: (column is not _MESH, not column.is_marked)))
+    return tuple(sorted(columns, key=lambda column: (column is not MESH, not column.is_marked)))
 
 
 def with_remarks(frame: pd.DataFrame) -> pd.DataFrame:
@@ -393,93 +360,3 @@ def _with_rates(frame: pd.DataFrame, x: str) -> pd.DataFrame:
     families, ordered_by = (frame[name].to_numpy()[:count] for name in ("family", "ordered_by"))
     rates, rate_errors = rates_in_families(families, ordered_by, distances, errors, 1 / sizes_of(frame, x)[:count])
     return frame.assign(rate=rates.ravel(), rate_error=rate_errors.ravel())
-
-
-def smallest_below(store: AnyStore, relative: float | str, order: Orders | None = None) -> pd.DataFrame:
-    """Return the mesh with the fewest triangles in each family whose relative distance is certainly below a bound.
-
-    Args:
-        store: Path, URL or opened DataTree of the store.
-        relative: Bound on the relative distance with its error, such as 0.01 or "1%".
-        order: One of the store's orders, or several; default all.
-
-    Returns:
-        One row for each order and family with meshes of triangles: order, family, mesh (empty if none is below the
-        bound), its triangles, relative and relative_error (missing likewise); nearest (the mesh of the family with the
-        smallest distance), nearest_relative and nearest_relative_error; undecided (meshes with fewer triangles of
-        which the errors leave open whether they are below the bound, separated by commas). The frame's ``attrs`` have
-        the reference's label and the bound.
-
-    Raises:
-        InputError: The store has no tables yet, lacks an order, or has no meshes of triangles, or the bound is not
-            positive.
-        StoreError: The location has no store of a study.
-
-    >>> import sobolev_batch as sb
-    >>> frame = sb.smallest_below("storage/icosphere.zarr", "5%", order=-10)
-    >>> frame[["family", "mesh", "triangles"]].values.tolist()
-    [['icosphere', 'icosphere/2', 320]]
-    """
-    most = fraction(relative)
-    tree = as_tree(store)
-    require_one_object(tree)
-    frame = table(tree, order)
-    if not (frame["triangles"] > 0).any():
-        raise InputError("the smallest mesh has the fewest triangles, and no surface of the store is known to have any")
-    smallest = smallest_of(frame, most)
-    return smallest.assign(undecided=smallest["undecided"].map(", ".join))
-
-
-def smallest_of(frame: pd.DataFrame, most: float) -> pd.DataFrame:
-    """Return the smallest mesh of each family of triangles below a bound, of rows of `table`; see `smallest_below`."""
-    with_triangles = frame[frame["triangles"] > 0]
-    rows = [
-        {"order": s, "family": family, **_smallest(members, most)}
-        for (s, family), members in with_triangles.groupby(["order", "family"], sort=False)
-    ]
-    smallest = pd.DataFrame(rows, columns=["order", "family", *_SMALLEST]).astype({"triangles": "Int64"})
-    smallest.attrs = {"reference": frame.attrs["reference"], "below": most}
-    return smallest
-
-
-def format_smallest(
-    tree: xr.DataTree, style: Format = "text", orders: Sequence[float] | None = None, *, below: float | str
-) -> str:
-    """Return the smallest meshes below a bound as text; see `smallest_below`."""
-    frame = smallest_below(tree, below, orders)
-    amount = f"{100 * frame.attrs['below']:g} %"
-    sections = []
-    for order, rows in frame.groupby("order", sort=False):
-        caption = f"Smallest mesh below {amount} of the norm of {frame.attrs['reference']}, order {order:g}"
-        cells = [
-            {**row, "mesh": row["mesh"] or "none", "remark": _remark(row)} for row in rows.to_dict(orient="records")
-        ]
-        sections.append(Section(caption, [(_SMALLEST_COLUMNS, cells)]))
-    return rendered(style, frame, sections, wrapped(_SMALLEST_NOTE))
-
-
-def _smallest(members: pd.DataFrame, most: float) -> dict[str, Any]:
-    lowest, highest = (members["relative"] + sign * members["relative_error"] for sign in (-1, 1))
-    below = members[highest < most].sort_values(["triangles", "relative"])
-    best = _UNKNOWN if below.empty else below.iloc[0]
-    # An unknown error leaves everything open.
-    is_open = members["relative"].notna() & ~(highest < most) & ~(lowest >= most)
-    is_fewer = True if below.empty else members["triangles"] < best["triangles"]
-    nearest = members.loc[members["relative"].idxmin()] if members["relative"].notna().any() else _UNKNOWN
-    return {
-        **{name: best[name] for name in ("mesh", "triangles", *_RELATIVE)},
-        "nearest": nearest["mesh"],
-        **{f"nearest_{name}": nearest[name] for name in _RELATIVE},
-        "undecided": tuple(members.loc[is_open & is_fewer, "mesh"]),
-    }
-
-
-def _remark(row: Mapping[Any, Any]) -> str:
-    """Return the nearest mesh of a family without one below the bound, and the undecided ones."""
-    remarks = []
-    if not row["mesh"]:
-        amount = percent(row["nearest_relative"], row["nearest_relative_error"])
-        remarks.append(f"nearest: {row['nearest']}, {amount}" if row["nearest"] else "no distance is known")
-    if row["undecided"]:
-        remarks.append(f"undecided: {row['undecided']}")
-    return "; ".join(remarks)

@@ -14,8 +14,8 @@ from sobolev_batch.norms.columns import parts_as_variables
 from sobolev_batch.norms.estimate import PARTS, quotients
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.open import AnyStore, as_tree, complete_meshes, finished_group, reference_of
+from sobolev_batch.tables.other_orders import distances_at, norms_at, order_note
 from sobolev_batch.tables.rendering import Column, Section, rendered
-from sobolev_batch.tables.store_accessor import distances_at, norms_at, order_note
 from sobolev_batch.tables.text import middle_cut, with_error
 from sobolev_batch.transform.lattice import check_orders
 

@@ -21,9 +21,10 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.store.records import Records
 from sobolev_batch.tables.conclusion import format_objects, format_verdict
-from sobolev_batch.tables.convergence import format_smallest, format_table
+from sobolev_batch.tables.convergence import format_table
 from sobolev_batch.tables.matrix import format_matrix
 from sobolev_batch.tables.rendering import printed_table
+from sobolev_batch.tables.smallest import format_smallest
 from tests.support.made_tree import root_attributes
 from tests.support.studies import small_table
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 import sobolev_batch as sb
 from sobolev_batch.norms.estimate import AREA_AND_SHAPE, PARTS, NormEstimate
-from sobolev_batch.tables.store_accessor import distances_at, stored_reducer
+from sobolev_batch.tables.other_orders import distances_at, stored_reducer
 from tests.support.studies import small_table, variable
 
 STORED, OTHERS = [-1.5, -3.0], [-2.0, -4.0]

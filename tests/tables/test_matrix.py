@@ -15,7 +15,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.norms.estimate import PARTS
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.matrix import format_matrix, matrix_frame, pairs_of
-from sobolev_batch.tables.store_accessor import distances_at
+from sobolev_batch.tables.other_orders import distances_at
 from tests.support.trees import tree_of
 
 

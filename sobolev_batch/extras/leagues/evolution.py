@@ -13,8 +13,9 @@ from sobolev_batch.norms.columns import NUMBER, VARIABLES, described
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.open import AnyStore, as_tree, complete_meshes, finished_group, has_times, reference_of
+from sobolev_batch.tables.other_orders import convergence_at
 from sobolev_batch.tables.rendering import Column, Section, rendered
-from sobolev_batch.tables.store_accessor import StoreAccessor, convergence_at
+from sobolev_batch.tables.store_accessor import StoreAccessor
 from sobolev_batch.tables.text import with_error, wrapped
 from sobolev_batch.transform.lattice import Orders, check_orders
 

@@ -34,7 +34,7 @@ from sobolev_batch.extras.leagues.league import (
     pair_lines,
 )
 from sobolev_batch.store.objects import Objects
-from sobolev_batch.tables.conclusion import VERDICT_COLUMNS, Row, study_verdict
+from sobolev_batch.tables.conclusion import VERDICT_COLUMNS, TableRow, study_verdict
 from sobolev_batch.tables.convergence import (
     CONNECTION_COLUMNS,
     page_columns,
@@ -102,13 +102,13 @@ class PageTable:
 
     name: str
     columns: Sequence[Column]
-    rows: Sequence[Row]
+    rows: Sequence[TableRow]
     orders: Sequence[float] | None = None
     is_sortable: bool = True
     omitted: int = 0
 
     @property
-    def bodies(self) -> list[tuple[float | None, str, list[Row]]]:
+    def bodies(self) -> list[tuple[float | None, str, list[TableRow]]]:
         """Each order, its text and its rows."""
         if self.orders is None:
             return [(None, "", list(self.rows))]
@@ -259,14 +259,14 @@ def cost_content(tables: Mapping[str, pd.DataFrame], methods: Sequence[str]) -> 
     }
 
 
-def _rows(league: League | CostLeague, name: Literal["table", "pairs", "front"]) -> list[Row]:
+def _rows(league: League | CostLeague, name: Literal["table", "pairs", "front"]) -> list[TableRow]:
     """Return the rows of a table of a league, with the colours of the methods."""
     frame: pd.DataFrame = getattr(league, name)
     colors = frame["method"].map(list(league.methods).index)
     return list(frame.assign(order=league.order, color=colors).to_dict(orient="records"))
 
 
-def _object_rows(tables: Mapping[str, pd.DataFrame], order: float, league: League | None) -> Iterator[Row]:
+def _object_rows(tables: Mapping[str, pd.DataFrame], order: float, league: League | None) -> Iterator[TableRow]:
     """Yield the objects with their best methods at one order."""
     for name, frame in tables.items():
         meshes = frame[frame["order"] == order]
@@ -285,7 +285,7 @@ def _object_rows(tables: Mapping[str, pd.DataFrame], order: float, league: Leagu
             yield {**row, **_best(league, league.objects.index(name))}
 
 
-def _best(league: League, number: int) -> Row:
+def _best(league: League, number: int) -> TableRow:
     """Return the best method of an object, and the next one."""
     values, errors = league.values[number], league.errors[number]
     first, *others = np.argsort(values, kind="stable").tolist()

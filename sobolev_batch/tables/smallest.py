@@ -1,0 +1,124 @@
+"""The smallest mesh of each family whose relative distance is below a bound."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import pandas as pd
+import xarray as xr
+
+from sobolev_batch.errors import InputError
+from sobolev_batch.parameters import fraction
+from sobolev_batch.tables import Format
+from sobolev_batch.tables.convergence import MESH, TRIANGLES, table
+from sobolev_batch.tables.open import AnyStore, as_tree, require_one_object
+from sobolev_batch.tables.rendering import Column, Section, rendered
+from sobolev_batch.tables.text import percent, wrapped
+from sobolev_batch.transform.lattice import Orders
+
+_RELATIVE = ["relative", "relative_error"]
+_NAMES = ["mesh", "triangles", *_RELATIVE, "nearest", *(f"nearest_{name}" for name in _RELATIVE), "undecided"]
+_NOTE = """\
+A mesh is below the bound if its relative distance and the error of that are together.
+Meshes that are smaller, and that the errors leave open, are named as undecided."""
+
+_UNKNOWN: dict[str, Any] = {"mesh": "", "triangles": pd.NA, "relative": math.nan, "relative_error": math.nan}
+_COLUMNS = (
+    Column("family", "family"),
+    MESH,
+    TRIANGLES,
+    Column("relative", "relative", percent, "relative_error"),
+    Column("remark", "remark", kind="text"),
+)
+
+
+def smallest_below(store: AnyStore, relative: float | str, order: Orders | None = None) -> pd.DataFrame:
+    """Return the mesh with the fewest triangles in each family whose relative distance is certainly below a bound.
+
+    Args:
+        store: Path, URL or opened DataTree of the store.
+        relative: Bound on the relative distance with its error, such as 0.01 or "1%".
+        order: One of the store's orders, or several; default all.
+
+    Returns:
+        One row for each order and family with meshes of triangles: order, family, mesh (empty if none is below the
+        bound), its triangles, relative and relative_error (missing likewise); nearest (the mesh of the family with the
+        smallest distance), nearest_relative and nearest_relative_error; undecided (meshes with fewer triangles of
+        which the errors leave open whether they are below the bound, separated by commas). The frame's ``attrs`` have
+        the reference's label and the bound.
+
+    Raises:
+        InputError: The store has no tables yet, lacks an order, or has no meshes of triangles, or the bound is not
+            positive.
+        StoreError: The location has no store of a study.
+
+    >>> import sobolev_batch as sb
+    >>> frame = sb.smallest_below("storage/icosphere.zarr", "5%", order=-10)
+    >>> frame[["family", "mesh", "triangles"]].values.tolist()
+    [['icosphere', 'icosphere/2', 320]]
+    """
+    most = fraction(relative)
+    tree = as_tree(store)
+    require_one_object(tree)
+    frame = table(tree, order)
+    if not (frame["triangles"] > 0).any():
+        raise InputError("the smallest mesh has the fewest triangles, and no surface of the store is known to have any")
+    smallest = smallest_of(frame, most)
+    return smallest.assign(undecided=smallest["undecided"].map(", ".join))
+
+
+def smallest_of(frame: pd.DataFrame, most: float) -> pd.DataFrame:
+    """Return the smallest mesh of each family of triangles below a bound, of rows of `table`; see `smallest_below`."""
+    with_triangles = frame[frame["triangles"] > 0]
+    rows = [
+        {"order": s, "family": family, **_smallest(members, most)}
+        for (s, family), members in with_triangles.groupby(["order", "family"], sort=False)
+    ]
+    smallest = pd.DataFrame(rows, columns=["order", "family", *_NAMES]).astype({"triangles": "Int64"})
+    smallest.attrs = {"reference": frame.attrs["reference"], "below": most}
+    return smallest
+
+
+def format_smallest(
+    tree: xr.DataTree, style: Format = "text", orders: Sequence[float] | None = None, *, below: float | str
+) -> str:
+    """Return the smallest meshes below a bound as text; see `smallest_below`."""
+    frame = smallest_below(tree, below, orders)
+    amount = f"{100 * frame.attrs['below']:g} %"
+    sections = []
+    for order, rows in frame.groupby("order", sort=False):
+        caption = f"Smallest mesh below {amount} of the norm of {frame.attrs['reference']}, order {order:g}"
+        cells = [
+            {**row, "mesh": row["mesh"] or "none", "remark": _remark(row)} for row in rows.to_dict(orient="records")
+        ]
+        sections.append(Section(caption, [(_COLUMNS, cells)]))
+    return rendered(style, frame, sections, wrapped(_NOTE))
+
+
+def _smallest(members: pd.DataFrame, most: float) -> dict[str, Any]:
+    lowest, highest = (members["relative"] + sign * members["relative_error"] for sign in (-1, 1))
+    below = members[highest < most].sort_values(["triangles", "relative"])
+    best = _UNKNOWN if below.empty else below.iloc[0]
+    # An unknown error leaves everything open.
+    is_open = members["relative"].notna() & ~(highest < most) & ~(lowest >= most)
+    is_fewer = True if below.empty else members["triangles"] < best["triangles"]
+    nearest = members.loc[members["relative"].idxmin()] if members["relative"].notna().any() else _UNKNOWN
+    return {
+        **{name: best[name] for name in ("mesh", "triangles", *_RELATIVE)},
+        "nearest": nearest["mesh"],
+        **{f"nearest_{name}": nearest[name] for name in _RELATIVE},
+        "undecided": tuple(members.loc[is_open & is_fewer, "mesh"]),
+    }
+
+
+def _remark(row: Mapping[Any, Any]) -> str:
+    """Return the nearest mesh of a family without one below the bound, and the undecided ones."""
+    remarks = []
+    if not row["mesh"]:
+        amount = percent(row["nearest_relative"], row["nearest_relative_error"])
+        remarks.append(f"nearest: {row['nearest']}, {amount}" if row["nearest"] else "no distance is known")
+    if row["undecided"]:
+        remarks.append(f"undecided: {row['undecided']}")
+    return "; ".join(remarks)
