@@ -74,7 +74,7 @@ def _transforms(
 
     def to_the_device(given: sb.Mesh) -> None:
         with gpu.work():
-            points = settings.plan(given, lattice).batches(spec.batch, gpu)
+            points = settings.kind_for(given, lattice).batches(spec.batch, gpu)
             transform_points(points, lattice, lattice.half, spec, gpu)
             gpu.cupy.cuda.Device().synchronize()
 

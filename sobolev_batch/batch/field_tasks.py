@@ -270,11 +270,11 @@ def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block], target: E
     """Compute and store some of several blocks, whose settings follow from their a priori error."""
     lattice, execution = job.lattice, job.execution
     transform = choose_settings(surface, lattice, target, job.transform) if target else job.transform
-    plan = transform.plan(surface, lattice)
-    draws = draws_for([surface], lattice, job.orders, plan.lowest_degree, COMMON)
+    kind = transform.kind_for(surface, lattice)
+    draws = draws_for([surface], lattice, job.orders, kind.lowest_degree, COMMON)
     probes, backends, checksums, points = [], [], [], 0
     for block in blocks:
-        result = transform_block(surface, lattice, block, transform, execution, plan)
+        result = transform_block(surface, lattice, block, transform, execution, kind)
         checksums.append(Fields(job.store).write(job.index, lattice.place(block), result.values))
         probes.append(probe_block(surface, lattice, transform, block, result.values, draws, execution))
         backends.append(result.backend)

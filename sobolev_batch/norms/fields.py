@@ -199,15 +199,15 @@ def compute_field(
     A sample of the surface, drawn for these orders and `USUAL_DEGREE`, saves time.
     """
     block = lattice.half
-    plan = settings.plan(surface, lattice)
-    transformed = transform_block(surface, lattice, block, settings, execution, plan)
+    kind = settings.kind_for(surface, lattice)
+    transformed = transform_block(surface, lattice, block, settings, execution, kind)
     values = transformed.values
     if not needs_probe(surface, settings):
         probe = Probe()
-    elif sample is not None and plan.lowest_degree <= USUAL_DEGREE:
+    elif sample is not None and kind.lowest_degree <= USUAL_DEGREE:
         probe = probe_block(surface, lattice, settings, block, values, sample.draws, execution, sample)
     else:
-        draws = draws_for([surface], lattice, orders, plan.lowest_degree, COMMON)
+        draws = draws_for([surface], lattice, orders, kind.lowest_degree, COMMON)
         probe = probe_block(surface, lattice, settings, block, values, draws, execution)
     quality = Quality.from_surface(surface, probe)
     return Field(values, transformed.points, transformed.backend, quality, settings)

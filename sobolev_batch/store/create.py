@@ -375,7 +375,7 @@ def _attributes(plan: Plan, labels: Sequence[str]) -> dict[str, Any]:
             "name": plan.name,
             **_lattice_entry(plan),
             "eps": None if study.accuracy else study.transform.eps,
-            "choice": plan.choice.to_table() if study.accuracy else None,
+            "choice": plan.choice.to_dict() if study.accuracy else None,
             "orders": list(study.orders),
             "reference": plan.reference,
             "table": dict(study.object.table),

@@ -65,7 +65,7 @@ class Fields:
         They are compared with the checksums that the tasks returned; without these, missing values read as NaN. A
         DamageError names the row whose values are damaged, lost, or others.
         """
-        parts = self.store.parts
+        parts = self.store.stores
         arrays = [part.array(_array_at(place)) for _, part in parts]
         values = np.empty((len(rows), *(axis.stop - axis.start for axis in place)), dtype=arrays[0].dtype)
 

@@ -186,7 +186,7 @@ class Store:
         study = self.attributes()["study"]
         dtypes = {"dtype": study["dtype"], "transform_dtype": study["dtype"]}
         given = {**study["lattice"], **dtypes, "closest": (), "reasons": (), "basis": ""}
-        return LatticeChoice.from_table(study.get("choice") or given, study.get("octaves"))
+        return LatticeChoice.from_dict(study.get("choice") or given, study.get("octaves"))
 
     @property
     def is_unfinished(self) -> bool:
@@ -199,7 +199,7 @@ class Store:
         return frozenset(self.attributes().get(REMOVED, ()))
 
     @property
-    def parts(self) -> tuple[tuple[int, Store], ...]:
+    def stores(self) -> tuple[tuple[int, Store], ...]:
         """The stores that this one is made of, each with the number of rows before its own; see `JoinedStore`."""
         return ((0, self),)
 
@@ -426,7 +426,7 @@ class JoinedStore(Store):
         self._stores, self._labels = tuple(stores), tuple(labels)
 
     @property
-    def parts(self) -> tuple[tuple[int, Store], ...]:
+    def stores(self) -> tuple[tuple[int, Store], ...]:
         """The stores, each with the number of rows before its own."""
         firsts = accumulate((store.row_count for store in self._stores), initial=0)
         return tuple(zip(firsts, self._stores, strict=False))

@@ -23,7 +23,7 @@ Document = dict[str, Any]
 # No document is larger. That of the root repeats all others, with about 1 kB for each.
 MOST_BYTES = 64_000_000
 
-# Attributes of the root that are tables. They are stored as JSON, since NetCDF has no attributes of attributes.
+# Attributes of the root that are mappings. They are stored as JSON, since NetCDF has no attributes of attributes.
 _TABLES = ("study", "similarity", "versions")
 _GROUP_KEYS = {"attributes", "consolidated_metadata", "node_type", "zarr_format"}
 _ARRAY_KEYS = {
@@ -59,14 +59,14 @@ def consolidated(documents: Mapping[str, Document]) -> Document:
 
 
 def attributes_of(root: Document) -> dict[str, Any]:
-    """Return the attributes of a root as it is stored, with its tables; ValueError where one is none."""
+    """Return the attributes of a root as it is stored, with its mappings; ValueError where one is none."""
     attributes: dict[str, Any] = root.get("attributes", {})
     texts = {name: attributes[name] for name in _TABLES if isinstance(attributes.get(name), str)}
-    return attributes | {name: table_in(text) for name, text in texts.items()}
+    return attributes | {name: mapping_in(text) for name, text in texts.items()}
 
 
-def table_in(text: str) -> dict[str, Any]:
-    """Return the table that an attribute of the root holds as JSON; ValueError where it holds none."""
+def mapping_in(text: str) -> dict[str, Any]:
+    """Return the mapping that an attribute of the root holds as JSON; ValueError where it holds none."""
     try:
         return dict(json.loads(text))
     except (TypeError, RecursionError) as error:

@@ -55,25 +55,25 @@ class LatticeChoice:
 
     @property
     def octaves(self) -> dict[str, Any] | None:
-        """The sampling of the octaves as a table; None without octaves."""
-        return None if self.tail is None else self.tail.to_table()
+        """The sampling of the octaves as a dictionary; None without octaves."""
+        return None if self.tail is None else self.tail.to_dict()
 
-    def to_table(self) -> dict[str, Any]:
-        """Return the choice as a table, without the octaves."""
+    def to_dict(self) -> dict[str, Any]:
+        """Return the choice as a dictionary, without the octaves."""
         others = {name: getattr(self, name) for name in ("dtype", "transform_dtype", "closest", "reasons", "basis")}
         return {"xi_max": self.lattice.xi_max, "M": self.lattice.M, **others}
 
     @classmethod
-    def from_table(cls, table: Mapping[str, Any], octaves: Mapping[str, Any] | None) -> Self:
-        """Return the choice that a table holds, with its `octaves`."""
+    def from_dict(cls, values: Mapping[str, Any], octaves: Mapping[str, Any] | None) -> Self:
+        """Return the choice that a dictionary holds, with its `octaves`."""
         return cls(
-            Lattice(table["xi_max"], table["M"]),
-            table["dtype"],
-            table["transform_dtype"],
-            tuple(table["closest"]),
-            tuple(table["reasons"]),
-            table["basis"],
-            None if octaves is None else TailSampling.from_table(octaves),
+            Lattice(values["xi_max"], values["M"]),
+            values["dtype"],
+            values["transform_dtype"],
+            tuple(values["closest"]),
+            tuple(values["reasons"]),
+            values["basis"],
+            None if octaves is None else TailSampling.from_dict(octaves),
         )
 
     def grown(self, distances: NormEstimate, orders: Sequence[float], accuracy: Accuracy) -> LatticeChoice | None:

@@ -38,7 +38,7 @@ from sobolev_batch.store.layout import (
     table_attributes,
 )
 from sobolev_batch.store.location import Location
-from sobolev_batch.store.metadata import table_in
+from sobolev_batch.store.metadata import mapping_in
 from sobolev_batch.store.objects import stores_below
 from sobolev_batch.visible import FILE_UNITS
 
@@ -146,8 +146,8 @@ def _joined(trees: Sequence[xr.DataTree]) -> xr.DataTree:
                 f"{source_of(tree)}: it cannot be opened as one with {source_of(trees[0])}: "
                 f"they differ in {', '.join(differences)}"
             )
-    names, study = _names_in_all(trees), root_table(trees[0], "study")
-    stored = [set(root_table(tree, "study")["orders"]) for tree in trees]
+    names, study = _names_in_all(trees), root_attribute(trees[0], "study")
+    stored = [set(root_attribute(tree, "study")["orders"]) for tree in trees]
     orders = [s for s in study["orders"] if all(s in others for others in stored)]
     firsts = [*accumulate((store_of(tree).row_count for tree in trees), initial=0)]
     groups = {
@@ -169,8 +169,8 @@ def _joined(trees: Sequence[xr.DataTree]) -> xr.DataTree:
 def _common(tree: xr.DataTree) -> dict[str, Any]:
     """Return what stores have in common that open as one."""
     reference = finished_group(tree, "meshes", load=False)["key"].sel(mesh=reference_of(tree)).item()
-    of_study = {name: root_table(tree, "study")[name] for name in ("lattice", "dtype", "octaves")}
-    return {**of_study, "similarity": root_table(tree, "similarity"), "reference": reference}
+    of_study = {name: root_attribute(tree, "study")[name] for name in ("lattice", "dtype", "octaves")}
+    return {**of_study, "similarity": root_attribute(tree, "similarity"), "reference": reference}
 
 
 def _names_in_all(trees: Sequence[xr.DataTree]) -> list[dict[str, str]]:
@@ -179,7 +179,7 @@ def _names_in_all(trees: Sequence[xr.DataTree]) -> list[dict[str, str]]:
     for tree, labels in zip(trees[1:], own[1:], strict=True):
         labels.remove(reference_of(tree))
     twice = next((label for label, count in Counter(chain(*own)).items() if count > 1), None)
-    begins = [f"{root_table(tree, 'study')['name']}/" if twice else "" for tree in trees]
+    begins = [f"{root_attribute(tree, 'study')['name']}/" if twice else "" for tree in trees]
     if twice and len(set(begins)) < len(begins):
         raise StoreError(f"{source_of(trees[0])}: another study of the same name has a mesh {quoted(twice)} too")
     names = [{label: f"{begin}{label}" for label in labels} for begin, labels in zip(begins, own, strict=True)]
@@ -189,7 +189,7 @@ def _names_in_all(trees: Sequence[xr.DataTree]) -> list[dict[str, str]]:
 
 def _part(tree: xr.DataTree, group: str, names: Mapping[str, str], first: int, orders: Sequence[float]) -> xr.Dataset:
     """Return a group of one of several stores: of these meshes, with their labels among all, and rows after others."""
-    part, study = tree[group].to_dataset(), str(root_table(tree, "study")["name"])
+    part, study = tree[group].to_dataset(), str(root_attribute(tree, "study")["name"])
     if "order" in part.dims:
         part = part.sel(order=list(orders))
     if "other" in part.dims:
@@ -311,28 +311,28 @@ def finished_group(tree: xr.DataTree, name: str, *, load: bool = True) -> xr.Dat
 
 def has_objects(tree: xr.DataTree) -> bool:
     """Return True for the root of several objects."""
-    return OBJECTS in root_table(tree, "study")
+    return OBJECTS in root_attribute(tree, "study")
 
 
 def require_one_object(tree: xr.DataTree) -> None:
     """Refuse the root of several objects, by an InputError that names the store of one."""
     if has_objects(tree):
-        one = f"{source_of(tree)}/{next(iter(root_table(tree, 'study')[OBJECTS]), 'NAME')}"
+        one = f"{source_of(tree)}/{next(iter(root_attribute(tree, 'study')[OBJECTS]), 'NAME')}"
         raise InputError(f"{source_of(tree)}: the store of several objects; name that of one, such as {one}")
 
 
-def root_table(tree: xr.DataTree, name: str) -> dict[str, Any]:
-    """Return an attribute of the root of an open store that is a table; an empty one where it has none."""
-    return _table_in(tree.attrs[name]) if name in tree.attrs else {}
+def root_attribute(tree: xr.DataTree, name: str) -> dict[str, Any]:
+    """Return an attribute of the root of an open store that is a mapping; an empty one where it has none."""
+    return _mapping_in(tree.attrs[name]) if name in tree.attrs else {}
 
 
 # That of many objects is long.
-_table_in = lru_cache(table_in)
+_mapping_in = lru_cache(mapping_in)
 
 
 def similarity_of(tree: xr.DataTree) -> Similarity:
     """Return the map from the unit of length of the files to that of the study of an open store."""
-    table = root_table(tree, "similarity")
+    table = root_attribute(tree, "similarity")
     return Similarity(table["scale"], tuple(table["origin"]))
 
 
@@ -398,8 +398,8 @@ def placement_doubts(tree: xr.DataTree) -> dict[str, str]:
 
 def unit_of(tree: xr.DataTree) -> tuple[str, float]:
     """Return the name of the unit of length of the files, and the study's unit in terms of it."""
-    header = root_table(tree, "study").get("table", {}).get("study", {})
-    return header.get("length_unit", FILE_UNITS), 1 / root_table(tree, "similarity").get("scale", 1.0)
+    header = root_attribute(tree, "study").get("table", {}).get("study", {})
+    return header.get("length_unit", FILE_UNITS), 1 / root_attribute(tree, "similarity").get("scale", 1.0)
 
 
 def study_unit(tree: xr.DataTree) -> str:

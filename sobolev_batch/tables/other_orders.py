@@ -36,7 +36,7 @@ def stored_reducer(tree: xr.DataTree, order: Orders, *meshes: str) -> tuple[Redu
     store, orders = store_of(tree), check_orders(order)
     labels, removed, chosen = store.labels(), store.removed, set(meshes)
     complete: dict[int, Record] = {}
-    for first, part in store.parts:
+    for first, part in store.stores:
         own = labels[first : first + part.row_count]
         known = ((i, label) for i, label in enumerate(own) if label and label not in removed)
         wanted = {i for i, label in known if not chosen or label in chosen}
@@ -70,7 +70,7 @@ def _computed(tree: xr.DataTree, orders: tuple[float, ...], meshes: Meshes = Non
     row_of_reference = dict(zip(labels, complete_rows, strict=True)).get(reference, -1)
     keys = spectrum_keys(dict(zip(complete_rows, own_keys, strict=True)), row_of_reference)
     qualities: dict[int, Quality] = {}
-    for first, part in store.parts:
+    for first, part in store.stores:
         rows = [row for row in sorted(keys) if first <= row < first + part.row_count]
         if stale_chunks(part, {row - first: keys[row] for row in rows}):
             problem = "they are not those of the stored fields"

@@ -102,7 +102,7 @@ class Reducer:
         compared_with: int | None = None,
     ) -> Self:
         """Return the reducer of rows with known qualities; distances are to the reference, or another row."""
-        count = sum(part.row_count for _, part in store.parts)
+        count = sum(part.row_count for _, part in store.stores)
         areas, errors = np.full(count, np.nan), np.full((len(orders), count), np.nan)
         weights = SobolevWeights(choice.lattice, orders, None if choice.tail is None else choice.tail.cutoff)
         for row, quality in qualities.items():

@@ -27,7 +27,7 @@ def spectrum_keys(keys: Mapping[int, str], reference: int) -> dict[int, str]:
 
 def chunks_of_spectra(store: Store) -> Iterator[range]:
     """Yield the rows of each chunk of spectra."""
-    for before, part in store.parts:
+    for before, part in store.stores:
         document = part.document(SPECTRA_KEYS)
         (count,), (step,) = document["shape"], chunk_shape(document)
         for first in range(0, count, step):
@@ -88,7 +88,7 @@ def _places(of: set[int], rows: range) -> list[int]:
 def read_spectra(store: Store, rows: Sequence[int]) -> ComparedSpectra:
     """Return the spectra of rows, in their order; a damaged chunk raises a `DamageError`."""
     parts, wanted = [], set(rows)
-    for before, part in store.parts:
+    for before, part in store.stores:
         for number, chunk in enumerate(chunks_of_spectra(part)):
             of_chunk = {row - before for row in wanted.intersection(range(before + chunk.start, before + chunk.stop))}
             if of_chunk:

@@ -100,9 +100,9 @@ class TransformSettings:
         fixed_rule(quadrature)
         vars(self).update(eps=eps, dtype=dtype, quadrature=quadrature, tolerance=tolerance, stored=stored or dtype)
 
-    def plan(self, surface: Surface, lattice: FrequencyLattice) -> SurfaceKind:
+    def kind_for(self, surface: Surface, lattice: FrequencyLattice) -> SurfaceKind:
         """Return a surface with quadrature points for a lattice."""
-        return kind_of(surface).plan(lattice.highest_frequency, self.eps, self.quadrature, self.tolerance)
+        return kind_of(surface).with_points(lattice.highest_frequency, self.eps, self.quadrature, self.tolerance)
 
 
 def thread_count(threads: int | None) -> int:
@@ -186,11 +186,11 @@ def transform_block(
     block: Block,
     settings: TransformSettings,
     execution: Execution = ON_CPU,
-    plan: SurfaceKind | None = None,
+    kind: SurfaceKind | None = None,
 ) -> Transformed:
     """Return the transform of a surface on one block of the lattice.
 
-    Several blocks take one choice of rules with the plan of the surface by the same settings. LatticeError where the
+    Several blocks take one choice of rules with the kind of the surface for the same settings. LatticeError where the
     surface extends beyond the lattice's half period, InputError where the allowed memory is too little, or the
     quadrature of a parametrised surface does not converge.
     """
@@ -202,24 +202,24 @@ def transform_block(
         for part in block.split(_SAMPLES):
             values[part.place_in(block)] = kind.block_values(lattice, part)
         return Transformed(values, 0, "closed form")
-    plan = plan or settings.plan(surface, lattice)
+    kind = kind or settings.kind_for(surface, lattice)
     whole = NufftSpec(block.shape, settings.eps, settings.dtype, threads=execution.threads, batch=execution.batch)
     low, high = surface.extent.box
     fill = min(1.0, float(np.prod((high - low) / (2 * lattice.half_period))))
 
-    plan.choose_points(execution.backend)
-    points = plan.expected_points if isinstance(execution.backend, Gpu) else math.inf
+    kind.choose_points(execution.backend)
+    points = kind.expected_points if isinstance(execution.backend, Gpu) else math.inf
 
     def fitting(costs: Costs, allowed_bytes: float) -> tuple[NufftSpec, int]:
-        workload = Workload(points, triangles=plan.triangles, fill=fill)
+        workload = Workload(points, triangles=kind.triangles, fill=fill)
         if costs.projected_bytes(whole, workload) > allowed_bytes:
             # Only now do the points need counting.
-            workload = replace(workload, points=plan.expected_points, largest_points=plan.largest_points)
+            workload = replace(workload, points=kind.expected_points, largest_points=kind.largest_points)
         spec = fastest_spec(whole, workload, costs, allowed_bytes)
         return spec, costs.projected_bytes(spec, workload)
 
     def compute(backend: Backend, spec: NufftSpec) -> tuple[Array, int]:
-        values, points = transform_points(plan.batches(spec.batch, backend), lattice, block, spec, backend)
+        values, points = transform_points(kind.batches(spec.batch, backend), lattice, block, spec, backend)
         return values.astype(settings.stored, copy=False), points
 
     # Before the GPU is tried: the memory must be enough for the processor that may have to step in.
@@ -328,4 +328,4 @@ def _points_of_triangle(area: float, lattice: Lattice, settings: TransformSettin
     sphere = icosphere(_STAND_IN_LEVEL)
     count = len(sphere.triangles)
     alike = Similarity(math.sqrt(area * count / sphere.area)).apply(sphere)
-    return settings.plan(alike, lattice).expected_points / count
+    return settings.kind_for(alike, lattice).expected_points / count

@@ -45,7 +45,7 @@ _FEWEST_NODES = 500
 class SurfaceKind(ABC):
     """A surface as transforms see it: exact values anywhere, and points that stand for it up to a frequency.
 
-    `kind_of` makes it for exact values, and `plan` for points, which are chosen when first needed.
+    `kind_of` makes it for exact values, and `with_points` for points, which are chosen when first needed.
 
     Attributes:
         surface: Surface in units of length.
@@ -63,7 +63,7 @@ class SurfaceKind(ABC):
     # True if the transform is a formula at every frequency.
     is_closed_form: ClassVar[bool] = False
 
-    def plan(
+    def with_points(
         self, highest_frequency: float, eps: float, quadrature: str | int = "auto", tolerance: float | None = None
     ) -> Self:
         """Return the surface with points up to a frequency; see the attributes."""

@@ -264,7 +264,7 @@ def probe_block(
         own = kind_of(surface).sampled_values(further, execution.threads, execution.backend)
         exact = np.concatenate([sample.exact[common], own])
     probe = measure(pooled, values[pooled.places(block)], exact)
-    change = settings.plan(surface, lattice).change
+    change = settings.kind_for(surface, lattice).change
     if change and block.start == lattice.half.start:
         return join([probe, uniform_probe(lattice, change * surface.area)])
     return probe

@@ -65,12 +65,12 @@ class RuleUse:
     @property
     def largest_points(self) -> int:
         """Number of points, before shared ones are merged."""
-        return len(self.members) * self.rule.size << 2 * self.splits
+        return len(self.members) * self.rule.node_count << 2 * self.splits
 
     @property
     def expected_points(self) -> float:
         """Number of points of a closed mesh, after shared ones are merged."""
-        return len(self.members) * (self.rule.size << 2 * self.splits if self.splits else self.rule.cost)
+        return len(self.members) * (self.rule.node_count << 2 * self.splits if self.splits else self.rule.cost)
 
     def split(self, most: int) -> Iterator[RuleUse]:
         """Yield parts whose expected points are at most a number, or of one triangle without splits."""
@@ -95,8 +95,8 @@ class RuleUse:
         for _ in range(self.splits):
             a, b, c = (np.concatenate(quarters, axis=1) for quarters in zip(*_quarters(corners), strict=True))
             corners, areas = (a, b, c), np.tile(areas / 4, 4)
-        coordinates = np.empty((3, self.rule.size * len(areas)), like=areas)
-        combine(self.rule.barycentric, np.stack(corners, axis=1), out=coordinates.reshape(3, self.rule.size, -1))
+        coordinates = np.empty((3, self.rule.node_count * len(areas)), like=areas)
+        combine(self.rule.barycentric, np.stack(corners, axis=1), out=coordinates.reshape(3, self.rule.node_count, -1))
         return WeightedPoints(coordinates, _products(self.rule.weights, areas))
 
 

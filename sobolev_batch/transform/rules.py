@@ -58,7 +58,7 @@ class TriangleRule:
     weights: Reals
 
     @property
-    def size(self) -> int:
+    def node_count(self) -> int:
         """Number of nodes."""
         return len(self.weights)
 
@@ -88,7 +88,7 @@ class TriangleRule:
     @property
     def shares(self) -> bool:
         """True if neighbouring triangles share nodes."""
-        return self.cost < self.size
+        return self.cost < self.node_count
 
 
 @cache

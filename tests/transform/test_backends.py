@@ -228,7 +228,7 @@ def test_rules_are_chosen_alike(
     monkeypatch.setattr(kinds, "_MANY_TRIANGLES", 1)
     chosen = []
     for each in (backend, CPU):
-        plan: Any = ROUGH.plan(mesh, lattice)
+        plan: Any = ROUGH.kind_for(mesh, lattice)
         plan.choose_points(each)
         chosen.append([(use.rule, use.splits, use.members.tolist()) for use in plan.uses])
     assert chosen[0] == chosen[1]

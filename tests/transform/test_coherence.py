@@ -77,7 +77,7 @@ def test_no_frequency_exceeds_eps_where_errors_add_up(mesh: Mesh, eps: float) ->
 
 
 def expected_points(mesh: Mesh, eps: float) -> float:
-    return TransformSettings(eps).plan(mesh, LATTICE).expected_points
+    return TransformSettings(eps).kind_for(mesh, LATTICE).expected_points
 
 
 @pytest.mark.slow

@@ -126,7 +126,7 @@ from sobolev_batch.transform.fourier import projected_bytes, transform_block
 
 mesh, lattice, settings = sb.shapes.icosphere(5), sb.Lattice(5.0, {intervals}), TransformSettings()
 mesh.areas, mesh.centroid_radii, mesh.extent
-settings.plan(mesh, lattice).lowest_degree
+settings.kind_for(mesh, lattice).lowest_degree
 unit = 1 if sys.platform == "darwin" else 1024
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 values = transform_block(mesh, lattice, lattice.half, settings, Execution(allowed_bytes={memory})).values

@@ -32,7 +32,7 @@ from sobolev_batch.tables.open import (
     location_of,
     reference_of,
     require_one_object,
-    root_table,
+    root_attribute,
     similarity_of,
 )
 from sobolev_batch.testing.difference import VertexWitness, named_distances, order_text, witness_at_vertices
@@ -62,7 +62,7 @@ class StudyMeshes:
         require_one_object(tree)
         table = finished_group(tree, "meshes")
         try:
-            study = Study.from_table(root_table(tree, "study")["table"], folder=folder)
+            study = Study.from_table(root_attribute(tree, "study")["table"], folder=folder)
             # The place that the store itself names may be anybody's.
             with suppress(InputError):
                 place = root_of(Location.parse(location_of(tree)))
@@ -108,7 +108,7 @@ class StudyMeshes:
         own, scaled = self.make(label)
         with fields_read(self.tree):
             values = witness_at_vertices(*fields_of(self.tree, label), orders, scaled)
-        title = f"{label} against {reference_of(self.tree)}, study {root_table(self.tree, 'study')['name']}"
+        title = f"{label} against {reference_of(self.tree)}, study {root_attribute(self.tree, 'study')['name']}"
         lengths = None if reference is None else named_distances(own, reference)
         return VertexWitness(own, values, orders, title, 1 / self.similarity.scale, lengths)
 

@@ -15,7 +15,7 @@ from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.study.comparable import SIGNIFICANCE, least_objects
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.convergence import table
-from sobolev_batch.tables.open import AnyStore, as_tree, finished_group, reference_of, root_table, stores_of
+from sobolev_batch.tables.open import AnyStore, as_tree, finished_group, reference_of, root_attribute, stores_of
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.text import wrapped
 from sobolev_batch.transform.lattice import Orders
@@ -126,7 +126,7 @@ def _joined(
 def _identity(tree: xr.DataTree) -> str:
     """Return what tells the reference from others: the digest of its mesh, or the keys of a surface in closed form."""
     digest = str(finished_group(tree, "meshes")["digest"].sel(mesh=reference_of(tree)).item())
-    return digest or repr(sorted(root_table(tree, "study")["table"]["reference"].items()))
+    return digest or repr(sorted(root_attribute(tree, "study")["table"]["reference"].items()))
 
 
 def _numbers(frame: pd.DataFrame, y: str) -> pd.DataFrame:

@@ -35,7 +35,7 @@ from sobolev_batch.store.objects import Objects
 from sobolev_batch.study.comparable import SIGNIFICANCE, gap_of, least_objects
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.convergence import tables_of
-from sobolev_batch.tables.open import EDGE_LENGTH, AnyStore, as_tree, root_table
+from sobolev_batch.tables.open import EDGE_LENGTH, AnyStore, as_tree, root_attribute
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.text import wrapped
 from sobolev_batch.transform.lattice import Orders
@@ -171,7 +171,7 @@ class League:
         slopes = [of_method[np.isfinite(of_method[:, 0])] for of_method in self.slopes.swapaxes(0, 1)]
         frame = pd.DataFrame({"method": self.methods, "objects": self.known.sum(axis=0)})
         frame[[self.y, *ENDS]] = np.exp(list(map(interval, self.values.T, self.errors.T, spreads)))
-        frame[["rate", "rate_low", "rate_high"]] = [interval(*known.T) for known in slopes]
+        frame[["rate", "rate_low", "rate_high"]] = [interval(*of_method.T) for of_method in slopes]
         frame = frame.sort_values(self.y, kind="stable", ignore_index=True)
         low, high = frame["low"].to_numpy(), frame["high"].to_numpy()
         # Where there are no intervals, any place is possible.
@@ -285,7 +285,7 @@ def league(
         objects = found.names
     elif by == "cost":
         tree = as_tree(store)
-        objects = (str(root_table(tree, "study")["name"]),)
+        objects = (str(root_attribute(tree, "study")["name"]),)
         stores = {objects[0]: tree}
     else:
         raise StoreError(
@@ -338,13 +338,13 @@ def _league(
     unfinished: Mapping[str, str],
 ) -> League:
     rows: dict[str, tuple[Reals, Reals, Reals, Reals]] = {}
-    known: dict[str, dict[str, Curve]] = {}
+    of_objects: dict[str, dict[str, Curve]] = {}
     left_out, least = dict(unfinished), np.log(NEXT_TO_EQUAL) if y == RELATIVE else -np.inf
     for name, frame in tables.items():
         at_order = frame[frame["order"] == order]
         found = _curves(at_order, x, y, methods)
         curves = {method: curve for method, curve in found.items() if np.all(curve.values >= least)}
-        known[name], in_common = curves, _with_common_sizes(curves)
+        of_objects[name], in_common = curves, _with_common_sizes(curves)
         lacking = [method for method in methods if method not in in_common]
         why = {method: f"no {y if y != RELATIVE else 'distance'} of {method}" for method in methods}
         why |= {method: f"{method} reproduced it, up to rounding" for method in found}
@@ -366,8 +366,8 @@ def _league(
         with suppress(np.linalg.LinAlgError):
             values = np.stack([filled(at_size) for at_size in values.transpose(2, 0, 1)], axis=2)
             errors = np.where(np.isnan(errors), np.nanmean(errors, axis=0), errors)
-            parts = sizes, values, errors, slopes_of
-            return League(order, x, y, tuple(rows), tuple(methods), left_out, known, is_known, *parts)
+            at_sizes = sizes, values, errors, slopes_of
+            return League(order, x, y, tuple(rows), tuple(methods), left_out, of_objects, is_known, *at_sizes)
     reasons = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:3])
     raise InputError(
         f"no objects can serve to compare the methods {', '.join(methods)} ({reasons}); compare fewer methods, "

@@ -38,7 +38,7 @@ from sobolev_batch.tables.open import (
     location_of,
     reference_of,
     require_unchanged,
-    root_table,
+    root_attribute,
     study_unit,
 )
 from sobolev_batch.tables.text import duration, minus
@@ -204,7 +204,7 @@ def chart_data(tree: xr.DataTree, spectra: xr.Dataset | None, views: Sequence[Me
     """Return the data of all charts of an open store, with texts not escaped, and null for missing numbers."""
     orders = finished_group(tree, "convergence")["order"].values.tolist()
     return {
-        "name": root_table(tree, "study")["table"]["study"]["name"],
+        "name": root_attribute(tree, "study")["table"]["study"]["name"],
         "orders": [minus(f"{order:g}") for order in orders],
         "unit": study_unit(tree),
         "families": list(dict.fromkeys(families_of(tree).values())),

@@ -48,7 +48,7 @@ from sobolev_batch.tables.open import (
     has_proximity,
     open_store,
     placement_doubts,
-    root_table,
+    root_attribute,
     similarity_of,
 )
 from sobolev_batch.tables.rendering import Column
@@ -163,7 +163,7 @@ def _without_nulls(value: Any) -> Any:
 def study_content(tree: xr.DataTree, status: Status) -> dict[str, Any]:
     """Return what the template of an open store takes, nothing escaped; InputError where it has no tables yet."""
     meshes, convergence = finished_group(tree, "meshes"), finished_group(tree, "convergence")
-    settings = root_table(tree, "study")
+    settings = root_attribute(tree, "study")
     families = tuple(dict.fromkeys(meshes["family"].values.tolist()))
     frame, study = table(tree), settings["table"]
     missing = meshes.sel(mesh=meshes["status"] != "complete")
@@ -172,7 +172,7 @@ def study_content(tree: xr.DataTree, status: Status) -> dict[str, Any]:
     sentences, rows, omitted = study_verdict(frame, failed)
     orders = frame["order"].drop_duplicates().tolist()
     return {
-        **common_content(tree.attrs["title"], study, {"": frame}, status, failed, root_table(tree, "versions")),
+        **common_content(tree.attrs["title"], study, {"": frame}, status, failed, root_attribute(tree, "versions")),
         **cost_content({str(study["study"]["name"]): frame}, families),
         "reference": convergence.attrs["reference"],
         "settings": settings,
@@ -226,7 +226,7 @@ def league_content(objects: Objects, status: Status) -> dict[str, Any]:
     of_objects = [row for s in orders for row in _object_rows(tables, s, by_order.get(s))]
     ranked, pairs = ([row for league in leagues for row in _rows(league, name)] for name in ("table", "pairs"))
     methods = leagues[0].methods if leagues else list(dict.fromkeys(pd.concat(tables.values())["family"]))
-    versions = root_table(open_store(objects.location.below(next(iter(tables)))), "versions")
+    versions = root_attribute(open_store(objects.location.below(next(iter(tables)))), "versions")
     return {
         **common_content(objects.title, objects.table, tables, status, status.failed, versions),
         **cost_content(tables, methods),

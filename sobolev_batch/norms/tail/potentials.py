@@ -338,9 +338,9 @@ def of_triangles(points: Array, corners: Array, kernels: Kernels) -> Array:
     values = np.empty((len(points), len(kernels.orders)), like=points)
     for degree, _, _ in _RULES:
         rule = symmetric_rule(degree)
-        for here in _pieces(np.flatnonzero(degrees == degree), _NODES_AT_ONCE // rule.size):
+        for here in _pieces(np.flatnonzero(degrees == degree), _NODES_AT_ONCE // rule.node_count):
             nodes = combine(rule.barycentric, np.ascontiguousarray(rows[:, :, here], like=points))
-            at_nodes = kernels.looked_up(kernels.values, _dots(nodes, nodes)).reshape(rule.size, -1)
+            at_nodes = kernels.looked_up(kernels.values, _dots(nodes, nodes)).reshape(rule.node_count, -1)
             values[here] = (doubled[here] / 2)[:, None] * combine(rule.weights, at_nodes).reshape(len(here), -1)
     for near in _pieces(np.flatnonzero(degrees == 0), _NEAR_AT_ONCE):
         values[near] = _over_edges(rows[:, :, near], normals[:, near] / doubled[near], kernels)

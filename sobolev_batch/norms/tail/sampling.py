@@ -247,8 +247,8 @@ class TailSampling:
             samplings.append(OctaveSampling.random(octave, sizes, last.draws, normals, last.uniform_fraction, rng))
         return TailSampling(self.cutoff, tuple(samplings))
 
-    def to_table(self) -> dict[str, Any]:
-        """Return the sampling as a table, from which `from_table` makes it again."""
+    def to_dict(self) -> dict[str, Any]:
+        """Return the sampling as a dictionary for JSON, from which `from_dict` makes it again."""
         normals = self.octaves[0].normals
 
         def of_lattice(lattice: OctaveLattice) -> dict[str, Any]:
@@ -261,24 +261,24 @@ class TailSampling:
         }
 
     @classmethod
-    def from_table(cls, table: Mapping[str, Any]) -> Self:
-        """Return the sampling that a table holds."""
-        arrays = {name: np.array(values, dtype=np.float64) for name, values in table["normals"].items()}
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """Return the sampling that a dictionary holds."""
+        arrays = {name: np.array(normals, dtype=np.float64) for name, normals in values["normals"].items()}
         normals = FaceNormals(arrays["directions"].reshape(-1, 3), arrays["shares"], arrays["sizes"])
         samplings = []
-        for index, one in enumerate(table["octaves"], 1):
-            octave = Octave(table["cutoff"], index)
+        for index, one in enumerate(values["octaves"], 1):
+            octave = Octave(values["cutoff"], index)
             lattices = tuple(
                 OctaveLattice(octave.lowest, octave.highest, it["M"], tuple(it["quaternion"]), tuple(it["offset"]))
                 for it in one["lattices"]
             )
             samplings.append(OctaveSampling(octave, normals=normals, **{**one, "lattices": lattices}))
-        return cls(table["cutoff"], tuple(samplings))
+        return cls(values["cutoff"], tuple(samplings))
 
     @property
     def digest(self) -> str:
         """SHA-256 of all that the samples follow from."""
-        return hashlib.sha256(json.dumps(self.to_table(), sort_keys=True).encode()).hexdigest()
+        return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()
 
     @property
     def size(self) -> int:

@@ -135,7 +135,7 @@ def test_its_points_are_those_of_a_field_whatever_the_rules() -> None:
     waves = np.random.default_rng(3).normal(size=(3, 20))
     for tolerance in 10.0 ** -np.arange(0, 7):
         settings = TransformSettings(tolerance=float(tolerance))
-        plan = settings.plan(mesh, SMALL)
+        plan = settings.kind_for(mesh, SMALL)
         degrees |= {
             use.rule.degree
             for use in assign_rules(mesh, SMALL.highest_frequency, settings.eps, tolerance=settings.tolerance)

@@ -196,7 +196,7 @@ def test_refined_samplings_have_more_samples_within_the_largest_lattice() -> Non
 
 def test_samples_follow_from_the_seed_differ_in_each_octave_and_survive_storage() -> None:
     first, again, other = (TailSampling.usual(4.0, 2, [BOX], seed=seed) for seed in (0, 0, 1))
-    stored = TailSampling.from_table(json.loads(json.dumps(first.to_table())))
+    stored = TailSampling.from_dict(json.loads(json.dumps(first.to_dict())))
     assert stored.digest == first.digest == again.digest != other.digest
     for same in (again, stored):
         assert np.array_equal(same.frequencies, first.frequencies)
@@ -214,5 +214,5 @@ def test_long_triangles_take_points_like_large_ones(count: int, is_exact: bool) 
     across, beyond = i + 1 + count, i + 2 + count
     square = Mesh(vertices, np.concatenate([np.stack([i, across, beyond], 1), np.stack([i, beyond, i + 1], 1)]))
     lattice = OctaveLattice.random(40.0, 160.0, 64, np.random.default_rng(0))
-    assert (TransformSettings(1e-3).plan(square, lattice).expected_points > 1e6) == is_exact
+    assert (TransformSettings(1e-3).kind_for(square, lattice).expected_points > 1e6) == is_exact
     assert SurfaceSize.from_surface(square).prefers_exact(lattice) == is_exact
