@@ -54,12 +54,7 @@ class Submission:
 
 
 def submit(
-    study: StudyLike,
-    store: StoreLike,
-    client: Client,
-    *,
-    allow_commands: bool = False,
-    only: Sequence[str] = (),
+    study: StudyLike, store: StoreLike, client: Client, *, allow_commands: bool = False, only: Sequence[str] = ()
 ) -> Submission:
     """Hand a study over to a cluster and return; it goes on without this process.
 

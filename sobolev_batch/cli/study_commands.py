@@ -126,13 +126,7 @@ def run_command(
 @_only_option
 @click.pass_context
 def submit_command(
-    context: click.Context,
-    /,
-    study: Path,
-    scheduler: str,
-    trust_network: bool,
-    store: Location | None,
-    **settings: Any,
+    context: click.Context, /, study: Path, scheduler: str, trust_network: bool, store: Location | None, **settings: Any
 ) -> None:
     """Hand STUDY over to a cluster and return.
 

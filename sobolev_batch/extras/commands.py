@@ -109,12 +109,7 @@ def init_command(folder: Path, output: Path) -> None:
 @click.option("--keep-boundary", is_flag=True, help="Leave vertices of open boundaries where they are.")
 @click.option("--no-scaling", is_flag=True, help="Keep the files' unit. Otherwise TARGET is scaled to the unit sphere.")
 def fit_command(
-    start: Path,
-    target: Path,
-    output: Path,
-    triangles: int | None,
-    no_scaling: bool,
-    **settings: Any,
+    start: Path, target: Path, output: Path, triangles: int | None, no_scaling: bool, **settings: Any
 ) -> None:
     """Move the vertices of START to bring it nearer to TARGET, and write the mesh.
 
@@ -396,9 +391,7 @@ def report_command(store: Location, output: Path, folder: Path, up: Axis | None,
 @click.command("time")
 @table_options
 @click.option(
-    "--truth",
-    metavar="FAMILY",
-    help="Measure from this family, which is the true surface. [default: the reference]",
+    "--truth", metavar="FAMILY", help="Measure from this family, which is the true surface. [default: the reference]"
 )
 @click.option(
     "--factor",

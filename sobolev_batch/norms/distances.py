@@ -27,15 +27,7 @@ from sobolev_batch.norms.accuracy.tolerance import Accuracy
 from sobolev_batch.norms.budget import Support, sums_of_shells
 from sobolev_batch.norms.columns import VARIABLES, labelled, labelled_distances, lattice_attributes
 from sobolev_batch.norms.estimate import NormEstimate, ReferenceEstimate, estimate_norms
-from sobolev_batch.norms.fields import (
-    OperandLike,
-    as_operand,
-    field_of,
-    pair_of,
-    quality_of,
-    shells_against,
-    shells_of,
-)
+from sobolev_batch.norms.fields import OperandLike, as_operand, field_of, pair_of, quality_of, shells_against, shells_of
 from sobolev_batch.parameters import check_seed
 from sobolev_batch.shown import progress_line
 from sobolev_batch.transform.lattice import Lattice, Orders, SobolevWeights, check_orders

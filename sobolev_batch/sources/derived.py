@@ -18,15 +18,7 @@ from sobolev_batch.errors import MeshError, from_extra
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Point, normals
 from sobolev_batch.sources.generated import Levels, Triple
-from sobolev_batch.sources.registry import (
-    MadeMember,
-    Member,
-    NestedSource,
-    OtherSource,
-    Several,
-    Times,
-    single_member,
-)
+from sobolev_batch.sources.registry import MadeMember, Member, NestedSource, OtherSource, Several, Times, single_member
 
 # Measured peak of simplifying and of clustering, for each triangle of the original.
 _REDUCING_BYTES = 450

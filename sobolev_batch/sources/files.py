@@ -174,9 +174,7 @@ class FileSource(Source):
 
     paths: (
         Annotated[
-            tuple[Annotated[str, Field(min_length=1)], ...],
-            Field(min_length=1, strict=False),
-            at_most(MOST_MESHES),
+            tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=1, strict=False), at_most(MOST_MESHES)
         ]
         | None
     ) = None

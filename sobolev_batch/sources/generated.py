@@ -17,14 +17,7 @@ from sobolev_batch.errors import refused_by_pydantic
 from sobolev_batch.geometry.closed_forms import MOST_TRIANGLES, Ellipsoid, Sphere, Torus
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.subdivision import FINEST_LEVEL, icosphere
-from sobolev_batch.sources.registry import (
-    Fingerprint,
-    MadeMember,
-    Member,
-    Several,
-    Source,
-    SurfaceMember,
-)
+from sobolev_batch.sources.registry import Fingerprint, MadeMember, Member, Several, Source, SurfaceMember
 
 # Measured peak of the subdivision, for each triangle that it makes.
 _SUBDIVISION_BYTES = 140

@@ -210,8 +210,7 @@ def _lay_out(store: Store, plan: Plan, labels: Sequence[str], qualities: Sequenc
             coordinates="quality",
         ),
         **dataset_keys(
-            "fourier",
-            xr.Dataset({"quality": quality}, coords={**axes, "mesh": mesh, **_weight_columns(plan)}),
+            "fourier", xr.Dataset({"quality": quality}, coords={**axes, "mesh": mesh, **_weight_columns(plan)})
         ),
         **record_keys(rows),
     }

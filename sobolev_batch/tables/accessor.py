@@ -76,12 +76,7 @@ class SobolevAccessor:
         return self._each(partial(spectrum, order=order, bands=bands, similarity=similarity), common)
 
     def witness(
-        self,
-        other: OperandLike,
-        order: Orders,
-        points: ArrayLike,
-        *,
-        eps: float | None = None,
+        self, other: OperandLike, order: Orders, points: ArrayLike, *, eps: float | None = None
     ) -> xr.DataArray:
         """Return the witness function at points (n, 3), positive where this surface has more area.
 

@@ -25,13 +25,7 @@ from sobolev_batch.norms.accuracy.problem import (
     only_or_difference,
     sums_on,
 )
-from sobolev_batch.norms.accuracy.tolerance import (
-    LEAST_CLEARANCE,
-    Accuracy,
-    first_lattice,
-    lattice_of,
-    refined,
-)
+from sobolev_batch.norms.accuracy.tolerance import LEAST_CLEARANCE, Accuracy, first_lattice, lattice_of, refined
 from sobolev_batch.norms.bounds import modulus_bound
 from sobolev_batch.norms.budget import Sums, Support
 from sobolev_batch.norms.estimate import NormEstimate, estimate_norms
