@@ -19,7 +19,6 @@ import xarray as xr
 
 from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, describe_failure
 from sobolev_batch.batch.field_costs import MESH_BYTES
-from sobolev_batch.batch.table_stage import table_order
 from sobolev_batch.errors import InputError, MeshError, StoreError, one_line
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.proximity import LENGTHS, NUMBERS, POINT_BYTES, TRIANGLE_BYTES, WORKING_BYTES, proximity
@@ -30,6 +29,7 @@ from sobolev_batch.store.records import ProximityRecord, Record, Records
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.plan import Row
 from sobolev_batch.study.schema import ProximitySection
+from sobolev_batch.tables.mesh_table import table_order
 
 _log = logging.getLogger(__name__)
 

@@ -6,6 +6,7 @@ import logging
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 from sobolev_batch.errors import InputError, StudyError
@@ -42,7 +43,7 @@ def ready_to_run(
     study: StudyLike, store: StoreLike, *, allow_commands: bool, only: Sequence[str] = ()
 ) -> tuple[Study, Location]:
     """Return a study that may run, or a part of it, and its place; log what would make the run useless."""
-    study, location = settled(as_study(study).with_only(tuple(only)), store, may_run=True)
+    study, location = settled(replace(as_study(study), only=tuple(only)), store, may_run=True)
     require_permission(study, allow_commands)
     _require_members(study, only)
     if store is None:

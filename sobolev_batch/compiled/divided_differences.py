@@ -121,13 +121,6 @@ def _edges(vertices: Reals, triangle: Indices) -> tuple[float, float, float, flo
 
 
 @part
-def _centroid(b: Reals, edges: tuple[float, float, float, float, float, float]) -> tuple[float, float, float]:
-    """Return the centroid, from the second corner."""
-    px, py, pz, qx, qy, qz = edges
-    return b[0] + (qx - px) / 3, b[1] + (qy - py) / 3, b[2] + (qz - pz) / 3
-
-
-@part
 def _gaps(
     edges: tuple[float, float, float, float, float, float], u: float, v: float, w: float
 ) -> tuple[float, float, float]:
@@ -160,7 +153,9 @@ def _exact_group(
     for i in range(len(triangles)):
         edges, area, apart = _edges(vertices, triangles[i]), doubled[i], 0
         a, b, c = vertices[triangles[i, 0]], vertices[triangles[i, 1]], vertices[triangles[i, 2]]
-        x, y, z = _centroid(b, edges)
+        px, py, pz, qx, qy, qz = edges
+        # The centroid, from the second corner.
+        x, y, z = b[0] + (qx - px) / 3, b[1] + (qy - py) / 3, b[2] + (qz - pz) / 3
         for f in range(len(u)):
             ab, bc, ac = _gaps(edges, u[f], v[f], w[f])
             is_close = _are_close(ab, bc, ac)

@@ -54,7 +54,8 @@ def dataset_keys(group: str, dataset: xr.Dataset) -> dict[str, bytes]:
     variables, attributes = xr.conventions.encode_dataset_coordinates(dataset)
     keys = {f"{group}/{ROOT}": _group_document(attributes)}
     for name, variable in variables.items():
-        chunks = variable.encoding.get("chunks", (_steps(variable), *variable.shape[1:]))
+        step = max(1, min(variable.shape[0], LARGEST_CHUNK_BYTES * variable.shape[0] // max(1, variable.nbytes)))
+        chunks = variable.encoding.get("chunks", (step, *variable.shape[1:]))
         encoded = variable if variable.dtype == bool else xr.conventions.encode_cf_variable(variable)
         # What xarray has read from a store has another type of texts.
         values = encoded.values.astype(object) if encoded.dtype.kind in "TU" else encoded.values
@@ -94,11 +95,6 @@ def chunks_of(values: NDArray[Any], steps: Sequence[int]) -> Iterator[tuple[tupl
         else:
             data = chunk.astype(chunk.dtype.newbyteorder("<"), copy=False).tobytes()
         yield index, data + int(google_crc32c.value(data)).to_bytes(4, "little")
-
-
-def _steps(variable: xr.Variable) -> int:
-    """Return the length of a chunk along the first axis."""
-    return max(1, min(variable.shape[0], LARGEST_CHUNK_BYTES * variable.shape[0] // max(1, variable.nbytes)))
 
 
 def _array_document(

@@ -304,10 +304,6 @@ class Study:
         """Return the study with objects whose members are listed anew."""
         return replace(self, objects={name: replace(one) for name, one in self.objects.items()})
 
-    def with_only(self, only: tuple[str, ...]) -> Self:
-        """Return the study for a run of a part; see `only`."""
-        return replace(self, only=only)
-
 
 # As functions take it.
 StudyLike = Study | str | Path

@@ -165,7 +165,8 @@ def doubled_areas(mesh: Mesh) -> Reals:
         a, b, c = (corner.T for corner in mesh.corners(flat))
         (p, p_low), (q, q_low) = _two_sum(b, -a), _two_sum(c, -a)
         forward, backward = _multiply((p[y], p_low[y]), (q[z], q_low[z])), _multiply((p[z], p_low[z]), (q[y], q_low[y]))
-        high, low = _subtract(forward, backward)
+        high, low = _two_sum(forward[0], -backward[0])
+        high, low = _two_sum(high, low + (forward[1] - backward[1]))
         doubled[flat] = np.sqrt(((high + low) ** 2).sum(axis=0))
     return doubled
 
@@ -324,12 +325,6 @@ def _multiply(a: Pair, b: Pair) -> Pair:
     """Return the product of two double-double numbers, to about twice double precision."""
     high, low = _two_product(a[0], b[0])
     return _two_sum(high, low + (a[0] * b[1] + a[1] * b[0]))
-
-
-def _subtract(a: Pair, b: Pair) -> Pair:
-    """Return the difference of two double-double numbers, to about twice double precision of the larger one."""
-    high, low = _two_sum(a[0], -b[0])
-    return _two_sum(high, low + (a[1] - b[1]))
 
 
 def _halves(a: Array) -> Pair:

@@ -151,7 +151,9 @@ class Watch:
         tasks = self._ask("processing", workers=list(silences))
         told = []
         for address, since in list(silences.items())[:_MOST_NAMED]:
-            labels = list(dict.fromkeys(_label_of(key) for key in tasks.get(address, ())))
+            # See `task_key`.
+            ours = (key if isinstance(key, tuple) and len(key) == 3 else None for key in tasks.get(address, ()))
+            labels = list(dict.fromkeys(str(key[1]) if key else "a task of something else" for key in ours))
             more = f" and {len(labels) - _MOST_NAMED} more" if len(labels) > _MOST_NAMED else ""
             held = f", and has {', '.join(labels[:_MOST_NAMED])}{more}" if labels else ""
             told.append(f"the worker {address} has said nothing since {since}{held}")
@@ -226,8 +228,3 @@ class Heartbeat:
         except Exception as error:  # The store may answer again at the next beat.
             _log.warning("the run's record could not be written: %s", error)
         return self._lost is None
-
-
-def _label_of(key: object) -> str:
-    """Return what a task works for; see `task_key`."""
-    return str(key[1]) if isinstance(key, tuple) and len(key) == 3 else "a task of something else"

@@ -23,7 +23,6 @@ from sobolev_batch.norms.estimate import PARTS
 from sobolev_batch.norms.fields import (
     Operand,
     OperandLike,
-    Quality,
     as_operand,
     common_lattice,
     field_of,
@@ -327,7 +326,9 @@ class _Difference:
         extent = Extent.union([self.mesh.extent, quality.extent])
         support = Support(np.array(self.mesh.area + quality.area), extent.widths)
         none = np.zeros(len(gradients))
-        of_field = self._of_field(quality) if self.is_given else none
+        # A given field's own error counts by the largest change of the transform by a movement.
+        own = zip(self.factors, quality.error_norms(self.weights), strict=True) if self.is_given else ()
+        of_field = np.array([2 * self._sensitivity(one) * error for one, error in own]) if self.is_given else none
         return np.stack([self._truncation(support), self._aliasing(support, gradients), of_field, none], axis=1)
 
     def _truncation(self, support: Support) -> Reals:
@@ -347,11 +348,6 @@ class _Difference:
         changes = _norms(self.gradients(8.0 * self.factors * even) - gradients)
         decays = [decay_to_period(lattice.spacing, order, support.widths) for order in orders]
         return np.asarray(_ALIASING_CAUTION * changes * decays)
-
-    def _of_field(self, quality: Quality) -> Reals:
-        """Bound the part of the given field's own error by the largest change of the transform by a movement."""
-        errors = quality.error_norms(self.weights)
-        return np.array([2 * self._sensitivity(one) * error for one, error in zip(self.factors, errors, strict=True)])
 
     def _sensitivity(self, factors: Reals) -> float:
         """Return the largest norm of the transform's derivative along movements of length 1, by power iteration."""

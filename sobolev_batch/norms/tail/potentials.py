@@ -238,7 +238,10 @@ def add_of_triangles(
     Return the number of pairs of a point and a triangle that are close enough to count.
     """
     centers, radii = triangles.balls
-    share = _close_share(points, centers, kernels.reach + radii) if len(centers) else 0.0
+    # The share of pairs that are close, by a sample.
+    some, which = slice(None, None, len(points) // _SAMPLE + 1), slice(None, None, len(centers) // _SAMPLE + 1)
+    are_close = _are_close(points[some], centers[which], (kernels.reach + radii)[which])
+    share = float(are_close.mean()) if len(centers) else 0.0
     is_worth = share * len(points) * len(centers) >= _FEWEST_FOR_GPU
 
     def added(backend: Backend) -> tuple[Reals | None, int]:
@@ -407,12 +410,6 @@ def centers_and_radii(corners: Reals) -> tuple[Reals, Reals]:
     """Return the centroids (n, 3) of triangles, and the distance of the farthest corner (n,)."""
     centers = (corners[:, 0] + corners[:, 1] + corners[:, 2]) / 3
     return centers, np.linalg.norm(corners - centers[:, None], axis=2).max(axis=1)
-
-
-def _close_share(points: Reals, centers: Reals, farthest: Reals) -> float:
-    """Return the share of pairs of a point and a triangle that are closer than some distances (m,), by a sample."""
-    some, which = slice(None, None, len(points) // _SAMPLE + 1), slice(None, None, len(centers) // _SAMPLE + 1)
-    return float(_are_close(points[some], centers[which], farthest[which]).mean())
 
 
 def _are_close(points: Array, centers: Array, farthest: Array) -> Array:
