@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -29,7 +29,7 @@ from sobolev_batch.store.layout import (
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, acquire, release
 from sobolev_batch.store.objects import Objects, labelled, root_of
-from sobolev_batch.store.records import Record, Records
+from sobolev_batch.store.records import Records
 from sobolev_batch.store.sealed_chunks import Index, damaged_chunks, withdraw_chunk
 from sobolev_batch.store.workspace import Contents
 from sobolev_batch.tables.pairs import Pairs
@@ -174,8 +174,11 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, *, may
     if contents.has_tables:
         if not {"meshes/row", "meshes/status", "meshes/key"} & tables.keys():
             damaged = contents.unlike_tables | damaged
-        if QUALITY not in tables and _have_other_qualities(records, store.read_strings(QUALITY)):
-            tables[QUALITY] = "it is not what records have"
+        if QUALITY not in tables:
+            stored = zip(records, store.read_strings(QUALITY), strict=True)
+            # A run may have ended between a field and the tables.
+            if any(record is not None and quality not in ("", record.quality) for record, quality in stored):
+                tables[QUALITY] = "it is not what records have"
         if tables.keys().isdisjoint(store.keyed_arrays()):
             chunks = dict(damaged_chunks(store))
         if not tables:
@@ -241,9 +244,3 @@ def _stale(store: Store) -> Iterator[tuple[str, Index]]:
     yield from ((SPECTRA_KEYS, (n,)) for n in stale_chunks(store, spectrum_keys(pairs.keys, pairs.reference)))
     if PAIRS_KEYS in store.documents:
         yield from ((PAIRS_KEYS, tile) for tile in pairs.stale())
-
-
-def _have_other_qualities(records: Sequence[Record | None], qualities: Sequence[str]) -> bool:
-    pairs = zip(records, qualities, strict=True)
-    # A run may have ended between a field and the tables.
-    return any(record is not None and quality not in ("", record.quality) for record, quality in pairs)

@@ -205,7 +205,8 @@ def to_accuracy(
     if name == "norm":
         dataset = labelled(order, solution.estimate.named(name), attributes)
     else:
-        reference = Reference.for_problem(problem, solution, seed) if problem.is_different else None
+        is_zero = not problem.surfaces and not np.any(problem.moved)
+        reference = None if is_zero else Reference.for_problem(problem, solution, seed)
         estimate = ReferenceEstimate.of_equal(len(problem.orders)) if reference is None else reference.estimate
         dataset = labelled_distances(order, solution.estimate, estimate, attributes)
     within = accuracy.met(solution.estimate).reshape(np.shape(order))

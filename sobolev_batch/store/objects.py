@@ -47,7 +47,7 @@ class Objects:
 
     @property
     def records(self) -> Records[ObjectRecord]:
-        """Records of the objects, whose rows are in the order of their names, and that of the latest run."""
+        """Records of the objects, whose rows are in the order of their names."""
         return Records(self.root, ObjectRecord)
 
     @cached_property

@@ -177,18 +177,18 @@ def tables_of(
         tree = as_tree(store)
         if not has_objects(tree):
             return {"": _table(tree, order, x)}
-        stored = finished_group(tree, "convergence", load=False)["order"].values if _has_rows(tree) else np.empty(0)
+        stored = (
+            finished_group(tree, "convergence", load=False)["order"].values
+            if "convergence" in tree.children
+            else np.empty(0)
+        )
         if stored.size and (order is None or np.isin(order, stored).all()):
             return _divided(_rows(tree, order), x)
     trees = {name: as_tree(place) for name, place in stores_of(store).items()}
-    finished = {name: tree for name, tree in trees.items() if _has_rows(tree)}
+    finished = {name: tree for name, tree in trees.items() if "convergence" in tree.children}
     if not finished:
         raise InputError("there are no tables yet: run the study to its end")
     return {name: _table(tree, order, x) for name, tree in finished.items()}
-
-
-def _has_rows(tree: xr.DataTree) -> bool:
-    return "convergence" in tree.children
 
 
 def _table(tree: xr.DataTree, order: Orders | None, x: str) -> pd.DataFrame:

@@ -175,11 +175,6 @@ class Problem:
         return self.surfaces is self.pair
 
     @property
-    def is_different(self) -> bool:
-        """True if the surfaces differ, maybe by no more than rounding."""
-        return bool(self.surfaces) or bool(np.any(self.moved))
-
-    @property
     def inexact_count(self) -> int:
         """Number of fields among which an error is divided: those without a closed form, or 1."""
         return max(1, sum(needs_probe(surface, TransformSettings()) for surface in self.surfaces))
