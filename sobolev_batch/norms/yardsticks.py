@@ -159,7 +159,8 @@ class _Curve:
 
         Both are NaN if there is none. The search follows secants of the logarithms.
         """
-        gaps = {amount: _gap(distances[order], wanted) for amount, distances in self.known.items()}
+        least = np.finfo(np.float64).tiny
+        gaps = {one: math.log(max(found[order], least) / wanted) for one, found in self.known.items()}
         amount = min(gaps, key=lambda one: abs(gaps[one]), default=self.start)
         for _ in range(_MOST_STEPS):
             if amount not in gaps:
@@ -167,7 +168,7 @@ class _Curve:
                     self.known[amount] = self.distances(amount)
                 except (LatticeError, MeshError):
                     return math.nan, math.nan
-                gaps[amount] = _gap(self.known[amount][order], wanted)
+                gaps[amount] = math.log(max(self.known[amount][order], least) / wanted)
             power = self._power(gaps)
             nearest = min(gaps, key=lambda one: abs(gaps[one]))
             if abs(gaps[nearest]) <= _CLOSENESS:
@@ -192,7 +193,3 @@ class _Curve:
             if power / self.slope > _LEAST_POWER:
                 return power
         return self.slope
-
-
-def _gap(found: float, wanted: float) -> float:
-    return math.log(max(found, np.finfo(np.float64).tiny) / wanted)

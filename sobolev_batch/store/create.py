@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import DamageError, StoreError
-from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms.spectrum import RadialAxis
 from sobolev_batch.norms.tail.sampling import TailSampling
 from sobolev_batch.store.encoding import ROOT, array_keys, dataset_keys, documents_in
@@ -129,7 +128,8 @@ def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
     labels = _labels_for(plan, stored, [None] * len(stored) if is_kept else Records(store).read(), is_trusted=True)
     if labels != list(stored):
         _lay_out(store, plan, labels, store.read_strings(QUALITY))
-    if attributes.get("similarity") != _similarity_entry(plan.similarity):
+    similarity = {"scale": plan.similarity.scale, "origin": list(plan.similarity.origin)}
+    if attributes.get("similarity") != similarity:
         # Tables are in another unit of length, and the run may end before there are others.
         hide_tables(store)
     store.documents[""]["attributes"].update(_attributes(plan, labels))
@@ -381,7 +381,7 @@ def _attributes(plan: Plan, labels: Sequence[str]) -> dict[str, Any]:
             "mesh_cache": str(study.cache.folder) if study.cache else None,
         },
         REMOVED: [label for label in labels if label not in planned],
-        "similarity": _similarity_entry(plan.similarity),
+        "similarity": {"scale": plan.similarity.scale, "origin": list(plan.similarity.origin)},
         "versions": {**_versions(), NUMERICS: NUMERICS_VERSION},
     }
 
@@ -394,7 +394,3 @@ def _versions() -> dict[str, str]:
 def _lattice_entry(plan: Plan) -> dict[str, Any]:
     lattice = {"xi_max": plan.lattice.xi_max, "M": plan.lattice.M}
     return {"lattice": lattice, "dtype": plan.choice.dtype, "octaves": plan.choice.octaves}
-
-
-def _similarity_entry(similarity: Similarity) -> dict[str, Any]:
-    return {"scale": similarity.scale, "origin": list(similarity.origin)}

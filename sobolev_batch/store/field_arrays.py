@@ -51,7 +51,7 @@ class Fields:
 
     def write(self, row: int, place: Place, values: NDArray[Any]) -> int:
         """Write a row's values at a place, made of whole chunks, and return their checksum for `read`."""
-        name = _array_at(place)
+        name = FIELD if len(place) == len(AXES) else OCTAVES
         document = self.store.document(name)
         values = np.ascontiguousarray(values, dtype=document["data_type"])
         steps = chunk_shape(document)[1:]
@@ -66,7 +66,7 @@ class Fields:
         DamageError names the row whose values are damaged, lost, or others.
         """
         parts = self.store.stores
-        arrays = [part.array(_array_at(place)) for _, part in parts]
+        arrays = [part.array(FIELD if len(place) == len(AXES) else OCTAVES) for _, part in parts]
         values = np.empty((len(rows), *(axis.stop - axis.start for axis in place)), dtype=arrays[0].dtype)
 
         def read(i: int) -> None:
@@ -114,7 +114,3 @@ class Fields:
 
 def _damage(store: Store, row: int, problem: str) -> DamageError:
     return store.damage(f"the field of {store.names_of_rows(row + 1)[row]}", problem, row)
-
-
-def _array_at(place: Place) -> str:
-    return FIELD if len(place) == len(AXES) else OCTAVES

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 
 from sobolev_batch.errors import InputError
@@ -82,14 +82,10 @@ def _gap_in_sizes(members: Members, *, alone: bool) -> str:
         sizes = [member.expected_size() for member in listed]
         counts = [size.triangles for size in sizes]
         if all(size.triangles > 0 and math.isfinite(size.factor) for size in sizes) and len({*counts}) > alone:
-            likely[family] = _range_of(counts)
+            likely[family] = math.log(min(counts)), math.log(max(counts))
             ends = [size.triangles * by for size in sizes for by in (1 / size.factor, size.factor)]
-            largest.append(_range_of(ends))
+            largest.append((math.log(min(ends)), math.log(max(ends))))
     return gap_of(likely) if likely and common_range(largest) is None else ""
-
-
-def _range_of(sizes: Sequence[float]) -> Range:
-    return math.log(min(sizes)), math.log(max(sizes))
 
 
 def _test_warnings(study: Study, objects: int) -> Iterator[str]:

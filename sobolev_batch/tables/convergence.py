@@ -284,7 +284,9 @@ def _sections(name: str, tree: xr.DataTree, frame: pd.DataFrame, x: str) -> Iter
         yield Section(f"Sobolev distance of order {order:g} to {frame.attrs['reference']}", [(columns, rows)])
     once = marked.drop_duplicates("mesh")
     if has_proximity(tree):
-        yield Section("Other distances, the same at all orders", [((MESH, *_metric_columns(tree)), once)])
+        metrics = _metrics_of(tree)
+        columns = [MESH, *(column for column in _METRIC_COLUMNS if column.name in metrics)]
+        yield Section("Other distances, the same at all orders", [(columns, once)])
     connection = [column for column in CONNECTION_COLUMNS if column.name in frame]
     if once[[column.name for column in connection]].nunique().gt(1).any():
         yield Section("How triangles are connected", [((MESH, *connection), once)])
@@ -299,14 +301,10 @@ def _metrics_of(tree: xr.DataTree) -> list[str]:
     return [name for metric in metrics for name in METRICS.get(metric, ())]
 
 
-def _metric_columns(tree: xr.DataTree) -> list[Column]:
-    shown = _metrics_of(tree)
-    return [column for column in _METRIC_COLUMNS if column.name in shown]
-
-
 def page_columns(tree: xr.DataTree) -> tuple[Column, ...]:
     """Return the columns whose numbers an open store has, for a page, which may be narrow."""
-    columns = [*_COLUMNS, *_metric_columns(tree)]
+    metrics = _metrics_of(tree)
+    columns = [*_COLUMNS, *(column for column in _METRIC_COLUMNS if column.name in metrics)]
     return tuple(sorted(columns, key=lambda column: (column is not MESH, not column.is_marked)))
 
 

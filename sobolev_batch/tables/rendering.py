@@ -113,12 +113,8 @@ def machine_table(frame: pd.DataFrame, style: Format) -> str:
 
 def json_text(value: Any) -> str:
     """Return dataclasses, paths, tables and lists as ASCII JSON; null are numbers that are unknown or unbounded."""
-    text = json.dumps(value, default=_plain)
+    text = json.dumps(value, default=lambda one: os.fspath(one) if isinstance(one, os.PathLike) else asdict(one))
     return json.dumps(json.loads(text, parse_constant=lambda _: None), indent=2)
-
-
-def _plain(value: Any) -> Any:
-    return os.fspath(value) if isinstance(value, os.PathLike) else asdict(value)
 
 
 def printed_table(

@@ -81,7 +81,7 @@ def exact_transform(mesh: Mesh, frequencies: Reals, backend: Backend = CPU, thre
             parts.append(_sums(corners, doubled[batch], frequencies, backend))
         return np.asarray(np.sum(parts, axis=0, dtype=np.complex128))
 
-    return compute_on(_faster(backend, mesh, frequencies), sums)
+    return compute_on(backend if len(mesh.triangles) * len(frequencies) >= _FEWEST_FOR_GPU else CPU, sums)
 
 
 def _compiled_exact_transform(mesh: Mesh, frequencies: Reals, threads: int) -> Complexes:
@@ -123,10 +123,6 @@ def _by_threads(
         found = [over_faces(part) for part in parts]
         totals = [sum(of_part, np.zeros(len(part), np.complex128)) for of_part, part in zip(found, parts, strict=True)]
     return np.concatenate(totals)
-
-
-def _faster(backend: Backend, mesh: Mesh, frequencies: Reals) -> Backend:
-    return backend if len(mesh.triangles) * len(frequencies) >= _FEWEST_FOR_GPU else CPU
 
 
 def second_difference(ab: Array, ac: Array) -> Array:
@@ -363,7 +359,8 @@ def sampled_transform(mesh: Mesh, frequencies: Reals, threads: int = 1, backend:
             total += np.concatenate([backend.download(_group_sums(faces, group)) for group in groups])
         return total
 
-    values[~fine] = compute_on(_faster(backend, mesh, others), sums) if len(others) else 0
+    faster = backend if len(mesh.triangles) * len(others) >= _FEWEST_FOR_GPU else CPU
+    values[~fine] = compute_on(faster, sums) if len(others) else 0
     return values
 
 
