@@ -194,13 +194,13 @@ def transform_block(
     surface extends beyond the lattice's half period, InputError where the allowed memory is too little, or the
     quadrature of a parametrised surface does not converge.
     """
-    kind = kind_of(surface)
+    exact = kind_of(surface)
     if isinstance(lattice, Lattice):
         require_inside(surface, lattice)
-    if kind.is_closed_form:
+    if exact.is_closed_form:
         values: Complexes = np.empty(block.shape, dtype=settings.stored)
         for part in block.split(_SAMPLES):
-            values[part.place_in(block)] = kind.block_values(lattice, part)
+            values[part.place_in(block)] = exact.block_values(lattice, part)
         return Transformed(values, 0, "closed form")
     kind = kind or settings.kind_for(surface, lattice)
     whole = NufftSpec(block.shape, settings.eps, settings.dtype, threads=execution.threads, batch=execution.batch)
