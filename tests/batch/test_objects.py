@@ -236,15 +236,16 @@ def test_a_league_needs_no_more_than_the_store(store: Path, monkeypatch: pytest.
     frame = sb.compare_studies({"a": more}, {"a": store / "a"}, y=("relative", "triangles"))
     grown = frame[frame["y"] == "triangles"].set_index("method")["ratio"].to_dict()
     assert (len(frame), grown) == (6, {"ico": pytest.approx(2.0), "egg": pytest.approx(2.0)})
-    monkeypatch.setattr("sobolev_batch.extras.leagues.changes.compare_studies", lambda *_, **__: frame)
-    for words, status in (([], 0), (["--most", "2.1"], 0), (["--most", "1.05"], 1)):
-        assert call("table", "league", store, "--against", store, *words).returncode == status
-    frame.attrs["lost"] = ("a/ico/1",)
-    done = call("table", "league", store, "--against", store)
-    assert (done.returncode, "a/ico/1 is in the old study, and missing in the new one." in done.stdout) == (1, True)
-    frame.attrs["lost"] = ()
-    frame.loc[0, "verdict"] = "farther"
-    assert call("table", "league", store, "--against", store).returncode == 1
+    with monkeypatch.context() as patched:
+        patched.setattr("sobolev_batch.extras.leagues.changes.compare_studies", lambda *_, **__: frame)
+        for words, status in (([], 0), (["--most", "2.1"], 0), (["--most", "1.05"], 1)):
+            assert call("table", "league", store, "--against", store, *words).returncode == status
+        frame.attrs["lost"] = ("a/ico/1",)
+        done = call("table", "league", store, "--against", store)
+        assert (done.returncode, "a/ico/1 is in the old study, and missing in the new one." in done.stdout) == (1, True)
+        frame.attrs["lost"] = ()
+        frame.loc[0, "verdict"] = "farther"
+        assert call("table", "league", store, "--against", store).returncode == 1
     # What an earlier study has and a new one lacks.
     one, both = {"a": store / "a"}, {"a": store / "a", "b": store / "b"}
     assert sb.compare_studies(one, both, -3).attrs["lost"] == ("b (all of it)",)
