@@ -8,6 +8,7 @@ import logging
 import os
 import re
 import sys
+import threading
 from importlib.util import find_spec
 from io import StringIO
 from pathlib import Path
@@ -22,6 +23,7 @@ from distributed import Client
 from plyfile import PlyData
 
 import sobolev_batch as sb
+from sobolev_batch.cli.output import echo, patience, show_step
 from sobolev_batch.tables import FORMATS
 from tests.geometry.test_deviation import plate
 from tests.support.commands import LATTICE, STUDY, ball, call, command, finished, output, write_inputs
@@ -302,7 +304,39 @@ def test_json_of_studies_and_stores(folder: Path) -> None:
 def test_a_command_that_is_silent_says_that_it_goes_on(folder: Path) -> None:
     done = call("compare", "1.off", "3.off", folder=folder, patience_seconds=0.0)
     assert done.stdout == output("compare", "1.off", "3.off", folder=folder)
-    assert re.fullmatch(r"compare: \d+ s so far\n", done.stderr)
+    assert re.fullmatch(r"(compare: \d+ s so far.*\n)+", done.stderr)
+
+
+def test_a_command_that_has_told_something_still_says_that_it_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("_PATIENCE_SECONDS", "_SECONDS_BETWEEN_LINES"):
+        monkeypatch.setattr(f"sobolev_batch.cli.output.{name}", 0.0)
+    has_step = threading.Event()
+    monkeypatch.setattr("click.echo", lambda text, **_: has_step.set() if "s so far: octaves" in text else None)
+    with patience("compare"):
+        echo("note: in another unit", err=True)
+        show_step("octaves")
+        assert has_step.wait(60)
+
+
+def test_a_terminal_has_prose_on_lines_of_its_width(folder: Path) -> None:
+    line = ("compare", "1.off", "3.off", "--yardsticks")
+    done, whole = call(*line, folder=folder, columns=40, patience_seconds=0.0), output(*line, folder=folder)
+    assert max(map(len, done.stdout.splitlines())) <= 40 < max(map(len, whole.splitlines()))
+    assert done.stdout.split() == whole.split()
+    assert "\n    " in done.stdout, "an item of a list goes on below itself"
+    # What stood there while it computed is gone.
+    assert done.stderr.startswith("\r\x1b[Kcompare: 0 s so far")
+    assert done.stderr.endswith("\r\x1b[K")
+    refused = call("info", "1.off", "no file of this name.off", folder=folder, columns=40).stderr
+    assert max(map(len, refused.splitlines())) <= 40
+
+
+def test_a_terminal_has_data_and_commands_as_they_are(folder: Path) -> None:
+    for line in (("table", STORE, "--format", "csv"), ("info", "1.off", "--format", "json"), ("schema",)):
+        assert call(*line, folder=folder, columns=40).stdout == output(*line, folder=folder)
+    assert f"all distances: sobolev-batch table {STORE}" in call("run", "study.toml", folder=folder, columns=40).stdout
+    # Rows of a table that has no room are left to the terminal.
+    assert "------  ------" in call("table", STORE, folder=folder, columns=25).stdout
 
 
 def test_what_mesh_files_hold(folder: Path) -> None:

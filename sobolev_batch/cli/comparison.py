@@ -15,7 +15,7 @@ import xarray as xr
 from scipy.spatial.transform import Rotation
 
 from sobolev_batch.arrays import Reals
-from sobolev_batch.cli.output import echo
+from sobolev_batch.cli.output import echo, show_step
 from sobolev_batch.errors import require_writable
 from sobolev_batch.geometry.deviation import Deviations, largest_deviation
 from sobolev_batch.geometry.formats.readers import read_mesh
@@ -217,12 +217,13 @@ class Comparison:
             echo(f"note: {line}", err=True)
         # Bad settings are refused before a long computation.
         nearness, deviations = None, None
+        show_step("distances of points")
         if options.proximity or options.report is not None:
             nearness, deviations = proximity_and_deviations(first, second, threshold=options.threshold)
         elif options.unit is not None:
             deviations = largest_deviation(first, second)
         changes = CHANGES if options.yardsticks else ("moved",)
-        results = yardsticks(*pair, orders, **accuracy, changes=changes)
+        results = yardsticks(*pair, orders, **accuracy, changes=changes, on_progress=show_step)
         return cls(options, first, second, similarity, results, nearness, deviations, before, doubt)
 
     @property

@@ -12,6 +12,8 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import ClassVar, NoReturn
 
+from sobolev_batch.cli.output import CLEAR_LINE
+
 # Time in which a command ends by itself; a transform may take longer to return to Python.
 SECONDS_TO_END = 1.0
 # Work that ends with what it has leaves out up to three steps, each when it is asked again.
@@ -99,7 +101,7 @@ def end_process(number: int, remark: str) -> NoReturn:
     """End this process at once, with the last message and the status that shells expect: 130 or 143."""
     word = "interrupted" if number == signal.SIGINT else "terminated"
     with suppress(OSError):
-        os.write(2, f"{word}{remark}\n".encode())
+        os.write(2, f"{CLEAR_LINE * os.isatty(2)}{word}{remark}\n".encode())
     os._exit(128 + number)
 
 

@@ -288,6 +288,6 @@ def reduce_command(
     tell = partial(echo, err=True) if len(files) > 1 else None
     with client_of(scheduler, trust_network) as client:
         found = reduce(files, client=client, on_progress=tell, **settings)
-    echo_lines(format_reductions(found, style, settings["unit"]))
+    echo_lines(format_reductions(found, style, settings["unit"]), style)
     if any(one.reason for one in found.values()):
         context.exit(EXIT_SOME_FAILED)

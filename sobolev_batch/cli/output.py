@@ -5,8 +5,10 @@ All of it passes through here, so that no name reaches a terminal as a command.
 
 from __future__ import annotations
 
+import logging
 import shutil
 import sys
+import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -23,61 +25,89 @@ if TYPE_CHECKING:
 
 # Labels of bars, of one length.
 _STAGES = {"lattice": "lattice   ", "fields": "transforms", "reduction": "tables    ", "proximity": "proximity "}
-_CLEAR_LINE = "\r\x1b[K"
+CLEAR_LINE = "\r\x1b[K"
 # Time after which a silent command says that it goes on, and that between such lines without a terminal.
 _PATIENCE_SECONDS, _SECONDS_BETWEEN_LINES = 2.0, 30.0
-_is_answered = threading.Event()
-_reporter: threading.Thread | None = None
+# The step that a command is at, whether a line stands on the terminal that has not ended, and who may write.
+_step, _stands = "", False
+_writing = threading.RLock()
 
 
 @contextmanager
 def patience(command: str) -> Iterator[None]:
-    """Report on standard error, from two seconds on and until something is printed, that a command goes on."""
-    global _reporter
-    began, is_terminal = time.monotonic(), sys.stderr.isatty()
+    """Report on standard error, from two seconds on, that a command goes on, and its step."""
+    began, ended = time.monotonic(), threading.Event()
+    show_step("")
 
     def report() -> None:
-        wait, shown = _PATIENCE_SECONDS, False
-        while not _is_answered.wait(wait):
-            text = f"{command}: {time.monotonic() - began:.0f} s so far"
-            click.echo(f"{_CLEAR_LINE}{text}" if is_terminal else text, nl=not is_terminal, err=True)
-            wait, shown = 1.0 if is_terminal else _SECONDS_BETWEEN_LINES, True
-        if shown and is_terminal:
-            click.echo(_CLEAR_LINE, nl=False, err=True)
+        wait, is_terminal = _PATIENCE_SECONDS, sys.stderr.isatty()
+        while not ended.wait(wait):
+            text = f"{command}: {time.monotonic() - began:.0f} s so far{': ' * bool(_step)}{visible(_step)}"
+            # A longer line would wrap, and stay.
+            most = shutil.get_terminal_size().columns - 1 if is_terminal else None
+            _write(text[:most], err=True, nl=not is_terminal)
+            wait = 1.0 if is_terminal else _SECONDS_BETWEEN_LINES
 
-    _is_answered.clear()
-    _reporter = threading.Thread(target=report, name="sobolev-batch-patience", daemon=True)
-    _reporter.start()
+    reporter = threading.Thread(target=report, name="sobolev-batch-patience", daemon=True)
+    reporter.start()
     try:
         yield
     finally:
-        _answer()
+        ended.set()
+        reporter.join()
+        _write("", err=True, nl=False)
 
 
-def _answer() -> None:
-    """End the report of `patience`, whose line would be in the way."""
-    _is_answered.set()
-    if _reporter is not None:
-        _reporter.join()
+def show_step(text: str) -> None:
+    """Name the step that a command is at, for whoever waits."""
+    global _step
+    _step = text
+
+
+def _write(text: str, *, err: bool, nl: bool = True) -> None:
+    """Write a text in the place of a line that stands on the terminal and has not ended."""
+    global _stands
+    with _writing:
+        if _stands:
+            click.echo(CLEAR_LINE, nl=False, err=True)
+        click.echo(text, nl=nl, err=err)
+        _stands = bool(text) and not nl
+
+
+def _fitted(line: str) -> str:
+    """Return a line broken where it is longer than the terminal; one with gaps is the row of a table."""
+    words, width = line.lstrip(), shutil.get_terminal_size().columns
+    indent = 2 * line.removesuffix(words)
+    fitted = textwrap.fill(line, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+    return line if "  " in words else fitted
 
 
 def echo(line: object = "", *, err: bool = False) -> None:
-    """Print one line, on standard error if asked."""
-    _answer()
-    click.echo(visible(str(line)), err=err)
+    """Print one line, on standard error if asked; a terminal shows it on lines of its width."""
+    echo_lines(visible(str(line)), err=err)
 
 
-def echo_lines(text: object, *, err: bool = False) -> None:
-    """Print a text of several lines, whose names are visible already."""
-    _answer()
-    click.echo(visible_lines(str(text)), err=err)
+def echo_lines(text: object, style: str = "text", *, err: bool = False) -> None:
+    """Print a text of several lines, whose names are visible already, likewise unless it has a style for programs."""
+    shown = visible_lines(str(text))
+    if style == "text" and (sys.stderr if err else sys.stdout).isatty():
+        shown = "\n".join(map(_fitted, shown.split("\n")))
+    _write(shown, err=err)
 
 
 def echo_result(style: str, text: object, document: Mapping[str, Any]) -> None:
     """Print a result: its text for people, or one JSON document, whose keys docs/commands.md lists."""
     from sobolev_batch.tables.rendering import json_text
 
-    echo_lines(json_text(document) if style == "json" else text)
+    echo_lines(json_text(document) if style == "json" else text, style)
+
+
+class EchoHandler(logging.Handler):
+    """Prints log messages, whose names are visible already, as errors are printed."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print a message."""
+        echo_lines(self.format(record), err=True)
 
 
 def progress_bar(length: int, label: str, *, show_count: bool = True) -> Any:
@@ -103,7 +133,7 @@ def replace_line(text: str, before: str) -> str:
     if sys.stdout.isatty():
         if text or before:
             # A longer line would wrap, and stay.
-            click.echo(_CLEAR_LINE + visible(text)[: shutil.get_terminal_size().columns - 1], nl=False)
+            click.echo(CLEAR_LINE + visible(text)[: shutil.get_terminal_size().columns - 1], nl=False)
     elif text not in ("", before):
         echo(text)
     return text

@@ -7,7 +7,6 @@ show its help.
 from __future__ import annotations
 
 import logging
-import sys
 import traceback
 from importlib.metadata import EntryPoint
 from typing import Any
@@ -15,7 +14,7 @@ from typing import Any
 import click
 
 from sobolev_batch.cli.interruption import SECONDS_TO_END, Deadline
-from sobolev_batch.cli.output import echo, echo_lines, patience
+from sobolev_batch.cli.output import EchoHandler, echo, echo_lines, patience
 from sobolev_batch.errors import InputError, SobolevBatchError, SpaceError, one_line
 from sobolev_batch.plugins import COMMANDS, extra, is_extra, registered
 
@@ -129,7 +128,8 @@ def cli(context: click.Context, debug: bool) -> None:
     mesh and prints its distance from the reference.
 
     The exit status is 0 if all is done, 2 if the input is wrong, 3 if some meshes failed or are missing, 5 if a disk
-    is full, 1 after another error, 130 after Ctrl-C and 143 after SIGTERM. `compare --below` has its own.
+    is full, 1 after another error, 130 after Ctrl-C and 143 after SIGTERM. `compare --below` and `compare --within`
+    have their own.
     """
     _set_up_logging(debug)
     command = cli.get_command(context, str(context.invoked_subcommand))
@@ -142,7 +142,7 @@ def _set_up_logging(debug: bool) -> None:
     logging.basicConfig(
         level=logging.DEBUG if debug else logging.WARNING,
         format="%(kind)s %(name)s: %(message)s" if debug else "%(kind)s: %(message)s",
-        stream=sys.stderr,
+        handlers=[EchoHandler()],
     )
     for handler in logging.root.handlers:
         handler.addFilter(_with_kind)

@@ -23,6 +23,7 @@ from sobolev_batch.cli.output import echo, echo_lines, echo_result, progress_rep
 from sobolev_batch.cli.program import EXIT_SOME_FAILED, cli
 from sobolev_batch.cli.table_commands import table_command
 from sobolev_batch.errors import InputError
+from sobolev_batch.visible import visible
 
 if TYPE_CHECKING:
     from sobolev_batch.store.location import Location
@@ -106,7 +107,7 @@ def run_command(
     echo()
     echo(str(summary).partition("\n")[0])
     if not tables:
-        echo(f"all distances: sobolev-batch table {shlex.quote(summary.store)}")
+        echo_lines(f"all distances: sobolev-batch table {visible(shlex.quote(summary.store))}", "shell")
     for label, reason in summary.not_compared.items():
         echo(f"{label}: {reason}", err=True)
     for label, error in list(summary.imprecise.items())[:_MOST_IMPRECISE]:
@@ -141,7 +142,7 @@ def submit_command(
     echo(f"{submission.missing} of {submission.surfaces} surfaces to be computed by the cluster at {scheduler}")
     for name, reason in submission.refused.items():
         echo(f"{name}: {reason}", err=True)
-    echo(f"follow it by: sobolev-batch status --follow {shlex.quote(submission.store)}")
+    echo_lines(f"follow it by: sobolev-batch status --follow {visible(shlex.quote(submission.store))}", "shell")
     if submission.refused:
         context.exit(EXIT_SOME_FAILED)
 
@@ -192,4 +193,4 @@ def schema_command() -> None:
     """Print the JSON schema of study files, by which editors complete and check them."""
     from sobolev_batch.study.json_schema import study_schema
 
-    echo_lines(json.dumps(study_schema(), indent=2))
+    echo_lines(json.dumps(study_schema(), indent=2), "json")

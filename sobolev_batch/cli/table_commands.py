@@ -82,7 +82,7 @@ def convergence_command(table: TableOptions, x: str) -> None:
     """
     from sobolev_batch.tables.convergence import format_table
 
-    echo_lines(format_table(table.store, table.style, table.orders, x=x))
+    echo_lines(format_table(table.store, table.style, table.orders, x=x), table.style)
 
 
 @table_command.command("matrix")
@@ -91,7 +91,7 @@ def matrix_command(table: TableOptions) -> None:
     """Print distances of all pairs of meshes."""
     from sobolev_batch.tables.matrix import format_matrix
 
-    echo_lines(format_matrix(table.tree, table.style, table.orders))
+    echo_lines(format_matrix(table.tree, table.style, table.orders), table.style)
 
 
 @table_command.command("verdict")
@@ -100,7 +100,7 @@ def verdict_command(table: TableOptions) -> None:
     """Print the nearest mesh at each size, and the smallest below 5 % and 1 %."""
     from sobolev_batch.tables.conclusion import format_verdict
 
-    echo_lines(format_verdict(table.tree, table.style, table.orders))
+    echo_lines(format_verdict(table.tree, table.style, table.orders), table.style)
 
 
 @table_command.command("objects")
@@ -109,7 +109,7 @@ def objects_command(table: TableOptions) -> None:
     """Print the nearest mesh of each object, the worst objects first."""
     from sobolev_batch.tables.conclusion import format_objects
 
-    echo_lines(format_objects(table.store, table.style, table.orders))
+    echo_lines(format_objects(table.store, table.style, table.orders), table.style)
 
 
 @table_command.command("smallest")
@@ -119,4 +119,4 @@ def smallest_command(table: TableOptions, below: float) -> None:
     """Print the smallest mesh below a bound."""
     from sobolev_batch.tables.smallest import format_smallest
 
-    echo_lines(format_smallest(table.tree, table.style, table.orders, below=below))
+    echo_lines(format_smallest(table.tree, table.style, table.orders, below=below), table.style)

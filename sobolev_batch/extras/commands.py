@@ -404,7 +404,7 @@ def time_command(table: TableOptions, truth: str | None, factor: float) -> None:
     """Print distances of moving meshes over time."""
     from sobolev_batch.extras.leagues.evolution import format_evolution
 
-    echo_lines(format_evolution(table.tree, table.style, table.orders, truth=truth, factor=factor))
+    echo_lines(format_evolution(table.tree, table.style, table.orders, truth=truth, factor=factor), table.style)
 
 
 @click.command("league")
@@ -462,5 +462,5 @@ def league_command(
     else:
         by_size = [league(table.store, table.orders, x=x, y=y, methods=families or None) for y in columns]
         text = format_league([one for leagues in by_size for one in leagues], table.style)
-    echo_lines(text)
+    echo_lines(text, table.style)
     return int(is_worse)

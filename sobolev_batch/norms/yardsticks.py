@@ -53,6 +53,7 @@ def yardsticks(
     best_effort: bool = False,
     seed: int = 0,
     changes: Collection[Change] = CHANGES,
+    on_progress: Callable[[str], object] | None = None,
 ) -> xr.Dataset:
     """Return the distance of two meshes, and which changes of the second one bring it as far from itself.
 
@@ -69,6 +70,7 @@ def yardsticks(
         best_effort: As for `distance`.
         seed: Seed of the noise, and with rtol of the random frequencies.
         changes: The changes to look for.
+        on_progress: Called with a line about each step.
 
     Returns:
         What `distance` returns, and over `order` these changes of b: `moved`, its move in any direction (root mean
@@ -98,7 +100,7 @@ def yardsticks(
         found = distance(a, b, order, lattice=lattice, memory=memory, best_effort=best_effort)
     else:
         accuracy = accuracy_of(rtol, memory, best_effort=best_effort)
-        found, solved = to_accuracy("distance", (a, b), order, lattice, accuracy, seed)
+        found, solved = to_accuracy("distance", (a, b), order, lattice, accuracy, seed, on_progress)
     distances, errors, relative = (np.atleast_1d(found[name].values) for name in ("distance", "error", "relative"))
     columns = {name: np.full(len(orders), np.nan) for change in changes for name in (change, f"{change}_error")}
     if distances.any():
@@ -113,6 +115,7 @@ def yardsticks(
         curves = _curves(b, frequencies, values, target, float(relative.min()), seed)
         for i in np.flatnonzero(distances > errors).tolist():
             for change in changes:
+                (on_progress or str)(f"order {orders[i]:g}, as far {change}")
                 curve = curves[change]
                 columns[change][i], columns[f"{change}_error"][i] = curve.equivalent(i, distances[i], errors[i])
     return found.assign(labelled(order, columns, {}).data_vars)

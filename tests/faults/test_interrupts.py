@@ -11,6 +11,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from sobolev_batch.cli.interruption import end_process
 from sobolev_batch.store.lock import LOCK_KEY
 from tests.support.commands import call, finished, read_until, started, write_toml
 from tests.support.processes import PATIENCE_SECONDS, wait_until
@@ -63,6 +64,16 @@ def test_the_last_word_is_that_of_the_command() -> None:
     # Of a local cluster, semaphores may be left.
     done = finished(sys.executable, "-c", SEMAPHORE_LEFT)
     assert (done.returncode, done.stderr) == (130, "interrupted\n")
+
+
+def test_the_last_word_takes_the_place_of_what_a_terminal_shows(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[bytes] = []
+    monkeypatch.setattr(os, "isatty", lambda number: True)
+    monkeypatch.setattr(os, "write", lambda number, text: said.append(text))
+    monkeypatch.setattr(os, "_exit", sys.exit)
+    with pytest.raises(SystemExit):
+        end_process(signal.SIGINT, "; go on")
+    assert said == [b"\r\x1b[Kinterrupted; go on\n"]
 
 
 # Says when the command line is about to be imported.

@@ -72,9 +72,21 @@ def write_inputs(folder: Path) -> None:
     (folder / "taken" / "precious").write_text("text")
 
 
-def call(*arguments: object, folder: Path = Path(), patience_seconds: float = 1e6) -> subprocess.CompletedProcess[str]:
-    """Run a command to its end within this process, which has imported already what a new one takes seconds for."""
+class _Terminal(StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def call(
+    *arguments: object, folder: Path = Path(), patience_seconds: float = 1e6, columns: int = 0
+) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end within this process, which has imported already what a new one takes seconds for.
+
+    With a number of columns, it prints on a terminal.
+    """
+    stream = _Terminal if columns else StringIO
     with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("COLUMNS", str(columns))
         patch.chdir(folder)
         patch.setattr(sys, "argv", ["sobolev-batch", *map(str, arguments)])
         # Signals, warnings and log records are the test runner's, and so are its log handlers: the command is to set up
@@ -88,8 +100,8 @@ def call(*arguments: object, folder: Path = Path(), patience_seconds: float = 1e
         # It tells of connections that earlier tests of this process left open.
         patch.setattr(logging.getLogger("asyncio"), "disabled", True)
         with (
-            redirect_stdout(StringIO()) as printed,
-            redirect_stderr(StringIO()) as errors,
+            redirect_stdout(stream()) as printed,
+            redirect_stderr(stream()) as errors,
             pytest.raises(SystemExit) as end,
         ):
             cli.main()
