@@ -94,6 +94,10 @@ class Reduction:
     def to_row(self) -> dict[str, Any]:
         """Return the row of a table; bounds are lengths in the unit of the meshes, or fractions of the norm."""
         best, failed = self.bracket.best, self.bracket.failed
+        notes = {
+            "not monotone: a finer mesh was farther away": not self.bracket.is_monotone,
+            "no smaller one holds; another method may make one": best and best.triangles >= self.original_triangles,
+        }
         return {
             "object": self.name,
             "original_triangles": self.original_triangles,
@@ -102,7 +106,7 @@ class Reduction:
             "trials": len(self.trials),
             "seconds": sum(one.seconds for one in self.trials),
             "is_monotone": self.bracket.is_monotone,
-            "note": self.reason or ("" if self.bracket.is_monotone else "not monotone: a finer mesh was farther away"),
+            "note": self.reason or "; ".join(text for text, holds in notes.items() if holds),
             "path": self.path,
         }
 

@@ -250,6 +250,13 @@ def test_results_that_are_not_monotone_are_told() -> None:
     assert "not monotone" in format_reductions({"disc": found})
 
 
+def test_a_mesh_that_cannot_be_reduced_is_told() -> None:
+    found = found_by(lumpy(1), within=1e-6)
+    assert found.bracket.best is not None
+    assert found.bracket.best.triangles == found.original_triangles
+    assert "another method" in " ".join(format_reductions({"lumpy": found}).split())
+
+
 def test_several_meshes_on_a_cluster(client: Client, scan: Path, tmp_path: Path) -> None:
     (tmp_path / "more").mkdir()
     sb.write_mesh(lumpy(2), tmp_path / "more" / "other.obj")
