@@ -12,7 +12,7 @@ from distributed import Client
 
 from sobolev_batch.batch.cluster.clients import require_blocking
 from sobolev_batch.batch.cluster.workers import Workers, prepare_workers, worker_slowness
-from sobolev_batch.batch.field_costs import Sizes, row_seconds, size_rows
+from sobolev_batch.batch.field_costs import Sizes, is_predictable, row_seconds, size_rows
 from sobolev_batch.batch.object_run import ended_before, lacks_nothing
 from sobolev_batch.batch.start import StoreLike, require_permission, settled, warnings_of
 from sobolev_batch.geometry.surface import Similarity, placement_doubt
@@ -84,6 +84,7 @@ class ObjectPlan:
         memory_bytes: Projected peak memory of each surface's largest task, by label.
         task_seconds: Processor time of the tasks of each surface that is missing, by label. It leaves out Hausdorff and
             Chamfer distances, and distances of very many pairs.
+        unknown: Labels of those that programs or searches make, which takes a time that is not known.
         planning_seconds: Processor time of the choice of a lattice, where a run makes it again.
         lacks_tables: True where no field is missing, and tables, or distances of other kinds, are.
         lines: What is shown: name and text of each line; an empty name goes on with the line before.
@@ -107,6 +108,7 @@ class ObjectPlan:
     field_bytes: int
     memory_bytes: dict[str, float]
     task_seconds: dict[str, float]
+    unknown: tuple[str, ...]
     planning_seconds: float
     lacks_tables: bool
     lines: tuple[tuple[str, str], ...] = field(repr=False)
@@ -365,10 +367,12 @@ def _forecast(
     all_work = _PROCESS_SECONDS * processes + work
     fields = f"{missing:,} missing field{'s' * (missing != 1)}"
     tasks = f"{workers.threads} task{'s' * (workers.threads != 1)} at once"
-    lines = (
+    lines: tuple[str, ...] = (
         f"about {duration(seconds, digits=2)} for {fields}, with {tasks}",
         f"{duration(all_work, digits=2)} of processor time; the speed is that of {' and '.join(sorted(bases))}",
     )
+    if unknown := round(share * sum(len(one.unknown) for one in objects)):
+        lines += (f"besides, programs and searches make {unknown:,} of the meshes, and their time is not known",)
     return seconds, all_work, lines
 
 
@@ -399,6 +403,7 @@ def _plan(study: Study, location: Location, workers: Workers, client: Client | N
         field_bytes=study_plan.field_bytes,
         memory_bytes={label: task_bytes for label, (*_, task_bytes) in sizes.items()},
         task_seconds=seconds,
+        unknown=tuple(row.label for row in study_plan.rows if row.label in seconds and not is_predictable(row)),
         planning_seconds=planning_seconds,
         lacks_tables=not seconds and (workspace is None or not lacks_nothing(workspace)),
         lines=(

@@ -191,6 +191,13 @@ def test_what_would_make_a_run_useless_is_told_before_it(
         assert "\n" not in line
 
 
+def test_a_plan_says_what_nobody_can_predict(tmp_path: Path) -> None:
+    found = sb.plan(sb.Study.from_table(small_table(family=made_of(coarse=COMMAND, fine=[3]))), tmp_path / "s.zarr")
+    assert found.object.unknown == tuple(label for label in found.missing if label.startswith("coarse"))
+    assert "programs and searches make 1 of the meshes, and their time is not known" in " ".join(str(found).split())
+    assert "not known" not in str(sb.plan(sb.Study.from_table(small_table()), tmp_path / "s.zarr"))
+
+
 def test_pairs_that_the_disk_has_no_place_for_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     place = Location.parse(tmp_path / "not" / "yet.zarr")
     needed = 5**2 * 2 * 6 * 8
