@@ -31,7 +31,7 @@ from sobolev_batch.tables.open import (
     unit_of,
 )
 from sobolev_batch.tables.other_orders import convergence_at, order_note
-from sobolev_batch.tables.rendering import Column, Section, rendered
+from sobolev_batch.tables.rendering import Column, Section, machine_table, rendered
 from sobolev_batch.tables.results import rates_in_families
 from sobolev_batch.tables.text import between, count, percent, with_error, wrapped
 from sobolev_batch.transform.lattice import Orders
@@ -266,6 +266,8 @@ def format_table(
 ) -> str:
     """Return the convergence tables of a store, or of several objects by their names, as text."""
     frames = tables_of(store, orders, x=x)
+    if style in ("csv", "json"):
+        return machine_table(_joined(frames), style)
     stores = stores_of(store)
     trees = {name: as_tree(stores[name]) for name in frames}
     sections = (part for name, frame in frames.items() for part in _sections(name, trees[name], frame, x))

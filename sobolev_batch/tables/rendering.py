@@ -124,7 +124,8 @@ def printed_table(
 
     In a text, spaces beside headers, texts and labels of the first column give way where lines would be too long: texts
     are wrapped, and labels lose what they repeat and then their middle. Columns that still have no room follow in a
-    table of their own, without rows that have no cells there. Tabulate escapes LaTeX's special characters.
+    table of their own, beside the first column, or the first two where only these tell rows apart, and without rows
+    that have no cells there. Tabulate escapes LaTeX's special characters.
     """
     rows = [[_escaped(cell, style) for cell in row] for row in rows]
     headers = [_escaped(text, style) for text in headers]
@@ -136,17 +137,18 @@ def printed_table(
     padding = 0 if _lacking(_widths(rows, headers, _PADDING)) > 0 else _PADDING
     short = _with_short_texts(rows, headers, texts)
     widths = _widths(short, headers, padding)
-    groups = [[0]]
-    for column in range(1, len(headers)):
-        if len(groups[-1]) > 1 and _lacking([widths[other] for other in (*groups[-1], column)]) > 0:
-            groups.append([0])
+    labels = 1 + (len({row[0] for row in rows}) < len({(*row[:2],) for row in rows}) == len(rows))
+    groups = [[*range(labels)]]
+    for column in range(labels, len(headers)):
+        if len(groups[-1]) > labels and _lacking([widths[other] for other in (*groups[-1], column)]) > 0:
+            groups.append([*range(labels)])
         groups[-1].append(column)
     if len(groups) == 1:
         return "\n".join(_lines(short, headers, {0, *texts}, widths))
     # Each by itself, in which longer labels and texts may have room.
     parts = [
         (
-            [[row[i] for i in group] for row in rows if group is groups[0] or any(row[i] for i in group[1:])],
+            [[row[i] for i in group] for row in rows if group is groups[0] or any(row[i] for i in group[labels:])],
             [headers[i] for i in group],
             style,
             [group.index(i) for i in texts if i in group],

@@ -21,7 +21,7 @@ from sobolev_batch.transform.lattice import Orders
 _RELATIVE = ["relative", "relative_error"]
 _NAMES = ["mesh", "triangles", *_RELATIVE, "nearest", *(f"nearest_{name}" for name in _RELATIVE), "undecided"]
 _NOTE = """\
-A mesh is below the bound if its relative distance and the error of that are together.
+A mesh is below the bound if its relative distance plus the error of that is.
 Meshes that are smaller, and that the errors leave open, are named as undecided."""
 
 _UNKNOWN: dict[str, Any] = {"mesh": "", "triangles": pd.NA, "relative": math.nan, "relative_error": math.nan}

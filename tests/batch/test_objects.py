@@ -25,6 +25,7 @@ from sobolev_batch.store.lock import Lock, locked
 from sobolev_batch.store.objects import Objects
 from sobolev_batch.study.plan import Plan, make_plan
 from sobolev_batch.tables.conclusion import format_objects
+from sobolev_batch.tables.convergence import format_table
 from tests.support.commands import call
 from tests.support.stores import flip
 from tests.support.studies import GONE, balls, methods_of, small_table
@@ -293,6 +294,13 @@ def test_a_finished_object_costs_no_look_at_its_store(
     # What another version of a file or of the study would change is computed again, and what was removed.
     shutil.rmtree(changeable / "b")
     assert {label[0] for label in sb.run(study, changeable, threads).computed} == {"b"}
+
+
+def test_rows_for_programs_open_no_store_of_an_object(changeable: Path) -> None:
+    for name in "ab":
+        shutil.rmtree(changeable / name)
+    rows = pd.read_csv(StringIO(format_table(changeable, "csv")))
+    assert rows["object"].drop_duplicates().tolist() == ["a", "b"]
 
 
 def test_objects_come_and_go(changeable: Path, threads: Client) -> None:

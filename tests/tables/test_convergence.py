@@ -87,6 +87,12 @@ def test_tables_fit_the_terminal(columns: int, monkeypatch: pytest.MonkeyPatch) 
     assert all(text.count(number) == len(labels) for number in numbers)
 
 
+def test_columns_that_follow_keep_what_tells_rows_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    rows = [[method, by, "1" * 12, "2" * 12] for by in ("relative", "triangles") for method in ("a", "b")]
+    assert printed_table(rows, ["method", "by", "new", "old"], "text").count("triangles") == 2 * 2
+
+
 def test_meshes_that_are_not_computed_are_counted_on_one_line(tree: xr.DataTree) -> None:
     status = ("mesh", ["missing", "missing", "failed", "complete"])
     tree["meshes"] = xr.DataTree(tree["meshes"].to_dataset().assign(status=status))
