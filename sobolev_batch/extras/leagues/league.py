@@ -307,6 +307,8 @@ def leagues_of(
     methods: Sequence[str] | None = None,
 ) -> tuple[League, ...]:
     """Rank methods by the rows of `table` of each object that has some, among all objects; see `league`."""
+    if x == y:
+        raise InputError(f"all methods have the same {y} at equal {x}; choose another x, such as target_tolerance")
     chosen = _chosen(tables, methods)
     unfinished = dict.fromkeys((name for name in objects if name not in tables), "it has no tables yet")
     return tuple(_league(tables, s, x, y, chosen, unfinished) for s in orders_of(tables.values(), y))

@@ -51,6 +51,12 @@ def test_factors_between_methods_are_found_whatever_the_objects() -> None:
     assert pair["nearer"] == "a"
 
 
+def test_a_number_is_not_compared_at_equal_values_of_itself() -> None:
+    tables = {name: of_powers({"a": 1.0, "b": 2.0}, 1.0) for name in ("x", "y", "z")}
+    with pytest.raises(sb.errors.InputError, match="the same triangles at equal triangles; choose another x"):
+        ranked(tables, y="triangles")
+
+
 def test_methods_are_compared_at_equal_sizes() -> None:
     first = {n: 1.0 / n for n in SIZES}
     # The same curve, sampled elsewhere: with fewer triangles each, at which a mean of distances would be larger.

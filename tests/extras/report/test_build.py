@@ -377,6 +377,9 @@ def test_meshes_of_several_objects_are_shown_by_the_report_of_an_object(objects:
 
 
 SEPARATED = "a is nearest to the references over 8 objects at order −2: it differs by 0.5 %."
+CHANCE = (
+    "a has the smallest mean over 3 objects at order −2, 0.5 %, but the test of pairs does not tell it from all others."
+)
 OPEN = "The intervals do not separate {} over {} objects at order −2. a has the smallest mean, 0.5 %."
 
 
@@ -384,6 +387,7 @@ OPEN = "The intervals do not separate {} over {} objects at order −2. a has th
     ("factors", "objects", "sentence"),
     [
         ({"b": 2.0, "a": 1.0}, 8, SEPARATED),
+        ({"b": 2.0, "a": 1.0}, 3, CHANCE),
         ({"a": 1.0}, 2, "a differs from the references by 0.5 % over 2 objects at order −2."),
         ({"b": 2.0, "a": 1.0}, 1, "a is nearest on o0 at order −2: it differs by 0.5 %. One object ranks no methods."),
         ({"a": 1.0, "b": 1.0, "c": 2.0}, 8, OPEN.format("a and b", 8)),
