@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.norms.estimate import PARTS, NormEstimate, ReferenceEstimate
-from sobolev_batch.transform.lattice import AXES, Lattice, Orders
+from sobolev_batch.transform.lattice import AXES, Lattice, Orders, check_orders
 
 KERNEL = "weight (1 + |xi|^2)^s, xi in cycles per unit length"
 LENGTH, AREA, VOLUME = "unit length", "unit length squared", "unit length cubed"
@@ -173,8 +173,8 @@ def describe(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def order_axis(order: Orders) -> tuple[tuple[str, ...], Reals, dict[str, str]]:
-    """Return the coordinate `order`: a dimension for several orders, a scalar for one."""
-    orders = np.asarray(order, dtype=np.float64)
+    """Return the coordinate `order`: a dimension for several orders, each once, a scalar for one."""
+    orders = np.reshape(check_orders(order), (-1,) * np.ndim(order))
     return ("order",) * orders.ndim, orders, dict(VARIABLES["order"])
 
 

@@ -169,7 +169,7 @@ class _NormSection(Section):
 
     def settings(self) -> tuple[float, ...]:
         """Return the orders, each once."""
-        return tuple(dict.fromkeys(check_orders(self.orders)))
+        return check_orders(self.orders)
 
 
 class _CompareSection(Section):

@@ -17,7 +17,7 @@ from sobolev_batch.tables.open import AnyStore, as_tree, complete_meshes, finish
 from sobolev_batch.tables.other_orders import distances_at, norms_at, order_note
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.text import middle_cut, with_error
-from sobolev_batch.transform.lattice import check_orders
+from sobolev_batch.transform.lattice import single_order
 
 _COLUMNS = ("distance", "error", *PARTS)
 # A longer printed matrix cannot be read.
@@ -74,7 +74,7 @@ def matrix(
     'reference'
     """
     tree = as_tree(store)
-    (order,) = check_orders(order)
+    order = single_order(order)
     distances = distances_at(tree, order)
     if values not in _COLUMNS:
         raise InputError(f"values must be one of {', '.join(_COLUMNS)}, found {values!r}")

@@ -70,7 +70,7 @@ class StoreAccessor:
         >>> tree.sobolev.norm([-4, -3.5])["norm"].sizes
         Frozen({'mesh': 5, 'order': 2})
         """
-        return self._chosen(norms_at(self._tree, order, mesh).drop_vars("beyond"), order, mesh)
+        return self._chosen(norms_at(self._tree, check_orders(order), mesh).drop_vars("beyond"), order, mesh)
 
     def distance(self, order: Orders, mesh: Meshes = None, other: str | None = None) -> xr.Dataset:
         """Return distances of meshes with their errors, relative to the other mesh, and in parts of area and shape.
@@ -98,7 +98,7 @@ class StoreAccessor:
         Frozen({'mesh': 5})
         """
         if other is None or other == reference_of(self._tree):
-            table = convergence_at(self._tree, order, mesh)
+            table = convergence_at(self._tree, check_orders(order), mesh)
             return self._chosen(table[[name for name in _OF_DISTANCES if name in table]], order, mesh)
         meshes = finished_group(self._tree, "meshes")
         complete = meshes["mesh"].values[meshes["status"].values == "complete"].tolist()

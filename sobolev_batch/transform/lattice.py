@@ -339,14 +339,14 @@ def smooth_step(radii: Reals, cutoff: float) -> Reals:
 
 
 def check_orders(order: Orders) -> tuple[float, ...]:
-    """Return one or several orders as floats; OrderError where one is not between -100 and -1/2, or none is given."""
+    """Return one or several orders as floats, each once; OrderError where one is not between -100 and -1/2, or none."""
     try:
         given = np.atleast_1d(np.asarray(order))
     except ValueError:
         given = np.empty((0, 0))
     if given.dtype.kind not in "iuf" or given.ndim > 1:
         raise OrderError(f"an order is a number, such as -2.0, or a list of numbers; found {order!r}")
-    orders = tuple(float(s) for s in given)
+    orders = tuple(dict.fromkeys(given.astype(float).tolist()))
     if not orders:
         raise OrderError("at least one order is needed")
     for s in orders:

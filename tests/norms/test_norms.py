@@ -28,6 +28,14 @@ def test_refuses_orders_without_a_norm(order: float | list[float]) -> None:
         sb.norm(sb.shapes.Sphere(), order)
 
 
+def test_an_order_that_is_named_twice_counts_once() -> None:
+    field = sb.fourier_transform(BOX, LATTICE)
+    for ask in (sb.norm, lambda one, order: sb.spectrum(one, None, order)):
+        assert ask(field, [-2, -3.0, -2.0])["order"].values.tolist() == [-2.0, -3.0]
+        assert ask(field, [-2, -2]).sizes["order"] == 1
+        assert "order" not in ask(field, np.float64(-2.0)).dims
+
+
 def test_surfaces_take_the_lattice_of_the_field_beside_them() -> None:
     field = sb.fourier_transform(sb.shapes.Sphere(), LATTICE)
     direct = sb.distance(sb.fourier_transform(BOX, LATTICE), field, -2)["distance"].item()

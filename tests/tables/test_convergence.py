@@ -288,6 +288,18 @@ def test_other_orders_are_refused(stores: tuple[str, str]) -> None:
             ask(stores[0], order)
 
 
+@pytest.mark.slow
+def test_tables_have_an_order_that_is_named_twice_once(stores: tuple[str, str]) -> None:
+    for orders in ([-3.0, -3], [-3.7, -3, -3.7]):
+        once = list(dict.fromkeys(orders))
+        pd.testing.assert_frame_equal(sb.table(stores[0], orders), sb.table(stores[0], once))
+        assert sb.open_store(stores[0]).sobolev.norm(orders).sizes["order"] == len(once)
+    with pytest.raises(sb.errors.InputError, match="one order is needed, found 2"):
+        sb.matrix(stores[0], [-3.0, -3.7])  # type: ignore[arg-type]
+    with pytest.raises(sb.errors.OrderError, match="found None"):
+        sb.open_store(stores[0]).sobolev.norm(None)
+
+
 def test_a_study_of_its_reference_alone_has_nothing_to_compare(store_path: Path, threads: Client) -> None:
     family, reference = [{"name": "ico", "source": "icosphere", "levels": [1]}], {"source": "family", "family": "ico"}
     sb.run(sb.Study.from_table(small_table(reference=reference, family=family)), store_path, threads)

@@ -163,7 +163,7 @@ def exported(
     """
     tree = as_tree(store)
     of_study = finished_group(tree, "convergence")["order"].values.tolist()
-    orders = tuple(dict.fromkeys(check_orders(of_study if order is None else order)))
+    orders = check_orders(of_study if order is None else order)
     made, reference = StudyMeshes.from_tree(tree, folder), reference_of(tree)
     status = made.table["status"].sel(mesh=reference).item()
     if status != "complete":

@@ -70,7 +70,7 @@ def evolution(
     tree = as_tree(store)
     # Distances to a surface that moves are computed for each time.
     convergence = convergence_at(tree, order) if truth is None else finished_group(tree, "convergence")
-    orders = list(dict.fromkeys(convergence["order"].values.tolist() if order is None else check_orders(order)))
+    orders = convergence["order"].values.tolist() if order is None else list(check_orders(order))
     meshes, complete = _moving_meshes(tree, truth), set(complete_meshes(tree))
     frames = []
     for row in meshes.itertuples(index=False):
