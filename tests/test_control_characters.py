@@ -11,6 +11,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 import tomllib
 import unicodedata
 from pathlib import Path
@@ -23,7 +24,7 @@ from distributed import Client
 
 import sobolev_batch as sb
 from sobolev_batch.cli import cli
-from sobolev_batch.cli.output import progress_bar, replace_line, show_usage_error
+from sobolev_batch.cli.output import EchoHandler, echo, progress_bar, replace_line, show_usage_error
 from sobolev_batch.sources import files
 from sobolev_batch.tables import FORMATS
 from sobolev_batch.tables.rendering import machine_table, printed_table, prose
@@ -245,6 +246,24 @@ def test_lines_that_are_updated_in_place(capsys: pytest.CaptureFixture[str], mon
     with progress_bar(1, HOSTILE) as bar:
         bar.update(1)
     assert not harmful(capsys.readouterr().err)
+
+
+def test_a_message_takes_the_place_of_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = io.StringIO()
+    monkeypatch.setattr(terminal, "isatty", lambda: True)
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setattr(logging.root, "handlers", [EchoHandler()])
+    with progress_bar(3, "transforms") as bar:
+        bar.update(1)
+        echo("a message", err=True)
+        bar.update(1)
+        logging.getLogger("sobolev_batch").warning("a warning")
+        bar.update(1)
+    first, second, *bar_of_all = terminal.getvalue().split("\n")
+    # Before it stands what was cleared.
+    assert first.endswith("\r\x1b[Ka message")
+    assert second.endswith("\r\x1b[Ka warning")
+    assert "3/3" in bar_of_all[0]
 
 
 def test_first_studies_of_hostile_folders(tmp_path: Path) -> None:

@@ -65,10 +65,10 @@ def show_step(text: str) -> None:
 
 
 def _write(text: str, *, err: bool, nl: bool = True) -> None:
-    """Write a text in the place of a line that stands on the terminal and has not ended."""
+    """Write a text in the place of a line that stands on the terminal and has not ended, or of a bar."""
     global _stands
     with _writing:
-        if _stands:
+        if _stands or (err and text and sys.stderr.isatty()):
             click.echo(CLEAR_LINE, nl=False, err=True)
         click.echo(text, nl=nl, err=err)
         _stands = bool(text) and not nl
