@@ -240,9 +240,11 @@ async def _shake_hands(address: str, seconds: float, arguments: dict[str, Any]) 
 
 
 def _unreachable(address: str, seconds: float, error: BaseException) -> ClusterError:
+    # Settings of a client without certificates, for example, fail at once.
+    when = f" within {seconds:g} s" if isinstance(error, OSError) else ""
     causes = [one_line(cause) for cause in (error, error.__cause__) if cause is not None and str(cause)]
     return ClusterError(
-        f"no Dask scheduler answers at {address!r} within {seconds:g} s "
+        f"no Dask scheduler answers at {address!r}{when} "
         f"({'; '.join(causes) or 'something listens and says nothing'}); start one with: dask scheduler. One with "
         "certificates has an address tls://..., and its DASK_CONFIG is needed here (docs/clusters.md)"
     )

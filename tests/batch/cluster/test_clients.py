@@ -13,7 +13,7 @@ import pytest
 from distributed import Client, LocalCluster, Security
 
 from sobolev_batch import Study, run
-from sobolev_batch.batch.cluster.clients import remote_client, require_private
+from sobolev_batch.batch.cluster.clients import check_connection, remote_client, require_private
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.errors import ClusterError, InputError
 from tests.support.commands import call
@@ -138,6 +138,15 @@ def test_private_addresses_those_that_are_open_to_others_malformed_ones_and_none
     with pytest.raises(ClusterError, match=r"there is no host 'example\.invalid'") as caught:
         require_private("tcp://example.invalid:1", "the scheduler")
     assert not isinstance(caught.value, InputError)
+
+
+def test_a_client_without_certificates_fails_at_once_and_says_so() -> None:
+    with (
+        socket.create_server(("127.0.0.1", 0)) as server,
+        pytest.raises(ClusterError, match=r"no Dask scheduler answers at 'tls://\S+' \(") as refused,
+    ):
+        check_connection(f"tls://127.0.0.1:{server.getsockname()[1]}", 1e6)
+    assert "its DASK_CONFIG is needed here" in str(refused.value)
 
 
 def test_all_that_a_name_stands_for_counts(monkeypatch: pytest.MonkeyPatch) -> None:
