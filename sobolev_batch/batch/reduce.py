@@ -201,11 +201,14 @@ def reduce(
         for name, (one, suffix) in _originals(meshes, folder).items()
     ]
     found: dict[str, Reduction] = {}
+    by_name = {search.name: search for search in searches}
     for name, outcome in _outcomes(searches, client, workers):
+        if isinstance(outcome, Exception):
+            by_name[name].forget()
         found[name] = outcome if isinstance(outcome, Reduction) else Reduction(name, limit, reason=one_line(outcome))
         if on_progress is not None:
             on_progress(found[name])
-    return {search.name: found[search.name] for search in searches}
+    return {name: found[name] for name in by_name}
 
 
 def _permitted(method: Method, search: Range | None) -> Remesher:

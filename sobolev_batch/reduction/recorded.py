@@ -77,12 +77,10 @@ class RecordedSearch:
     def recorded(self) -> SearchRecord | None:
         """Return the record; None where there is none of the same search, or where nothing could be made so far."""
         digest = self.digest
-        with suppress(ValidationError):
-            data = self.folder.read(f"{self.name or digest}.json") or b""
-            record = _RECORDS.validate_json(data, strict=True)
-            # A program that was missing may be there now.
-            return record if record.digest == digest and any(one.triangles for one in self._counted(record)) else None
-        return None
+        record = self._stored(digest)
+        # A program that was missing may be there now.
+        is_same = record is not None and record.digest == digest
+        return record if is_same and any(one.triangles for one in self._counted(record)) else None
 
     def begun(self) -> SearchRecord:
         """Return the record of a search that begins; MeshError where the original cannot be read."""
@@ -108,6 +106,8 @@ class RecordedSearch:
         """Record the outcome of a trial, after the mesh if it is the best one, and return the record."""
         if self.digest != record.digest:
             raise MeshError("a file of it was changed while it was searched; try again")
+        if self.name and not record.trials:
+            self.forget()
         trial, mesh = outcome
         record = replace(record, trials=(*(one for one in record.trials if one.size != trial.size), trial))
         if mesh is not None and self.bracket(record).best == trial:
@@ -117,6 +117,12 @@ class RecordedSearch:
             record = replace(record, mesh_digest=_digest(data))
         self.folder.write({f"{self.name or record.digest}.json": _RECORDS.dump_json(record, exclude_defaults=True)})
         return record
+
+    def forget(self) -> None:
+        """Remove the mesh that an earlier search has left under this name, unless another file has replaced it."""
+        record = self._stored()
+        if record is not None and _digest(self._read_mesh(record)) == record.mesh_digest:
+            self.folder.discard(self._key_of_mesh(record))
 
     def reason(self, record: SearchRecord) -> str:
         """Return why nothing was found; empty where something was."""
@@ -129,6 +135,12 @@ class RecordedSearch:
     def mesh(self, record: SearchRecord) -> Mesh:
         """Return the best mesh, which is kept as a PLY file."""
         return Mesh(*parse_ply(self._read_mesh(record)))
+
+    def _stored(self, digest: str = "") -> SearchRecord | None:
+        """Return the last record under the name, of whatever search, or else under a digest."""
+        with suppress(ValidationError):
+            return _RECORDS.validate_json(self.folder.read(f"{self.name or digest}.json") or b"", strict=True)
+        return None
 
     def _counted(self, record: SearchRecord) -> tuple[Trial, ...]:
         """Return the trials, without the original itself where the remesher made nothing at any other size."""

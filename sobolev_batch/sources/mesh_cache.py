@@ -24,11 +24,18 @@ class Folder(Protocol):
     def write(self, documents: Mapping[str, bytes]) -> None:
         """Write files by their keys, each as a whole."""
 
+    def discard(self, key: str) -> None:
+        """Remove a file, if it exists."""
+
 
 class InMemory(dict[str, bytes]):
     """A place for files that ends with the process."""
 
     read, write = dict.get, dict.update
+
+    def discard(self, key: str) -> None:
+        """Remove a file, if it exists."""
+        self.pop(key, None)
 
     def __str__(self) -> str:
         return "memory"

@@ -198,6 +198,21 @@ def test_what_changed_since_is_tried_again(scan: Path, tmp_path: Path, tried: li
         assert len(tried) > 1
 
 
+def test_no_mesh_of_an_earlier_search_passes_for_one_that_failed(scan: Path, tmp_path: Path) -> None:
+    mesh, output = tmp_path / "part.ply", tmp_path / "reduced"
+    shutil.copy(scan, mesh)
+    for fail in (lambda: None, lambda: mesh.write_bytes(b"broken")):
+        assert not found_by(mesh, within=0.1, output=output).reason
+        assert (output / "part.ply").exists()
+        fail()
+        assert found_by(mesh, within=1e-30, output=output).reason
+        assert not (output / "part.ply").exists()
+    # A file that no search has written stays.
+    (output / "part.ply").write_text("precious")
+    assert found_by(mesh, within=0.1, output=output).reason
+    assert (output / "part.ply").read_text() == "precious"
+
+
 def test_a_tolerance_that_nothing_meets_and_one_that_four_triangles_meet() -> None:
     nothing = found_by(lumpy(2), within=1e-30)
     assert nothing.bracket.best is None
