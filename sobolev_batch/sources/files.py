@@ -110,7 +110,7 @@ def number_as_text(number: float) -> str:
     >>> number_as_text(7.0), number_as_text(1234567), number_as_text(0.5)
     ('7', '1234567', '0.5')
     """
-    return str(int(number)) if number == int(number) else repr(float(number))
+    return str(int(number)) if float(number).is_integer() else repr(float(number))
 
 
 def _listed(tables: Any) -> tuple[MeshTable, ...]:

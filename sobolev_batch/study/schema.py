@@ -10,7 +10,7 @@ import os
 import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from datetime import date
 from functools import reduce
@@ -57,6 +57,8 @@ Metric = Literal[
 
 # Deeper tables are mistakes.
 _DEEPEST = 20
+# Of integers in TOML, the sign among them.
+_INTEGER_BITS = 64
 _MOST_ORDERS, _MOST_OBJECTS = 100, 100_000
 MOST_OCTAVES = 24
 # Larger study files are mistakes.
@@ -395,6 +397,8 @@ def _plain(value: Any, key: tuple[object, ...]) -> Any:
         return _plain(known.to_dict(orient="records"), key)
     if isinstance(value, date):
         return value.isoformat()
+    if isinstance(value, int) and value.bit_length() >= _INTEGER_BITS:
+        raise StudyError(f"{_dotted(key)}: an integer has at most {_INTEGER_BITS} bits, found one of {value.bit_length()}")
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     return os.fspath(value) if isinstance(value, os.PathLike) else value
@@ -419,7 +423,7 @@ def _refusals(error: ValidationError, values: Mapping[str, Any]) -> list[str]:
             found = "" if is_said else f", found {shown_value(value)}"
             messages.append(": ".join(filter(None, (name, said + found))))
         # Wrong entries are not counted; the list may be long enough with them.
-        elif kind != "too_short" or len(_value_at(values, key)) < item["ctx"]["min_length"]:
+        elif kind != "too_short" or _value_at(values, key) == []:
             allowed.setdefault(key, []).append(_demand(item))
     for key, demands in allowed.items():
         text = " or ".join(dict.fromkeys(demands)).replace(" or be ", " or ")
@@ -491,7 +495,9 @@ def _known_keys(values: Mapping[str, Any], key: _Key) -> Iterable[str]:
     """Return the keys that the table at a key may have."""
     if not key:
         return StudyDocument.model_fields
-    table = with_named_meshes(_value_at(values, key), values.get("mesh", {}))
+    table = _value_at(values, key)
+    with suppress(ValueError):  # as where a key is that of another section
+        table = with_named_meshes(table, values.get("mesh", {}))
     if "source" not in table:
         return next(models_in(StudyDocument.model_fields[str(key[0])].annotation)).model_fields
     if key == ("reference",) and table["source"] == "family":

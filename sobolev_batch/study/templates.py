@@ -28,6 +28,8 @@ from sobolev_batch.study.schema import (
 OBJECT, METHOD = "{object}", "{method}"
 
 _PART = re.compile(r"(\*\*/|\*\*|\*|\?|\[[^\]]*\]|\{object\}|\{method\})")
+# With the stars beside them, since two in a row would stand for whole folders.
+_PLACEHOLDERS = re.compile(r"(?:\*?\{(?:object|method)\}\*?)+")
 _PATTERNS = {"**/": "(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
 
 # Meshes of a list as entries of a family, by object and method.
@@ -49,8 +51,9 @@ def sections_of_objects(
     # Objects and lists may bring references and families.
     values = {"reference": None, "family": [], **written}
     # A family may be of the mesh that has the name of the object: any will do to check it.
-    names = [section.get("name") for section in values.get("object") or [] if isinstance(section, dict)]
-    checked = _filled(values["family"], OBJECT, names[0]) if names and names[0] else values["family"]
+    given = values.get("object") if isinstance(values.get("object"), list) else []
+    names = [section.get("name") for section in given if isinstance(section, dict)]
+    checked = _filled(values["family"], OBJECT, str(names[0])) if names and names[0] else values["family"]
     document = StudyDocument.from_tables({**values, "family": checked})
     listed = _listed_meshes(document.objects.get("meshes", ()), folder)
     objects = _objects(document, values, list(dict.fromkeys(name for name, _ in listed)), folder)
@@ -197,7 +200,7 @@ def _filled(value: Any, placeholder: str, name: str) -> Any:
 
 def _matching(template: str, folder: Path) -> list[str]:
     """Return the files that a template may name, as it would have them."""
-    found = matching_files(folder, template.replace(OBJECT, "*").replace(METHOD, "*"))
+    found = matching_files(folder, _PLACEHOLDERS.sub("*", template))
     return [(path.relative_to(folder) if path.is_relative_to(folder) else path).as_posix() for path in found]
 
 

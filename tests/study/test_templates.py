@@ -78,6 +78,13 @@ def test_a_file_is_of_the_object_with_the_longest_name_that_fits(
     }
 
 
+def test_a_star_may_follow_the_name_of_an_object(folder: Path) -> None:
+    family = [{"name": "{method}", "source": "files", "paths": ["out/{method}/{object}*.ply"]}]
+    found = sb.Study.from_table(table(family=family), folder=folder)
+    assert files(found, folder, "cow", "even") == ["cow_100"]
+    assert files(found, folder, "cow_2", "even") == ["cow_2_100"]
+
+
 def test_files_of_longer_names_alone_are_no_files(folder: Path) -> None:
     (folder / "out/quick/cow_100.ply").unlink()
     (folder / "out/quick/cow_200.ply").unlink()
@@ -136,6 +143,8 @@ def listed(name: str) -> dict[str, str]:
     ("changes", "message"),
     [
         ({"reference": {"source": "sphere"}, "object": []}, "object"),
+        ({"object": 3}, "object must be a list, found 3"),
+        ({"object": [{"name": 3}]}, r"\[\[object\]\] 1: name must be text in quotes, found 3"),
         ({"object": [{"name": "a/b"}]}, "holds none of|without / and"),
         ({"object": [{"name": ".a"}]}, r"does not begin with \. or __"),
         ({"object": [{"name": "cow"}, {"name": "COW"}]}, r"object: names must differ by more than case"),
@@ -187,6 +196,7 @@ def test_the_study_of_an_object_is_one_of_its_own(folder: Path) -> None:
         ("{object}/{object}-1.ply", "m/m-1.ply", "m"),
         ("m[0-9]/{object}.ply", "m3/y.ply", "y"),
         ("?/{object}.ply", "k/y.ply", "y"),
+        ("{object}*.ply", "y_1.ply", "y_1"),
     ],
 )
 def test_placeholders_take_as_much_as_they_can(tmp_path: Path, template: str, path: str, name: str) -> None:
