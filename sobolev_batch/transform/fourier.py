@@ -23,7 +23,7 @@ from sobolev_batch.machine import available_cores
 from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.transform.backends import CPU, Backend, Gpu
 from sobolev_batch.transform.kinds import SurfaceKind, kind_of
-from sobolev_batch.transform.lattice import Block, FrequencyLattice, Lattice
+from sobolev_batch.transform.lattice import LARGEST_M, Block, FrequencyLattice, Lattice
 from sobolev_batch.transform.nufft import transform_points
 from sobolev_batch.transform.nufft_costs import (
     CPU_COSTS,
@@ -283,10 +283,11 @@ def require_points_inside(
     reach = float(np.abs(coordinates).max(initial=0.0))
     if not reach < lattice.half_period:
         intervals = 2 * math.floor(2 * lattice.xi_max * reach) + 2
+        wider = f"M >= {intervals}, " if intervals <= LARGEST_M else ""
         raise LatticeError(
             f"{subject} to |coordinate| = {reach:.6g}, but the lattice (xi_max {lattice.xi_max:g}, "
             f"M {lattice.M}) holds only |coordinate| < 1/(2h) = {lattice.half_period:.6g}; "
-            f"take M >= {intervals}, a smaller xi_max, or scale {pronoun} down"
+            f"take {wider}a smaller xi_max, or scale {pronoun} down"
         )
 
 
