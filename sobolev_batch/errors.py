@@ -1,9 +1,12 @@
 """Exceptions of the package: one tree, with plain messages, safe to pickle between processes."""
 
 import errno
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import IO
+from uuid import uuid4
 
 from sobolev_batch.visible import visible
 
@@ -136,6 +139,31 @@ def written(place: object, what: str, kind: type[InputError] = StoreError) -> It
     except OSError as error:
         kind = SpaceError if is_for_want_of_space(error) else kind
         raise kind(f"{place}: {what} cannot be written there: {error.strerror or error}") from error
+
+
+@contextmanager
+def new_file_beside(path: Path, what: str, kind: type[InputError] = StoreError) -> Iterator[IO[bytes]]:
+    """Open a file that may replace another one, and is gone at the end unless it has; see `written`."""
+    # A link stays, and may lead to another disk.
+    place = Path(os.path.realpath(path)).with_name(f".{uuid4().hex}{path.suffix}")
+    try:
+        with written(path, what, kind), place.open("xb") as file:
+            yield file
+    finally:
+        place.unlink(missing_ok=True)
+
+
+def write_file(path: Path, data: bytes | memoryview, what: str, kind: type[InputError] = StoreError) -> None:
+    """Write a file; the old one stays until the new one is whole, since a disk may be full. See `written`."""
+    if path.exists() and not path.is_file():  # /dev/stdout, for example
+        with written(path, what, kind):
+            path.write_bytes(data)
+        return
+    with new_file_beside(path, what, kind) as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+        os.replace(file.name, os.path.realpath(path))
 
 
 def require_writable(path: Path, what: str) -> None:

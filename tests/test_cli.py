@@ -29,6 +29,7 @@ from tests.geometry.test_deviation import plate
 from tests.support.commands import LATTICE, STUDY, ball, call, command, finished, output, write_inputs
 from tests.support.processes import with_certificates
 from tests.support.repository import install
+from tests.support.stores import full_disk
 
 pytestmark = pytest.mark.process
 
@@ -88,6 +89,27 @@ def test_a_part_of_a_study_and_then_the_rest(folder: Path) -> None:
     columns = ["mesh", "order", "distance", "error", "rate"]
     part, whole = (sb.table(folder / store)[columns] for store in ("part.zarr", STORE))
     pd.testing.assert_frame_equal(part, whole, rtol=1e-12)
+
+
+def test_a_file_is_whole_or_the_one_that_was_there(folder: Path, tmp_path: Path) -> None:
+    for name, library in (("t.csv", "csv"), ("t.parquet", "pyarrow"), ("t.nc", "h5netcdf")):
+        if find_spec(library) is None:
+            continue
+        (tmp_path / name).write_text("before")
+        with full_disk(1000):
+            done = call("export", STORE, tmp_path / name, folder=folder)
+        assert (done.returncode, (tmp_path / name).read_text()) == (2, "before")
+        assert f"{name}: the file cannot be written there: File too large" in done.stderr
+    with full_disk(1000):
+        done = call("report", STORE, "--output", tmp_path / "t.csv", folder=folder)
+    assert (done.returncode, (tmp_path / "t.csv").read_text()) == (2, "before")
+    assert {path.name for path in tmp_path.iterdir()} <= {"t.csv", "t.parquet", "t.nc"}
+    (tmp_path / "link.csv").symlink_to("t.csv")
+    for path in (tmp_path / "link.csv", Path("/dev/null")):
+        output("export", STORE, str(path), "--to", "csv", folder=folder)
+    assert (tmp_path / "link.csv").is_symlink()
+    assert (tmp_path / "t.csv").read_text().startswith("order,mesh")
+    assert Path("/dev/null").is_char_device()
 
 
 def test_tables_as_files_of_other_programs(folder: Path, tmp_path: Path) -> None:

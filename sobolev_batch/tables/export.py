@@ -7,7 +7,7 @@ from typing import Literal
 
 import xarray as xr
 
-from sobolev_batch.errors import from_extra, written
+from sobolev_batch.errors import from_extra, write_file
 from sobolev_batch.store.lock import utc_now
 from sobolev_batch.tables.convergence import table
 from sobolev_batch.tables.open import AnyStore, as_tree, finished_group, stores_of
@@ -26,16 +26,18 @@ def export(store: AnyStore, path: Path, style: ExportFormat, order: Orders | Non
     groups of their objects where there are several. InputError where a library is not installed, StoreError where the
     file cannot be written.
     """
-    with written(path, "the file"):
-        if style == "csv":
-            path.write_text(machine_table(table(store, order), "csv") + "\n", encoding="utf-8")
-        elif style == "parquet":
-            with from_extra("export", "a Parquet file needs"):
-                table(store, order).to_parquet(path, engine="pyarrow", index=False)
-        else:
-            with from_extra("export", "a NetCDF file needs"):
-                import h5netcdf  # noqa: F401
-            _groups_of(store).to_netcdf(path, engine="h5netcdf")
+    data: bytes | memoryview
+    if style == "csv":
+        data = f"{machine_table(table(store, order), 'csv')}\n".encode()
+    elif style == "parquet":
+        with from_extra("export", "a Parquet file needs"):
+            data = table(store, order).to_parquet(engine="pyarrow", index=False)
+    else:
+        with from_extra("export", "a NetCDF file needs"):
+            import h5netcdf  # noqa: F401
+        # In memory: where a disk is full, its library ends the process.
+        data = _groups_of(store).to_netcdf(engine="h5netcdf")
+    write_file(path, data, "the file")
 
 
 def _groups_of(store: AnyStore) -> xr.DataTree:

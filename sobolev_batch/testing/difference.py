@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from sobolev_batch.arrays import ComplexDtype, Reals
-from sobolev_batch.errors import InputError, from_extra, written
+from sobolev_batch.errors import InputError, from_extra, write_file
 from sobolev_batch.geometry.closest import signs
 from sobolev_batch.geometry.formats.ply import write_ply
 from sobolev_batch.geometry.mesh import Mesh
@@ -168,8 +168,7 @@ def write_difference(
     if is_picture:
         files = extra(FEATURES, "picture", _PURPOSE)(path, drawn, fields, order, distances, similarity.scale)
     for file, one in () if is_picture else found.items():
-        with written(file, "the witness"):
-            file.write_bytes(one.to_ply())
+        write_file(file, one.to_ply(), "the witness")
     greatest, place = max((one.largest for one in found.values()), key=lambda largest: abs(largest[0]))
     kind = "more" if greatest > 0 else "less"
     near = f"{names[0]} has {kind} area near ({', '.join(f'{x:.4g}' for x in place)})"

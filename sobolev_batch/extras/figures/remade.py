@@ -15,7 +15,7 @@ from typing import Self
 import xarray as xr
 
 from sobolev_batch.batch.start import MADE_MESHES
-from sobolev_batch.errors import InputError, SobolevBatchError, from_extra, written
+from sobolev_batch.errors import InputError, SobolevBatchError, from_extra, write_file
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.sources.mesh_cache import MeshCache
@@ -226,9 +226,7 @@ def write_witness(
 
 def write_vertex_witness(path: Path, found: VertexWitness) -> None:
     """Write a mesh with its witness function as .ply or .vtp; StoreError where the file cannot be written."""
-    data = found.to_ply() if path.suffix == ".ply" else _vtp(found)
-    with written(path, "the witness"):
-        path.write_bytes(data)
+    write_file(path, found.to_ply() if path.suffix == ".ply" else _vtp(found), "the witness")
 
 
 def _vtp(found: VertexWitness) -> bytes:

@@ -16,7 +16,7 @@ import pandas as pd
 import xarray as xr
 
 from sobolev_batch.batch.status import Status
-from sobolev_batch.errors import InputError, from_extra, written
+from sobolev_batch.errors import InputError, from_extra, write_file
 from sobolev_batch.extras.leagues.costs import CostLeague
 from sobolev_batch.extras.leagues.evolution import evolution
 from sobolev_batch.extras.leagues.league import League, percent_text
@@ -102,8 +102,7 @@ def report(
 
 def write_page(path: Path, text: str) -> None:
     """Write a page; StoreError where that cannot be done."""
-    with written(path, "the report"):
-        path.write_text(text, encoding="utf-8")
+    write_file(path, text.encode(), "the report")
 
 
 def make_report(

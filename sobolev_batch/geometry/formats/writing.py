@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
-from uuid import uuid4
 
-from sobolev_batch.errors import InputError, MeshError, written
+from sobolev_batch.errors import InputError, MeshError, new_file_beside, write_file
 from sobolev_batch.geometry.formats.by_name import WRITERS
 from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
+
+_WHAT = "the mesh"
 
 
 def write_mesh(mesh: MeshLike, path: str | Path) -> None:
@@ -36,13 +33,7 @@ def write_mesh(mesh: MeshLike, path: str | Path) -> None:
     Mesh(42 vertices, 80 triangles)
     """
     path = require_writable(path)
-    data = WRITERS[path.suffix.lower()](as_mesh(mesh))
-    # The old file stays until the new one is whole: a disk may be full.
-    with _new_file_beside(path) as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-        os.replace(file.name, os.path.realpath(path))
+    write_file(path, WRITERS[path.suffix.lower()](as_mesh(mesh)), _WHAT, MeshError)
 
 
 def require_writable(path: str | Path) -> Path:
@@ -52,18 +43,7 @@ def require_writable(path: str | Path) -> Path:
         raise InputError(f"{path}: meshes are written as {', '.join(WRITERS)}; found the suffix {path.suffix!r}")
     if not path.parent.is_dir():
         raise InputError(f"{path}: there is no folder {path.parent}")
-    with _new_file_beside(path):
+    with new_file_beside(path, _WHAT, MeshError):
         if path.exists() and not path.is_file():
             raise InputError(f"{path}: it exists already and is no file; name another file")
     return path
-
-
-@contextmanager
-def _new_file_beside(path: Path) -> Iterator[IO[bytes]]:
-    """Open a file that may replace another one, and is gone at the end unless it has; MeshError where that fails."""
-    place = path.parent / f".{uuid4().hex}{path.suffix}"
-    try:
-        with written(path, "the mesh", MeshError), place.open("xb") as file:
-            yield file
-    finally:
-        place.unlink(missing_ok=True)
