@@ -37,7 +37,7 @@ class Status(Shown):
         not_compared: Reason for each surface that is computed but lacks the Hausdorff and Chamfer distances that the
             study requests.
         run: Record of the latest run, or None.
-        reduced: True once the store has tables.
+        reduced: True once the store has tables, of all objects that can be carried out.
         silence_seconds: Seconds since the latest sign of life of a run that goes on, else 0.
         rate: Surfaces that the latest run finishes in a second, as at the last of them; NaN before there are a few.
         lost_records: Labels of surfaces that the tables list, and whose completion records are gone, or others. A run
@@ -80,6 +80,7 @@ class Status(Shown):
             tallies = {"": contents.tally()}
             moments = [record.finished for record in contents.records if record is not None]
         refused = {name: one.reason for name, one in tallies.items() if one.reason}
+        has_tables = [one.reduced for name, one in tallies.items() if name not in refused]
         return cls(
             str(location_of(store)),
             sum(one.complete for one in tallies.values()),
@@ -87,7 +88,7 @@ class Status(Shown):
             refused | labelled({name: one.failed for name, one in tallies.items()}),
             labelled({name: one.not_compared for name, one in tallies.items()}),
             run,
-            bool(tallies) and all(one.reduced for one in tallies.values()),
+            bool(has_tables) and all(has_tables),
             age_seconds(run.seen) if run is not None and run.state in _PATIENCE_SECONDS else 0.0,
             math.nan if run is None else _rate(moments, run),
             tuple(labelled({name: dict.fromkeys(one.lost_records) for name, one in tallies.items()})),

@@ -368,7 +368,7 @@ def test_a_run_of_a_part_takes_objects_families_or_members(changeable: Path, thr
     for only, computed in (
         (["p/ico"], {"p/ico/1", "p/ico/2", "p/reference"}),
         (["p"], {"p/egg/1", "p/egg/2"}),
-        (["q/egg/1"], {"q/egg/1", "q/reference"}),
+        ("q/egg/1", {"q/egg/1", "q/reference"}),
     ):
         assert set(sb.run(study, changeable, threads, only=only).computed) == computed
     # What a run leaves out stays as it was.
@@ -388,6 +388,16 @@ def test_objects_that_no_run_has_come_to_are_not_begun(tmp_path: Path, threads: 
     assert (found.not_begun, found.failed) == (("a",), {})
     assert (found.complete, found.total, found.is_incomplete) == (8, 10, True)
     assert "8 of 10 complete, 0 failed, 2 to go, and 1 objects that are not begun" in str(found)
+
+
+def test_an_object_that_cannot_be_carried_out_hides_no_tables(store: Path, tmp_path: Path, threads: Client) -> None:
+    found = sb.status(store)
+    assert (found.reduced, list(found.failed)) == (True, ["gone"])
+    assert "no tables" not in str(found)
+    sb.run(study_of([GONE]), tmp_path / "gone.zarr", threads)
+    assert "no tables yet" in str(sb.status(tmp_path / "gone.zarr"))
+    with pytest.raises(sb.errors.InputError, match=r"the new one has \['a'\], the old one \[\]"):
+        sb.compare_studies({"a": store / "a"}, tmp_path / "gone.zarr")
 
 
 @pytest.mark.process
