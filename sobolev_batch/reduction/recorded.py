@@ -78,9 +78,10 @@ class RecordedSearch:
         """Return the record; None where there is none of the same search, or where nothing could be made so far."""
         digest = self.digest
         record = self._stored(digest)
-        # A program that was missing may be there now.
-        is_same = record is not None and record.digest == digest
-        return record if is_same and any(one.triangles for one in self._counted(record)) else None
+        # A program that was missing may be there now, so a search that made nothing begins anew.
+        if record is None or record.digest != digest or not any(one.triangles for one in self._counted(record)):
+            return None
+        return record
 
     def begun(self) -> SearchRecord:
         """Return the record of a search that begins; MeshError where the original cannot be read."""

@@ -24,18 +24,14 @@ class Folder(Protocol):
     def write(self, documents: Mapping[str, bytes]) -> None:
         """Write files by their keys, each as a whole."""
 
-    def discard(self, key: str) -> None:
-        """Remove a file, if it exists."""
+    def discard(self, key: str) -> object:
+        """Remove a file."""
 
 
 class InMemory(dict[str, bytes]):
     """A place for files that ends with the process."""
 
-    read, write = dict.get, dict.update
-
-    def discard(self, key: str) -> None:
-        """Remove a file, if it exists."""
-        self.pop(key, None)
+    read, write, discard = dict.get, dict.update, dict.pop
 
     def __str__(self) -> str:
         return "memory"

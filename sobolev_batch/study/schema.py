@@ -57,8 +57,6 @@ Metric = Literal[
 
 # Deeper tables are mistakes.
 _DEEPEST = 20
-# Of integers in TOML, the sign among them.
-_INTEGER_BITS = 64
 _MOST_ORDERS, _MOST_OBJECTS = 100, 100_000
 MOST_OCTAVES = 24
 # Larger study files are mistakes.
@@ -397,8 +395,8 @@ def _plain(value: Any, key: tuple[object, ...]) -> Any:
         return _plain(known.to_dict(orient="records"), key)
     if isinstance(value, date):
         return value.isoformat()
-    if isinstance(value, int) and value.bit_length() >= _INTEGER_BITS:
-        raise StudyError(f"{_dotted(key)}: an integer has at most {_INTEGER_BITS} bits, found one of {value.bit_length()}")
+    if isinstance(value, int) and value.bit_length() > 63:
+        raise StudyError(f"{_dotted(key)}: an integer of TOML has 64 bits, found {quoted(value)}")
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     return os.fspath(value) if isinstance(value, os.PathLike) else value

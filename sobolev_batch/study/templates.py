@@ -51,8 +51,8 @@ def sections_of_objects(
     # Objects and lists may bring references and families.
     values = {"reference": None, "family": [], **written}
     # A family may be of the mesh that has the name of the object: any will do to check it.
-    given = values.get("object") if isinstance(values.get("object"), list) else []
-    names = [section.get("name") for section in given if isinstance(section, dict)]
+    given = values.get("object")
+    names = [section.get("name") for section in given if isinstance(section, dict)] if isinstance(given, list) else []
     checked = _filled(values["family"], OBJECT, str(names[0])) if names and names[0] else values["family"]
     document = StudyDocument.from_tables({**values, "family": checked})
     listed = _listed_meshes(document.objects.get("meshes", ()), folder)
