@@ -43,8 +43,7 @@ def ready_to_run(
     study: StudyLike, store: StoreLike, *, allow_commands: bool, only: Sequence[str] = ()
 ) -> tuple[Study, Location]:
     """Return a study that may run, or a part of it, and its place; log what would make the run useless."""
-    # A text is a sequence of its letters.
-    parts = (only,) if isinstance(only, str) else tuple(only)
+    parts = (only,) if isinstance(only, str) else tuple(only)  # A text is a sequence of its letters.
     study, location = settled(replace(as_study(study), only=parts), store, may_run=True)
     require_permission(study, allow_commands)
     _require_members(study, parts)

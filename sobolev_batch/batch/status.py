@@ -80,7 +80,6 @@ class Status(Shown):
             tallies = {"": contents.tally()}
             moments = [record.finished for record in contents.records if record is not None]
         refused = {name: one.reason for name, one in tallies.items() if one.reason}
-        has_tables = [one.reduced for name, one in tallies.items() if name not in refused]
         return cls(
             str(location_of(store)),
             sum(one.complete for one in tallies.values()),
@@ -88,7 +87,7 @@ class Status(Shown):
             refused | labelled({name: one.failed for name, one in tallies.items()}),
             labelled({name: one.not_compared for name, one in tallies.items()}),
             run,
-            bool(has_tables) and all(has_tables),
+            {one.reduced for one in tallies.values() if not one.reason} == {True},
             age_seconds(run.seen) if run is not None and run.state in _PATIENCE_SECONDS else 0.0,
             math.nan if run is None else _rate(moments, run),
             tuple(labelled({name: dict.fromkeys(one.lost_records) for name, one in tallies.items()})),

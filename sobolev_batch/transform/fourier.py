@@ -283,11 +283,10 @@ def require_points_inside(
     reach = float(np.abs(coordinates).max(initial=0.0))
     if not reach < lattice.half_period:
         intervals = 2 * math.floor(2 * lattice.xi_max * reach) + 2
-        wider = f"M >= {intervals}, " if intervals <= LARGEST_M else ""
         raise LatticeError(
             f"{subject} to |coordinate| = {reach:.6g}, but the lattice (xi_max {lattice.xi_max:g}, "
             f"M {lattice.M}) holds only |coordinate| < 1/(2h) = {lattice.half_period:.6g}; "
-            f"take {wider}a smaller xi_max, or scale {pronoun} down"
+            f"take {f'M >= {intervals}, ' if intervals <= LARGEST_M else ''}a smaller xi_max, or scale {pronoun} down"
         )
 
 

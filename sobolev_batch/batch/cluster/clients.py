@@ -240,7 +240,6 @@ async def _shake_hands(address: str, seconds: float, arguments: dict[str, Any]) 
 
 
 def _unreachable(address: str, seconds: float, error: BaseException) -> ClusterError:
-    # Settings of a client without certificates, for example, fail at once.
     when = f" within {seconds:g} s" if isinstance(error, OSError) else ""
     causes = [one_line(cause) for cause in (error, error.__cause__) if cause is not None and str(cause)]
     return ClusterError(
