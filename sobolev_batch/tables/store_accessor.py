@@ -17,7 +17,7 @@ from sobolev_batch.tables.pairs import pair_distances
 from sobolev_batch.tables.reducer import Reducer
 from sobolev_batch.tables.results import table_of
 from sobolev_batch.tables.shells import lower_bounds
-from sobolev_batch.transform.lattice import Orders, shell_sums, single_order, smooth_step
+from sobolev_batch.transform.lattice import Orders, check_orders, shell_sums, single_order, smooth_step
 
 # The upper end of a band, its squares (orders,), its energy, and the standard error of that.
 Band = tuple[float, Reals, float, float]
