@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import cached_property
 
 import numpy as np
 
@@ -51,6 +52,12 @@ class Triangles:
         self._has_area = sizes > 0
         self._inverse_sizes = _inverse(sizes)
         self._inverse_lengths = [_inverse(dot(side, side)) for side in self._sides]
+
+    @cached_property
+    def across(self) -> Indices:
+        """For each side, the triangle on its other side; the triangle itself where there is none (3, m)."""
+        found = igl.triangle_triangle_adjacency(self._triangles)[0].T
+        return np.where(found < 0, np.arange(found.shape[1]), found)
 
     def closest(self, points: Reals) -> tuple[Reals, Indices]:
         """Return the distance of points (n, 3) from the mesh, exact to rounding, and the triangle closest to each."""
