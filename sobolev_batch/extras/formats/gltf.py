@@ -11,6 +11,7 @@ import json
 import re
 import struct
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from itertools import count, takewhile
 from typing import Any
 from urllib.parse import unquote
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.formats.by_name import Format
-from sobolev_batch.geometry.formats.parsing import Raw, joined, triangle_strips, unpacked_limit
+from sobolev_batch.geometry.formats.parsing import Raw, joined, placed, triangle_strips, unpacked_limit
 from sobolev_batch.geometry.mesh import merge_coincident
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -30,7 +31,13 @@ _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _INSTANCING = "EXT_mesh_gpu_instancing"
 # Required extensions that do not change the positions of vertices, or that are read.
-_HARMLESS = re.compile(rf"[A-Z]+_(materials|texture|lights)_.*|KHR_mesh_quantization|KHR_xmp.*|{_INSTANCING}")
+_HARMLESS = re.compile(
+    r"[A-Z]+_(materials|texture|techniques|lights|animation)_.*|KHR_(mesh_quantization|xmp.*)|"
+    rf"EXT_(mesh_features|instance_features|structural_metadata)|{_INSTANCING}"
+)
+# Vertices (n, 3) and triangles (m, 3).
+_Part = tuple[Reals, Indices]
+_PLAIN = "export it without; a compression by npx @gltf-transform/cli copy scan.glb plain.glb"
 
 
 def parse_gltf(data: bytes, beside: Mapping[str, bytes]) -> Raw:
@@ -41,10 +48,10 @@ def parse_gltf(data: bytes, beside: Mapping[str, bytes]) -> Raw:
     tree, binary = _document(data)
     required = [name for name in map(str, tree.get("extensionsRequired", [])) if not _HARMLESS.fullmatch(name)]
     if required:
-        raise MeshError(f"it requires the glTF extension {', '.join(required)}; export it without")
-    buffers = _loaded_buffers(tree, binary, beside)
+        raise MeshError(f"it requires the glTF extension {', '.join(required)}; {_PLAIN}")
+    file = _File(tree, _loaded_buffers(tree, binary, beside))
     most = unpacked_limit(len(data) + sum(map(len, beside.values())))
-    placed: list[tuple[Reals, Indices]] = []
+    parts: list[_Part] = []
     total = 0
     matrices = _node_matrices(tree)
     for index, matrix in matrices.items():
@@ -55,23 +62,23 @@ def parse_gltf(data: bytes, beside: Mapping[str, bytes]) -> Raw:
         for primitive in mesh["primitives"]:
             if primitive.get("mode", _TRIANGLES) < _TRIANGLES:
                 continue
-            vertices, triangles = _primitive(tree, buffers, primitive, node.get("weights", mesh.get("weights", [])))
+            part = vertices, triangles = _primitive(file, primitive, node.get("weights", mesh.get("weights", [])))
             if "skin" in node:
-                skin, attributes = _entry(tree, "skins", node["skin"]), primitive["attributes"]
-                vertices = _skinned(tree, buffers, attributes, skin, matrices, vertices)
-            for instance in _instances(tree, buffers, node):
+                skin = _entry(tree, "skins", node["skin"])
+                vertices = _skinned(file, primitive["attributes"], skin, matrices, part)
+            for instance in _instances(file, node):
                 # Its joints alone place a skin.
                 one = np.eye(4) if "skin" in node else matrix @ instance
-                placed.append((vertices @ one[:3, :3].T + one[:3, 3], triangles))
+                parts.append(placed(vertices, triangles, one[:3, :3].T, one[:3, 3]))
                 total += vertices.nbytes + triangles.nbytes
                 # Any number of nodes may place one mesh, and any number of primitives use one array.
                 if total > most:
-                    raise MeshError(
-                        f"its scene repeats parts until they take more than {most} bytes; export it unfolded"
-                    )
-    if not placed:
+                    raise MeshError(f"its scene repeats parts until they take over {most} bytes; export it unfolded")
+    if not parts:
         raise MeshError("the file's scene has no faces")
-    return Raw(*merge_coincident(*joined(placed)))
+    others = sum("mesh" in node for index, node in enumerate(tree["nodes"]) if index not in matrices)
+    notes = (f"{others:,} nodes with meshes are outside of the scene that is shown, and left out",) if others else ()
+    return Raw(*merge_coincident(*joined(parts)), notes)
 
 
 def files_beside(data: bytes) -> tuple[str, ...]:
@@ -106,33 +113,48 @@ def _entry(tree: Mapping[str, Any], kind: str, index: Any) -> Any:
     return entries[index]
 
 
-def _values(
-    tree: dict[str, Any], buffers: list[bytes], index: int, kind: str, expected: int | None = None
-) -> NDArray[Any]:
-    """Return the values of an accessor: (count,) of a SCALAR, (count, 3) of a VEC3 and so on, as many as expected."""
-    accessor = _entry(tree, "accessors", index)
-    if expected not in (None, accessor["count"]):
-        raise MeshError(f"accessor {index} has {accessor['count']} entries, expected {expected}")
-    if accessor["type"] != kind:
-        raise MeshError(f"accessor {index} has the type {accessor['type']}, expected {kind}")
-    if "sparse" in accessor or "bufferView" not in accessor:
-        raise MeshError(f"accessor {index} is sparse or without data: not supported, export it plainly")
-    view = _entry(tree, "bufferViews", accessor["bufferView"])
-    dtype, width, count = np.dtype(_COMPONENTS[accessor["componentType"]]), _WIDTHS[kind], accessor["count"]
-    stride = view.get("byteStride", dtype.itemsize * width)
-    offset = accessor.get("byteOffset", 0)
-    end = offset + (stride * (count - 1) + dtype.itemsize * width if count else 0)
-    if stride < dtype.itemsize * width:
-        raise MeshError(f"accessor {index} has entries of {dtype.itemsize * width} bytes every {stride} bytes")
-    if min(offset, count) < 0 or end > view["byteLength"]:
-        raise MeshError(f"accessor {index} announces {count} entries, more than its {view['byteLength']} bytes hold")
-    start, buffer = view.get("byteOffset", 0), _entry({"buffers": buffers}, "buffers", view["buffer"])
-    if start < 0 or start + view["byteLength"] > len(buffer):
-        raise MeshError(f"a buffer view ends at byte {start + view['byteLength']} of a buffer of {len(buffer)}")
-    values: NDArray[Any] = np.ndarray((count, width), dtype, buffer, start + offset, (stride, dtype.itemsize))
-    if accessor.get("normalized"):
-        values = np.maximum(values / np.iinfo(dtype).max, -1.0)
-    return values[:, 0] if kind == "SCALAR" else values
+@dataclass(frozen=True)
+class _File:
+    """A document, and the bytes of its buffers."""
+
+    tree: dict[str, Any]
+    buffers: list[bytes]
+
+    def values(self, index: int, kind: str, expected: int | None = None) -> NDArray[Any]:
+        """Return the values of an accessor: (count,) of a SCALAR, (count, 3) of a VEC3 ..., as many as expected."""
+        accessor = _entry(self.tree, "accessors", index)
+        count, component, sparse = accessor["count"], accessor["componentType"], accessor.get("sparse")
+        if expected not in (None, count):
+            raise MeshError(f"accessor {index} has {count} entries, expected {expected}")
+        if accessor["type"] != kind:
+            raise MeshError(f"accessor {index} has the type {accessor['type']}, expected {kind}")
+        if "bufferView" in accessor:
+            values = self._held(accessor, (count, _WIDTHS[kind]), component)
+        elif sparse is None or count > max(map(len, self.buffers), default=0):
+            raise MeshError(f"accessor {index} has no data, as in compressed files; {_PLAIN}")
+        else:
+            values = np.zeros((count, _WIDTHS[kind]), _COMPONENTS[component])
+        if sparse is not None:
+            some, places, values = sparse["count"], sparse["indices"], values.copy()
+            rows = self._held(places, (some, 1), places["componentType"])[:, 0]
+            values[rows] = self._held(sparse["values"], (some, _WIDTHS[kind]), component)
+        if accessor.get("normalized"):
+            values = np.maximum(values / np.iinfo(values.dtype).max, -1.0)
+        return values[:, 0] if kind == "SCALAR" else values
+
+    def _held(self, place: Mapping[str, Any], shape: tuple[int, int], component: int) -> NDArray[Any]:
+        """Return the rows at some place of a view of a buffer."""
+        view, dtype = _entry(self.tree, "bufferViews", place["bufferView"]), np.dtype(_COMPONENTS[component])
+        count, width = shape[0], dtype.itemsize * shape[1]
+        stride, offset = view.get("byteStride", width), place.get("byteOffset", 0)
+        if stride < width:
+            raise MeshError(f"an accessor has entries of {width} bytes every {stride} bytes")
+        if min(offset, count) < 0 or (count and offset + stride * (count - 1) + width > view["byteLength"]):
+            raise MeshError(f"an accessor announces {count} entries, more than its {view['byteLength']} bytes hold")
+        start, buffer = view.get("byteOffset", 0), _entry({"buffers": self.buffers}, "buffers", view["buffer"])
+        if start < 0 or start + view["byteLength"] > len(buffer):
+            raise MeshError(f"a buffer view ends at byte {start + view['byteLength']} of a buffer of {len(buffer)}")
+        return np.ndarray(shape, dtype, buffer, start + offset, (stride, dtype.itemsize))
 
 
 def _document(data: bytes) -> tuple[dict[str, Any], bytes | None]:
@@ -151,7 +173,8 @@ def _document(data: bytes) -> tuple[dict[str, Any], bytes | None]:
             if len(binary) != binary_size:
                 raise MeshError(f"a GLB chunk announces {binary_size} bytes, found {len(binary)}")
         data = data[20 : 20 + size]
-    tree = json.loads(data.decode("utf-8"))
+    # Some programs fill up the first chunk with zeros.
+    tree = json.loads(data.rstrip(b"\0").decode("utf-8"))
     if not isinstance(tree, dict):
         raise MeshError("the file's JSON is not an object")
     # The meshes of the first version have names.
@@ -200,18 +223,14 @@ def _matrix(node: dict[str, Any]) -> Reals:
     return matrix
 
 
-def _instances(tree: dict[str, Any], buffers: list[bytes], node: dict[str, Any]) -> Iterator[Reals]:
+def _instances(file: _File, node: dict[str, Any]) -> Iterator[Reals]:
     """Yield the matrix of each instance of a node's mesh, within the node."""
-    extension = node.get("extensions", {}).get(_INSTANCING)
-    if extension is None:
+    found = node.get("extensions", {}).get(_INSTANCING)
+    if found is None:
         yield np.eye(4)
         return
     kinds = {"TRANSLATION": "VEC3", "ROTATION": "VEC4", "SCALE": "VEC3"}
-    columns = {
-        name.lower(): _values(tree, buffers, index, kinds[name])
-        for name, index in extension["attributes"].items()
-        if name in kinds
-    }
+    columns = {name.lower(): file.values(at, kinds[name]) for name, at in found["attributes"].items() if name in kinds}
     if not columns:
         raise MeshError(f"a node has instances ({_INSTANCING}) without places; export it without the extension")
     for rows in zip(*columns.values(), strict=True):
@@ -219,42 +238,40 @@ def _instances(tree: dict[str, Any], buffers: list[bytes], node: dict[str, Any])
 
 
 def _skinned(
-    tree: dict[str, Any],
-    buffers: list[bytes],
-    attributes: dict[str, int],
-    skin: dict[str, Any],
-    matrices: dict[int, Reals],
-    vertices: Reals,
+    file: _File, attributes: dict[str, int], skin: dict[str, Any], matrices: dict[int, Reals], part: _Part
 ) -> Reals:
-    """Return the vertices of a skin where its joints hold them."""
+    """Return the vertices of a skin where its joints hold them, and no numbers for those that none holds."""
     if lost := [joint for joint in skin["joints"] if joint not in matrices]:
         raise MeshError(f"a skin has the joint {str(lost[0])[:20]}, which is no node of the scene; export it whole")
     joints = np.array([matrices[joint] for joint in skin["joints"]])
     if "inverseBindMatrices" in skin:
-        inverse = _values(tree, buffers, skin["inverseBindMatrices"], "MAT4").reshape(-1, 4, 4).transpose(0, 2, 1)
+        inverse = file.values(skin["inverseBindMatrices"], "MAT4").reshape(-1, 4, 4).transpose(0, 2, 1)
         if len(inverse) < len(joints):
             raise MeshError(f"a skin has {len(joints)} joints and {len(inverse)} matrices to bind them")
         joints = joints @ inverse[: len(joints)]
-    found = np.zeros_like(vertices)
+    vertices, triangles = part
+    found, total = np.zeros_like(vertices), np.zeros((len(vertices), 1))
     for group in takewhile(lambda group: f"JOINTS_{group}" in attributes, count()):
-        held = _values(tree, buffers, attributes[f"JOINTS_{group}"], "VEC4", len(vertices))
-        weights = _values(tree, buffers, attributes[f"WEIGHTS_{group}"], "VEC4", len(vertices))
+        held = file.values(attributes[f"JOINTS_{group}"], "VEC4", len(vertices))
+        weights = file.values(attributes[f"WEIGHTS_{group}"], "VEC4", len(vertices))
         for joint in range(4):
             by = joints[held[:, joint], :3]
+            total += weights[:, joint, None]
             found += weights[:, joint, None] * (np.einsum("nij,nj->ni", by[..., :3], vertices) + by[..., 3])
-    return found
+    if not (total[triangles] > 0).all():
+        raise MeshError("a skin has vertices that no joint holds; export it posed, without the skin")
+    # Bytes round weights, and some programs leave their sum open.
+    return found / total
 
 
-def _primitive(
-    tree: dict[str, Any], buffers: list[bytes], primitive: dict[str, Any], weights: list[float]
-) -> tuple[Reals, Indices]:
+def _primitive(file: _File, primitive: dict[str, Any], weights: list[float]) -> _Part:
     """Return positions and triangles of a primitive, morphed by the weights of its targets."""
-    vertices = _values(tree, buffers, primitive["attributes"]["POSITION"], "VEC3").astype(np.float64)
+    vertices = file.values(primitive["attributes"]["POSITION"], "VEC3").astype(np.float64)
     for target, weight in zip(primitive.get("targets", []), weights, strict=False):
         if weight and "POSITION" in target:
-            vertices += weight * _values(tree, buffers, target["POSITION"], "VEC3", len(vertices))
+            vertices += weight * file.values(target["POSITION"], "VEC3", len(vertices))
     if "indices" in primitive:
-        corners = _values(tree, buffers, primitive["indices"], "SCALAR").astype(np.int64)
+        corners = file.values(primitive["indices"], "SCALAR").astype(np.int64)
     else:
         corners = np.arange(len(vertices), dtype=np.int64)
     mode = primitive.get("mode", _TRIANGLES)
@@ -266,10 +283,10 @@ def _primitive(
         triangles = corners.reshape(-1, 3)
     else:
         raise MeshError(f"{len(corners)} indices make no whole triangles of the mode {mode}")
-    bad = np.flatnonzero((triangles >= len(vertices)).any(axis=1))
-    if bad.size:
+    bad = np.count_nonzero((triangles >= len(vertices)).any(axis=1))
+    if bad:
         raise MeshError(
-            f"{bad.size} of {len(triangles)} triangles of a primitive have indices outside 0..{len(vertices) - 1}"
+            f"{bad} of {len(triangles)} triangles of a primitive have indices outside 0..{len(vertices) - 1}"
         )
     return vertices, triangles
 

@@ -7,6 +7,7 @@ which objects lie in further parts of the archive.
 from __future__ import annotations
 
 import io
+import re
 import zipfile
 from array import array
 from collections.abc import Iterator, Mapping
@@ -20,6 +21,7 @@ from sobolev_batch.geometry.formats.by_name import Format
 from sobolev_batch.geometry.formats.parsing import (
     Raw,
     joined,
+    placed,
     reals,
     require_memory_to_read,
     unpacked_limit,
@@ -32,6 +34,9 @@ _UNIT, _SUPPORTS = "millimeter", ("support", "solidsupport")
 _AS_IT_IS = "1 0 0 0 1 0 0 0 1 0 0 0"
 # Extensions that do not change what is built, by words of their names.
 _HARMLESS = ("/material/", "/production/", "/trianglesets/")
+# Where slicers say what they print in another way, or not at all.
+_SETTINGS = ("/slic3r_pe_model.config", "/model_settings.config")
+_UNLIKE = re.compile(rb'subtype="(?!normal_part)|"(?:ParameterModifier|NegativeVolume|SupportEnforcer|SupportBlocker)"')
 # Objects within each other.
 _DEEPEST = 30
 # Bytes of memory for each of XML, and for each object that is placed.
@@ -53,6 +58,8 @@ class _Package:
 
     def __init__(self, data: bytes) -> None:
         self.archive = zipfile.ZipFile(io.BytesIO(data))
+        # Names of parts are the same in upper case.
+        self.names = {name.lower(): name for name in self.archive.namelist()}
         self.most = self.left = unpacked_limit(len(data))
         self.parts: dict[str, dict[str, _Object]] = {}
         self.items: list[_Placing] = []
@@ -61,7 +68,7 @@ class _Package:
 
     def read(self, name: str) -> bytes:
         """Return the bytes of a part; it has no more than its entry says, or is refused by the library."""
-        entry = self.archive.getinfo(name)
+        entry = self.archive.getinfo(self.names.get(name.lower(), name))
         self.left -= entry.file_size
         if self.left < 0 or entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise MeshError(
@@ -115,7 +122,7 @@ class _Package:
         triangles = np.array(found.triangles, dtype=np.int64).reshape(-1, 3)
         if triangles.size and not 0 <= triangles.min() <= triangles.max() < len(vertices):
             raise MeshError(f"object {number[:20]} has an index outside 0..{len(vertices) - 1}")
-        yield vertices @ matrix[:3, :3] + matrix[3, :3], triangles
+        yield placed(vertices, triangles, matrix[:3, :3], matrix[3, :3])
         for component in found.components:
             yield from self.placed(component, matrix, depth + 1)
 
@@ -127,14 +134,17 @@ def parse_3mf(data: bytes) -> Raw:
     roots = [values["Target"] for _, _, values in relations if values.get("Type", "").endswith(_OF_MODEL)]
     package.part("".join(roots[:1]).lstrip("/"))
     # What further parts would build does not count.
-    placed = [one for item in tuple(package.items) for one in package.placed(item, np.eye(4))]
-    if not sum(len(triangles) for _, triangles in placed):
+    parts = [one for item in tuple(package.items) for one in package.placed(item, np.eye(4))]
+    if not sum(len(triangles) for _, triangles in parts):
         raise MeshError("the file builds no faces")
     if len(package.units) > 1:
         raise MeshError(f"its parts have several units of length: {', '.join(sorted(package.units))}")
     notes = [f"{package.supports} supports are left out"] if package.supports else []
     notes += [f"its unit of length is the {unit}" for unit in package.units - {_UNIT}]
-    return Raw(*joined(placed), tuple(notes))
+    settings = b"".join(package.read(name) for name in package.names if name.endswith(_SETTINGS))
+    if others := len(_UNLIKE.findall(settings)):
+        notes.append(f"{others} parts that the slicer calls modifiers, negative or for supports count like all others")
+    return Raw(*joined(parts), tuple(notes))
 
 
 def _placing(values: Mapping[str, str], part: str) -> _Placing:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import errno
 import gzip
 import io
@@ -54,8 +55,9 @@ BYTE_ORDERS: dict[str, Literal["<", ">"]] = {"LittleEndian": "<", "BigEndian": "
 _MOST_DIGITS = 18
 _REAL = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
 _INTEGERS = re.compile("[-+0-9]*")
-# Fortran writes the exponents of doubles with a D.
+# Fortran writes the exponents of doubles with a D, and Windows what is no number as -nan(ind) or 1.#QNAN.
 _FORTRAN = re.compile(r"(?<=[0-9.])[dD](?=[+-]?[0-9])")
+_NO_NUMBER = re.compile(r"[+-]?(nan\(\w*\)|1\.#\w+)", re.ASCII | re.IGNORECASE)
 # The index that ends a strip of triangles within a list.
 _BREAK = -1
 
@@ -99,7 +101,7 @@ def require_memory_to_read(needed_bytes: float) -> None:
 
 
 def read_unpacked(path: Path, factor: float, read: Read = BufferedReader.read) -> bytes:
-    """Return the bytes of a regular file, unpacked if its name ends in .gz, at a factor of memory for each byte."""
+    """Return a file's bytes without a byte-order mark, unpacked from .gz, each of which takes a factor of memory."""
     try:
         with open_regular(path) as file:
             length = checked_length(file)
@@ -110,6 +112,7 @@ def read_unpacked(path: Path, factor: float, read: Read = BufferedReader.read) -
             data = _unpacked_bounded(data, factor)
     except (OSError, EOFError, ValueError, zlib.error) as error:
         raise MeshError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    data = data.removeprefix(codecs.BOM_UTF8)
     if not data:
         raise MeshError("the file is empty")
     return data
@@ -194,7 +197,7 @@ def reals(words: Sequence[str], owner: str) -> array[float]:
             raise ValueError("no spelling of C")
         return array("d", map(float, words))
     except ValueError as error:
-        plain = [_FORTRAN.sub("e", word) for word in words]
+        plain = ["nan" if _NO_NUMBER.fullmatch(word) else _FORTRAN.sub("e", word) for word in words]
         wrong = [word for word in plain if not _REAL.fullmatch(word)]
         if wrong:
             raise MeshError(f"{owner} has a word that is not a number: {wrong[0][:40]!r}") from error
@@ -232,6 +235,11 @@ def typed(words: Sequence[str], dtype: np.dtype[Any], owner: str) -> NDArray[Any
 def beside_volume(cells: int, faces: int) -> tuple[str, ...]:
     """Return what notes say of cells with volume, which have no part in the surface of the faces beside them."""
     return (f"{cells:,} cells with volume are left out beside {faces:,} faces",) if cells else ()
+
+
+def placed(vertices: Reals, triangles: Indices, linear: Reals, shift: Reals) -> tuple[Reals, Indices]:
+    """Return vertices x as x @ linear + shift, and their triangles, which a mirror turns round."""
+    return vertices @ linear + shift, triangles[:, :: -1 if np.linalg.det(linear) < 0 else 1]
 
 
 def joined(parts: Sequence[tuple[Reals, Indices]]) -> tuple[Reals, Indices]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ PLACED: dict[str, tuple[list[dict[str, Any]], list[int] | None, float, list[floa
     # Column by column: the same rotation, with lengths doubled and a shift.
     "matrix": ([{"mesh": 0, "matrix": [0, 2, 0, 0, -2, 0, 0, 0, 0, 0, 2, 0, 9, 0, 0, 1]}], None, 4 * 28, [9, 2, 8]),
     "child": ([{"children": [1], "scale": [2, 2, 2]}, {"mesh": 0, "translation": [1, 0, 0]}], [0], 4 * 28, [4, 4, 8]),
+    "mirrored": ([{"mesh": 0, "scale": [-1, -1, -1]}], None, 28, [0, 0, 0]),
     "outside the scene": ([{"mesh": 0}, {"mesh": 0, "scale": [2, 2, 2]}], [0], 28, [1, 2, 4]),
 }
 
@@ -42,6 +44,8 @@ def test_gltf_nodes_place_their_meshes(read: Read, name: str) -> None:
     mesh = read(".glb", scene.glb())
     assert mesh.area == pytest.approx(area, rel=1e-14)
     assert mesh.extent.box[1] == pytest.approx(upper, abs=1e-14)
+    # Triangles face outwards, also in a mirror.
+    assert mesh.volume > 0
     embedded = read(".gltf", scene.gltf())
     assert soup(embedded) == soup(mesh)
 
@@ -103,6 +107,19 @@ def skinned(weights: list[float]) -> Gltf:
     return scene
 
 
+def with_unused_vertex() -> Gltf:
+    """The box on its first joint, with one vertex more, which nothing uses."""
+    scene = skinned([1, 0])
+    attributes = scene.tree["meshes"][0]["primitives"][0]["attributes"]
+    for name, rows, kind, dtype in (
+        ("POSITION", [*BOX_VERTICES, [99, 99, 99]], "VEC3", "float32"),
+        ("JOINTS_0", [[0] * 4] * 9, "VEC4", "uint8"),
+        ("WEIGHTS_0", [[1, 0, 0, 0]] * 8 + [[0] * 4], "VEC4", "float32"),
+    ):
+        attributes[name] = scene.accessor(rows, kind, dtype)
+    return scene
+
+
 def bound() -> Gltf:
     """The box on two joints as it was bound to them: where it was."""
     scene = skinned([0.25, 0.75])
@@ -140,12 +157,33 @@ def quantised(dtype: str) -> Gltf:
     return scene
 
 
+def sparse(*, is_new: bool) -> Gltf:
+    """The box with its last corners, or all, in place of other numbers or of none."""
+    scene, rows = box_scene(), [0, *range(7, 0, -1)] if is_new else [7, 3]
+    places = [scene.accessor(rows, "SCALAR", "uint16"), scene.accessor(BOX_VERTICES[rows], "VEC3", "float32")]
+    position = scene.accessor([*BOX_VERTICES[:3], [9, 9, 9], *BOX_VERTICES[4:7], [9, 9, 9]], "VEC3", "float32")
+    accessors = scene.tree["accessors"]
+    accessors[position]["sparse"] = {
+        "count": len(rows),
+        "indices": {"bufferView": places[0], "componentType": accessors[places[0]]["componentType"]},
+        "values": {"bufferView": places[1]},
+    }
+    if is_new:
+        del accessors[position]["bufferView"]
+    scene.tree["meshes"][0]["primitives"][0]["attributes"]["POSITION"] = position
+    return scene
+
+
 # Scenes, and the area and the upper corner of what they show before any animation.
 SHOWN: dict[str, tuple[Gltf, float, list[float]]] = {
     "instances": (instanced(), 14 * 28, [9, 46, 12]),
     "a joint below another": (skinned([1, 0]), 4 * 28, [12, 4, 8]),
     "between two joints": (skinned([0.5, 0.5]), 4 * 28, [7, 4, 8]),
+    "weights that add to less than 1": (skinned([0.25, 0.25]), 4 * 28, [7, 4, 8]),
+    "a vertex that no joint and no triangle holds": (with_unused_vertex(), 4 * 28, [12, 4, 8]),
     "bound": (bound(), 28, [1, 2, 4]),
+    "places in place of others": (sparse(is_new=False), 28, [1, 2, 4]),
+    "places in place of none": (sparse(is_new=True), 28, [1, 2, 4]),
     "weights of the mesh": (morphed(of_node=False), 1.25**2 * 28, [1.25, 2.5, 5]),
     "weights of the node": (morphed(of_node=True), 1.25**2 * 28, [1.25, 2.5, 5]),
     **{dtype: (quantised(dtype), 28, [1, 2, 4]) for dtype in ("int8", "uint8", "int16", "uint16")},
@@ -210,6 +248,15 @@ WRONG: dict[str, tuple[Gltf, str]] = {
     ),
     "a target of one vertex": (with_a_short("POSITION"), "has 1 entries, expected 8"),
     "weights of one vertex": (with_a_short("WEIGHTS_0"), "has 1 entries, expected 8"),
+    "a vertex that no joint holds": (skinned([0, 0]), "vertices that no joint holds"),
+    "no data": (
+        changed(box_scene(), lambda tree: tree["accessors"][0].pop("bufferView")),
+        "accessor 0 has no data, as in compressed files.*gltf-transform/cli copy",
+    ),
+    "sparse data alone, of too many": (
+        changed(sparse(is_new=True), lambda tree: tree["accessors"][-1].update(count=10**9)),
+        "has no data",
+    ),
     "fewer matrices than joints": (with_one_bind(), "2 joints and 1 matrices"),
 }
 
@@ -241,12 +288,27 @@ def test_gltf_instances_without_places_do_not_vanish(read: Read) -> None:
 
 
 @pytest.mark.parametrize(
-    "extension", ["EXT_texture_webp", "KHR_texture_basisu", "MSFT_texture_dds", "KHR_materials_ior"]
+    "extension",
+    [
+        "EXT_texture_webp",
+        "KHR_texture_basisu",
+        "MSFT_texture_dds",
+        "KHR_materials_ior",
+        "KHR_techniques_webgl",
+        "EXT_mesh_features",
+    ],
 )
 def test_gltf_materials_do_not_matter(read: Read, extension: str) -> None:
     scene = box_scene()
     scene.tree["extensionsRequired"] = [extension]
     assert read(".glb", scene.glb()).area == BOX_AREA
+
+
+def test_gltf_may_fill_up_its_document_with_zeros(read: Read) -> None:
+    content = box_scene().glb()
+    size = int.from_bytes(content[12:16], "little")
+    head = struct.pack("<4s3I", b"glTF", 2, len(content) + 4, size + 4)
+    assert read(".glb", head + content[16 : 20 + size] + bytes(4) + content[20 + size :]).area == BOX_AREA
 
 
 @pytest.mark.parametrize("named", [{"asset": {"version": "1.0"}}, {"meshes": {"box": {}}, "asset": {}}])
