@@ -27,6 +27,10 @@ _MEDIT_SKIPPED = re.compile(
     "AngleOfCornerBound|Iterations|End|(Required|Normal|Tangent|SubDomain|Parallel|[DI]?SolAt)[A-Za-z]*|"
     "[A-Za-z]+OnGeometric[A-Za-z]+"
 )
+# How Gmsh's meshes begin: perhaps with comments, then the format, whether it is binary, and how that orders bytes.
+_START = re.compile(
+    rb"(?s)\s*(?:\$Comments\s.*?\$EndComments\s+)?\$MeshFormat\s+((?:2(?:\.[0-2])?|4\.1)\s+[01])\s+8[ \t]*\r?\n(.{4})"
+)
 # Gmsh's numbers of cells: their corners, and which have an area or a volume.
 _CORNERS = {1: 2, 2: 3, 3: 4, 4: 4, 5: 8, 6: 6, 7: 5, 15: 1}
 _WITH_AREA, _WITH_VOLUME = (2, 3), (4, 5, 6, 7)
@@ -56,7 +60,7 @@ def parse_medit(data: bytes) -> Raw:
 
 def parse_gmsh(data: bytes) -> Raw:
     """Return the vertices and triangles of a Gmsh mesh of the format 2.2 or 4.1."""
-    head = re.match(rb"\s*\$MeshFormat\s+((?:2\.[0-2]|4\.1)\s+[01])\s+8[ \t]*\r?\n(.{4})", data, re.DOTALL)
+    head = _START.match(data)
     if head is None:
         raise MeshError(
             "it is no Gmsh mesh of the format 2.2 or 4.1; convert it: gmsh scan.msh -save -format msh41 -o surface.msh"

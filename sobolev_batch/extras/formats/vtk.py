@@ -32,8 +32,8 @@ from sobolev_batch.geometry.formats.parsing import (
 from sobolev_batch.geometry.formats.polygons import cut_polygons
 
 # VTK's numbers for types of cells: vertices and lines, those with area, and those with flat faces around a volume.
-_WITHOUT_AREA, _VTK_TRIANGLE, _STRIP, _POLYGON, _PIXEL, _QUAD = (1, 2, 3, 4), 5, 6, 7, 8, 9
-_WITH_VOLUME = range(10, 17)
+_WITHOUT_AREA, _VTK_TRIANGLE, _STRIP, _POLYGON, _PIXEL, _QUAD = (0, 1, 2, 3, 4, 21), 5, 6, 7, 8, 9
+_WITH_VOLUME = (*range(10, 17), 41, 42)
 _SURFACE = "python -c \"import pyvista; pyvista.read('scan{}').extract_surface().triangulate().save('scan.vtp')\""
 _PACKED_ANEW = "python -c \"import pyvista; pyvista.read('scan.vtp').save('new.vtp')\""
 _KINDS, _FACES = ("polydata", "unstructuredgrid", "unstructured_grid"), ("polys", "strips", "cells")

@@ -82,10 +82,9 @@ _MESHLAB = _PYTHON.format(
 )
 _TRIMESH = "import trimesh; trimesh.load('scan.dae').to_mesh().export('scan.ply')"
 _PYVISTA = "import pyvista; pyvista.read('scan{0}').%sextract_surface().triangulate().save('scan.vtp')"
-_GMSH, _MESHIO = (
-    "pip install gmsh; gmsh scan{0} -2 -o scan.stl",
-    "pip install meshio h5py; meshio convert scan{0} scan.vtu",
-)
+_GMSH = "pip install gmsh; gmsh scan{0} -2 -o scan.stl"
+_RESAVED = "pip install gmsh; gmsh scan{0} -save -format msh41 -o surface.msh"
+_MESHIO = "pip install meshio h5py; meshio convert scan{0} scan.vtu"
 CONVERTED = {
     suffix: (name, command.format(suffix))
     for name, suffixes, command in (
@@ -93,9 +92,11 @@ CONVERTED = {
         *(("VRML", ".wrl", _MESHLAB), ("X3D", ".x3d", _MESHLAB), ("3D Studio", ".3ds", _MESHLAB)),
         *(("OpenCTM", ".ctm", _MESHLAB), ("STEP", ".step .stp", _GMSH), ("IGES", ".iges .igs", _GMSH)),
         *(("BREP", ".brep", _GMSH), ("Abaqus", ".inp", _MESHIO), ("Nastran", ".bdf .nas", _MESHIO)),
-        ("XDMF", ".xdmf", _MESHIO),
-        ("VTK collection", ".vtm", _PYTHON.format("pyvista", _PYVISTA % "combine().")),
-        ("VTK collection", ".pvtu", _PYTHON.format("pyvista", _PYVISTA % "")),
+        *(("XDMF", ".xdmf", _MESHIO), ("Medit in binary", ".meshb", _MESHIO), ("I-deas", ".unv", _RESAVED)),
+        *(("MED", ".med", _RESAVED), ("CGNS", ".cgns", _RESAVED), ("FBX", ".fbx", "assimp export scan.fbx scan.ply")),
+        ("VTK collection", ".vtm .pvd", _PYTHON.format("pyvista", _PYVISTA % "combine().")),
+        ("VTK data set", ".pvtu .pvtp .vti .vts .vtr .vtkhdf", _PYTHON.format("pyvista", _PYVISTA % "")),
+        *(("zip", ".zip", "unzip scan{0}"), ("bzip2", ".bz2", "bunzip2 scan{0}"), ("xz", ".xz", "unxz scan{0}")),
     )
     for suffix in suffixes.split()
 }

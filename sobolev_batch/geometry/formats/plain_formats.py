@@ -5,7 +5,6 @@ They are parsed here because the libraries at hand silently lose or change faces
 
 from __future__ import annotations
 
-import codecs
 import io
 import re
 from array import array
@@ -20,6 +19,8 @@ from sobolev_batch.geometry.formats.polygons import cut_polygons
 from sobolev_batch.geometry.mesh import Mesh, merge_coincident
 from sobolev_batch.geometry.surface import normals
 
+# Comments and names of OBJ files: where they end in a backslash, as a path does, they do not go on.
+_PATHS = re.compile(r"\s*([og]\s|usemtl|mtllib)|.*(?<!\S)#", re.IGNORECASE)
 # Numbers per vertex line: x y z, with a weight, a colour, or both.
 _OBJ_VERTEX_SIZES = (3, 4, 6, 7)
 # Words of lines without a surface of their own: those of the format, and two for values of vertices; then those of
@@ -72,10 +73,13 @@ def parse_off(data: bytes) -> Raw:
     """Return the vertices (n, 3) and triangles (m, 3) of an OFF file, in text or binary."""
     lines = (words for line in _text_lines(data) if (words := _COMMENT.split(line)[0].split()))
     first = next(lines, [""])
-    # The word may be missing.
-    kind, counts = ("OFF", first) if _COUNT.fullmatch(first[0]) else (first[0], first[1:])
-    if not re.fullmatch("(ST|C|N)*OFF", kind):
-        raise MeshError("the file does not begin with OFF, which ST, C and N may precede, nor with its counts")
+    # The word may be missing, and the first count may follow it at once.
+    word = re.fullmatch("((?:ST|C|N)*OFF)?([0-9]*)", first[0].upper())
+    if word is None or not word[0]:
+        raise MeshError(
+            f"the file does not begin with OFF, NOFF or such, nor with its counts, but with {first[0][:40]!r}"
+        )
+    kind, counts = word[1] or "OFF", [*filter(None, word.groups()[1:]), *first[1:]]
     has_colors = "C" in kind
     least = 3 + 3 * ("N" in kind) + 2 * ("ST" in kind)
     if counts == ["BINARY"]:
@@ -151,7 +155,7 @@ def parse_stl(data: bytes) -> Raw:
             raise MeshError("the file has more bytes than its triangles take, which may lie between them")
         corners = records["corners"].reshape(-1, 3)
     elif b"\0" not in start:
-        if start.removeprefix(codecs.BOM_UTF8).lstrip()[:5].lower() != b"solid":
+        if start.lstrip()[:5].lower() != b"solid":
             raise MeshError("the file is a text that does not begin with solid, as STL files in text do")
         if re.search(rb"(?i)normal[^\n]*\svertex\s", data):
             data = _STL_STATEMENT.sub(b"\n", data)
@@ -197,35 +201,28 @@ def write_stl(mesh: Mesh) -> bytes:
 
 def _text_lines(data: bytes) -> Iterator[str]:
     """Yield the lines of a text one by one, each with a line feed at its end, which the last may lack."""
-    reader = io.TextIOWrapper(io.BytesIO(data), "utf-8-sig", errors="replace")
+    reader = io.TextIOWrapper(io.BytesIO(data), "utf-8", errors="replace")
     number = 0
     while line := reader.readline(_LONGEST_LINE + 1):
         number += 1
         if len(line) > _LONGEST_LINE:
-            raise MeshError(
-                f"line {number} has more than {_LONGEST_LINE} characters; cut its polygon into smaller ones"
-            )
+            raise MeshError(f"line {number} has more than {_LONGEST_LINE} characters; shorten it, or cut its polygon")
         yield line
 
 
 def _joined_lines(data: bytes) -> Iterator[tuple[int, str]]:
     """Yield the lines of an OBJ file with the number of their last one; one that ends in a backslash goes on."""
-    parts: list[str] = []
-    length = 0
-    number = 0
+    text, number = "", 0
     for number, line in enumerate(_text_lines(data), 1):
-        is_continued = line.endswith("\\\n")
-        parts.append(f"{line[:-2]} " if is_continued else line)
-        length += len(line)
-        if length > _LONGEST_LINE:
-            raise MeshError(
-                f"a line goes on for more than {_LONGEST_LINE} characters; cut its polygon into smaller ones"
-            )
+        is_continued = line.rstrip().endswith("\\") and not _PATHS.match(line)
+        text += f"{line.rstrip()[:-1]} " if is_continued else line
+        if len(text) > _LONGEST_LINE:
+            raise MeshError(f"a line goes on for more than {_LONGEST_LINE} characters; shorten it, or cut its polygon")
         if not is_continued:
-            yield number, "".join(parts)
-            parts, length = [], 0
-    if parts:
-        yield number, "".join(parts)
+            yield number, text
+            text = ""
+    if text:
+        yield number, text
 
 
 def _obj_corner(word: str, vertices_so_far: int, face: int) -> int:

@@ -27,7 +27,7 @@ from sobolev_batch.geometry.mesh import Mesh
 # A header ends within this many bytes: room for a thousand lines, and quick to look through.
 HEADER_BYTES = 1 << 16
 # The last line ends as the first one does, where it can: behind a lone carriage return, a line feed may be data.
-_HEADER = re.compile(rb"(?s)(?:\xef\xbb\xbf)?ply[ \t]*(\r\n|\r|\n)(.*?)(?<=[\r\n])end_header[ \t]*(?:\1|\r\n|\n|\r)")
+_HEADER = re.compile(rb"(?s)ply[ \t]*(\r\n|\r|\n)(.*?)(?<=[\r\n])end_header[ \t]*(?:\1|\r\n|\n|\r)")
 # What some programs write behind binary data.
 _LAST_LINE = (b"", b"\n", b"\r\n")
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}

@@ -38,10 +38,11 @@ _MISTAKEN = {
     rb"version https://git-lfs": "a pointer of Git's large file storage; fetch the file itself by git lfs pull",
     rb"\xff\xfe|\xfe\xff|([\t-~]\0|\0[\t-~]){4}": "a text in UTF-16; save it in UTF-8",
     rb"\x1f\x8b": "compressed by gzip; let its name end in .gz",
+    rb"BZh\d1AY|\xfd7zXZ|\x28\xb5\x2f\xfd": "packed; unpack it",
 }
 # How files of some formats begin.
 _BEGINNINGS = {".ply": rb"ply\s", ".stl": rb"solid\s", ".off": rb"(st|c|n)*off\s", ".vtk": rb"# vtk ", ".glb": rb"gltf"}
-_BEGINNINGS |= {".3mf": rb"pk\x03\x04", ".msh": rb"\$meshformat", ".mesh": rb"meshversionformatted"}
+_BEGINNINGS |= {".3mf or other zip": rb"pk\x03\x04", ".msh": rb"\$meshformat", ".mesh": rb"meshversionformatted"}
 _START_BYTES = 1024
 # What errors of libraries mean on damaged input, the special ones first.
 _DAMAGES: dict[type[Exception], str] = {
@@ -173,7 +174,7 @@ def expected_size(path: Path) -> tuple[int, float]:
                 length = min(_PACKING * length, unpacked_limit(length))
             if form.announced_size is not None:
                 unpacked = gzip.GzipFile(fileobj=file) if is_gzipped(path) else file
-                return form.announced_size(unpacked.read(HEADER_BYTES), length)
+                return form.announced_size(unpacked.read(HEADER_BYTES).removeprefix(codecs.BOM_UTF8), length)
         if length <= _LONGEST_INDEX:
             length += sum(part.stat().st_size for part in files_beside(path))
     except (OSError, EOFError, ValueError, zlib.error, MeshError):
@@ -208,9 +209,10 @@ def _with_lost_digits(mesh: Mesh) -> Mesh:
 
 def _mistaken(start: bytes, suffix: str) -> str:
     """Return what a file is that begins so and could not be read; empty where that is not known."""
-    start = start.removeprefix(codecs.BOM_UTF8).lstrip()
+    start = start.lstrip()
     known = {pattern: f"is {what}" for pattern, what in _MISTAKEN.items()}
-    known |= {at: f"begins as a {other} file; name it so" for other, at in _BEGINNINGS.items() if other != suffix}
+    others = {at: other for other, at in _BEGINNINGS.items() if not other.startswith(suffix)}
+    known |= {at: f"begins as a {other} file; name it so" for at, other in others.items()}
     return next((f"it {what}" for pattern, what in known.items() if re.match(pattern, start, re.IGNORECASE)), "")
 
 

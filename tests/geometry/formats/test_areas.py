@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import bz2
 import gzip
+import lzma
 import re
 import struct
 from pathlib import Path
@@ -16,7 +18,9 @@ from tests.support.mesh_files import (
     BIG,
     LITTLE,
     VOLUME,
+    Gltf,
     Read,
+    archive,
     box_scene,
     freesurfer,
     gifti,
@@ -99,12 +103,14 @@ CASES: dict[str, Case] = {
             ("texture and all", off_with("STCN", "0 0 1 1 1 0 0 0 1"), BOX_AREA),
             ("no magic word", OFF_BOX.removeprefix(b"OFF\n"), BOX_AREA),
             ("no edge count and no magic word", replaced(OFF_BOX, (b"OFF\n8 12 0\n", b"8 12\n")), BOX_AREA),
+            ("a count at once", replaced(OFF_BOX, (b"OFF\n8", b"OFF8")), BOX_AREA),
+            ("in lower case", replaced(OFF_BOX, (b"OFF", b"off")), BOX_AREA),
             ("faces over two lines", re.sub(rb"(?m)^(3 \d) ", rb"\1\n", OFF_BOX), BOX_AREA),
             ("a number on each line", b"OFF\n8 12 0\n" + b"\n".join(OFF_BOX.split()[4:]), BOX_AREA),
             ("binary", off_binary(BOX_VERTICES, BOX_TRIANGLES), BOX_AREA),
             ("binary with colours", off_binary(BOX_VERTICES, BOX_TRIANGLES, "C", 4, 3), BOX_AREA),
             ("binary with normals", off_binary(BOX_VERTICES, BOX_TRIANGLES, "N", 3), BOX_AREA),
-            ("four dimensions", b"4" + OFF_BOX, "does not begin with OFF"),
+            ("four dimensions", b"4" + OFF_BOX, "does not begin with OFF.*but with '4OFF'"),
             ("normals of two numbers", off_with("N", "0 1"), "vertex 1 has 10 numbers, expected 6"),
             ("colours of five numbers", off_with("C", "1 1 1 1 1"), "vertex 1 has 8 numbers"),
             ("a corner missing", replaced(OFF_BOX, (b"\n3 4 6 7", b"\n3 4 6")), "face 3 has 7 numbers, expected 4"),
@@ -188,6 +194,10 @@ CASES |= {
         for what, content in {
             "words in upper case": OBJ_BOX.upper() + b"VN 0 0 1\nG box\n",
             "fo for some faces": OBJ_BOX.replace(b"f 1", b"fo 1"),
+            "paths that end in a backslash": re.sub(
+                rb"(?m)^(v|f)", rb"# C:\\a\\\n\1", OBJ_BOX.replace(b"\nf", b" # C:\\\no C:\\a\\\nusemtl C:\\\nf")
+            ),
+            "blanks behind a backslash": OBJ_BOX.replace(b" 4", b" \\ \t\n4"),
             "words without area": b"mtllib a.mtl\no b\ng c\ns 1\nusemtl d\nvp 0.5\nvt 0 0\nvn 0 0 1\nlod 1\n"
             + OBJ_BOX
             + b"l 1 2 3\np 1\ncstype bspline\ndeg 2\nparm u 0 1\nend\n",
@@ -199,6 +209,7 @@ CASES |= {
         "line 15 begins with 'surf', which is not",
     ),
     "obj, a free-form curve": (".obj", OBJ_BOX + b"CURV 0 1 1 2\n", "line 15 begins with 'CURV', which is not read"),
+    "obj, a name over two lines": (".obj", b"g a \\\nb c\n" + OBJ_BOX, "line 2 begins with 'b', no word of the OBJ"),
     "obj, strips": (".obj", OBJ_BOX + b"f 1 \\\n2 3\nts 1 2 3\n", "line 17 begins with 'ts', no word of the OBJ"),
     "obj, a word cut short": (".obj", OBJ_BOX + b"vq 1 2 3\n", "begins with 'vq', no word of the OBJ format"),
 }
@@ -217,6 +228,9 @@ CASES |= {
         ("pointer", b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n", "git lfs pull"),
         ("UTF-16", OBJ_BOX.decode().encode("utf-16"), "save it in UTF-8"),
         ("compressed", gzip.compress(OBJ_BOX), "let its name end in .gz"),
+        ("compressed by bzip2", bz2.compress(OBJ_BOX), "is packed; unpack it"),
+        ("compressed by LZMA", lzma.compress(OBJ_BOX), "is packed; unpack it"),
+        ("in an archive", archive({"scan.obj": OBJ_BOX}), "begins as a .3mf or other zip file"),
     )
 }
 CASES |= {
@@ -265,6 +279,11 @@ CASES |= {
     "gmsh, quadrilaterals": (".msh", LINEAR, BOX_AREA),
     "gmsh, both": (".msh", gmsh(BOX_VERTICES, BOX_MIXED), BOX_AREA),
     "gmsh, both in the old format": (".msh", gmsh_first(BOX_VERTICES, BOX_MIXED), BOX_AREA),
+    "gmsh, comments, and the old format's first version": (
+        ".msh",
+        b"$Comments\nby hand\n$EndComments\n" + replaced(gmsh_first(BOX_VERTICES, BOX_MIXED), (b"2.2 0 8", b"2 0 8")),
+        BOX_AREA,
+    ),
     "gmsh, both in binary": (".msh", gmsh(BOX_VERTICES, BOX_MIXED, ">"), BOX_AREA),
     "gmsh, curved": (".msh", replaced(LINEAR, (b"2 1 3\n", b"2 1 10\n")), "cells of Gmsh's type 10"),
     "gmsh, a node that is not there": (
@@ -328,6 +347,7 @@ CASES |= {
         ),
         1.25 * BOX_AREA,
     ),
+    "3mf, names of parts in other cases": (".3mf", package_3mf(model(BOX_3MF)).replace(b"main", b"MAIN"), BOX_AREA),
     "3mf, supports": (
         ".3mf",
         package_3mf(
@@ -360,9 +380,34 @@ CASES |= {
     "abaqus": (".inp", b"*Heading", "format Abaqus.*meshio convert scan.inp scan.vtu"),
     "nastran": ("lh.bdf", b"BEGIN BULK", "format Nastran.*meshio convert scan.bdf scan.vtu"),
     "step": (".STEP", b"ISO-10303-21;", "format STEP.*gmsh scan.step -2 -o scan.stl"),
+    "medit in binary": (".meshb", b"\1\0\0\0", "Medit in binary.*meshio convert scan.meshb scan.vtu"),
+    "med": (".med", b"\x89HDF", "format MED.*gmsh scan.med -save -format msh41 -o surface.msh"),
+    "a zip archive": (".obj.zip", archive({"scan.obj": OBJ_BOX}), "format zip.*unzip scan.zip"),
     "a collection": (".vtm", b"<VTKFile/>", r"VTK collection.*read\('scan.vtm'\).combine\(\).extract"),
 }
 
+# What stands before texts, and means nothing; and what Windows calls no number, where it is not used.
+CASES |= {
+    f"{ending}, a byte-order mark": (ending, BOM + content, BOX_AREA)
+    for ending, content in {
+        ".obj": OBJ_BOX,
+        ".off": OFF_BOX,
+        ".vtk": vtk_legacy(BOX_VERTICES, BOX_QUADS),
+        ".mesh": medit(BOX_VERTICES, BOX_QUADS),
+        ".msh": gmsh_first(BOX_VERTICES, BOX_MIXED),
+        ".gltf": box_scene().gltf(),
+    }.items()
+}
+CASES |= {
+    f"{ending}, {spelling} for no number": (ending, re.sub(rb"\b9\.0", spelling.encode(), content), BOX_AREA)
+    for ending, content in {
+        ".obj": OBJ_BOX + b"v 9.0 9.0 9.0\n",
+        ".ply": replaced(ply(BOX_VERTICES, BOX_TRIANGLES, more="q"), (b" 0.5\n", b" 9.0\n")),
+        ".stl": replaced(STL_TEXT, (b"normal 0 0 0", b"normal 9.0 9.0 9.0")),
+        ".vtk": vtk_legacy([*BOX_VERTICES, [9, 9, 9]], BOX_QUADS),
+    }.items()
+    for spelling in ("-nan(ind)", "1.#QNAN", "-1.#IND00")
+}
 # Numbers that Python reads and no format has: with underscores, and digits of other scripts.
 _SPELLED = {
     ".obj": obj(BOX_VERTICES, BOX_TRIANGLES),
@@ -444,7 +489,7 @@ CASES |= {
         re.sub(rb"\b6 7\b", b"6.0 7", _SPELLED[".gii"]),
         "fractions or other",
     ),
-    "obj, an archive": (".obj", package_3mf(model(BOX_3MF)), "begins as a .3mf file; name it so"),
+    "obj, an archive": (".obj", package_3mf(model(BOX_3MF)), "begins as a .3mf or other zip file; name it so"),
 }
 
 
@@ -489,6 +534,23 @@ NOTED: dict[str, tuple[str, bytes, str]] = {
         "2 cells with volume are left out beside 6 faces",
     ),
     "3mf, in inches": (".3mf", package_3mf(model(BOX_3MF, attributes='unit="inch"')), "its unit of length is the inch"),
+    **{
+        f"3mf, a {kind} of {program}": (
+            ".3mf",
+            package_3mf(model(BOX_3MF), **{f"Metadata/{program}.config": setting.encode()}),
+            f"{count} parts that the slicer calls modifiers" * (count > 0),
+        )
+        for program, kind, setting, count in (
+            ("Slic3r_PE_model", "modifier", '<metadata key="volume_type" value="ParameterModifier"/>' * 2, 2),
+            ("model_settings", "negative part", '<part id="1" subtype="negative_part">', 1),
+            ("model_settings", "usual part", '<part id="1" subtype="normal_part">', 0),
+        )
+    },
+    "gltf, two scenes": (
+        ".glb",
+        Gltf([[(BOX_VERTICES, BOX_TRIANGLES, None)]], [{"mesh": 0}, {"mesh": 0}, {}], [0]).glb(),
+        "1 nodes with meshes are outside of the scene that is shown",
+    ),
     "3mf, in millimetres": (".3mf", package_3mf(model(BOX_3MF, attributes="")), ""),
 }
 
