@@ -115,7 +115,7 @@ def yardsticks(
         curves = _curves(b, frequencies, values, target, float(relative.min()), seed)
         for i in np.flatnonzero(distances > errors).tolist():
             for change in changes:
-                (on_progress or str)(f"order {orders[i]:g}, as far {change}")
+                (on_progress or str)(f"order {orders[i]:g}: {change} as far")
                 curve = curves[change]
                 columns[change][i], columns[f"{change}_error"][i] = curve.equivalent(i, distances[i], errors[i])
     return found.assign(labelled(order, columns, {}).data_vars)
