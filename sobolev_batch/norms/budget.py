@@ -28,6 +28,9 @@ _TROUGH_PERIODS = 3.0
 # Two outer ranges of |ξ|, in fractions of xi_max. The energy of a difference is extrapolated from them. Where it is
 # measured beyond xi_max, they are octaves as well.
 _WINDOWS, _OCTAVES = ((0.5, 0.75), (0.75, 1.0)), ((0.25, 0.5), (0.5, 1.0))
+# Least power by which the energy grows below half of its ceiling, and the largest one. On a given lattice nothing but
+# this law tells what lies beyond. With an accuracy, more is measured there.
+_POWERS, _POWERS_IF_GIVEN = (1.0, 4.0), (2.0, 32.0)
 
 _CUBE = np.array(list(product(range(-3, 4), repeat=3)), dtype=np.float64)
 _ODD_ENTRIES = (np.abs(_CUBE) % 2).sum(axis=1)
@@ -101,14 +104,17 @@ def outer_windows(weights: SobolevWeights) -> Reals:
     ).astype(np.float64)
 
 
-def truncated(sums: Sums, weights: SobolevWeights, support: Support, highest: float | None = None) -> Reals:
-    """Bound the squared norm beyond xi_max, or beyond a higher frequency (orders, ...).
+def truncated(
+    sums: Sums, weights: SobolevWeights, support: Support, highest: float | None = None, *, is_given: bool = False
+) -> Reals:
+    """Bound the squared norm beyond xi_max, or beyond a higher frequency (orders, ...), of a lattice chosen or given.
 
     The energy on |ξ| = r grows like r^p until it reaches 2 area(μ) + 2 area(ν), its mean for unrelated
-    surfaces. Between two surfaces closer than the wavelength, p is 2. The energy oscillates with the
-    inverse width of the surfaces; if ξ_max covers few of these periods, the outer ranges may lie in a trough.
+    surfaces. Between two surfaces closer than the wavelength, p is 2, whatever the two ranges show, and more where
+    detail begins. The energy oscillates with the inverse width of the surfaces; if ξ_max covers few of these periods,
+    the outer ranges may lie in a trough.
     """
-    lattice = weights.lattice
+    lattice, (least, most) = weights.lattice, _POWERS_IF_GIVEN if is_given else _POWERS
     inner, outer = sums.outer
     # A lattice of very few samples has none in the outer windows.
     outer = np.where((outer == 0) & (sums.totals > 0).any(axis=0), 2 * support.areas, outer)
@@ -116,9 +122,9 @@ def truncated(sums: Sums, weights: SobolevWeights, support: Support, highest: fl
     middles = [(low + high) / 2 for low, high in _WINDOWS]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         power = np.log(outer / inner) / np.log(middles[1] / middles[0])
-        power = np.clip(np.nan_to_num(power, nan=0.0), 0.0, 4.0)
+        power = np.clip(np.nan_to_num(power, nan=0.0), 0.0, most)
         # Below half the ceiling the energy must still grow, whatever the two windows show.
-        power = np.where(outer < ceiling / 2, np.maximum(power, 1.0), power)
+        power = np.where(outer < ceiling / 2, np.maximum(power, least), power)
         start = 1 + (highest or lattice.xi_max) ** 2
         reached = (middles[1] * lattice.xi_max) * (ceiling / outer) ** (1 / power)
     saturated = np.maximum(1 + np.minimum(np.nan_to_num(reached, nan=0.0), 1e150) ** 2, start)

@@ -218,7 +218,8 @@ def _estimate(weights: SobolevWeights, sums: Reals, fields: Sequence[xr.DataArra
     qualities = [quality for quality in map(quality_of, fields) if quality is not None]
     areas = np.array(sum(quality.area for quality in qualities))
     errors = np.hypot.reduce([quality.probe.norms(weights) for quality in qualities])
-    estimate = estimate_norms(sums_of_shells(sums, weights), weights, Support(areas, _widths(fields)), errors)
+    support = Support(areas, _widths(fields))
+    estimate = estimate_norms(sums_of_shells(sums, weights), weights, support, errors, is_given=True)
     if len(qualities) == len(fields):
         return estimate
     return NormEstimate(estimate.values, *[np.full_like(estimate.values, np.nan)] * 4)

@@ -118,17 +118,24 @@ class Tail:
 
 
 def estimate_norms(
-    sums: Sums, weights: SobolevWeights, support: Support, discretisation: Reals, tail: Tail | None = None
+    sums: Sums,
+    weights: SobolevWeights,
+    support: Support,
+    discretisation: Reals,
+    tail: Tail | None = None,
+    *,
+    is_given: bool = False,
 ) -> NormEstimate:
     """Return norms (orders, ...) from sums over the lattice, and the tail beyond it where octaves measured that.
 
-    The discretisation is the norm of the values' own errors (orders, ...), of a difference that of both together.
+    The discretisation is the norm of the values' own errors (orders, ...), of a difference that of both together. The
+    lattice is chosen for an accuracy, or given.
     """
     squares: Reals = np.maximum(sums.totals, 0.0)
     images = aliased(sums, weights, support.widths)
     if tail is None:
         values = np.sqrt(squares)
-        truncation = np.sqrt(squares + truncated(sums, weights, support)) - values
+        truncation = np.sqrt(squares + truncated(sums, weights, support, is_given=is_given)) - values
         return NormEstimate(values, truncation, change_of_root(squares, images), discretisation)
     squares = np.maximum(squares + tail.totals, 0.0)
     truncation, aliasing, statistical = (

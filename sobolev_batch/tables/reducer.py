@@ -74,6 +74,7 @@ class Reducer:
         known_reference: Row of the study's reference, which the qualities know; None if it has no field.
         tile_bytes: Bytes of fields that a task holds at a time, in all: the rows of a tile, a group of the others,
             and fields as they are read.
+        is_given: True if the lattice was given, and not chosen for an accuracy.
     """
 
     store: Store
@@ -89,6 +90,7 @@ class Reducer:
     qualities: Mapping[int, TailQuality] = field(default_factory=dict)
     known_reference: int | None = None
     tile_bytes: int = 384 << 20
+    is_given: bool = False
 
     @classmethod
     def for_fields(
@@ -122,6 +124,7 @@ class Reducer:
             sampling=choice.tail,
             qualities={row: quality.tail for row, quality in qualities.items() if quality.tail is not None},
             known_reference=known,
+            is_given=not choice.basis,
         )
 
     @property
@@ -286,7 +289,8 @@ class Reducer:
 
     def _estimate(self, sums: Sums, tail: Tail | None, areas: Reals, errors: Reals) -> NormEstimate:
         """Return norms; areas and norms of the fields' own errors are those of both surfaces of a pair together."""
-        return estimate_norms(sums, self.weights, Support(areas, self.widths), errors, tail)
+        support = Support(areas, self.widths)
+        return estimate_norms(sums, self.weights, support, errors, tail, is_given=self.is_given)
 
     def _block_sums(
         self, rows: Sequence[int], others: Sequence[int], number: int, shared: int

@@ -16,6 +16,7 @@ from sobolev_batch.shapes import Sphere, icosphere
 from sobolev_batch.transform.lattice import SobolevWeights
 from sobolev_batch.transform.probe import draw
 from sobolev_batch.transform.spheres import sphere_distance, sphere_inner_product
+from tests.support.rectangles import Rectangles
 from tests.support.shapes import CENTRED_BOX as BOX
 
 ORDERS = (-2.0, -3.0, -5.0, -10.0)
@@ -49,6 +50,35 @@ def test_reported_errors_cover_the_true_ones_and_stay_near_them() -> None:
     every = np.concatenate(ratios)
     assert len(every) > 35
     assert np.median(every) < 10
+
+
+@pytest.mark.parametrize(
+    ("lattice", "radius", "near"),
+    [
+        (Lattice(3.0, 20), 0.5, Sphere(0.5003, (1e-4, 0.0, 0.0))),
+        (Lattice(4.0, 36), 0.8, Sphere(0.8, (1e-3, 0.0, 0.0))),
+        (Lattice(5.4, 24), 0.9, Sphere(0.899, (5e-4, 0.0, 0.0))),
+    ],
+)
+def test_what_lies_between_near_surfaces_grows_beyond_a_given_lattice(
+    lattice: Lattice, radius: float, near: Sphere
+) -> None:
+    orders = (-0.75, -1.0, -1.5, -2.0)
+    found, exact = distance(Sphere(radius), near, orders, lattice=lattice), distance(Sphere(radius), near, orders)
+    # The outer ranges of the lattice show less growth than there is, since the energy oscillates.
+    ratios = found["error"].values / np.abs(found["distance"].values - exact["distance"].values)
+    assert (ratios > 1).all()
+    assert (ratios < 10).all()
+
+
+@pytest.mark.parametrize("xi_max", [5.0, 6.0])
+def test_steep_growth_at_the_end_of_a_given_lattice_goes_on(xi_max: float) -> None:
+    # Half a pitch of 1/8 apart, plates hardly differ below |ξ| = 8.
+    a, b = Rectangles.tapered(12, 1 / 8, 0.3), Rectangles.tapered(12, 1 / 8, 0.3, 0.5)
+    orders = (-1.0, -2.0, -3.0, -5.0)
+    truth = np.sqrt(a.squared_distance(b, orders)[0])
+    found = distance(a.mesh(), b.mesh(), orders, lattice=Lattice(xi_max, 28))
+    assert (np.abs(found["distance"].values - truth) <= found["error"].values).all()
 
 
 def test_closed_forms_lie_within_the_error() -> None:
