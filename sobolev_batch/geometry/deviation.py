@@ -47,6 +47,8 @@ _BATCH, _MOST_PIECES = 1 << 15, 100_000_000
 _MANY, _MANY_OF_EACH = 1 << 17, 2
 # A plane that cuts off less of the sides than these fractions leaves slivers, and the piece is cut in two.
 _LEAST_CUT, _LEAST_SHORTER_CUT, _LARGEST_CUT = 0.05, 0.003, 0.97
+# The distance is steep where the square of its change along a side exceeds the square of the side over this.
+_STEEP = 4.0
 # For so many pieces, the farthest ones, the closest triangle to the worst corner is worth a search.
 _FEW = 300
 
@@ -295,7 +297,7 @@ def _parts(corners: Reals, best: Indices, squares: Reals, other: Triangles, boun
     thin &= (heights.max(axis=0) > least) & (heights.min(axis=0) < -least)
     is_cut = is_beyond.any(axis=0) & ~is_beyond.all(axis=0) & (fair | thin)
     parts = [*_beside_plane(a[:, is_cut], b[:, is_cut], c[:, is_cut], shares[:, is_cut])]
-    parts += _halves(corners[..., ~is_cut])
+    parts += _halves(corners[..., ~is_cut], np.sqrt(squares[:, ~is_cut]), bounds.enough)
     # Beyond a side, the triangle across it is likely to be the closest one; of the farthest pieces a search tells.
     likely, first = other.across[side, best], (-squares.max(axis=0)).argsort()[:_FEW]
     points = corners[worst[first], :, first]
@@ -318,10 +320,17 @@ def _beside_plane(a: Reals, b: Reals, c: Reals, shares: Reals) -> list[Reals]:
     return [np.stack(part) for part in ((a, along_b, along_c), (along_b, b, c), (along_b, c, along_c))]
 
 
-def _halves(corners: Reals) -> list[Reals]:
-    """Return triangles (3, 3, n) cut at the middles of their longest sides: thin ones become less so."""
-    squares = np.stack([dot(side, side) for side in np.roll(corners, -1, axis=0) - corners])
-    first, which = squares.argmax(axis=0), np.arange(corners.shape[2])
+def _halves(corners: Reals, distances: Reals, enough: float) -> list[Reals]:
+    """Return triangles (3, 3, n) cut at the middles of their longest sides: thin ones become less so.
+
+    Within a thin wall the distance changes across thin triangles, and not along them. Where it is steep, and its change
+    is what is too much, the side along which it changes most is cut.
+    """
+    lengths, changes = (np.roll(values, -1, axis=0) - values for values in (corners, distances))
+    squares, changes = np.stack([dot(side, side) for side in lengths]), changes**2
+    is_steep = (_STEEP * changes > squares).any(axis=0)
+    is_steep &= changes.max(axis=0) >= (distances.max(axis=0) - enough) ** 2
+    first, which = np.where(is_steep, changes, squares).argmax(axis=0), np.arange(corners.shape[2])
     a, b, c = (corners[(first + k) % 3, :, which].T for k in range(3))
     middle = (a + b) / 2
     return [np.stack(part) for part in ((a, middle, c), (middle, b, c))]

@@ -18,7 +18,7 @@ from sobolev_batch.geometry.surface import Surface
 APART_FRACTION = 0.01
 # The order below which points have a norm.
 _OF_POINTS = -1.5
-# What layers and folds may add to the norm of faces that move by a rounding.
+# What folds may add to the norm of faces that move by a rounding.
 _FOLDS = 3.0
 # Edge of the cubes that bound norms from below, in units of length: the kernel hardly falls within one.
 _EDGE = 0.25
@@ -58,17 +58,21 @@ def norm_of_moves(areas: Reals, distances: Reals, orders: Sequence[float]) -> Re
     return np.array([np.sqrt(areas * _square_of_moves(distances, -order)).sum() for order in orders])
 
 
-def norm_of_rounding(area: float, distance: float, missing: float, orders: Sequence[float]) -> Reals:
-    """Return what a norm is not likely to change by (orders,) if each of many faces moves by a small distance at most.
+def norm_of_rounding(area: float, distance: float, missing: float, orders: Sequence[float], norms: Reals) -> Reals:
+    """Return what norms (orders,) are not likely to change by if each of many faces moves by a small distance at most.
 
     On the way a test function changes by no more than the distance times its slope, and by the trace theorem a surface
-    has little more of the squares of both than a plane has. So all faces count as one that is flat. Shifts and growth
-    of spheres, boxes and plates took up to 1.1 of that at orders from -4 to -1; the factor 3 is for layers and folds.
-    Area that is missing counts as points; above order -3/2, where points have no norm, moves are far more.
+    has little more of the squares of both than a plane has. So all faces count as one that is flat, and as several
+    where their norm is that of several close layers, which may move alike. Shifts and growth of spheres, boxes and
+    plates took up to 1.1 of that at orders from -4 to -1, and of stacks of plates up to 1.5; the factor 3 is for folds.
+    Area that is missing counts as points. Above order -3/2, where points have no norm, moves are far more, and are
+    those of short waves, in which layers do not move alike.
     """
-    moved = np.array([_FOLDS * (area * _square_of_moves(np.array([distance]), -order)[0]) ** 0.5 for order in orders])
+    powers = -np.array(orders)
+    moved = np.array([_FOLDS * (area * _square_of_moves(np.array([distance]), a)[0]) ** 0.5 for a in powers])
+    layers = np.where(powers <= -_OF_POINTS, 1.0, norms**2 / (area * beta(0.5, powers - 0.5)))
     at_zero = np.array([_kernel(order, np.zeros(1))[0] if order < _OF_POINTS else 0.0 for order in orders])
-    return np.asarray(moved + missing * np.sqrt(at_zero))
+    return np.asarray(moved * np.sqrt(np.maximum(layers, 1.0)) + missing * np.sqrt(at_zero))
 
 
 def _square_of_moves(distances: Reals, a: float) -> Reals:

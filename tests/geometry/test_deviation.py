@@ -12,6 +12,7 @@ from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.geometry import deviation
 from sobolev_batch.geometry.closest import Triangles
 from sobolev_batch.geometry.subdivision import subdivided
+from tests.support.shapes import CENTRED_BOX
 
 
 def distance_from_triangles(points: Reals, mesh: sb.Mesh) -> Reals:
@@ -235,3 +236,13 @@ def test_planes_cut_into_strips_across_each_other_take_few_pieces(pieces: list[i
     assert found.both.upper <= 1.01 * found.both.lower
     # They cross each other half a million times.
     assert sum(pieces) < 2_500_000
+
+
+@pytest.mark.parametrize("is_open", [False, True])
+def test_the_inside_of_a_thin_wall_takes_few_pieces(is_open: bool, pieces: list[int]) -> None:
+    vertices = CENTRED_BOX.vertices * [1, 0.7, 1e-3] @ np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    wall, triangles = sb.Mesh(vertices, CENTRED_BOX.triangles), CENTRED_BOX.triangles
+    changed = sb.Mesh(vertices, triangles[1:]) if is_open else sb.Mesh(1.003 * vertices, triangles)
+    found = sb.largest_deviation(wall, changed).both
+    assert found.upper <= 1.01 * found.lower * (1 + 1e-9)
+    assert sum(pieces) < 10_000

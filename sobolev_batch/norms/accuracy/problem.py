@@ -129,9 +129,9 @@ class Problem:
             return self
         # Moves within a plane show at folds alone.
         distance = max(refinement.distance, _LEAST_MOVE * rounding)
-        moved = norm_of_rounding(fine.area, distance, refinement.missing, self.orders)
-        norm = replace(self, surfaces=self.pair[:1], signs=self.signs[:1])
-        return replace(self, surfaces=(), moved=moved) if np.all(moved <= _ROUNDED * norm.rough_values) else self
+        norms = replace(self, surfaces=self.pair[:1], signs=self.signs[:1]).rough_values
+        moved = norm_of_rounding(fine.area, distance, refinement.missing, self.orders, norms)
+        return replace(self, surfaces=(), moved=moved) if np.all(moved <= _ROUNDED * norms) else self
 
     @classmethod
     def _between(

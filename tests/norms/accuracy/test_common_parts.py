@@ -182,3 +182,13 @@ def test_a_mesh_that_is_cut_finer_and_rounded_is_the_same_up_to_rounding(
     known = float(sb.distance(a, b, order, lattice=sb.Lattice(6.0, 48))["distance"])
     assert 0 < known <= error < 1e-2 * norm
     assert float(found["relative_error"]) == pytest.approx(error / norm, rel=0.1)
+
+
+@pytest.mark.parametrize("order", [-2.0, -4.0])
+def test_plates_that_a_rounding_moves_alike_are_no_farther_apart_than_the_error(order: float) -> None:
+    plates = Rectangles.sheets(60, 2.0**-8, -0.125).mesh()
+    moved = sb.Mesh(plates.vertices + np.array([0, 0, 0.9 * plates.rounding]), plates.triangles)
+    found = sb.distance(moved, plates, order, rtol=1e-2)
+    known = float(sb.distance(moved, plates, order, lattice=sb.Lattice(6.0, 48))["distance"])
+    assert found["distance"] == 0
+    assert 0 < known <= found["error"] < 30 * known
