@@ -35,13 +35,47 @@ class Draw(NamedTuple):
     """Random points on a signed sum of surfaces.
 
     Attributes:
-        points: Float64 (n, 3).
-        weights: Inverse density times the sign of the surface of each point (n,): Σ weights · f is the integral of f
-            over the signed sum, in expectation.
+        points: Float64 (n, 3), or (2, n, 3) for pairs.
+        weights: Inverse density times the sign of the surface of each point (n,) or (2, n): Σ weights · f is the
+            integral of f over the signed sum, in expectation.
     """
 
     points: Reals
     weights: Reals
+
+
+@dataclass(frozen=True, eq=False)
+class Moved:
+    """Two meshes with the same triangles, of opposite signs: a point on one has its counterpart on the other."""
+
+    meshes: Sequence[tuple[Mesh, int]]
+
+    @cached_property
+    def areas(self) -> Reals:
+        """Area of each triangle, of both meshes together (m,)."""
+        return np.asarray(sum(mesh.areas for mesh, _ in self.meshes))
+
+    @property
+    def squared_moves(self) -> Reals:
+        """Largest squared move of a corner of each triangle (m,)."""
+        (one, _), (other, _) = self.meshes
+        return np.asarray(((one.vertices - other.vertices) ** 2).sum(axis=1)[one.triangles].max(axis=1))
+
+    def in_proportion(self, densities: Reals, count: int, rng: np.random.Generator) -> tuple[Draw, Reals, Indices]:
+        """Draw pairs in proportion to densities (m,), most of them, and evenly by area for the others.
+
+        Return also the square of how far each point is from the plane of the other's triangle (2, n), and which
+        triangles these are (n,).
+        """
+        shares = _shares(self.areas, densities)
+        chosen, barycentric = _places(np.cumsum(shares), count, rng)
+        corners = np.stack([mesh.vertices[mesh.triangles[chosen]] for mesh, _ in self.meshes])
+        points = np.einsum("nk,snkd->snd", barycentric, corners)
+        normals = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
+        squares = np.maximum((normals**2).sum(axis=2), np.finfo(np.float64).tiny)
+        heights = np.einsum("nd,snd->sn", points[1] - points[0], normals[::-1]) ** 2 / squares[::-1]
+        weights = np.array([[sign / 2 / count] for _, sign in self.meshes]) * np.sqrt(squares) / shares[chosen]
+        return Draw(points, weights), heights, chosen
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +109,15 @@ class Sheets:
     def cancel(self) -> bool:
         """True where the sum has differences."""
         return len(set(self._signs)) > 1
+
+    @cached_property
+    def moved(self) -> Moved | None:
+        """The two meshes with the same triangles that the sheets are; None if they are others."""
+        if self.spheres or len(self.meshes) != 2 or not self.cancel:
+            return None
+        (one, _), (other, _) = self.meshes
+        is_same = len(one.vertices) == len(other.vertices) and np.array_equal(one.triangles, other.triangles)
+        return Moved(self.meshes) if is_same else None
 
     @property
     def _signs(self) -> list[int]:
@@ -146,7 +189,7 @@ class Sheets:
     def in_proportion(self, densities: Reals, count: int, rng: np.random.Generator) -> Draw:
         """Draw points in proportion to densities (m,), most of them, and evenly by area for the others."""
         areas = np.diff(self._levels, prepend=0.0)
-        shares = areas * (_EVEN_SHARE / areas.sum() + (1 - _EVEN_SHARE) * densities / (areas @ densities))
+        shares = _shares(areas, densities)
         weights = np.divide(areas, count * shares, out=np.zeros_like(areas), where=shares > 0)
         return self._drawn(count, np.cumsum(shares), weights, rng)
 
@@ -155,9 +198,7 @@ class Sheets:
 
         The weights (m,) are those of a point on each of them.
         """
-        places = (np.arange(count) + rng.random(count)) / count * levels[-1]
-        chosen = np.minimum(np.searchsorted(levels, places), len(levels) - 1)
-        first, second = np.sqrt(rng.random((count, 1))), rng.random((count, 1))
+        chosen, barycentric = _places(levels, count, rng)
         directions = rng.normal(size=(count, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         points, signed, start = np.empty((count, 3)), weights[chosen], 0
@@ -168,10 +209,23 @@ class Sheets:
                 points[here] = part.center + part.radius * directions[here]
             else:
                 a, b, c = part.corners(chosen[here] - start)
-                r, t = first[here], second[here]
-                points[here] = (1 - r) * a + r * (1 - t) * b + r * t * c
+                r, s, t = barycentric[here].T[..., None]
+                points[here] = r * a + s * b + t * c
             start += len(areas)
         return Draw(points, signed)
+
+
+def _shares(areas: Reals, densities: Reals) -> Reals:
+    """Return the shares of points in proportion to densities, most of them, and by area alone."""
+    return np.asarray(areas * (_EVEN_SHARE / areas.sum() + (1 - _EVEN_SHARE) * densities / (areas @ densities)))
+
+
+def _places(levels: Reals, count: int, rng: np.random.Generator) -> tuple[Indices, Reals]:
+    """Return a piece for each of equal parts of cumulative shares (m,), and barycentric coordinates (n, 3) there."""
+    places = (np.arange(count) + rng.random(count)) / count * levels[-1]
+    first, second = np.sqrt(rng.random((count, 1))), rng.random((count, 1))
+    chosen = np.minimum(np.searchsorted(levels, places), len(levels) - 1)
+    return chosen, np.concatenate([1 - first, first * (1 - second), first * second], axis=1)
 
 
 def _ordered(mesh: Mesh, spacing: float) -> Mesh:

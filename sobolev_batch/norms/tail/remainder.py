@@ -18,14 +18,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import takewhile
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.geometry.surface import Surface
-from sobolev_batch.norms.tail.close_points import Draw, Sheets
+from sobolev_batch.norms.tail.close_points import Draw, Moved, Sheets
 from sobolev_batch.norms.tail.integrals import quantile
 from sobolev_batch.norms.tail.potentials import (
     Kernels,
@@ -54,6 +55,10 @@ _PER_REACH, _CONTROLS = 2.0, 24
 # the mean over points on scans, a cow, spheres and a square, at all orders. Controls are drawn where that is a larger
 # fraction of the other errors. What they leave was at most 4e-5 for single pairs of a point and a triangle.
 _CUT, _CUT_FRACTION, _CUT_LEFT = 1e-3, 0.3, 2e-5
+# A move of corners is little where the same move of a plane changes its potential by less than this part, in the mean.
+_LITTLE = 0.5
+# Pairs of points of which only heights are computed: for each pair of a draw, at most, and never fewer for each.
+_HEIGHTS, _MOST_HEIGHTS, _FEWEST_HEIGHTS = 1000, 1 << 18, 4
 # Points saw unevenly where the mean square of what they saw exceeds the square of the mean by this factor, and nothing
 # where it is this fraction of what a surface alone has.
 _UNEVEN, _NOTHING = 2.0, 1e-11
@@ -155,10 +160,80 @@ def remainder(
 
 
 def _estimate(seen_by: _Seen, count: int, rng: np.random.Generator, *, is_exact: bool = True) -> Remainder:
-    """Return an estimate from some points; where these saw unevenly, from more of them."""
-    covering, share = seen_by.covering, seen_by.sheets.area / count
+    """Return an estimate from some points."""
+    little = seen_by.moved
+    found = _from_pairs(seen_by, *little, count, rng) if little else _from_points(seen_by, count, rng)
+    terms, covering, n, means = found.terms, seen_by.covering, len(found.terms), found.terms.mean(axis=0)
+    # A single point may stand for others like it that were not met.
+    variances = terms.var(axis=0, ddof=1) / n + (np.abs(terms - means).max(axis=0) / n) ** 2 + found.variances
+    missed = (found.largest * seen_by.alone) ** 2 * float(found.total < covering)
+    variances += missed
+    hidden = float((missed / np.maximum(variances, np.finfo(np.float64).tiny)).max())
+    errors = np.sqrt(variances) * quantile(n - 1)
+    scale = seen_by.sheets.area * seen_by.alone
+    # A move changes what tables leave in proportion to itself, and smooth kernels in proportion to its square.
+    cut, left = _CUT * found.share * scale, _CUT_LEFT * np.sqrt(found.share) * scale
+    if is_exact and np.any(cut > _CUT_FRACTION * errors):
+        corrections, cut = seen_by.corrections(found.draw, found.potentials, rng)
+        means += corrections
+    kernels = seen_by.kernels
+    scales = np.array([tail_integral(kernels.cutoff, order) for order in kernels.orders])
+    energies, errors = (tuple(values.tolist()) for values in (means / scales, (errors + cut + left) / scales))
+    return Remainder(kernels.cutoff, kernels.orders, energies, errors, found.total, found.pairs, covering, hidden)
+
+
+class _Found(NamedTuple):
+    """Points (k, n), where k is 2 for pairs, with their potentials (k, n, orders), and n terms whose mean is wanted.
+
+    Attributes:
+        variances: Variance of the mean that the scatter of the terms does not show (orders,).
+        share: Part of `_Seen.alone` that is there to be seen, in the mean (orders,).
+        largest: Area that one point stands for at most, times that part there (orders,).
+        total: Number of points that were looked at.
+        pairs: Number of pairs of a point and a triangle.
+    """
+
+    draw: Draw
+    potentials: Reals
+    terms: Reals
+    variances: Reals
+    share: Reals
+    largest: Reals
+    total: int
+    pairs: int
+
+
+def _from_pairs(seen_by: _Seen, moved: Moved, shares: Reals, count: int, rng: np.random.Generator) -> _Found:
+    """Return what pairs of points on meshes with the same triangles see, where a plane would have shares (m, orders).
+
+    Near a plane the potential at a height above it is known. It is most of what a pair sees, and its mean over many
+    more pairs takes no time: only how the rest scatters counts.
+    """
+    kernels, share, n = seen_by.kernels, moved.areas @ shares / moved.areas.sum(), (count + 1) // 2
+    densities = (shares / share).sum(axis=1)
+    draw, heights, chosen = moved.in_proportion(densities, n, rng)
+    potentials, pairs = seen_by.potentials(draw.points.reshape(-1, 3))
+    potentials = potentials.reshape(2, n, -1)
+
+    def near_planes(draw: Draw, heights: Reals) -> Reals:
+        drops = kernels.looked_up(kernels.drops, heights)
+        return np.asarray(2 * np.pi * heights.shape[1] * (np.abs(draw.weights)[..., None] * drops).sum(axis=0))
+
+    most = max(min(_HEIGHTS * n, _MOST_HEIGHTS), _FEWEST_HEIGHTS * n)
+    few, many = near_planes(draw, heights), near_planes(*moved.in_proportion(densities, most, rng)[:2])
+    terms, scatter = n * (draw.weights[..., None] * potentials).sum(axis=0), few - few.mean(axis=0)
+    squares = np.maximum((scatter**2).sum(axis=0), np.finfo(np.float64).tiny)
+    slopes = np.clip((scatter * terms).sum(axis=0) / squares, 0.0, 1.0)
+    terms -= slopes * (few - many.mean(axis=0))
+    largest = (np.abs(draw.weights).sum(axis=0)[:, None] * shares[chosen]).max(axis=0)
+    return _Found(draw, potentials, terms, slopes**2 * many.var(axis=0) / most, share, largest, 2 * n, pairs)
+
+
+def _from_points(seen_by: _Seen, count: int, rng: np.random.Generator) -> _Found:
+    """Return the potentials at some points; where these saw unevenly, at more of them."""
+    share = seen_by.sheets.area / count
     sheets = replace(seen_by.sheets, spacing=max(seen_by.squared_reach, share) ** 0.5)
-    draw = sheets.even(min(count, max(covering, _USUAL_POINTS)), rng)
+    draw = sheets.even(min(count, max(seen_by.covering, _USUAL_POINTS)), rng)
     potentials, pairs = seen_by.potentials(draw.points)
     total, seen = len(draw.points), seen_by.shares(potentials)
     if (seen**2).mean() > _UNEVEN * seen.mean() ** 2 and seen.max() > _NOTHING:
@@ -179,23 +254,9 @@ def _estimate(seen_by: _Seen, count: int, rng: np.random.Generator, *, is_exact:
         weights *= np.repeat([total / count, (count - total) / count], [total, count - total])
         draw, potentials = Draw(points, weights), np.concatenate([potentials, found])
         total, pairs = count, pairs + more
-    n = len(draw.points)
-    terms = n * draw.weights[:, None] * potentials
-    means = terms.mean(axis=0)
-    # A single point may stand for others like it that were not met.
-    variances = terms.var(axis=0, ddof=1) / n + (np.abs(terms - means).max(axis=0) / n) ** 2
-    missed = (np.abs(draw.weights).max() * seen_by.alone) ** 2 * float(total < covering)
-    variances += missed
-    hidden = float((missed / np.maximum(variances, np.finfo(np.float64).tiny)).max())
-    errors = np.sqrt(variances) * quantile(n - 1)
-    cut, left = (part * sheets.area * seen_by.alone for part in (_CUT, _CUT_LEFT))
-    if is_exact and np.any(cut > _CUT_FRACTION * errors):
-        corrections, cut = seen_by.corrections(draw, potentials, rng)
-        means += corrections
-    kernels = seen_by.kernels
-    scales = np.array([tail_integral(kernels.cutoff, order) for order in kernels.orders])
-    energies, errors = (tuple(values.tolist()) for values in (means / scales, (errors + cut + left) / scales))
-    return Remainder(kernels.cutoff, kernels.orders, energies, errors, total, pairs, covering, hidden)
+    terms, largest = len(draw.points) * draw.weights[:, None] * potentials, np.abs(draw.weights).max()
+    draw = Draw(draw.points[None], draw.weights[None])
+    return _Found(draw, potentials[None], terms, np.zeros(()), np.ones(()), largest, total, pairs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,6 +282,15 @@ class _Seen:
         """Potential of a plane on itself (orders,): no spot of a smooth surface alone has more."""
         return 2 * np.pi * self.kernels.totals
 
+    @cached_property
+    def moved(self) -> tuple[Moved, Reals] | None:
+        """Meshes of the same triangles that are a little moved, and the parts of `alone` that a plane so far has."""
+        if (moved := self.sheets.moved) is None:
+            return None
+        shares = self.kernels.looked_up(self.kernels.drops, moved.squared_moves) / self.kernels.totals
+        means = moved.areas @ shares / moved.areas.sum()
+        return (moved, shares) if np.all((means > 0) & (means < _LITTLE)) else None
+
     def shares(self, potentials: Reals) -> Reals:
         """Return the size of potentials (n, orders) at the order where it is largest, as parts of `alone` (n,)."""
         return np.asarray((np.abs(potentials) / self.alone).max(axis=1))
@@ -239,11 +309,12 @@ class _Seen:
 
         Some of the points tell. Between surfaces that nearly cancel, what is cut at the reach is much of the rest.
         """
-        n, count = len(draw.points), min(_CONTROLS, len(draw.points))
+        count = min(_CONTROLS, n := draw.weights.shape[1])
         chosen = np.sort(rng.choice(n, count, replace=False))
         finer = _Seen(self.sheets, self.kernels.finer, self.execution)
-        changes = finer.potentials(draw.points[chosen])[0] - potentials[chosen]
-        changes *= n * draw.weights[chosen, None]
+        changes = finer.potentials(draw.points[:, chosen].reshape(-1, 3))[0]
+        changes = changes.reshape(-1, count, changes.shape[1]) - potentials[:, chosen]
+        changes = n * (draw.weights[:, chosen, None] * changes).sum(axis=0)
         return changes.mean(axis=0), changes.std(axis=0, ddof=1) / np.sqrt(count) * quantile(count - 1)
 
     def affordable(self, rng: np.random.Generator) -> int:

@@ -91,3 +91,27 @@ def test_between_the_orders_of_a_study_energies_are_interpolated() -> None:
         (value,), (error,) = usual.at([order])
         (other,), (other_error,) = remainder(pair, [1, -1], 60.0, [order], points=1000).at([order])
         assert abs(value - other) < 0.03 * other + 0.1 * (error + other_error)
+
+
+@pytest.mark.parametrize("size", [1e-6, 1e-3])
+def test_few_points_tell_apart_meshes_that_moved_a_little(size: float) -> None:
+    rng = np.random.default_rng(3)
+    moved = Mesh(BOX.vertices + size * rng.normal(size=BOX.vertices.shape), BOX.triangles)
+    # In another order of triangles, points have no counterparts.
+    many = remainder([Mesh(BOX.vertices, BOX.triangles[::-1]), moved], [1, -1], 20.0, (-1.0,), points=20_000)
+    for seed in range(10):
+        few = remainder([BOX, moved], [1, -1], 20.0, (-1.0,), points=200, seed=seed)
+        assert few.errors[0] < 0.1 * few.energies[0]
+        assert abs(few.energies[0] - many.energies[0]) < few.errors[0] + many.errors[0]
+
+
+def test_a_far_move_among_small_ones_is_seen_by_few_points() -> None:
+    sheets = Rectangles.sheets(400, 0.01, 0.0, (0.05, 0.05))
+    offsets = 1e-7 * np.random.default_rng(4).normal(size=(400, 3))
+    offsets[77] += 2e-3
+    surfaces = [sheets.mesh(), Rectangles(sheets.low + offsets, sheets.high + offsets).mesh()]
+    many = remainder(surfaces, [1, -1], 60.0, (-1.0, -2.0), points=4000)
+    for seed in range(10):
+        few = remainder(surfaces, [1, -1], 60.0, (-1.0, -2.0), points=40, seed=seed)
+        assert np.all(np.abs(np.subtract(few.energies, many.energies)) < few.errors)
+        assert np.all(np.less(few.errors, many.energies))
