@@ -53,16 +53,6 @@ def subdivided(mesh: Mesh) -> Mesh:
     return edges.split(np.ones(len(edges.ends), dtype=bool))
 
 
-def evenly_divided(mesh: Mesh, most: int) -> Mesh:
-    """Return the mesh with its longest edges split at their middles, and again, up to most triangles."""
-    edges = Edges.from_mesh(mesh)
-    while True:
-        longest = edges.lengths >= edges.lengths.max() / 2
-        if len(edges.sides) + np.count_nonzero(longest[edges.sides]) > most:
-            return edges.mesh
-        edges = Edges.from_mesh(edges.split(longest))
-
-
 @dataclass(frozen=True, eq=False)
 class Edges:
     """The edges of a mesh.

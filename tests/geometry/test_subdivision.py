@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import sobolev_batch as sb
-from sobolev_batch.geometry.subdivision import Edges, evenly_divided
+from sobolev_batch.geometry.subdivision import Edges
 from tests.support.shapes import CLOSED
 
 
@@ -59,15 +59,6 @@ def test_the_best_triangles_are_as_many_as_fit(wanted: int) -> None:
     longest = edges.lengths[edges.sides].argmax(axis=1)
     touched = marks[edges.sides].any(axis=1)
     assert marks[edges.sides[np.arange(len(longest)), longest]][touched].all()
-
-
-def test_long_edges_are_divided_first() -> None:
-    strip = sb.Mesh([[0, 0, 0], [100, 0, 0], [100, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
-    fine = evenly_divided(strip, 2_000)
-    assert 500 < len(fine.triangles) <= 2_000
-    assert Edges.from_mesh(fine).lengths.max() < 2
-    assert fine.area == pytest.approx(100)
-    assert evenly_divided(strip, 2) is strip
 
 
 def test_triangles_do_not_become_ever_thinner() -> None:

@@ -39,7 +39,7 @@ from sobolev_batch.extras.figures.style import (
 )
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.proximity import point_distances
-from sobolev_batch.geometry.subdivision import evenly_divided, subdivided
+from sobolev_batch.geometry.subdivision import subdivided
 from sobolev_batch.geometry.surface import normals
 from sobolev_batch.norms.causes import witness
 from sobolev_batch.sources.names import file_stem
@@ -283,13 +283,11 @@ def distance_view(
 ) -> MeshView:
     """Return a view of a mesh with distances from another one, in a unit which is this scale in that of both.
 
-    Triangles are divided up to enough of them, by default four times the most that a mesh keeps, so that no color of a
-    spot is drawn along a thin one. Signed distances are positive outside of the other mesh and negative inside.
+    Triangles are divided up to enough of them, by default four times the most that a mesh keeps. Signed distances are
+    positive outside of the other mesh and negative inside.
     """
     # All vertices of a simplified mesh may lie on the other one: what lies between them counts, too.
-    shown = mesh if len(mesh.triangles) > most else evenly_divided(mesh, enough or 4 * most)
-    view = _shown(label, shown, most if shown is mesh else len(shown.triangles), 0)
-    view = replace(view, original_triangles=len(mesh.triangles))
+    view = _shown(label, mesh, most, 4 * most if enough is None else enough)
     if len(view.triangles) >= len(mesh.triangles):
         distances = point_distances(view.vertices, other, signed=signed)
     else:
