@@ -214,12 +214,12 @@ def test_the_status_is_that_of_the_run(changeable: Path) -> None:
     assert f"unlock {changeable}" in str(lost)
 
 
-def test_a_second_run_computes_what_is_new(store: Path, threads: Client) -> None:
-    summary = sb.run(study_of(balls(a=1.0, b=1.1, c=1.2)), store, threads)
+def test_a_second_run_computes_what_is_new(changeable: Path, threads: Client) -> None:
+    summary = sb.run(study_of(balls(a=1.0, b=1.1, c=1.2)), changeable, threads)
     assert set(summary.computed) == {f"c/{label}" for label in LABELS}
     assert summary.failed == {}
     with pytest.raises(sb.errors.StoreError, match="it holds the store of another study, 'small', not 'other'"):
-        sb.run(study_of(balls(a=1.0), "other"), store, threads)
+        sb.run(study_of(balls(a=1.0), "other"), changeable, threads)
 
 
 @pytest.mark.extras
