@@ -49,7 +49,7 @@ _MANY, _MANY_OF_EACH = 1 << 17, 2
 _LEAST_CUT, _LEAST_SHORTER_CUT, _LARGEST_CUT = 0.05, 0.003, 0.97
 # The distance is steep where the square of its change along a side exceeds the square of the side over this.
 _STEEP = 4.0
-# For so many pieces, the farthest ones, the closest triangle to the worst corner is worth a search.
+# For so many pieces, those with the farthest centers, the closest triangle to the worst corner is worth a search.
 _FEW = 300
 
 
@@ -259,18 +259,23 @@ def _cut(pieces: _Pieces, other: Triangles, bounds: _Bounds) -> _Pieces | None:
         centers = corners[..., left].mean(axis=0)
         distances, closest = other.closest(other.scale * centers.T)
         bounds.see(centers, distances / other.scale)
+        depths = np.zeros(count)
+        depths[left] = distances
         left = look(closest)
     if bounds.is_over:
         left = left[:0]
     bounds.upper = max(bounds.upper, math.sqrt(np.delete(upper, left).max(initial=0.0)))
     if not len(left):
         return None
-    return _parts(corners[..., left], best[left], squares[:, left], other, bounds)
+    farthest = (-depths[left]).argsort()[:_FEW]
+    return _parts(corners[..., left], best[left], np.sqrt(squares[:, left]), farthest, other, bounds)
 
 
-def _parts(corners: Reals, best: Indices, squares: Reals, other: Triangles, bounds: _Bounds) -> _Pieces:
-    """Cut pieces: along the plane through a side of the best triangle of each, or in two."""
-    pieces, worst = np.arange(len(best)), squares.argmax(axis=0)
+def _parts(
+    corners: Reals, best: Indices, distances: Reals, farthest: Indices, other: Triangles, bounds: _Bounds
+) -> _Pieces:
+    """Cut pieces, of corners at distances (3, n): along the plane through a side of the best triangle, or in two."""
+    pieces, worst = np.arange(len(best)), distances.argmax(axis=0)
     # How far each corner lies beyond each side, in lengths of the direction outward.
     starts, outward = (np.stack([each[:, best] for each in sides]) for sides in (other.corners, other.outward))
     lengths = np.sqrt(np.einsum("kin,kin->kn", outward, outward))
@@ -297,12 +302,11 @@ def _parts(corners: Reals, best: Indices, squares: Reals, other: Triangles, boun
     thin &= (heights.max(axis=0) > least) & (heights.min(axis=0) < -least)
     is_cut = is_beyond.any(axis=0) & ~is_beyond.all(axis=0) & (fair | thin)
     parts = [*_beside_plane(a[:, is_cut], b[:, is_cut], c[:, is_cut], shares[:, is_cut])]
-    parts += _halves(corners[..., ~is_cut], np.sqrt(squares[:, ~is_cut]), bounds.enough)
+    parts += _halves(corners[..., ~is_cut], distances[:, ~is_cut], bounds.enough)
     # Beyond a side, the triangle across it is likely to be the closest one; of the farthest pieces a search tells.
-    likely, first = other.across[side, best], (-squares.max(axis=0)).argsort()[:_FEW]
-    points = corners[worst[first], :, first]
-    distances, likely[first] = other.closest(other.scale * points)
-    bounds.see(points.T, distances / other.scale)
+    likely, points = other.across[side, best], corners[worst[farthest], :, farthest]
+    depths, likely[farthest] = other.closest(other.scale * points)
+    bounds.see(points.T, depths / other.scale)
     near, far = np.stack([best, best]), np.stack([likely, best])
     is_lone = is_beyond[lone, pieces]
     alone, beside = np.where(is_lone, far, near)[:, is_cut], np.where(is_lone, near, far)[:, is_cut]
