@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import resource
+import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -79,8 +80,11 @@ print(float(tree["convergence"]["relative"].sel(mesh="ico/3", order=-10.0)))
 def full_disk(most_bytes: int | None = None) -> Iterator[Callable[[int], None]]:
     """Let this process write no larger files, from now on or once the yielded function is called with a size."""
     before, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+    writes_no_bytecode = sys.dont_write_bytecode
 
     def fill(size_bytes: int) -> None:
+        # Python cuts a compiled module off at the limit and keeps it, so that every later import of it would fail.
+        sys.dont_write_bytecode = writes_no_bytecode or size_bytes != before
         # Python ignores the signal, so that writing fails.
         resource.setrlimit(resource.RLIMIT_FSIZE, (size_bytes, most))
 
