@@ -18,12 +18,13 @@ from sobolev_batch.cli.output import CLEAR_LINE
 SECONDS_TO_END = 1.0
 # Work that ends with what it has leaves out up to three steps, each when it is asked again.
 _SECONDS_TO_LEAVE_OUT = 0.5
+_SECONDS_TO_LEAVE_A_FINALIZER = 0.02
 
 
 class Deadline:
     """The end of this process soon after a request to end, even while it computes.
 
-    Python raises no exception until a library returns to it, and loses one in a finalizer. A thread of its own hears
+    Python raises no exception until a library returns to it. A thread of its own hears
     of signals at once. It leaves the command some seconds to clean up, and then ends the process: files and stores are
     only ever replaced as a whole. The remark is added to the last message. The request is the number of the signal that
     requests the end, and 0 before.
@@ -61,8 +62,18 @@ class Deadline:
             Deadline._current = self
             requests, wake = os.pipe()
             os.set_blocking(wake, False)
+            sys.unraisablehook = self._raise_again
             signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
             threading.Thread(target=self._listen, args=(requests,), name="sobolev-batch-deadline", daemon=True).start()
+
+    def _raise_again(self, lost: sys.UnraisableHookArgs) -> None:
+        """Raise the exception of a request again that came to a finalizer, where Python ignores all exceptions."""
+        if lost.exc_type not in (KeyboardInterrupt, SystemExit):
+            sys.__unraisablehook__(lost)
+            return
+        number = signal.SIGINT if lost.exc_type is KeyboardInterrupt else signal.SIGTERM
+        again = (threading.main_thread().ident or 0, number)
+        threading.Timer(_SECONDS_TO_LEAVE_A_FINALIZER, signal.pthread_kill, again).start()
 
     def _listen(self, requests: int) -> None:
         number = 0

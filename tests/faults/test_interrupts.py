@@ -119,15 +119,36 @@ def keeping():
                 parts.append(part)
     click.echo(f"written: {parts}")
 
+class Heavy:
+    def __del__(self):
+        click.echo("here", err=True)
+        line.signal.pause()
+
+@line.cli.command()
+def forgetting():
+    # A finalizer, where Python ignores every exception.
+    heavy = Heavy()
+    del heavy
+    line.signal.pause()
+
 sys.argv[1:] = ["%s"]
 line.main()
 """
-COMPUTING, KEEPING = WORKING % "computing", WORKING % "keeping"
+COMPUTING, KEEPING, FORGETTING = (WORKING % command for command in ("computing", "keeping", "forgetting"))
 
 
-@pytest.mark.all
-@pytest.mark.parametrize("script", [IMPORTING, COMPUTING, KEEPING], ids=["importing", "computing", "keeping"])
-@pytest.mark.parametrize("number", WORDS)
+@pytest.mark.parametrize(
+    ("number", "script"),
+    [
+        (signal.SIGINT, FORGETTING),
+        pytest.param(signal.SIGTERM, FORGETTING, marks=pytest.mark.all),
+        *(
+            pytest.param(number, script, marks=pytest.mark.all)
+            for number in WORDS
+            for script in (IMPORTING, COMPUTING, KEEPING)
+        ),
+    ],
+)
 def test_a_command_ends_while_it_starts_and_computes_and_with_what_it_has(script: str, number: int) -> None:
     with started(script=script) as process:
         assert read_until(process, "here")
@@ -138,4 +159,4 @@ def test_a_command_ends_while_it_starts_and_computes_and_with_what_it_has(script
         assert (process.returncode, output) == (0, "written: [0, 1, 2]\n"), rest
     else:
         word = "interrupted before anything began" if script == IMPORTING else WORDS[number]
-        assert (process.returncode, rest) == (128 + number, f"{word}\n")
+        assert (process.returncode, rest.strip()) == (128 + number, word)
