@@ -24,8 +24,10 @@ _TRIANGLES, _FEWEST = "triangles", 4
 # within 0.2 to 5 % of the radius, and within 1 % of the norm at order -2, took 2 to 20 in the end, and 10 in the mean.
 _FIRST = 10.0
 # Decimation works best at this size: five meshes of this radius kept 1.5 to 5 times fewer triangles than those of 1 or
-# less within the same fraction of their radius, and those of 3,000 did not come below some number of triangles.
-_RADIUS = 100.0
+# less within the same fraction of their radius, and those of 3,000 did not come below some number of triangles. And
+# open borders move early if they may: half of the triangles of an open cow were off by 2.3 % of the radius, and by
+# 0.09 % with its border kept.
+_DECIMATION = {"radius": 100.0, "keep_boundary": True}
 # Stands for the mesh of a source until that is given.
 _ANY_MESH = {"source": "icosphere", "levels": [0]}
 
@@ -80,7 +82,7 @@ class Remesher:
         elif PLACEHOLDER.search(method):
             table = {"source": "command", "command": shlex.split(method)}
         if table.get("source") == "decimate":
-            table = {"radius": _RADIUS, **table}
+            table = {**_DECIMATION, **table}
         parameter, ends = searched_parameter(search)
         kind = source_type_of(table.get("source"))
         if parameter in table:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -36,13 +37,16 @@ _DISPLACING_BYTES, _CARRYING_BYTES = 400, 200
 Fractions = Several[Annotated[float, Field(gt=0, allow_inf_nan=False)]]
 
 
-def decimated(mesh: Mesh, triangles: int) -> Mesh:
-    """Return a mesh with its edges collapsed down to a number of triangles."""
+def decimated(mesh: Mesh, triangles: int, keep_boundary: bool = False) -> Mesh:
+    """Return a mesh with its edges collapsed down to a number of triangles, but for those at an open border if kept."""
     with from_extra("studies", "decimation needs", MeshError):
         import fast_simplification
 
     vertices, faces = fast_simplification.simplify(
-        np.array(mesh.vertices), np.array(mesh.triangles, dtype=np.int32), target_count=triangles
+        np.array(mesh.vertices),
+        np.array(mesh.triangles, dtype=np.int32),
+        target_count=triangles,
+        preserve_border=keep_boundary,
     )
     return Mesh(vertices, faces)
 
@@ -65,32 +69,37 @@ def remeshed(mesh: Mesh, triangles: int) -> Mesh:
     return Mesh(np.asarray(result.points), np.asarray(result.regular_faces))
 
 
-class DecimateSource(NestedSource):
-    """Simplifications of one mesh by quadric edge collapse.
+class _ReducingSource(NestedSource):
+    """Meshes of one mesh, down to numbers of triangles, by a library.
 
-    M. Garland, P. S. Heckbert, "Surface simplification using quadric error metrics" (1997),
-    doi:10.1145/258734.258849; by the library fast-simplification. The library has thresholds that are lengths, so what
-    it makes depends on the unit. With a ``radius``, meshes are scaled for it until their bounding sphere has this one.
+    The libraries have thresholds that are lengths, so what they make depends on the unit. With a ``radius``, meshes are
+    scaled for them until their bounding sphere has this one.
     """
 
     triangles: Several[Annotated[int, Field(ge=4, le=_MOST_TRIANGLES)]]
     radius: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
 
-    kind: ClassVar[str] = "decimate"
-    library: ClassVar[str] = "fast-simplification"
+    kind: ClassVar[str]
+    library: ClassVar[str]
     # What the library does to a mesh, down to a number of triangles.
-    reduce: ClassVar[Callable[[Mesh, int], Mesh]] = staticmethod(decimated)
+    reduce: ClassVar[Callable[..., Mesh]]
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """What else the library is told."""
+        return {}
 
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member per triangle count, coarse to fine."""
         original = single_member(self.mesh, folder)
+        reduce = partial(type(self).reduce, **self.options)
         return tuple(
             MadeMember(
                 str(count),
                 rank,
                 _reduced,
-                {"triangles": count} | ({} if self.radius is None else {"radius": self.radius}),
-                (type(self).reduce, count, self.radius),
+                {"triangles": count, **self.options} | ({} if self.radius is None else {"radius": self.radius}),
+                (reduce, count, self.radius),
                 originals={self.kind: original},
                 libraries=(self.library,),
                 triangles=count,
@@ -98,6 +107,24 @@ class DecimateSource(NestedSource):
             )
             for rank, count in enumerate(sorted(set(self.triangles)))
         )
+
+
+class DecimateSource(_ReducingSource):
+    """Simplifications of one mesh by quadric edge collapse, which keep the vertices of open borders if asked to.
+
+    M. Garland, P. S. Heckbert, "Surface simplification using quadric error metrics" (1997),
+    doi:10.1145/258734.258849; by the library fast-simplification.
+    """
+
+    keep_boundary: bool = False
+
+    kind, library = "decimate", "fast-simplification"
+    reduce: ClassVar[Callable[..., Mesh]] = staticmethod(decimated)
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Whether open borders are kept, if so."""
+        return {"keep_boundary": True} if self.keep_boundary else {}
 
 
 def _reduced(mesh: Mesh, reduce: Callable[[Mesh, int], Mesh], triangles: int, radius: float | None) -> Mesh:
@@ -112,8 +139,8 @@ def _reduced(mesh: Mesh, reduce: Callable[[Mesh, int], Mesh], triangles: int, ra
     return Mesh(found.vertices * (own / radius) + center, found.triangles)
 
 
-class RemeshSource(DecimateSource):
-    """Even remeshings of one mesh, by clustering its vertices into cells of similar area; keys as for `decimate`.
+class RemeshSource(_ReducingSource):
+    """Even remeshings of one mesh, by clustering its vertices into cells of similar area.
 
     A closed mesh comes out within a few triangles of the counts. S. Valette, J.-M. Chassery, "Approximated
     centroidal Voronoi diagrams for uniform polygonal mesh coarsening" (2004),
@@ -121,7 +148,7 @@ class RemeshSource(DecimateSource):
     """
 
     kind, library = "remesh", "pyacvd"
-    reduce: ClassVar[Callable[[Mesh, int], Mesh]] = staticmethod(remeshed)
+    reduce: ClassVar[Callable[..., Mesh]] = staticmethod(remeshed)
 
     @property
     def libraries(self) -> tuple[str, ...]:

@@ -105,6 +105,15 @@ def test_the_mesh_holds_and_the_next_smaller_one_does_not(tmp_path: Path) -> Non
     assert len(found.trials) <= 8
 
 
+def test_a_scan_with_an_open_border_gets_smaller() -> None:
+    whole = lumpy(3)
+    scan = sb.Mesh(whole.vertices, whole.triangles[whole.vertices[whole.triangles][:, :, 0].max(axis=1) < 0.3])
+    # The border moves early if it may.
+    found = found_by(scan, within=0.03)
+    assert rows(found)[0] < len(scan.triangles) / 2
+    assert rows(found_by(scan, within=0.03, method={"source": "decimate", "keep_boundary": False}))[0] > rows(found)[0]
+
+
 @pytest.mark.slow
 def test_a_fraction_of_the_norm_does_not_depend_on_the_unit(tmp_path: Path) -> None:
     found = sb.reduce({"mm": lumpy(), "m": lumpy(scale=1e-3)}, "2%", order=-4, workers=1)

@@ -142,6 +142,24 @@ def test_decimation_at_a_radius_does_not_depend_on_the_unit(tmp_path: Path) -> N
     assert at_radius.fingerprint() == {**without.fingerprint(), "radius": 100.0}
 
 
+def test_decimation_keeps_open_borders_if_asked_to(tmp_path: Path) -> None:
+    ball = icosphere(3)
+    is_low = ball.vertices[ball.triangles][:, :, 2].max(axis=1) < 0.3
+    sb.write_mesh(Mesh(ball.vertices, ball.triangles[is_low]), tmp_path / "bowl.ply")
+    table = {
+        "source": "decimate",
+        "mesh": {"source": "files", "paths": [str(tmp_path / "bowl.ply")]},
+        "triangles": [99],
+    }
+    (moved,), (kept,) = members(table), members({**table, "keep_boundary": True})
+    shared = {tuple(vertex) for vertex in ball.vertices[np.unique(ball.triangles[~is_low])].tolist()}
+    border = shared & {tuple(vertex) for vertex in ball.vertices[np.unique(ball.triangles[is_low])].tolist()}
+    assert len(border) > 20
+    assert border <= {tuple(vertex) for vertex in loaded(kept).vertices.tolist()}
+    assert not border <= {tuple(vertex) for vertex in loaded(moved).vertices.tolist()}
+    assert kept.fingerprint() == {**moved.fingerprint(), "keep_boundary": True}
+
+
 def test_remeshed_surfaces_are_even_and_have_about_the_counts_asked_for() -> None:
     found = members({"source": "remesh", "mesh": BALL, "triangles": [320, 80, 80]})
     assert listed(found) == [("80", 0), ("320", 1)]

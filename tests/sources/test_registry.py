@@ -114,7 +114,7 @@ BAD: list[tuple[str, dict[str, Any], dict[str, list[Any]]]] = [
         {"paths": ["a.ply"]},
         {"paths": [[], "a.ply"], "paths.0": [[""]], "distribution": [7], "path": ["a.ply"]},
     ),
-    ("decimate", COUNTS, {**NO_COUNTS, "radius": [0.0, "1", True]}),
+    ("decimate", COUNTS, {**NO_COUNTS, "radius": [0.0, "1", True], "keep_boundary": [1, "yes"]}),
     ("remesh", COUNTS, NO_COUNTS),
     ("spherical-levels", {"mesh": BALL, "sphere": BALL, "levels": [1]}, {"sphere": [None, "a.ply"], **NO_LEVELS}),
     (
