@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,7 +19,7 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 
 from sobolev_batch.arrays import Reals
-from sobolev_batch.errors import InputError, written
+from sobolev_batch.errors import InputError, write_file, written
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.tables.text import middle_cut
 from sobolev_batch.visible import visible
@@ -209,10 +210,12 @@ def write_figures(
         for stem, figure in figures.items():
             for style in formats:
                 dpi = _SCREEN_DPI if style == "png" and size is None else _PAPER_DPI
-                paths.append(folder / f"{stem}.{style}")
+                picture = BytesIO()
                 with drawing(size), mpl.rc_context(_SAVING), warnings.catch_warnings():
                     warnings.filterwarnings("ignore", message="Glyph .* missing from")
-                    figure.savefig(paths[-1], dpi=dpi, metadata=_METADATA.get(style))
+                    figure.savefig(picture, format=style, dpi=dpi, metadata=_METADATA.get(style))
+                paths.append(folder / f"{stem}.{style}")
+                write_file(paths[-1], picture.getbuffer(), "the picture")
     return tuple(paths)
 
 

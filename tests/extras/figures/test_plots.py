@@ -24,6 +24,7 @@ from sobolev_batch.extras.figures.selection import Selection
 from sobolev_batch.extras.figures.style import Plot, drawing, notes_of, parse_size, set_log_scale, style_of
 from tests.support.commands import finished
 from tests.support.made_tree import root_attributes
+from tests.support.stores import full_disk
 from tests.support.trees import distances_of, tree_of
 
 
@@ -162,6 +163,10 @@ def test_the_size_is_that_of_a_panel_and_refused_places_are_named(tree: xr.DataT
     assert struct.unpack(">II", path.read_bytes()[16:24]) == (900, 1200)
     with pytest.raises(sb.errors.StoreError, match="pictures cannot be written there"):
         write_plots(Selection.from_store(tree), path)
+    before = path.read_bytes()
+    with full_disk(1000), pytest.raises(sb.errors.StoreError, match="the picture cannot be written there"):
+        write_plots(Selection.from_store(tree), path.parent)
+    assert path.read_bytes() == before
     for text in ("8.4x6cm", "84x60mm", "84 × 60 mm"):
         assert parse_size(text) == pytest.approx((8.4 / 2.54, 6 / 2.54))
     for text in ("6", "6x", "6x4m", "axb", "1.2.3x4", "100x100", "0x4", "5x5mm"):
