@@ -130,6 +130,18 @@ def duration(seconds: float, digits: int = 3) -> str:
     return f"{rounded:g} {unit}"
 
 
+def place_text(place: Sequence[float], length: float) -> str:
+    """Return a point with six digits of its largest coordinate, or up to twelve that show a tenth of a length.
+
+    >>> place_text((60.0, -1e-17, 10.25), 0.3), place_text((512345.678, 4651310.123, 0.0), 0.97)
+    ('(60, 0, 10.25)', '(512345.68, 4651310.12, 0)')
+    """
+    largest = _magnitude(max(*map(abs, place), length))
+    decimals = max(5 - largest, min(1 - _magnitude(length), 11 - largest))
+    # The sum turns a negative zero into zero.
+    return f"({', '.join(f'{round(x, decimals) + 0.0:.15g}' for x in place)})"
+
+
 def minus(text: str) -> str:
     """Return numbers with minus signs as wide as a digit."""
     return text.replace("-", "−")

@@ -21,6 +21,7 @@ from sobolev_batch.norms.budget import Support
 from sobolev_batch.norms.causes import witness
 from sobolev_batch.norms.fields import fourier_transform
 from sobolev_batch.plugins import FEATURES, extra
+from sobolev_batch.tables.text import place_text
 
 _PICTURES = (".png", ".svg", ".pdf")
 _PURPOSE = "a picture of meshes"
@@ -171,7 +172,7 @@ def write_difference(
         write_file(file, one.to_ply(), "the witness")
     greatest, place = max((one.largest for one in found.values()), key=lambda largest: abs(largest[0]))
     kind = "more" if greatest > 0 else "less"
-    near = f"{names[0]} has {kind} area near ({', '.join(f'{x:.4g}' for x in place)})"
+    near = f"{names[0]} has {kind} area near {place_text(place.tolist(), _ACCURACY / similarity.scale)}"
     return f"{near if greatest else 'they differ nowhere'}; witness: {' '.join(map(str, files))}"
 
 

@@ -10,12 +10,10 @@ from sobolev_batch.geometry.deviation import Deviation, Deviations, largest_devi
 from sobolev_batch.geometry.formats.conversion import MeshLike
 from sobolev_batch.geometry.proximity import share_beyond
 from sobolev_batch.parameters import length_in
-from sobolev_batch.tables.text import between, percent
+from sobolev_batch.tables.text import between, percent, place_text
 
 # Digits of bounds and of the length, at least.
 _DIGITS, _LENGTH_DIGITS = 4, 6
-# Digits of places: of their largest coordinate, or of the deviation where that is larger.
-_PLACE_DIGITS = 6
 # Fraction of the largest coordinate below which a deviation is rounding.
 _ROUNDING = 1e-14
 # A longer upper bound, in lower ones, was left where it was when the answer was clear, and would mislead.
@@ -111,11 +109,7 @@ def assert_within(a: MeshLike, b: MeshLike, length: float | str, *, unit: str | 
 
 def deviation_text(deviation: Deviation, unit: str | None, digits: int = _DIGITS) -> str:
     """Return the bounds of a deviation with their unit, the upper one where it is known, and the place."""
-    # What rounding makes of zero is small against the deviation.
     largest = max(*map(abs, deviation.place), deviation.lower)
-    decimals = _PLACE_DIGITS - 1 - math.floor(math.log10(largest)) if largest else 0
-    # The sum turns a negative zero into zero.
-    place = ", ".join(f"{round(x, decimals) + 0.0:.{_PLACE_DIGITS}g}" for x in deviation.place)
     # Coordinates have no digits for less.
     bounds = (0.0, 0.0) if deviation.upper <= _ROUNDING * largest else (deviation.lower, deviation.upper)
-    return f"{between(*bounds, f' {unit}' if unit else '', digits)}, at ({place})"
+    return f"{between(*bounds, f' {unit}' if unit else '', digits)}, at {place_text(deviation.place, deviation.lower)}"
