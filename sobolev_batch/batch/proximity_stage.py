@@ -21,7 +21,14 @@ from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, d
 from sobolev_batch.batch.field_costs import MESH_BYTES
 from sobolev_batch.errors import InputError, MeshError, StoreError, one_line
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.geometry.proximity import LENGTHS, NUMBERS, POINT_BYTES, TRIANGLE_BYTES, WORKING_BYTES, proximity
+from sobolev_batch.geometry.proximity import (
+    LENGTHS,
+    NUMBERS,
+    POINT_BYTES,
+    TRIANGLE_BYTES,
+    WORKING_BYTES,
+    proximity_and_deviations,
+)
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms.columns import describe
 from sobolev_batch.store.layout import Store, table_attributes, write_table
@@ -34,7 +41,9 @@ from sobolev_batch.tables.mesh_table import table_order
 _log = logging.getLogger(__name__)
 
 # Raise it whenever the distances come out differently: they are then measured again.
-_VERSION = 5
+_VERSION = 6
+# What a search has proved up to rounding still holds in the unit of the files.
+_BELOW = 1 - 1e-9
 _GROUP = "proximity"
 
 
@@ -110,7 +119,11 @@ def measure_proximity(
     started = time.perf_counter()
     try:
         limit = None if threshold is None else threshold * similarity.scale
-        found = proximity(*(_load(*mesh, similarity) for mesh in pair), points=points, threshold=limit)
+        meshes = (_load(*mesh, similarity) for mesh in pair)
+        # The bounds of a mesh that was searched are to prove what the search has proved.
+        tolerance = dict(pair[0][0].member.metadata).get("target_tolerance")
+        within = _BELOW * tolerance * similarity.scale if isinstance(tolerance, float) else None
+        found, _ = proximity_and_deviations(*meshes, points=points, threshold=limit, within=within)
         lengths = {name: found[name] / similarity.scale for name in LENGTHS}
         measured = ProximityRecord(key, "", {**found, **lengths})
     except StoreError:

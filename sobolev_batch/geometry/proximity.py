@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from sobolev_batch.arrays import Indices, Reals
@@ -105,9 +107,18 @@ def proximity(
 
 
 def proximity_and_deviations(
-    a: MeshLike, b: MeshLike, *, points: int = DEFAULT_POINTS, threshold: float | None = None, seed: int = 0
+    a: MeshLike,
+    b: MeshLike,
+    *,
+    points: int = DEFAULT_POINTS,
+    threshold: float | None = None,
+    seed: int = 0,
+    within: float | None = None,
 ) -> tuple[dict[str, float], Deviations]:
-    """Measure the same, and return also the largest deviations, which know their places."""
+    """Measure the same, and return also the largest deviations, which know their places, and whether they are within.
+
+    Where a length for that lies between the bounds of a deviation, these are closer.
+    """
     if not is_whole_number(points) or not 1 < points <= MOST_POINTS:
         raise InputError(f"points must be an integer from 2 to {MOST_POINTS}, found {points!r}")
     if threshold is not None and not (is_finite_number(threshold) and threshold > 0):
@@ -123,7 +134,10 @@ def proximity_and_deviations(
     for way, own, other, search, own_seed in ways:
         drawn, triangles = _drawn(own, points, np.random.default_rng(own_seed))
         distances, closest = search.closest(drawn)
-        deviations.append(directed_deviation(own, search))
+        found = directed_deviation(own, search)
+        if within is not None and found.lower < within < found.upper:
+            found = replace(found, upper=min(found.upper, directed_deviation(own, search, within=within).upper))
+        deviations.append(found)
         # Powers of two lose no digit, and keep squares of lengths within the range of doubles.
         scale = 2.0 ** np.frexp(distances.max(initial=np.finfo(float).tiny))[1]
         squares = (distances / scale) ** 2

@@ -11,6 +11,7 @@ from sobolev_batch import compiled
 from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.geometry import deviation
 from sobolev_batch.geometry.closest import Triangles
+from sobolev_batch.geometry.proximity import proximity_and_deviations
 from sobolev_batch.geometry.subdivision import subdivided
 from tests.support.shapes import CENTRED_BOX
 
@@ -115,6 +116,18 @@ def test_a_hole_that_was_closed_is_found_between_all_vertices() -> None:
         found.backward.lower,
         found.backward.upper,
     )
+
+
+def test_bounds_are_closer_where_a_length_lies_between_them() -> None:
+    meshes = sb.shapes.icosphere(4), sb.shapes.icosphere(2)
+    usual, close = sb.proximity(*meshes, points=100), sb.largest_deviation(*meshes, gap=1e-4).both
+    length = (close.upper + usual["hausdorff_upper"]) / 2
+    assert usual["hausdorff"] < close.lower < close.upper < length < usual["hausdorff_upper"]
+    found, _ = proximity_and_deviations(*meshes, points=100, within=length)
+    assert close.lower <= found["hausdorff_upper"] <= length
+    assert {name for name in usual if usual[name] != found[name]} <= {
+        f"hausdorff_upper{way}" for way in ("", "_forward", "_backward")
+    }
 
 
 def test_spheres_against_their_refinements() -> None:
