@@ -82,9 +82,11 @@ class _Package:
         if name in self.parts:
             return self.parts[name]
         objects = self.parts[name] = {}
-        data = self.read(name)
+        data, prefix = self.read(name), None
         for event, tag, values in xml_events(data, "3MF", len(data)):
-            match event, tag:
+            # The names of the core may have a prefix, which is that of the root.
+            prefix = tag.removesuffix("model") if prefix is None else prefix
+            match event, tag.removeprefix(prefix):
                 case "start", "model":
                     self.units.add(values.get("unit", _UNIT))
                     names = [

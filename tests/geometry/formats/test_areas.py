@@ -348,6 +348,11 @@ CASES |= {
         1.25 * BOX_AREA,
     ),
     "3mf, names of parts in other cases": (".3mf", package_3mf(model(BOX_3MF)).replace(b"main", b"MAIN"), BOX_AREA),
+    "3mf, names with a prefix": (
+        ".3mf",
+        package_3mf(re.sub(rb"(</?)(?=\w)", rb"\1c:", model(BOX_3MF))),
+        BOX_AREA,
+    ),
     "3mf, supports": (
         ".3mf",
         package_3mf(
