@@ -275,6 +275,11 @@ def test_a_hole_that_was_closed_is_seen(folder: Path) -> None:
         done = call("compare", "full.off", "hole.off", "--within", length, *unit, folder=folder)
         assert (done.returncode, done.stdout.count("\n")) == (status, 1), done.stderr
         assert done.stdout.startswith(f"full.off: {answer}")
+    one_way = output("compare", "hole.off", "full.off", "--within", "2", "--one-way", folder=folder)
+    assert one_way.startswith("hole.off: within 2: largest deviation ")
+    for more in ((), ("--within", "2%")):
+        wrong = call("compare", "hole.off", "full.off", "--one-way", *more, folder=folder)
+        assert (wrong.returncode, "--one-way" in wrong.stderr) == (2, True)
     found = document("compare", "full.off", "hole.off", "--within", "2", folder=folder, status=1)
     assert (found["outcome"], found["length"], found["unit"]) == ("not within", 2.0, None)
     assert 2 < found["forward"]["lower"] == found["lower"] <= found["upper"]

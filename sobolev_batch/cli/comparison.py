@@ -39,7 +39,7 @@ from sobolev_batch.visible import FILE_UNITS, visible
 # Options that every verdict knows; those of one on a fraction of the norm, which chooses the accuracy of the distance
 # itself; and those of one on a length.
 _KNOWN = {"a", "b", "align", "below", "within", "report", "style"}
-_KNOWN_OF_FRACTIONS, _KNOWN_OF_LENGTHS = {"orders", "memory", "no_scaling"}, {"unit"}
+_KNOWN_OF_FRACTIONS, _KNOWN_OF_LENGTHS = {"orders", "memory", "no_scaling"}, {"unit", "one_way"}
 
 # A radius beyond it, or below its inverse, is far from the unit of length.
 _FAR_UNIT = 10.0
@@ -81,12 +81,15 @@ class CompareOptions:
     no_scaling: bool
     below: float | None
     within: str | None
+    one_way: bool
     verbose: bool
     style: str
 
     def __post_init__(self) -> None:
         if self.below is not None or self.within is not None:
             self._check_verdict()
+        elif self.one_way:
+            raise click.UsageError("--one-way goes with --within LENGTH; give that, or leave it out")
         elif self.has_lattice and self.rtol is not None:
             raise click.UsageError("--rtol chooses the lattice; leave out --xi-max and --M")
         if self.report is not None:
@@ -131,9 +134,9 @@ class CompareOptions:
             (order,), scaling = self.chosen_orders, not self.no_scaling
             same = same_surface(a, b, tolerance=tolerance, order=order, scaling=scaling, memory=self.memory)
             return f"{self.a.name}: {same}", vars(same) | numbers | {"distance": same.distance, "error": same.error}
-        near = judge_deviation(a, b, str(self.within), self.unit)
+        near = judge_deviation(a, b, str(self.within), self.unit, one_way=self.one_way)
         numbers |= {"outcome": near.outcome, "length": near.length, "unit": near.unit, "beyond": near.beyond}
-        return f"{self.a.name}: {near}", numbers | asdict(near.deviations.both) | asdict(near.deviations)
+        return f"{self.a.name}: {near}", numbers | asdict(near.largest) | asdict(near.deviations)
 
     @cached_property
     def meshes(self) -> tuple[Mesh, Mesh]:

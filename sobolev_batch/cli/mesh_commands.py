@@ -101,6 +101,7 @@ _STATUSES = {"same": 0, "within": 0, "different": 1, "not within": 1, "undecided
     help="Tell by the exit status whether no point of either mesh is farther from the other one than LENGTH, such as "
     "0.1 in the files' unit, or 0.1mm with --unit. A percentage is that of --below.",
 )
+@click.option("--one-way", is_flag=True, help="Of --within, count points of A alone: B may have parts that A lacks.")
 @click.option("--verbose", is_flag=True, help="Also print the parts of each error, and the settings that were chosen.")
 @json_option
 @click.pass_context

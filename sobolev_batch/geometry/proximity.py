@@ -174,16 +174,17 @@ def proximity_and_deviations(
     return {name: numbers[name] for name in NUMBERS}, Deviations(*deviations)
 
 
-def share_beyond(a: MeshLike, b: MeshLike, length: float, points: int = DEFAULT_POINTS) -> tuple[float, float]:
+def share_beyond(
+    a: MeshLike, b: MeshLike, length: float, points: int = DEFAULT_POINTS, *, one_way: bool = False
+) -> tuple[float, float]:
     """Return the share of the area that is farther from the other mesh than a length, by random points, and its error.
 
-    It is the larger of both directions. The standard error is that of a share which is one point larger.
+    It is the larger of both directions, or that of the first mesh. The standard error is that of a share which is one
+    point larger.
     """
     meshes = as_mesh(a), as_mesh(b)
-    rng = np.random.default_rng(0)
-    count = max(
-        np.count_nonzero(sampled_distances(mesh, other, rng, points) > length) for mesh, other in (meshes, meshes[::-1])
-    )
+    rng, ways = np.random.default_rng(0), (meshes, meshes[::-1])[: 1 if one_way else 2]
+    count = max(np.count_nonzero(sampled_distances(mesh, other, rng, points) > length) for mesh, other in ways)
     likely = (count + 1) / (points + 2)
     return count / points, float(np.sqrt(likely * (1 - likely) / points))
 

@@ -30,17 +30,24 @@ class DeviationVerdict:
         deviations: Bounds of the largest deviation, only as close as the answer needs.
         beyond: Share of the area that is farther away, the larger of both directions, and its standard error; zero
             where the meshes are within the length.
+        one_way: True where only the points of the first mesh count.
     """
 
     length: float
     unit: str | None
     deviations: Deviations
     beyond: tuple[float, float] = (0.0, 0.0)
+    one_way: bool = False
+
+    @property
+    def largest(self) -> Deviation:
+        """Bounds of the deviation that counts."""
+        return self.deviations.forward if self.one_way else self.deviations.both
 
     @property
     def outcome(self) -> Literal["within", "not within", "undecided"]:
         """The answer; it is undecided where the length lies between the bounds, which rounding keeps apart."""
-        is_within = self.deviations.both.is_within(self.length)
+        is_within = self.largest.is_within(self.length)
         return "undecided" if is_within is None else "within" if is_within else "not within"
 
     def __str__(self) -> str:
@@ -48,7 +55,7 @@ class DeviationVerdict:
         length = f"{self.length:.{max(_LENGTH_DIGITS, self._digits)}g}{f' {self.unit}' if self.unit else ''}"
         answer = f"undecided whether within {length}" if self.outcome == "undecided" else f"{self.outcome} {length}"
         beyond = "" if self.outcome == "within" else f"; {percent(*self.beyond)} of the area is farther away"
-        largest = self.deviations.both
+        largest = self.largest
         if self.outcome == "not within" and largest.upper > _CLOSE * largest.lower:
             largest = replace(largest, upper=math.nan)
         return f"{answer}: largest deviation {deviation_text(largest, self.unit, self._digits)}{beyond}"
@@ -56,20 +63,26 @@ class DeviationVerdict:
     @property
     def _digits(self) -> int:
         """Digits of bounds: as many as tell the lower one from a length that it is above."""
-        lower = self.deviations.both.lower
+        lower = self.largest.lower
         if self.outcome != "not within":
             return _DIGITS
         return max(_DIGITS, 2 + math.floor(math.log10(lower)) - math.floor(math.log10(lower - self.length)))
 
 
-def judge_deviation(a: MeshLike, b: MeshLike, length: float | str, unit: str | None = None) -> DeviationVerdict:
+def judge_deviation(
+    a: MeshLike, b: MeshLike, length: float | str, unit: str | None = None, *, one_way: bool = False
+) -> DeviationVerdict:
     """Return whether the largest deviation of two meshes is within a length; see `assert_within`."""
     limit = length_in(length, unit)
-    verdict = DeviationVerdict(limit, unit, largest_deviation(a, b, within=limit))
-    return verdict if verdict.outcome == "within" else replace(verdict, beyond=share_beyond(a, b, limit))
+    verdict = DeviationVerdict(limit, unit, largest_deviation(a, b, within=limit), one_way=one_way)
+    if verdict.outcome == "within":
+        return verdict
+    return replace(verdict, beyond=share_beyond(a, b, limit, one_way=one_way))
 
 
-def assert_within(a: MeshLike, b: MeshLike, length: float | str, *, unit: str | None = None) -> Deviations:
+def assert_within(
+    a: MeshLike, b: MeshLike, length: float | str, *, unit: str | None = None, one_way: bool = False
+) -> Deviations:
     """Raise an AssertionError unless no point of either mesh is farther from the other mesh than a length.
 
     Bounds decide, and no sample: a spike or a hole that was closed is found, however small. Which vertices and
@@ -81,6 +94,7 @@ def assert_within(a: MeshLike, b: MeshLike, length: float | str, *, unit: str | 
         length: Largest deviation that passes: a number in the unit of the meshes, or a text such as "0.1 mm".
         unit: Name of the unit of the meshes, which a length with a unit needs. um, mm, cm, m and in are converted into
             each other.
+        one_way: True if points of b may be farther from a: what a scan has not seen of a part, for example.
 
     Returns:
         Bounds of the largest deviation each way and both, in the unit of the meshes; they are only as close as the
@@ -101,7 +115,7 @@ def assert_within(a: MeshLike, b: MeshLike, length: float | str, *, unit: str | 
     AssertionError: not within 0.001: largest deviation ≥ 0.00..., at (...); 9... % of the area is farther away
     """
     __tracebackhide__ = True
-    verdict = judge_deviation(a, b, length, unit)
+    verdict = judge_deviation(a, b, length, unit, one_way=one_way)
     if verdict.outcome != "within":
         raise AssertionError(str(verdict))
     return verdict.deviations

@@ -30,6 +30,16 @@ def test_a_hole_that_was_closed_fails_and_names_its_place() -> None:
     sb.testing.assert_within(box, sb.Mesh(box.vertices, box.triangles[::-1]), 1e-9)
 
 
+def test_what_a_scan_has_not_seen_counts_unless_only_its_own_points_do() -> None:
+    part = sb.shapes.icosphere(2)
+    scan = sb.Mesh(part.vertices, part.triangles[:200])
+    found = sb.testing.assert_within(scan, part, 1e-6, one_way=True)
+    assert found.forward.upper <= 1e-6 < found.backward.lower
+    for pair, one_way in (((scan, part), False), ((part, scan), True)):
+        with pytest.raises(AssertionError, match=r"^not within .*; 3\d\S* % ± .* of the area is farther away$"):
+            sb.testing.assert_within(*pair, 1e-6, one_way=one_way)
+
+
 @pytest.mark.parametrize(
     ("length", "unit", "passes"),
     [
