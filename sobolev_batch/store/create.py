@@ -56,6 +56,10 @@ ROWS_PER_PAGE = 100
 _RECORDED_VERSIONS = ("sobolev-batch", "finufft", "numpy", "scipy", "xarray", "zarr")
 
 
+class OtherStudyError(StoreError):
+    """A store belongs to another study: giving the same command again would not help."""
+
+
 def require_usable(location: Location, *, of_objects: bool = False) -> None:
     """Check, without writing, that a store exists or may be created at a location."""
     store = Store(location)
@@ -331,8 +335,10 @@ def _check_same_study(store: Store, plan: Plan) -> None:
             comparisons.append(("octaves:", first, second if first != second else f"{second} others"))
     differences = [f"{what} {old}, not {new}" for what, old, new in comparisons if old != new]
     if differences:
-        raise StoreError(
-            f"{store.path}: it holds a store of another study, with {'; '.join(differences)}. "
+        # The store of an object lies in that of the whole study.
+        whole = store.location.beside("") if plan.study.object.name else store.path
+        raise OtherStudyError(
+            f"{whole}: it holds a store of another study, with {'; '.join(differences)}. "
             "Name another store, or remove this one"
         )
 

@@ -220,6 +220,14 @@ def test_a_second_run_computes_what_is_new(changeable: Path, threads: Client) ->
     assert summary.failed == {}
     with pytest.raises(sb.errors.StoreError, match="it holds the store of another study, 'small', not 'other'"):
         sb.run(study_of(balls(a=1.0), "other"), changeable, threads)
+    # An object has no store of its own to be named or removed, and the same command would not go on.
+    other = small_table(study={"name": "small"}, object=balls(a=1.0), family=methods_of())
+    other["lattice"]["M"] += 2
+    message = (
+        f"{changeable}: it holds a store of another study, with a lattice of .* Name another store, or remove this"
+    )
+    with pytest.raises(sb.errors.StoreError, match=rf"^{message} one$"):
+        sb.run(sb.Study.from_table(other), changeable, threads)
 
 
 @pytest.mark.extras
