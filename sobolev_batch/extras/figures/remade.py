@@ -15,7 +15,7 @@ from typing import Self
 import xarray as xr
 
 from sobolev_batch.batch.start import MADE_MESHES
-from sobolev_batch.errors import InputError, SobolevBatchError, from_extra, write_file
+from sobolev_batch.errors import InputError, SobolevBatchError, StoreError, from_extra, write_file
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.sources.mesh_cache import MeshCache
@@ -219,7 +219,12 @@ def write_witness(
     made, labels, orders = exported(store, [mesh], order, folder)
     if len(labels) > 1:
         raise InputError(f"{mesh!r} stands for several meshes, and one is written; give its label")
-    found = made.with_witness(labels[0], orders, made.reference if distances else None)
+    try:
+        found = made.with_witness(labels[0], orders, made.reference if distances else None)
+    except StoreError:
+        raise
+    except InputError as error:
+        raise InputError(f"{labels[0]}: {error}") from error
     write_vertex_witness(path, found)
     return path
 

@@ -145,7 +145,7 @@ def test_what_cannot_be_asked_for(spheres: Spheres, tmp_path: Path, monkeypatch:
         ("files/beside", "a.stl", None, r"written as \.ply or \.vtp, found '\.stl'"),
         ("files/beside", "a.ply", [-0.5], "below -1/2, found -0.5"),
         ("files/beside", "a.ply", [], "at least one order"),
-        ("files/bad", "a.ply", None, "its status is 'failed'"),
+        ("files/bad", "a.ply", None, "^files/bad: its status is 'failed'"),
     ]
     for label, name, orders, message in refused:
         with pytest.raises(sb.errors.InputError, match=message):
