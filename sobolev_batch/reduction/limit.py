@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Self
 
@@ -53,10 +54,15 @@ class Limit:
         """
         if order is None and not str(within).rstrip().endswith("%"):
             return cls(length_in(within, unit))
-        limit = cls(fraction(within), single_order(DEFAULT_ORDER if order is None else order))
-        if limit.value >= 1:
-            raise InputError(f"a Sobolev distance is a fraction of the norm below 1, such as 1%, found {within!r}")
-        return limit
+        value = math.inf
+        with suppress(InputError):
+            value = fraction(within)
+        if value >= 1:
+            raise InputError(
+                "in per cent or with an order, a tolerance is a fraction of the norm below 1, such as 1%, found "
+                f"{within!r}; a length has no order"
+            )
+        return cls(value, single_order(DEFAULT_ORDER if order is None else order))
 
     def bounds(self, mesh: Mesh, reference: Mesh) -> tuple[float, float, float]:
         """Return an estimate of the distance of a mesh from a reference, a lower and an upper bound."""
