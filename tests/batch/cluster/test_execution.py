@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from distributed import Client, Event, Future, KilledWorker, LocalCluster, as_completed
@@ -324,11 +325,16 @@ def test_the_dashboard_names_tasks_by_stage_study_and_mesh(threads: Client, monk
     assert threads.run_on_scheduler(transforms) == len(shown)
 
 
-def test_an_asynchronous_client_is_refused_before_anything_is_made() -> None:
-    client: Any = SimpleNamespace(asynchronous=True)
+def test_an_asynchronous_client_and_an_address_are_refused_before_anything_is_made() -> None:
+    asynchronous: Any = Mock(spec=Client, asynchronous=True)
+    address: Any = "tcp://127.0.0.1:8786"
     for act in (run, submit, plan):
         with pytest.raises(InputError, match=r"the client is asynchronous.*give a Client without asynchronous=True"):
-            act(Study.from_table(small_table()), "memory://asynchronous.zarr", client)
+            act(Study.from_table(small_table()), "memory://asynchronous.zarr", asynchronous)
+        with pytest.raises(
+            InputError, match=rf"client must be a dask\.distributed\.Client, found '{address}'; for the"
+        ):
+            act(Study.from_table(small_table()), "memory://asynchronous.zarr", address)
 
 
 def test_a_run_prints_its_progress(capsys: pytest.CaptureFixture[str]) -> None:
