@@ -19,6 +19,7 @@ from sobolev_batch.batch.object_run import Ended, ended_before, run_object, work
 from sobolev_batch.batch.start import StoreLike, ready_to_run
 from sobolev_batch.errors import DamageError, InputError, SobolevBatchError, StoreError
 from sobolev_batch.machine import available_cores, require_machine_memory
+from sobolev_batch.reduction.searched import SearchedSource
 from sobolev_batch.shown import Shown, reasons
 from sobolev_batch.store.create import give_up, require_usable, reserve
 from sobolev_batch.store.location import Location
@@ -143,6 +144,9 @@ def run(
             # Without bokeh, a cluster of this process has a page that says no more than that.
             if client is not None or find_spec("bokeh"):
                 notify(Progress("cluster", 0, 0, started.dashboard_link))
+            families = (family for one in study.objects.values() for family in one.families)
+            if searched := dict.fromkeys(one.name for one in families if isinstance(one.source, SearchedSource)):
+                notify(Progress("search", 0, 0, ", ".join(searched)))
             return Cluster(started, prepare_workers(started, study.libraries), study=study.name), watch
 
         with locked(location, lock):

@@ -147,7 +147,7 @@ def progress_reports() -> Iterator[Callable[[Progress], None]]:
 
         def show(progress: Progress) -> None:
             nonlocal bar
-            if progress.stage == "cluster":
+            if progress.stage in ("cluster", "search"):
                 echo(progress, err=True)
             elif not sys.stderr.isatty():
                 if progress.record is not None or progress.done == progress.total:

@@ -74,7 +74,9 @@ def test_meshes_of_two_objects_hold_and_are_those_of_reduce(client: Client, fold
     store = folder / "scans.zarr"
     sb.plan(study, store)
     assert not (folder / "made-meshes").exists()
-    assert not sb.run(study, store, client=client).failed
+    said: list[str] = []
+    assert not sb.run(study, store, client=client, on_progress=lambda step: said.append(str(step))).failed
+    assert "searching meshes of decimated: each takes several trials, unless it is kept from before" in said[:2]
     rows = sb.table(store).set_index(["object", "mesh"])
     for name in ("a", "b"):
         original = sb.read_mesh(folder / "scans" / f"{name}.ply")

@@ -22,7 +22,7 @@ from sobolev_batch.errors import ClusterError, SpaceError, StoreError, one_line
 from sobolev_batch.store.records import Record
 
 Result = TypeVar("Result")
-Stage = Literal["cluster", "lattice", "fields", "reduction", "proximity"]
+Stage = Literal["cluster", "search", "lattice", "fields", "reduction", "proximity"]
 # Runs that have begun and not ended: at least so many, and so many for each thread of the workers, whose first task may
 # be their only one. Each has its plan and its records in memory.
 _FEWEST_RUNS, _RUNS_PER_THREAD = 64, 4
@@ -42,11 +42,11 @@ class Progress:
     """One step of a run.
 
     Attributes:
-        stage: "cluster" once there is one, "lattice" while one is chosen for an accuracy, "fields" while meshes are
-            transformed, "reduction" while tables are computed, "proximity" while Hausdorff and Chamfer distances are
-            measured.
+        stage: "cluster" once there is one, "search" where families are searched for meshes within tolerances,
+            "lattice" while one is chosen for an accuracy, "fields" while meshes are transformed, "reduction" while
+            tables are computed, "proximity" while Hausdorff and Chamfer distances are measured.
         done, total: Steps of the stage.
-        label: Label of the mesh that was finished, or address of the cluster's dashboard; else empty.
+        label: Label of the mesh that was finished, address of the cluster's dashboard, or families; else empty.
         part: Object that is worked on and its number, such as "cow, 2 of 8"; empty where the study names no object.
     """
 
@@ -61,6 +61,8 @@ class Progress:
         part, count = f"{self.part}: " if self.part else "", f"{self.done} of {self.total}"
         if self.stage == "cluster":
             return f"dashboard: {self.label}"
+        if self.stage == "search":
+            return f"searching meshes of {self.label}: each takes several trials, unless it is kept from before"
         if self.record is not None:
             outcome = self.record.reason or f"{self.record.seconds:.2f} s"
             return f"{part}[{self.done}/{self.total}] {self.label}: {self.record.status}, {outcome}"
