@@ -307,7 +307,8 @@ def _originals(meshes: Any, folder: Location | None) -> dict[str, tuple[Member, 
         raise InputError(f"meshes to reduce need names of their own, found {', '.join(names) or 'no mesh'}")
     found: dict[str, tuple[Member, str]] = {}
     for name, path in zip(names, paths, strict=True):
-        suffix = mesh_format(path) if mesh_format(path) in WRITERS else ".ply"
+        # Memory keeps the mesh as search records do.
+        suffix = mesh_format(path) if folder is not None and mesh_format(path) in WRITERS else ".ply"
         if folder is not None and not folder.scheme and path.resolve() == Path(folder.name, name + suffix).resolve():
             raise InputError(f"{path}: the reduced mesh would replace it; name another folder for these")
         found[name] = FileMember(name, -1, path.absolute()), suffix

@@ -137,6 +137,13 @@ def test_lengths_are_converted_into_the_unit_of_the_files() -> None:
         found_by(lumpy(), "0.1 mm")
 
 
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".stl"])
+def test_a_file_of_any_format_needs_no_output(suffix: str, tmp_path: Path) -> None:
+    sb.write_mesh(lumpy(2), tmp_path / f"scan{suffix}")
+    found = sb.reduce(tmp_path / f"scan{suffix}", within=0.1)["scan"]
+    assert (found.reason, found.mesh is not None) == ("", True)
+
+
 class EndedError(Exception):
     """What ends a search in the middle."""
 
