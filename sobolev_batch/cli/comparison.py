@@ -29,7 +29,7 @@ from sobolev_batch.norms.yardsticks import CHANGES, yardsticks
 from sobolev_batch.parameters import fraction
 from sobolev_batch.plugins import FEATURES, extra
 from sobolev_batch.tables.rendering import printed_table
-from sobolev_batch.tables.text import answer, likeness, percent, with_error
+from sobolev_batch.tables.text import bound, count_text, percent, rounded, second_digit, with_error
 from sobolev_batch.testing.difference import require_place, write_difference
 from sobolev_batch.testing.verdict import same_surface
 from sobolev_batch.testing.within import deviation_text, judge_deviation
@@ -47,6 +47,12 @@ _FAR_UNIT = 10.0
 _DEFAULT_RTOL = 1e-2
 # A turn by less, in degrees, or a shift by less than this fraction of the largest one, is rounding.
 _NO_MOTION = 1e-9
+# Surfaces whose distance, relative to the reference, is certainly smaller differ by rounding.
+_ROUNDING, _OF_FILES = 1e-10, 1e-5
+# A share of area is told if its error is no larger, and to whole per cents.
+_LARGEST_SHARE_ERROR, _WHOLE_PERCENT = 0.1, 0.01
+# Area is called lost or gained if the surface really lost or gained at least this fraction of what fits best.
+_LEAST_CHANGE = 0.5
 # Numbers of `proximity` that are printed in both directions.
 _DISTANCES = {
     "mean": "mean",
@@ -400,3 +406,70 @@ def _settings_text(attributes: Mapping[str, Any]) -> str:
         octaves = f"{attributes['octaves']} octave{'s' * (attributes['octaves'] != 1)}"
         text += f", {octaves} up to {attributes['highest_frequency']:.4g}"
     return f"{text}, seed {attributes['seed']}"
+
+
+def answer(name: str, reference: str, result: xr.Dataset | Mapping[str, float], area_change: float) -> str:
+    """Return a sentence that says how much a surface differs from the reference, from `distance` at one order.
+
+    The change of area is the area of the surface over that of the reference, minus one.
+    """
+    numbers = {key: float(result[key]) for key in ("distance", "error", "relative", "relative_error")}
+    at_order = f"at order {float(result['order']):g}"
+    if numbers["distance"] == numbers["error"] == 0:
+        return f"{name} and {reference} are identical: they cover the same surface."
+    if numbers["distance"] > numbers["error"]:
+        amount = percent(numbers["relative"], numbers["relative_error"])
+        return f"{name} differs from {reference} by {amount} {at_order}{_share_text(result, area_change)}."
+    most = numbers["relative"] + numbers["relative_error"]
+    if most < _OF_FILES:
+        rounding = "rounding" if most < _ROUNDING else "the rounding of files"
+        return f"{name} and {reference} are equal up to {rounding} {at_order}: they differ by less than {bound(most)}."
+    amount = "an unknown amount" if math.isnan(most) else f"less than {bound(most)}"
+    return f"{name} differs from {reference} by {amount} {at_order}: not resolved."
+
+
+def likeness(name: str, reference: str, result: xr.Dataset | Mapping[str, float], radius: float, unit: str) -> str:
+    """Return sentences about changes that bring the reference as far from itself, from `yardsticks` at one order.
+
+    The radius is that of the reference in a unit. Without noise and decimation there is one sentence about the move.
+
+    >>> amounts = {"order": -2.0, "moved": 0.0081, "noise": 0.0032, "decimated": 2312.0}
+    >>> errors = {"moved_error": 1e-4, "noise_error": 1e-4, "decimated_error": 40.0}
+    >>> print(likeness("small.obj", "large.obj", {**amounts, **errors}, 50.0, "mm"))
+    At order -2, small.obj is as far from large.obj as
+      large.obj moved by 0.81 % of its radius, 0.405 mm,
+      large.obj with noise of 0.32 % of its radius, 0.160 mm,
+      large.obj decimated to 2,300 triangles.
+    """
+    kinds = [kind for kind in ("moved", "noise", "decimated") if kind in result]
+    amounts = {kind: float(result[kind]) for kind in kinds if not math.isnan(result[kind])}
+    errors = {kind: max(float(result[f"{kind}_error"]), second_digit(amount)) for kind, amount in amounts.items()}
+
+    def length(kind: str) -> str:
+        fraction, own = (rounded(size * amounts[kind], size * errors[kind]) for size in (100.0, radius))
+        return f"{fraction} % of its radius, {own} {unit}"
+
+    wordings = {"moved": "moved by {}", "noise": "with noise of {}"}
+    texts = [f"  {reference} {wordings[kind].format(length(kind))}" for kind in amounts if kind in wordings]
+    if "decimated" in amounts:
+        texts.append(f"  {reference} decimated to {count_text(amounts['decimated'], errors['decimated'])} triangles")
+    at_order = f"At order {float(result['order']):g}, "
+    if kinds == ["moved"]:
+        return f"{at_order}this is as far as{texts[0][1:]}." if texts else ""
+    if not texts:
+        return f"{at_order}no move, noise or decimation of {reference} is known to be as far from it."
+    return f"{at_order}{name} is as far from {reference} as\n" + ",\n".join(texts) + "."
+
+
+def _share_text(result: xr.Dataset | Mapping[str, float], area_change: float) -> str:
+    """Return which share of a squared distance is a change of area; nothing where that is not known."""
+    share, error, excess = (float(result[key]) for key in ("area_share", "area_share_error", "excess"))
+    if not error <= _LARGEST_SHARE_ERROR:
+        return ""
+    if share + error < _WHOLE_PERCENT:
+        return "; a uniform change of area explains less than 1 % of the squared distance"
+    # A moved surface has lost no area, though a smaller multiple of the reference fits it best.
+    if share <= error or not area_change / excess >= _LEAST_CHANGE:
+        return ""
+    amount = rounded(100 * share, 100 * max(error, _WHOLE_PERCENT), " %")
+    return f"; a uniform {'loss' if excess < 0 else 'gain'} of area explains {amount} of the squared distance"

@@ -267,7 +267,8 @@ class _PlotOptions:
         from sobolev_batch.extras.figures.drawing import write_plots
         from sobolev_batch.extras.figures.selection import Selection
         from sobolev_batch.extras.figures.views import write_witness_plots
-        from sobolev_batch.tables.open import EDGE_LENGTH, fields_read
+        from sobolev_batch.tables.convergence import EDGE_LENGTH
+        from sobolev_batch.tables.open import fields_read
 
         with fields_read(self.store):
             selection = Selection.from_store(self.store, self.orders, self.families or None, self.x or EDGE_LENGTH)

@@ -15,7 +15,8 @@ import xarray as xr
 from sobolev_batch.errors import InputError, from_extra
 from sobolev_batch.extras.leagues.costs import CostLeague
 from sobolev_batch.extras.leagues.league import League
-from sobolev_batch.tables.open import EDGE_LENGTH, AnyStore, Families, as_tree, fields_read, finished_group
+from sobolev_batch.tables.convergence import EDGE_LENGTH
+from sobolev_batch.tables.open import AnyStore, Families, as_tree, fields_read, finished_group
 
 with from_extra("plot", "a plot needs"):
     from matplotlib.axes import Axes

@@ -1,4 +1,4 @@
-"""The verdict on a study: the nearest mesh at each size, and the smallest mesh of each family below a bound."""
+"""The verdict on a study: the nearest meshes, the smallest ones below bounds; and its objects, the worst first."""
 
 from __future__ import annotations
 

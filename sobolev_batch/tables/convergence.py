@@ -1,4 +1,4 @@
-"""Tables of distances to the reference, with observed rates."""
+"""Tables of distances to the reference, with observed rates, and the sizes of meshes that rates are over."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.proximity import METRICS, OF_ONE_MESH
 from sobolev_batch.norms.columns import parts_as_variables
 from sobolev_batch.norms.estimate import AREA_AND_SHAPE, PARTS
+from sobolev_batch.sources.names import quoted
 from sobolev_batch.sources.programs import Cost
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.open import (
-    EDGE_LENGTH,
     AnyStore,
     as_tree,
     finished_group,
@@ -25,17 +26,27 @@ from sobolev_batch.tables.open import (
     metadata_of,
     placement_doubts,
     reference_of,
-    sizes_of,
     stores_of,
     study_unit,
     unit_of,
 )
 from sobolev_batch.tables.other_orders import convergence_at, order_note
 from sobolev_batch.tables.rendering import Column, Section, machine_table, rendered
-from sobolev_batch.tables.results import rates_in_families
+from sobolev_batch.tables.results import FROM_COARSE_TO_FINE, rates_in_families
 from sobolev_batch.tables.text import between, count, percent, with_error, wrapped
 from sobolev_batch.transform.lattice import Orders
 
+EDGE_LENGTH = "edge_length"
+# Columns of a table that are sizes: the finer a mesh is, the smaller is the first, and the larger are the others.
+_LABELS = {
+    EDGE_LENGTH: "mean edge length in {unit}",
+    "triangles": "number of triangles",
+    "vertices": "number of vertices",
+    "seconds": "computing time of the mesh in seconds",
+    "make_seconds": "time of making the mesh in seconds",
+    "make_cpu_seconds": "processor time of making the mesh in seconds",
+    "make_peak_bytes": "memory of making the mesh in bytes",
+}
 ALONE = "The study has its reference alone: there is nothing to compare."
 # What a remesher may break.
 CONNECTION_COLUMNS = (
@@ -360,3 +371,26 @@ def _with_rates(frame: pd.DataFrame, x: str) -> pd.DataFrame:
     families, ordered_by = (frame[name].to_numpy()[:count] for name in ("family", "ordered_by"))
     rates, rate_errors = rates_in_families(families, ordered_by, distances, errors, 1 / sizes_of(frame, x)[:count])
     return frame.assign(rate=rates.ravel(), rate_error=rate_errors.ravel())
+
+
+def label_of(x: str, unit: str = "each object's unit") -> str:
+    """Return the label of an axis of sizes; one of the metadata has its name."""
+    return _LABELS[x].format(unit=unit) if x in _LABELS else x
+
+
+def sizes_of(frame: pd.DataFrame, x: str) -> Reals:
+    """Return a column of `table`, NaN where sizes are not known; InputError where it has no such numbers."""
+    if x not in frame or not pd.api.types.is_numeric_dtype(frame[x]):
+        numbers = [name for name in _LABELS if name in frame]
+        given = [name for name in frame.attrs.get("metadata", ()) if pd.api.types.is_numeric_dtype(frame[name])]
+        only = " (the store has no families of commands, functions or searches, which have it)"
+        hint = only if x.startswith("make_") else ""
+        raise InputError(f"no size of meshes is named {quoted(x)}{hint}; known are {', '.join([*numbers, *given])}")
+    sizes: Reals = frame[x].to_numpy(dtype=np.float64, na_value=np.nan)
+    # A surface in closed form has none.
+    return np.where(sizes > 0, sizes, np.nan)
+
+
+def is_sequence(rows: pd.DataFrame) -> bool:
+    """Return True where the meshes of a family go from coarse to fine, so that a line may join them."""
+    return bool(rows["ordered_by"].isin(FROM_COARSE_TO_FINE).all())

@@ -1,4 +1,4 @@
-"""A store that is open for reading, and what it has: groups, orders, families and sizes of meshes."""
+"""A store that is open for reading, and what it has: groups, orders, families and units."""
 
 from __future__ import annotations
 
@@ -14,10 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 
-from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import DamageError, InputError, StoreError, one_line
 from sobolev_batch.geometry.surface import Similarity, placement_doubt
 from sobolev_batch.norms.columns import describe
@@ -46,20 +44,6 @@ _log = logging.getLogger(__name__)
 
 # Names of families, or globs of names; None is all of them.
 Families = str | Sequence[str] | None
-
-EDGE_LENGTH = "edge_length"
-# What orders families that go from coarse to fine.
-FROM_COARSE_TO_FINE = ("level", "triangles")
-# Columns of a table that are sizes: the finer a mesh is, the smaller is the first, and the larger are the others.
-_LABELS = {
-    EDGE_LENGTH: "mean edge length in {unit}",
-    "triangles": "number of triangles",
-    "vertices": "number of vertices",
-    "seconds": "computing time of the mesh in seconds",
-    "make_seconds": "time of making the mesh in seconds",
-    "make_cpu_seconds": "processor time of making the mesh in seconds",
-    "make_peak_bytes": "memory of making the mesh in bytes",
-}
 
 # A store as functions for its readers take it.
 AnyStore = str | Path | Location | xr.DataTree
@@ -406,26 +390,3 @@ def study_unit(tree: xr.DataTree) -> str:
     """Return the study's unit of length in words, by the unit of the files."""
     name, size = unit_of(tree)
     return name if size == 1 else f"units of {size:.4g} {name}"
-
-
-def label_of(x: str, unit: str = "each object's unit") -> str:
-    """Return the label of an axis of sizes; one of the metadata has its name."""
-    return _LABELS[x].format(unit=unit) if x in _LABELS else x
-
-
-def sizes_of(frame: pd.DataFrame, x: str) -> Reals:
-    """Return a column of `table`, NaN where sizes are not known; InputError where it has no such numbers."""
-    if x not in frame or not pd.api.types.is_numeric_dtype(frame[x]):
-        numbers = [name for name in _LABELS if name in frame]
-        given = [name for name in frame.attrs.get("metadata", ()) if pd.api.types.is_numeric_dtype(frame[name])]
-        only = " (the store has no families of commands, functions or searches, which have it)"
-        hint = only if x.startswith("make_") else ""
-        raise InputError(f"no size of meshes is named {quoted(x)}{hint}; known are {', '.join([*numbers, *given])}")
-    sizes: Reals = frame[x].to_numpy(dtype=np.float64, na_value=np.nan)
-    # A surface in closed form has none.
-    return np.where(sizes > 0, sizes, np.nan)
-
-
-def is_sequence(rows: pd.DataFrame) -> bool:
-    """Return True where the meshes of a family go from coarse to fine, so that a line may join them."""
-    return bool(rows["ordered_by"].isin(FROM_COARSE_TO_FINE).all())

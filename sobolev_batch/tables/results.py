@@ -16,7 +16,6 @@ from sobolev_batch.norms.columns import dataset_of, describe
 from sobolev_batch.norms.estimate import AREA_AND_SHAPE, NormEstimate
 from sobolev_batch.norms.rates import observed_rates
 from sobolev_batch.sources.programs import Cost
-from sobolev_batch.tables.open import FROM_COARSE_TO_FINE
 from sobolev_batch.tables.reducer import Reducer
 from sobolev_batch.tables.shells import chunks_of_spectra, read_spectra
 
@@ -25,6 +24,8 @@ _IDENTITY = ("family", "name", "is_reference", "level", "status")
 COORDINATES = (*_IDENTITY, "vertices", "triangles", "edge_length_mean", "seconds")
 # Those that only some studies have.
 SOME_COORDINATES = {"time", *(item.name for item in fields(Cost))}
+# What orders families that go from coarse to fine.
+FROM_COARSE_TO_FINE = ("level", "triangles")
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,22 +1,18 @@
-"""Numbers, durations and sentences about distances as text, as exact as their errors allow."""
+"""Numbers and durations as text, as exact as their errors allow, on lines that fit the terminal."""
 
 from __future__ import annotations
 
 import math
 import shutil
 import textwrap
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, TypeVar
+from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 
 from sobolev_batch.visible import visible
 
-if TYPE_CHECKING:
-    import xarray as xr
-
 Item = TypeVar("Item")
-
 
 # More digits are hard to read, whatever the error.
 _MOST_DIGITS = 7
@@ -25,12 +21,6 @@ _DIGITS_WITHOUT_ERROR = 4
 _SMALLEST_PLAIN, _LARGEST_PLAIN, _LAST_PLAIN = 1e-3, 1e5, -6
 POWER = " × 10"
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-# Surfaces whose distance, relative to the reference, is certainly smaller differ by rounding.
-_ROUNDING, _OF_FILES = 1e-10, 1e-5
-# A share of area is told if its error is no larger, and to whole per cents.
-_LARGEST_SHARE_ERROR, _WHOLE_PERCENT = 0.1, 0.01
-# Area is called lost or gained if the surface really lost or gained at least this fraction of what fits best.
-_LEAST_CHANGE = 0.5
 
 # Length of lines without a terminal, longest line of prose, and the least that remains of a label or a text.
 _LINE_LENGTH, _LONGEST_PROSE, SHORTEST_TEXT = 100, 100, 20
@@ -155,73 +145,6 @@ def spread(items: Sequence[Item], most: int) -> list[Item]:
 def middle_cut(label: str, longest: int) -> str:
     """Return a label that is cut in its middle: labels of one family differ at their ends."""
     return label if len(label) <= longest else f"{label[: longest // 2]}…{label[1 - longest // 2 :]}"
-
-
-def answer(name: str, reference: str, result: xr.Dataset | Mapping[str, float], area_change: float) -> str:
-    """Return a sentence that says how much a surface differs from the reference, from `distance` at one order.
-
-    The change of area is the area of the surface over that of the reference, minus one.
-    """
-    numbers = {key: float(result[key]) for key in ("distance", "error", "relative", "relative_error")}
-    at_order = f"at order {float(result['order']):g}"
-    if numbers["distance"] == numbers["error"] == 0:
-        return f"{name} and {reference} are identical: they cover the same surface."
-    if numbers["distance"] > numbers["error"]:
-        amount = percent(numbers["relative"], numbers["relative_error"])
-        return f"{name} differs from {reference} by {amount} {at_order}{_share_text(result, area_change)}."
-    most = numbers["relative"] + numbers["relative_error"]
-    if most < _OF_FILES:
-        rounding = "rounding" if most < _ROUNDING else "the rounding of files"
-        return f"{name} and {reference} are equal up to {rounding} {at_order}: they differ by less than {bound(most)}."
-    amount = "an unknown amount" if math.isnan(most) else f"less than {bound(most)}"
-    return f"{name} differs from {reference} by {amount} {at_order}: not resolved."
-
-
-def likeness(name: str, reference: str, result: xr.Dataset | Mapping[str, float], radius: float, unit: str) -> str:
-    """Return sentences about changes that bring the reference as far from itself, from `yardsticks` at one order.
-
-    The radius is that of the reference in a unit. Without noise and decimation there is one sentence about the move.
-
-    >>> amounts = {"order": -2.0, "moved": 0.0081, "noise": 0.0032, "decimated": 2312.0}
-    >>> errors = {"moved_error": 1e-4, "noise_error": 1e-4, "decimated_error": 40.0}
-    >>> print(likeness("small.obj", "large.obj", {**amounts, **errors}, 50.0, "mm"))
-    At order -2, small.obj is as far from large.obj as
-      large.obj moved by 0.81 % of its radius, 0.405 mm,
-      large.obj with noise of 0.32 % of its radius, 0.160 mm,
-      large.obj decimated to 2,300 triangles.
-    """
-    kinds = [kind for kind in ("moved", "noise", "decimated") if kind in result]
-    amounts = {kind: float(result[kind]) for kind in kinds if not math.isnan(result[kind])}
-    errors = {kind: max(float(result[f"{kind}_error"]), second_digit(amount)) for kind, amount in amounts.items()}
-
-    def length(kind: str) -> str:
-        fraction, own = (rounded(size * amounts[kind], size * errors[kind]) for size in (100.0, radius))
-        return f"{fraction} % of its radius, {own} {unit}"
-
-    wordings = {"moved": "moved by {}", "noise": "with noise of {}"}
-    texts = [f"  {reference} {wordings[kind].format(length(kind))}" for kind in amounts if kind in wordings]
-    if "decimated" in amounts:
-        texts.append(f"  {reference} decimated to {count_text(amounts['decimated'], errors['decimated'])} triangles")
-    at_order = f"At order {float(result['order']):g}, "
-    if kinds == ["moved"]:
-        return f"{at_order}this is as far as{texts[0][1:]}." if texts else ""
-    if not texts:
-        return f"{at_order}no move, noise or decimation of {reference} is known to be as far from it."
-    return f"{at_order}{name} is as far from {reference} as\n" + ",\n".join(texts) + "."
-
-
-def _share_text(result: xr.Dataset | Mapping[str, float], area_change: float) -> str:
-    """Return which share of a squared distance is a change of area; nothing where that is not known."""
-    share, error, excess = (float(result[key]) for key in ("area_share", "area_share_error", "excess"))
-    if not error <= _LARGEST_SHARE_ERROR:
-        return ""
-    if share + error < _WHOLE_PERCENT:
-        return "; a uniform change of area explains less than 1 % of the squared distance"
-    # A moved surface has lost no area, though a smaller multiple of the reference fits it best.
-    if share <= error or not area_change / excess >= _LEAST_CHANGE:
-        return ""
-    amount = rounded(100 * share, 100 * max(error, _WHOLE_PERCENT), " %")
-    return f"; a uniform {'loss' if excess < 0 else 'gain'} of area explains {amount} of the squared distance"
 
 
 def _last_digit(value: float, error: float) -> int:

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sobolev_batch.tables.text import answer, bound, percent, with_error
+from sobolev_batch.cli.comparison import answer
+from sobolev_batch.tables.text import bound, percent, with_error
 
 _NAN = float("nan")
 

@@ -40,19 +40,9 @@ from sobolev_batch.extras.figures.style import (
 from sobolev_batch.extras.leagues.costs import CostLeague, objects_text
 from sobolev_batch.extras.leagues.evolution import evolution
 from sobolev_batch.extras.leagues.league import RELATIVE, League
-from sobolev_batch.tables.convergence import table
+from sobolev_batch.tables.convergence import is_sequence, label_of, sizes_of, table
 from sobolev_batch.tables.matrix import pairs_of
-from sobolev_batch.tables.open import (
-    complete_meshes,
-    families_of,
-    finished_group,
-    has_times,
-    is_sequence,
-    label_of,
-    reference_of,
-    sizes_of,
-    study_unit,
-)
+from sobolev_batch.tables.open import complete_meshes, families_of, finished_group, has_times, reference_of, study_unit
 
 _MOST_NAMED = 3
 # More labels along a front would overlap.

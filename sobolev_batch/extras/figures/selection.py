@@ -14,8 +14,8 @@ import xarray as xr
 from sobolev_batch.errors import InputError
 from sobolev_batch.extras.figures.style import Style, style_of
 from sobolev_batch.norms.causes import spectrum
+from sobolev_batch.tables.convergence import EDGE_LENGTH
 from sobolev_batch.tables.open import (
-    EDGE_LENGTH,
     AnyStore,
     Families,
     as_tree,

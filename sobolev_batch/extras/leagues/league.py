@@ -34,8 +34,8 @@ from sobolev_batch.store.location import Location
 from sobolev_batch.store.objects import Objects
 from sobolev_batch.study.comparable import SIGNIFICANCE, gap_of, least_objects
 from sobolev_batch.tables import Format
-from sobolev_batch.tables.convergence import tables_of
-from sobolev_batch.tables.open import EDGE_LENGTH, AnyStore, as_tree, root_attribute
+from sobolev_batch.tables.convergence import EDGE_LENGTH, tables_of
+from sobolev_batch.tables.open import AnyStore, as_tree, root_attribute
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.text import wrapped
 from sobolev_batch.transform.lattice import Orders

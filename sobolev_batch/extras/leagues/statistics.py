@@ -16,7 +16,7 @@ from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.study.comparable import Range, common_range
-from sobolev_batch.tables.open import sizes_of
+from sobolev_batch.tables.convergence import sizes_of
 
 # Sizes at which curves are compared, evenly spaced on a logarithmic axis.
 _SIZES = 5

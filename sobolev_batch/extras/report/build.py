@@ -23,7 +23,7 @@ from sobolev_batch.extras.leagues.league import League, percent_text
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import utc_now
 from sobolev_batch.store.objects import Objects
-from sobolev_batch.tables.convergence import table
+from sobolev_batch.tables.convergence import is_sequence, label_of, table
 from sobolev_batch.tables.matrix import pairs_of
 from sobolev_batch.tables.open import (
     AnyStore,
@@ -33,8 +33,6 @@ from sobolev_batch.tables.open import (
     fields_read,
     finished_group,
     has_times,
-    is_sequence,
-    label_of,
     location_of,
     reference_of,
     require_unchanged,

@@ -1,4 +1,4 @@
-"""A norm or a distance to compute, the accuracy that it needs, and its division among fields."""
+"""A norm or a distance to compute, the accuracy that it needs, its division among fields, and its solution."""
 
 from __future__ import annotations
 
