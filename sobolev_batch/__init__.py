@@ -7,12 +7,11 @@ tables. Data flows one way through the folders, which docs/design.md lists.
 The public names by subject:
 
 - Numbers with their errors, of surfaces and of fields: `distance`, `norm`; of a sequence of meshes, with observed
-  orders: `convergence`. Their causes: `spectrum` (wavelengths),
-  `witness` (places). For orientation: `yardsticks`, and `proximity` (Hausdorff, Chamfer) and
-  `vertex_distances`.
+  rates: `convergence`. Their causes: `spectrum` (wavelengths), `witness` (places). For orientation: `yardsticks`,
+  `largest_deviation` (between bounds), `proximity` (Hausdorff, Chamfer) and `vertex_distances`.
 - Meshes: `Mesh`, `as_mesh` (of paths, arrays and other libraries' meshes), `read_mesh`, `write_mesh`; `fit` moves the
   vertices of one towards a target.
-- Fields: `fourier_transform` on a `Lattice`; all of the above are methods of `field.sobolev`.
+- Fields: `fourier_transform` on a `Lattice`; `norm`, `distance`, `spectrum` and `witness` are methods of `field.sobolev`.
 - Studies: `Study`, `init_study`, `plan`, `run`, `submit`.
 - Stores: `open_store`, `status`, `verify`, `unlock`.
 - Meshes within a tolerance: `reduce`.

@@ -92,9 +92,11 @@ def submit(
         workers.require_accuracy(study.accuracy)
         submission = _prepared(study, lock.of_run(location))
         Heartbeat(location, lock, watch).write("submitted")
+        # The worker was started in another folder.
+        objects = {name: replace(one, folder=one.folder.absolute()) for name, one in study.objects.items()}
+        study, key = replace(study, objects=objects), task_key("drive", study.name, "", "")
         # Before all tasks of other studies, from which it takes no thread: it leaves its own at once.
-        key = task_key("drive", study.name, "", "")
-        future = client.submit(drive, _absolute(study), location.name, lock.run, key=key, pure=False, priority=1)
+        future = client.submit(drive, study, location.name, lock.run, key=key, pure=False, priority=1)
         fire_and_forget(future)
         _await_acceptance(client, future)
     except BaseException:
@@ -113,12 +115,6 @@ def _prepared(study: Study, location: Location) -> Submission:
     complete = sum(recorded[name].complete for name in listed if name in recorded)
     surfaces = sum(map(len, listed.values()))
     return Submission(location.name, surfaces, surfaces - complete, refused)
-
-
-def _absolute(study: Study) -> Study:
-    """Return a study for processes that were started in another folder."""
-    objects = {name: replace(one, folder=one.folder.absolute()) for name, one in study.objects.items()}
-    return replace(study, objects=objects)
 
 
 def drive(study: Study, store: str, run: str) -> None:

@@ -30,7 +30,7 @@ def convergence(
     seed: int = 0,
     on_progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> xr.Dataset:
-    """Return the distances of some meshes to a surface, and the observed orders of convergence between them.
+    """Return the distances of some meshes to a surface, and the observed rates of convergence between them.
 
     Args:
         meshes: Meshes in any form that `as_mesh` takes, in any order, with labels if they are a mapping.
@@ -43,7 +43,7 @@ def convergence(
         on_progress: Called with the number of meshes that are done, and that of all.
 
     Returns:
-        Dataset over `mesh` and `order` with the variables of `distance`, and with `rate` and `rate_error`: the order p
+        Dataset over `mesh` and `order` with the variables of `distance`, and with `rate` and `rate_error`: the power p
         in distance ~ h^p between a mesh and the next one whose mean edge length h is larger by a tenth at least. They
         are NaN for the coarsest meshes, and for distances below their error. Coordinates (mesh) are the labels,
         `edge_length` (mean) and `triangles`. All are float64, but for booleans and counts.

@@ -392,7 +392,7 @@ class KeepingSource(Source):
 
 def source_type_of(name: object) -> type[Source]:
     """Return the source of a name; StudyError where there is none, or it cannot be loaded."""
-    registry = _registry()
+    registry = sources_by_name()
     if not isinstance(name, str) or name not in registry:
         message = f"no source is named {quoted(name)}; known are {', '.join(sorted(registry))}"
         similar = difflib.get_close_matches(name[:100].lower(), registry, n=1) if isinstance(name, str) else []
@@ -404,11 +404,6 @@ def source_type_of(name: object) -> type[Source]:
     if not (isinstance(source_type, type) and issubclass(source_type, Source)):
         raise StudyError(f"the entry point of the source {name!r} is not a subclass of Source: {registry[name].value}")
     return source_type
-
-
-def source_names() -> list[str]:
-    """Return the names of all sources, those of other packages among them."""
-    return sorted(_registry())
 
 
 def single_member(source: Source, folder: Path) -> Member:
@@ -440,7 +435,8 @@ def installed_version(distribution: str) -> str:
 
 
 @lru_cache(maxsize=1)
-def _registry() -> dict[str, EntryPoint]:
+def sources_by_name() -> dict[str, EntryPoint]:
+    """Return where each source is loaded from, those of other packages among them."""
     own = [EntryPoint(name, value, SOURCES) for name, value in _OWN.items()]
     # The first one that has a name keeps it.
     return {point.name: point for point in reversed((*own, *registered(SOURCES)))}

@@ -12,7 +12,7 @@ from typing import Literal, Self
 from sobolev_batch.errors import LockError, StoreError
 from sobolev_batch.store.checked import CHANGED
 from sobolev_batch.store.encoding import ROOT
-from sobolev_batch.store.layout import DIGEST, RECORDS, Store, digest_of
+from sobolev_batch.store.layout import DIGEST, RECORDS, Store, document_digest
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import LOCK_KEYS, Lock, Time, age_seconds
 from sobolev_batch.store.objects import Objects, root_of
@@ -54,14 +54,14 @@ class RunRecord:
         if table is None:
             return None
         digest, name = table.pop(DIGEST, ""), f"{store.path}: {RECORDS}/{ROOT}, the record of the latest run,"
-        if digest != digest_of(table):
+        if digest != document_digest(table):
             raise damaged_record(name, CHANGED, table)
         return record_in(cls, table, name)
 
     def write(self, store: Store) -> None:
         """Replace the record in a store: an attribute of the group of records, in one key."""
         # The store does not remember it: consolidated metadata would tell readers of a run that ended long ago.
-        attributes = {_RUN: {**asdict(self), DIGEST: digest_of(asdict(self))}}
+        attributes = {_RUN: {**asdict(self), DIGEST: document_digest(asdict(self))}}
         group = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
         store.location.write({f"{RECORDS}/{ROOT}": json.dumps(group).encode()})
 

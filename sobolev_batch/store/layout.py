@@ -371,7 +371,7 @@ class Store:
             contents = each(self.location.read, unknown, unknown.values())
             for key, content in zip(unknown, contents, strict=True):
                 self._hashes[key] = hashlib.sha256(content or b"").hexdigest(), tags.get(key, "")
-        return digest_of([root, {key: self._hashes[key][0] for key in keys}])
+        return document_digest([root, {key: self._hashes[key][0] for key in keys}])
 
     def remember(self) -> None:
         """Write down the hashes of keys that have tags, so that later runs read only those that have changed since."""
@@ -445,7 +445,7 @@ def stored_choice(store: str | Path | Location) -> LatticeChoice | None:
     return None
 
 
-def digest_of(table: Any) -> str:
+def document_digest(table: Any) -> str:
     """Return the SHA-256 of a table, however its JSON is spelled."""
     return hashlib.sha256(json.dumps(table, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 

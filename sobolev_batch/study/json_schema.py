@@ -9,7 +9,7 @@ from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
 from sobolev_batch.reduction.searched import SearchedSource
-from sobolev_batch.sources.registry import Source, source_names, source_type_of
+from sobolev_batch.sources.registry import Source, source_type_of, sources_by_name
 from sobolev_batch.study.schema import KEYS_OF_FAMILY, KEYS_OF_SEARCH, Family, FamilyReference, StudyDocument
 
 _DIALECT = "https://json-schema.org/draft/2020-12/schema"
@@ -30,7 +30,7 @@ def study_schema() -> dict[str, Any]:
     >>> study_schema()["required"]
     ['reference', 'family', 'study']
     """
-    sources: dict[str, type[BaseModel]] = {name: source_type_of(name) for name in source_names()}
+    sources: dict[str, type[BaseModel]] = {name: source_type_of(name) for name in sorted(sources_by_name())}
     models: set[type[BaseModel]] = {StudyDocument, Source, Family, FamilyReference, SearchedSource, *sources.values()}
     references, whole = models_json_schema(
         [(model, "validation") for model in sorted(models, key=attrgetter("__name__"))]

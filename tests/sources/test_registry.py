@@ -50,9 +50,9 @@ def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         f"other-class = {__name__}:Path\n"
     )
     monkeypatch.syspath_prepend(str(tmp_path))
-    sources._registry.cache_clear()
+    sources.sources_by_name.cache_clear()
     yield
-    sources._registry.cache_clear()
+    sources.sources_by_name.cache_clear()
 
 
 @pytest.mark.usefixtures("plugin")

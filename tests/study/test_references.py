@@ -126,9 +126,9 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The package of the page with a source, installed."""
     name = install_example(tmp_path / "site", of="sources")
     monkeypatch.syspath_prepend(str(tmp_path / "site"))
-    registry._registry.cache_clear()
+    registry.sources_by_name.cache_clear()
     yield
-    registry._registry.cache_clear()
+    registry.sources_by_name.cache_clear()
     sys.modules.pop(name, None)
 
 
