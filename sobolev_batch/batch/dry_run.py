@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain, repeat, starmap
 from time import process_time
@@ -286,18 +286,25 @@ def _workers_text(workers: Workers) -> str:
 
 
 def plan(
-    study: StudyLike, store: StoreLike = None, client: Client | None = None, *, allow_commands: bool = False
+    study: StudyLike,
+    store: StoreLike = None,
+    client: Client | None = None,
+    *,
+    allow_commands: bool = False,
+    on_progress: Callable[[str], object] = str,
 ) -> StudyPlan:
-    """Return what running a study would do, without computing anything.
+    """Return what running a study would do, without computing its fields.
 
-    References are loaded, and a few other surfaces where the study requests an accuracy. An object that cannot be
-    carried out stops no other. Of many objects, 16 unfinished ones are looked at, and others count as their mean.
+    References are loaded; where the study requests an accuracy, a few other surfaces are made and compared. An object
+    that cannot be carried out stops no other. Of many objects, 16 unfinished ones are looked at, and others count as
+    their mean.
 
     Args:
         study: Study, or the path of its file.
         store: Path or URL of a new or existing store; default storage/NAME.zarr.
         client: Client of the cluster to plan for; default processes on this machine, one per core.
         allow_commands: True if the commands of the study may run here, which make the few surfaces that are loaded.
+        on_progress: Called with the name of each object before it is planned.
 
     Raises:
         StudyError, MeshError, LatticeError: The study cannot be carried out.
@@ -328,7 +335,12 @@ def plan(
     bases: set[str] = set()
     names, share = _looked_at(study, location)
     part = replace(study, objects={name: study.objects[name] for name in names})
-    plans, refused = for_each_object(part, location, lambda one, place: _plan(one, place, workers, client, bases))
+
+    def planned(one: Study, place: Location) -> ObjectPlan:
+        on_progress(one.object.name or one.name)
+        return _plan(one, place, workers, client, bases)
+
+    plans, refused = for_each_object(part, location, planned)
     seconds, processor_seconds, time = _forecast(plans.values(), share, workers, client is None, bases)
     warnings, count = warnings_of(study, location), len(study.objects)
     return StudyPlan(

@@ -19,7 +19,7 @@ from sobolev_batch.cli.options import (
     scheduler_options,
     workers_option,
 )
-from sobolev_batch.cli.output import echo, echo_lines, echo_result, progress_reports
+from sobolev_batch.cli.output import echo, echo_lines, echo_result, progress_reports, show_step
 from sobolev_batch.cli.program import EXIT_SOME_FAILED, cli
 from sobolev_batch.cli.table_commands import table_command
 from sobolev_batch.errors import InputError
@@ -172,7 +172,7 @@ def plan_command(
     from sobolev_batch.batch.dry_run import plan
 
     with client_of(scheduler, trust_network) as client:
-        made = plan(study, store, client, allow_commands=allow_commands)
+        made = plan(study, store, client, allow_commands=allow_commands, on_progress=show_step)
     echo_result(style, made, made.to_table())
     if made.refused:
         context.exit(EXIT_SOME_FAILED)

@@ -125,8 +125,9 @@ def test_of_many_objects_some_are_looked_at(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr("sobolev_batch.batch.dry_run.make_plan", planned)
     names = [f"ball{k:02}" for k in range(40)]
     study = sb.Study.from_table(small_table(object=balls(**dict.fromkeys(names, 1.0)), family=methods_of()))
-    found = sb.plan(study, tmp_path / "many.zarr")
-    assert looked == list(found.objects) == [names[k * 40 // 16] for k in range(16)]
+    named: list[str] = []
+    found = sb.plan(study, tmp_path / "many.zarr", on_progress=named.append)
+    assert named == looked == list(found.objects) == [names[k * 40 // 16] for k in range(16)]
     assert (found.count, found.share) == (40, 2.5)
     assert found.total_bytes == 40 * found.objects["ball00"].total_bytes
     assert "for 200 missing fields" in str(found)
