@@ -11,7 +11,7 @@ The public names by subject:
   `largest_deviation` (between bounds), `proximity` (Hausdorff, Chamfer) and `vertex_distances`.
 - Meshes: `Mesh`, `as_mesh` (of paths, arrays and other libraries' meshes), `read_mesh`, `write_mesh`; `fit` moves the
   vertices of one towards a target.
-- Fields: `fourier_transform` on a `Lattice`; `norm`, `distance`, `spectrum` and `witness` are methods of `field.sobolev`.
+- Fields: `fourier_transform` on a `Lattice`; `norm`, `distance`, `spectrum` and `witness` as methods, `field.sobolev`.
 - Studies: `Study`, `init_study`, `plan`, `run`, `submit`.
 - Stores: `open_store`, `status`, `verify`, `unlock`.
 - Meshes within a tolerance: `reduce`.

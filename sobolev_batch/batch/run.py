@@ -107,7 +107,7 @@ def run(
         StoreError: The store cannot be reached or written, belongs to another study, or is being written by another run
             (LockError).
         ClusterError: No worker has the GPU or the memory that the study requests; or the scheduler was lost.
-        InputError: The memory is no size, or not there; or the client is asynchronous.
+        InputError: The memory is no size, or not there; or the client is none of Dask's, or asynchronous.
 
     >>> import sobolev_batch as sb
     >>> study = sb.Study.from_table({

@@ -30,7 +30,7 @@ def convergence(
     seed: int = 0,
     on_progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> xr.Dataset:
-    """Return the distances of some meshes to a surface, and the observed rates of convergence between them.
+    """Return the distances of some meshes to a surface, and the observed orders of convergence between them.
 
     Args:
         meshes: Meshes in any form that `as_mesh` takes, in any order, with labels if they are a mapping.
