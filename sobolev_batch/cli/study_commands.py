@@ -84,7 +84,6 @@ def run_command(
     from sobolev_batch.study.study import as_study
     from sobolev_batch.tables.conclusion import format_objects, format_verdict
     from sobolev_batch.tables.convergence import format_table
-    from sobolev_batch.tables.open import open_store
 
     if scheduler and (settings["workers"] or settings["memory"]):
         raise click.UsageError(
@@ -94,7 +93,7 @@ def run_command(
     with progress_reports() as show, client_of(scheduler, trust_network) as client:
         summary = run(parsed, store, client, on_progress=show, **settings)
     if "" in parsed.objects:
-        echo_lines(format_verdict(open_store(summary.store)))
+        echo_lines(format_verdict(summary.store))
     else:
         _print_league(context, summary.store)
         with suppress(InputError):  # As the league says, no object has tables.

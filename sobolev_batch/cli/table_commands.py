@@ -14,8 +14,6 @@ from sobolev_batch.cli.output import echo_lines
 from sobolev_batch.cli.program import NamedCommands, cli
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from sobolev_batch.store.location import Location
     from sobolev_batch.tables import Format
 
@@ -39,13 +37,6 @@ class TableOptions:
     store: Location
     style: Format
     orders: tuple[float, ...] | None
-
-    @property
-    def tree(self) -> xr.DataTree:
-        """The store of one object, opened."""
-        from sobolev_batch.tables.open import open_store
-
-        return open_store(self.store)
 
 
 def table_options(command: Callable[..., int | None]) -> Callable[..., int | None]:
@@ -91,7 +82,7 @@ def matrix_command(table: TableOptions) -> None:
     """Print distances of all pairs of meshes."""
     from sobolev_batch.tables.matrix import format_matrix
 
-    echo_lines(format_matrix(table.tree, table.style, table.orders), table.style)
+    echo_lines(format_matrix(table.store, table.style, table.orders), table.style)
 
 
 @table_command.command("verdict")
@@ -100,7 +91,7 @@ def verdict_command(table: TableOptions) -> None:
     """Print the nearest mesh at each size, and the smallest below 5 % and 1 %."""
     from sobolev_batch.tables.conclusion import format_verdict
 
-    echo_lines(format_verdict(table.tree, table.style, table.orders), table.style)
+    echo_lines(format_verdict(table.store, table.style, table.orders), table.style)
 
 
 @table_command.command("objects")
@@ -119,4 +110,4 @@ def smallest_command(table: TableOptions, below: float) -> None:
     """Print the smallest mesh below a bound."""
     from sobolev_batch.tables.smallest import format_smallest
 
-    echo_lines(format_smallest(table.tree, table.style, table.orders, below=below), table.style)
+    echo_lines(format_smallest(table.store, table.style, table.orders, below=below), table.style)

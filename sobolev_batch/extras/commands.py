@@ -405,7 +405,7 @@ def time_command(table: TableOptions, truth: str | None, factor: float) -> None:
     """Print distances of moving meshes over time."""
     from sobolev_batch.extras.leagues.evolution import format_evolution
 
-    echo_lines(format_evolution(table.tree, table.style, table.orders, truth=truth, factor=factor), table.style)
+    echo_lines(format_evolution(table.store, table.style, table.orders, truth=truth, factor=factor), table.style)
 
 
 @click.command("league")

@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import xarray as xr
 
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.convergence import ALONE, remarks, table, tables_of
-from sobolev_batch.tables.open import AnyStore, require_one_object
+from sobolev_batch.tables.open import AnyStore, as_tree, require_one_object
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.smallest import smallest_of
 from sobolev_batch.tables.text import count, minus, percent, spread, wrapped
@@ -212,8 +211,9 @@ def _names(labels: Sequence[str]) -> str:
     return ", ".join(labels[:MOST_NAMED]) + (f" and {more:,} more" if more > 0 else "")
 
 
-def format_verdict(tree: xr.DataTree, style: Format = "text", orders: Sequence[float] | None = None) -> str:
-    """Return the verdict on the study of an open store as text, or its rows for programs."""
+def format_verdict(store: AnyStore, style: Format = "text", orders: Sequence[float] | None = None) -> str:
+    """Return the verdict on the study of one object as text, or its rows for programs."""
+    tree = as_tree(store)
     require_one_object(tree)
     frame = table(tree, orders)
     reasons = frame[frame["status"] != "complete"].drop_duplicates("mesh").set_index("mesh")["reason"]

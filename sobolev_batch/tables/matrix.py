@@ -90,8 +90,9 @@ def matrix_frame(distances: xr.Dataset, order: float) -> pd.DataFrame:
     return frame[["order", "mesh", "other", *_COLUMNS]]
 
 
-def format_matrix(tree: xr.DataTree, style: Format = "text", orders: Sequence[float] | None = None) -> str:
-    """Return the distance matrices of an open store as text; InputError where they are too large for people."""
+def format_matrix(store: AnyStore, style: Format = "text", orders: Sequence[float] | None = None) -> str:
+    """Return the distance matrices of a store as text; InputError where they are too large for people."""
+    tree = as_tree(store)
     distances = distances_at(tree, orders)
     chosen = list(dict.fromkeys(distances["order"].values.tolist()))
     count = distances.sizes["mesh"]

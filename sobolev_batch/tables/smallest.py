@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import pandas as pd
-import xarray as xr
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.parameters import fraction
@@ -82,10 +81,10 @@ def smallest_of(frame: pd.DataFrame, most: float) -> pd.DataFrame:
 
 
 def format_smallest(
-    tree: xr.DataTree, style: Format = "text", orders: Sequence[float] | None = None, *, below: float | str
+    store: AnyStore, style: Format = "text", orders: Sequence[float] | None = None, *, below: float | str
 ) -> str:
     """Return the smallest meshes below a bound as text; see `smallest_below`."""
-    frame = smallest_below(tree, below, orders)
+    frame = smallest_below(store, below, orders)
     amount = f"{100 * frame.attrs['below']:g} %"
     sections = []
     for order, rows in frame.groupby("order", sort=False):

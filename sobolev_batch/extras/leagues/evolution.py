@@ -90,7 +90,7 @@ def evolution(
 
 
 def format_evolution(
-    tree: xr.DataTree,
+    store: AnyStore,
     style: Format = "text",
     orders: Sequence[float] | None = None,
     *,
@@ -98,6 +98,7 @@ def format_evolution(
     factor: float = REMESHING_FACTOR,
 ) -> str:
     """Return the distances of moving meshes as text; see `evolution`."""
+    tree = as_tree(store)
     found = evolution(tree, orders, truth=truth, factor=factor)
     columns = [*_NUMBERS, "growth"]
     frame: pd.DataFrame = found[columns].to_dataframe().dropna(how="all").reset_index()
