@@ -22,7 +22,6 @@ from sobolev_batch.tables.open import (
     as_tree,
     finished_group,
     has_objects,
-    has_proximity,
     metadata_of,
     placement_doubts,
     reference_of,
@@ -221,7 +220,7 @@ def _rows(tree: xr.DataTree, order: Orders | None) -> pd.DataFrame:
     if of_all:
         columns = {**{key: meshes[key].values[others] for key in _OF_ALL}, **columns}
     nearness = {}
-    if has_proximity(tree):
+    if "proximity" in tree.children:
         proximity = finished_group(tree, "proximity").reindex(mesh=labels[others])
         asked = [f"{name}{way}" for name in _metrics_of(tree) for way in ("", "_forward", "_backward")]
         nearness = {name: proximity[name].values for name in asked if name in proximity}
@@ -296,7 +295,7 @@ def _sections(name: str, tree: xr.DataTree, frame: pd.DataFrame, x: str) -> Iter
     for order, rows in marked.groupby("order", sort=False):
         yield Section(f"Sobolev distance of order {order:g} to {frame.attrs['reference']}", [(columns, rows)])
     once = marked.drop_duplicates("mesh")
-    if has_proximity(tree):
+    if "proximity" in tree.children:
         metrics = _metrics_of(tree)
         columns = [MESH, *(column for column in _METRIC_COLUMNS if column.name in metrics)]
         yield Section("Other distances, the same at all orders", [(columns, once)])
@@ -310,7 +309,7 @@ def _sections(name: str, tree: xr.DataTree, frame: pd.DataFrame, x: str) -> Iter
 
 def _metrics_of(tree: xr.DataTree) -> list[str]:
     """Return the names of the numbers, besides distances of orders, that the study shows in its tables."""
-    metrics = finished_group(tree, "proximity").attrs["metrics"] if has_proximity(tree) else []
+    metrics = finished_group(tree, "proximity").attrs["metrics"] if "proximity" in tree.children else []
     return [name for metric in metrics for name in METRICS.get(metric, ())]
 
 
@@ -337,7 +336,7 @@ def _notes(trees: Sequence[xr.DataTree], frames: Sequence[pd.DataFrame], x: str)
     """Return what the numbers of all tables mean."""
     notes = [*wrapped(_NOTE), *([] if x == EDGE_LENGTH else [f"Rates are those of distance ~ ({x})^-rate."])]
     notes += wrapped(" ".join(unit_notes(trees)))
-    if any(map(has_proximity, trees)):
+    if any("proximity" in tree.children for tree in trees):
         notes += wrapped(_PROXIMITY_NOTE)
     for rtol in dict.fromkeys(frame.attrs["rtol"] for frame in frames if "rtol" in frame.attrs):
         notes += wrapped(_ACCURACY_NOTE.format(rtol=rtol))
@@ -357,7 +356,7 @@ def remarks(tree: xr.DataTree, frame: pd.DataFrame) -> list[str]:
     failures = [f"{row.mesh} failed: {row.reason}" for row in rows.query("status == 'failed'").itertuples(index=False)]
     if missing := int((rows["status"] == "missing").sum()):
         failures.append(f"{missing:,} of {len(rows):,} meshes are not computed; run the whole study to add them")
-    if has_proximity(tree):
+    if "proximity" in tree.children:
         reasons = finished_group(tree, "proximity")["reason"].to_series()
         failures += [f"{mesh} has no proximity: {reason}" for mesh, reason in reasons.items() if reason]
     return [*failures, *(f"{mesh}: {doubt}" for mesh, doubt in placement_doubts(tree).items())]

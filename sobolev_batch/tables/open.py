@@ -320,11 +320,6 @@ def similarity_of(tree: xr.DataTree) -> Similarity:
     return Similarity(table["scale"], tuple(table["origin"]))
 
 
-def has_proximity(tree: xr.DataTree) -> bool:
-    """Return True if the store has Hausdorff and Chamfer distances."""
-    return "proximity" in tree.children
-
-
 def reference_of(tree: xr.DataTree) -> str:
     """Return the label of the reference of an object's study."""
     require_one_object(tree)

@@ -367,7 +367,12 @@ class _Loop(Generic[Result]):
                 if run not in self._ready:
                     self._ready.append(run)
             elif was_alone:
-                self._give(run, task, _deadly(outcome))
+                reason = (
+                    "its tasks ended the worker that they ran on again and again, at last with nothing else beside "
+                    f"them, as happens for want of memory ({outcome}); start workers with more memory, or take it "
+                    "out of the study"
+                )
+                self._give(run, task, ClusterError(reason))
             else:
                 run.suspects.append(task)
         for run in runs:
@@ -448,10 +453,3 @@ def _outcomes(futures: Sequence[Future]) -> list[Any]:
 def describe_failure(error: BaseException) -> str:
     """Return why a task failed, in one line."""
     return one_line(error) if isinstance(error, ClusterError) else f"{type(error).__name__}: {one_line(error)}"
-
-
-def _deadly(error: KilledWorker) -> ClusterError:
-    return ClusterError(
-        "its tasks ended the worker that they ran on again and again, at last with nothing else beside them, as "
-        f"happens for want of memory ({error}); start workers with more memory, or take it out of the study"
-    )

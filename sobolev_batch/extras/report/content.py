@@ -45,7 +45,6 @@ from sobolev_batch.tables.convergence import (
 )
 from sobolev_batch.tables.open import (
     finished_group,
-    has_proximity,
     open_store,
     placement_doubts,
     root_attribute,
@@ -186,7 +185,7 @@ def study_content(tree: xr.DataTree, status: Status) -> dict[str, Any]:
         "omissions": [f"verdict: only {omitted} are shown"] if omitted else [],
         "doubtful": reasons_table("doubtful", "mesh", placement_doubts(tree)),
         "rtol": convergence.attrs.get("rtol"),
-        "has_proximity": has_proximity(tree),
+        "has_proximity": "proximity" in tree.children,
         "units": " ".join(unit_notes([tree])),
     }
 
