@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections import defaultdict, deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
@@ -323,24 +323,29 @@ def _check_same_study(store: Store, plan: Plan) -> None:
     may_change = plan.study.accuracy is not None and study.get("choice")
     comparisons = [("the study", repr(study["name"]), repr(plan.name))]
     if not may_change:
-        old_lattice, new_lattice = (
-            f"xi_max {lattice['xi_max']:.6g} and M {lattice['M']}"
-            for lattice in (study["lattice"], _lattice_entry(plan)["lattice"])
-        )
-        comparisons.append(("a lattice of", old_lattice, new_lattice))
+        comparisons.append(lattices_text(study["lattice"], _lattice_entry(plan)["lattice"]))
         comparisons.append(("dtype", repr(study["dtype"]), repr(plan.choice.dtype)))
         old, new = study.get("octaves"), plan.choice.octaves
         if old != new:
             first, second = (str(len(table["octaves"])) if table else "none" for table in (old, new))
             comparisons.append(("octaves:", first, second if first != second else f"{second} others"))
-    differences = [f"{what} {old}, not {new}" for what, old, new in comparisons if old != new]
-    if differences:
-        # The store of an object lies in that of the whole study.
-        whole = store.location.beside("") if plan.study.object.name else store.path
+    # The store of an object lies in that of the whole study.
+    require_equal(store.location.beside("") if plan.study.object.name else store.location, comparisons)
+
+
+def require_equal(location: Location, comparisons: Sequence[tuple[str, str, str]]) -> None:
+    """Refuse a store of another study, in which something is this and not that, by an OtherStudyError."""
+    if differences := [f"{what} {old}, not {new}" for what, old, new in comparisons if old != new]:
         raise OtherStudyError(
-            f"{whole}: it holds a store of another study, with {'; '.join(differences)}. "
+            f"{location}: it holds a store of another study, with {'; '.join(differences)}. "
             "Name another store, or remove this one"
         )
+
+
+def lattices_text(old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, str, str]:
+    """Return the comparison of the lattices of two studies."""
+    before, now = (f"xi_max {lattice['xi_max']:.6g} and M {lattice['M']}" for lattice in (old, new))
+    return "a lattice of", before, now
 
 
 def _labels_for(plan: Plan, stored: Sequence[str], records: Sequence[Record | None], *, is_trusted: bool) -> list[str]:

@@ -13,7 +13,7 @@ from typing import Any, Self, TypeVar
 
 from sobolev_batch.errors import DamageError, InputError, StoreError
 from sobolev_batch.sources.names import node_problem, quoted
-from sobolev_batch.store.create import list_records, record_keys
+from sobolev_batch.store.create import lattices_text, list_records, record_keys, require_equal
 from sobolev_batch.store.encoding import ROOT
 from sobolev_batch.store.layout import DESCRIPTION, OBJECTS, PAGE, RECORD, RECORDS, TABLES_OF_ALL, TAGS, Store
 from sobolev_batch.store.location import Location
@@ -100,6 +100,12 @@ class Objects:
             root, root.documents[""]["attributes"]["title"], study["name"], tuple(study[OBJECTS]), study["table"]
         )
 
+    def _require_lattice_of(self, study: Study) -> None:
+        """Refuse another lattice, as stores of objects do, before the root has the table of the other study."""
+        old, new = self.table.get("lattice"), study.table.get("lattice")
+        if old and new and old != new and any(Store(self.location.below(name)).exists() for name in self.recorded()):
+            require_equal(self.location, [lattices_text(old, new)])
+
     @classmethod
     def prepared(cls, location: Location, study: Study) -> Self:
         """Write down at a location which objects a study has; records of those that it had before stay."""
@@ -114,6 +120,8 @@ class Objects:
                 f"{location}: it holds the store of another study, {present.name!r}, not {study.name!r}; "
                 "name another store, or remove this one"
             )
+        else:
+            present._require_lattice_of(study)
         root = Store(location) if present is None else present.root
         entry = {
             "name": study.name,

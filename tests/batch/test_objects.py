@@ -226,8 +226,10 @@ def test_a_second_run_computes_what_is_new(changeable: Path, threads: Client) ->
     message = (
         f"{changeable}: it holds a store of another study, with a lattice of .* Name another store, or remove this"
     )
+    before = (changeable / "zarr.json").read_bytes()
     with pytest.raises(sb.errors.StoreError, match=rf"^{message} one$"):
         sb.run(sb.Study.from_table(other), changeable, threads)
+    assert (changeable / "zarr.json").read_bytes() == before
 
 
 @pytest.mark.extras
