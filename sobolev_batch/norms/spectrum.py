@@ -17,7 +17,7 @@ from typing import Any, Self
 import numpy as np
 
 from sobolev_batch.arrays import Indices, Reals
-from sobolev_batch.norms.tail.integrals import Scatter, error_of_sum, pooled
+from sobolev_batch.norms.tail.integrals import Scatter, deviations_by_images, error_of_sum, pooled
 from sobolev_batch.norms.tail.sampling import OctaveSampling, SampleSet, TailSampling
 from sobolev_batch.transform.lattice import Lattice, smooth_step
 
@@ -26,7 +26,8 @@ _NODES = 40
 # Chebyshev points and their barycentric weights.
 _ANGLES = np.pi * (np.arange(_NODES) + 0.5) / _NODES
 _POINTS, _POINT_WEIGHTS = -np.cos(_ANGLES), np.where(np.arange(_NODES) % 2, -1.0, 1.0) * np.sin(_ANGLES)
-# Orders at which the largest sample is known. Between them its logarithm is convex in the order, and below the chord.
+# Orders at which peaks are known. Between them the logarithm of the largest sample is convex in the order, and below
+# the chord.
 _PEAK_ORDERS = np.array([-0.5, -1, -1.5, -2, -2.5, -3, -3.5, -4, -5, -6, -8, -10, -14, -20, -100])
 
 
@@ -38,7 +39,8 @@ class Spectra:
         sums: Integrals of |field|² over the frequencies of each radius, float64 (fields, radii).
         moments: Sums of the squared terms of drawn samples, moved to radii likewise, float64 (fields, moments); their
             weights are the squared ones.
-        peaks: Largest term of each part of an octave at some orders, float64 (fields, peaks).
+        peaks: Deviation of each part of an octave that the scatter of its groups does not show, at some orders, float64
+            (fields, peaks): the largest term, and images that all groups have.
     """
 
     sums: Reals
@@ -234,7 +236,7 @@ class RadialAxis:
             arrays |= {
                 name: (len(self), "shell", f"radial spectrum of the {meaning}"),
                 f"{name}_moments": (moments, "moment", "squared terms of drawn samples, by radius"),
-                f"{name}_peaks": (peaks, "peak", "largest term of each part of an octave, at some orders"),
+                f"{name}_peaks": (peaks, "peak", "largest term of each part of an octave, and images, at some orders"),
             }
         return {name: array for name, array in arrays.items() if array[0]}
 
@@ -277,7 +279,12 @@ class RadialAxis:
                 if segment.sample_set.is_drawn:
                     moments.append(segment.moved(terms**2))
                 sizes = np.abs(terms)
-                peaks.append(np.stack([(sizes * weights).max(axis=1) for weights in segment.peak_weights], axis=1))
+                largest = np.stack([(sizes * weights).max(axis=1) for weights in segment.peak_weights])
+                if not segment.sample_set.is_drawn:
+                    sampling, number = segment.sampling, segment.number
+                    images = deviations_by_images(sampling, number, terms, _PEAK_ORDERS, segment.least_length)
+                    largest = np.hypot(largest, images)
+                peaks.append(largest.T)
         return Spectra(*(np.concatenate(columns, axis=1) for columns in (sums, moments, peaks)))
 
     def energies(self, spectra: Spectra) -> Reals:

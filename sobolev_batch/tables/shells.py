@@ -15,6 +15,8 @@ from sobolev_batch.store.metadata import chunk_shape
 from sobolev_batch.store.sealed_chunks import arrays_of, key_in, key_of, missing_chunks, read_chunk, seal
 from sobolev_batch.tables.reducer import Reducer
 
+# Raise it whenever the same fields lead to other spectra: those of older versions are then made again.
+_SPECTRA_VERSION = 2
 # Rounding may raise a lower bound by this fraction of it.
 _ROUNDING = 1e-9
 
@@ -22,7 +24,7 @@ _ROUNDING = 1e-9
 def spectrum_keys(keys: Mapping[int, str], reference: int) -> dict[int, str]:
     """Return what tells which fields a row's spectra were computed from, by the keys of all rows with a field."""
     of_reference = keys.get(reference, "")
-    return {row: key_of([key, of_reference]) for row, key in keys.items()}
+    return {row: key_of([key, of_reference, str(_SPECTRA_VERSION)]) for row, key in keys.items()}
 
 
 def chunks_of_spectra(store: Store) -> Iterator[range]:

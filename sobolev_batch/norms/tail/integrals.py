@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,9 @@ from sobolev_batch.norms.tail.sampling import OctaveSampling
 
 # The true value lies within an error by chance with this probability, if sums over groups, or over points, are normal.
 _CONFIDENCE = 0.99
+# Images up to this many periods away along each axis: farther ones have others of sublattices beside them, which tell
+# of them. And ranges of |ξ| in which samples count as one: phases of images turn by 0.5 in one, on the usual M of 64.
+_FARTHEST_IMAGE, _RANGES = 5, 2048
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,21 +71,57 @@ class OctaveWeights:
     def sums(self, squares: Reals) -> OctaveSums:
         """Return the integrals of |field|², or of products of two fields, with variances, from all samples (n,)."""
         sums, scatters = np.zeros(len(self.by_order)), []
-        for sample_set in self.sampling.sample_sets:
+        for number, sample_set in enumerate(self.sampling.sample_sets):
             if sample_set.samples.start == sample_set.samples.stop:
                 continue
-            columns = []
-            for weights in self.by_order:
-                terms = weights[sample_set.samples] * squares[sample_set.samples]
-                groups = terms if sample_set.starts is None else np.add.reduceat(terms, sample_set.starts)
-                columns.append((groups.sum(), len(groups) * groups.var(ddof=1), np.abs(terms).max()))
-            values, variances, largest = np.array(columns).T
-            sums += values
-            scatters.append(Scatter(sample_set.is_drawn, variances, largest, len(groups) - 1))
+            groups = terms = self.by_order[:, sample_set.samples] * squares[sample_set.samples]
+            unseen = np.abs(terms).max(axis=1)
+            if sample_set.starts is not None:
+                groups = np.add.reduceat(terms, sample_set.starts, axis=1)
+                images = deviations_by_images(self.sampling, number, terms[-1:], (*self.orders, 0.0))
+                unseen = np.hypot(unseen, images[:, 0])
+            sums, count = sums + groups.sum(axis=1), groups.shape[1]
+            scatters.append(Scatter(sample_set.is_drawn, count * groups.var(axis=1, ddof=1), unseen, count - 1))
         by_origin, degrees = pooled(scatters)
         # The weights of the last row are those of the energy.
         deviation = float(np.sqrt(by_origin[:, -1].sum())) / self.width
         return OctaveSums(sums[:-1], by_origin[:, :-1], degrees, float(sums[-1]) / self.width, deviation)
+
+
+def deviations_by_images(
+    sampling: OctaveSampling, number: int, terms: Reals, orders: Sequence[float] | Reals, least_length: float = 1.0
+) -> Reals:
+    """Return the deviations (orders, fields) of sums over a lattice by images that its sublattices have in common.
+
+    The terms (fields, n) are weights times |field|². Their factors are powers of (1 + |ξ|²) over the least length.
+
+    The scatter among sublattices tells of images at halves of periods alone. Those at whole periods are like them where
+    many images overlap. Of few, they may touch the surface where no other does: a ball meets all at its diameter at
+    once, whatever the rotation. The mean of an image over directions follows from the radii of samples. It is that of
+    |field|² less its mean, since a constant has no images.
+    """
+    lattice, samples = sampling.lattices[number], sampling.sample_sets[number].samples
+    places = (sampling.radii[samples] / lattice.highest * _RANGES).astype(np.int64)
+    radii = np.maximum((np.arange(_RANGES) + 0.5) / _RANGES * lattice.highest, lattice.lowest)
+    even = np.bincount(places, sampling.weights[samples], _RANGES)
+    profiles = np.stack([np.bincount(places, row, _RANGES) for row in terms])
+    (waves, counts), found = _images_of(lattice.M), []
+    for order in orders:
+        factors = ((1 + radii**2) / least_length) ** order
+        means = profiles @ factors / np.maximum(even @ factors, np.finfo(np.float64).tiny)
+        images = (factors * (profiles - means[:, None] * even)) @ waves
+        found.append(np.sqrt(images**2 @ counts))
+    return np.stack(found)
+
+
+@lru_cache(maxsize=8)
+def _images_of(intervals: int) -> tuple[Reals, Reals]:
+    """Return for images at each distance their mean waves over ranges of |ξ| (ranges, distances), and their number."""
+    axis = range(-_FARTHEST_IMAGE, _FARTHEST_IMAGE + 1)
+    squares, counts = np.unique([i * i + j * j + k * k for i, j, k in product(axis, axis, axis)], return_counts=True)
+    # A period is half of M over the largest |ξ|.
+    waves = np.sinc(intervals * np.sqrt(squares[1:]) * ((np.arange(_RANGES) + 0.5) / _RANGES)[:, None])
+    return waves, counts[1:].astype(np.float64)
 
 
 def squared_moduli(values: NDArray[np.complexfloating]) -> Reals:
@@ -93,24 +133,25 @@ class Scatter(NamedTuple):
     """Variance of a sum over the samples of one lattice, or over all drawn samples of an octave.
 
     The variance follows from groups of samples, each (orders, ...), of which there is one more than degrees of freedom.
+    It does not show the unseen deviation: the largest term, which may stand for others like it that were not met, and
+    images that all groups of a lattice have.
     """
 
     is_drawn: bool
     variance: Reals
-    largest_term: Reals
+    unseen: Reals
     degrees: int
 
 
 def pooled(scatters: Sequence[Scatter]) -> tuple[Reals, Reals]:
     """Return the variances (2, orders, ...) and degrees of freedom (2,) of what lattices and drawn samples contribute.
 
-    A single sample may stand for others like it that were not met: the largest one counts as a further deviation.
     Lattices count apart from draws, so that few sublattices stay few beside many draws.
     """
     variances, degrees = [np.zeros(()), np.zeros(())], np.zeros(2)
     for one in scatters:
         origin = int(one.is_drawn)
-        variances[origin] = variances[origin] + (one.variance + one.largest_term**2)
+        variances[origin] = variances[origin] + (one.variance + one.unseen**2)
         degrees[origin] += one.degrees
     return np.stack(np.broadcast_arrays(*variances)), degrees
 

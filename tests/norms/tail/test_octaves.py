@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from sobolev_batch import Mesh
+from sobolev_batch import Lattice, Mesh
 from sobolev_batch.geometry.surface import Surface
+from sobolev_batch.norms.spectrum import RadialAxis
 from sobolev_batch.norms.tail.face_normals import FaceNormals
 from sobolev_batch.norms.tail.integrals import OctaveSums, OctaveWeights, integral_over, squared_moduli
 from sobolev_batch.norms.tail.sampling import Octave, OctaveSampling, TailSampling
@@ -43,11 +44,11 @@ def sums_of(surface: Surface, sampling: OctaveSampling) -> OctaveSums:
     return OctaveWeights(sampling, ORDERS).sums(squared_moduli(values_of(surface, sampling).values))
 
 
-def sphere_integral(order: float) -> float:
-    """∫ window (1+r²)^s |σ^|² over an octave, for the unit sphere."""
+def sphere_integral(order: float, radius: float = 1.0) -> float:
+    """∫ window (1+r²)^s |σ^|² over an octave, for a sphere."""
 
     def integrand(r: float) -> float:
-        value = 2 * np.sin(2 * np.pi * r) / r
+        value = 2 * radius * np.sin(2 * np.pi * radius * r) / r
         return float(OCTAVE.window(np.array(r)) * (1 + r * r) ** order * value**2 * 4 * np.pi * r * r)
 
     return float(quad(integrand, OCTAVE.lowest, OCTAVE.highest, limit=200)[0])
@@ -88,6 +89,25 @@ def test_sums_over_an_octave_are_right_within_their_standard_errors(intervals: i
     # Without a random shift, or with wrong weights, the mean would be off by many standard errors of a mean.
     assert (np.abs(misses.mean(axis=0)) < 4 / np.sqrt(60) * misses.std(axis=0)).all()
     assert np.mean(np.abs(misses) < 3 * np.sqrt([sums.variances for sums in found])) > 0.95
+
+
+@pytest.mark.parametrize("stored", [False, True])
+def test_errors_of_a_lattice_hold_where_images_touch_a_ball_that_no_sublattice_shows(stored: bool) -> None:
+    # Six images one period away meet the ball at once, whatever the rotation.
+    ball, missed = Sphere(3.05), 0
+    expected = np.array([sphere_integral(order, ball.radius) for order in ORDERS])
+    for seed in range(25):
+        sampling = sampling_of(ball, seed, 48, 0)
+        squares = squared_moduli(sphere_transform(ball, sampling.frequencies))
+        if stored:
+            axis = RadialAxis(Lattice(2.0, 8), TailSampling(OCTAVE.cutoff, (sampling,)))
+            spectra = axis.spectra(np.zeros((1, axis.lattice.shell_count)), squares[None])
+            values, errors = (found[:, 0] for found in axis.octave_integrals(spectra, ORDERS))
+        else:
+            values, errors = integral_over([OctaveWeights(sampling, ORDERS).sums(squares)])
+        missed += bool(np.any(np.abs(values - expected) > errors))
+        assert (errors < 0.08 * expected).all()
+    assert missed <= 1
 
 
 def test_draws_follow_their_density() -> None:
