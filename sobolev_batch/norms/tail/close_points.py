@@ -85,25 +85,29 @@ class Sheets:
     Attributes:
         meshes: Meshes, and those that stand for smooth surfaces.
         spacing: Triangles are in the order of cells of this width, and long ones are cut into pieces no longer.
+        lacking: Area that meshes which stand for smooth surfaces lack.
     """
 
     meshes: Sequence[tuple[Mesh, int]]
     spheres: Sequence[tuple[Sphere, int]]
     spacing: float = np.inf
+    lacking: float = 0.0
 
     @classmethod
     def from_surfaces(cls, surfaces: Sequence[Surface], signs: Sequence[int], cutoff: float) -> Self:
         """Return the sheets of surfaces; smooth ones become meshes that are fine beside the wavelength at a cutoff."""
         meshes: list[tuple[Mesh, int]] = []
         spheres: list[tuple[Sphere, int]] = []
+        lacking = 0.0
         for surface, sign in zip(surfaces, signs, strict=True):
             if isinstance(surface, Sphere):
                 spheres.append((surface, sign))
             elif isinstance(surface, Smooth):
                 meshes.append((_triangulated(surface, cutoff), sign))
+                lacking += surface.area - meshes[-1][0].area
             elif isinstance(surface, Mesh):
                 meshes.append((surface, sign))
-        return cls(meshes, spheres)
+        return cls(meshes, spheres, lacking=lacking)
 
     @property
     def cancel(self) -> bool:
@@ -278,12 +282,34 @@ def _triangulated(surface: Smooth, cutoff: float) -> Mesh:
     except InputError:
         counts = (_MOST_CELLS, _MOST_CELLS)
     cells = (min(_CELLS_PER_NODE * count, _MOST_CELLS) for count in counts)
-    u, v = (_grid(interval, count) for interval, count in zip(surface.intervals, cells, strict=True))
-    vertices = surface.positions(*np.meshgrid(u, v, indexing="ij")).reshape(3, -1).T
-    first = (np.arange(len(u) - 1)[:, None] * len(v) + np.arange(len(v) - 1)).ravel()
-    across, both = first + len(v), first + len(v) + 1
+    # With the middles of cells, which tell how far facets lie from the surface.
+    fine = [_grid(interval, 2 * count) for interval, count in zip(surface.intervals, cells, strict=True)]
+    positions = np.moveaxis(surface.positions(*np.meshgrid(*fine, indexing="ij")), 0, -1)
+    corners = _facing_both_sides(positions)
+    rows, columns, _ = corners.shape
+    first = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    across, both = first + columns, first + columns + 1
     triangles = np.concatenate([np.stack([first, across, both], 1), np.stack([first, both, first + 1], 1)])
-    return Mesh.from_checked(np.ascontiguousarray(vertices), triangles)
+    return Mesh.from_checked(corners.reshape(-1, 3), triangles)
+
+
+def _facing_both_sides(positions: Reals) -> Reals:
+    """Return corners of facets whose mean distance from a surface is next to zero, from its positions (2m+1, 2n+1, 3).
+
+    Facets between positions lie within a ball, and its distance from a sphere of nearly the same size was off by 3 %.
+    In the mean, one lies off the surface by a third of what the middles of its edges do together.
+    """
+    corners = positions[::2, ::2]
+    moves = np.zeros_like(corners)
+    for u, v in ((1, 0), (0, 1), (1, 1)):
+        firsts, lasts = (slice(-u or None), slice(-v or None)), (slice(u, None), slice(v, None))
+        offsets = positions[u::2, v::2] - (corners[firsts] + corners[lasts]) / 2
+        sums, counts = np.zeros_like(corners), np.zeros((*corners.shape[:2], 1))
+        for ends in (firsts, lasts):
+            sums[ends] += offsets
+            counts[ends] += 1
+        moves += sums / np.maximum(counts, 1) / 3
+    return np.asarray(corners + moves)
 
 
 def _grid(interval: Interval, cells: int) -> Reals:

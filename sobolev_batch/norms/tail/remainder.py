@@ -176,6 +176,9 @@ def _estimate(seen_by: _Seen, count: int, rng: np.random.Generator, *, is_exact:
     if is_exact and np.any(cut > _CUT_FRACTION * errors):
         corrections, cut = seen_by.corrections(found.draw, found.potentials, rng)
         means += corrections
+    # Facets of smooth surfaces are off by up to 6e-5 of the area, most of the error where nothing cancels.
+    lacking = 0.0 if seen_by.sheets.cancel else seen_by.sheets.lacking
+    means, left = means * (1 + lacking / seen_by.sheets.area), left + abs(lacking) * seen_by.alone
     kernels = seen_by.kernels
     scales = np.array([tail_integral(kernels.cutoff, order) for order in kernels.orders])
     energies, errors = (tuple(values.tolist()) for values in (means / scales, (errors + cut + left) / scales))

@@ -11,8 +11,10 @@ import sobolev_batch as sb
 from sobolev_batch import Mesh
 from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms.fields import Quality, TailQuality
+from sobolev_batch.norms.tail.close_points import Sheets
 from sobolev_batch.norms.tail.remainder import remainder
 from sobolev_batch.shapes import Sphere
+from sobolev_batch.transform.lattice import smooth_step
 from sobolev_batch.transform.probe import Probe
 from tests.support.rectangles import Rectangles
 
@@ -28,6 +30,28 @@ def test_energies_of_one_surface_are_twice_its_area() -> None:
     for surface in (BOX, Sphere(0.7, (0.1, 0.2, 0.3)), sb.shapes.Torus(1.0, 0.4)):
         beyond = remainder([surface], [1], 60.0, ORDERS, points=200)
         assert np.allclose(beyond.energies, 2 * surface.area, rtol=0.02), surface
+
+
+def test_facets_lack_no_area_of_a_smooth_surface() -> None:
+    radius, cutoff, orders = 4.0, 1.5, (-1.0, -2.0)
+    # ∫ (1 - step) (1 + r²)^s |σ^|² dr for a sphere; beyond the last node the sine is averaged out.
+    radii, step = np.linspace(cutoff / 2, 600.0, 400_001, retstep=True)
+    squares = (1 - smooth_step(radii, cutoff)) * 16 * np.pi * radius**2 * np.sin(2 * np.pi * radius * radii) ** 2
+    ball = sb.shapes.Ellipsoid((radius, radius, radius))
+    for order, value, error in zip(orders, *remainder([ball], [1], cutoff, orders).at(orders), strict=True):
+        last = 8 * np.pi * radius**2 * radii[-1] ** (2 * order + 1) / (-2 * order - 1)
+        exact = step * float(squares @ (1 + radii**2) ** order) + last
+        assert abs(value - exact) < error < 3e-4 * exact
+
+
+def test_facets_lie_on_both_sides_of_a_smooth_surface_alike() -> None:
+    for surface, tube in ((sb.shapes.Ellipsoid((0.5, 0.5, 0.5)), 0.0), (sb.shapes.Torus(0.5, 0.2), 0.5)):
+        ((mesh, _),) = Sheets.from_surfaces([surface], [1], 9.0).meshes
+        shares = np.random.default_rng(0).dirichlet([1, 1, 1], len(mesh.triangles))
+        x, y, z = np.einsum("nk,nkd->dn", shares, mesh.vertices[mesh.triangles])
+        # From the centre of a ball, or the middle of a tube.
+        heights = np.sqrt((np.hypot(x, y) - tube) ** 2 + z**2) - (0.2 if tube else 0.5)
+        assert abs(mesh.areas @ heights) < 0.03 * np.sqrt(mesh.areas @ heights**2 * mesh.area) < 3e-6 * mesh.area
 
 
 def test_what_two_surfaces_share_cancels() -> None:
