@@ -6,6 +6,7 @@ import os
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.compiled import pays
@@ -56,8 +57,20 @@ class Triangles:
     @cached_property
     def across(self) -> Indices:
         """For each side, the triangle on its other side; the triangle itself where there is none (3, m)."""
-        found = igl.triangle_triangle_adjacency(self._triangles)[0].T
-        return np.where(found < 0, np.arange(found.shape[1]), found)
+        return np.where(self._adjacency[0] < 0, np.arange(len(self._triangles)), self._adjacency[0])
+
+    @cached_property
+    def is_paired(self) -> NDArray[np.bool_]:
+        """For each side, whether it is one of a single pair of triangles that both name each other (3, m)."""
+        found, sides = self._adjacency
+        is_named = (found[sides, found] == np.arange(found.shape[1])) & (sides[sides, found] == np.arange(3)[:, None])
+        return np.asarray((found >= 0) & is_named)
+
+    @cached_property
+    def _adjacency(self) -> tuple[Indices, Indices]:
+        """For each side, the triangle across it, and which of its sides that is; -1 where there is none (3, m)."""
+        found, sides = igl.triangle_triangle_adjacency(self._triangles)
+        return found.T, sides.T
 
     def closest(self, points: Reals) -> tuple[Reals, Indices]:
         """Return the distance of points (n, 3) from the mesh, exact to rounding, and the triangle closest to each."""

@@ -10,6 +10,9 @@ by too much is cut. Both bounds hold wherever it is cut, so the cut decides abou
 at right angles to the best t, through the side beyond which the worst corner lies. The part on the side of t then has
 its closest points in t, and its bound is the distance itself.
 
+Where the question is only whether the distance exceeds a length, many triangles of B may answer it together for all of
+a triangle that they cover (see `cover`).
+
 Where both meshes cut one plane into long thin triangles, pieces are as many as these cross each other. What takes many
 is begun again without the parts of planes that both meshes cover (see `overlap`).
 
@@ -23,13 +26,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.closest import Triangles
+from sobolev_batch.geometry.cover import cover_distances
 from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
 from sobolev_batch.geometry.mesh import Mesh, dot
 from sobolev_batch.geometry.overlap import ROUNDING, rests_of
@@ -49,7 +53,8 @@ _MANY, _MANY_OF_EACH = 1 << 17, 2
 _LEAST_CUT, _LEAST_SHORTER_CUT, _LARGEST_CUT = 0.05, 0.003, 0.97
 # The distance is steep where the square of its change along a side exceeds the square of the side over this.
 _STEEP = 4.0
-# For so many pieces, those with the farthest centers, the closest triangle to the worst corner is worth a search.
+# For so many pieces, those with the farthest centers, the closest triangle to the worst corner is worth a search. So
+# many are worth a search of covers.
 _FEW = 300
 
 
@@ -179,16 +184,21 @@ class _Bounds:
 
 @dataclass(frozen=True, eq=False)
 class _Pieces:
-    """Parts of triangles: corners (3 corners, 3 coordinates, n), and triangles (k, n) that may be close to each."""
+    """Parts of triangles: corners (3 corners, 3 coordinates, n), and triangles (k, n) that may be close to each.
+
+    Covers of these parts, or of what they were cut from, may have been searched: where there was none, there hardly is
+    one now.
+    """
 
     corners: Reals
     close: Indices
+    is_searched: bool = False
 
     def batches(self) -> Iterator[_Pieces]:
         """Yield them in groups that memory holds."""
         for start in range(0, self.corners.shape[2], _BATCH):
             group = slice(start, start + _BATCH)
-            yield _Pieces(self.corners[..., group], self.close[:, group])
+            yield _Pieces(self.corners[..., group], self.close[:, group], self.is_searched)
 
 
 def directed_deviation(
@@ -259,16 +269,22 @@ def _cut(pieces: _Pieces, other: Triangles, bounds: _Bounds) -> _Pieces | None:
         centers = corners[..., left].mean(axis=0)
         distances, closest = other.closest(other.scale * centers.T)
         bounds.see(centers, distances / other.scale)
-        depths = np.zeros(count)
-        depths[left] = distances
+        depths, near = np.zeros(count), np.zeros(count, dtype=np.int64)
+        depths[left], near[left] = distances, closest
         left = look(closest)
     if bounds.is_over:
         left = left[:0]
+    is_searched = pieces.is_searched
+    if bounds.within is not None and not is_searched and len(left) >= _FEW:
+        covers = cover_distances(corners[..., left], other, near[left], bounds.enough)
+        upper[left] = np.minimum(upper[left], covers**2)
+        left, is_searched = left[covers > bounds.enough], True
     bounds.upper = max(bounds.upper, math.sqrt(np.delete(upper, left).max(initial=0.0)))
     if not len(left):
         return None
     farthest = (-depths[left]).argsort()[:_FEW]
-    return _parts(corners[..., left], best[left], np.sqrt(squares[:, left]), farthest, other, bounds)
+    parts = _parts(corners[..., left], best[left], np.sqrt(squares[:, left]), farthest, other, bounds)
+    return replace(parts, is_searched=is_searched)
 
 
 def _parts(

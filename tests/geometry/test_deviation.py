@@ -176,6 +176,28 @@ def test_a_clear_question_takes_fewer_pieces(pieces: list[int]) -> None:
     assert deviation.Deviation(0.1, 0.3, (0, 0, 0)).is_within(0.2) is None
 
 
+@pytest.mark.parametrize("factor", [1.05, 2])
+def test_a_yes_searches_each_triangle_once_where_many_others_cover_it(
+    factor: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    searched: list[int] = []
+    closest = Triangles.closest
+
+    def counted(self: Triangles, points: Reals) -> tuple[Reals, Indices]:
+        searched.append(len(points))
+        return closest(self, points)
+
+    monkeypatch.setattr(Triangles, "closest", counted)
+    coarse, fine = sb.shapes.icosphere(3), Triangles(sb.shapes.icosphere(5))
+    value = deviation.directed_deviation(coarse, fine).lower
+    of_value, least = sum(searched), len(coarse.vertices) + len(coarse.triangles)
+    searched.clear()
+    found = deviation.directed_deviation(coarse, fine, within=factor * value)
+    assert value <= found.upper <= factor * value
+    # Its corners and its center.
+    assert sum(searched) == least < of_value / 10
+
+
 def test_a_question_on_the_edge_is_decided() -> None:
     ball, egg = sb.shapes.icosphere(2), sb.shapes.Ellipsoid((1.0, 0.9, 0.8)).mesh(2)
     found = sb.largest_deviation(ball, egg, gap=1e-4).both
