@@ -41,8 +41,6 @@ class Triangles:
         self.mesh = mesh
         self._vertices = np.ascontiguousarray(mesh.vertices / self.scale)
         self._triangles = np.ascontiguousarray(mesh.triangles, dtype=np.int64)
-        self._tree = igl.AABB()
-        self._tree.init(self._vertices, self._triangles)
         self._by_triangle = self._vertices[self._triangles]
         self.corners = [np.ascontiguousarray(self._vertices[self._triangles[:, k]].T) for k in range(3)]
         a, b, c = self.corners
@@ -53,6 +51,12 @@ class Triangles:
         self._has_area = sizes > 0
         self._inverse_sizes = _inverse(sizes)
         self._inverse_lengths = [_inverse(dot(side, side)) for side in self._sides]
+
+    @cached_property
+    def _tree(self) -> igl.AABB:
+        tree = igl.AABB()
+        tree.init(self._vertices, self._triangles)
+        return tree
 
     @cached_property
     def across(self) -> Indices:

@@ -205,6 +205,8 @@ def directed_deviation(
     mesh: Mesh, other: Triangles, gap: float = DEFAULT_GAP, within: float | None = None
 ) -> Deviation:
     """Bound the largest distance of a mesh's points from triangles; see `largest_deviation`."""
+    if within is not None and (moved := _moved(mesh, other, within)) is not None:
+        return moved
     scale, reach = other.scale, max(other.scale, float(np.abs(mesh.vertices).max()))
     of_files = max(mesh.rounding, other.mesh.rounding)
     length = None if within is None else within / scale
@@ -222,6 +224,24 @@ def directed_deviation(
             pass
     x, y, z = (scale * bounds.place).tolist()
     return Deviation(scale * bounds.lower, scale * max(bounds.lower, bounds.upper), (x, y, z))
+
+
+def _moved(mesh: Mesh, other: Triangles, within: float) -> Deviation | None:
+    """Bound it by the largest move of a vertex, without a search; None for other triangles, and for longer moves."""
+    if len(mesh.vertices) != len(other.mesh.vertices) or not np.array_equal(mesh.triangles, other.mesh.triangles):
+        return None
+    used = mesh.used_vertices
+    moves = ((mesh.vertices[used] - other.mesh.vertices[used]) / other.scale).T
+    squares = dot(moves, moves)
+    upper, farthest = other.scale * math.sqrt(squares.max()), mesh.vertices[used[squares.argmax()]]
+    # Lengths below rounding are left to the search, as for other meshes.
+    if upper + _BOUND_ROUNDING * other.scale > within:
+        return None
+    every = np.arange(len(mesh.triangles))
+    points = np.broadcast_to(farthest[:, None] / other.scale, (3, len(every)))
+    lower = other.scale * math.sqrt(other.squares(points, every).min())
+    x, y, z = farthest.tolist()
+    return Deviation(lower, max(lower, upper), (x, y, z))
 
 
 def _cut_all(mesh: Mesh, other: Triangles, bounds: _Bounds) -> Iterator[None]:

@@ -198,6 +198,23 @@ def test_a_yes_searches_each_triangle_once_where_many_others_cover_it(
     assert sum(searched) == least < of_value / 10
 
 
+@pytest.mark.parametrize("size", [1e-60, 1.0, 1e60])
+def test_vertices_that_moved_less_than_a_length_take_no_search(size: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    ball, rng = sb.shapes.icosphere(3), np.random.default_rng(0)
+    moves = rng.normal(scale=0.01, size=ball.vertices.shape)
+    # No triangle uses the last one.
+    rows = np.append(ball.vertices, [[0, 0, 0]], axis=0), np.append(ball.vertices + moves, [[9, 9, 9]], axis=0)
+    pair = [sb.Mesh(size * vertices, ball.triangles) for vertices in rows]
+    value, longest = sb.largest_deviation(*pair), size * np.linalg.norm(moves, axis=1).max()
+    monkeypatch.delattr(Triangles, "closest")
+    found = sb.largest_deviation(*pair, within=1.001 * longest)
+    for way, of_value in ((found.forward, value.forward), (found.backward, value.backward)):
+        assert 0 < way.lower <= of_value.upper <= way.upper
+        assert way.upper == pytest.approx(longest)
+    with pytest.raises(AttributeError, match="closest"):
+        sb.largest_deviation(*pair, within=0.999 * longest)
+
+
 def test_a_question_on_the_edge_is_decided() -> None:
     ball, egg = sb.shapes.icosphere(2), sb.shapes.Ellipsoid((1.0, 0.9, 0.8)).mesh(2)
     found = sb.largest_deviation(ball, egg, gap=1e-4).both
