@@ -26,9 +26,16 @@ def tolerances(effort: Effort) -> Iterator[Row]:
     for cells, triangles, most in [(30, 200, 5.0)] if effort.quick else pairs:
         fine = _scan(cells)
         coarse = decimated(fine, triangles)
-        seconds = _processor_seconds(partial(sb.largest_deviation, coarse, fine))
+        started = time.process_time()
+        deviation = sb.largest_deviation(coarse, fine).both.upper
+        seconds = time.process_time() - started
         what = f"largest deviation within 1 %, {len(fine.triangles):,} against {triangles:,} triangles, both ways"
         yield Row("14", what, f"{seconds:.3g} CPU s", ratio=seconds, target=at_most(most))
+        for factor, answer in ((2.0, "yes"), (0.5, "no")):
+            ask = partial(sb.largest_deviation, coarse, fine, within=factor * deviation)
+            asked = _processor_seconds(ask)
+            what = f"the same, within {factor:g} times of it: {answer}; the bounds"
+            yield Row("14", what, f"{asked:.3g} CPU s", f"{seconds:.3g} CPU s", asked / seconds, at_most(1 / 3))
     count, cells = (10, 100) if not effort.quick else (2, 30)
     scans = {f"{seed}": _scan(cells, seed) for seed in range(count)}
     radius = scans["0"].bounding_sphere[1]
