@@ -115,9 +115,9 @@ def proximity_and_deviations(
     seed: int = 0,
     within: float | None = None,
 ) -> tuple[dict[str, float], Deviations]:
-    """Measure the same, and return also the largest deviations, which know their places, and whether they are within.
+    """Measure the same, and return also the largest deviations, which know their places.
 
-    Where a length for that lies between the bounds of a deviation, these are closer.
+    Bounds between which the length `within` would lie are closer, so that they tell on which side it is.
     """
     if not is_whole_number(points) or not 1 < points <= MOST_POINTS:
         raise InputError(f"points must be an integer from 2 to {MOST_POINTS}, found {points!r}")

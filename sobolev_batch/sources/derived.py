@@ -86,7 +86,7 @@ class _ReducingSource(NestedSource):
 
     @property
     def options(self) -> dict[str, Any]:
-        """What else the library is told."""
+        """Further arguments of `reduce`, which the fingerprint has too."""
         return {}
 
     def members(self, folder: Path) -> tuple[Member, ...]:
@@ -123,7 +123,7 @@ class DecimateSource(_ReducingSource):
 
     @property
     def options(self) -> dict[str, Any]:
-        """Whether open borders are kept, if so."""
+        """The choice of borders, where it is not that of the library."""
         return {"keep_boundary": True} if self.keep_boundary else {}
 
 
