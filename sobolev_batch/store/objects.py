@@ -100,11 +100,13 @@ class Objects:
             root, root.documents[""]["attributes"]["title"], study["name"], tuple(study[OBJECTS]), study["table"]
         )
 
-    def _require_lattice_of(self, study: Study) -> None:
-        """Refuse another lattice, as stores of objects do, before the root has the table of the other study."""
-        old, new = self.table.get("lattice"), study.table.get("lattice")
-        if old and new and old != new and any(Store(self.location.below(name)).exists() for name in self.recorded()):
-            require_equal(self.location, [lattices_text(old, new)])
+    def _require_fields_of(self, study: Study) -> None:
+        """Refuse other fields, as stores of objects do, before the root has the table of the other study."""
+        (old, old_dtype), (new, new_dtype) = ((one.table.get("lattice"), _dtype_of(one.table)) for one in (self, study))
+        if not (old and new) or (old, old_dtype) == (new, new_dtype):
+            return
+        if any(Store(self.location.below(name)).exists() for name in self.recorded()):
+            require_equal(self.location, [lattices_text(old, new), ("dtype", old_dtype, new_dtype)])
 
     @classmethod
     def prepared(cls, location: Location, study: Study) -> Self:
@@ -121,7 +123,7 @@ class Objects:
                 "name another store, or remove this one"
             )
         else:
-            present._require_lattice_of(study)
+            present._require_fields_of(study)
         root = Store(location) if present is None else present.root
         entry = {
             "name": study.name,
@@ -144,6 +146,10 @@ class Objects:
                     made.records.write(made.rows[name], record)
         root.consolidate()
         return made
+
+
+def _dtype_of(table: Mapping[str, Any]) -> str:
+    return repr(table.get("transform", {}).get("dtype", "complex128"))
 
 
 def stores_below(location: Location) -> dict[str, Location]:

@@ -221,15 +221,16 @@ def test_a_second_run_computes_what_is_new(changeable: Path, threads: Client) ->
     with pytest.raises(sb.errors.StoreError, match="it holds the store of another study, 'small', not 'other'"):
         sb.run(study_of(balls(a=1.0), "other"), changeable, threads)
     # An object has no store of its own to be named or removed, and the same command would not go on.
-    other = small_table(study={"name": "small"}, object=balls(a=1.0), family=methods_of())
-    other["lattice"]["M"] += 2
-    message = (
-        f"{changeable}: it holds a store of another study, with a lattice of .* Name another store, or remove this"
-    )
+    other = {"study": {"name": "small"}, "object": balls(a=1.0), "family": methods_of()}
     before = (changeable / "zarr.json").read_bytes()
-    with pytest.raises(sb.errors.StoreError, match=rf"^{message} one$"):
-        sb.run(sb.Study.from_table(other), changeable, threads)
-    assert (changeable / "zarr.json").read_bytes() == before
+    for change, difference in (
+        ({"lattice": {"xi_max": 3.0, "M": 4}}, "a lattice of .*, not xi_max 3 and M 4"),
+        ({"transform": {"dtype": "complex64"}}, "dtype 'complex128', not 'complex64'"),
+    ):
+        message = f"{changeable}: it holds a store of another study, with {difference}. Name another store, or remove"
+        with pytest.raises(sb.errors.StoreError, match=rf"^{message} this one$"):
+            sb.run(sb.Study.from_table(small_table(**other, **change)), changeable, threads)
+        assert (changeable / "zarr.json").read_bytes() == before
 
 
 @pytest.mark.extras
