@@ -185,3 +185,12 @@ def from_extra(extra: str, purpose: str, kind: type[InputError] = InputError) ->
         raise kind(
             f"{purpose} a library that is missing ({error}); install the extra: pip install 'sobolev-batch[{extra}]'"
         ) from error
+
+
+@contextmanager
+def naming(what: str) -> Iterator[None]:
+    """Name in a StudyError what it is about, unless that is empty."""
+    try:
+        yield
+    except StudyError as error:
+        raise StudyError(f"{what}: {error}" if what else str(error)) from error

@@ -12,10 +12,9 @@ from pathlib import Path
 from sobolev_batch.errors import InputError, StudyError
 from sobolev_batch.parameters import format_bytes
 from sobolev_batch.sources.mesh_cache import MeshCache
-from sobolev_batch.sources.names import quoted
+from sobolev_batch.sources.names import known_names, quoted
 from sobolev_batch.store.location import Location
 from sobolev_batch.study.comparable import comparison_warnings
-from sobolev_batch.study.schema import known_names
 from sobolev_batch.study.study import Study, StudyLike, as_study
 from sobolev_batch.tables.pairs import PAIR_BYTES
 

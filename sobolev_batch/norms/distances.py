@@ -21,7 +21,8 @@ from sobolev_batch.geometry.surface import DIRECTIONS, Extent
 from sobolev_batch.machine import available, available_cores
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.accuracy.frequencies import Reference
-from sobolev_batch.norms.accuracy.problem import Problem, Solution, are_equal
+from sobolev_batch.norms.accuracy.problem import Problem, are_equal
+from sobolev_batch.norms.accuracy.solution import Solution
 from sobolev_batch.norms.accuracy.solve import solve
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
 from sobolev_batch.norms.budget import Support, sums_of_shells

@@ -17,7 +17,8 @@ from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.machine import available_cores
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.accuracy.frequencies import Frequencies
-from sobolev_batch.norms.accuracy.problem import SurfaceValues, support_of
+from sobolev_batch.norms.accuracy.problem import support_of
+from sobolev_batch.norms.accuracy.solution import SurfaceValues
 from sobolev_batch.norms.columns import labelled
 from sobolev_batch.norms.distances import accuracy_of, distance, to_accuracy
 from sobolev_batch.parameters import check_seed

@@ -5,6 +5,7 @@ Labels stand side by side in tables, logs and stores, so each must be legible an
 
 from __future__ import annotations
 
+import difflib
 import re
 import reprlib
 import unicodedata
@@ -14,6 +15,8 @@ from collections.abc import Iterable
 _LONGEST_LABEL = 1000
 # Of a file system's names; and characters of what becomes a name in a store.
 _MOST_BYTES, _LONGEST_NODE = 255, 100
+# Longer keys are quoted, and not compared with others.
+_LONGEST_KEY = 40
 # Short enough for every file system, with a number before it and a suffix after it.
 _LONGEST_STEM = 60
 _NUMBER = re.compile(r"\d+(?:\.\d+)?(?:[eE][+-]?\d+)?")
@@ -33,6 +36,11 @@ def quoted(value: object, longest: int = 80) -> str:
     except ValueError:
         return f"a {type(value).__name__} that holds an integer of too many digits"
     return text if len(text) <= longest else text[: longest - 3] + "..."
+
+
+def shown_value(value: object) -> str:
+    """Return a value as a study file spells it, on one short line."""
+    return str(value).lower() if isinstance(value, bool) else quoted(value)
 
 
 def name_problem(text: str, longest: int, forbidden: str = "") -> str | None:
@@ -74,6 +82,18 @@ def node_problem(name: object) -> str | None:
 def caseless_key(name: str) -> str:
     """Return a key that is equal for names that differ only in case and the encoding of accents (Unicode's D145)."""
     return unicodedata.normalize("NFD", unicodedata.normalize("NFD", name).casefold())
+
+
+def known_names(name: str, known: Iterable[str]) -> str:
+    """Return the name that an unknown one is probably meant to be, or else all that are known."""
+    by_lower = {candidate.lower(): candidate for candidate in known}
+    near = difflib.get_close_matches(name.lower(), by_lower, n=1) if len(name) <= _LONGEST_KEY else []
+    return f"did you mean {by_lower[near[0]]}?" if near else f"known are {', '.join(map(readable_key, known))}"
+
+
+def readable_key(key: str) -> str:
+    """Return a key, in quotes where it is unusual."""
+    return key if name_problem(key, _LONGEST_KEY) is None else quoted(key)
 
 
 def numbers_in(text: str) -> list[float]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 from sobolev_batch.arrays import ComplexDtype
-from sobolev_batch.errors import InputError, StudyError
+from sobolev_batch.errors import InputError, StudyError, naming
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
@@ -21,7 +21,7 @@ from sobolev_batch.norms.columns import TAKEN_NAMES
 from sobolev_batch.reduction.searched import SearchedSource
 from sobolev_batch.sources.command import function_name
 from sobolev_batch.sources.mesh_cache import MeshCache
-from sobolev_batch.sources.names import caseless_key, duplicate_names, node_problem, quoted
+from sobolev_batch.sources.names import caseless_key, duplicate_names, known_names, node_problem, quoted
 from sobolev_batch.sources.registry import Member, Source, single_member
 from sobolev_batch.study.schema import (
     REFERENCE_LABEL,
@@ -30,12 +30,9 @@ from sobolev_batch.study.schema import (
     FamilyReference,
     ProximitySection,
     SurfaceSections,
-    known_names,
-    plain_tables,
-    read_toml,
-    within,
 )
 from sobolev_batch.study.templates import sections_of_objects
+from sobolev_batch.study.toml import plain_tables, read_toml
 from sobolev_batch.transform.fourier import TransformSettings
 from sobolev_batch.transform.lattice import Lattice, check_orders
 
@@ -92,7 +89,7 @@ class StudyObject:
         for family in sections.family:
             source = family.source.with_reference(reference) if isinstance(reference, Source) else family.source
             if isinstance(source, SearchedSource):
-                with within(f"family {family.name!r}"):
+                with naming(f"family {family.name!r}"):
                     source = source.in_study(header.get("length_unit"), orders[0])
             families.append(family.model_copy(update={"source": source}))
         title, scaling = header.get("title") or header["name"], sections.scaling.settings()
@@ -106,7 +103,7 @@ class StudyObject:
         """
         members: dict[str, tuple[str, Member]] = {}
         for family in self.families:
-            with within(f"family {family.name!r}"):
+            with naming(f"family {family.name!r}"):
                 listed = [_with_other_names(one, family.name) for one in family.source.members(self.folder)]
             for member in listed:
                 label = f"{family.name}/{member.name}"
@@ -114,7 +111,7 @@ class StudyObject:
                     raise StudyError(f"two surfaces of the study have the label {label!r}")
                 members[label] = family.name, member
         if not isinstance(self.reference, FamilyReference):
-            with within("reference"):
+            with naming("reference"):
                 members[REFERENCE_LABEL] = REFERENCE_LABEL, single_member(self.reference, self.folder)
         columns = dict.fromkeys(name for _, member in members.values() for name, _ in member.metadata)
         if same := duplicate_names(columns):
@@ -247,7 +244,7 @@ class Study:
         document, sections = sections_of_objects(values, folder)
         objects: dict[str, StudyObject] = {}
         for name, (of_object, as_written) in sections.items():
-            with within(f"object {quoted(name)}" if name else ""):
+            with naming(f"object {quoted(name)}" if name else ""):
                 objects[name] = StudyObject.from_sections(name, of_object, as_written, folder)
         methods = dict.fromkeys(family.name for one in objects.values() for family in one.families)
         for name, one in objects.items():

@@ -13,16 +13,16 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from sobolev_batch.errors import StudyError
+from sobolev_batch.errors import StudyError, naming
 from sobolev_batch.sources.files import MeshTable, matching_files, number_as_text, read_mesh_list
 from sobolev_batch.sources.names import caseless_key, duplicate_names, natural_key, quoted
+from sobolev_batch.study.refusals import validated
 from sobolev_batch.study.schema import (
     REFERENCE_LABEL,
     ObjectSection,
     StudyDocument,
     SurfaceSections,
     with_named_meshes,
-    within,
 )
 
 OBJECT, METHOD = "{object}", "{method}"
@@ -46,7 +46,7 @@ def sections_of_objects(
     """
     templates = str([written.get(key) for key in ("mesh", "reference", "family")])
     if not ("object" in written or "objects" in written or OBJECT in templates or METHOD in templates):
-        document = StudyDocument.from_tables(written)
+        document = validated(StudyDocument, written)
         return document, {"": (document, dict(written))}
     # Objects and lists may bring references and families.
     values = {"reference": None, "family": [], **written}
@@ -54,7 +54,7 @@ def sections_of_objects(
     given = values.get("object")
     names = [section.get("name") for section in given if isinstance(section, dict)] if isinstance(given, list) else []
     checked = _filled(values["family"], OBJECT, str(names[0])) if names and names[0] else values["family"]
-    document = StudyDocument.from_tables({**values, "family": checked})
+    document = validated(StudyDocument, {**values, "family": checked})
     listed = _listed_meshes(document.objects.get("meshes", ()), folder)
     objects = _objects(document, values, list(dict.fromkeys(name for name, _ in listed)), folder)
     families = [_families(family, [section.name for section in objects], folder) for family in values["family"]]
@@ -62,9 +62,9 @@ def sections_of_objects(
     for section in objects:
         own = [entry for entries in families for entry in entries[section.name]]
         table = _table_of_object(values, section, listed, own)
-        with within(f"object {quoted(section.name)}"):
+        with naming(f"object {quoted(section.name)}"):
             own_sections = {name: table[name] for name in SurfaceSections.model_fields if name in table}
-            sections[section.name] = SurfaceSections.from_tables(own_sections), table
+            sections[section.name] = validated(SurfaceSections, own_sections), table
     return document, sections
 
 
@@ -92,7 +92,7 @@ def _objects(
     """Return the objects that have sections, or those that a list or the files of the reference name."""
     if document.object is None:
         found = [{"name": name} for name in listed or _names_in_reference(values, folder)]
-        document = StudyDocument.from_tables({**values, "object": found})
+        document = validated(StudyDocument, {**values, "object": found})
     objects = document.object or []
     names = [section.name for section in objects]
     unnamed = [name for name in listed if name not in names]

@@ -11,7 +11,8 @@ import numpy as np
 
 from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.geometry.surface import Surface, centering
-from sobolev_batch.norms.accuracy.problem import OFF_CENTER, Problem, Solution, SurfaceValues, error_target, support_of
+from sobolev_batch.norms.accuracy.problem import OFF_CENTER, Problem, error_target, support_of
+from sobolev_batch.norms.accuracy.solution import Solution, SurfaceValues
 from sobolev_batch.norms.accuracy.solve import solve
 from sobolev_batch.norms.budget import Sums, Support, sums_of_shells
 from sobolev_batch.norms.estimate import NormEstimate, ReferenceEstimate, Tail, estimate_norms

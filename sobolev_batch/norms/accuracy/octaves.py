@@ -18,12 +18,11 @@ from sobolev_batch.geometry.smooth import Smooth
 from sobolev_batch.norms.accuracy.problem import (
     ESTIMATE_CAUTION,
     Problem,
-    Solution,
-    SurfaceValues,
     error_target,
     only_or_difference,
     sums_on,
 )
+from sobolev_batch.norms.accuracy.solution import Solution, SurfaceValues
 from sobolev_batch.norms.accuracy.tolerance import FINER_LATTICE, core_lattice, good_intervals
 from sobolev_batch.norms.budget import Sums, aliased
 from sobolev_batch.norms.estimate import Tail, change_of_root, estimate_norms

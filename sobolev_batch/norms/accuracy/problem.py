@@ -1,11 +1,11 @@
-"""A norm or a distance to compute, the accuracy that it needs, its division among fields, and its solution."""
+"""A norm or a distance to compute, the accuracy that it needs, and its division among fields."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Self, cast
+from typing import Any, Self
 
 import numpy as np
 
@@ -25,10 +25,8 @@ from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Similarity, Surfa
 from sobolev_batch.norms.accuracy.tolerance import Accuracy, first_lattice, unreachable
 from sobolev_batch.norms.bounds import APART_FRACTION, norm_of_moves, norm_of_rounding, product_apart
 from sobolev_batch.norms.budget import Sums, Support, sums_of_shells
-from sobolev_batch.norms.estimate import NormEstimate, change_of_root
+from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.norms.fields import USUAL_DEGREE, Field, field_for
-from sobolev_batch.norms.tail.sampling import OctaveSampling
-from sobolev_batch.norms.tail.values import OctaveValues
 from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, cheapest_dtype
 from sobolev_batch.transform.lattice import Lattice, SobolevWeights, shell_sums
 from sobolev_batch.transform.probe import Sample, draws_for, estimate, needs_probe
@@ -48,8 +46,6 @@ _MOVED_FRACTION = 0.1
 _LEAST_MOVE = 1 / 8
 # Part of a norm below which a distance is not measured that roundings of files explain.
 _ROUNDED = 1e-2
-# Settings that each field has.
-_OF_FIELDS = ("eps", "quadrature_eps", "points")
 # An accuracy called reachable must hold when it is requested.
 _REACHABLE_MARGIN = 1.3
 
@@ -284,88 +280,3 @@ def are_equal(a: Surface, b: Surface) -> bool:
 def _rounding(surfaces: Sequence[Surface]) -> float:
     """Return how far a file may have moved the vertices of meshes, in units of length."""
     return max([mesh.rounding for mesh in surfaces if isinstance(mesh, Mesh)], default=0.0)
-
-
-@dataclass(frozen=True, eq=False)
-class SurfaceValues:
-    """Values of a surface at some frequencies: its field on a lattice, and in the octaves beyond it."""
-
-    field: Field
-    octaves: tuple[OctaveValues, ...] = ()
-
-    def error_norms(self, weights: SobolevWeights) -> Reals:
-        """Return the norms of the values' own errors (orders,)."""
-        on_lattice = self.field.quality.probe.norms(weights)
-        return np.asarray(np.hypot.reduce([on_lattice, *(one.error_norms(weights.orders) for one in self.octaves)]))
-
-
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """Norms or distances, and how they were computed.
-
-    Attributes:
-        estimate: Numbers with their errors, each (orders,).
-        lattice: Lattice of the fields; None where nothing had to be computed.
-        values: Values of each surface on the lattice and in octaves beyond it.
-        shortfall: Why the numbers miss the accuracy; None if they do not.
-        has_tail: True where all that lies beyond the lattice was measured, and the lattice ends in a step.
-        alone: Norms that a distance of surfaces far apart consists of, each with a lattice of its own.
-    """
-
-    estimate: NormEstimate
-    lattice: Lattice | None = None
-    values: tuple[SurfaceValues, ...] = ()
-    shortfall: AccuracyError | None = None
-    has_tail: bool = False
-    alone: tuple[Solution, ...] = ()
-
-    @classmethod
-    def zero(cls, orders: Sequence[float], moved: Reals | float = 0.0) -> Self:
-        """Return the distance of surfaces that are equal, but for some moves, for which nothing is computed."""
-        zeros = np.zeros(len(orders))
-        return cls(NormEstimate(zeros, zeros, zeros, zeros + moved))
-
-    @classmethod
-    def of_apart(cls, problem: Problem, alone: Sequence[Solution]) -> Self:
-        """Return the distance of surfaces far apart from their norms: its square is the sum of both squares.
-
-        What the product of both surfaces may change is an error by images.
-        """
-        norms = np.stack([one.estimate.values for one in alone])
-        errors = np.stack([one.estimate.errors for one in alone])
-        values, highest = np.hypot(*norms), np.hypot(*(norms + errors))
-        # Each error is weighted such that all of them together lead from the values to the highest ones.
-        weights = (2 * norms + errors) / (highest + values)
-        parts = np.sum([w * np.stack([*one.estimate][1:]) for w, one in zip(weights, alone, strict=True)], axis=0)
-        found = NormEstimate(values, *parts)
-        product = change_of_root(values**2, 2 * cast(Reals, problem.apart))
-        shortfall = next((one.shortfall for one in alone if one.shortfall is not None), None)
-        return cls(replace(found, aliasing=found.aliasing + product), shortfall=shortfall, alone=tuple(alone))
-
-    @property
-    def octaves(self) -> tuple[OctaveSampling, ...]:
-        """Octaves that were measured beyond the lattice."""
-        return tuple(one.sampling for one in self.values[0].octaves) if self.values else ()
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """Settings that the numbers were computed with, as attributes."""
-        if self.alone:
-            # Those of the larger lattice, and of the fields of both.
-            both = [one.settings for one in self.alone]
-            lists = {name: [value for one in both for value in one[name]] for name in _OF_FIELDS}
-            return {**max(both, key=lambda one: one["M"]), **lists}
-        if self.lattice is None:
-            return {}
-        fields = [one.field for one in self.values]
-        settings = [field.settings for field in fields]
-        return {
-            "xi_max": self.lattice.xi_max,
-            "M": self.lattice.M,
-            "octaves": len(self.octaves),
-            "highest_frequency": max([self.lattice.xi_max, *(one.octave.highest for one in self.octaves)]),
-            "dtype": settings[0].dtype,
-            "eps": [setting.eps for setting in settings],
-            "quadrature_eps": [setting.tolerance or setting.eps for setting in settings],
-            "points": [field.points for field in fields],
-        }

@@ -19,12 +19,11 @@ from sobolev_batch.norms.accuracy.octaves import solve_in_octaves
 from sobolev_batch.norms.accuracy.problem import (
     ESTIMATE_CAUTION,
     Problem,
-    Solution,
-    SurfaceValues,
     error_target,
     only_or_difference,
     sums_on,
 )
+from sobolev_batch.norms.accuracy.solution import Solution, SurfaceValues
 from sobolev_batch.norms.accuracy.tolerance import LEAST_CLEARANCE, Accuracy, first_lattice, lattice_of, refined
 from sobolev_batch.norms.bounds import modulus_bound
 from sobolev_batch.norms.budget import Sums, Support
@@ -100,7 +99,7 @@ def solve(problem: Problem, seed: int = 0) -> Solution:
     if not problem.surfaces:
         return Solution.zero(problem.orders, problem.moved)
     if problem.apart is not None:
-        return Solution.of_apart(problem, [solve(norm, seed) for norm in problem.alone])
+        return Solution.of_apart(problem.apart, [solve(norm, seed) for norm in problem.alone])
     strict = replace(problem, accuracy=replace(problem.accuracy, best_effort=False))
     first = first_lattice(problem.support, problem.orders, problem.accuracy)
     on_lattices, in_octaves = partial(_solve_on_lattices, strict, *first), partial(solve_in_octaves, strict, seed)
