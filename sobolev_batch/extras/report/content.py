@@ -226,8 +226,10 @@ def league_content(objects: Objects, status: Status) -> dict[str, Any]:
     ranked, pairs = ([row for league in leagues for row in _rows(league, name)] for name in ("table", "pairs"))
     methods = leagues[0].methods if leagues else list(dict.fromkeys(pd.concat(tables.values())["family"]))
     versions = root_attribute(open_store(objects.location.below(next(iter(tables)))), "versions")
+    unfinished = {name: "it has no tables yet; run the study again" for name in objects.names if name not in tables}
+    missing = unfinished | dict(status.failed)
     return {
-        **common_content(objects.title, objects.table, tables, status, status.failed, versions),
+        **common_content(objects.title, objects.table, tables, status, missing, versions),
         **cost_content(tables, methods),
         "leagues": leagues,
         "no_league": no_league,

@@ -33,6 +33,7 @@ from sobolev_batch.extras.report import build, content
 from sobolev_batch.extras.report.build import make_report
 from sobolev_batch.shapes import icosphere
 from sobolev_batch.store.layout import Store, hide_tables
+from sobolev_batch.tables.convergence import tables_of
 from tests.support.browser import Browser, browser
 from tests.support.studies import GONE, balls, method_rows, methods_of, small_table
 
@@ -369,6 +370,13 @@ def test_objects_without_league_say_why(objects: str, monkeypatch: pytest.Monkey
     assert "left out: methods cannot be compared" in text
     assert 'id="table-objects"' in text
     assert text.count("Methods cannot be compared over the objects.") == 1
+
+
+def test_objects_without_tables_are_missing(objects: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(content, "tables_of", lambda place: {"ball": tables_of(place)["ball"]})
+    missing = make_report(objects)[0].split('id="table-failed"')[1].split("</table>")[0]
+    assert re.findall(r'<th scope="row"[^>]*>(.*?)</th>', missing) == ["large", "gone"]
+    assert "it has no tables yet; run the study again" in missing
 
 
 def test_meshes_of_several_objects_are_shown_by_the_report_of_an_object(objects: str) -> None:
