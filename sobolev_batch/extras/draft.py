@@ -140,7 +140,7 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
         for path in paths
         if {path, references[name]} <= extents.keys()
     }
-    left_out |= {str(path): "its name is that of no object" for path in sizes if path not in used}
+    left_out |= {str(path): "no other mesh belongs to it by name, nor it to one" for path in sizes if path not in used}
     if "" in references:
         sections, summary = _one_object(references[""], families, sizes, below)
     else:
@@ -244,7 +244,10 @@ def _references(sizes: Mapping[PurePosixPath, int]) -> dict[str, PurePosixPath]:
 
 
 def _continued(sizes: Mapping[PurePosixPath, int]) -> list[PurePosixPath]:
-    """Return the files whose names all others have or continue, in any folder, and with fewer triangles; or none."""
+    """Return the files whose names others continue or have, in any folder, and with fewer triangles.
+
+    There are none if the others of most lack, as outputs that failed, or that of the finest file.
+    """
     finest = {mesh_stem(path): path for path in sorted(sizes, key=lambda path: sizes[path])}
     owners = {}
     for path, size in sizes.items():
@@ -255,7 +258,11 @@ def _continued(sizes: Mapping[PurePosixPath, int]) -> list[PurePosixPath]:
         if path != owner and size * (1 + (owner == finest[stem])) > sizes[owner]:
             return []
     own = [path for path, owner in owners.items() if path == owner]
-    return own if {*own} == {owner for path, owner in owners.items() if path != owner} else []
+    followed = {owner for path, owner in owners.items() if path != owner}
+    if not followed <= {*own} or 2 * len(followed) <= len(own):
+        return []
+    is_finest = max(sizes[path] for path in followed) == max(sizes.values())
+    return [path for path in own if path in followed] if is_finest else []
 
 
 def _families(paths: Iterable[PurePosixPath], references: Mapping[str, PurePosixPath]) -> _Families:
