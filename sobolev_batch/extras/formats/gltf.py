@@ -78,7 +78,10 @@ def parse_gltf(data: bytes, beside: Mapping[str, bytes]) -> Raw:
         raise MeshError("the file's scene has no faces")
     others = sum("mesh" in node for index, node in enumerate(tree["nodes"]) if index not in matrices)
     notes = (f"{others:,} nodes with meshes are outside of the scene that is shown, and left out",) if others else ()
-    return Raw(*merge_coincident(*joined(parts)), notes)
+    vertices, triangles = merge_coincident(*joined(parts))
+    # Nodes that turn nothing leave the single precision of the file.
+    single = vertices.astype(np.float32)
+    return Raw(single if np.array_equal(single, vertices) else vertices, triangles, notes)
 
 
 def files_beside(data: bytes) -> tuple[str, ...]:

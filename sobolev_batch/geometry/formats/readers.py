@@ -109,8 +109,10 @@ def _files_beside(path: Path, names: Iterable[str]) -> dict[str, Path]:
     for name in names:
         # Links are followed here, so that none leads elsewhere.
         found[name] = (folder / name).resolve()
-        if not found[name].is_relative_to(folder) or ":" in name:
-            raise MeshError(f"it needs {name[:80]!r}, which is no file in its folder; export it as one file")
+        if not found[name].is_relative_to(folder) or ":" in name or not found[name].is_file():
+            raise MeshError(
+                f"it needs {name[:80]!r}, which is no file in its folder; put it there, or export both as one file"
+            )
     return found
 
 

@@ -336,8 +336,7 @@ def test_gltf_buffers_may_lie_in_the_same_folder(tmp_path: Path) -> None:
     inner.symlink_to(outer)
     for uri in ("nowhere.bin", "of%20scan/1.bin", "../outer.bin", outer.as_posix(), f"file://{outer}"):
         path.write_bytes(scene.gltf(uri))
-        reason = "No such file" if uri == "nowhere.bin" else "is no file in its folder"
-        with pytest.raises(MeshError, match=reason):
+        with pytest.raises(MeshError, match=r"scan\.gltf: it needs '.*', which is no file in its folder"):
             sb.read_mesh(path)
     assert [*member.fingerprint()] == ["file", "format"]
 

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 import sobolev_batch as sb
 from sobolev_batch.cli.program import cli
 from sobolev_batch.errors import MeshError
-from tests.support.mesh_files import BIG, obj, ply, stl_binary
+from tests.support.mesh_files import BIG, Gltf, obj, ply, stl_binary
 from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES
 from tests.support.studies import small_table
 
@@ -66,6 +66,7 @@ INFO: dict[str, tuple[str, bytes, list[str], list[str]]] = {
     "range map": (".ply", ply(RANGES[::-1], [[9 - i for i in f] for f in BOX_TRIANGLES]), ["note: 2 vertices"], []),
     "UTM": (".obj", obj(UTM, BOX_TRIANGLES), ["y 5000000 to 5000050, z 100 to 120: 25 by 50 by 20"], ["note"]),
     "UTM in single precision": (".stl", stl_binary(UTM, BOX_TRIANGLES), ["single precision keeps 2 digits"], []),
+    "UTM of glTF": (".glb", Gltf([[(UTM, BOX_TRIANGLES, None)]], [{"mesh": 0}]).glb(), ["keeps 2 digits"], []),
     "UTM and a place without data": (".ply", ply([*UTM, [0, 0, 0]], BOX_TRIANGLES, BIG), ["keeps 2 digits"], []),
 }
 
