@@ -244,7 +244,7 @@ def _decoded(
     attributes: Mapping[str, str], text: str, behind: tuple[bytes, bool], root: Mapping[str, str], most: int
 ) -> NDArray[Any]:
     """Return the values of a DataArray, from its text or from what lies behind the XML, as at most so many bytes."""
-    kind, form = attributes.get("type", ""), attributes.get("format", "")
+    kind, form = attributes.get("type", ""), attributes.get("format", "ascii")
     owner = f"its array {attributes.get('Name')!r}"
     if kind.lower() not in _TYPES or form not in ("ascii", "binary", "appended"):
         raise MeshError(f"{owner} has the type {kind[:40]!r} and the format {form[:40]!r}, which VTK does not have")

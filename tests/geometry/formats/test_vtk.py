@@ -220,6 +220,12 @@ def test_a_box_of_several_pieces_is_one(tmp_path: Path) -> None:
         read_mesh(path)
 
 
+def test_arrays_without_a_format_are_text(tmp_path: Path) -> None:
+    path = saved(polygons(BOX_TRIANGLES), tmp_path / "scan.vtp", binary=False)
+    path.write_bytes(path.read_bytes().replace(b' format="ascii"', b""))
+    assert read_mesh(path).area == pyvista.read(path).area == BOX_AREA
+
+
 @pytest.mark.parametrize(
     ("old", "new", "reason"),
     [
