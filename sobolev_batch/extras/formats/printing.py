@@ -64,7 +64,7 @@ class _Package:
         self.parts: dict[str, dict[str, _Object]] = {}
         self.items: list[_Placing] = []
         self.units: set[str] = set()
-        self.supports = self.size = 0
+        self.supports = self.unprinted = self.size = 0
 
     def read(self, name: str) -> bytes:
         """Return the bytes of a part; it has no more than its entry says, or is refused by the library."""
@@ -104,6 +104,7 @@ class _Package:
                     found.components.append(_placing(values, name))
                 case "start", "item":
                     self.items.append(_placing(values, name))
+                    self.unprinted += values.get("printable") == "0"
         return objects
 
     def placed(self, placing: _Placing, outer: Reals, depth: int = 0) -> Iterator[tuple[Reals, Indices]]:
@@ -146,6 +147,8 @@ def parse_3mf(data: bytes) -> Raw:
     settings = b"".join(package.read(name) for name in package.names if name.endswith(_SETTINGS))
     if others := len(_UNLIKE.findall(settings)):
         notes.append(f"{others} parts that the slicer calls modifiers, negative or for supports count like all others")
+    if package.unprinted:
+        notes.append(f"{package.unprinted} items that the slicer does not print count like all others")
     return Raw(*joined(parts), tuple(notes))
 
 

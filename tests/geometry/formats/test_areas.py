@@ -551,6 +551,11 @@ NOTED: dict[str, tuple[str, bytes, str]] = {
             ("model_settings", "usual part", '<part id="1" subtype="normal_part">', 0),
         )
     },
+    "3mf, not to be printed": (
+        ".3mf",
+        package_3mf(model(BOX_3MF, '<item objectid="1" printable="0"/>')),
+        "1 items that the slicer does not print count",
+    ),
     "gltf, two scenes": (
         ".glb",
         Gltf([[(BOX_VERTICES, BOX_TRIANGLES, None)]], [{"mesh": 0}, {"mesh": 0}, {}], [0]).glb(),
