@@ -87,6 +87,11 @@ def is_gzipped(path: PurePath) -> bool:
     return path.name.lower().endswith(".gz")
 
 
+def is_packed(path: PurePath, file: BufferedReader) -> bool:
+    """Return whether an open file is compressed: what unpacks it, such as a browser, may leave its name."""
+    return is_gzipped(path) and file.peek(2)[:2] == b"\x1f\x8b"
+
+
 def require_memory_to_read(needed_bytes: float) -> None:
     """Refuse a file, before it is read, that takes more memory than reading may."""
     if needed_bytes <= _HARMLESS_BYTES:
@@ -104,11 +109,11 @@ def read_unpacked(path: Path, factor: float, read: Read = BufferedReader.read) -
     """Return a file's bytes without a byte-order mark, unpacked from .gz, each of which takes a factor of memory."""
     try:
         with open_regular(path) as file:
-            length = checked_length(file)
-            if not is_gzipped(path):
+            length, packed = checked_length(file), is_packed(path, file)
+            if not packed:
                 require_memory_to_read(factor * length)
             data = read(file, length)
-        if is_gzipped(path):
+        if packed:
             data = _unpacked_bounded(data, factor)
     except (OSError, EOFError, ValueError, zlib.error) as error:
         raise MeshError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from error

@@ -22,7 +22,7 @@ from sobolev_batch.geometry.formats.parsing import (
     Raw,
     Read,
     checked_length,
-    is_gzipped,
+    is_packed,
     open_regular,
     read_unpacked,
     require_memory_to_read,
@@ -171,11 +171,11 @@ def expected_size(path: Path) -> tuple[int, float]:
         return 0, 0.0
     try:
         with open_regular(path) as file:
-            length = checked_length(file)
-            if is_gzipped(path):
+            length, packed = checked_length(file), is_packed(path, file)
+            if packed:
                 length = min(_PACKING * length, unpacked_limit(length))
             if form.announced_size is not None:
-                unpacked = gzip.GzipFile(fileobj=file) if is_gzipped(path) else file
+                unpacked = gzip.GzipFile(fileobj=file) if packed else file
                 return form.announced_size(unpacked.read(HEADER_BYTES).removeprefix(codecs.BOM_UTF8), length)
         if length <= _LONGEST_INDEX:
             length += sum(part.stat().st_size for part in files_beside(path))

@@ -234,6 +234,11 @@ CASES |= {
     )
 }
 CASES |= {
+    "gz, unpacked already": (".ply.gz", PLY_BOX, BOX_AREA),
+    "gz, web page": (".ply.gz", b"<!DOCTYPE HTML><html>404</html>", "or a web page"),
+    "gz, pointer": (".gii.gz", b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\n", "git lfs pull"),
+}
+CASES |= {
     f"obj, {suffix} by its contents": (".obj", content, f"it begins as a {suffix} file; name it so")
     for suffix, content in {
         ".ply": PLY_BOX,
