@@ -1,7 +1,7 @@
 """glTF 2.0: scenes of triangles, .gltf or .glb, as they stand before any animation.
 
 The library at hand silently leaves out primitives, placements and encodings; here they are read or refused. Source:
-Khronos Group, "glTF 2.0" (2021), with KHR_mesh_quantization and EXT_mesh_gpu_instancing.
+Khronos Group, "glTF 2.0" (2021), with KHR_mesh_quantization, KHR_node_visibility and EXT_mesh_gpu_instancing.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 # Modes of primitives: points and lines have none of the area; triangles, strips and fans of them follow.
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
-_INSTANCING = "EXT_mesh_gpu_instancing"
+_INSTANCING, _VISIBILITY = "EXT_mesh_gpu_instancing", "KHR_node_visibility"
 # Required extensions that do not change the positions of vertices, or that are read.
 _HARMLESS = re.compile(
     r"[A-Z]+_(materials|texture|techniques|lights|animation)_.*|KHR_(mesh_quantization|xmp.*)|"
-    rf"EXT_(mesh_features|instance_features|structural_metadata)|{_INSTANCING}"
+    rf"EXT_(mesh_features|instance_features|structural_metadata)|{_INSTANCING}|{_VISIBILITY}"
 )
 # Vertices (n, 3) and triangles (m, 3).
 _Part = tuple[Reals, Indices]
@@ -191,7 +191,7 @@ def _require_second(version: str) -> None:
 
 
 def _node_matrices(tree: dict[str, Any]) -> dict[int, Reals]:
-    """Return the matrix that places each node of the default scene, by the node's index."""
+    """Return the matrix that places each node of the default scene that is not hidden, by the node's index."""
     nodes = tree.get("nodes", [])
     scenes = tree.get("scenes")
     if scenes:
@@ -206,6 +206,8 @@ def _node_matrices(tree: dict[str, Any]) -> dict[int, Reals]:
         if index in found:
             raise MeshError(f"node {index} of the scene has two parents")
         node = _entry(tree, "nodes", index)
+        if not node.get("extensions", {}).get(_VISIBILITY, {}).get("visible", True):
+            continue
         found[index] = matrix = parent_matrix @ _matrix(node)
         pending += [(child, matrix) for child in reversed(node.get("children", []))]
     return found

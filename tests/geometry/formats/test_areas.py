@@ -521,6 +521,13 @@ def frame_of_volume(middle: str, valid: int = 1) -> bytes:
     )
 
 
+def hidden_gltf() -> bytes:
+    nodes = [{"mesh": 0}, {"children": [2], "extensions": {"KHR_node_visibility": {"visible": False}}}, {"mesh": 0}]
+    scene = Gltf([[(BOX_VERTICES, BOX_TRIANGLES, None)]], nodes, [0, 1])
+    scene.tree["extensionsRequired"] = ["KHR_node_visibility"]
+    return scene.glb()
+
+
 MOVED = "the file has a transform to another frame"
 # Of each case: the end of the file's name, its bytes, and how its only note begins; none where that is empty.
 NOTED: dict[str, tuple[str, bytes, str]] = {
@@ -566,6 +573,7 @@ NOTED: dict[str, tuple[str, bytes, str]] = {
         Gltf([[(BOX_VERTICES, BOX_TRIANGLES, None)]], [{"mesh": 0}, {"mesh": 0}, {}], [0]).glb(),
         "1 nodes with meshes are outside of the scene that is shown",
     ),
+    "gltf, hidden below a hidden node": (".glb", hidden_gltf(), "1 nodes with meshes are outside of the scene"),
     "3mf, in millimetres": (".3mf", package_3mf(model(BOX_3MF, attributes="")), ""),
 }
 
