@@ -36,6 +36,8 @@ _REFERENCE = re.compile(r"(?<![^\W\d_])(original|reference|ref|target|ground[\W_
 _REFERENCES = re.compile(r"(originals|references|targets|objects)", re.IGNORECASE)
 # The size of a mesh at the end of its name: cow_500, cow-1k7, cow 20.5.
 _SIZE = re.compile(r"\d+(?:[.,]\d+)?(?:[kKmM]\d*)?$")
+# A word at the end of a name, of which so many may be that of references.
+_ENDING, _MOST_ENDINGS = re.compile(r"[ _.-][^\W\d_]+$"), 9
 _LONGEST_NAME = 100
 # Characters between the parts of a name.
 _BETWEEN = " _-."
@@ -94,7 +96,7 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
     The reference is the mesh that is called original, reference, target or ground truth, or else the one with the most
     triangles. Each folder is a family; the meshes of a single folder are families by their names without the number at
     the end. Where several files are called references and others belong to them by name, the study has several
-    objects, and so it has where the names of all files begin with those of finer ones, in any folder. Files are looked
+    objects, and so it has where the names of files begin as those of finer ones, in any folder. Files are looked
     at, and only small ones are read.
 
     Args:
@@ -235,34 +237,42 @@ def _references(sizes: Mapping[PurePosixPath, int]) -> dict[str, PurePosixPath]:
 
     There are several objects if several files are called references, and each has files of its name.
     """
-    called = [path for path in sizes if _is_called_reference(path)] or _continued(sizes)
-    references = {_object_of(path): path for path in called}
-    owners = {_owner(path, references) for path in sizes if path not in called}
-    are_different = 2 <= len({*map(caseless_key, references)}) == len(called)
+    called = [path for path in sizes if _is_called_reference(path)]
+    references = {_object_of(path): path for path in called} or _finest_of_names(sizes)
+    owners = {_owner(path, references) for path in sizes if path not in references.values()}
+    are_different = 2 <= len({*map(caseless_key, references)}) == len(called or references)
     is_refused = any(name_problem(name, _LONGEST_NAME, RESERVED) or name.startswith((".", "__")) for name in references)
     return references if are_different and not is_refused and references.keys() <= owners else {}
 
 
-def _continued(sizes: Mapping[PurePosixPath, int]) -> list[PurePosixPath]:
-    """Return the files whose names others continue or have, in any folder, and with fewer triangles.
+def _finest_of_names(sizes: Mapping[PurePosixPath, int]) -> dict[str, PurePosixPath]:
+    """Return the finest file of each object whose names begin alike: cow.ply, or all that end in a word as cow_high."""
+    endings = Counter(found[0] for path in sizes if (found := _ENDING.search(mesh_stem(path))))
+    usual = [ending for ending, count in endings.most_common(_MOST_ENDINGS) if count > 1]
+    return next(filter(None, (_continued(sizes, ending) for ending in ("", *usual))), {})
+
+
+def _continued(sizes: Mapping[PurePosixPath, int], ending: str) -> dict[str, PurePosixPath]:
+    """Return the files whose names without an ending others continue or have, in any folder, with fewer triangles.
 
     There are none if the others of most lack, as outputs that failed, or that of the finest file.
     """
-    finest = {mesh_stem(path): path for path in sorted(sizes, key=lambda path: sizes[path])}
+    stems = {path: mesh_stem(path) for path in sorted(sizes, key=lambda path: sizes[path])}
+    finest = {stem.removesuffix(ending): path for path, stem in stems.items() if stem.endswith(ending)}
     owners = {}
     for path, size in sizes.items():
-        stem = mesh_stem(path)
+        stem = stems[path]
         beginnings = (stem[:end] for end in range(len(stem) - 1, 0, -1) if not stem[end].isalnum())
-        owners[path] = owner = next((finest[name] for name in beginnings if name in finest), finest[stem])
+        owners[path] = owner = next((finest[name] for name in beginnings if name in finest), finest.get(stem, path))
         # Files of one name may be of two methods, unless one is much finer.
-        if path != owner and size * (1 + (owner == finest[stem])) > sizes[owner]:
-            return []
-    own = [path for path, owner in owners.items() if path == owner]
+        if path != owner and size * (1 + (bool(ending) or stems[owner] == stem)) > sizes[owner]:
+            return {}
+    own = {stems[path].removesuffix(ending): path for path, owner in owners.items() if path == owner}
     followed = {owner for path, owner in owners.items() if path != owner}
-    if not followed <= {*own} or 2 * len(followed) <= len(own):
-        return []
+    if not followed <= {*own.values()} or 2 * len(followed) <= len(own):
+        return {}
     is_finest = max(sizes[path] for path in followed) == max(sizes.values())
-    return [path for path in own if path in followed] if is_finest else []
+    return {name: path for name, path in own.items() if path in followed} if is_finest else {}
 
 
 def _families(paths: Iterable[PurePosixPath], references: Mapping[str, PurePosixPath]) -> _Families:

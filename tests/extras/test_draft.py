@@ -129,16 +129,19 @@ def test_files_of_one_name_belong_together_where_one_is_finer(tmp_path: Path, le
     assert (summary[0] == "3 objects: part_0, part_1, part_2") == is_paired
 
 
+@pytest.mark.parametrize("end", ["", "_high", " scan"])
 @pytest.mark.parametrize(("lacking", "level", "found"), [("5", 2, 5), ("45", 3, 1), ("345", 2, 1)])
-def test_objects_need_no_other_mesh_if_most_have_one(tmp_path: Path, lacking: str, level: int, found: int) -> None:
+def test_objects_need_no_other_mesh_if_most_have_one(
+    tmp_path: Path, lacking: str, level: int, found: int, end: str
+) -> None:
     for number in "012345":
-        write(tmp_path / f"in/part_{number}.ply", level if number in lacking else 2)
+        write(tmp_path / f"in/part_{number}{end}.ply", level if number in lacking else 2)
         if number not in lacking:
             write(tmp_path / f"out/part_{number}_low.ply", 1)
     draft = sb.init_study(tmp_path, tmp_path / "study.toml")
     assert len(as_study(draft.path).objects) == found
     reason = "no other mesh belongs to it by name, nor it to one"
-    assert draft.left_out == (dict.fromkeys(["in/part_5.ply"], reason) if found > 1 else {})
+    assert draft.left_out == (dict.fromkeys([f"in/part_5{end}.ply"], reason) if found > 1 else {})
 
 
 def test_meshes_far_larger_than_their_reference_are_named(tmp_path: Path) -> None:

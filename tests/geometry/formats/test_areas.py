@@ -522,8 +522,8 @@ def frame_of_volume(middle: str, valid: int = 1) -> bytes:
 
 
 def hidden_gltf() -> bytes:
-    nodes = [{"mesh": 0}, {"children": [2], "extensions": {"KHR_node_visibility": {"visible": False}}}, {"mesh": 0}]
-    scene = Gltf([[(BOX_VERTICES, BOX_TRIANGLES, None)]], nodes, [0, 1])
+    hiding = {"children": [2], "extensions": {"KHR_node_visibility": {"visible": False}}}
+    scene = Gltf([[(BOX_VERTICES, BOX_TRIANGLES, None)]], [{"mesh": 0}, hiding, {"mesh": 0}], [0, 1])
     scene.tree["extensionsRequired"] = ["KHR_node_visibility"]
     return scene.glb()
 
