@@ -178,8 +178,9 @@ def moving_families(selection: Selection) -> list[str]:
 def draw_league(_leagues: Sequence[League], league: League, axes: Axes) -> None:
     """Draw the mean of each method of a league with its interval, and all meshes as dots, at their sizes."""
     set_log_scale(axes, "xy")
-    for number, method in enumerate(league.methods):
-        style, (sizes, means) = style_of(number), league.mean_curve(method)
+    # The legend has the order of the table.
+    for method in league.table["method"]:
+        style, (sizes, means) = style_of(league.methods.index(method)), league.mean_curve(method)
         draw_curve(axes, sizes, means[:, 0], np.zeros(len(sizes)), style, shortened(method))
         axes.fill_between(sizes, means[:, 1], means[:, 2], color=style["color"], alpha=0.2, linewidth=0)
         for curve in (one[method] for one in league.curves.values() if method in one):

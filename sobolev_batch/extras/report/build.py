@@ -221,7 +221,7 @@ def league_data(leagues: Sequence[League], name: str, orders: Sequence[str]) -> 
         "orders": list(orders),
         "families": list(leagues[0].methods) if leagues else [],
         "size": label_of(leagues[0].x) if leagues else "",
-        "league": [[_mean_line(league, method) for method in league.methods] for league in leagues],
+        "league": [[_mean_line(league, method) for method in league.table["method"]] for league in leagues],
     }
 
 

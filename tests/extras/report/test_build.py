@@ -408,6 +408,9 @@ def test_a_sentence_says_which_method_is_nearest(factors: dict[str, float], obje
     (league,) = leagues_of(tables, list(tables))
     macros: Any = build.page_template("macros").module
     assert macros.nearest_method(league) == sentence
+    # The legend has the order of the table.
+    (lines,) = build.league_data([league], "", [])["league"]
+    assert [line["family"] for line in lines] == league.table["method"].tolist()
 
 
 class _Live(HTMLParser):
