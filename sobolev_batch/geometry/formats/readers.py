@@ -57,6 +57,8 @@ _DAMAGES: dict[type[Exception], str] = {
 }
 # Coordinates so many times the size of a mesh have four digits of it in single precision.
 _FAR = 1000
+# What rounding to double precision leaves of a digit behind the seventh.
+_NO_DIGIT = 1e-6
 # Factor by which gzip usually shrinks mesh files.
 _PACKING = 4
 # Bytes of a file that is mostly a list of files beside it; larger ones hold their data themselves.
@@ -146,9 +148,7 @@ def read_mesh_by(path: Path, read: Read) -> Mesh:
             raw = _without_unused(Raw(*form.parse(data.pop(), *beside)))
             for array in (raw.vertices, raw.triangles):
                 array.setflags(write=False)
-            mesh = Mesh(*raw)
-            is_single = raw.vertices.dtype.newbyteorder("=") == np.float32
-            return _with_lost_digits(mesh) if is_single else mesh
+            return _with_lost_digits(Mesh(*raw), raw.vertices.dtype.newbyteorder("=") == np.float32)
     except MeshError as error:
         raise MeshError(f"{path}: {_mistaken(start, suffix) or _shortened(error)}") from error
     except MemoryError as error:
@@ -196,14 +196,21 @@ def _without_unused(raw: Raw) -> Raw:
     return Raw(vertices, triangles, notes)
 
 
-def _with_lost_digits(mesh: Mesh) -> Mesh:
-    """Note it where a mesh in single precision is far from the origin for its size."""
+def _with_lost_digits(mesh: Mesh, is_single: bool) -> Mesh:
+    """Note it where a mesh in single precision, or in a text of as many digits, is far from the origin for its size."""
     lower, upper = mesh.extent.box
     times = np.abs([lower, upper]).max() / np.linalg.norm(upper - lower)
     if times <= _FAR:
         return mesh
+    if not is_single:
+        numbers = mesh.vertices[mesh.vertices != 0]
+        counts = numbers / 10 ** (np.floor(np.log10(np.abs(numbers))) - 6)
+        # Whole numbers may be all that there is.
+        if not (np.abs(counts - np.rint(counts)) < _NO_DIGIT).all() or not (numbers % 1).any():
+            return mesh
     note = (
-        f"coordinates are {times:,.0f} times the size of the mesh, of which single precision keeps "
+        f"coordinates are {times:,.0f} times the size of the mesh, of which "
+        f"{'single precision' if is_single else 'a text of seven digits'} keeps "
         f"{max(0.0, -np.log10(times * np.finfo(np.float32).eps / 2)):.0f} digits"
     )
     return Mesh.from_checked(mesh.vertices, mesh.triangles, (*mesh.notes, note))

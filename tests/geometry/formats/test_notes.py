@@ -12,7 +12,7 @@ from click.testing import CliRunner
 import sobolev_batch as sb
 from sobolev_batch.cli.program import cli
 from sobolev_batch.errors import MeshError
-from tests.support.mesh_files import BIG, Gltf, obj, ply, stl_binary
+from tests.support.mesh_files import BIG, Gltf, obj, off, ply, stl_binary
 from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES
 from tests.support.studies import small_table
 
@@ -57,6 +57,7 @@ def several(*placed: tuple[float, float]) -> bytes:
 APART = obj(BALL.vertices[BALL.triangles].reshape(-1, 3), np.arange(240).reshape(-1, 3).tolist())
 RANGES = [*BOX_VERTICES, [np.nan, np.nan, np.nan], [np.inf, 0, 0]]
 UTM = BOX_VERTICES * [25, 25, 5] + [500_000, 5_000_000, 100]
+SEVEN = UTM + np.array([0.4, 0, 0.25])
 INFO: dict[str, tuple[str, bytes, list[str], list[str]]] = {
     "one ball": (".obj", several((1, 0)), ["closed, all triangles face outwards"], ["components", "note"]),
     "shells": (".obj", several((1, 0), (0.5, 0), (0.1, 0), (1, 3)), ["4 closed components, 2 inside others"], ["note"]),
@@ -66,6 +67,8 @@ INFO: dict[str, tuple[str, bytes, list[str], list[str]]] = {
     "range map": (".ply", ply(RANGES[::-1], [[9 - i for i in f] for f in BOX_TRIANGLES]), ["note: 2 vertices"], []),
     "UTM": (".obj", obj(UTM, BOX_TRIANGLES), ["y 5000000 to 5000050, z 100 to 120: 25 by 50 by 20"], ["note"]),
     "UTM in single precision": (".stl", stl_binary(UTM, BOX_TRIANGLES), ["single precision keeps 2 digits"], []),
+    "UTM in seven digits": (".off", off(SEVEN, BOX_TRIANGLES), ["a text of seven digits keeps 2 digits"], []),
+    "UTM in eight digits": (".off", off(SEVEN + 0.01, BOX_TRIANGLES), [], ["note"]),
     "UTM of glTF": (".glb", Gltf([[(UTM, BOX_TRIANGLES, None)]], [{"mesh": 0}]).glb(), ["keeps 2 digits"], []),
     "UTM and a place without data": (".ply", ply([*UTM, [0, 0, 0]], BOX_TRIANGLES, BIG), ["keeps 2 digits"], []),
 }
