@@ -33,7 +33,7 @@ REASONS = {
     "FIFO .ply": "it is a pipe",
     "ply, sparse": r"scan\.ply: larger than 8589934592 bytes.*1099511627776",
     "stl, sparse": r"scan\.stl: larger than 8589934592 bytes.*1099511627776",
-    "gltf, buffer ../data.bin": "needs '../data.bin', which is no file in its folder; export it as one file",
+    "gltf, buffer ../data.bin": "needs '../data.bin', which is no file in its folder; put it there",
     "bomb .ply.gz": "no mesh file shrinks that far",
     "gifti, bomb": "unpacks to more than the 96 bytes announced",
     "gifti, bomb that is announced": "no mesh file shrinks that far",
