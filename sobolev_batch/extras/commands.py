@@ -268,15 +268,13 @@ class _PlotOptions:
         from sobolev_batch.extras.figures.selection import Selection
         from sobolev_batch.extras.figures.views import write_witness_plots
         from sobolev_batch.tables.convergence import EDGE_LENGTH
-        from sobolev_batch.tables.open import fields_read
 
-        with fields_read(self.store):
-            selection = Selection.from_store(self.store, self.orders, self.families or None, self.x or EDGE_LENGTH)
-            # First, since a label may be wrong.
-            witness_paths, missing = write_witness_plots(
-                selection, self.output, self.folder, self.meshes, self.up, self.colors, self.formats, self.panel
-            )
-            paths, omissions = write_plots(selection, self.output, self.formats, self.panel)
+        selection = Selection.from_store(self.store, self.orders, self.families or None, self.x or EDGE_LENGTH)
+        # First, since a label may be wrong.
+        witness_paths, missing = write_witness_plots(
+            selection, self.output, self.folder, self.meshes, self.up, self.colors, self.formats, self.panel
+        )
+        paths, omissions = write_plots(selection, self.output, self.formats, self.panel)
         for path in (*paths, *witness_paths):
             echo(path)
         for name, notes in omissions.items():

@@ -16,7 +16,7 @@ from sobolev_batch.errors import InputError, from_extra
 from sobolev_batch.extras.leagues.costs import CostLeague
 from sobolev_batch.extras.leagues.league import League
 from sobolev_batch.tables.convergence import EDGE_LENGTH
-from sobolev_batch.tables.open import AnyStore, Families, as_tree, fields_read, finished_group
+from sobolev_batch.tables.open import AnyStore, Families, as_tree, finished_group
 
 with from_extra("plot", "a plot needs"):
     from matplotlib.axes import Axes
@@ -185,8 +185,7 @@ def witness(
     """
     tree = as_tree(store)
     orders = finished_group(tree, "convergence")["order"].values[:1].tolist() if order is None else [order]
-    with fields_read(store):
-        views, missing = make_views(tree, folder, [mesh], PICTURE_LIMITS, up, orders)
+    views, missing = make_views(tree, folder, [mesh], PICTURE_LIMITS, up, orders)
     if len(views) + len(missing) > 1:
         raise InputError(f"{mesh!r} stands for several meshes, and one is plotted; give its label")
     for label, reason in missing.items():

@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from functools import lru_cache
 from itertools import accumulate, chain
@@ -266,22 +265,6 @@ def location_of(store: AnyStore) -> str | Path | Location:
             "or give the path or URL of the store"
         )
     return source
-
-
-@contextmanager
-def fields_read(store: AnyStore) -> Iterator[None]:
-    """Turn a checksum error that reading a field of an open store raises into a DamageError."""
-    try:
-        yield
-    except ValueError as error:
-        # zarr's codec has no exception of its own.
-        if "checksum" not in str(error):
-            raise
-        place = store.encoding.get(_SOURCE, "the store") if isinstance(store, xr.DataTree) else Location.parse(store)
-        problem = "its bytes are not those that were stored"
-        raise DamageError(
-            f"{place}: a field is damaged: {problem}; sobolev-batch verify names it, and run computes it again", problem
-        ) from error
 
 
 def finished_group(tree: xr.DataTree, name: str, *, load: bool = True) -> xr.Dataset:

@@ -27,7 +27,6 @@ from sobolev_batch.study.study import Study
 from sobolev_batch.tables.open import (
     AnyStore,
     as_tree,
-    fields_read,
     finished_group,
     location_of,
     reference_of,
@@ -106,8 +105,7 @@ class StudyMeshes:
     def with_witness(self, label: str, orders: Sequence[float], reference: Mesh | None = None) -> VertexWitness:
         """Return the mesh of a label with its witness function, and with distances from a reference if one is given."""
         own, scaled = self.make(label)
-        with fields_read(self.tree):
-            values = witness_at_vertices(*fields_of(self.tree, label), orders, scaled)
+        values = witness_at_vertices(*fields_of(self.tree, label), orders, scaled)
         title = f"{label} against {reference_of(self.tree)}, study {root_attribute(self.tree, 'study')['name']}"
         lengths = None if reference is None else named_distances(own, reference)
         return VertexWitness(own, values, orders, title, 1 / self.similarity.scale, lengths)

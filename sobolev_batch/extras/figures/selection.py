@@ -22,7 +22,6 @@ from sobolev_batch.tables.open import (
     chosen_families,
     complete_meshes,
     families_of,
-    fields_read,
     finished_group,
     reference_of,
 )
@@ -81,8 +80,7 @@ class Selection:
         """Spectra of the chosen families, see `spectra_of`; InputError where the store has no mesh to compare."""
         if not self.compared:
             raise InputError("the store has no mesh to compare: the reference or all others are not computed")
-        with fields_read(self.tree):
-            return spectra_of(self.tree, self.orders, self.compared)
+        return spectra_of(self.tree, self.orders, self.compared)
 
     @property
     def has_spectra(self) -> bool:

@@ -30,7 +30,6 @@ from sobolev_batch.tables.open import (
     as_tree,
     complete_meshes,
     families_of,
-    fields_read,
     finished_group,
     has_times,
     location_of,
@@ -127,8 +126,7 @@ def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], u
     selection = Selection.from_store(tree)
     spectra = selection.spectra if selection.has_spectra else None
     omission = "" if spectra is None else spectra.attrs["omission"]
-    with fields_read(store):
-        views, missing = make_views(tree, folder, witnesses, up=up)
+    views, missing = make_views(tree, folder, witnesses, up=up)
     charts = {**chart_data(tree, spectra, views), "costs": cost_data(content["costs"])}
     # Who names meshes leaves out the others.
     content["omissions"] += chart_omissions(tree, charts, omission, () if witnesses else views, missing)

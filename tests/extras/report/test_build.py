@@ -35,6 +35,7 @@ from sobolev_batch.shapes import icosphere
 from sobolev_batch.store.layout import Store, hide_tables
 from sobolev_batch.tables.convergence import tables_of
 from tests.support.browser import Browser, browser
+from tests.support.stores import flip
 from tests.support.studies import GONE, balls, method_rows, methods_of, small_table
 
 SCRIPT = "<script>window.ran=1</script>"
@@ -296,20 +297,20 @@ def test_a_page_shows_one_state_of_a_store(copy: Path, tmp_path: Path, monkeypat
 
 
 @pytest.mark.slow
-def test_what_is_missing_or_damaged_is_said(store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def damaged(*_: object, **__: object) -> None:
-        raise ValueError("Stored and computed checksum do not match.")
-
+def test_what_is_missing_or_damaged_is_said(
+    store: str, copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(StoreError, match="it holds no store of a study"):
         make_report(tmp_path)
     with monkeypatch.context() as patch:
         patch.setattr(build, "make_report", lambda *_, **__: ("", ()))
         with pytest.raises(StoreError, match="cannot be written there"):
             sb.report(store, tmp_path / "nowhere" / "a.html")
-    with monkeypatch.context() as patch:
-        patch.setattr(selection, "spectra_of", damaged)
-        with pytest.raises(DamageError, match=r"memory://hostile.zarr: a field is damaged.*verify"):
-            make_report(store)
+    for chunk in (copy / "fourier" / "fourier" / "c").glob("*/*/*/*"):
+        flip(chunk)
+    for read in (make_report, sb.plot.spectrum):
+        with pytest.raises(DamageError, match=f"{copy}: chunk .* of fourier/fourier is damaged .*verify names what"):
+            read(copy)
 
 
 @pytest.fixture(scope="module")
