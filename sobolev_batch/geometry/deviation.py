@@ -77,10 +77,11 @@ class Deviation:
     place: tuple[float, float, float]
 
     def is_within(self, length: float) -> bool | None:
-        """Tell whether the largest distance is at most a length; None where the bounds leave it open."""
+        """Tell whether the largest distance is at most a length; None where the bounds or rounding leave it open."""
         if self.upper <= length * (1 + _EQUAL):
             return True
-        return False if self.lower > length * (1 + _EQUAL) else None
+        rounding = _BOUND_ROUNDING * max(*map(abs, self.place), self.lower)
+        return False if self.lower > length * (1 + _EQUAL) + rounding else None
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ class DeviationVerdict:
         unit: Name of this unit; None where it is not known.
         deviations: Bounds of the largest deviation, only as close as the answer needs.
         beyond: Share of the area that is farther away, the larger of both directions, and its standard error; zero
-            where the meshes are within the length.
+            unless some is certainly.
         one_way: True where only the points of the first mesh count.
     """
 
@@ -54,7 +54,7 @@ class DeviationVerdict:
         """Return the answer with the bounds and the place, and the share of the area beyond the length."""
         length = f"{self.length:.{max(_LENGTH_DIGITS, self._digits)}g}{f' {self.unit}' if self.unit else ''}"
         answer = f"undecided whether within {length}" if self.outcome == "undecided" else f"{self.outcome} {length}"
-        beyond = "" if self.outcome == "within" else f"; {percent(*self.beyond)} of the area is farther away"
+        beyond = f"; {percent(*self.beyond)} of the area is farther away" if self.outcome == "not within" else ""
         largest = self.largest
         if self.outcome == "not within" and largest.upper > _CLOSE * largest.lower:
             largest = replace(largest, upper=math.nan)
@@ -75,7 +75,7 @@ def judge_deviation(
     """Return whether the largest deviation of two meshes is within a length; see `assert_within`."""
     limit = length_in(length, unit)
     verdict = DeviationVerdict(limit, unit, largest_deviation(a, b, within=limit), one_way=one_way)
-    if verdict.outcome == "within":
+    if verdict.outcome != "not within":
         return verdict
     return replace(verdict, beyond=share_beyond(a, b, limit, one_way=one_way))
 

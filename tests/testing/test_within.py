@@ -96,6 +96,14 @@ def test_an_open_question_fails_too(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert (done.exit_code, done.stdout.startswith("a.ply: undecided")) == (4, True)
 
 
+def test_rounding_alone_is_no_deviation() -> None:
+    ball = sb.shapes.icosphere(3)
+    other = sb.Mesh(ball.vertices, ball.triangles[::-1])
+    assert sb.largest_deviation(ball, other).both.lower > 0
+    with pytest.raises(AssertionError, match=r"^undecided whether within 1e-300: largest deviation 0, at \S+ \S+ \S+$"):
+        sb.testing.assert_within(ball, other, 1e-300)
+
+
 @pytest.mark.parametrize("unit", [None, "mm"])
 def test_bounds_are_rounded_outwards_and_places_of_rounding_are_zero(unit: str | None) -> None:
     found = deviation.Deviation(0.33312, 0.33519, (60.0, -1e-17, 10.25))
