@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from numbers import Integral
+from pathlib import Path
 from typing import TypeGuard
 
 from pydantic import ByteSize, TypeAdapter, ValidationError
@@ -31,6 +32,20 @@ def check_seed(seed: object) -> None:
     """Refuse anything but a whole number from 0 on, by an InputError."""
     if not is_whole_number(seed) or seed < 0:
         raise InputError(f"seed must be a whole number from 0 on, found {seed!r}")
+
+
+def check_workers(workers: object) -> None:
+    """Refuse anything but a whole number from 1 on, or None, by an InputError."""
+    if workers is not None and (not is_whole_number(workers) or workers < 1):
+        raise InputError(f"workers must be a whole number from 1 on, found {workers!r}")
+
+
+def path_of(path: object) -> Path:
+    """Return a path that a text or a path names; InputError where it is neither."""
+    try:
+        return Path(path)  # type: ignore[arg-type]
+    except TypeError as error:
+        raise InputError(f"a path is a text or a pathlib.Path, found {type(path).__name__}") from error
 
 
 def byte_count(memory: float | str) -> int:

@@ -20,6 +20,7 @@ from sobolev_batch.errors import MeshError, StudyError, written
 from sobolev_batch.geometry.formats.by_name import is_mesh_name, mesh_stem
 from sobolev_batch.geometry.formats.readers import expected_size, read_mesh
 from sobolev_batch.geometry.surface import Extent, placement_doubt
+from sobolev_batch.parameters import path_of
 from sobolev_batch.shown import Shown, reasons
 from sobolev_batch.sources.files import MOST_MESHES
 from sobolev_batch.sources.names import caseless_key, label_problem, name_problem, natural_key, quoted
@@ -121,7 +122,7 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
     >>> study.orders
     (-2.0,)
     """
-    folder, output = Path(folder), Path(output)
+    folder, output = path_of(folder), path_of(output)
     if os.path.lexists(output):
         # Before files are looked at, which may take a while.
         raise StudyError(f"{output} exists already; name another file, or move it away")

@@ -31,6 +31,7 @@ from zarr.core.sync import sync
 from zarr.storage import FsspecStore, LocalStore
 
 from sobolev_batch.errors import DamageError, SobolevBatchError, SpaceError, StoreError, is_for_want_of_space
+from sobolev_batch.parameters import path_of
 
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)(://|::)(.*)", re.DOTALL)
 _FOLDER_SCHEMES = ("file", "local")
@@ -246,7 +247,7 @@ class Location:
 def _folder_name(store: str | Path) -> str:
     if not str(store):
         raise StoreError("the path of the store is empty; name a folder or a URL")
-    first = Path(store).parts[0] if Path(store).parts else ""
+    first = next(iter(path_of(store).parts), "")
     if first.endswith(":") and first[:-1] in available_protocols():
         # The rest may hold a password.
         raise StoreError(

@@ -18,6 +18,7 @@ from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
 from sobolev_batch.norms.columns import TAKEN_NAMES
+from sobolev_batch.parameters import path_of
 from sobolev_batch.reduction.searched import SearchedSource
 from sobolev_batch.sources.command import function_name
 from sobolev_batch.sources.mesh_cache import MeshCache
@@ -222,7 +223,7 @@ class Study:
             StudyError: The file cannot be read, is no TOML, or has keys that are unknown, of the wrong type, or out of
                 range. The message lists every offender.
         """
-        path = Path(path)
+        path = path_of(path)
         try:
             return cls.from_table(read_toml(path), folder=path.parent)
         except InputError as error:

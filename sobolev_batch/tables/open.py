@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from functools import lru_cache
 from itertools import accumulate, chain
@@ -85,7 +85,7 @@ def open_store(store: str | Path | Location | Sequence[str | Path | Location]) -
     >>> tree["convergence"].attrs["reference"]
     'reference'
     """
-    if not isinstance(store, str | Path | Location):
+    if isinstance(store, Iterable) and not isinstance(store, str):
         return _joined([open_store(place) for place in store])
     # Else values that are read once the process has gone to another folder would be missing ones.
     location = Location.parse(store).absolute()

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import gzip
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -68,6 +70,12 @@ def write(path: Path, level: int) -> None:
     if plain != path:
         path.write_bytes(gzip.compress(plain.read_bytes()))
         plain.unlink()
+
+
+@pytest.mark.parametrize("function", [sb.init_study, partial(sb.report, "storage/no.zarr")])
+def test_what_is_no_path_is_refused_by_its_type(function: Callable[[Any], object]) -> None:
+    with pytest.raises(sb.errors.InputError, match=r"^a path is a text or a pathlib\.Path, found int$"):
+        function(7)
 
 
 def files_of(one: StudyObject) -> dict[str, dict[str, str]]:

@@ -8,6 +8,7 @@ import sys
 import time
 import tomllib
 import tracemalloc
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -321,10 +322,27 @@ def test_files_that_are_no_studies(tmp_path: Path, content: bytes, reason: str) 
 def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "zero").symlink_to("/dev/zero")
-    reasons = {"pipe": "it is a pipe", "zero": "it is a pipe, a socket or a device", "": "Is a directory"}
+    reasons = {"pipe": "it is a pipe", "zero": "it is a pipe, a socket or a device", "": "it is a folder"}
     for name, reason in {**reasons, "no": "No such file", "a\0b": "(null byte|null character)"}.items():
         with pytest.raises(sb.errors.StudyError, match=f"cannot be read: .*{reason}"):
             sb.Study.from_toml(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        sb.read_mesh,
+        sb.Study.from_toml,
+        sb.run,
+        sb.open_store,
+        sb.status,
+        sb.table,
+        lambda path: sb.write_mesh(sb.shapes.icosphere(0), path),
+    ],
+)
+def test_what_is_no_path_is_refused_by_its_type(call: Callable[[Any], object]) -> None:
+    with pytest.raises(sb.errors.InputError, match=r"^a path is a text or a pathlib.Path, found int$"):
+        call(7)
 
 
 _KEYS = "study lattice accuracy norm reference family name xi_max M rtol orders source levels mesh radius paths scale"

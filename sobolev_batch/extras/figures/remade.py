@@ -18,6 +18,7 @@ from sobolev_batch.batch.start import MADE_MESHES
 from sobolev_batch.errors import InputError, SobolevBatchError, StoreError, from_extra, write_file
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Similarity
+from sobolev_batch.parameters import path_of
 from sobolev_batch.sources.mesh_cache import MeshCache
 from sobolev_batch.sources.names import file_stem
 from sobolev_batch.sources.registry import Member
@@ -211,7 +212,7 @@ def write_witness(
     >>> sb.read_mesh(path).vertices.shape
     (162, 3)
     """
-    path = Path(path)
+    path = path_of(path)
     if path.suffix not in (".ply", ".vtp"):
         raise InputError(f"{path}: a witness is written as .ply or .vtp, found {path.suffix!r}")
     made, labels, orders = exported(store, [mesh], order, folder)

@@ -20,6 +20,7 @@ from sobolev_batch.errors import InputError, from_extra, write_file
 from sobolev_batch.extras.leagues.costs import CostLeague
 from sobolev_batch.extras.leagues.evolution import evolution
 from sobolev_batch.extras.leagues.league import League, percent_text
+from sobolev_batch.parameters import path_of
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import utc_now
 from sobolev_batch.store.objects import Objects
@@ -93,8 +94,9 @@ def report(
     >>> sb.report("storage/icosphere.zarr", "report.html").name  # doctest: +SKIP
     'report.html'
     """
-    write_page(Path(path), make_report(store, folder=folder, witnesses=witnesses, up=up)[0])
-    return Path(path)
+    output = path_of(path)
+    write_page(output, make_report(store, folder=folder, witnesses=witnesses, up=up)[0])
+    return output
 
 
 def write_page(path: Path, text: str) -> None:

@@ -68,8 +68,9 @@ def open_regular(path: Path) -> BufferedReader:
     Pipes could keep a reader waiting for ever, devices could never end.
     """
     mode = path.stat().st_mode
-    # A folder is refused when it is opened.
-    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+    if stat.S_ISDIR(mode):
+        raise OSError(errno.EISDIR, "it is a folder; name the files in it")
+    if not stat.S_ISREG(mode):
         raise OSError(errno.EINVAL, "it is a pipe, a socket or a device, and no regular file")
     return path.open("rb")
 

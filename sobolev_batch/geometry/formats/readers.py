@@ -30,6 +30,7 @@ from sobolev_batch.geometry.formats.parsing import (
 )
 from sobolev_batch.geometry.formats.ply import HEADER_BYTES
 from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.parameters import path_of
 
 _LONGEST_REASON = 250
 # How files begin that are taken for meshes, and what they are.
@@ -89,7 +90,7 @@ def read_mesh(path: str | Path) -> Mesh:
     ...     sb.read_mesh(path)
     Mesh(3 vertices, 1 triangles)
     """
-    return read_mesh_by(Path(path), BufferedReader.read)
+    return read_mesh_by(path_of(path), BufferedReader.read)
 
 
 def files_beside(path: Path) -> tuple[Path, ...]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from sobolev_batch.errors import InputError, MeshError, new_file_beside, write_file
 from sobolev_batch.geometry.formats.by_name import WRITERS
 from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
+from sobolev_batch.parameters import path_of
 
 _WHAT = "the mesh"
 
@@ -38,7 +39,7 @@ def write_mesh(mesh: MeshLike, path: str | Path) -> None:
 
 def require_writable(path: str | Path) -> Path:
     """Return a path that a mesh can be written to; InputError where its suffix or folder does not permit that."""
-    path = Path(path)
+    path = path_of(path)
     if path.suffix.lower() not in WRITERS:
         raise InputError(f"{path}: meshes are written as {', '.join(WRITERS)}; found the suffix {path.suffix!r}")
     if not path.parent.is_dir():

@@ -269,7 +269,7 @@ def test_empty_and_missing_files_and_folders_are_told_apart(tmp_path: Path, endi
     path = tmp_path / f"scan{ending}"
     assert refusal(path) == "cannot be read: No such file or directory"
     path.mkdir()
-    assert refusal(path) == "cannot be read: Is a directory"
+    assert refusal(path) == "cannot be read: it is a folder; name the files in it"
     path.rmdir()
     for content in (b"", gzip.compress(b""))[: 1 + ending.endswith(".gz")]:
         path.write_bytes(content)
