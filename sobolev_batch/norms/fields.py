@@ -257,7 +257,7 @@ def field_of(
             )
         return a
     surface = as_surface(a)
-    if lattice is None:
+    if not isinstance(lattice, Lattice):
         raise InputError(
             f"a surface such as this {type(surface).__name__} needs a lattice or an accuracy: "
             "pass lattice=Lattice(xi_max=..., M=...), or rtol=... to a norm or distance"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -10,6 +11,7 @@ import xarray as xr
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.formats.conversion import MeshLike, SurfaceLike, as_mesh
+from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.columns import describe
 from sobolev_batch.norms.distances import distance
@@ -61,6 +63,8 @@ def convergence(
     >>> found["triangles"].sel(mesh="level 3").item()
     1280
     """
+    if isinstance(meshes, str | os.PathLike | Mesh):
+        raise InputError(f"meshes are a list, or meshes by name, found one {type(meshes).__name__}; put it into a list")
     named = meshes if isinstance(meshes, Mapping) else {str(number): mesh for number, mesh in enumerate(meshes)}
     if not named:
         raise InputError("there are no meshes; pass one or more")

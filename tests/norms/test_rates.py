@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -36,6 +38,12 @@ def test_meshes_without_labels_are_numbered() -> None:
     assert found["distance"].dims == ("mesh",)
     assert found["mesh"].values.tolist() == ["0", "1"]
     assert found["within"].all()
+
+
+@pytest.mark.parametrize("meshes", [icosphere(1), "ball.ply"])
+def test_one_mesh_is_no_list_of_meshes(meshes: Any) -> None:
+    with pytest.raises(sb.errors.InputError, match="put it into a list"):
+        sb.convergence(meshes, Sphere(), rtol=1e-2)
 
 
 def test_no_meshes_are_refused() -> None:
