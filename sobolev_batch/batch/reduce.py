@@ -31,13 +31,14 @@ from sobolev_batch.geometry.formats.by_name import WRITERS, mesh_format
 from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.machine import available_cores
+from sobolev_batch.parameters import check_workers
 from sobolev_batch.reduction.limit import Limit, tried
 from sobolev_batch.reduction.recorded import RecordedSearch
 from sobolev_batch.reduction.remesher import Method, Range, Remesher
 from sobolev_batch.reduction.search import PRECISION, Bracket, Trial
 from sobolev_batch.sources.files import FileMember, matching_files, names_of_files
 from sobolev_batch.sources.mesh_cache import InMemory, MeshCache
-from sobolev_batch.sources.names import duplicate_names
+from sobolev_batch.sources.names import duplicate_names, label_problem, quoted
 from sobolev_batch.sources.registry import Member, SurfaceMember
 from sobolev_batch.store.location import Location
 from sobolev_batch.tables import Format
@@ -192,6 +193,7 @@ def reduce(
     """
     if client is not None:
         require_blocking(client)
+    check_workers(workers)
     limit, remesher = Limit.parse(within, order, unit), _permitted(method, search)
     # It refuses a wrong precision.
     remesher.search(limit, 1, 1.0, precision)
@@ -298,6 +300,9 @@ def _originals(meshes: Any, folder: Location | None) -> dict[str, tuple[Member, 
         meshes = [meshes]
     if not isinstance(meshes, list | tuple) or not all(isinstance(one, str | os.PathLike) for one in meshes):
         by_name = meshes if isinstance(meshes, Mapping) else {"mesh": meshes}
+        names = [*map(str, by_name)]
+        if problem := next(filter(None, map(label_problem, names)), None if names else "there is none"):
+            raise InputError(f"meshes to reduce need names of their own, found {quoted(names)}: {problem}")
         made = {str(name): as_mesh(mesh) for name, mesh in by_name.items()}
         return {name: (SurfaceMember(name, -1, mesh, {"mesh": mesh.digest}), ".ply") for name, mesh in made.items()}
     paths = list(dict.fromkeys(path for one in meshes for path in matching_files(Path(), os.fspath(one))))

@@ -19,6 +19,7 @@ from sobolev_batch.batch.object_run import Ended, ended_before, run_object, work
 from sobolev_batch.batch.start import StoreLike, ready_to_run
 from sobolev_batch.errors import DamageError, InputError, SobolevBatchError, StoreError
 from sobolev_batch.machine import available_cores, require_machine_memory
+from sobolev_batch.parameters import check_workers
 from sobolev_batch.reduction.searched import SearchedSource
 from sobolev_batch.shown import Shown, reasons
 from sobolev_batch.store.create import give_up, require_usable, reserve
@@ -125,6 +126,7 @@ def run(
     """
     if client is not None:
         require_blocking(client)
+    check_workers(workers)
     study, location = ready_to_run(study, store, allow_commands=allow_commands, only=only)
     location = location if client is None else location.absolute()
     notify, lock = on_progress or (lambda progress: None), Lock.of_this_process()

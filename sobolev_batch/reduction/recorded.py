@@ -122,8 +122,10 @@ class RecordedSearch:
     def forget(self) -> None:
         """Remove the mesh that an earlier search has left under this name, unless another file has replaced it."""
         record = self._stored()
-        if record is not None and _digest(self._read_mesh(record)) == record.mesh_digest:
-            self.folder.discard(self._key_of_mesh(record))
+        # What was searched before may have had another format.
+        for key in (f"{self.name}{suffix}" for suffix in WRITERS):
+            if record is not None and _digest(self.folder.read(key) or b"") == record.mesh_digest:
+                self.folder.discard(key)
 
     def reason(self, record: SearchRecord) -> str:
         """Return why nothing was found; empty where something was."""

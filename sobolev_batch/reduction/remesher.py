@@ -39,8 +39,8 @@ Range = Mapping[str, tuple[float, float]]
 
 def searched_parameter(search: Range | None) -> tuple[str, tuple[float, float] | None]:
     """Return the parameter that is searched, and its ends; by default triangles, whose ends depend on the mesh."""
-    if search is not None and len(search) != 1:
-        raise InputError(f"one parameter is searched, found {len(search)}; give the others fixed values")
+    if search is not None and not (isinstance(search, Mapping) and len(search) == 1):
+        raise InputError(f"one parameter is searched, as in {{'triangles': (100, 1000)}}, found {search!r}")
     return next(iter(search.items())) if search else (_TRIANGLES, None)
 
 
@@ -79,7 +79,7 @@ class Remesher:
             table = method
         elif callable(method):
             table = {"source": "function", "function": method}
-        elif PLACEHOLDER.search(method):
+        elif isinstance(method, str) and PLACEHOLDER.search(method):
             table = {"source": "command", "command": shlex.split(method)}
         if table.get("source") == "decimate":
             table = {**_DECIMATION, **table}

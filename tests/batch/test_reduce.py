@@ -223,6 +223,14 @@ def test_no_mesh_of_an_earlier_search_passes_for_one_that_failed(scan: Path, tmp
         fail()
         assert found_by(mesh, within=1e-30, output=output).reason
         assert not (output / "part.ply").exists()
+    # Nor does one of another format.
+    sb.write_mesh(lumpy(2), tmp_path / "part.obj")
+    assert found_by(tmp_path / "part.obj", within=0.1, output=output).path.endswith("part.obj")
+    sb.write_mesh(lumpy(1), mesh)
+    assert found_by(mesh, within=0.1, output=output).path.endswith("part.ply")
+    assert {file.name for file in output.iterdir()} == {"part.json", "part.ply"}
+    mesh.write_bytes(b"broken")
+    assert found_by(mesh, within=0.1, output=output).reason
     # A file that no search has written stays.
     (output / "part.ply").write_text("precious")
     assert found_by(mesh, within=0.1, output=output).reason
@@ -327,12 +335,21 @@ def test_several_meshes_on_a_cluster(client: Client, scan: Path, tmp_path: Path)
         ({"within": 1, "method": "x {input} {hausd}", "search": {"hausd": (0.1, 1.0)}}, "no {output}"),
         ({"within": 1, "search": {"triangles": (9, 4)}}, "the smaller one first"),
         ({"within": 1, "search": {"a": (1, 2), "b": (1, 2)}}, "one parameter is searched"),
+        ({"within": 1, "search": ("triangles", 4, 9)}, r"as in \{'triangles': \(100, 1000\)\}, found \('triangles'"),
+        ({"within": 1, "method": 3}, "no source is named 3"),
         ({"within": 1, "precision": 0}, "precision"),
+        *(({"within": 1, "workers": wrong}, "workers must be a whole number from 1 on") for wrong in (0, -3, "two")),
     ],
 )
 def test_wrong_parameters_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(sb.errors.InputError, match=message):
-        found_by(lumpy(1), **options)
+        sb.reduce(lumpy(1), **{"workers": 1, **options})
+
+
+@pytest.mark.parametrize(("names", "message"), [([], "none"), ([""], "empty"), (["a\nb"], "invisible")])
+def test_meshes_by_name_need_names(names: list[str], message: str) -> None:
+    with pytest.raises(sb.errors.InputError, match=f"^meshes to reduce need names of their own, found .*{message}"):
+        sb.reduce(dict.fromkeys(names, lumpy(1)), 1.0)
 
 
 def test_no_original_is_replaced(scan: Path) -> None:

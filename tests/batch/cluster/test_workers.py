@@ -56,6 +56,12 @@ def test_workers_declare_their_memory(client: Client) -> None:
         assert 0.5 < member.allowed_bytes / limit < 0.85
 
 
+@pytest.mark.parametrize("count", [0, -3, "two", True])
+def test_there_are_one_or_more_workers(count: Any) -> None:
+    with pytest.raises(InputError, match="workers must be a whole number from 1 on"):
+        run("missing.toml", workers=count)
+
+
 @pytest.mark.parametrize("count", [1, 3])
 def test_local_workers_have_equal_parts_of_the_machine(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
     limits: list[float] = []
