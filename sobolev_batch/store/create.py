@@ -342,9 +342,9 @@ def require_equal(location: Location, comparisons: Sequence[tuple[str, str, str]
         )
 
 
-def lattices_text(old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, str, str]:
-    """Return the comparison of the lattices of two studies."""
-    before, now = (f"xi_max {lattice['xi_max']:.6g} and M {lattice['M']}" for lattice in (old, new))
+def lattices_text(old: Mapping[str, Any] | None, new: Mapping[str, Any] | None) -> tuple[str, str, str]:
+    """Return the comparison of the lattices of two studies; None is one that an accuracy chooses."""
+    before, now = (f"xi_max {one['xi_max']:.6g} and M {one['M']}" if one else "an accuracy" for one in (old, new))
     return "a lattice of", before, now
 
 

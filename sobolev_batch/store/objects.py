@@ -102,11 +102,18 @@ class Objects:
 
     def _require_fields_of(self, study: Study) -> None:
         """Refuse other fields, as stores of objects do, before the root has the table of the other study."""
-        (old, old_dtype), (new, new_dtype) = ((one.table.get("lattice"), _dtype_of(one.table)) for one in (self, study))
-        if not (old and new) or (old, old_dtype) == (new, new_dtype):
+        if all(self.table.get(section) == study.table.get(section) for section in ("lattice", "transform")):
             return
-        if any(Store(self.location.below(name)).exists() for name in self.recorded()):
-            require_equal(self.location, [lattices_text(old, new), ("dtype", old_dtype, new_dtype)])
+        given = study.table.get("lattice")
+        for store in (Store(self.location.below(name)) for name in self.recorded()):
+            with suppress(DamageError):
+                if not store.exists() or store.is_unfinished:
+                    continue
+                held = store.attributes()["study"]
+                dtypes = "dtype", repr(held["dtype"]), repr(study.table.get("transform", {}).get("dtype", "complex128"))
+                if given or not held.get("choice"):
+                    require_equal(self.location, [lattices_text(held["lattice"], given), *([dtypes] if given else [])])
+                return
 
     @classmethod
     def prepared(cls, location: Location, study: Study) -> Self:
@@ -146,10 +153,6 @@ class Objects:
                     made.records.write(made.rows[name], record)
         root.consolidate()
         return made
-
-
-def _dtype_of(table: Mapping[str, Any]) -> str:
-    return repr(table.get("transform", {}).get("dtype", "complex128"))
 
 
 def stores_below(location: Location) -> dict[str, Location]:

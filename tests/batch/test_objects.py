@@ -226,6 +226,7 @@ def test_a_second_run_computes_what_is_new(changeable: Path, threads: Client) ->
     for change, difference in (
         ({"lattice": {"xi_max": 3.0, "M": 4}}, "a lattice of .*, not xi_max 3 and M 4"),
         ({"transform": {"dtype": "complex64"}}, "dtype 'complex128', not 'complex64'"),
+        ({"lattice": None, "accuracy": {"rtol": 0.1}}, r"a lattice of xi_max \S+ and M \d+, not an accuracy"),
     ):
         message = f"{changeable}: it holds a store of another study, with {difference}. Name another store, or remove"
         with pytest.raises(sb.errors.StoreError, match=rf"^{message} this one$"):
