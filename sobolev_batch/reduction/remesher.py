@@ -9,6 +9,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
+
 from sobolev_batch.errors import InputError
 from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.reduction.limit import Limit
@@ -39,9 +41,13 @@ Range = Mapping[str, tuple[float, float]]
 
 def searched_parameter(search: Range | None) -> tuple[str, tuple[float, float] | None]:
     """Return the parameter that is searched, and its ends; by default triangles, whose ends depend on the mesh."""
-    if search is not None and not (isinstance(search, Mapping) and len(search) == 1):
-        raise InputError(f"one parameter is searched, as in {{'triangles': (100, 1000)}}, found {search!r}")
-    return next(iter(search.items())) if search else (_TRIANGLES, None)
+    if search is None:
+        return _TRIANGLES, None
+    match [*search.items()] if isinstance(search, Mapping) else []:
+        case [(str(name), (low, high))]:
+            low, high = (end.item() if isinstance(end, np.generic) else end for end in (low, high))
+            return name, (low, high)
+    raise InputError(f"one parameter is searched, as in {{'triangles': (100, 1000)}}, found {search!r}")
 
 
 class GivenSource(Source):

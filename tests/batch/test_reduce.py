@@ -336,6 +336,7 @@ def test_several_meshes_on_a_cluster(client: Client, scan: Path, tmp_path: Path)
         ({"within": 1, "search": {"triangles": (9, 4)}}, "the smaller one first"),
         ({"within": 1, "search": {"a": (1, 2), "b": (1, 2)}}, "one parameter is searched"),
         ({"within": 1, "search": ("triangles", 4, 9)}, r"as in \{'triangles': \(100, 1000\)\}, found \('triangles'"),
+        ({"within": 1, "search": {"triangles": 9}}, r"one parameter is searched, as in .*, found \{'triangles': 9\}"),
         ({"within": 1, "method": 3}, "no source is named 3"),
         ({"within": 1, "precision": 0}, "precision"),
         *(({"within": 1, "workers": wrong}, "workers must be a whole number from 1 on") for wrong in (0, -3, "two")),
@@ -344,6 +345,12 @@ def test_several_meshes_on_a_cluster(client: Client, scan: Path, tmp_path: Path)
 def test_wrong_parameters_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(sb.errors.InputError, match=message):
         sb.reduce(lumpy(1), **{"workers": 1, **options})
+
+
+def test_ends_of_a_search_may_be_numbers_of_numpy() -> None:
+    numbers, ends = (np.int64(4), np.int32(200)), (4, 200)
+    found, same = (found_by(lumpy(2), within=0.1, search={"triangles": one}) for one in (numbers, ends))
+    assert sizes(found) == sizes(same)
 
 
 @pytest.mark.parametrize(("names", "message"), [([], "none"), ([""], "empty"), (["a\nb"], "invisible")])
