@@ -242,6 +242,8 @@ def test_a_league_needs_no_more_than_the_store(store: Path, monkeypatch: pytest.
     assert leagues[1].objects[:2] == ("a", "b")
     frame = sb.compare_studies(store, store, -3)
     assert frame["ratio"].tolist() == [1.0, 1.0]
+    with pytest.raises(sb.errors.StoreError, match="it does not exist"):
+        sb.compare_studies(store, store / "no.zarr")
     assert set(frame["verdict"]) == {"undecided"}
     # Twice as many triangles are worse, at all orders alike; the exit status says so.
     more = sb.open_store(store / "a").load()

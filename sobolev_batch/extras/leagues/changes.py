@@ -79,6 +79,9 @@ def compare_studies(
     news, olds = stores_of(new), stores_of(old)
     common = [name for name in news if name in olds]
     if not common:
+        for stores in (news, olds):
+            if "" in stores:
+                as_tree(stores[""])  # It says where there is no store.
         raise InputError(
             f"the studies have no object in common: the new one has {quoted([*news])}, the old one {quoted([*olds])}"
         )
