@@ -105,11 +105,11 @@ class Objects:
         if all(self.table.get(section) == study.table.get(section) for section in ("lattice", "transform")):
             return
         given = study.table.get("lattice")
-        for store in (Store(self.location.below(name)) for name in self.recorded()):
+        for name in self.recorded():
             with suppress(DamageError):
-                if not store.exists() or store.is_unfinished:
+                if (place := self.existing_store(name)) is None:
                     continue
-                held = store.attributes()["study"]
+                held = Store(place).attributes()["study"]
                 dtypes = "dtype", repr(held["dtype"]), repr(study.table.get("transform", {}).get("dtype", "complex128"))
                 if given or not held.get("choice"):
                     require_equal(self.location, [lattices_text(held["lattice"], given), *([dtypes] if given else [])])
