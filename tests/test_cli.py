@@ -450,6 +450,7 @@ MISUSED = [
     ("compare 1.off 3.off --below 0.1 --proximity --rtol 0.1", "leave out --proximity, --rtol"),
     ("compare 1.off 3.off --below 0.1 --order -2,-4", "--below takes one --order"),
     ("compare 1.off 3.off --below 0.1 --within 1", "leave out one of them"),
+    ("compare 1.off 3.off --threshold 1", "--threshold goes with --proximity or --report"),
     ("compare 1.off 3.off --within 1 --order -2 --proximity", "leave out --order, --proximity"),
     ("compare 1.off 3.off --within 1% --unit mm", "leave out --unit"),
 ]

@@ -96,6 +96,8 @@ class CompareOptions:
             self._check_verdict()
         elif self.one_way:
             raise click.UsageError("--one-way goes with --within LENGTH; give that, or leave it out")
+        elif self.threshold is not None and not self.proximity and self.report is None:
+            raise click.UsageError("--threshold goes with --proximity or --report; give one, or leave it out")
         elif self.has_lattice and self.rtol is not None:
             raise click.UsageError("--rtol chooses the lattice; leave out --xi-max and --M")
         if self.report is not None:
