@@ -271,6 +271,7 @@ def _searched(search: RecordedSearch, cluster: Callable[[], Any], at_once: Calla
     """Search for the fewest triangles of a mesh, on a cluster or, where that is None, in this process."""
     known = search.recorded()
     if known is None:
+        search.make_room()
         read = Task(search.begun, (), search.projected_bytes(0), label=search.name, stage="read")
         known = yield from result_from(cluster(), read)
     record = known

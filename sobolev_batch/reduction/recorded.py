@@ -107,17 +107,23 @@ class RecordedSearch:
         """Record the outcome of a trial, after the mesh if it is the best one, and return the record."""
         if self.digest != record.digest:
             raise MeshError("a file of it was changed while it was searched; try again")
-        if self.name and not record.trials:
-            self.forget()
         trial, mesh = outcome
         record = replace(record, trials=(*(one for one in record.trials if one.size != trial.size), trial))
+        written: dict[str, bytes] = {}
         if mesh is not None and self.bracket(record).best == trial:
             key = self._key_of_mesh(record)
-            data = WRITERS[PurePath(key).suffix](mesh)
-            self.folder.write({key: data})
-            record = replace(record, mesh_digest=_digest(data))
+            written[key] = WRITERS[PurePath(key).suffix](mesh)
+            record = replace(record, mesh_digest=_digest(written[key]))
+        # The record first: no mesh lies there that none tells of, and one that is missing is made again.
         self.folder.write({f"{self.name or record.digest}.json": _RECORDS.dump_json(record, exclude_defaults=True)})
+        self.folder.write(written)
         return record
+
+    def make_room(self) -> None:
+        """Remove the mesh of an earlier search; MeshError where a file lies in its place and no search has a record."""
+        self.forget()
+        if self.folder.read(f"{self.name}.json") is None and self.folder.read(self.mesh_key) is not None:
+            raise MeshError(f"no search wrote {self.mesh_key} in the output; move it, or name another folder")
 
     def forget(self) -> None:
         """Remove the mesh that an earlier search has left under this name, unless another file has replaced it."""

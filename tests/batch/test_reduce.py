@@ -366,6 +366,17 @@ def test_no_original_is_replaced(scan: Path) -> None:
     assert scan.read_bytes() == before
 
 
+def test_no_file_is_replaced_that_no_search_wrote(scan: Path, tmp_path: Path) -> None:
+    other = tmp_path / scan.name
+    other.write_bytes(b"of somebody else")
+    found = found_by(scan, within=0.1, output=tmp_path)
+    assert "no search wrote scan.ply" in found.reason
+    assert not found.trials
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"of somebody else"]
+    other.unlink()
+    assert found_by(scan, within=0.1, output=tmp_path).path
+
+
 @pytest.mark.process
 def test_the_command_goes_on_after_it_was_killed(tmp_path: Path) -> None:
     (tmp_path / "rings.py").write_text(f"{SCRIPT}\nassert sys.argv[1][-4:] == sys.argv[2][-4:] == '.off'")
