@@ -1,9 +1,10 @@
-"""Parameters of the public interface: numbers, fractions, lengths and sizes of memory, checked once on their way in."""
+"""Parameters of the public interface: numbers, names, lengths, paths and sizes of memory, checked where they enter."""
 
 from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable
 from numbers import Integral
 from pathlib import Path
 from typing import TypeGuard
@@ -46,6 +47,15 @@ def path_of(path: object) -> Path:
         return Path(path)  # type: ignore[arg-type]
     except TypeError as error:
         raise InputError(f"a path is a text or a pathlib.Path, found {type(path).__name__}") from error
+
+
+def as_names(given: str | Iterable[str]) -> list[str]:
+    """Return names, or the one that a text is: a text is a sequence of its letters otherwise.
+
+    >>> as_names("decimated"), as_names(("decimated", "remeshed"))
+    (['decimated'], ['decimated', 'remeshed'])
+    """
+    return [given] if isinstance(given, str) else [*given]
 
 
 def byte_count(memory: float | str) -> int:

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sobolev_batch.errors import InputError, StudyError
-from sobolev_batch.parameters import format_bytes
+from sobolev_batch.parameters import as_names, format_bytes
 from sobolev_batch.sources.mesh_cache import MeshCache
 from sobolev_batch.sources.names import known_names, quoted
 from sobolev_batch.store.location import Location
@@ -42,10 +42,9 @@ def ready_to_run(
     study: StudyLike, store: StoreLike, *, allow_commands: bool, only: Sequence[str] = ()
 ) -> tuple[Study, Location]:
     """Return a study that may run, or a part of it, and its place; log what would make the run useless."""
-    parts = (only,) if isinstance(only, str) else tuple(only)  # A text is a sequence of its letters.
-    study, location = settled(replace(as_study(study), only=parts), store, may_run=True)
+    study, location = settled(replace(as_study(study), only=tuple(as_names(only))), store, may_run=True)
     require_permission(study, allow_commands)
-    _require_members(study, parts)
+    _require_members(study, study.only)
     if store is None:
         # Other folders are not made: their names may be mistakes.
         with location.access("written"):

@@ -21,7 +21,7 @@ from sobolev_batch.norms.accuracy.problem import support_of
 from sobolev_batch.norms.accuracy.solution import SurfaceValues
 from sobolev_batch.norms.columns import labelled
 from sobolev_batch.norms.distances import accuracy_of, distance, to_accuracy
-from sobolev_batch.parameters import check_seed
+from sobolev_batch.parameters import as_names, check_seed
 from sobolev_batch.sources.derived import decimated, with_noise
 from sobolev_batch.transform.fourier import ErrorTarget, Execution
 from sobolev_batch.transform.lattice import Lattice, Orders, check_orders
@@ -53,7 +53,7 @@ def yardsticks(
     memory: float | str | None = None,
     best_effort: bool = False,
     seed: int = 0,
-    changes: Collection[Change] = CHANGES,
+    changes: Change | Collection[Change] = CHANGES,
     on_progress: Callable[[str], object] | None = None,
 ) -> xr.Dataset:
     """Return the distance of two meshes, and which changes of the second one bring it as far from itself.
@@ -94,16 +94,16 @@ def yardsticks(
     """
     a, b = as_mesh(a), as_mesh(b)
     check_seed(seed)
-    if unknown := set(changes) - set(CHANGES):
+    if unknown := {*as_names(changes)} - {*CHANGES}:
         raise InputError(f"changes must be among {', '.join(CHANGES)}, found {', '.join(map(repr, sorted(unknown)))}")
-    orders, solved = check_orders(order), None
+    orders, solved, wanted = check_orders(order), None, [one for one in CHANGES if one in as_names(changes)]
     if rtol is None:
         found = distance(a, b, order, lattice=lattice, memory=memory, best_effort=best_effort)
     else:
         accuracy = accuracy_of(rtol, memory, best_effort=best_effort)
         found, solved = to_accuracy("distance", (a, b), order, lattice, accuracy, seed, on_progress)
     distances, errors, relative = (np.atleast_1d(found[name].values) for name in ("distance", "error", "relative"))
-    columns = {name: np.full(len(orders), np.nan) for change in changes for name in (change, f"{change}_error")}
+    columns = {name: np.full(len(orders), np.nan) for change in wanted for name in (change, f"{change}_error")}
     if distances.any():
         values_errors = np.maximum(_VALUES_ACCURACY * np.maximum(distances, errors), _ROUNDING * b.area)
         target = ErrorTarget(orders, tuple(values_errors.tolist()))
@@ -115,7 +115,7 @@ def yardsticks(
             values = frequencies.values(b, target, Execution(threads=available_cores()))
         curves = _curves(b, frequencies, values, target, float(relative.min()), seed)
         for i in np.flatnonzero(distances > errors).tolist():
-            for change in changes:
+            for change in wanted:
                 (on_progress or str)(f"order {orders[i]:g}: {change} as far")
                 curve = curves[change]
                 columns[change][i], columns[f"{change}_error"][i] = curve.equivalent(i, distances[i], errors[i])

@@ -19,6 +19,7 @@ from sobolev_batch.errors import DamageError, InputError, StoreError, one_line
 from sobolev_batch.geometry.surface import Similarity, placement_doubt
 from sobolev_batch.norms.columns import describe
 from sobolev_batch.norms.fields import Quality
+from sobolev_batch.parameters import as_names
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.store.encoding import with_coordinates
 from sobolev_batch.store.layout import (
@@ -321,7 +322,7 @@ def chosen_families(tree: xr.DataTree, family: Families) -> list[str]:
     if family is None:
         return known
     chosen: set[str] = set()
-    for pattern in [family] if isinstance(family, str) else family:
+    for pattern in as_names(family):
         # A name may have characters that mean something else in a glob.
         fitting = [pattern] if pattern in known else [name for name in known if fnmatchcase(name, pattern)]
         if not fitting:

@@ -11,6 +11,7 @@ from sobolev_batch.errors import DamageError, InputError
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
 from sobolev_batch.norms.columns import describe
 from sobolev_batch.norms.fields import Quality
+from sobolev_batch.parameters import as_names
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.store.layout import QUALITY
 from sobolev_batch.store.records import Record, Records
@@ -62,7 +63,7 @@ def _computed(tree: xr.DataTree, orders: tuple[float, ...], meshes: Meshes = Non
     store, reference = store_of(tree), reference_of(tree)
     table = finished_group(tree, "meshes", load=False)
     if meshes is not None:
-        chosen = [meshes] if isinstance(meshes, str) else list(meshes)
+        chosen = as_names(meshes)
         require_fields(tree, table, chosen)
         table = table.sel(mesh=list(dict.fromkeys([*chosen, reference])))
     complete = table.isel(mesh=table["status"].values == "complete")

@@ -87,7 +87,7 @@ def test_a_move_is_as_far_beyond_all_frequencies_too() -> None:
 
 
 def test_changes_are_chosen() -> None:
-    found = yardsticks(moved(0.1), BALL, ORDERS, lattice=LATTICE, changes=["moved"])
+    found = yardsticks(moved(0.1), BALL, ORDERS, lattice=LATTICE, changes="moved")
     np.testing.assert_allclose(found["moved"], 0.1, rtol=0.05)
     assert not {"noise", "decimated_error"} & set(found)
     with pytest.raises(InputError, match="'turned'"):

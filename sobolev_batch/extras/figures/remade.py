@@ -18,7 +18,7 @@ from sobolev_batch.batch.start import MADE_MESHES
 from sobolev_batch.errors import InputError, SobolevBatchError, StoreError, from_extra, write_file
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Similarity
-from sobolev_batch.parameters import path_of
+from sobolev_batch.parameters import as_names, path_of
 from sobolev_batch.sources.mesh_cache import MeshCache
 from sobolev_batch.sources.names import file_stem
 from sobolev_batch.sources.registry import Member
@@ -127,7 +127,7 @@ def matching_labels(tree: xr.DataTree, names: Sequence[str]) -> tuple[str, ...]:
     usable = (meshes["status"] == "complete") & (meshes["triangles"] > 0) & (meshes["mesh"] != reference_of(tree))
     candidates: list[str] = meshes["mesh"].values[usable.values].tolist()
     chosen, labels = list[str](), set(known)
-    for name in names:
+    for name in as_names(names):
         if name in labels:
             chosen.append(name)
         elif any(character in name for character in "*?["):

@@ -12,6 +12,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.extras.leagues.league import ENDS, RELATIVE, AnyStores, interval_text, number_text, orders_of
 from sobolev_batch.extras.leagues.statistics import adjusted, interval, numbers_of, sign_flip_test
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
+from sobolev_batch.parameters import as_names
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.study.comparable import SIGNIFICANCE, least_objects
 from sobolev_batch.tables import Format
@@ -85,7 +86,7 @@ def compare_studies(
         raise InputError(
             f"the studies have no object in common: the new one has {quoted([*news])}, the old one {quoted([*olds])}"
         )
-    columns = [y] if isinstance(y, str) else list(y)
+    columns = as_names(y)
     lost = [f"{name} (all of it)" for name in olds if name not in news]
     frames = [frame for name in common for frame in _joined(name, news[name], olds[name], order, columns, lost)]
     joined = pd.concat(frames, ignore_index=True)

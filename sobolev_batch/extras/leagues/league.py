@@ -28,6 +28,7 @@ from sobolev_batch.extras.leagues.statistics import (
     within_objects,
 )
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
+from sobolev_batch.parameters import as_names
 from sobolev_batch.shown import shown_tables
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.store.location import Location
@@ -324,7 +325,7 @@ def orders_of(frames: Iterable[pd.DataFrame], y: str) -> list[float]:
 def _chosen(tables: Mapping[str, pd.DataFrame], methods: Sequence[str] | None) -> list[str]:
     """Return the methods to compare, default all; InputError where one is unknown."""
     families = list(dict.fromkeys(family for frame in tables.values() for family in frame["family"]))
-    chosen = families if methods is None else list(methods)
+    chosen = families if methods is None else as_names(methods)
     for method in chosen:
         if method not in families:
             raise InputError(f"no method is named {quoted(method)}; known are {', '.join(families)}")

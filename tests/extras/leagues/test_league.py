@@ -188,7 +188,7 @@ def test_the_picture_has_order_and_interval_of_the_table_and_every_mesh() -> Non
 
 def test_methods_may_be_chosen_and_must_be_known() -> None:
     one = of_powers({"a": 1}, 1.0)
-    assert ranked({"x": POWERS, "y": one}, methods=["a"]).objects == ("x", "y")
+    assert ranked({"x": POWERS, "y": one}, methods="a").objects == ("x", "y")
     with pytest.raises(
         sb.errors.InputError, match=r"compare the methods a, b \(y: no distance of b; w: no distance of a\)"
     ):
