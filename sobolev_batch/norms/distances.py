@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import xarray as xr
@@ -17,7 +18,7 @@ from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.closed_forms import Sphere
 from sobolev_batch.geometry.formats.conversion import as_surface
-from sobolev_batch.geometry.surface import DIRECTIONS, Extent
+from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Surface
 from sobolev_batch.machine import available, available_cores
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.accuracy.frequencies import Reference
@@ -29,6 +30,7 @@ from sobolev_batch.norms.budget import Support, sums_of_shells
 from sobolev_batch.norms.columns import VARIABLES, labelled, labelled_distances, lattice_attributes
 from sobolev_batch.norms.estimate import NormEstimate, ReferenceEstimate, estimate_norms
 from sobolev_batch.norms.fields import OperandLike, as_operand, field_of, pair_of, quality_of, shells_against, shells_of
+from sobolev_batch.norms.tail.values import flat_beyond
 from sobolev_batch.parameters import check_seed
 from sobolev_batch.shown import progress_line
 from sobolev_batch.transform.lattice import Lattice, Orders, SobolevWeights, check_orders
@@ -162,7 +164,9 @@ def distance(
     first, second = pair_of(a, b, lattice, orders)
     weights = SobolevWeights(Lattice.from_field(first), orders)
     squares, products, own = shells_against(first, second, weights.lattice)
-    distances, of_second = _estimate(weights, squares, [first, second]), _estimate(weights, own, [second])
+    # The tail of flat faces follows no law that a lattice could extrapolate, since they may repeat.
+    beyond = 0.0 if has_fields else flat_beyond(cast(Surface, a), cast(Surface, b), weights.lattice, orders)
+    distances, of_second = _estimate(weights, squares, [first, second], beyond), _estimate(weights, own, [second])
     reference = ReferenceEstimate.from_products(
         sums_of_shells(products, weights), weights, _widths([first, second]), distances, of_second
     )
@@ -214,13 +218,18 @@ def to_accuracy(
     return dataset.assign(within=(dataset[name].dims, within, VARIABLES["within"])), reference
 
 
-def _estimate(weights: SobolevWeights, sums: Reals, fields: Sequence[xr.DataArray]) -> NormEstimate:
-    """Return a norm or distance from shell sums, with the errors that follow from the fields' qualities."""
+def _estimate(
+    weights: SobolevWeights, sums: Reals, fields: Sequence[xr.DataArray], beyond: Reals | float = 0.0
+) -> NormEstimate:
+    """Return a norm or distance from shell sums, with the errors that follow from the fields' qualities.
+
+    What is known to lie beyond the lattice, a squared norm (orders,), counts too.
+    """
     qualities = [quality for quality in map(quality_of, fields) if quality is not None]
     areas = np.array(sum(quality.area for quality in qualities))
     errors = np.hypot.reduce([quality.probe.norms(weights) for quality in qualities])
     support = Support(areas, _widths(fields))
-    estimate = estimate_norms(sums_of_shells(sums, weights), weights, support, errors, is_given=True)
+    estimate = estimate_norms(sums_of_shells(sums, weights), weights, support, errors, is_given=True, beyond=beyond)
     if len(qualities) == len(fields):
         return estimate
     return NormEstimate(estimate.values, *[np.full_like(estimate.values, np.nan)] * 4)

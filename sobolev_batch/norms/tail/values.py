@@ -12,8 +12,11 @@ from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.geometry.smooth import Smooth
 from sobolev_batch.geometry.surface import Surface
-from sobolev_batch.norms.tail.sampling import OctaveSampling
+from sobolev_batch.norms.tail.face_normals import FaceNormals
+from sobolev_batch.norms.tail.integrals import squared_moduli
+from sobolev_batch.norms.tail.sampling import Octave, OctaveSampling
 from sobolev_batch.transform.backends import Backend
 from sobolev_batch.transform.fourier import (
     ON_CPU,
@@ -25,7 +28,7 @@ from sobolev_batch.transform.fourier import (
     transform_block,
 )
 from sobolev_batch.transform.kinds import kind_of
-from sobolev_batch.transform.lattice import OctaveLattice
+from sobolev_batch.transform.lattice import Lattice, OctaveLattice
 from sobolev_batch.transform.probe import norms_of_checks
 
 # Samples at which values on a lattice are checked: for small meshes, for huge ones, and in between as many as make this
@@ -43,6 +46,10 @@ _EQUILATERAL = 0.75 * math.sqrt(3)
 _OVERHEAD_TRIANGLES = 50
 # Draws of an octave, for the time that one of them takes.
 _USUAL_DRAWS = 20_000
+# Octaves beyond a given lattice that are looked at, the fraction of uniform directions there, and the standard errors
+# by which what is found is raised. Draws of each for small meshes, for huge ones, and pairs with triangles in between.
+_OCTAVES_BEYOND, _UNIFORM_BEYOND, _DEVIATIONS_BEYOND = 5, 0.4, 8.0
+_MOST_BEYOND, _FEWEST_BEYOND, _PAIRS_BEYOND = 800, 32, 250_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +108,30 @@ def octave_values(
             values.append(block.ravel()[sample_set.places])
     joined = np.concatenate(values)
     return OctaveValues(sampling, joined, *_compared(surface, sampling, joined, orders, execution.backend))
+
+
+def flat_beyond(a: Surface, b: Surface, lattice: Lattice, orders: tuple[float, ...]) -> Reals:
+    """Bound the squared distance of two surfaces beyond the cube of a lattice (orders,), from few exact values.
+
+    Where flat faces repeat, it is all in peaks along their normals, of which the lattice may show nothing. Zero where
+    no faces are flat, or beside a parametrised surface, whose values there take long.
+    """
+    normals = FaceNormals.from_surfaces((a, b))
+    if not normals or isinstance(a, Smooth) or isinstance(b, Smooth):
+        return np.zeros(len(orders))
+    count = _PAIRS_BEYOND // sum(kind_of(surface).triangles for surface in (a, b))
+    draws = int(np.clip(count, _FEWEST_BEYOND, _MOST_BEYOND))
+    octaves = (Octave(lattice.xi_max, index) for index in range(1, _OCTAVES_BEYOND + 1))
+    samplings = [OctaveSampling(one, (), draws, one.index, normals, _UNIFORM_BEYOND) for one in octaves]
+    frequencies = np.concatenate([sampling.frequencies for sampling in samplings])
+    weights = np.concatenate([sampling.weights for sampling in samplings])
+    weights *= np.abs(frequencies).max(axis=1) > lattice.xi_max
+    first, second = (kind_of(surface).sampled_values(frequencies, ON_CPU.threads) for surface in (a, b))
+    lengths = 1 + np.square(frequencies).sum(axis=1)
+    terms = weights * squared_moduli(first - second) * np.array([lengths**order for order in orders])
+    # The last octave stands for all that follow, with as much energy.
+    terms[:, -draws:] /= 1 - 2.0 ** (2 * np.array(orders)[:, None] + 1)
+    return np.asarray(terms.sum(axis=1) + _DEVIATIONS_BEYOND * np.sqrt(np.square(terms).sum(axis=1)))
 
 
 def settings_on(
