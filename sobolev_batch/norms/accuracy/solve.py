@@ -230,9 +230,10 @@ def _solve_on_lattices(problem: Problem, lattice: Lattice, is_pilot: bool, *, be
         else:
             solution, larger = _with_hidden_part(problem, solution, before_octaves)
             is_met = bool(np.all(problem.accuracy.met(solution.estimate) | has_no_digit))
-            if is_met or larger is None or not rounds_left:
+            if is_met or not rounds_left or (larger is None and not is_pilot):
                 break
-            lattice, is_pilot = larger, False
+            # The coarse fields of a pilot may have taken what the hidden part needs.
+            lattice, is_pilot = larger or lattice, False
     shortfall = None if is_met else problem.out_of_reach(solution.estimate, f"on a lattice of M = {lattice.M}")
     # No error is smaller than rounding where its number is.
     found = solution.estimate

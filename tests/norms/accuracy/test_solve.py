@@ -17,6 +17,7 @@ from sobolev_batch.norms.accuracy.tolerance import Accuracy, first_lattice
 from sobolev_batch.norms.budget import Support
 from sobolev_batch.norms.estimate import NormEstimate
 from tests.support.shapes import CENTRED_BOX as BOX
+from tests.support.shapes import tetrahedron
 
 
 @pytest.mark.parametrize(
@@ -189,6 +190,14 @@ def test_a_pilot_without_a_digit_needs_no_larger_lattice() -> None:
     again = sb.Mesh(ball.vertices.copy(), ball.triangles)
     problem = Problem((again, ball), (-4.0, -10.0), Accuracy(1e-2), support_of((again, ball)), "a copy")
     assert not run_pilot(problem)[0].any()
+
+
+def test_a_pilot_that_happens_to_be_exact_enough_refuses_nothing() -> None:
+    # Its coarse field just meets the accuracy, which leaves no room for what may lie beyond the lattice.
+    fine = sb.norm(tetrahedron(), -5.0, rtol=1e-6)["norm"].item()
+    for rtol in (3.08e-5, 3.1e-5, 3.14e-5):
+        found = sb.norm(tetrahedron(), -5.0, rtol=rtol)
+        assert abs(found["norm"].item() - fine) <= found["error"].item() <= rtol * fine
 
 
 def test_memory_limits_the_lattice() -> None:
