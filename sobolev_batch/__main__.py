@@ -1,7 +1,5 @@
 """Entry point of the command line: ``sobolev-batch``, or ``python -m sobolev_batch``."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

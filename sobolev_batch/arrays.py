@@ -1,7 +1,5 @@
 """Types of arrays, for annotations. Shapes are in docstrings."""
 
-from __future__ import annotations
-
 from typing import Any, Literal
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The memory and the cores of this machine that this process may use."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Iterator

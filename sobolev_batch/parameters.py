@@ -1,7 +1,5 @@
 """Parameters of the public interface: numbers, names, lengths, paths and sizes of memory, checked where they enter."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable

@@ -4,8 +4,6 @@ Nothing below the extras imports them, so that the rest works without their fold
 to the groups that other packages extend too: sources of surfaces, formats of files, and commands.
 """
 
-from __future__ import annotations
-
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from typing import Any

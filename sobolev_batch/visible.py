@@ -4,8 +4,6 @@ Names of files and messages of other programs may hold any characters. Data keep
 to people passes through here.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 import sys

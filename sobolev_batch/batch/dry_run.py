@@ -1,7 +1,5 @@
 """The plan of a study for people: its lattice, tasks, memory, storage, and the time that a run will take."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain, repeat, starmap

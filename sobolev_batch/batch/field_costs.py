@@ -1,7 +1,5 @@
 """What the tasks of fields take: the memory that they are sized by, and the time that they are predicted to need."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """The fields that a store lacks, computed as tasks that fit into the workers' memory."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence

@@ -4,8 +4,6 @@ Each task is a pure function of its arguments that writes whole chunks, so runni
 twice at once, leaves the same store.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ One task measures those of a mesh, from both meshes and no field, and adds them 
 table is made from the records.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging

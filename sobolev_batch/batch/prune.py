@@ -1,7 +1,5 @@
 """Pruning: what a store keeps and no record needs, counted and removed."""
 
-from __future__ import annotations
-
 from collections import Counter
 from contextlib import nullcontext, suppress
 

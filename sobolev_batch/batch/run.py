@@ -1,7 +1,5 @@
 """A run of a study: its objects side by side on a cluster, in a store that the run has to itself."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress

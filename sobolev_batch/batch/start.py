@@ -1,7 +1,5 @@
 """What `plan`, `run` and `submit` settle first: the place of the store, permissions, and what to warn of."""
 
-from __future__ import annotations
-
 import logging
 import shutil
 from collections.abc import Iterator, Sequence

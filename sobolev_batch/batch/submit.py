@@ -1,7 +1,5 @@
 """A study handed over to a cluster, which goes on with it alone."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Tables from stored fields: the reduction as tasks of the cluster, and its results in the store."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 In: words. Out: text for people, JSON for programs, exit statuses.
 """
 
-from __future__ import annotations
-
 import signal
 import sys
 

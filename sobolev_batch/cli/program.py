@@ -4,8 +4,6 @@ The modules of commands import whatever computes inside of their functions: with
 show its help.
 """
 
-from __future__ import annotations
-
 import logging
 import traceback
 from importlib.metadata import EntryPoint

@@ -6,8 +6,6 @@ takes half a second to import and some seconds to compile a loop, once for a mac
 and turns to loops as soon as its work on arrays has taken, or is predicted to take, as long as that.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

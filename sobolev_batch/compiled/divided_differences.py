@@ -4,8 +4,6 @@ The inner loop of each sum runs over some frequencies, so that a processor takes
 corners and edges once for all. Phases are counted in cycles, and whole cycles are subtracted exactly.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The compiled loop over pairs of a point and a triangle: see `potentials`, whose array code says the same."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Loops over the triangles of a mesh: what their errors have in common, and distances from them."""
 
-from __future__ import annotations
-
 import math
 
 from sobolev_batch.arrays import Indices, Reals

@@ -1,7 +1,5 @@
 """A first study file for a folder of meshes. What its files are for is guessed from their names and sizes."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -6,8 +6,6 @@ from what it holds. `family` are names or globs of families, default all. All fu
 store has no tables yet or lacks a family, and a `DamageError` where what they read is damaged.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import xarray as xr

@@ -1,7 +1,5 @@
 """Distances of points from the triangles of a mesh, the closest ones and the sides, found by libigl's tree of boxes."""
 
-from __future__ import annotations
-
 import os
 from functools import cached_property
 

@@ -8,8 +8,6 @@ modulo 2 is seen beside the piece, and winds around all of its points equally of
 Each piece is drawn together first, so that the mesh may turn away a little before the piece ends.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from sobolev_batch.arrays import Indices, Reals

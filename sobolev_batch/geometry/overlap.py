@@ -7,8 +7,6 @@ not balance, where the meshes hardly cover each other, and where cutting would m
 than it divides the area, as between combs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self

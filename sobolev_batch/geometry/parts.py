@@ -1,7 +1,5 @@
 """The connected parts of a mesh, and which of them lie inside others."""
 
-from __future__ import annotations
-
 import igl
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Whether the triangles of a mesh are those of another one, cut into smaller ones and rounded, as files round them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ At a pole, one end of a parameter is a single point of the surface. The area ele
 vanishes there, which does no harm.
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Subdivision of a mesh at some of its edges, without vertices inside of edges; and icospheres, made by it."""
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_right
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Their kernel, the inverse transform of (1 + |ξ|²)^s, is Matérn's.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

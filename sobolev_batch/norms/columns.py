@@ -1,7 +1,5 @@
 """Datasets of norms and distances, with units, long names, and the lattice and kernel that they belong to."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

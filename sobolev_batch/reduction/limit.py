@@ -3,8 +3,6 @@
 A question that is clear is answered early: bounds are only as close as it needs.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from contextlib import suppress

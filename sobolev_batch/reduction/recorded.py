@@ -1,7 +1,5 @@
 """The search for the fewest triangles of one mesh, recorded after each trial, so that it goes on where it was ended."""
 
-from __future__ import annotations
-
 import hashlib
 from contextlib import suppress
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Remeshers as families of one size after another: a source of meshes with a parameter that is searched."""
 
-from __future__ import annotations
-
 import math
 import shlex
 from collections.abc import Callable, Mapping

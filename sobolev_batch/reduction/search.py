@@ -5,8 +5,6 @@ at. Distances follow a power of it, nearly, so the search takes secant steps in 
 coarsest mesh that holds and the next coarser one that does not.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Families of meshes as coarse as tolerances permit: each member is a search, which its task carries out."""
 
-from __future__ import annotations
-
 import math
 from contextlib import suppress
 from dataclasses import dataclass, replace

@@ -4,8 +4,6 @@ Such a mesh may take long, so it is kept in a `MeshCache`. Nothing runs without 
 come from somebody else.
 """
 
-from __future__ import annotations
-
 import hashlib
 import inspect
 import math

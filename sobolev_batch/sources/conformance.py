@@ -1,7 +1,5 @@
 """Conformance of sources: a check that the author of a plug-in runs on a source of their own."""
 
-from __future__ import annotations
-
 import contextlib
 import pickle
 import tempfile

@@ -3,8 +3,6 @@
 docs/studies.md has the keys of each source.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from functools import partial

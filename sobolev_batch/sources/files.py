@@ -4,8 +4,6 @@ A list is a CSV file, or tables of a study. Each mesh has a ``path``, relative t
 may have a ``name`` and a ``time``. All else are its metadata, numbers or texts, which the tables of a store repeat.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import time

@@ -3,8 +3,6 @@
 docs/studies.md has the keys of each source.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import astuple, fields
 from pathlib import Path

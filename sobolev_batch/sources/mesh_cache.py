@@ -1,7 +1,5 @@
 """A cache of meshes that took long to make, and of the versions of programs that made them."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shlex

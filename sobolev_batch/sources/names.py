@@ -3,8 +3,6 @@
 Labels stand side by side in tables, logs and stores, so each must be legible and distinct.
 """
 
-from __future__ import annotations
-
 import difflib
 import re
 import reprlib

@@ -1,7 +1,5 @@
 """A program that makes a mesh of another one: it runs in a folder of its own, within limits, and leaves nothing."""
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

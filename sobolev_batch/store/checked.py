@@ -4,8 +4,6 @@ zarr raises exceptions of many kinds for broken chunks, and takes any amount of 
 is damaged.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,7 +1,5 @@
 """Preparation of a store for a run: create it, or lay it out again for what the study or its state has become."""
 
-from __future__ import annotations
-
 import json
 import logging
 from collections import defaultdict, deque

@@ -4,8 +4,6 @@ They are those that zarr and xarray write. These take a millisecond and more for
 have a hundred each.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any

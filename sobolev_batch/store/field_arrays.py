@@ -1,7 +1,5 @@
 """Fields in a store: their chunks, of blocks of the lattice and of octaves, written and read against checksums."""
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """The latest run of a store: its record with signs of life, by which a store whose run is gone can be unlocked."""
 
-from __future__ import annotations
-
 import json
 import math
 from contextlib import suppress

@@ -5,8 +5,6 @@ they read, and any installed distribution may offer more. A store may come from 
 reaches zarr or xarray before its documents were checked here.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

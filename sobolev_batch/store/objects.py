@@ -3,8 +3,6 @@
 A study that names no object has its only one at the root itself.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass

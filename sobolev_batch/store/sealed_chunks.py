@@ -5,8 +5,6 @@ the numbers were computed from, so that they are computed again only where a fie
 checksums of the numbers: a chunk that took the place of another is found.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterable, Iterator
 

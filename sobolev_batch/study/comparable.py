@@ -1,7 +1,5 @@
 """Whether methods can be compared: at sizes that all of them have, and over enough objects for a test."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """The JSON schema of study files, by which editors complete and check them."""
 
-from __future__ import annotations
-
 from operator import attrgetter
 from typing import Any
 

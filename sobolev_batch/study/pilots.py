@@ -3,8 +3,6 @@
 They are compared with the reference, and the most demanding of these pairs decides.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace

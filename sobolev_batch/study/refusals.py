@@ -1,7 +1,5 @@
 """Refusals of study files: a message for each key that is wrong, with what was found and what is allowed."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Schema of study files: their sections, keys and limits."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Annotated, Any, Literal, Self, get_args

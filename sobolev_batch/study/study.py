@@ -1,7 +1,5 @@
 """Studies: objects, each with its own reference, and how meshes by the same methods are compared with these."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence

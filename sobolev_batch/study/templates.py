@@ -3,8 +3,6 @@
 Texts with {object} and {method} are filled in, or matched with the names of files.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache

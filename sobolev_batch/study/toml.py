@@ -1,7 +1,5 @@
 """Study files and mappings as the nested tables, lists and values that TOML has."""
 
-from __future__ import annotations
-
 import os
 import re
 import tomllib

@@ -1,7 +1,5 @@
 """`field.sobolev`: norms, distances and more as methods of the fields themselves."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 

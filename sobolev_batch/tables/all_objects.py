@@ -3,8 +3,6 @@
 Thousands of objects are queried there without opening thousands of groups. Labels begin with the name of the object.
 """
 
-from __future__ import annotations
-
 import pickle
 import zlib
 from collections.abc import Collection, Iterable, Mapping, Sequence

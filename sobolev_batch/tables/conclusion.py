@@ -1,7 +1,5 @@
 """The verdict on a study: the nearest meshes, the smallest ones below bounds; and its objects, the worst first."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Tables of distances to the reference, with observed rates, and the sizes of meshes that rates are over."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
 

@@ -1,7 +1,5 @@
 """The tables of a store as a file for other programs: in long form as Parquet or CSV, by groups as NetCDF."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Distances of every mesh to every other and to the reference, order by order."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from typing import Literal
 

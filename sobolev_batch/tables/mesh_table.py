@@ -1,7 +1,5 @@
 """The table of a store's meshes: families in the order of the study, and the meshes of each from coarse to fine."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import fields

@@ -1,7 +1,5 @@
 """A store that is open for reading, and what it has: groups, orders, families and units."""
 
-from __future__ import annotations
-
 import json
 import logging
 from collections import Counter

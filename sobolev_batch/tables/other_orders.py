@@ -1,7 +1,5 @@
 """Tables of an open store at orders that it lacks, computed from its spectra and fields."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

@@ -4,8 +4,6 @@ Neither the driver nor a task holds the whole matrix. A tile has a key, which te
 from: an interrupted run goes on with the tiles that are missing, and new meshes, which come last, cost new tiles.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Norms and distances from stored fields: batches and tiles of rows, each one task over the store."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, field, fields, replace

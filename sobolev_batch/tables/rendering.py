@@ -1,7 +1,5 @@
 """Results in every format: rows for programs (csv, json), sections of tables and sentences for people."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

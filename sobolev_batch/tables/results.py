@@ -1,7 +1,5 @@
 """The results of a reduction as datasets: norms, distances and observed rates of meshes, in the order of tables."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Self

@@ -1,7 +1,5 @@
 """Radial spectra in the store: computed from fields by tasks, one chunk of rows each, and read for any order."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence, Set
 from contextlib import suppress
 

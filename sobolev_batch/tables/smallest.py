@@ -1,7 +1,5 @@
 """The smallest mesh of each family whose relative distance is below a bound."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """`tree.sobolev`: norms, distances and spectra of any order from all that a store holds."""
 
-from __future__ import annotations
-
 import numpy as np
 import xarray as xr
 

@@ -1,7 +1,5 @@
 """Numbers and durations as text, as exact as their errors allow, on lines that fit the terminal."""
 
-from __future__ import annotations
-
 import math
 import shutil
 import textwrap

@@ -1,7 +1,5 @@
 """Where two surfaces differ: meshes with their witness function at their vertices, as files and as pictures."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

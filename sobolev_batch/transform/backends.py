@@ -4,8 +4,6 @@ Arrays on the processor are NumPy's, arrays on a GPU are CuPy's. NumPy's functio
 or on ``like=`` where they create an array, so the same expressions run on both. The exceptions are here.
 """
 
-from __future__ import annotations
-
 import ctypes
 import importlib
 import logging

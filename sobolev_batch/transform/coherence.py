@@ -1,7 +1,5 @@
 """Errors of a mesh's triangles that add up at some frequency: all of them in arrays, whose pieces repeat."""
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache, partial
 

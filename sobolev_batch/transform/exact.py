@@ -12,8 +12,6 @@ extending the available precision" (1971), doi:10.1007/BF01397083; T. Ogita, S. 
 product" (2005), doi:10.1137/030601818. That is valid without over- and underflow.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor

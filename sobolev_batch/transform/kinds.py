@@ -3,8 +3,6 @@
 A further kind of surface is one more class here.
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """The primitive of all fields: weighted points transformed onto a block of the lattice; and its adjoint."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

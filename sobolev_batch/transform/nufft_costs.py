@@ -1,7 +1,5 @@
 """Time and memory of nonuniform FFTs, and which of them computes a block within the memory that it may take."""
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_left
 from collections.abc import Iterator, Mapping

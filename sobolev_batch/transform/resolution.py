@@ -1,7 +1,5 @@
 """Nodes that the transform of a smooth surface takes: doubled until it changes by less than a tolerance."""
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """Errors to be expected of the rules of a mesh's triangles, and the loosest tolerance that keeps them small enough."""
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_left
 from collections.abc import Callable, Sequence

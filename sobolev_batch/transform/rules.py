@@ -1,7 +1,5 @@
 """Quadrature rules on the triangle, and their errors on plane waves: which rule does for a triangle of some size."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 from itertools import permutations

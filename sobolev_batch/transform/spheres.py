@@ -1,7 +1,5 @@
 """Spheres: the Fourier transforms of their area measures, their norms, and the distances of two."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable

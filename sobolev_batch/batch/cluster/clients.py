@@ -3,8 +3,6 @@
 Who reaches a scheduler can run programs on its machines, so its address has to be private.
 """
 
-from __future__ import annotations
-
 import asyncio
 import os
 import signal

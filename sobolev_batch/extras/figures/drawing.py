@@ -1,7 +1,5 @@
 """What each plot draws on axes, and the table of plots."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Meshes of a store, made again by its study, with witness functions at their vertices; and as files."""
 
-from __future__ import annotations
-
 import difflib
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """What plots show of a store: orders, families, and the spectra of their meshes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

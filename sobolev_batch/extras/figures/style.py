@@ -1,7 +1,5 @@
 """What all plots share: colours, titles, legends, error bars, panels, and files of a format and size."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Meshes with their witness functions, or distances of vertices, for display: simplified, and in plots."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """The transform of a mesh as a function of its vertices, and the derivatives of sums over it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Self

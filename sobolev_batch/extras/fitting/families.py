@@ -1,7 +1,5 @@
 """The sources `fit` and `refine`: meshes of another source, brought nearer to the reference of a study."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated

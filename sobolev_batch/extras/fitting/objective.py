@@ -1,7 +1,5 @@
 """A fit before it begins: mesh and target, checked and brought to a common centre and to one lattice."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self

@@ -3,8 +3,6 @@
 Source: FreeSurfer wiki, "Surface file format", https://surfer.nmr.mgh.harvard.edu/fswiki/FileFormats.
 """
 
-from __future__ import annotations
-
 import math
 import re
 

@@ -4,8 +4,6 @@ The library at hand expands the entities of XML, unpacks data of any size, belie
 missing arrays; here they are refused. Source: "GIFTI surface data format" 1.0 (2011), https://www.nitrc.org/projects/gifti.
 """
 
-from __future__ import annotations
-
 import base64
 import math
 import zlib

@@ -4,8 +4,6 @@ The library at hand silently leaves out primitives, placements and encodings; he
 Khronos Group, "glTF 2.0" (2021), with KHR_mesh_quantization, KHR_node_visibility and EXT_mesh_gpu_instancing.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import re

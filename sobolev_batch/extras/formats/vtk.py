@@ -4,8 +4,6 @@ They are parsed here because VTK itself ends the process, or fills the memory, o
 rest of others. Source: Kitware, "VTK File Formats", https://docs.vtk.org/en/latest/vtk_file_formats.
 """
 
-from __future__ import annotations
-
 import base64
 import re
 import zlib

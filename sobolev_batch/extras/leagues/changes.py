@@ -1,7 +1,5 @@
 """A study against an earlier one of the same objects, and as text: which methods came nearer."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A league by cost: which meshes no other one beats in both the distance and the cost of making it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass

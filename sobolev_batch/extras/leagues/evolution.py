@@ -1,7 +1,5 @@
 """Distances over time, for families of meshes that move."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A league: the methods of a study, ranked over all objects, and as text."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Curves of methods at equal sizes, their intervals, and tests whether two methods differ."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The report of a store: one HTML page that needs no other files, with the data of its charts."""
 
-from __future__ import annotations
-
 import base64
 import gzip
 import hashlib

@@ -1,7 +1,5 @@
 """The page of one comparison: the verdict, both meshes with their deviations, and how large these are, on one sheet."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib.metadata import version

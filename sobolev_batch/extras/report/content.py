@@ -1,7 +1,5 @@
 """Texts and tables of a report: of one object, with its verdict, and of several, with their league."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass

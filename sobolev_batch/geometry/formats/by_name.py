@@ -4,8 +4,6 @@ A format comes from an entry point of the group ``sobolev_batch.formats``, which
 rarely comes the same way from the extras of this package.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path, PurePath

@@ -3,8 +3,6 @@
 They are parsed here because the libraries at hand silently lose or change faces where a line is not what they expect.
 """
 
-from __future__ import annotations
-
 import io
 import re
 from array import array

@@ -1,7 +1,5 @@
 """Polygons cut into triangles, by rules that depend neither on the corner that a file lists first nor on its order."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import mapbox_earcut

@@ -1,7 +1,5 @@
 """Meshes from files."""
 
-from __future__ import annotations
-
 import binascii
 import codecs
 import gzip

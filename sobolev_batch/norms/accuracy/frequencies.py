@@ -1,7 +1,5 @@
 """Frequencies at which surfaces are compared, with the norms and products that follow from values there."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property

@@ -1,7 +1,5 @@
 """A norm or a distance to compute, the accuracy that it needs, and its division among fields."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Norms and distances to an accuracy: predict settings, compute, check the result, tighten where it misses it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial

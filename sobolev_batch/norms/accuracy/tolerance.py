@@ -3,8 +3,6 @@
 A first lattice follows from the sizes of surfaces, a refined one from their sums.
 """
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """Points on surfaces that nothing escapes: evenly spread, no farther apart than a reach, or where much was seen."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property

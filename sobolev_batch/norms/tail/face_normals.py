@@ -1,7 +1,5 @@
 """Normals of flat faces, around which transforms are concentrated, and a density of directions that follows them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self

@@ -1,7 +1,5 @@
 """Integrals over octaves from sums over their samples, with the errors that follow from the scatter of these sums."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache

@@ -1,7 +1,5 @@
 """Transforms of surfaces at the samples of octaves: values with their errors, and the processor time that they take."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
