@@ -87,8 +87,8 @@ class Mesh:
             )
         if self._sizes.without_area == len(self.triangles):
             raise MeshError(
-                f"the total area of the {len(self.triangles)} triangles is zero: every one is "
-                "degenerate, so there is no surface measure to compare"
+                f"the total area of the {len(self.triangles)} triangles is zero: every one is degenerate, or too small "
+                "for double precision, so there is no surface measure to compare"
             )
 
     @classmethod
@@ -150,6 +150,11 @@ class Mesh:
         vertices = vertices if turn is None else vertices @ turn.T
         vertices *= scale
         moved = Mesh.from_checked(vertices, self.triangles, self.notes)
+        if moved._sizes.without_area == len(self.triangles):
+            raise MeshError(
+                f"a mesh of size {self.extent.widths.max():.3g} is lost in the rounding of coordinates, as the origin "
+                f"moves to ({', '.join(f'{x:.6g}' for x in origin)}): check the units and places of the meshes"
+            )
         moved._require_sizes()
         moved.__dict__["rounding"] = scale * self.rounding
         return moved

@@ -83,6 +83,12 @@ def test_a_total_area_of_zero_is_refused(vertices: Any) -> None:
         Mesh(vertices, [[0, 1, 2], [0, 0, 1]])
 
 
+def test_a_mesh_that_a_move_leaves_no_digits_is_refused_with_its_size() -> None:
+    tiny = Mesh(np.array([[0, 0, 0], [1e-12, 0, 0], [0, 1e-12, 0]]), [[0, 1, 2]])
+    with pytest.raises(MeshError, match=r"size 1.41e-12 is lost .* moves to \(1e\+06, 0, 0\)"):
+        tiny.moved(1.0, (1e6, 0.0, 0.0))
+
+
 @pytest.mark.parametrize(
     ("extra_vertices", "triangles", "counts"),
     [
