@@ -50,6 +50,7 @@ def local_client(workers: int | None = None, memory: float | str | None = None) 
     # Loopback is spelt out for the dashboard too: its own default is every interface.
     with (
         _shielded_from_interrupts() as unshield,
+        _pointing_to_the_guard(),
         dask.config.set(
             {
                 # A task whose worker died twice is set aside, and tried with nothing beside it.
@@ -79,6 +80,19 @@ def local_client(workers: int | None = None, memory: float | str | None = None) 
     ):
         unshield()
         yield client
+
+
+@contextmanager
+def _pointing_to_the_guard() -> Iterator[None]:
+    """Say what a script lacks whose workers run it once more: Dask ends with the failure of a process alone."""
+    try:
+        yield
+    except RuntimeError as error:
+        if "Nanny failed to start" not in str(error):
+            raise
+        raise ClusterError(
+            "no worker process could start; a script needs 'if __name__ == \"__main__\":' around its main part"
+        ) from error
 
 
 @contextmanager

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import socket
 import ssl
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -28,6 +30,15 @@ def test_a_scheduler_without_workers() -> None:
         pytest.raises(ClusterError, match="has no workers; start some with: dask worker"),
     ):
         remote_client(cluster.scheduler_address).__enter__()
+
+
+@pytest.mark.process
+def test_a_script_without_a_guarded_main_part_is_told_what_it_lacks(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text("from sobolev_batch.batch.cluster.clients import local_client\nlocal_client(1).__enter__()\n")
+    ended = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert ended.returncode == 1
+    assert ended.stderr.splitlines()[-1].endswith("""needs 'if __name__ == "__main__":' around its main part""")
 
 
 def test_a_cluster_that_adapts_from_no_worker_at_all(study: Study) -> None:
