@@ -82,11 +82,14 @@ class _Package:
         if name in self.parts:
             return self.parts[name]
         objects = self.parts[name] = {}
-        data, prefix = self.read(name), None
+        data, prefixes = self.read(name), set[str]()
         for event, tag, values in xml_events(data, "3MF", len(data)):
-            # The names of the core may have a prefix, which is that of the root.
-            prefix = tag.removesuffix("model") if prefix is None else prefix
-            match event, tag.removeprefix(prefix):
+            prefix, _, word = tag.rpartition(":")
+            # The names of the core may have a prefix: that of the root, or another one of the same meaning.
+            if not prefixes:
+                meaning = values.get(f"xmlns:{prefix}" if prefix else "xmlns")
+                prefixes = {prefix, *(key[len("xmlns:") :] for key in values if values[key] == meaning)}
+            match event, word if prefix in prefixes else "":
                 case "start", "model":
                     self.units.add(values.get("unit", _UNIT))
                     names = [

@@ -358,6 +358,17 @@ CASES |= {
         package_3mf(re.sub(rb"(</?)(?=\w)", rb"\1c:", model(BOX_3MF))),
         BOX_AREA,
     ),
+    "3mf, some names with another prefix": (
+        ".3mf",
+        package_3mf(
+            re.sub(
+                rb"(</?)(?=object|vert)",
+                rb"\1c:",
+                model(BOX_3MF, attributes='xmlns="http://x/core/2015/02" xmlns:c="http://x/core/2015/02"'),
+            )
+        ),
+        BOX_AREA,
+    ),
     "3mf, supports": (
         ".3mf",
         package_3mf(
