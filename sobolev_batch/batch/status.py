@@ -109,7 +109,7 @@ class Status(Shown):
         """Progress in one line, as ``sobolev-batch status --follow`` shows it."""
         parts = [f"{self.total - self.waiting} of {self.total} done", f"{len(self.failed)} failed"]
         if self.not_begun:
-            parts.append(f"{len(self.not_begun):,} objects not begun")
+            parts.append(f"objects not begun: {len(self.not_begun):,}")
         if self.run is not None and self.run.state == "submitted":
             parts.append("no worker has taken it up yet")
         elif self.waiting == 0:
@@ -142,7 +142,7 @@ class Status(Shown):
 
     def lines(self) -> Iterator[str]:
         """Yield the lines that ``sobolev-batch status`` prints."""
-        objects = f", and {len(self.not_begun):,} objects that are not begun" if self.not_begun else ""
+        objects = f"; objects not begun: {len(self.not_begun):,}" if self.not_begun else ""
         counts = f"{self.complete} of {self.total} complete, {len(self.failed)} failed, {self.waiting} to go"
         yield f"{self.store}: {counts}{objects}"
         lost = dict.fromkeys(self.lost_records, "its completion record is gone or another one; run the study again")

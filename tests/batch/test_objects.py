@@ -401,7 +401,7 @@ def test_objects_that_no_run_has_come_to_are_not_begun(tmp_path: Path, threads: 
     found = sb.status(path)
     assert (found.not_begun, found.failed) == (("a",), {})
     assert (found.complete, found.total, found.is_incomplete) == (8, 10, True)
-    assert "8 of 10 complete, 0 failed, 2 to go, and 1 objects that are not begun" in str(found)
+    assert "8 of 10 complete, 0 failed, 2 to go; objects not begun: 1" in str(found)
 
 
 def test_an_object_that_cannot_be_carried_out_hides_no_tables(store: Path, tmp_path: Path, threads: Client) -> None:
