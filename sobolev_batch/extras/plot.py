@@ -3,7 +3,8 @@
 Each function returns the axes. Without `ax`, the plot has a figure of its own, ``axes.figure``, which pyplot does not
 know, with the legend beside it. `order` is any order below -1/2, default the first of the store; others are computed
 from what it holds. `family` are names or globs of families, default all. All functions raise an `InputError` where the
-store has no tables yet or lacks a family, and a `DamageError` where what they read is damaged.
+store has no tables yet or lacks a family, and a `DamageError` where what they read of a store is damaged, unless plain
+xarray opened it.
 """
 
 from pathlib import Path

@@ -43,6 +43,8 @@ from sobolev_batch.geometry.surface import is_finite_number
 DEFAULT_GAP = 0.01
 # Bounds are not closer than rounding permits: units in the last place of the largest coordinate.
 _BOUND_ROUNDING = 32 * np.finfo(float).eps
+# Fraction of the largest coordinate below which a deviation is rounding.
+_PLACE_ROUNDING = 1e-14
 # Lengths that people write down are met up to this fraction.
 _EQUAL = 1e-9
 # Pieces that are cut at a time, in some 2 kB each; and pieces after which bounds stay apart.
@@ -80,8 +82,12 @@ class Deviation:
         """Tell whether the largest distance is at most a length; None where the bounds or rounding leave it open."""
         if self.upper <= length * (1 + _EQUAL):
             return True
-        rounding = _BOUND_ROUNDING * max(*map(abs, self.place), self.lower)
-        return False if self.lower > length * (1 + _EQUAL) + rounding else None
+        return False if self.lower > length * (1 + _EQUAL) + self.rounding else None
+
+    @property
+    def rounding(self) -> float:
+        """A length for which coordinates have no digits there."""
+        return _PLACE_ROUNDING * max(*map(abs, self.place), self.lower)
 
 
 @dataclass(frozen=True)

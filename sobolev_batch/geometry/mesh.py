@@ -150,12 +150,13 @@ class Mesh:
         vertices = vertices if turn is None else vertices @ turn.T
         vertices *= scale
         moved = Mesh.from_checked(vertices, self.triangles, self.notes)
-        if moved._sizes.without_area == len(self.triangles):
+        try:
+            moved._require_sizes()
+        except MeshError as error:
             raise MeshError(
-                f"a mesh of size {self.extent.widths.max():.3g} is lost in the rounding of coordinates, as the origin "
-                f"moves to ({', '.join(f'{x:.6g}' for x in origin)}): check the units and places of the meshes"
-            )
-        moved._require_sizes()
+                f"{error}, once a mesh of size {self.extent.widths.max():.3g} is scaled by {scale:.3g} about "
+                f"({', '.join(f'{x:.6g}' for x in origin)}); check the units and places of the meshes"
+            ) from error
         moved.__dict__["rounding"] = scale * self.rounding
         return moved
 

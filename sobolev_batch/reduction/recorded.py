@@ -120,7 +120,7 @@ class RecordedSearch:
     def make_room(self) -> None:
         """Remove the mesh of an earlier search; MeshError where a file lies in its place and no search has a record."""
         self.forget()
-        if self.folder.read(f"{self.name}.json") is None and self.folder.read(self.mesh_key) is not None:
+        if self.folder.read(self.mesh_key) is not None and self.folder.read(f"{self.name}.json") is None:
             raise MeshError(f"no search wrote {self.mesh_key} in the output; move it, or name another folder")
 
     def forget(self) -> None:

@@ -9,6 +9,7 @@ from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.causes import band_coordinates
 from sobolev_batch.norms.columns import AREA, KERNEL, LENGTH, NUMBER, described, order_axis
 from sobolev_batch.norms.estimate import AREA_AND_SHAPE, NormEstimate
+from sobolev_batch.parameters import as_names
 from sobolev_batch.tables.open import finished_group, reference_of, similarity_of
 from sobolev_batch.tables.other_orders import Meshes, convergence_at, norms_at, require_fields, stored_reducer
 from sobolev_batch.tables.pairs import pair_distances
@@ -100,7 +101,7 @@ class StoreAccessor:
             return self._chosen(table[[name for name in _OF_DISTANCES if name in table]], order, mesh)
         meshes = finished_group(self._tree, "meshes")
         complete = meshes["mesh"].values[meshes["status"].values == "complete"].tolist()
-        labels = [mesh] if isinstance(mesh, str) else complete if mesh is None else list(mesh)
+        labels = complete if mesh is None else as_names(mesh)
         reducer, rows = stored_reducer(self._tree, order, *labels, other)
         found = reducer.norms(rows[:-1])
         columns = {**found.distances.named("distance"), **found.reference.area_and_shape(found.distances)}
@@ -155,7 +156,7 @@ class StoreAccessor:
     def _chosen(self, table: xr.Dataset, order: Orders, mesh: Meshes) -> xr.Dataset:
         """Return a table (mesh, order) of some meshes, without the dimension of what is single."""
         if mesh is not None:
-            require_fields(self._tree, table, [mesh] if isinstance(mesh, str) else list(mesh))
+            require_fields(self._tree, table, as_names(mesh))
             table = table.sel(mesh=mesh if isinstance(mesh, str) else list(mesh))
         if np.ndim(order) == 0:
             table = table.squeeze("order")

@@ -12,8 +12,6 @@ from sobolev_batch.tables.text import between, percent, place_text
 
 # Digits of bounds and of the length, at least.
 _DIGITS, _LENGTH_DIGITS = 4, 6
-# Fraction of the largest coordinate below which a deviation is rounding.
-_ROUNDING = 1e-14
 # A longer upper bound, in lower ones, was left where it was when the answer was clear, and would mislead.
 _CLOSE = 1.1
 
@@ -121,7 +119,5 @@ def assert_within(
 
 def deviation_text(deviation: Deviation, unit: str | None, digits: int = _DIGITS) -> str:
     """Return the bounds of a deviation with their unit, the upper one where it is known, and the place."""
-    largest = max(*map(abs, deviation.place), deviation.lower)
-    # Coordinates have no digits for less.
-    bounds = (0.0, 0.0) if deviation.upper <= _ROUNDING * largest else (deviation.lower, deviation.upper)
+    bounds = (0.0, 0.0) if deviation.upper <= deviation.rounding else (deviation.lower, deviation.upper)
     return f"{between(*bounds, f' {unit}' if unit else '', digits)}, at {place_text(deviation.place, deviation.lower)}"

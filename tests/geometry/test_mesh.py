@@ -83,10 +83,14 @@ def test_a_total_area_of_zero_is_refused(vertices: Any) -> None:
         Mesh(vertices, [[0, 1, 2], [0, 0, 1]])
 
 
-def test_a_mesh_that_a_move_leaves_no_digits_is_refused_with_its_size() -> None:
+@pytest.mark.parametrize(
+    ("scale", "origin", "what", "how"),
+    [(1.0, 1e6, "is zero", r"1 about \(1e\+06, 0, 0\)"), (1e190, 0.0, "overflow", r"1e\+190 about \(0, 0, 0\)")],
+)
+def test_a_move_that_leaves_no_area_is_refused_with_its_size(scale: float, origin: float, what: str, how: str) -> None:
     tiny = Mesh(np.array([[0, 0, 0], [1e-12, 0, 0], [0, 1e-12, 0]]), [[0, 1, 2]])
-    with pytest.raises(MeshError, match=r"size 1.41e-12 is lost .* moves to \(1e\+06, 0, 0\)"):
-        tiny.moved(1.0, (1e6, 0.0, 0.0))
+    with pytest.raises(MeshError, match=rf"{what}.*, once a mesh of size 1.41e-12 is scaled by {how}; check the units"):
+        tiny.moved(scale, (origin, 0.0, 0.0))
 
 
 @pytest.mark.parametrize(

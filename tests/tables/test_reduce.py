@@ -74,7 +74,7 @@ def test_tables_have_coordinates_and_nothing_but_nan_of_a_mesh_that_failed(store
 
 
 def test_open_stores_are_selected_by_mesh_and_written_as_netcdf(finished_store: Path, tmp_path: Path) -> None:
-    pytest.importorskip("h5netcdf")
+    pytest.importorskip("h5netcdf", reason="h5netcdf comes with the extra 'export'")
     for tree in (xr.open_datatree(finished_store, engine="zarr"), open_store(finished_store)):
         one = tree.sel(mesh="ico/1", order=-3.0)
         assert one["convergence/triangles"].item() == 80

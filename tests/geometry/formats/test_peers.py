@@ -221,8 +221,6 @@ OTHERS: dict[str, Callable[[Path], object]] = {
 
 @pytest.mark.parametrize("suffix", OTHERS)
 def test_the_command_of_a_refusal_converts_the_file(tmp_path: Path, suffix: str) -> None:
-    if suffix == ".dae":
-        pytest.importorskip("collada")
     OTHERS[suffix](tmp_path / f"scan{suffix}")
     with pytest.raises(MeshError, match="convert it: ") as refusal:
         read_mesh(tmp_path / f"scan{suffix}")
