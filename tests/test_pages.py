@@ -1,4 +1,4 @@
-"""The pages run as printed, and do what they say: README, tutorial, queries, fitting, moving, testing."""
+"""The pages run as printed, and do what they say: README, tutorial, queries, fitting, moving, formats, testing."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ import pytest
 from distributed import Client
 
 import sobolev_batch as sb
+from sobolev_batch.geometry.formats.by_name import mesh_format
 from tests.support.commands import call
+from tests.support.mesh_files import BOXES
 from tests.support.repository import ROOT, blocks, run_blocks, run_icospheres
 from tests.support.studies import balls, methods_of, small_table
 
@@ -234,6 +236,15 @@ def test_the_workflow_of_a_flow_is_a_valid_study() -> None:
     study = sb.Study.from_toml(ROOT / "workflows/flow.toml")
     levels = [family.source.members(ROOT) for family in study.object.families]
     assert [len(members) for members in levels] == [14, 14, 14]
+
+
+def test_the_page_about_formats_names_each_and_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
+    formats = {mesh_format(Path(f"scan{ending}")) for ending, _ in BOXES.values()}
+    assert {f"`{name}`" for name in formats if name[0] == "."} <= set(re.findall(r"`\.\w+`", page))
+    monkeypatch.chdir(tmp_path)
+    results = run_blocks("docs/formats.md")
+    assert sb.read_mesh("fitted.glb").area == pytest.approx(results["fitted"].area, rel=1e-6)
 
 
 @pytest.mark.slow

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -17,9 +16,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 import sobolev_batch as sb
-from sobolev_batch.geometry.formats.by_name import mesh_format
-from tests.support.mesh_files import BOXES
-from tests.support.repository import ROOT, run_blocks
 from tests.support.shapes import AWKWARD_VERTICES, BOX_QUADS, BOX_TRIANGLES, BOX_VERTICES, box
 
 try:
@@ -172,13 +168,3 @@ def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyvista", None)
     with pytest.raises(sb.errors.InputError, match=r"PyVista .* pip install 'sobolev-batch\[vtk\]'"):
         box().to_pyvista()
-
-
-@pytest.mark.slow
-def test_the_page_names_every_format_and_its_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    page = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
-    formats = {mesh_format(Path(f"scan{ending}")) for ending, _ in BOXES.values()}
-    assert {f"`{name}`" for name in formats if name[0] == "."} <= set(re.findall(r"`\.\w+`", page))
-    monkeypatch.chdir(tmp_path)
-    results = run_blocks("docs/formats.md")
-    assert sb.read_mesh("fitted.glb").area == pytest.approx(results["fitted"].mesh.area, rel=1e-6)
