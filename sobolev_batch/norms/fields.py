@@ -283,6 +283,8 @@ def common_lattice(operands: Sequence[OperandLike], lattice: Lattice | None) -> 
     """Return the lattice of the fields among operands, else the given one or None; LatticeError where they differ."""
     lattices = [Lattice.from_field(x) for x in operands if isinstance(x, xr.DataArray)]
     if lattice is not None:
+        if not isinstance(lattice, Lattice):
+            raise InputError(f"a lattice is a Lattice(xi_max=..., M=...), found {type(lattice).__name__}")
         lattices.append(lattice)
     for other in lattices[1:]:
         if other.M != lattices[0].M or not np.isclose(other.xi_max, lattices[0].xi_max, rtol=1e-12, atol=0):

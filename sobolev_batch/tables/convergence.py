@@ -381,7 +381,7 @@ def sizes_of(frame: pd.DataFrame, x: str) -> Reals:
         numbers = [name for name in _LABELS if name in frame]
         given = [name for name in frame.attrs.get("metadata", ()) if pd.api.types.is_numeric_dtype(frame[name])]
         only = " (the store has no families of commands, functions or searches, which have it)"
-        hint = only if x.startswith("make_") else ""
+        hint = only if str(x).startswith("make_") else ""
         raise InputError(f"no size of meshes is named {quoted(x)}{hint}; known are {', '.join([*numbers, *given])}")
     sizes: Reals = frame[x].to_numpy(dtype=np.float64, na_value=np.nan)
     # A surface in closed form has none.

@@ -208,6 +208,8 @@ def _turned(views: Sequence[MeshView], up: Axis | None = None) -> list[MeshView]
 
 def upwards(points: Reals, up: Axis | None = None) -> int:
     """Return by how many axes points (n, 3) are rolled until one axis, by default their `up_axis`, is the third."""
+    if up not in (None, *_AXES):
+        raise InputError(f"up must be one of {', '.join(_AXES)}, found {up!r}")
     return _AXES.index("z") - _AXES.index(up or up_axis(points))
 
 

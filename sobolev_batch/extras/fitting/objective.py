@@ -117,15 +117,15 @@ class FitProblem:
         """Check mesh and target, and prepare them. The field of a surface is as accurate as the distance needs."""
         require_comparable(mesh, target)
         as_given, (start, place) = (target, lattice), welded(mesh)
-        move = Similarity()
+        move, common = Similarity(), common_lattice((target,), lattice)
         if isinstance(target, xr.DataArray):
-            given = field_of(target, common_lattice((target,), lattice), (settings.order,))
+            given = field_of(target, common, (settings.order,))
             own, values, quality = Lattice.from_field(given), field_values(given), quality_of(given)
         else:
             move = centering([start, target]) if lattice is None else move
             start, target = move.apply(start), move.apply(target)
             orders = tuple(dict.fromkeys((settings.order, settings.coarse_order)))
-            own = lattice or fit_lattice(start, target, orders)
+            own = common or fit_lattice(start, target, orders)
             draws = draws_for([start, target], own, orders, USUAL_DEGREE)
             distances = estimate([Sample.from_surface(surface, draws) for surface in (start, target)], orders)
             rounding = np.finfo(np.float64).eps * target.area

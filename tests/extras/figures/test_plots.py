@@ -74,6 +74,7 @@ def test_plots_take_the_axes_of_a_caller_and_leave_pyplot_alone(tree: xr.DataTre
         (sb.plot.convergence, {"order": -0.4}, "below -1/2, found -0.4"),
         (sb.plot.convergence, {"family": "g*"}, "the study has no family 'g\\*', only f_1, reference"),
         (sb.plot.convergence, {"x": "weight"}, "no size of meshes is named 'weight'; known are edge_length, triangles"),
+        (sb.plot.convergence, {"x": 3}, "no size of meshes is named 3; known"),
         (sb.plot.matrix, {}, "distances to the reference alone; set pairs"),
     ],
 )

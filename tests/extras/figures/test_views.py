@@ -232,6 +232,11 @@ def test_the_axis_that_points_upwards(up: Literal["x", "y", "z"], spheres: Spher
     assert volumes[1] == pytest.approx(volumes[0], rel=1e-9)
 
 
+def test_an_axis_that_cannot_point_upwards_is_named() -> None:
+    with pytest.raises(sb.errors.InputError, match=r"^up must be one of x, y, z, found 'up'$"):
+        views.upwards(FEET, "up")  # type: ignore[arg-type]
+
+
 FEET = np.array([[x, 0, z] for x in (0, 1) for z in (0, 2)])
 # With a head in front and a tail behind.
 TABLE = np.vstack([FEET, np.add(FEET, [0, 1, 0]), [[0.5, 1.4, 2.6], [0.5, 1, -0.4]]])

@@ -212,6 +212,7 @@ def test_no_triangle_is_turned_over_on_the_way(distance: float) -> None:
         ({"threads": 10**6}, "threads must be a whole number from 1 to 1,024, found 1000000"),
         ({"order": "a"}, "an order is a number, such as -2.0, or a list of numbers; found 'a'"),
         ({"lattice": sb.Lattice(8.0, 8)}, "the mesh reaches to |coordinate|"),
+        ({"lattice": 3}, "a lattice is a Lattice(xi_max=..., M=...), found int"),
         ({"keep_boundary": True, "mesh": sb.Mesh(np.eye(3), [[0, 1, 2]])}, "all vertices lie on the boundary"),
     ],
 )
