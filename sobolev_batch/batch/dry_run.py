@@ -230,7 +230,6 @@ def _study_lines(plan: Plan) -> Iterator[tuple[str, str]]:
     yield "similarity", f"scale {similarity.scale:.9g}, origin {' '.join(f'{x:.9g}' for x in similarity.origin)}"
     spacing = f"spacing {lattice.spacing:g}, half period {lattice.half_period:g}"
     yield "lattice", f"xi_max {lattice.xi_max:g}, M {lattice.M}, {spacing}"
-    yield from (("", reason) for reason in plan.choice.reasons)
     yield "orders", ", ".join(f"{order:g}" for order in study.orders)
     if tail is not None:
         shortest = 1 / (tail.highest_frequency * similarity.scale)
@@ -246,6 +245,7 @@ def _study_lines(plan: Plan) -> Iterator[tuple[str, str]]:
     else:
         allowed = f"{format_bytes(accuracy.allowed_bytes)} for a transform, M <= {accuracy.largest_intervals}"
         yield "accuracy", f"rtol {accuracy.rtol:g} of every distance to {plan.reference}; {allowed}"
+        yield from (("chosen", reason) for reason in plan.choice.reasons)
         yield "transform", f"{transform.dtype}, eps and quadrature for each surface from its distance"
     yield "backend", study.backend
     yield from (("command", command) for command in study.commands)

@@ -40,7 +40,7 @@ class LatticeChoice:
         dtype: Dtype of the fields in the store.
         transform_dtype: Dtype in which they are computed.
         closest: Smallest distance to the reference among the pilots, for each order; empty if the lattice was given.
-        reasons: Reasons of the choice, one line each; of a given lattice what speaks against it.
+        reasons: Reasons of the choice, one line each.
         basis: Digest of the data that the choice was made from; empty if the lattice was given.
         tail: Sampling of the octaves beyond the lattice; None without octaves.
     """

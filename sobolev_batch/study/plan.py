@@ -14,7 +14,6 @@ from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Extent, Similarity, Surface
 from sobolev_batch.norms.accuracy.solve import DistanceTarget
 from sobolev_batch.norms.fields import USUAL_DEGREE
-from sobolev_batch.norms.tail.face_normals import FaceNormals
 from sobolev_batch.norms.tail.sampling import TailSampling
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.sources.registry import Member, digest_of
@@ -27,12 +26,6 @@ from sobolev_batch.transform.lattice import Block, Lattice
 from sobolev_batch.transform.probe import Sample, draws_for
 
 _log = logging.getLogger(__name__)
-
-# What a plan says of a given lattice.
-_EXTRAPOLATED = (
-    "the reference has flat faces, and what they have beyond the lattice is extrapolated: if they may repeat, set "
-    "octaves beside it, or an accuracy"
-)
 
 
 @dataclass(frozen=True)
@@ -167,9 +160,7 @@ def _lattice_choice(
 ) -> tuple[LatticeChoice, Look]:
     if study.lattice is not None:
         tail = TailSampling.usual(study.lattice.xi_max, study.octaves, [surface]) if study.octaves else None
-        reasons = (_EXTRAPOLATED,) if tail is None and FaceNormals.from_surfaces([surface]) else ()
-        dtype = study.transform.dtype
-        return LatticeChoice(study.lattice, dtype, dtype, reasons=reasons, tail=tail), Look()
+        return LatticeChoice(study.lattice, study.transform.dtype, study.transform.dtype, tail=tail), Look()
     if study.accuracy is None:
         raise ValueError("a study has a lattice or an accuracy")
     basis = choice_basis(study, study.accuracy, similarity, members[reference][1].fingerprint())

@@ -26,7 +26,6 @@ from sobolev_batch.store.records import Record, Records
 from sobolev_batch.study.plan import Plan, make_plan
 from sobolev_batch.transform.fourier import TransformSettings, expected_points, field_seconds, transform_block
 from tests.support.commands import call
-from tests.support.shapes import box
 from tests.support.studies import balls, methods_of, small_table
 
 
@@ -198,9 +197,6 @@ def test_a_plan_says_what_nobody_can_predict(tmp_path: Path) -> None:
     assert found.object.unknown == tuple(label for label in found.missing if label.startswith("coarse"))
     assert "programs and searches make 1 of the meshes, and their time is not known" in " ".join(str(found).split())
     assert "not known" not in str(sb.plan(sb.Study.from_table(small_table()), tmp_path / "s.zarr"))
-    sb.write_mesh(box(), tmp_path / "box.off")
-    flat = small_table(reference={"source": "files", "paths": [str(tmp_path / "box.off")]})
-    assert "beyond the lattice is extrapolated" in " ".join(str(sb.plan(sb.Study.from_table(flat))).split())
 
 
 def test_pairs_that_the_disk_has_no_place_for_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -45,15 +45,6 @@ def test_the_similarity_takes_the_reference_to_the_unit_sphere_or_is_fixed_or_le
     assert (fixed.scale, fixed.origin) == (0.25, (1.0, 0.0, 0.0))
 
 
-def test_a_lattice_for_flat_faces_is_said_to_extrapolate(box_file: Path) -> None:
-    box = {"reference": {"source": "files", "paths": [box_file.name]}, "folder": box_file.parent}
-    lattice = small_table()["lattice"]
-    (reason,) = plan_of(**box).choice.reasons
-    assert "flat faces" in reason
-    assert not plan_of(**box, lattice={**lattice, "octaves": 1}).choice.reasons
-    assert not plan_of().choice.reasons
-
-
 def test_the_reference_may_be_a_member_of_a_family(box_file: Path) -> None:
     plan = plan_of(reference={"source": "family", "family": "ico"})
     assert plan.reference == "ico/3"
