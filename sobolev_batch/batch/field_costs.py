@@ -28,7 +28,7 @@ _ROW_SECONDS, _TRIANGLE_SECONDS = 0.015, 5e-6
 BlockGroups = tuple[tuple[Block, ...], ...]
 # The groups of a row, the memory that one transform may take besides mesh and block, and that of a task.
 Sizes = tuple[BlockGroups, float, float]
-# Every task of a study with octaves loads the reference too, but for a larger one.
+# Tasks that compare their surface with the reference load it too, but for a larger one.
 _LARGEST_REFERENCE = 3 << 20
 
 
@@ -39,10 +39,10 @@ def is_predictable(row: Row) -> bool:
 
 def size_rows(plan: Plan, rows: Sequence[Row], workers: Workers) -> tuple[dict[str, Sizes], dict[str, str]]:
     """Return what the tasks of rows take, by their labels, and the reason for each row that fits into no worker."""
-    octaves = _octave_memory(plan)
+    beyond = _memory_beyond(plan)
 
     def sizes_for(size: ExpectedSize) -> Sizes:
-        return size_tasks(plan.blocks, plan.transform, size, workers, len(rows), octaves)
+        return size_tasks(plan.blocks, plan.transform, size, workers, len(rows), beyond)
 
     # Where not even a mesh without triangles fits, the lattice is too large: a ClusterError for all rows.
     sizes_for(ExpectedSize())
@@ -56,21 +56,21 @@ def size_rows(plan: Plan, rows: Sequence[Row], workers: Workers) -> tuple[dict[s
 
 
 def reference_in_tasks(plan: Plan) -> Row | None:
-    """Return the reference as tasks of octaves load it beside their mesh; None without octaves, or if it is huge."""
+    """Return the reference, where tasks compare their surface with it beyond the lattice; None if it is huge."""
     row = next(row for row in plan.rows if row.label == plan.reference)
     is_small = row.member.expected_size().triangles <= _LARGEST_REFERENCE
-    return row if plan.tail is not None and is_small else None
+    return row if (plan.tail is not None or plan.choice.compared_with) and is_small else None
 
 
-def _octave_memory(plan: Plan) -> tuple[Block, float] | None:
-    """Return the largest block that octaves transform, and the bytes of their samples and of the reference."""
-    if plan.tail is None:
-        return None
-    blocks = [lattice.half for sampling in plan.tail.octaves for lattice in sampling.lattices]
+def _memory_beyond(plan: Plan) -> tuple[Block, float]:
+    """Return the largest block that is transformed, and the bytes of samples in octaves and of the reference."""
+    blocks, samples = [plan.blocks[0]], 0
+    if plan.tail is not None:
+        blocks += [lattice.half for sampling in plan.tail.octaves for lattice in sampling.lattices]
+        samples = plan.tail.size
     reference = reference_in_tasks(plan)
     triangles = 0 if reference is None else reference.member.expected_size().triangles
-    largest = max([plan.blocks[0], *blocks], key=lambda block: block.size)
-    return largest, _SAMPLE_BYTES * plan.tail.size + MESH_BYTES * triangles
+    return max(blocks, key=lambda block: block.size), _SAMPLE_BYTES * samples + MESH_BYTES * triangles
 
 
 def size_tasks(
@@ -79,20 +79,20 @@ def size_tasks(
     size: ExpectedSize,
     workers: Workers,
     rows: int,
-    octaves: tuple[Block, float] | None = None,
+    beyond: tuple[Block, float] | None = None,
 ) -> Sizes:
     """Fit a row's tasks into the memory of workers.
 
     Each task holds the mesh. Its transform adds up batches of points, as large as the memory allows. Every task is kept
     within what a worker has for each of its threads, as long as that leaves a transform enough to work in; a task that
     takes more runs beside fewer others.
-    Octaves are given by the largest block that they transform, and the bytes that they hold.
+    With what lies beyond the lattice come the largest block that is transformed, and the bytes that are held besides.
     """
-    block, octave_bytes = (blocks[0], 0.0) if octaves is None else octaves
+    block, beyond_bytes = beyond or (blocks[0], 0.0)
     block_bytes = float(block.size * np.dtype(transform.dtype).itemsize)
     mesh_bytes = MESH_BYTES * size.triangles
     # The mesh, the block, and a block that it is added to or compared with.
-    held_bytes = mesh_bytes + 2 * block_bytes + octave_bytes
+    held_bytes = mesh_bytes + 2 * block_bytes + beyond_bytes
     least_bytes = LEAST_TRANSFORM_BYTES + _CHOICE_BYTES * size.triangles
     loading_bytes = max(size.projected_bytes, mesh_bytes)
     workers.require_memory(max(loading_bytes, held_bytes + least_bytes))

@@ -18,10 +18,10 @@ from sobolev_batch.errors import InputError, LatticeError, MemoryLimitError, Mes
 from sobolev_batch.geometry.overlap import without_common_parts
 from sobolev_batch.geometry.surface import Similarity, Surface
 from sobolev_batch.norms.accuracy.solve import DistanceTarget
-from sobolev_batch.norms.fields import Quality, TailQuality, compute_field, field_for
+from sobolev_batch.norms.fields import BEYOND_ORDERS, Quality, TailQuality, compute_field, field_for
 from sobolev_batch.norms.tail.remainder import Remainder, remainder
 from sobolev_batch.norms.tail.sampling import TailSampling
-from sobolev_batch.norms.tail.values import octave_values
+from sobolev_batch.norms.tail.values import flat_beyond, octave_values
 from sobolev_batch.parameters import format_bytes
 from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.store.layout import Store
@@ -59,7 +59,8 @@ class Job:
         lattice, transform, orders, similarity, backend, tail: What all rows share; see `Plan`.
         distance_target: Accuracy that the field is computed for, if the study has one.
         allowed_bytes: Memory that one transform may take besides its mesh and its block.
-        reference: Row of the reference, which a surface in octaves is compared with; None where it is too large.
+        reference: Row of the reference, where the surface is compared with it beyond the lattice; None if it is too
+            large.
         numerics: Version of the numerics that the key of the row has.
     """
 
@@ -212,6 +213,8 @@ def compute_parts(job: Job, blocks: Sequence[Block] = (), octaves: bool = False)
                 )
             if octaves:
                 stored.append(_store_octaves(job, surface, target))
+            elif blocks and blocks[0].start == job.lattice.half.start and (quality := stored[0].quality) is not None:
+                stored[0] = replace(stored[0], quality=replace(quality, beyond=_beyond_given(job, surface)))
     except StoreError:
         raise
     except Exception as error:
@@ -242,6 +245,14 @@ def _store_octaves(job: Job, surface: Surface, target: ErrorTarget | None) -> St
     samples = np.concatenate([octave.values for octave in values])
     checksum = Fields(job.store).write(job.index, (slice(0, len(samples)),), samples)
     return StoredBlocks(quality=replace(Quality.from_surface(surface, Probe()), tail=quality), checksums=(checksum,))
+
+
+def _beyond_given(job: Job, surface: Surface) -> tuple[float, ...]:
+    """Return how far a surface may be from the reference beyond a given lattice, see `Quality`; empty if not known."""
+    if job.tail is not None or job.reference is None or job.reference.label == job.row.label:
+        return ()
+    reference = job.load_reference()
+    return () if reference is None else tuple(flat_beyond(surface, reference, job.lattice, BEYOND_ORDERS).tolist())
 
 
 def _remainder_between(surface: Surface, reference: Surface, cutoff: float, execution: Execution) -> Remainder:

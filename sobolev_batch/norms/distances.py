@@ -163,7 +163,12 @@ def distance(
     weights = SobolevWeights(Lattice.from_field(first), orders)
     squares, products, own = shells_against(first, second, weights.lattice)
     # The tail of flat faces follows no law that a lattice could extrapolate, since they may repeat.
-    beyond = 0.0 if has_fields else flat_beyond(cast(Surface, a), cast(Surface, b), weights.lattice, orders)
+    if has_fields:
+        # What a study knows of its fields is how far they are from one reference.
+        known = [quality.beyond_at(orders) for quality in map(quality_of, (first, second)) if quality is not None]
+        beyond = np.square(np.sqrt(known).sum(axis=0))
+    else:
+        beyond = flat_beyond(cast(Surface, a), cast(Surface, b), weights.lattice, orders)
     distances, of_second = _estimate(weights, squares, [first, second], beyond), _estimate(weights, own, [second])
     reference = ReferenceEstimate.from_products(
         sums_of_shells(products, weights), weights, _widths([first, second]), distances, of_second

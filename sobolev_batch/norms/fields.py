@@ -39,6 +39,9 @@ BLOCK_SAMPLES = 1 << 22
 
 # The orders that a field is probed for if none are named.
 PROBED_ORDERS = (-2.0, -5.0, -10.0)
+# Orders at which it is stored how far surfaces may be apart beyond a given lattice. In between, the logarithm is convex
+# in the order, and below the chord.
+BEYOND_ORDERS = (-100.0, -20.0, -10.0, -6.0, -4.0, -3.0, -2.5, -2.0, -1.5, -1.25, -1.0, -0.75, -0.6, -0.501)
 # The degree of the rule that most triangles get: samples drawn for it serve coarser and equal ones.
 USUAL_DEGREE = 2
 _ATTEMPTS = 3
@@ -75,12 +78,15 @@ class Quality:
         area: Area of the surface, in squared units of length.
         probe: Measured error of the field itself; empty for a closed form.
         tail: Quality of the values in octaves; None without octaves.
+        beyond: Bounds on the squared distance from the study's reference beyond a given lattice, at `BEYOND_ORDERS`;
+            empty where these are extrapolated.
     """
 
     area: float
     extent: Extent
     probe: Probe
     tail: TailQuality | None = None
+    beyond: tuple[float, ...] = ()
 
     @classmethod
     def from_surface(cls, surface: Surface, probe: Probe) -> Self:
@@ -95,17 +101,25 @@ class Quality:
         tails = norms_of_checks(np.array(self.tail.radii), np.array(self.tail.squares), weights.orders)
         return np.asarray(np.hypot(norms, tails))
 
+    def beyond_at(self, orders: Sequence[float]) -> Reals:
+        """Return the bounds on the squared distance beyond a given lattice (orders,); zero where there are none."""
+        if not self.beyond:
+            return np.zeros(len(orders))
+        logarithms = np.log(np.maximum(self.beyond, np.finfo(np.float64).tiny))
+        return np.asarray(np.exp(np.interp(orders, BEYOND_ORDERS, logarithms)))
+
     def to_json(self) -> str:
         """Return the quality as one line of JSON."""
-        parts = [self.area, self.extent.lowest, self.extent.highest, self.probe.shells, self.probe.sums]
-        return json.dumps(parts if self.tail is None else [*parts, asdict(self.tail)])
+        tail = None if self.tail is None else asdict(self.tail)
+        extent, probe = self.extent, self.probe
+        return json.dumps([self.area, extent.lowest, extent.highest, probe.shells, probe.sums, tail, self.beyond])
 
     @classmethod
     def from_json(cls, text: str) -> Self:
         """Read a quality from a line of `to_json`."""
-        area, lowest, highest, shells, sums, *tail = json.loads(text)
+        area, lowest, highest, shells, sums, tail, beyond = json.loads(text)
         extent, probe = Extent(tuple(lowest), tuple(highest)), Probe(tuple(shells), tuple(sums))
-        return cls(area, extent, probe, _TAIL_QUALITY.validate_python(*tail) if tail else None)
+        return cls(area, extent, probe, tail and _TAIL_QUALITY.validate_python(tail), tuple(beyond))
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,6 +43,8 @@ class LatticeChoice:
         reasons: Reasons of the choice, one line each.
         basis: Digest of the data that the choice was made from; empty if the lattice was given.
         tail: Sampling of the octaves beyond the lattice; None without octaves.
+        compared_with: Digest of the reference that surfaces are compared with beyond a given lattice, where it has flat
+            faces and there are no octaves; else empty.
     """
 
     lattice: Lattice
@@ -52,6 +54,7 @@ class LatticeChoice:
     reasons: tuple[str, ...] = ()
     basis: str = ""
     tail: TailSampling | None = None
+    compared_with: str = ""
 
     @property
     def octaves(self) -> dict[str, Any] | None:

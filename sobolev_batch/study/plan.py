@@ -14,6 +14,7 @@ from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Extent, Similarity, Surface
 from sobolev_batch.norms.accuracy.solve import DistanceTarget
 from sobolev_batch.norms.fields import USUAL_DEGREE
+from sobolev_batch.norms.tail.face_normals import FaceNormals
 from sobolev_batch.norms.tail.sampling import TailSampling
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.sources.registry import Member, digest_of
@@ -159,8 +160,11 @@ def _lattice_choice(
     earlier: LatticeChoice | None,
 ) -> tuple[LatticeChoice, Look]:
     if study.lattice is not None:
-        tail = TailSampling.usual(study.lattice.xi_max, study.octaves, [surface]) if study.octaves else None
-        return LatticeChoice(study.lattice, study.transform.dtype, study.transform.dtype, tail=tail), Look()
+        given = LatticeChoice(study.lattice, study.transform.dtype, study.transform.dtype)
+        if study.octaves:
+            return replace(given, tail=TailSampling.usual(study.lattice.xi_max, study.octaves, [surface])), Look()
+        is_flat = bool(FaceNormals.from_surfaces([surface]))
+        return replace(given, compared_with=fingerprint_of(reference, members[reference][1]) * is_flat), Look()
     if study.accuracy is None:
         raise ValueError("a study has a lattice or an accuracy")
     basis = choice_basis(study, study.accuracy, similarity, members[reference][1].fingerprint())
@@ -212,4 +216,6 @@ def _key(study: Study, similarity: Similarity, choice: LatticeChoice, fingerprin
     }
     if choice.tail is not None:
         dependencies["octaves"] = choice.tail.digest
+    if choice.compared_with:
+        dependencies["compared with"] = choice.compared_with
     return digest_of(dependencies)

@@ -65,6 +65,8 @@ class Reducer:
         reference: Row of the reference, or None if it has no field.
         areas: Area of every row's surface (rows,), NaN without a field.
         errors: Norms of the fields' own errors (orders, rows), likewise.
+        beyond: Bounds on the distances from the study's reference beyond a given lattice (orders, rows), likewise; zero
+            where these are extrapolated.
         widths: Widths of all surfaces together (13,), see `Extent`.
         checksums: Checksums of the blocks of each field, by its row, and of its values in octaves.
         sampling: Samples of the octaves; None where the fields are all there is.
@@ -82,6 +84,7 @@ class Reducer:
     reference: int | None
     areas: Reals
     errors: Reals
+    beyond: Reals
     widths: Reals
     checksums: Mapping[int, tuple[int, ...]]
     sampling: TailSampling | None = None
@@ -103,10 +106,11 @@ class Reducer:
     ) -> Self:
         """Return the reducer of rows with known qualities; distances are to the reference, or another row."""
         count = sum(part.row_count for _, part in store.stores)
-        areas, errors = np.full(count, np.nan), np.full((len(orders), count), np.nan)
+        areas, (errors, beyond) = np.full(count, np.nan), np.full((2, len(orders), count), np.nan)
         weights = SobolevWeights(choice.lattice, orders, None if choice.tail is None else choice.tail.cutoff)
         for row, quality in qualities.items():
             areas[row], errors[:, row] = quality.area, quality.error_norms(weights)
+            beyond[:, row] = np.sqrt(quality.beyond_at(orders))
         known = reference if reference in qualities else None
         extents = [quality.extent for quality in qualities.values()]
         return cls(
@@ -117,6 +121,7 @@ class Reducer:
             reference=known if compared_with is None else compared_with,
             areas=areas,
             errors=errors,
+            beyond=beyond,
             widths=Extent.union(extents).widths if extents else np.zeros(len(DIRECTIONS)),
             checksums=checksums,
             sampling=choice.tail,
@@ -194,7 +199,8 @@ class Reducer:
         areas, errors = self.areas[rows] + self.areas[b], np.hypot(self.errors[:, rows], self.errors[:, [b]])
         # The reference's distance to itself is zero, and nothing is uncertain about that.
         errors *= np.not_equal(rows, b)
-        distances = self._estimate(self._sums(spectra.distance), of_difference, areas, errors)
+        unseen = (self.beyond[:, rows] + self.beyond[:, [b]]) * np.not_equal(rows, b)
+        distances = self._estimate(self._sums(spectra.distance), of_difference, areas, errors, unseen)
         products = spectra.product(reference)
         of_product = Tail.of_product(self.axis.octave_integrals(products, self.orders), tail, of_b, of_difference)
         against = ReferenceEstimate.from_products(
@@ -282,13 +288,21 @@ class Reducer:
         areas = self.areas[list(rows)][:, None] + self.areas[list(others)]
         errors = np.hypot(self.errors[:, list(rows)][:, :, None], self.errors[:, list(others)][:, None, :])
         errors *= np.not_equal.outer(rows, others)
+        # By the triangle inequality, over the study's reference.
+        unseen = self.beyond[:, list(rows)][:, :, None] + self.beyond[:, list(others)][:, None, :]
+        unseen *= np.not_equal.outer(rows, others)
         tail = None if self.sampling is None else self._tails_of_pairs(self.sampling, rows, others, shared)
-        return self._estimate(sums, tail, areas, errors)
+        return self._estimate(sums, tail, areas, errors, unseen)
 
-    def _estimate(self, sums: Sums, tail: Tail | None, areas: Reals, errors: Reals) -> NormEstimate:
-        """Return norms; areas and norms of the fields' own errors are those of both surfaces of a pair together."""
-        support = Support(areas, self.widths)
-        return estimate_norms(sums, self.weights, support, errors, tail, is_given=self.is_given)
+    def _estimate(
+        self, sums: Sums, tail: Tail | None, areas: Reals, errors: Reals, unseen: Reals | float = 0.0
+    ) -> NormEstimate:
+        """Return norms; areas and norms of the fields' own errors are those of both surfaces of a pair together.
+
+        The norms beyond a given lattice may be known not to be less than what it leaves unseen.
+        """
+        support, beyond = Support(areas, self.widths), unseen**2
+        return estimate_norms(sums, self.weights, support, errors, tail, is_given=self.is_given, beyond=beyond)
 
     def _block_sums(
         self, rows: Sequence[int], others: Sequence[int], number: int, shared: int

@@ -92,6 +92,13 @@ def test_keys_follow_what_a_field_depends_on(box_file: Path) -> None:
     assert key(transform={"eps": 1e-6}) != before
     assert key(lattice={"xi_max": 3.0, "M": 18}) != before
     assert key(reference={"source": "sphere", "radius": 21.0}) != before
+    # What lies beyond a given lattice is measured against a reference with flat faces.
+    keys = set()
+    for width in (1.0, 2.0):
+        trimesh.creation.box(extents=(1.0, 1.0, width)).export(box_file.with_name("flat.off"))
+        flat = {"source": "files", "paths": ["flat.off"]}
+        keys.add(key(reference=flat, scaling={"mode": "none"}, lattice={"xi_max": 0.5, "M": 64}))
+    assert len(keys) == 2
     box_file.write_text(box_file.read_text() + "\n# one more line\n")
     assert key() != before
 

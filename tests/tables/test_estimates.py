@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 import sobolev_batch as sb
 from sobolev_batch.norms.estimate import AREA_AND_SHAPE, PARTS, NormEstimate
 from sobolev_batch.tables.other_orders import distances_at, stored_reducer
+from tests.support.rectangles import Rectangles
 from tests.support.studies import small_table, variable
 
 STORED, OTHERS = [-1.5, -3.0], [-2.0, -4.0]
@@ -58,6 +59,31 @@ def test_on_a_lattice_functions_tables_matrices_and_accessors_agree(
         assert share == pytest.approx(of_fields["area_share"].values, rel=1e-7)
     for name in AREA_AND_SHAPE:
         assert of_spectra[name].values == pytest.approx(against_twin[name].values, rel=1e-7)
+
+
+def test_flat_faces_that_repeat_beyond_a_given_lattice_are_in_every_error(store_path: Path, threads: Client) -> None:
+    strips = {"reference": (20, 0.0), "f/moved": (20, 0.1), "f/other": (19, 0.0)}
+    surfaces = {label: Rectangles.strips(*count_and_offset, 1.0, 0.5) for label, count_and_offset in strips.items()}
+    for label, surface in surfaces.items():
+        sb.write_mesh(surface.mesh(), store_path.parent / f"{label.removeprefix('f/')}.ply")
+    settings = {"lattice": {"xi_max": 4.0, "M": 24}, "norm": {"orders": STORED}, "scaling": {"mode": "none"}}
+    families = [{"name": "f", "source": "files", "paths": ["moved.ply", "other.ply"]}]
+    made = small_table(**settings, family=families, reference={"source": "files", "paths": ["reference.ply"]})
+    sb.run(sb.Study.from_table(made, folder=store_path.parent), store_path, threads)
+    tree, orders = sb.open_store(store_path), [-1.3, *STORED]
+    fields = variable(tree, "fourier", "fourier")
+    for mesh, other in (("f/moved", "reference"), ("f/other", "reference"), ("f/moved", "f/other")):
+        found = sb.distance(fields.sel(mesh=mesh), fields.sel(mesh=other), orders)
+        expected = found["error"].values
+        assert (np.abs(found["distance"] - surfaces[mesh].distance(surfaces[other], orders)) <= expected).all()
+        pairs = distances_at(tree, orders).sel(mesh=mesh, other=other)
+        for errors in (pairs["error"].values, tree.sobolev.distance(orders, mesh, other)["error"].values):
+            assert errors == pytest.approx(expected, rel=1e-6)
+        if other == "reference":
+            meshes = surfaces[mesh].mesh(), surfaces[other].mesh()
+            given = sb.distance(*meshes, orders, lattice=sb.Lattice(4.0, 24))["error"].values
+            assert expected[1:] == pytest.approx(given[1:], rel=1e-3)
+            assert given[0] <= expected[0] <= 1.5 * given[0]
 
 
 def test_with_octaves_stored_spectra_fields_and_tiles_of_pairs_agree(store_path: Path, threads: Client) -> None:

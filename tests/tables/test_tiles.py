@@ -54,6 +54,7 @@ def reducer(store_path: Path, fields: NDArray[np.complex128]) -> Reducer:
         reference=REFERENCE,
         areas=np.ones(ROWS),
         errors=np.zeros((2, ROWS)),
+        beyond=np.zeros((2, ROWS)),
         widths=np.ones(13),
         checksums=checksums,
         tile_bytes=5 * 16 * plan.blocks[0].size,
