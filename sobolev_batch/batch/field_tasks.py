@@ -16,12 +16,14 @@ from sobolev_batch import compiled
 from sobolev_batch.batch.cluster.workers import this_worker, worker_backend
 from sobolev_batch.errors import InputError, LatticeError, MemoryLimitError, MeshError, StoreError, one_line
 from sobolev_batch.geometry.overlap import without_common_parts
+from sobolev_batch.geometry.smooth import Smooth
 from sobolev_batch.geometry.surface import Similarity, Surface
 from sobolev_batch.norms.accuracy.solve import DistanceTarget
 from sobolev_batch.norms.fields import BEYOND_ORDERS, Quality, TailQuality, compute_field, field_for
+from sobolev_batch.norms.tail.face_normals import FaceNormals
 from sobolev_batch.norms.tail.remainder import Remainder, remainder
 from sobolev_batch.norms.tail.sampling import TailSampling
-from sobolev_batch.norms.tail.values import flat_beyond, octave_values
+from sobolev_batch.norms.tail.values import FlatBeyond, draws_beyond, octave_values
 from sobolev_batch.parameters import format_bytes
 from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.store.layout import Store
@@ -49,6 +51,9 @@ _OCTAVES_TIGHTENING = 5.0
 # it would take much of a worker's memory.
 _KEPT_TRIANGLES = 1 << 20
 _reference: dict[tuple[str, Similarity], Surface] = {}
+# A few references beyond given lattices, by these and the draws: for large ones their values take longer than a field.
+_KEPT_BEYOND = 16
+_references_beyond: dict[tuple[str, Similarity, Lattice, int], FlatBeyond] = {}
 
 
 @dataclass(frozen=True)
@@ -252,7 +257,17 @@ def _beyond_given(job: Job, surface: Surface) -> tuple[float, ...]:
     if job.tail is not None or job.reference is None or job.reference.label == job.row.label:
         return ()
     reference = job.load_reference()
-    return () if reference is None else tuple(flat_beyond(surface, reference, job.lattice, BEYOND_ORDERS).tolist())
+    # Values of a parametrised surface take long there.
+    if reference is None or isinstance(surface, Smooth):
+        return ()
+    draws = draws_beyond(sum(kind_of(one).triangles for one in (surface, reference)))
+    key = job.reference.fingerprint, job.similarity, job.lattice, draws
+    if key not in _references_beyond:
+        if len(_references_beyond) >= _KEPT_BEYOND:
+            _references_beyond.clear()
+        normals = FaceNormals.from_surfaces([reference])
+        _references_beyond[key] = FlatBeyond.of_surface(reference, job.lattice, normals, draws)
+    return tuple(_references_beyond[key].distance_bound(surface, BEYOND_ORDERS).tolist())
 
 
 def _remainder_between(surface: Surface, reference: Surface, cutoff: float, execution: Execution) -> Remainder:

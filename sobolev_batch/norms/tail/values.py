@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.arrays import Reals
+from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.smooth import Smooth
 from sobolev_batch.geometry.surface import Surface
@@ -108,28 +108,59 @@ def octave_values(
     return OctaveValues(sampling, joined, *_compared(surface, sampling, joined, orders, execution.backend))
 
 
-def flat_beyond(a: Surface, b: Surface, lattice: Lattice, orders: tuple[float, ...]) -> Reals:
-    """Bound the squared distance of two surfaces beyond the cube of a lattice (orders,), from few exact values.
+@dataclass(frozen=True, eq=False)
+class FlatBeyond:
+    """A surface beyond the cube of a given lattice, at few random frequencies around the normals of flat faces.
 
-    Where flat faces repeat, it is all in peaks along their normals, of which the lattice may show nothing. Zero where
-    no faces are flat, or beside a parametrised surface, whose values there take long.
+    Where flat faces repeat, all that two surfaces differ by is in peaks along these, of which the lattice may show
+    nothing.
+
+    Attributes:
+        frequencies: ξ, float64 (n, 3), in cycles per unit length.
+        weights: Weight of each in the integral beyond the cube (n,); the last ones, ``draws``, are the last octave's.
+        values: Exact transform there, complex128 (n,).
+    """
+
+    frequencies: Reals
+    weights: Reals
+    values: Complexes
+    draws: int
+
+    @classmethod
+    def of_surface(cls, surface: Surface, lattice: Lattice, normals: FaceNormals, draws: int) -> Self:
+        """Return a surface at ``draws`` frequencies of each octave."""
+        octaves = (Octave(lattice.xi_max, index) for index in range(1, _OCTAVES_BEYOND + 1))
+        samplings = [OctaveSampling(one, (), draws, one.index, normals, _UNIFORM_BEYOND) for one in octaves]
+        frequencies = np.concatenate([sampling.frequencies for sampling in samplings])
+        weights = np.concatenate([sampling.weights for sampling in samplings])
+        weights *= np.abs(frequencies).max(axis=1) > lattice.xi_max
+        return cls(frequencies, weights, kind_of(surface).sampled_values(frequencies, ON_CPU.threads), draws)
+
+    def distance_bound(self, other: Surface, orders: Sequence[float]) -> Reals:
+        """Bound the squared distance from another surface there (orders,)."""
+        differences = self.values - kind_of(other).sampled_values(self.frequencies, ON_CPU.threads)
+        lengths = 1 + np.square(self.frequencies).sum(axis=1)
+        terms = self.weights * squared_moduli(differences) * np.array([lengths**order for order in orders])
+        # The last octave stands for all that follow, with as much energy.
+        terms[:, -self.draws :] /= 1 - 2.0 ** (2 * np.array(orders)[:, None] + 1)
+        return np.asarray(terms.sum(axis=1) + _DEVIATIONS_BEYOND * np.sqrt(np.square(terms).sum(axis=1)))
+
+
+def draws_beyond(triangles: int) -> int:
+    """Return the frequencies of each octave that `FlatBeyond` takes; few different numbers, for any two surfaces."""
+    return int(np.clip(_PAIRS_BEYOND // (1 << triangles.bit_length()), _FEWEST_BEYOND, _MOST_BEYOND))
+
+
+def flat_beyond(a: Surface, b: Surface, lattice: Lattice, orders: Sequence[float]) -> Reals:
+    """Bound the squared distance of two surfaces beyond the cube of a lattice (orders,); see `FlatBeyond`.
+
+    It is zero where no faces are flat, or beside a parametrised surface, whose values there take long.
     """
     normals = FaceNormals.from_surfaces((a, b))
     if not normals or isinstance(a, Smooth) or isinstance(b, Smooth):
         return np.zeros(len(orders))
-    count = _PAIRS_BEYOND // sum(kind_of(surface).triangles for surface in (a, b))
-    draws = int(np.clip(count, _FEWEST_BEYOND, _MOST_BEYOND))
-    octaves = (Octave(lattice.xi_max, index) for index in range(1, _OCTAVES_BEYOND + 1))
-    samplings = [OctaveSampling(one, (), draws, one.index, normals, _UNIFORM_BEYOND) for one in octaves]
-    frequencies = np.concatenate([sampling.frequencies for sampling in samplings])
-    weights = np.concatenate([sampling.weights for sampling in samplings])
-    weights *= np.abs(frequencies).max(axis=1) > lattice.xi_max
-    first, second = (kind_of(surface).sampled_values(frequencies, ON_CPU.threads) for surface in (a, b))
-    lengths = 1 + np.square(frequencies).sum(axis=1)
-    terms = weights * squared_moduli(first - second) * np.array([lengths**order for order in orders])
-    # The last octave stands for all that follow, with as much energy.
-    terms[:, -draws:] /= 1 - 2.0 ** (2 * np.array(orders)[:, None] + 1)
-    return np.asarray(terms.sum(axis=1) + _DEVIATIONS_BEYOND * np.sqrt(np.square(terms).sum(axis=1)))
+    draws = draws_beyond(sum(kind_of(surface).triangles for surface in (a, b)))
+    return FlatBeyond.of_surface(b, lattice, normals, draws).distance_bound(a, orders)
 
 
 def settings_on(
