@@ -7,6 +7,7 @@ import io
 import re
 from array import array
 from collections.abc import Iterator
+from itertools import chain, islice
 
 import numpy as np
 
@@ -28,8 +29,10 @@ _OBJ_SKIPPED = re.compile(
     "step|parm|trim|hole|scrv|sp|end|con|res"
 )
 _OBJ_REFUSED = ("surf", "curv", "curv2", "bsp", "bzp", "cdc", "cdp", "call", "csh")
-# Further numbers per face: a colour or its index.
-_OFF_FACE_EXTRAS = (0, 1, 3, 4)
+# Further numbers per face: a colour or its index, or how many it has and a colour.
+_OFF_FACE_EXTRAS = (0, 1, 3, 4, 5)
+# Lines per row of an OFF file of which some hold several rows, at most.
+_MOST_LINES = 0.9
 _COUNT = re.compile("[0-9]{1,18}")
 # Within a word it begins no comment.
 _COMMENT = re.compile(r"(?<!\S)#")
@@ -69,7 +72,7 @@ def parse_obj(data: bytes) -> Raw:
 
 def parse_off(data: bytes) -> Raw:
     """Return the vertices (n, 3) and triangles (m, 3) of an OFF file, in text or binary."""
-    lines = (words for line in _text_lines(data) if (words := _COMMENT.split(line)[0].split()))
+    lines = _off_lines(data)
     first = next(lines, [""])
     # The word may be missing, and the first count may follow it at once.
     word = re.fullmatch("((?:ST|C|N)*OFF)?([0-9]*)", first[0].upper())
@@ -83,27 +86,50 @@ def parse_off(data: bytes) -> Raw:
     if counts == ["BINARY"]:
         return _parsed_binary_off(data, least + 4 * has_colors)
     counts = counts or next(lines, [])
-    if len(counts) not in (2, 3) or not all(_COUNT.fullmatch(word) for word in counts):
+    if len(counts) < 2 or not all(_COUNT.fullmatch(word) for word in counts[:3]):
         raise MeshError("the OFF header does not announce vertices and faces")
     vertex_count, face_count = int(counts[0]), int(counts[1])
+    # Some programs write colours, or normals, without the letter.
+    more = (0, 1) if has_colors else (0, 3, 4) if kind == "OFF" else (0,)
+    try:
+        rows = chain(filter(None, [counts[3:]]), lines)
+        return _parsed_off(vertex_count, face_count, least + 3 * has_colors, more, rows)
+    except MeshError:
+        # The lines of some programs hold many rows each. Fewer lines than rows may be damage instead.
+        if sum(1 for _ in _off_lines(data)) > _MOST_LINES * (vertex_count + face_count):
+            raise
+        numbers = islice(chain.from_iterable(_off_lines(data)), bool(word[1] and not word[2]) + len(counts[:3]), None)
+        return _parsed_off(vertex_count, face_count, least + 4 * has_colors, (0,), ([number] for number in numbers))
+
+
+def _parsed_off(
+    vertex_count: int, face_count: int, least: int, more: tuple[int, ...], rows: Iterator[list[str]]
+) -> Raw:
+    """Return what rows hold, whose vertices have the least count of numbers, or all the same one of some more."""
     vertices, corners, sizes = array("d"), array("q"), array("q")
     for number in range(1, vertex_count + 1):
         vertex = f"vertex {number}"
-        words = _off_row(next(lines, []), lines, vertex, least + 3 * has_colors, (0, 1) if has_colors else (0,))
+        words = _off_row(next(rows, []), rows, vertex, least, more)
+        more = (len(words) - least,)
         vertices.extend(reals(words[:3], vertex))
     for number in range(1, face_count + 1):
-        face, words = f"face {number}", next(lines, [])
+        face, words = f"face {number}", next(rows, [])
         size = whole(words[0], face) if words else 0
         corners.extend(
-            whole(word, face) for word in _off_row(words, lines, face, 1 + size, _OFF_FACE_EXTRAS)[1 : 1 + size]
+            whole(word, face) for word in _off_row(words, rows, face, 1 + size, _OFF_FACE_EXTRAS)[1 : 1 + size]
         )
         sizes.append(size)
-    if words := next(lines, []):
+    if words := next(rows, []):
         raise MeshError(
             f"the OFF header announces {vertex_count} vertices and {face_count} faces, but more follows: "
             f"{' '.join(words)[:80]!r}"
         )
     return cut_polygons(np.array(vertices).reshape(-1, 3), np.array(corners), np.array(sizes))
+
+
+def _off_lines(data: bytes) -> Iterator[list[str]]:
+    """Yield the words of each line that has some, without comments."""
+    return (words for line in _text_lines(data) if (words := _COMMENT.split(line)[0].split()))
 
 
 def _off_row(words: list[str], lines: Iterator[list[str]], owner: str, least: int, more: tuple[int, ...]) -> list[str]:
@@ -115,7 +141,7 @@ def _off_row(words: list[str], lines: Iterator[list[str]], owner: str, least: in
     while len(words) < least and (following := next(lines, [])):
         words += following
     if len(words) - least not in (more if len(words) == first else (0,)):
-        raise MeshError(f"{owner} has {len(words)} numbers, expected {least}, or the file breaks off there")
+        raise MeshError(f"{owner} has {len(words)} numbers, expected {least + more[0]}, or the file breaks off there")
     return words
 
 
