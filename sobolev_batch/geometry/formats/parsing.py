@@ -51,6 +51,8 @@ _LONGEST_MARKUP, _DEEPEST, _MOST_ELEMENTS = 1 << 16, 100, 100_000
 _XML_BYTES = 1 << 14
 # What NumPy calls the orders of bytes that files of XML name.
 BYTE_ORDERS: dict[str, Literal["<", ">"]] = {"LittleEndian": "<", "BigEndian": ">"}
+# Lines per row, at most, of a text whose lines hold several rows: damage alone joins fewer.
+MOST_LINES = 0.9
 # Digits of an integer: all that fit into 64 bits.
 _MOST_DIGITS = 18
 _REAL = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)

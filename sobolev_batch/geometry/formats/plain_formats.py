@@ -13,7 +13,7 @@ import numpy as np
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import MeshError
-from sobolev_batch.geometry.formats.parsing import Raw, reals, whole
+from sobolev_batch.geometry.formats.parsing import MOST_LINES, Raw, reals, whole
 from sobolev_batch.geometry.formats.polygons import cut_polygons
 from sobolev_batch.geometry.mesh import Mesh, merge_coincident
 from sobolev_batch.geometry.surface import normals
@@ -31,8 +31,6 @@ _OBJ_SKIPPED = re.compile(
 _OBJ_REFUSED = ("surf", "curv", "curv2", "bsp", "bzp", "cdc", "cdp", "call", "csh")
 # Further numbers per face: a colour or its index, or how many it has and a colour.
 _OFF_FACE_EXTRAS = (0, 1, 3, 4, 5)
-# Lines per row of an OFF file of which some hold several rows, at most.
-_MOST_LINES = 0.9
 _COUNT = re.compile("[0-9]{1,18}")
 # Within a word it begins no comment.
 _COMMENT = re.compile(r"(?<!\S)#")
@@ -43,7 +41,8 @@ _DIGITS = "%.17g"
 _STL_HEADER_BYTES = 84
 # A text has no zero byte; a binary file of fewer than 16 million triangles has one within this many.
 _STL_START_BYTES = 1024
-# The space before a statement of a facet. Some programs write several on a line.
+# Where a line holds several statements, as some programs write them, and the space before each.
+_STL_SHARED_LINE = re.compile(rb"(?i)(?:[\d.]|loop|facet)[ \t]+(?:vertex|endfacet|endsolid)(?!\S)")
 _STL_STATEMENT = re.compile(rb"(?i)\s(?=(?:facet\s+normal|outer\s+loop|vertex|endloop|endfacet|endsolid)(?!\S))")
 _STL_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
@@ -96,7 +95,7 @@ def parse_off(data: bytes) -> Raw:
         return _parsed_off(vertex_count, face_count, least + 3 * has_colors, more, rows)
     except MeshError:
         # The lines of some programs hold many rows each. Fewer lines than rows may be damage instead.
-        if sum(1 for _ in _off_lines(data)) > _MOST_LINES * (vertex_count + face_count):
+        if sum(1 for _ in _off_lines(data)) > MOST_LINES * (vertex_count + face_count):
             raise
         numbers = islice(chain.from_iterable(_off_lines(data)), bool(word[1] and not word[2]) + len(counts[:3]), None)
         return _parsed_off(vertex_count, face_count, least + 4 * has_colors, (0,), ([number] for number in numbers))
@@ -181,7 +180,7 @@ def parse_stl(data: bytes) -> Raw:
     elif b"\0" not in start:
         if start.lstrip()[:5].lower() != b"solid":
             raise MeshError("the file is a text that does not begin with solid, as STL files in text do")
-        if re.search(rb"(?i)normal[^\n]*\svertex\s", data):
+        if _STL_SHARED_LINE.search(start + data[-_STL_START_BYTES:]):
             data = _STL_STATEMENT.sub(b"\n", data)
         corners = _stl_text_corners(data)
     else:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Indices
 from sobolev_batch.errors import MeshError
-from sobolev_batch.geometry.formats.parsing import Raw, as_declared, reals, triangle_strips, whole
+from sobolev_batch.geometry.formats.parsing import MOST_LINES, Raw, as_declared, reals, triangle_strips, whole
 from sobolev_batch.geometry.formats.polygons import cut_polygons
 from sobolev_batch.geometry.mesh import Mesh
 
@@ -203,7 +203,7 @@ def _numbers(data: bytes, start: int, rows: int) -> tuple[array[float], array[in
 
 
 def _require_aligned(lines: NDArray[np.uintc], rows: Sequence[Indices]) -> None:
-    """Refuse a text where most rows, but not all, end with a line, or that has as many lines as rows and other ones.
+    """Refuse a text with a line for most rows where some rows do not end with one, or with as many lines and other ones.
 
     A number too many or too few would shift all that follow.
     """
@@ -211,7 +211,8 @@ def _require_aligned(lines: NDArray[np.uintc], rows: Sequence[Indices]) -> None:
     ends, lines_end = np.cumsum(sizes[sizes > 0]), np.cumsum(lines)
     is_whole = np.isin(ends, lines_end)
     wrong = np.flatnonzero(~is_whole & (ends <= lines_end[-1:]))
-    if wrong.size and (len(lines) == len(ends) or 2 * np.count_nonzero(is_whole) > len(ends)):
+    is_by_row = len(lines) > MOST_LINES * len(ends) and 2 * np.count_nonzero(is_whole) > len(ends)
+    if wrong.size and (len(lines) == len(ends) or is_by_row):
         raise MeshError(
             f"row {wrong[0] + 1} below the PLY header does not end with its line, as others do: "
             "a line has a number too many or too few"

@@ -152,6 +152,7 @@ CASES: dict[str, Case] = {
                 re.sub(rb"(\n3 \d \d \d)", rb"\1 9007199254740993", PLY_BOX),
                 (b"vertex_indices\n", b"vertex_indices\nproperty int64 medit:ref\n"),
             ),
+            "the vertices on a line": re.sub(rb"(?m)(\.0)\n(?=\d\.)", rb"\1 ", PLY_BOX),
             "a number on each line": PLY_BOX.partition(b"end_header\n")[0]
             + b"end_header\n"
             + PLY_BOX.partition(b"end_header\n")[2].replace(b" ", b"\n"),
@@ -243,7 +244,7 @@ CASES |= {
         ),
         ("pointer", b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n", "git lfs pull"),
         ("UTF-16", OBJ_BOX.decode().encode("utf-16"), "save it in UTF-8"),
-        ("compressed", gzip.compress(OBJ_BOX), "let its name end in .gz"),
+        ("compressed", gzip.compress(OBJ_BOX), "unpack it, or let its name end in .gz"),
         ("compressed by bzip2", bz2.compress(OBJ_BOX), "is packed; unpack it"),
         ("compressed by LZMA", lzma.compress(OBJ_BOX), "is packed; unpack it"),
         ("in an archive", archive({"scan.obj": OBJ_BOX}), "begins as a .3mf or other zip file"),

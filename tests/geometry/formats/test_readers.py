@@ -284,6 +284,10 @@ VARIANTS: dict[str, dict[str, bytes]] = {
     },
     ".stl": {
         "lines as on Windows": STL_BOX.replace(b"\n", b"\r\n"),
+        "what ends a facet behind what ends its loop": STL_BOX.replace(b"endloop\n", b"endloop "),
+        "a vertex behind its loop": STL_BOX.replace(b"loop\nvertex", b"loop vertex"),
+        "the vertices on a line": re.sub(rb"\n(?=vertex.*\nendloop|vertex.*\nvertex.*\nendloop)", b" ", STL_BOX),
+        "the end behind the last facet": STL_BOX.replace(b"facet\nends", b"facet ends"),
         "a name like a word": stl_text(BOX_VERTICES, BOX_TRIANGLES, "facet normal"),
         "capitals": STL_BOX.upper(),
         "two zeros": STL_BOX.replace(b"vertex 0.0 0.0 0.0", b"vertex -0.0 0.0 -0.0", 1),
