@@ -89,6 +89,8 @@ def _decoded(text: str, attributes: Mapping[str, str], number: int, most_bytes: 
     if encoding == "ASCII":
         if not text.strip():
             raise MeshError(f"{owner} is empty")
+        # The library at hand writes a text row by row, whatever order it declares.
+        order = "RowMajorOrder" if len(text.strip().splitlines()) == shape[0] else order
         values = typed(text.split(), dtype, owner)
     else:
         decoded = base64.b64decode(text)

@@ -23,8 +23,8 @@ from sobolev_batch.geometry.formats.polygons import cut_polygons
 # Medit's cells with volume, and words of sections that have no part in a surface.
 _MEDIT_VOLUMES = ("Tetrahedra", "Prisms", "Pyramids", "Hexahedra")
 _MEDIT_SKIPPED = re.compile(
-    "MeshVersionFormatted|Dimension|Vertices|Triangles|Quadrilaterals|Edges|Corners|Ridges|BoundingBox|Geometry|Time|"
-    "AngleOfCornerBound|Iterations|End|(Required|Normal|Tangent|SubDomain|Parallel|[DI]?SolAt)[A-Za-z]*|"
+    "MeshVersionFormatted|Dimension|Vertices|Triangles|Quadrilaterals|Edges|Corners|Ridges|BoundingBox|Geometry|"
+    "Identifier|Time|AngleOfCornerBound|Iterations|End|(Required|Normal|Tangent|SubDomain|Parallel|[DI]?SolAt)[A-Za-z]*|"
     "[A-Za-z]+OnGeometric[A-Za-z]+"
 )
 # How Gmsh's meshes begin: perhaps with comments, then the format, whether it is binary, and how that orders bytes.
@@ -38,8 +38,9 @@ _WITH_AREA, _WITH_VOLUME = (2, 3), (4, 5, 6, 7)
 
 def parse_medit(data: bytes) -> Raw:
     """Return the vertices and triangles of a Medit mesh in text."""
-    # Words have three letters or more, of which the first is a capital; numbers may have an e.
-    start, *words = re.split(rb"\b([A-Z][A-Za-z0-9]{2,})", re.sub(rb"(?<!\S)#[^\n]*", b"", data))
+    # Words have three letters or more, of which the first is a capital. Names stand between quotes.
+    plain = re.sub(rb'(?<!\S)#[^\n]*|"[^"\n]*"', b"", data)
+    start, *words = re.split(rb"(?<!\S)(?!NaN|Inf)([A-Z][A-Za-z0-9]{2,})", plain)
     names = [word.decode("ascii") for word in words[::2]]
     sections = dict(zip(names, words[1::2], strict=True))
     if start.strip() or names[:1] != ["MeshVersionFormatted"] or len(sections) < len(names):

@@ -203,7 +203,7 @@ def _numbers(data: bytes, start: int, rows: int) -> tuple[array[float], array[in
 
 
 def _require_aligned(lines: NDArray[np.uintc], rows: Sequence[Indices]) -> None:
-    """Refuse a text with a line for most rows where some rows do not end with one, or with as many lines and other ones.
+    """Refuse a text where most rows, but not all, are lines, or that has as many lines as rows and other ones.
 
     A number too many or too few would shift all that follow.
     """

@@ -288,6 +288,16 @@ CASES |= {
         b" ".join(medit(BOX_VERTICES, BOX_MIXED).replace(b"# by hand", b"").split()),
         BOX_AREA,
     ),
+    "medit, a vertex of no numbers": (
+        ".mesh",
+        replaced(medit([*BOX_VERTICES, (7, 7, 7)], BOX_QUADS), (b"7.0 7.0 7.0", b"NaN Inf -NaN")),
+        BOX_AREA,
+    ),
+    "medit, names": (
+        ".mesh",
+        medit(BOX_VERTICES, BOX_QUADS, 'Identifier "Box of Mine" Geometry "Box.geo"'),
+        BOX_AREA,
+    ),
     "medit, tetrahedra alone": (".mesh", medit(BOX_VERTICES, [], TETRAHEDRA), "2 cells with volume and no faces"),
     "medit, plane": (".mesh", medit(BOX_VERTICES, BOX_QUADS).replace(b"\n3\n", b"\n2\n", 1), "not of dimension 3"),
     "medit, curved": (".mesh", medit(BOX_VERTICES, BOX_QUADS, "TrianglesP2 1"), "has TrianglesP2, which are curved"),
@@ -516,6 +526,25 @@ CASES |= {
         ".msh",
         replaced(gmsh(BOX_VERTICES, BOX_MIXED, "<"), (b"\n$EndNodes", b"$EndNodes")),
         "or bytes too few",
+    ),
+    # Its library writes such a text row by row.
+    "gifti, text in columns": (
+        ".gii",
+        gifti(BOX_VERTICES, np.array(BOX_TRIANGLES, np.int32), "GIFTI_ENCODING_ASCII", ordering="F"),
+        BOX_AREA,
+    ),
+    "gifti, columns in lines": (
+        ".gii",
+        re.sub(
+            rb"(?s)(<Data>)([^<]*)(</Data>)",
+            lambda found: (
+                found[1]
+                + b"\n".join(map(b" ".join, zip(*map(bytes.split, found[2].strip().splitlines()), strict=True)))
+                + found[3]
+            ),
+            gifti(BOX_VERTICES, np.array(BOX_TRIANGLES, np.int32), "GIFTI_ENCODING_ASCII", ordering="F"),
+        ),
+        BOX_AREA,
     ),
     "gifti, an order that does not exist": (
         ".gii",

@@ -60,6 +60,11 @@ def test_gltf_meshes_may_have_several_primitives_and_no_indices(read: Read) -> N
     assert twice.area == 5 * BOX_AREA
 
 
+def test_gltf_rotations_of_few_digits_do_not_stretch(read: Read) -> None:
+    scene = Gltf([[(BOX_VERTICES, BOX_TRIANGLES, None)]], [{"mesh": 0, "rotation": [0.7, 0, 0, 0.7]}])
+    assert read(".glb", scene.glb()).area == pytest.approx(BOX_AREA, rel=1e-14)
+
+
 @pytest.mark.parametrize(("level", "index"), [(2, "uint8"), (6, "uint16"), (2, "uint32")])
 def test_gltf_parts_with_many_vertices_do_not_run_into_each_other(read: Read, level: int, index: str) -> None:
     # The second part's come after the first's, and no longer fit the type.

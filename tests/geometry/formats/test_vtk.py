@@ -109,7 +109,10 @@ def test_ghosts_are_refused_where_there_are_any(tmp_path: Path, suffix: str, bin
         mesh = with_ghosts()
         mesh.cell_data["vtkGhostType"] *= np.uint8(some)
         # Points of other parts alone change nothing; the file also has a text, which is not read.
-        mesh.point_data["vtkGhostType"], mesh.field_data["who"] = np.array([0] * 7 + [1], dtype=np.uint8), ["a b", "c"]
+        mesh.point_data["vtkGhostType"], mesh.field_data["who"] = (
+            np.array([0] * 7 + [1], dtype=np.uint8),
+            ["a b", "c POINTS d"],
+        )
         path = saved(mesh, tmp_path / f"scan{suffix}", binary=binary)
         if some:
             with pytest.raises(MeshError, match="ghost cells"):
