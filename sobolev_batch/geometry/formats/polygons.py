@@ -146,6 +146,11 @@ def _cut_others(axes: list[Reals], corners: Indices, sizes: Indices, found: _Mea
     following = begins + (rank + 1) % sizes[polygon]
     # From a point nearby: far from the origin, the parts cancel.
     points = np.array([axis[corners] - axis[corners[begins]] for axis in axes])
+    # A corner that is there several times in a row is one: between them, nothing tells how the outline turns.
+    is_new = (points != points[:, following]).any(axis=0)
+    left = np.bincount(polygon, is_new, len(sizes)).astype(np.int64)
+    if ((left < sizes) & (left > 2)).any():
+        return _cut_others(axes, corners[is_new | (left < 3)[polygon]], np.where(left < 3, sizes, left), found)
     # Newell's normals, of twice the area that the outline encloses along them.
     normals = np.add.reduceat(np.array(cross(points, points[:, following])), starts, axis=1)
     # Without the axis that is nearest to its normal, a polygon is as convex as along it.
