@@ -22,8 +22,8 @@ FLAT: dict[str, tuple[list[tuple[float, float]], float]] = {
     "L": ([(0, 0), (3, 0), (3, 1), (1, 1), (1, 3), (0, 3)], 5),
     "U": ([(0, 0), (3, 0), (3, 3), (2, 3), (2, 1), (1, 1), (1, 3), (0, 3)], 7),
     "comb": ([(0, 0), (9, 0), *((x, 1 + 3 * (x % 2)) for x in range(9, -1, -1))], 22.5),
-    "comb with corners twice": (
-        [(0, 0), (9, 0), *((x, 1 + 3 * (x % 2)) for x in range(9, -1, -1) for _ in "ab")],
+    "comb with inner corners twice": (
+        [(0, 0), (9, 0), *((x, 1 + 3 * (x % 2)) for x in (9, 8, 8, 7, 6, 6, 5, 4, 4, 3, 2, 2, 1, 0))],
         22.5,
     ),
     "triangle with all corners twice": ([(0, 0), (0, 0), (4, 0), (4, 0), (0, 4), (0, 4)], 8),
