@@ -226,7 +226,8 @@ def test_compare_tells_files_of_one_name_apart_and_rounding_from_a_deviation(tmp
 def test_compare_names_units_and_defects(folder: Path) -> None:
     ball = sb.shapes.icosphere(2)
     part = sb.Mesh(100 * ball.vertices, np.vstack([ball.triangles[1:], ball.triangles[5:6]]))
-    inverted = sb.Mesh(100 * ball.vertices, ball.triangles[:, ::-1])
+    shells = np.vstack([100 * ball.vertices, 10 * ball.vertices])
+    inverted = sb.Mesh(shells, np.vstack([ball.triangles, ball.triangles + len(ball.vertices)])[:, ::-1])
     sb.write_mesh(part, folder / "part.off")
     sb.write_mesh(inverted, folder / "inverted.off")
     files = ("part.off", "inverted.off", "--order=-4", "--unit", "mm", "--verbose")
@@ -235,6 +236,8 @@ def test_compare_names_units_and_defects(folder: Path) -> None:
     for shown in (scaled, kept):
         assert re.search(r"part\.off: 3 open edges, .* 1 duplicate triangle, counted twice$", shown, re.M)
         assert "inverted.off: all triangles face inwards\n" in shown
+        assert shown.count("inverted.off: components that lie inside others: 1\n") == 1
+        assert "part.off: components" not in shown
     assert "distances of orders are in radii of inverted.off, 100 mm each" in scaled
     assert "wavelengths above 1 mm" not in scaled
     assert "wavelengths above 1 mm weigh alike" in kept

@@ -20,6 +20,7 @@ from sobolev_batch.errors import require_writable
 from sobolev_batch.geometry.deviation import Deviations, largest_deviation
 from sobolev_batch.geometry.formats.readers import read_mesh
 from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.geometry.parts import nested_parts
 from sobolev_batch.geometry.proximity import proximity_and_deviations
 from sobolev_batch.geometry.surface import Similarity, placement_doubt
 from sobolev_batch.norms import DEFAULT_ORDER
@@ -369,10 +370,12 @@ def _motion_text(motion: Reals) -> str:
 
 
 def _remarks(options: CompareOptions, first: Mesh, second: Mesh, doubt: str | None) -> Iterator[str]:
-    """Yield what may make one doubt a comparison: defects, notes, places, and a unit far from the meshes' size."""
+    """Yield what may make one doubt a comparison: defects, notes, inner parts, places, a unit far from the sizes."""
     named = list(zip(options.names, (first, second), strict=True))
     yield from (f"{name}: {', '.join(mesh.defects)}" for name, mesh in named if mesh.defects)
     yield from (f"{name}: {note}" for name, mesh in named for note in mesh.notes)
+    nested = [(name, nested_parts(mesh.merged or mesh)) for name, mesh in named]
+    yield from (f"{name}: components that lie inside others: {count:,}" for name, count in nested if count)
     if doubt is not None:
         yield f"{options.names[0]}: {doubt}"
     size = second.bounding_sphere[1] if options.no_scaling else 1.0
