@@ -94,10 +94,10 @@ def parse_off(data: bytes) -> Raw:
         rows = chain(filter(None, [counts[3:]]), lines)
         return _parsed_off(vertex_count, face_count, least + 3 * has_colors, more, rows)
     except MeshError:
-        # The lines of some programs hold many rows each. Fewer lines than rows may be damage instead.
-        if sum(1 for _ in _off_lines(data)) > MOST_LINES * (vertex_count + face_count):
+        # The lines of some programs hold many rows each. Without a count of edges, numbers may be those of another row.
+        if len(counts) < 3 or sum(1 for _ in _off_lines(data)) > MOST_LINES * (vertex_count + face_count):
             raise
-        numbers = islice(chain.from_iterable(_off_lines(data)), bool(word[1] and not word[2]) + len(counts[:3]), None)
+        numbers = islice(chain.from_iterable(_off_lines(data)), 3 + bool(word[1] and not word[2]), None)
         return _parsed_off(vertex_count, face_count, least + 4 * has_colors, (0,), ([number] for number in numbers))
 
 

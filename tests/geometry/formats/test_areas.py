@@ -110,6 +110,11 @@ CASES: dict[str, Case] = {
             ("one line", b" ".join(off(BOX_VERTICES, BOX_MIXED).split()), BOX_AREA),
             ("one line with colours", b" ".join(off_with("C", "1 0 0 1").split()), BOX_AREA),
             ("one line and a count at once", b" ".join(OFF_BOX.split()).replace(b"OFF ", b"OFF"), BOX_AREA),
+            (
+                "one line behind two counts",
+                b" ".join(OFF_BOX.split()).replace(b"8 12 0", b"8 12\n0"),
+                "vertex 1 has 73 numbers, expected 3",
+            ),
             ("two vertices a line", re.sub(rb"(?m)^(\d\.\d.*)\n(.*)\n", rb"\1 \2\n", OFF_BOX), BOX_AREA),
             ("colours that no word announces", off_with("", "255 0 0"), BOX_AREA),
             (
