@@ -208,7 +208,8 @@ def reals(words: Sequence[str], owner: str) -> array[float]:
         plain = ["nan" if _NO_NUMBER.fullmatch(word) else _FORTRAN.sub("e", word) for word in words]
         wrong = [word for word in plain if not _REAL.fullmatch(word)]
         if wrong:
-            raise MeshError(f"{owner} has a word that is not a number: {wrong[0][:40]!r}") from error
+            hint = "; write decimals with a point, and blanks between numbers" * ("," in wrong[0])
+            raise MeshError(f"{owner} has a word that is not a number: {wrong[0][:40]!r}{hint}") from error
         return array("d", map(float, plain))
 
 

@@ -491,6 +491,11 @@ CASES |= {
         package_3mf(model(BOX_3MF.replace('v1="4"', 'v1="0_4"'))),
         "a triangle has '0_4' for an integer",
     ),
+    "obj, decimal commas": (
+        ".obj",
+        OBJ_BOX.replace(b".", b","),
+        r"vertex 1 has a word that is not a number: '0,0'; write decimals with a point",
+    ),
     "obj, lines": (
         ".obj",
         obj(BOX_VERTICES, []) + b"p 1 2\nl 3 4 5\n",
