@@ -50,6 +50,8 @@ _SKIPPED = {"field": re.compile(rb"\s(?=POINTS \d+ \w+\s)"), "metadata": re.comp
 _GHOSTS = re.compile(
     rb"(COLOR_SCALARS )?vtkGhostType(?: 1 \d+)?(?: unsigned_char)?(?: 1)?[ \r]*\n(?:LOOKUP_TABLE \w+[ \r]*\n)?"
 )
+# Names of arrays in XML, of which old versions of VTK, and its readers still, know the second.
+_NAMES = {"celldata vtkghosttype": "ghosts", "celldata vtkghostlevels": "ghosts", "cells types": "types"}
 _APPENDED = re.compile(rb"<AppendedData[^>]{0,200}encoding\s{0,9}=\s{0,9}[\"'](raw|base64)[\"'][^>]{0,200}>\s{0,99}_")
 _END, _END_OF_DATA = b"</VTKFile>", b"</AppendedData>"
 # Usual bytes of a number in text.
@@ -221,7 +223,7 @@ def _of_xml(data: bytes) -> tuple[str, list[_Arrays]]:
                 texts.append(piece)
             case "end", "DataArray" if section:
                 key = section if section == "points" else f"{section} {attributes.get('Name', '').lower()}"
-                key = {"celldata vtkghosttype": "ghosts", "cells types": "types"}.get(key, key)
+                key = _NAMES.get(key, key)
                 if key in arrays:
                     raise MeshError(f"a piece repeats the array {key[:40]!r}")
                 if not key.startswith("celldata"):

@@ -121,6 +121,14 @@ def test_ghosts_are_refused_where_there_are_any(tmp_path: Path, suffix: str, bin
             assert read_mesh(path).area == BOX_AREA
 
 
+def test_ghosts_of_old_versions_are_refused(tmp_path: Path) -> None:
+    path = saved(with_ghosts(), tmp_path / "scan.vtp", binary=False)
+    path.write_bytes(path.read_bytes().replace(b"vtkGhostType", b"vtkGhostLevels"))
+    assert pyvista.read(path)["vtkGhostType"].any()
+    with pytest.raises(MeshError, match="ghost cells"):
+        read_mesh(path)
+
+
 def test_an_unknown_section_is_named(tmp_path: Path) -> None:
     path = saved(polygons(BOX_TRIANGLES), tmp_path / "scan.vtk", binary=False)
     path.write_bytes(path.read_bytes().replace(b"POLYGONS", b"POLYG\xff\xfeNS"))
