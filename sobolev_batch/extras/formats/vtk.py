@@ -50,7 +50,7 @@ _SKIPPED = {"field": re.compile(rb"\s(?=POINTS \d+ \w+\s)"), "metadata": re.comp
 _GHOSTS = re.compile(
     rb"(COLOR_SCALARS )?vtkGhostType(?: 1 \d+)?(?: unsigned_char)?(?: 1)?[ \r]*\n(?:LOOKUP_TABLE \w+[ \r]*\n)?"
 )
-# Names of arrays in XML, of which old versions of VTK, and its readers still, know the second.
+# What arrays in XML hold, by their names; old versions of VTK use the second one.
 _NAMES = {"celldata vtkghosttype": "ghosts", "celldata vtkghostlevels": "ghosts", "cells types": "types"}
 _APPENDED = re.compile(rb"<AppendedData[^>]{0,200}encoding\s{0,9}=\s{0,9}[\"'](raw|base64)[\"'][^>]{0,200}>\s{0,99}_")
 _END, _END_OF_DATA = b"</VTKFile>", b"</AppendedData>"
