@@ -64,7 +64,8 @@ def parse_gmsh(data: bytes) -> Raw:
     head = _START.match(data)
     if head is None:
         raise MeshError(
-            "it is no Gmsh mesh of the format 2.2 or 4.1; convert it: gmsh scan.msh -save -format msh41 -o surface.msh"
+            "it is no Gmsh mesh of the format 2.2 or 4.1; Gmsh converts its other formats: gmsh scan.msh -save -format "
+            "msh41 -o surface.msh"
         )
     order = "" if head[1].endswith(b"0") else "<" if head[2] == b"\1\0\0\0" else ">"
     nodes, cells = (_Numbers(data, name, order) for name in (b"Nodes", b"Elements"))
