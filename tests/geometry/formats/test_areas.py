@@ -115,6 +115,12 @@ CASES: dict[str, Case] = {
                 b" ".join(OFF_BOX.split()).replace(b"8 12 0", b"8 12\n0"),
                 "vertex 1 has 73 numbers, expected 3",
             ),
+            # As a stream, the last 4 of the vertices begins the first face.
+            (
+                "a number more",
+                replaced(OFF_BOX.replace(b".0", b""), (b"\n0 0 0\n", b"\n0 0 0 0\n")),
+                "vertex 1 has 4 numbers, expected 3",
+            ),
             ("two vertices a line", re.sub(rb"(?m)^(\d\.\d.*)\n(.*)\n", rb"\1 \2\n", OFF_BOX), BOX_AREA),
             ("colours that no word announces", off_with("", "255 0 0"), BOX_AREA),
             (
