@@ -84,6 +84,7 @@ def parse_off(data: bytes) -> Raw:
     least = 3 + 3 * ("N" in kind) + 2 * ("ST" in kind)
     if counts == ["BINARY"]:
         return _parsed_binary_off(data, least + 4 * has_colors)
+    head = 1 if counts else 2
     counts = counts or next(lines, [])
     if len(counts) < 2 or not all(_COUNT.fullmatch(word) for word in counts[:3]):
         raise MeshError("the OFF header does not announce vertices and faces")
@@ -91,14 +92,16 @@ def parse_off(data: bytes) -> Raw:
     # Some programs write colours, or normals, without the letter.
     more = (0, 1) if has_colors else (0, 3, 4) if kind == "OFF" else (0,)
     try:
-        rows = chain(filter(None, [counts[3:]]), lines)
-        return _parsed_off(vertex_count, face_count, least + 3 * has_colors, more, rows)
+        return _parsed_off(
+            vertex_count, face_count, least + 3 * has_colors, more, chain(filter(None, [counts[3:]]), lines)
+        )
     except MeshError:
         # The lines of some programs hold many rows each. Without a count of edges, numbers may be those of another row.
         if len(counts) < 3 or sum(1 for _ in _off_lines(data)) > MOST_LINES * (vertex_count + face_count):
             raise
-        numbers = islice(chain.from_iterable(_off_lines(data)), 3 + bool(word[1] and not word[2]), None)
-        return _parsed_off(vertex_count, face_count, least + 4 * has_colors, (0,), ([number] for number in numbers))
+        least += 4 * has_colors
+        lines = chain([counts[3:]], islice(_off_lines(data), head, None))
+        return _parsed_off(vertex_count, face_count, least, (0,), _off_rows(lines, vertex_count, least))
 
 
 def _parsed_off(
@@ -129,6 +132,18 @@ def _parsed_off(
 def _off_lines(data: bytes) -> Iterator[list[str]]:
     """Yield the words of each line that has some, without comments."""
     return (words for line in _text_lines(data) if (words := _COMMENT.split(line)[0].split()))
+
+
+def _off_rows(lines: Iterator[list[str]], vertex_count: int, width: int) -> Iterator[list[str]]:
+    """Yield the rows of lines that hold several whole ones, those of vertices of a width."""
+    for words in lines:
+        place = 0
+        while place < len(words):
+            size = width if vertex_count > 0 else 1 + whole(words[place], "a face")
+            if not 0 < size <= len(words) - place:
+                raise MeshError(f"a line ends within a row, or a count is wrong: {' '.join(words[place:])[:80]!r}")
+            yield words[place : place + size]
+            place, vertex_count = place + size, vertex_count - 1
 
 
 def _off_row(words: list[str], lines: Iterator[list[str]], owner: str, least: int, more: tuple[int, ...]) -> list[str]:

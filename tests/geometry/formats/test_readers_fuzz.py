@@ -42,6 +42,7 @@ _KINDS: dict[str, Content] = {
     "ply ascii polygons": (".ply", ply(BOX_VERTICES, BOX_MIXED)),
     "obj polygons": (".obj", obj(BOX_VERTICES, BOX_MIXED)),
     "off polygons": (".off", off(BOX_VERTICES, BOX_MIXED)),
+    "off vertices on a line": (".off", off(BOX_VERTICES, BOX_MIXED).replace(b".0\n", b".0 ")),
     "off binary": (".off", off_binary(BOX_VERTICES, BOX_MIXED)),
     "gmsh 2.2 big polygons": (".msh", gmsh_first_binary(BOX_VERTICES, BOX_MIXED, ">")),
     "gmsh 4.1 polygons": (".msh", gmsh(BOX_VERTICES, BOX_MIXED)),
