@@ -108,7 +108,7 @@ def _parsed_off(
     vertex_count: int, face_count: int, least: int, more: tuple[int, ...], rows: Iterator[list[str]]
 ) -> Raw:
     """Return what rows hold, whose vertices have the least count of numbers, or all the same one of some more."""
-    vertices, corners, sizes = array("d"), array("q"), array("q")
+    vertices, corners, sizes, colored = array("d"), array("q"), array("q"), 0
     for number in range(1, vertex_count + 1):
         vertex = f"vertex {number}"
         words = _off_row(next(rows, []), rows, vertex, least, more)
@@ -117,16 +117,18 @@ def _parsed_off(
     for number in range(1, face_count + 1):
         face, words = f"face {number}", next(rows, [])
         size = whole(words[0], face) if words else 0
-        corners.extend(
-            whole(word, face) for word in _off_row(words, rows, face, 1 + size, _OFF_FACE_EXTRAS)[1 : 1 + size]
-        )
+        words = _off_row(words, rows, face, 1 + size, _OFF_FACE_EXTRAS)
+        corners.extend(whole(word, face) for word in words[1 : 1 + size])
         sizes.append(size)
+        colored += len(words) > 1 + size
     if words := next(rows, []):
         raise MeshError(
             f"the OFF header announces {vertex_count} vertices and {face_count} faces, but more follows: "
             f"{' '.join(words)[:80]!r}"
         )
-    return cut_polygons(np.array(vertices).reshape(-1, 3), np.array(corners), np.array(sizes))
+    raw = cut_polygons(np.array(vertices).reshape(-1, 3), np.array(corners), np.array(sizes))
+    note = f"{colored:,} of {face_count:,} faces have numbers behind their corners, which are taken for colours"
+    return raw._replace(notes=(*raw.notes, note)) if 0 < colored < face_count else raw
 
 
 def _off_lines(data: bytes) -> Iterator[list[str]]:

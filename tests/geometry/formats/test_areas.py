@@ -618,6 +618,12 @@ NOTED: dict[str, tuple[str, bytes, str]] = {
         MOVED,
     ),
     "gifti, not moved": (".gii", GIFTI_BOX, ""),
+    "off, a colour of one face": (
+        ".off",
+        replaced(OFF_BOX, (b"\n3 4 6 7\n", b"\n3 4 6 7 5\n")),
+        "1 of 12 faces have numbers behind their corners",
+    ),
+    "off, colours of all faces": (".off", re.sub(rb"(?m)^(3 .*)", rb"\1 5", OFF_BOX), ""),
     "medit, tetrahedra": (
         ".mesh",
         medit(BOX_VERTICES, BOX_QUADS, TETRAHEDRA),
