@@ -214,9 +214,9 @@ def _node_matrices(tree: dict[str, Any]) -> dict[int, Reals]:
 def _matrix(node: dict[str, Any]) -> Reals:
     if "matrix" in node:
         return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
-    rotation = np.array(node.get("rotation", (0.0, 0.0, 0.0, 1.0)), dtype=np.float64)
+    rotation = node.get("rotation", (0.0, 0.0, 0.0, 1.0))
     # Some programs write few digits, which would also stretch.
-    x, y, z, w = rotation / np.linalg.norm(rotation)
+    x, y, z, w = np.divide(rotation, np.linalg.norm(rotation), dtype=np.float64)
     matrix = np.eye(4)
     matrix[:3, :3] = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
