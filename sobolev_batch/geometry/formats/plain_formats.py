@@ -201,7 +201,7 @@ def parse_stl(data: bytes) -> Raw:
             data = _STL_STATEMENT.sub(b"\n", data)
         corners = _stl_text_corners(data)
     else:
-        count = (len(data) - _STL_HEADER_BYTES) / _STL_RECORD.itemsize
+        count = max(0, len(data) - _STL_HEADER_BYTES) / _STL_RECORD.itemsize
         raise MeshError(
             f"a binary STL file of {len(data)} bytes holds {count:.2f} triangles, but its header announces {announced}"
         )

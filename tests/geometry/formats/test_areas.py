@@ -89,6 +89,7 @@ CASES: dict[str, Case] = {
             ("bytes behind the triangles", STL_BINARY + b"\n" * 49, BOX_AREA),
             ("as many bytes as a triangle has", STL_BINARY + bytes(50), "holds 13.00 triangles, .* announces 12"),
             ("solid in a binary header and a triangle more", STL_SOLID + bytes(50), "holds 13.00 triangles"),
+            ("cut in its header", STL_BINARY[:83], "of 83 bytes holds 0.00 triangles"),
             ("another text", b"v 0 0 0\n" * 20, "a text that does not begin with solid"),
             ("solid in a binary header of a cut file", STL_SOLID[:-1], "holds 11.98 triangles, .* announces 12"),
         )
