@@ -534,6 +534,11 @@ CASES |= {
         replaced(medit(BOX_VERTICES, BOX_MIXED), (b"Quadrilaterals", b"Quadrilat")),
         "a section 'Quadrilat', which is not read",
     ),
+    "medit, a word cut short at its beginning, behind a section that is not read": (
+        ".mesh",
+        replaced(medit(BOX_VERTICES, BOX_MIXED), (b"Quadrilaterals", b"Corners 0 uadrilaterals")),
+        "a section 'uadrilaterals', which is not read",
+    ),
     "gmsh, a corner twice": (
         ".msh",
         re.sub(rb"(\d+)(\n\$EndElements)", rb"\1 \1\2", gmsh_first(BOX_VERTICES, BOX_MIXED)),
