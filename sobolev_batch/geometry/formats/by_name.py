@@ -94,6 +94,7 @@ CONVERTED = {
         *(("MED", ".med", _RESAVED), ("CGNS", ".cgns", _RESAVED), ("FBX", ".fbx", "assimp export scan.fbx scan.ply")),
         ("VTK collection", ".vtm .pvd", _PYTHON.format("pyvista", _PYVISTA % "combine().")),
         ("VTK data set", ".pvtu .pvtp .vti .vts .vtr .vtkhdf", _PYTHON.format("pyvista", _PYVISTA % "")),
+        ("tar", ".tar .tgz", "tar -xf scan{0}"),
         *(("zip", ".zip", "unzip scan{0}"), ("bzip2", ".bz2", "bunzip2 scan{0}"), ("xz", ".xz", "unxz scan{0}")),
     )
     for suffix in suffixes.split()

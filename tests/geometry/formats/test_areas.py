@@ -259,6 +259,11 @@ CASES |= {
         ("compressed", gzip.compress(OBJ_BOX), "unpack it, or let its name end in .gz"),
         ("compressed by bzip2", bz2.compress(OBJ_BOX), "is packed; unpack it"),
         ("compressed by LZMA", lzma.compress(OBJ_BOX), "is packed; unpack it"),
+        (
+            "in an archive of tar",
+            b"scan.obj".ljust(257, b"\0") + b"ustar  \0" + OBJ_BOX,
+            "an archive; unpack it by tar",
+        ),
         ("in an archive", archive({"scan.obj": OBJ_BOX}), "begins as a .3mf or other zip file"),
     )
 }
@@ -443,6 +448,7 @@ CASES |= {
     "medit in binary": (".meshb", b"\1\0\0\0", "Medit in binary.*meshio convert scan.meshb scan.vtu"),
     "med": (".med", b"\x89HDF", "format MED.*gmsh scan.med -save -format msh41 -o surface.msh"),
     "a zip archive": (".obj.zip", archive({"scan.obj": OBJ_BOX}), "format zip.*unzip scan.zip"),
+    "an archive of tar": (".tar.gz", gzip.compress(bytes(10240)), "format tar.*tar -xf scan.tar"),
     "a collection": (".vtm", b"<VTKFile/>", r"VTK collection.*read\('scan.vtm'\).combine\(\).extract"),
 }
 
