@@ -87,7 +87,8 @@ def parse_off(data: bytes) -> Raw:
     head = 1 if counts else 2
     counts = counts or next(lines, [])
     if len(counts) < 2 or not all(_COUNT.fullmatch(word) for word in counts[:3]):
-        raise MeshError("the OFF header does not announce vertices and faces")
+        found = f"{first[0][:40]!r} and then {' '.join(counts)[:40]!r}"
+        raise MeshError(f"the file begins with {found}, expected OFF or such and the counts of vertices and faces")
     vertex_count, face_count = int(counts[0]), int(counts[1])
     # Some programs write colours, or normals, without the letter.
     more = (0, 1) if has_colors else (0, 3, 4) if kind == "OFF" else (0,)

@@ -139,6 +139,11 @@ CASES: dict[str, Case] = {
             ("binary with colours", off_binary(BOX_VERTICES, BOX_TRIANGLES, "C", 4, 3), BOX_AREA),
             ("binary with normals", off_binary(BOX_VERTICES, BOX_TRIANGLES, "N", 3), BOX_AREA),
             ("four dimensions", b"4" + OFF_BOX, "does not begin with OFF.*but with '4OFF'"),
+            (
+                "any dimensions",
+                replaced(OFF_BOX, (b"OFF\n", b"nOFF\n3\n")),
+                "begins with 'nOFF' and then '3', expected",
+            ),
             ("normals of two numbers", off_with("N", "0 1"), "vertex 1 has 10 numbers, expected 6"),
             ("colours of five numbers", off_with("C", "1 1 1 1 1"), "vertex 1 has 8 numbers"),
             ("a corner missing", replaced(OFF_BOX, (b"\n3 4 6 7", b"\n3 4 6")), "face 3 has 7 numbers, expected 4"),
