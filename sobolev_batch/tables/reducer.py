@@ -106,22 +106,17 @@ class Reducer:
     ) -> Self:
         """Return the reducer of rows with known qualities; distances are to the reference, or another row."""
         count = sum(part.row_count for _, part in store.stores)
-        areas, (errors, beyond) = np.full(count, np.nan), np.full((2, len(orders), count), np.nan)
-        weights = SobolevWeights(choice.lattice, orders, None if choice.tail is None else choice.tail.cutoff)
-        for row, quality in qualities.items():
-            areas[row], errors[:, row] = quality.area, quality.error_norms(weights)
-            beyond[:, row] = np.sqrt(quality.beyond_at(orders))
         known = reference if reference in qualities else None
         extents = [quality.extent for quality in qualities.values()]
-        return cls(
+        reducer = cls(
             store=store,
             lattice=choice.lattice,
             blocks=Fields(store).blocks_of(choice.lattice),
             orders=orders,
             reference=known if compared_with is None else compared_with,
-            areas=areas,
-            errors=errors,
-            beyond=beyond,
+            areas=np.full(count, np.nan),
+            errors=np.full((len(orders), count), np.nan),
+            beyond=np.full((len(orders), count), np.nan),
             widths=Extent.union(extents).widths if extents else np.zeros(len(DIRECTIONS)),
             checksums=checksums,
             sampling=choice.tail,
@@ -129,13 +124,17 @@ class Reducer:
             known_reference=known,
             is_given=not choice.basis,
         )
+        for row, quality in qualities.items():
+            reducer.areas[row], reducer.errors[:, row] = quality.area, quality.error_norms(reducer.weights)
+            reducer.beyond[:, row] = np.sqrt(quality.beyond_at(orders))
+        return reducer
 
     @property
     def complete(self) -> list[int]:
         """Rows with a field."""
         return np.flatnonzero(~np.isnan(self.areas)).tolist()
 
-    @property
+    @cached_property
     def weights(self) -> SobolevWeights:
         """Weights of the orders on the lattice, with a step where octaves follow."""
         return SobolevWeights(self.lattice, self.orders, None if self.sampling is None else self.sampling.cutoff)
@@ -280,7 +279,9 @@ class Reducer:
             products, left, right = (add_sums(sums) for sums in zip(*by_block, strict=True))
             sums, direct_pairs = differences(products, left, right)
         for i, j in np.argwhere(np.triu(direct_pairs) if shared else direct_pairs).tolist():
-            direct = self._direct(rows[i], others[j])
+            pair = rows[i], others[j]
+            shells = np.zeros(self.lattice.shell_count) if pair[0] == pair[1] else self.sums_over_shells(pair)
+            direct = sums_of_shells(shells, self.weights)
             sums.squares[:, :, i, j], sums.outer[:, i, j] = direct.squares, direct.outer
         if shared:
             for square in (sums.squares[..., :shared], sums.outer[..., :shared]):
@@ -394,14 +395,13 @@ class Reducer:
         swing = max(_SWING * abs(total - last), _RISE * total if last > _STEEPEST_GROWTH * before else 0.0)
         return Remainder.between(min(_LEAST_LIMIT * last, total), max(total, min(total + swing, largest)), cutoff)
 
-    def _direct(self, row: int, other: int) -> Sums:
-        """Return the sums of one pair, from the difference of its fields."""
+    def sums_over_shells(self, rows: Sequence[int]) -> Reals:
+        """Return the sums of |a|² over shells, see `shell_sums`, of the field of a row or the difference of two."""
         sums = np.zeros(self.lattice.shell_count)
-        if row != other:
-            for number, block in enumerate(self.blocks):
-                a, b = self.read([row, other], number)
-                sums += shell_sums(a - b, None, self.lattice, block)
-        return sums_of_shells(sums, self.weights)
+        for number, block in enumerate(self.blocks):
+            values = self.read(rows, number)
+            sums += shell_sums(values[0] - values[1] if len(rows) > 1 else values[0], None, self.lattice, block)
+        return sums
 
 
 def _slices(count: int, size: int, start: int = 0) -> Iterator[slice]:

@@ -16,7 +16,7 @@ from sobolev_batch.tables.pairs import pair_distances
 from sobolev_batch.tables.reducer import Reducer
 from sobolev_batch.tables.results import table_of
 from sobolev_batch.tables.shells import lower_bounds
-from sobolev_batch.transform.lattice import Orders, check_orders, shell_sums, single_order, smooth_step
+from sobolev_batch.transform.lattice import Orders, check_orders, single_order, smooth_step
 
 # The upper end of a band, its squares (orders,), its energy, and the standard error of that.
 Band = tuple[float, Reals, float, float]
@@ -210,10 +210,7 @@ class StoreAccessor:
 
 def _inner_bands(reducer: Reducer, rows: list[int]) -> list[Band]:
     lattice, orders = reducer.lattice, reducer.orders
-    sums = np.zeros(lattice.shell_count)
-    for number, block in enumerate(reducer.blocks):
-        values = reducer.read(rows, number)
-        sums += shell_sums(values[0] - values[1] if len(rows) > 1 else values[0], None, lattice, block)
+    sums = reducer.sums_over_shells(rows)
     radii = lattice.spacing * np.sqrt(np.arange(lattice.shell_count))
     bands: list[Band] = []
     upper = lattice.xi_max
