@@ -18,7 +18,7 @@ from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import DamageError, StoreError
 from sobolev_batch.norms.spectrum import RadialAxis
 from sobolev_batch.norms.tail.sampling import TailSampling
-from sobolev_batch.store.encoding import ROOT, array_keys, dataset_keys, documents_in
+from sobolev_batch.store.encoding import ROOT, array_keys, dataset_keys, documents_in, group_document
 from sobolev_batch.store.layout import (
     DESCRIPTION,
     FIELD,
@@ -88,7 +88,7 @@ def give_up(location: Location) -> None:
 
 def list_records(store: Store) -> None:
     """List the group of records, whose own document has the record of a run that may be going on."""
-    store.documents[RECORDS] = {"zarr_format": 3, "node_type": "group", "attributes": {}}
+    store.documents[RECORDS] = group_document({})
     if store.location.read(f"{RECORDS}/{ROOT}") is None:
         store.location.write({f"{RECORDS}/{ROOT}": json.dumps(store.documents[RECORDS]).encode()})
 
@@ -233,7 +233,7 @@ def _lay_out(store: Store, plan: Plan, labels: Sequence[str], qualities: Sequenc
         # They are summed up from the fields again.
         store.location.remove(SPECTRA_GROUP)
     store.publish(keys | spectra)
-    store.documents[""] = _root(_attributes(plan, labels))
+    store.documents[""] = group_document(_attributes(plan, labels))
 
 
 def _spectra_keys(plan: Plan, mesh: NDArray[Any]) -> dict[str, bytes]:
@@ -294,11 +294,7 @@ def _sample_columns(tail: TailSampling) -> dict[str, tuple[str, NDArray[Any], di
 
 
 def _unfinished(title: str) -> dict[str, Any]:
-    return _root({"title": title, "schema_version": SCHEMA_VERSION, UNFINISHED: True})
-
-
-def _root(attributes: dict[str, Any]) -> dict[str, Any]:
-    return {"zarr_format": 3, "node_type": "group", "attributes": attributes}
+    return group_document({"title": title, "schema_version": SCHEMA_VERSION, UNFINISHED: True})
 
 
 def _require_same_samples(store: Store, plan: Plan) -> None:

@@ -38,7 +38,7 @@ def array_keys(
 ) -> dict[str, bytes]:
     """Return the keys of an array without chunks, and of its group. It reads as NaN, or as empty strings."""
     document = _array_document(np.dtype(dtype), shape, chunks, dimensions, _MISSING, attributes)
-    return {f"{name}/{ROOT}": document, f"{name.partition('/')[0]}/{ROOT}": _group_document({})}
+    return {f"{name}/{ROOT}": document, f"{name.partition('/')[0]}/{ROOT}": _json(group_document({}))}
 
 
 def dataset_keys(group: str, dataset: xr.Dataset) -> dict[str, bytes]:
@@ -50,7 +50,7 @@ def dataset_keys(group: str, dataset: xr.Dataset) -> dict[str, bytes]:
     # The attribute that lists coordinates has blanks between them.
     dataset = dataset.reset_coords([name for name in dataset.coords if " " in str(name)])
     variables, attributes = xr.conventions.encode_dataset_coordinates(dataset)
-    keys = {f"{group}/{ROOT}": _group_document(attributes)}
+    keys = {f"{group}/{ROOT}": _json(group_document(attributes))}
     for name, variable in variables.items():
         step = max(1, min(variable.shape[0], LARGEST_CHUNK_BYTES * variable.shape[0] // max(1, variable.nbytes)))
         chunks = variable.encoding.get("chunks", (step, *variable.shape[1:]))
@@ -124,8 +124,9 @@ def _array_document(
     )
 
 
-def _group_document(attributes: dict[Any, Any]) -> bytes:
-    return _json({"attributes": attributes, "zarr_format": 3, "node_type": "group"})
+def group_document(attributes: dict[Any, Any]) -> dict[str, Any]:
+    """Return the metadata document of a group."""
+    return {"attributes": attributes, "zarr_format": 3, "node_type": "group"}
 
 
 def _json(document: dict[str, Any]) -> bytes:

@@ -9,7 +9,7 @@ from typing import Literal, Self
 
 from sobolev_batch.errors import LockError, StoreError
 from sobolev_batch.store.checked import CHANGED
-from sobolev_batch.store.encoding import ROOT
+from sobolev_batch.store.encoding import ROOT, group_document
 from sobolev_batch.store.layout import DIGEST, RECORDS, Store, document_digest
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import LOCK_KEYS, Lock, Time, age_seconds
@@ -60,8 +60,7 @@ class RunRecord:
         """Replace the record in a store: an attribute of the group of records, in one key."""
         # The store does not remember it: consolidated metadata would tell readers of a run that ended long ago.
         attributes = {_RUN: {**asdict(self), DIGEST: document_digest(asdict(self))}}
-        group = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
-        store.location.write({f"{RECORDS}/{ROOT}": json.dumps(group).encode()})
+        store.location.write({f"{RECORDS}/{ROOT}": json.dumps(group_document(attributes)).encode()})
 
 
 def unlock(store: str | Path | Location, *, force: bool = False) -> Lock | None:

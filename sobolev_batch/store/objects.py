@@ -12,7 +12,7 @@ from typing import Any, Self, TypeVar
 from sobolev_batch.errors import DamageError, InputError, StoreError
 from sobolev_batch.sources.names import node_problem, quoted
 from sobolev_batch.store.create import lattices_text, list_records, record_keys, require_equal
-from sobolev_batch.store.encoding import ROOT
+from sobolev_batch.store.encoding import ROOT, group_document
 from sobolev_batch.store.layout import DESCRIPTION, OBJECTS, PAGE, RECORD, RECORDS, TABLES_OF_ALL, TAGS, Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import LOCK_KEYS
@@ -138,7 +138,7 @@ class Objects:
             "table": dict(study.table),
         }
         attributes = {"title": study.title, "description": DESCRIPTION, "schema_version": SCHEMA_VERSION}
-        root.documents[""] = {"zarr_format": 3, "node_type": "group", "attributes": {**attributes, "study": entry}}
+        root.documents[""] = group_document({**attributes, "study": entry})
         made = cls(root, study.title, study.name, tuple(study.objects), study.table)
         if present is None or present.names != made.names:
             kept = {} if present is None else present.recorded()
