@@ -119,7 +119,7 @@ def write_results(
         store.location.remove(name)
     store.consolidate()
     tables = {"meshes": results.meshes, "convergence": convergence}
-    return Tabulated(NormEstimate(*results.to_reference), tables), store.metadata
+    return Tabulated(results.to_reference, tables), store.metadata
 
 
 def _pairs(workspace: Workspace) -> Pairs | None:

@@ -20,7 +20,6 @@ sum of the same terms (`ReferenceEstimate`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -53,9 +52,11 @@ class NormEstimate:
     discretisation: Reals
     statistical: Reals = field(default_factory=lambda: np.zeros(()))
 
-    def __iter__(self) -> Iterator[Reals]:
-        yield from (self.values, self.truncation, self.aliasing, self.discretisation)
-        yield np.broadcast_to(self.statistical, np.shape(self.values))
+    @property
+    def stacked(self) -> Reals:
+        """Values and the parts of their errors, (5, orders, ...)."""
+        parts = self.values, self.truncation, self.aliasing, self.discretisation, self.statistical
+        return np.stack(np.broadcast_arrays(*parts))
 
     @property
     def errors(self) -> Reals:
@@ -68,7 +69,7 @@ class NormEstimate:
 
     def named(self, name: str) -> dict[str, Reals]:
         """Return the values under a name, the error, and as "error_part" its `PARTS` (orders, ..., part)."""
-        return {name: self.values, "error": self.errors, "error_part": np.stack([*self][1:], axis=-1)}
+        return {name: self.values, "error": self.errors, "error_part": np.moveaxis(self.stacked[1:], 0, -1)}
 
 
 def quotients(values: tuple[Reals, Reals], norms: tuple[Reals, Reals]) -> tuple[Reals, Reals]:

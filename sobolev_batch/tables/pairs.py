@@ -147,18 +147,18 @@ def known_distances(reducer: Reducer, rows: Sequence[int], others: Sequence[int]
     first, second = np.ix_(*([place for place, row in enumerate(side) if row in complete] for side in (rows, others)))
     values = np.full((1 + len(PARTS), len(reducer.orders), len(rows), len(others)), np.nan)
     if all(known):
-        values[..., first, second] = np.stack([*pair_distances(reducer, *known)])
+        values[..., first, second] = pair_distances(reducer, *known).stacked
     return NormEstimate(*values)
 
 
 def pair_distances(reducer: Reducer, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
     """Return distances over (orders, rows, others), the same or no rows; those to the reference come from spectra."""
-    distances = np.stack(list(reducer.pairs(rows, others)))
+    distances = reducer.pairs(rows, others).stacked
     reference = reducer.reference
     if reference is not None:
         of_reference = read_spectra(reducer.store, [reference]).norm
         for side, opposite, axis in ((rows, others, 2), (others, rows, 3)):
             if reference in side:
                 found = reducer.norms_of(opposite, read_spectra(reducer.store, opposite), of_reference).distances
-                distances.swapaxes(2, axis)[:, :, side.index(reference)] = np.stack(list(found))
+                distances.swapaxes(2, axis)[:, :, side.index(reference)] = found.stacked
     return NormEstimate(*distances)

@@ -262,7 +262,7 @@ class Reducer:
         distances, is_square = np.zeros((5, len(self.orders), len(rows), len(others))), tuple(rows) == tuple(others)
         for batch in _slices(len(rows), max(1, self._capacity - self._group - self._read_at_once)):
             first = batch.start if is_square else 0
-            found = np.stack(list(self.tile(rows[batch], others[first:])))
+            found = self.tile(rows[batch], others[first:]).stacked
             distances[..., batch, first:] = found
             if is_square:
                 distances[..., first:, batch] = np.swapaxes(found, -1, -2)

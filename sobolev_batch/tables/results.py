@@ -31,8 +31,7 @@ class Results:
     """The results of a reduction in the order of tables, NaN where there are none.
 
     Attributes:
-        norms: (5, orders, meshes), norms and their errors; see `NormEstimate`.
-        to_reference: (5, orders, meshes), distances to the reference.
+        norms, to_reference: Norms, and distances to the reference, each (orders, meshes).
         parts: (4, orders, meshes), the distance's parts of area and shape, each with its error; see `AREA_AND_SHAPE`.
         beyond: (2, orders, meshes), see `Compared`.
     """
@@ -40,8 +39,8 @@ class Results:
     meshes: xr.Dataset
     reference: str
     orders: tuple[float, ...]
-    norms: Reals
-    to_reference: Reals
+    norms: NormEstimate
+    to_reference: NormEstimate
     parts: Reals
     beyond: Reals
 
@@ -57,35 +56,37 @@ class Results:
             rows = [row for row in chunk if row in complete]
             if rows:
                 found = reducer.norms_of(rows, read_spectra(reducer.store, rows), of_reference)
-                parts = found.reference.area_and_shape(found.distances).values()
+                parts = [*found.reference.area_and_shape(found.distances).values()]
                 of_rows = [places[row] for row in rows]
-                numbers = ([*found.norms], [*found.distances], [*parts], [*found.beyond])
+                numbers = found.norms.stacked, found.distances.stacked, np.stack(parts), np.stack(found.beyond)
                 for array, values in zip(arrays, numbers, strict=True):
-                    array[..., of_rows] = np.stack(values)
-        return cls(meshes, reference, reducer.orders, *arrays)
+                    array[..., of_rows] = values
+        norms, to_reference, *others = arrays
+        return cls(meshes, reference, reducer.orders, NormEstimate(*norms), NormEstimate(*to_reference), *others)
 
     def norms_table(self) -> xr.Dataset:
         """Return `norm` (mesh, order) with its error."""
-        columns = {**NormEstimate(*self.norms).named("norm"), "beyond": self.beyond[0]}
+        columns = {**self.norms.named("norm"), "beyond": self.beyond[0]}
         return table_of(columns, self.meshes, self.orders)
 
     def distances_table(self) -> xr.Dataset:
         """Return `distance` (mesh, other, order) with its error; the only other is the reference."""
-        distances = NormEstimate(*self.to_reference[..., None]).named("distance")
+        named = self.to_reference.named("distance")
+        distances = {name: np.expand_dims(values, 2) for name, values in named.items()}
         table = table_of(distances, self.meshes, self.orders, "mesh", "other")
         return describe(table.assign_coords(other=("other", np.array([self.reference], dtype=object))))
 
     def convergence_table(self, accuracy: Accuracy | None) -> xr.Dataset:
         """Return distances to the reference, relative ones and their parts, and observed orders of convergence."""
-        to_reference = NormEstimate(*self.to_reference)
         sizes = self.meshes["edge_length_mean"].to_numpy()
         reference = self.meshes.indexes["mesh"].get_loc(self.reference)
-        distances, errors = to_reference.values, to_reference.errors
+        distances, errors = self.to_reference.values, self.to_reference.errors
         families, ordered_by = (self.meshes[name].values for name in ("family", "ordered_by"))
         rates, rate_errors = rates_in_families(families, ordered_by, distances, errors, sizes)
-        relative, relative_errors = to_reference.relative_to(NormEstimate(*self.norms[..., [reference]]))
+        norms = NormEstimate(*self.norms.stacked[..., [reference]])
+        relative, relative_errors = self.to_reference.relative_to(norms)
         columns = {
-            **to_reference.named("distance"),
+            **self.to_reference.named("distance"),
             "relative": relative,
             "relative_error": relative_errors,
             **dict(zip(AREA_AND_SHAPE, self.parts, strict=True)),
@@ -93,7 +94,7 @@ class Results:
             "rate": rates,
             "rate_error": rate_errors,
             "resolved": errors < distances,
-            "within": np.ones_like(distances, dtype=bool) if accuracy is None else accuracy.met(to_reference),
+            "within": np.ones_like(distances, dtype=bool) if accuracy is None else accuracy.met(self.to_reference),
         }
         attributes = {"reference": self.reference, **({} if accuracy is None else {"rtol": accuracy.rtol})}
         return table_of(columns, self.meshes, self.orders).assign_attrs(attributes)

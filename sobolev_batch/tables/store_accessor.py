@@ -10,7 +10,7 @@ from sobolev_batch.norms.causes import band_coordinates
 from sobolev_batch.norms.columns import AREA, KERNEL, LENGTH, NUMBER, described, order_axis
 from sobolev_batch.norms.estimate import AREA_AND_SHAPE, NormEstimate
 from sobolev_batch.parameters import as_names
-from sobolev_batch.tables.open import finished_group, reference_of, similarity_of
+from sobolev_batch.tables.open import complete_meshes, finished_group, reference_of, similarity_of
 from sobolev_batch.tables.other_orders import Meshes, convergence_at, norms_at, require_fields, stored_reducer
 from sobolev_batch.tables.pairs import pair_distances
 from sobolev_batch.tables.reducer import Reducer
@@ -100,8 +100,7 @@ class StoreAccessor:
             table = convergence_at(self._tree, check_orders(order), mesh)
             return self._chosen(table[[name for name in _OF_DISTANCES if name in table]], order, mesh)
         meshes = finished_group(self._tree, "meshes")
-        complete = meshes["mesh"].values[meshes["status"].values == "complete"].tolist()
-        labels = complete if mesh is None else as_names(mesh)
+        labels = complete_meshes(self._tree) if mesh is None else as_names(mesh)
         reducer, rows = stored_reducer(self._tree, order, *labels, other)
         found = reducer.norms(rows[:-1])
         columns = {**found.distances.named("distance"), **found.reference.area_and_shape(found.distances)}
@@ -145,7 +144,7 @@ class StoreAccessor:
             if len(rows) >= count and found[0, -1] <= bounds[candidates[start]]:
                 break
             group = candidates[start : start + _CANDIDATES]
-            found = np.hstack([found, np.stack([*pair_distances(reducer, [row], group)])[:, 0, 0]])
+            found = np.hstack([found, pair_distances(reducer, [row], group).stacked[:, 0, 0]])
             rows = np.append(rows, group)
             nearest = np.lexsort((rows, found[0]))[:count]
             found, rows = found[:, nearest], rows[nearest]

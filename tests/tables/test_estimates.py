@@ -94,11 +94,11 @@ def test_with_octaves_stored_spectra_fields_and_tiles_of_pairs_agree(store_path:
     of_fields = reducer.norms([row])
     expected = parts_of(of_spectra)
     assert (expected > 0).all()
-    assert np.stack([*of_fields.distances], axis=-1)[:, 0] == pytest.approx(expected, rel=1e-9)
+    assert np.moveaxis(of_fields.distances.stacked, 0, -1)[:, 0] == pytest.approx(expected, rel=1e-9)
     for name, values in of_fields.reference.area_and_shape(of_fields.distances).items():
         assert of_spectra[name].values == pytest.approx(values[:, 0], rel=1e-9)
     pair: NormEstimate = reducer.pairs([row], [reference])
-    found = np.stack([*pair], axis=-1)[:, 0, 0]
+    found = pair.stacked[..., 0, 0].T
     assert found[:, :4] == pytest.approx(expected[:, :4], rel=1e-7)
     # Of stored spectra the largest sample is known at some orders, and bounded between them.
     assert found[:, 4] == pytest.approx(expected[:, 4], rel=0.05)

@@ -70,7 +70,7 @@ class Solution:
         values, highest = np.hypot(*norms), np.hypot(*(norms + errors))
         # Each error is weighted such that all of them together lead from the values to the highest ones.
         weights = (2 * norms + errors) / (highest + values)
-        parts = np.sum([w * np.stack([*one.estimate][1:]) for w, one in zip(weights, alone, strict=True)], axis=0)
+        parts = np.sum([w * one.estimate.stacked[1:] for w, one in zip(weights, alone, strict=True)], axis=0)
         found = NormEstimate(values, *parts)
         product = change_of_root(values**2, 2 * apart)
         shortfall = next((one.shortfall for one in alone if one.shortfall is not None), None)
