@@ -1,6 +1,6 @@
 """Squared distances as functions of the vertices of a mesh, also of tensors: value, derivative, error of that."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Literal, Self
 
@@ -27,6 +27,7 @@ from sobolev_batch.norms.fields import (
     field_values,
     quality_of,
 )
+from sobolev_batch.norms.tail.integrals import squared_moduli
 from sobolev_batch.transform.backends import backend_named
 from sobolev_batch.transform.fourier import Execution, TransformSettings, thread_count
 from sobolev_batch.transform.lattice import Lattice, Orders, SobolevWeights, check_orders, shell_sums, single_order
@@ -120,13 +121,19 @@ class SquaredDistance:
         return (positions.reshape(-1, 3) if is_flat else positions).astype(np.float64, copy=False)
 
     def _square(self, difference: Complexes) -> float:
-        return float(np.sum(self.factors * (difference.real**2 + difference.imag**2)))
+        return float(squares_of(difference, [self.factors])[0])
 
 
 def factors_of(weights: SobolevWeights) -> Reals:
     """Return the weight of each sample of the half lattice in squared norms, float64 (orders, *lattice.shape)."""
     lattice = weights.lattice
     return np.asarray(weights.per_shell[:, lattice.shells(lattice.half)] * lattice.trapezoid_weights(lattice.half))
+
+
+def squares_of(values: Complexes, factors: Iterable[Reals]) -> Reals:
+    """Return the squared norms of values on the half lattice, one for the weights of samples of each order."""
+    energies = squared_moduli(values)
+    return np.array([np.sum(one * energies) for one in factors])
 
 
 def torch_function(squared: SquaredDistance) -> Callable[[Any], Any]:
@@ -275,7 +282,8 @@ def gradient(
     fine = pair[-1]
     parts = fine.errors(gradients)
     parts[:, PARTS.index("discretisation")] += _norms(gradients - coarser)
-    numbers = {"squared_distance": fine.squares(fine.factors), "error": parts.sum(axis=1), "error_part": parts}
+    squares = squares_of(fine.values, fine.factors)
+    numbers = {"squared_distance": squares, "error": parts.sum(axis=1), "error_part": parts}
     dataset = labelled(order, numbers, lattice_attributes(fine.weights.lattice, fine.field))
     for name in ("error", "error_part"):
         dataset[name].attrs = {**dataset[name].attrs, "units": NUMBER}
@@ -304,13 +312,8 @@ class _Difference:
         self.transform = MeshTransform.from_mesh(mesh, self.weights.lattice, settings, execution)
         self.values = self.transform.transform(np.asarray(mesh.vertices)) - field_values(self.field)
 
-    def squares(self, factors: Reals) -> Reals:
-        """Return the sums of the squared difference with some factors of samples, (orders,)."""
-        energies = self.values.real**2 + self.values.imag**2
-        return np.array([np.sum(one * energies) for one in factors])
-
     def gradients(self, factors: Reals) -> Reals:
-        """Return the derivatives of these sums with respect to the vertices, (orders, n, 3)."""
+        """Return the derivatives of `squares_of` the values with respect to the vertices, (orders, n, 3)."""
         return np.array([2 * self._derivative(one * self.values) for one in factors])
 
     def _derivative(self, coefficients: Complexes) -> Reals:
@@ -335,7 +338,7 @@ class _Difference:
         outer = self.factors * (lattice.shells(lattice.half) >= (lattice.M // 4) ** 2)
         sums = sums_of_shells(shell_sums(self.values, None, lattice, lattice.half), self.weights)
         with np.errstate(divide="ignore", invalid="ignore"):
-            ratios = np.nan_to_num(truncated(sums, self.weights, support) / self.squares(outer), posinf=0.0)
+            ratios = np.nan_to_num(truncated(sums, self.weights, support) / squares_of(self.values, outer), posinf=0.0)
         return np.asarray(_TRUNCATION_CAUTION * ratios * _norms(self.gradients(outer)))
 
     def _aliasing(self, support: Support, gradients: Reals) -> Reals:

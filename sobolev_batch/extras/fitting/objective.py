@@ -11,7 +11,7 @@ from sobolev_batch.arrays import Complexes, Indices, Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.extras.fitting import DEFAULT_SMOOTHING, DEFAULT_STEPS
 from sobolev_batch.extras.fitting.adjoint import MeshTransform
-from sobolev_batch.extras.fitting.derivatives import SquaredDistance, factors_of
+from sobolev_batch.extras.fitting.derivatives import SquaredDistance, factors_of, squares_of
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.subdivision import Edges
 from sobolev_batch.geometry.surface import Extent, Similarity, Surface, centering, is_finite_number
@@ -156,8 +156,7 @@ class FitProblem:
     def squares(self, vertices: Reals, orders: Sequence[float]) -> Reals:
         """Return the squared distances with vertices at some positions, (orders,), from coarse settings."""
         difference = self._transform(vertices, TransformSettings(1e-4)).transform(vertices) - self.values
-        energies = difference.real**2 + difference.imag**2
-        return np.array([float(np.sum(factors * energies)) for factors in self._factors(orders)])
+        return squares_of(difference, self._factors(orders))
 
     def relative_to(self, vertices: Reals, shares: OrderWeights) -> OrderWeights:
         """Return shares of orders, each over the squared distance with vertices at some positions."""
@@ -167,9 +166,8 @@ class FitProblem:
 
     def relative_distance(self, order: float) -> float:
         """Return the distance of the start over the norm of the target."""
-        energies = self.values.real**2 + self.values.imag**2
-        norm = float(np.sum(self._factors([order])[0] * energies))
-        return float(np.sqrt(self.squares(np.asarray(self.start.vertices), [order])[0] / norm))
+        squares = self.squares(np.asarray(self.start.vertices), [order])
+        return float(np.sqrt(squares / squares_of(self.values, self._factors([order])))[0])
 
     def objective(self, vertices: Reals, weights: OrderWeights) -> tuple[SquaredDistance, float]:
         """Return the weighted sum of squared distances, as exact as they need, and its least value that counts."""

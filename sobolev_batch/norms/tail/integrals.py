@@ -124,7 +124,7 @@ def _images_of(intervals: int) -> tuple[Reals, Reals]:
 
 def squared_moduli(values: NDArray[np.complexfloating]) -> Reals:
     """Return |values|² in double precision."""
-    return np.asarray(values.real.astype(np.float64) ** 2 + values.imag.astype(np.float64) ** 2)
+    return np.asarray(values.real.astype(np.float64, copy=False) ** 2 + values.imag.astype(np.float64, copy=False) ** 2)
 
 
 class Scatter(NamedTuple):
