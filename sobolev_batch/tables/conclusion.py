@@ -187,11 +187,20 @@ def _smallest_rows(rows: pd.DataFrame, families: Sequence[str]) -> Iterator[Tabl
 
 def _doubtful_rows(rows: pd.DataFrame, failed: Mapping[str, str]) -> Iterator[TableRow]:
     """Yield the meshes whose distances have larger errors than the study requests, and those that failed."""
-    short = rows[rows["resolved"].astype(bool) & ~rows["within"].astype(bool) & rows["distance"].notna()]
-    if len(short):
-        yield _absent("above rtol", _names(short["mesh"].tolist()))
+    if (is_short := _is_above_rtol(rows)).any():
+        yield _absent("above rtol", _names(rows["mesh"][is_short].tolist()))
     if failed:
         yield {**_absent("missing", _names(list(failed))), "reasons": "failed"}
+
+
+def totals_of(rows: pd.DataFrame) -> dict[str, int]:
+    """Return how many rows of `table` have a distance, how many lack one, and how many have one above rtol."""
+    known, short = rows["distance"].notna(), _is_above_rtol(rows)
+    return {"meshes": int(known.sum()), "missing": int((~known).sum()), "above_rtol": int(short.sum())}
+
+
+def _is_above_rtol(rows: pd.DataFrame) -> pd.Series:
+    return rows["resolved"].astype(bool) & ~rows["within"].astype(bool) & rows["distance"].notna()
 
 
 def _row(label: str, mesh: Mapping[str, Any] | pd.Series, remark: str) -> TableRow:
@@ -245,9 +254,7 @@ def format_objects(
             numbers: TableRow = {"mesh": "", "relative": math.nan}
             if len(known):
                 numbers = known.loc[known["relative"].idxmin(), ["mesh", "relative", "relative_error"]].to_dict()
-            totals = {"meshes": len(known), "missing": len(of_order) - len(known)}
-            imprecise = int((known["resolved"].astype(bool) & ~known["within"].astype(bool)).sum())
-            rows.append({"order": order, "object": name, **numbers, **totals, "above_rtol": imprecise})
+            rows.append({"order": order, "object": name, **numbers, **totals_of(of_order)})
     names = ["order", "object", "mesh", "relative", "relative_error", *_TOTALS]
     frame = pd.DataFrame(rows, columns=names).sort_values(["missing", "relative"], ascending=False, kind="stable")
     sections, notes = [] if rows else [Section(sentences=[ALONE])], []

@@ -32,7 +32,7 @@ from sobolev_batch.extras.leagues.league import (
     pair_lines,
 )
 from sobolev_batch.store.objects import Objects
-from sobolev_batch.tables.conclusion import VERDICT_COLUMNS, TableRow, study_verdict
+from sobolev_batch.tables.conclusion import VERDICT_COLUMNS, TableRow, study_verdict, totals_of
 from sobolev_batch.tables.convergence import (
     CONNECTION_COLUMNS,
     page_columns,
@@ -269,14 +269,7 @@ def _object_rows(tables: Mapping[str, pd.DataFrame], order: float, league: Leagu
     """Yield the objects with their best methods at one order."""
     for name, frame in tables.items():
         meshes = frame[frame["order"] == order]
-        known = meshes[meshes["distance"].notna()]
-        row = {
-            "order": order,
-            "object": name,
-            "meshes": len(known),
-            "missing": len(meshes) - len(known),
-            "above_rtol": int((known["resolved"].astype(bool) & ~known["within"].astype(bool)).sum()),
-        }
+        row = {"order": order, "object": name, **totals_of(meshes)}
         if league is None or name not in league.objects:
             reason = league.left_out.get(name, "no distances") if league else "methods cannot be compared"
             yield {**row, "absent": f"left out: {reason}"}
