@@ -266,6 +266,11 @@ def test_a_league_needs_no_more_than_the_store(store: Path, monkeypatch: pytest.
     assert sb.compare_studies(one, both, -3).attrs["lost"] == ("b (all of it)",)
     assert sb.compare_studies(both, one, -3).attrs["lost"] == ()
     convergence = more["convergence"].to_dataset()
+    known = convergence["relative_error"].where(convergence["mesh"] != "ico/1")
+    more["convergence"] = xr.DataTree(convergence.assign(relative_error=known))
+    # An error that nothing bounds leaves the interval open.
+    changes = sb.compare_studies({"a": more}, one, -3).set_index("method")
+    assert changes.loc["ico", ["low", "high"]].tolist() == [0.0, np.inf]
     more["convergence"] = xr.DataTree(convergence.where(convergence["mesh"] != "ico/1"))
     assert sb.compare_studies({"a": more}, one, -3).attrs["lost"] == ("a/ico/1",)
     with pytest.raises(sb.errors.StoreError, match="it holds the store of one object"):

@@ -8,7 +8,7 @@ import xarray as xr
 
 from sobolev_batch.errors import InputError
 from sobolev_batch.extras.leagues.league import ENDS, RELATIVE, AnyStores, interval_text, number_text, orders_of
-from sobolev_batch.extras.leagues.statistics import adjusted, interval, numbers_of, sign_flip_test
+from sobolev_batch.extras.leagues.statistics import adjusted, errors_of_logarithms, interval, numbers_of, sign_flip_test
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.parameters import as_names
 from sobolev_batch.sources.names import quoted
@@ -122,7 +122,7 @@ def _joined(
         both = first.merge(second, on=_KEYS, suffixes=("", "_old"))
         gone = second["mesh"][~second["mesh"].isin(first["mesh"])].unique()
         lost += [f"{name}/{mesh}".lstrip("/") for mesh in gone]
-        ratios, errors = np.log(both["value"] / both["value_old"]), both["share"] + both["share_old"]
+        ratios, errors = np.log(both["value"] / both["value_old"]), both["log_error"] + both["log_error_old"]
         yield both.assign(y=y, object=name, log_ratio=ratios, log_error=errors)
 
 
@@ -135,9 +135,8 @@ def _identity(tree: xr.DataTree) -> str:
 def _numbers(frame: pd.DataFrame, y: str) -> pd.DataFrame:
     values, errors = numbers_of(frame, y)
     values = np.maximum(values, NEXT_TO_EQUAL) if y == RELATIVE else values
-    with np.errstate(divide="ignore"):
-        share = -np.log1p(-np.minimum(errors / values, 1.0))
-    return frame[[*_KEYS, "family"]].assign(value=values, share=share)[np.isfinite(values)]
+    errors = errors_of_logarithms(values, errors)
+    return frame[[*_KEYS, "family"]].assign(value=values, log_error=errors)[np.isfinite(values)]
 
 
 def _change(meshes: pd.DataFrame) -> dict[str, object]:

@@ -50,8 +50,8 @@ class Curve:
             return None
         order = np.argsort(sizes[known], kind="stable")
         values, errors = values[known][order], errors[known][order]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return cls(np.log(sizes[known][order]), np.log(values), -np.log1p(-np.fmin(errors / values, 1.0)))
+        with np.errstate(divide="ignore"):
+            return cls(np.log(sizes[known][order]), np.log(values), errors_of_logarithms(values, errors))
 
     @property
     def range(self) -> Range:
@@ -81,6 +81,16 @@ class Curve:
         with np.errstate(invalid="ignore"):
             error = float(np.abs(weights) @ self.errors)
         return float(weights @ self.values), np.inf if np.isnan(error) else error
+
+
+def errors_of_logarithms(values: Reals, errors: Reals) -> Reals:
+    """Return bounds on the errors of logarithms; infinite where a value is not larger than its error, or that is NaN.
+
+    >>> errors_of_logarithms(np.array([2.0, 1.0, 1.0]), np.array([1.0, 3.0, np.nan]))
+    array([0.69314718,        inf,        inf])
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(-np.log1p(-np.fmin(errors / values, 1.0)))
 
 
 def numbers_of(frame: pd.DataFrame, y: str) -> tuple[Reals, Reals]:
