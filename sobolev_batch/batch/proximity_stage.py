@@ -78,7 +78,7 @@ def _measure(
             triangles, size = complete[row].facts.triangles, workspace.rows[row].member.expected_size()
             projected_bytes += TRIANGLE_BYTES * triangles + max(size.projected_bytes, MESH_BYTES * triangles)
         pair = tuple((workspace.rows[row], complete[row].facts.digest) for row in (i, reference))
-        arguments = workspace.store, i, complete[i], key, pair, similarity, requested.points, requested.threshold
+        arguments = workspace.store, i, complete[i], key, pair, similarity, requested
         label = workspace.labels[i]
         tasks.append(Task(measure_proximity, arguments, projected_bytes, row=i, label=label, stage="proximity"))
     advance = cluster.count_steps("proximity", len(tasks))
@@ -102,8 +102,7 @@ def measure_proximity(
     key: str,
     pair: Sequence[tuple[Row, str]],
     similarity: Similarity,
-    points: int,
-    threshold: float | None = None,
+    requested: ProximitySection,
 ) -> Record:
     """Measure the distances of a mesh from the reference, and write its record with them, unless it has them.
 
@@ -116,12 +115,12 @@ def measure_proximity(
         return stored
     started = time.perf_counter()
     try:
-        limit = None if threshold is None else threshold * similarity.scale
+        limit = None if requested.threshold is None else requested.threshold * similarity.scale
         meshes = (_load(*mesh, similarity) for mesh in pair)
         # The bounds of a mesh that was searched are to prove what the search has proved.
         tolerance = dict(pair[0][0].member.metadata).get("target_tolerance")
         within = _BELOW * tolerance * similarity.scale if isinstance(tolerance, float) else None
-        found, _ = proximity_and_deviations(*meshes, points=points, threshold=limit, within=within)
+        found, _ = proximity_and_deviations(*meshes, points=requested.points, threshold=limit, within=within)
         lengths = {name: found[name] / similarity.scale for name in LENGTHS}
         measured = ProximityRecord(key, "", {**found, **lengths})
     except StoreError:

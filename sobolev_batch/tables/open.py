@@ -121,8 +121,9 @@ def open_store(store: str | Path | Location | Sequence[str | Path | Location]) -
 def _joined(trees: Sequence[xr.DataTree]) -> xr.DataTree:
     if not trees:
         raise InputError("no store is named")
-    for tree in trees[1:]:
-        differences = [name for name, value in _common(tree).items() if value != _common(trees[0])[name]]
+    first, *others = map(_common, trees)
+    for tree, common in zip(trees[1:], others, strict=True):
+        differences = [name for name, value in common.items() if value != first[name]]
         if differences:
             raise StoreError(
                 f"{source_of(tree)}: it cannot be opened as one with {source_of(trees[0])}: "

@@ -24,6 +24,7 @@ from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.records import Records
 from sobolev_batch.study.plan import make_plan
+from sobolev_batch.study.schema import ProximitySection
 from tests.support.stores import assert_same_results
 from tests.support.studies import small_table, variable
 
@@ -172,7 +173,7 @@ def test_a_mesh_that_has_changed_is_not_measured(store: Path, tmp_path: Path) ->
     digests = [record.facts.digest for record in records if record is not None]
     assert records[1] is not None
     pair = (plan.rows[2], digests[1]), (plan.rows[-1], digests[-1])
-    record = measure_proximity(here, 1, records[1], "key", pair, plan.similarity, 100)
+    record = measure_proximity(here, 1, records[1], "key", pair, plan.similarity, ProximitySection(points=100))
     assert record.proximity is not None
     assert "is not the mesh whose field is stored" in record.proximity.reason
     assert Records(here).read()[1] is not None

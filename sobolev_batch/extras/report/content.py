@@ -35,6 +35,7 @@ from sobolev_batch.store.objects import Objects
 from sobolev_batch.tables.conclusion import VERDICT_COLUMNS, TableRow, study_verdict, totals_of
 from sobolev_batch.tables.convergence import (
     CONNECTION_COLUMNS,
+    MESH,
     page_columns,
     table,
     tables_of,
@@ -56,8 +57,9 @@ from sobolev_batch.transform.lattice import Lattice
 MOST_CONVERGENCE_ROWS, MOST_MESH_ROWS, _MOST_REASONS = 10_000, 5_000, 2_000
 
 _COUNTS = ["vertices", "triangles", "points", *(column.name for column in CONNECTION_COLUMNS)]
+_REASON_COLUMNS = MESH, Column("reason", "reason", kind="text")
 _MESH_COLUMNS = (
-    Column("mesh", "mesh", kind="label"),
+    MESH,
     Column("vertices", "vertices", "{:,.0f}".format),
     Column("triangles", "triangles", "{:,.0f}".format),
     Column("seconds", "seconds", "{:.2f}".format),
@@ -114,12 +116,11 @@ class PageTable:
         ]
 
 
-def reasons_table(name: str, label: str, reasons: Mapping[str, str]) -> PageTable | None:
-    """Return the table of reasons by mesh or object; None where there are none."""
-    columns = Column(label, label, kind="label"), Column("reason", "reason", kind="text")
-    rows = [{label: key, "reason": reason} for key, reason in list(reasons.items())[:_MOST_REASONS]]
+def reasons_table(name: str, reasons: Mapping[str, str]) -> PageTable | None:
+    """Return the table of reasons by mesh; None where there are none."""
+    rows = [{"mesh": label, "reason": reason} for label, reason in list(reasons.items())[:_MOST_REASONS]]
     omitted = len(reasons) - len(rows)
-    return PageTable(name, columns, rows, is_sortable=False, omitted=omitted) if rows else None
+    return PageTable(name, _REASON_COLUMNS, rows, is_sortable=False, omitted=omitted) if rows else None
 
 
 def common_content(
@@ -142,8 +143,8 @@ def common_content(
         "orders": [minus(f"{order:g}") for order in rows["order"].drop_duplicates()],
         "objects_in_all": len(frames) if "object" in study else 0,
         "meshes_in_all": rows[rows["order"].isin(rows["order"].head(1))],
-        "failed": reasons_table("failed", "mesh", failed),
-        "not_compared": reasons_table("lacking", "mesh", status.not_compared),
+        "failed": reasons_table("failed", failed),
+        "not_compared": reasons_table("lacking", status.not_compared),
         "status": status,
         "versions": versions,
         "study_text": tomli_w.dumps(_without_nulls(study)),
@@ -181,7 +182,7 @@ def study_content(tree: xr.DataTree, status: Status) -> dict[str, Any]:
         "convergence": convergence_table(tree, frame, families, MOST_CONVERGENCE_ROWS // convergence.sizes["order"]),
         "meshes": _meshes_table(meshes, families),
         "omissions": [f"verdict: only {omitted} are shown"] if omitted else [],
-        "doubtful": reasons_table("doubtful", "mesh", placement_doubts(tree)),
+        "doubtful": reasons_table("doubtful", placement_doubts(tree)),
         "rtol": convergence.attrs.get("rtol"),
         "has_proximity": "proximity" in tree.children,
         "units": " ".join(unit_notes([tree])),
