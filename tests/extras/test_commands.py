@@ -99,13 +99,15 @@ def test_compare_draws_where_meshes_differ(folder: Path) -> None:
 
 
 def test_fit_writes_a_nearer_mesh_in_the_unit_of_its_files(folder: Path) -> None:
-    options = ("--order", "-4", "--steps", "10", "--refine-to", "120")
+    options = ("--order", "-4", "--steps", "10", "--refine-to", "119")
     shown = output("fit", "start.ply", "target.ply", "-o", "fitted.obj", *options, folder=folder)
     before, after = re.findall(r"^(?:before|after): +differs by (\S+) % .*, Hausdorff ≥ (\S+), Chamfer", shown, re.M)
     assert float(after[0]) < float(before[0]) / 3
     assert 1.5 < float(before[1]) < 10  # millimetres
     fitted, target = (sb.read_mesh(folder / name) for name in ("fitted.obj", "target.ply"))
-    assert 80 < len(fitted.triangles) <= 120
+    # A closed mesh has an even number.
+    assert 80 < len(fitted.triangles) < 119
+    assert f"note: it has {len(fitted.triangles)} triangles instead of 119" in shown
     centre = (fitted.vertices.min(axis=0) + fitted.vertices.max(axis=0)) / 2
     assert centre == pytest.approx([100, 0, 0], abs=2)
     assert fitted.area == pytest.approx(target.area, rel=0.05)
@@ -117,10 +119,9 @@ def test_the_options_of_fit_reach_it(folder: Path) -> None:
     sb.write_mesh(half, folder / "half.ply")
     sb.write_mesh(target, folder / "ball.ply")
     arguments = ("half.ply", "ball.ply", "-o", "out.ply", "--steps", "2", "--no-scaling", "--order", "-4")
-    shown = output("fit", *arguments, "--keep-boundary", "--smoothing", "8", folder=folder)
+    output("fit", *arguments, "--keep-boundary", "--smoothing", "8", folder=folder)
     expected = sb.fit(half, target, -4.0, steps=2, keep_boundary=True, smoothing=8.0)
     np.testing.assert_allclose(sb.read_mesh(folder / "out.ply").vertices, expected.mesh.vertices, atol=1e-12)
-    assert all(f"note: {remark}" in shown for remark in expected.remarks)
 
 
 def test_fit_notes_that_a_file_has_too_few_digits(folder: Path) -> None:
