@@ -30,8 +30,8 @@ _PART = re.compile(r"(\*\*/|\*\*|\*|\?|\[[^\]]*\]|\{object\}|\{method\})")
 _PLACEHOLDERS = re.compile(r"(?:\*?\{(?:object|method)\}\*?)+")
 _PATTERNS = {"**/": "(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
 
-# Meshes of a list as entries of a family, by object and method.
-_Listed = Mapping[tuple[str, str], Sequence[Mapping[str, Any]]]
+# Meshes of a list as entries of a family, by method.
+_Listed = Mapping[str, Sequence[Mapping[str, Any]]]
 
 
 def sections_of_objects(
@@ -54,24 +54,24 @@ def sections_of_objects(
     checked = _filled(values["family"], OBJECT, str(names[0])) if names and names[0] else values["family"]
     document = validated(StudyDocument, {**values, "family": checked})
     listed = _listed_meshes(document.objects.get("meshes", ()), folder)
-    objects = _objects(document, values, list(dict.fromkeys(name for name, _ in listed)), folder)
+    objects = _objects(document, values, [*listed], folder)
     families = [_families(family, [section.name for section in objects], folder) for family in values["family"]]
     sections = {}
     for section in objects:
         own = [entry for entries in families for entry in entries[section.name]]
-        table = _table_of_object(values, section, listed, own)
+        table = _table_of_object(values, section, listed.get(section.name, {}), own)
         with naming(f"object {quoted(section.name)}"):
             own_sections = {name: table[name] for name in SurfaceSections.model_fields if name in table}
             sections[section.name] = validated(SurfaceSections, own_sections), table
     return document, sections
 
 
-def _listed_meshes(given: str | Sequence[MeshTable], folder: Path) -> _Listed:
-    """Return the meshes of the section [objects]."""
+def _listed_meshes(given: str | Sequence[MeshTable], folder: Path) -> dict[str, _Listed]:
+    """Return the meshes of the section [objects], by object."""
     base = Path()
     if isinstance(given, str):
         base, given = Path(given).parent, read_mesh_list(folder / given)
-    meshes: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    meshes: dict[str, dict[str, list[dict[str, Any]]]] = {}
     for mesh in given:
         known = dict(mesh)
         names: list[str] = []
@@ -80,8 +80,9 @@ def _listed_meshes(given: str | Sequence[MeshTable], folder: Path) -> _Listed:
                 raise StudyError(f"[objects]: meshes: {quoted(mesh['path'])} has no {column}; each mesh needs both")
             name = known.pop(column)
             names.append(number_as_text(name) if isinstance(name, float) else str(name))
-        meshes.setdefault((names[0], names[1]), []).append({**known, "path": (base / known["path"]).as_posix()})
-    return meshes
+        of_method = meshes.setdefault(names[0], {}).setdefault(names[1], [])
+        of_method.append({**known, "path": (base / known["path"]).as_posix()})
+    return {**meshes}
 
 
 def _objects(
@@ -93,8 +94,8 @@ def _objects(
         document = validated(StudyDocument, {**values, "object": found})
     objects = document.object or []
     names = [section.name for section in objects]
-    unnamed = [name for name in listed if name not in names]
-    if unnamed:
+    known = {*names}
+    if unnamed := [name for name in listed if name not in known]:
         raise StudyError(
             f"[objects] lists {quoted(unnamed[0])}, and no [[object]] section has this name; list all objects, or give "
             "all of them sections"
@@ -127,13 +128,12 @@ def _names_in_reference(values: Mapping[str, Any], folder: Path) -> list[str]:
 
 
 def _table_of_object(
-    values: Mapping[str, Any], section: ObjectSection, listed: _Listed, families: Iterable[Mapping[str, Any]]
+    values: Mapping[str, Any], section: ObjectSection, own: _Listed, families: Iterable[Mapping[str, Any]]
 ) -> dict[str, Any]:
-    """Return the study of an object as nested tables."""
+    """Return the study of an object as nested tables, with its own meshes of the list."""
     name = section.name
     common = {key: value for key, value in values.items() if key not in ("family", "object", "objects")}
     common = _filled(common, OBJECT, name)
-    own = {method: meshes for (owner, method), meshes in listed.items() if owner == name}
     is_reference = {method: caseless_key(method) == REFERENCE_LABEL for method in own}
     references = [mesh["path"] for method, meshes in own.items() if is_reference[method] for mesh in meshes]
     if section.reference is not None:
