@@ -141,8 +141,8 @@ def cost_leagues_of(
     if frame.empty:
         raise InputError(f"no mesh has both a distance and {x}; name another cost, such as triangles")
     left_out = {name: "it has no tables yet" for name in objects if name not in tables}
-    left_out |= {name: f"no mesh has a distance and {x}" for name in tables if name not in set(frame["object"])}
-    left_out |= {name: f"no mesh has a distance and {x}" for name in methods if name not in set(frame["family"])}
+    for names, present in ((tables, {*frame["object"]}), (methods, {*frame["family"]})):
+        left_out |= {name: f"no mesh has a distance and {x}" for name in names if name not in present}
     orders = dict.fromkeys(s for table in tables.values() for s in table["order"])
     return tuple(_cost_league(frame[frame["order"] == s], s, x, methods, left_out) for s in orders)
 

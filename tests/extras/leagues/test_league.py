@@ -295,6 +295,14 @@ def test_the_front_of_an_object_is_what_no_mesh_beats_in_both() -> None:
     assert made.left_out == {"later": "it has no tables yet"}
 
 
+def test_no_object_costs_a_look_at_the_meshes_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    tables = {f"cow {number}": priced({"quick": QUICK}) for number in range(20)}
+    iterate, looked = pd.Series.__iter__, list[object]()
+    monkeypatch.setattr(pd.Series, "__iter__", lambda column: looked.append(column.name) or iterate(column))
+    assert len(by_cost(tables).objects) == 20
+    assert looked.count("object") < 5
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_fronts_are_those_of_all_pairs(seed: int) -> None:
     rng = np.random.default_rng(seed)
