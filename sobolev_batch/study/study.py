@@ -247,8 +247,8 @@ class Study:
                 objects[name] = StudyObject.from_sections(name, of_object, as_written, folder)
         methods = dict.fromkeys(family.name for one in objects.values() for family in one.families)
         for name, one in objects.items():
-            lacking = tuple(methods.keys() - {family.name for family in one.families})
-            objects[name] = replace(one, lacking=tuple(method for method in methods if method in lacking))
+            own = {family.name for family in one.families}
+            objects[name] = replace(one, lacking=tuple(method for method in methods if method not in own))
         return cls(
             name=document.study.name,
             title=document.study.title or document.study.name,
