@@ -115,6 +115,6 @@ def test_without_a_reference_there_are_norms_alone(reducer: Reducer) -> None:
     assert compared.norms.values == pytest.approx(reducer.norms([1, 3]).norms.values, rel=1e-14)
     assert (compared.beyond[0] == 0).all()
     parts = compared.reference.area_and_shape(compared.distances).values()
-    for found in (*compared.distances, *parts, compared.beyond[1]):
+    for found in (*compared.distances.stacked, *parts, compared.beyond[1]):
         assert found.shape == compared.norms.values.shape
         assert np.isnan(found).all()
