@@ -25,6 +25,8 @@ CONFIDENCE = 0.95
 _MORE_IS_BETTER = ("fscore", "precision", "recall", "smallest_angle")
 # All changes of sign are tried for as many objects, and as many random ones for more.
 _MOST_ENUMERATED, _DRAWS, _SEED = 14, 20_000, 0
+# Signs that are in memory at a time.
+_MOST_SIGNS = 1 << 22
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,14 +119,17 @@ def filled(values: Reals) -> Reals:
     array([[ 1.,  2.,  4.],
            [11., 12., 14.]])
     """
-    objects, methods = values.shape
-    rows, columns = np.indices(values.shape).reshape(2, -1)
-    design = np.hstack([np.eye(objects)[rows], np.eye(methods)[columns]])
-    known = np.isfinite(values).ravel()
-    if np.linalg.matrix_rank(design[known]) < objects + methods - 1:
+    known = np.isfinite(values)
+    shares = known / known.sum(axis=1, keepdims=True)
+    # The equations of least squares, from which the effects of objects are eliminated: methods are few.
+    matrix = np.diag(known.sum(axis=0)) - known.T @ shares
+    if np.linalg.matrix_rank(matrix) < len(matrix) - 1:
         raise np.linalg.LinAlgError
-    effects = np.linalg.lstsq(design[known], values.ravel()[known])[0]
-    return np.where(np.isnan(values), (design @ effects).reshape(values.shape), values)
+    own = np.where(known, values, 0.0)
+    means = (shares * own).sum(axis=1, keepdims=True)
+    of_methods = np.linalg.lstsq(matrix, (own - known * means).sum(axis=0))[0]
+    of_objects = (shares * (own - of_methods)).sum(axis=1, keepdims=True)
+    return np.where(known, values, of_objects + of_methods)
 
 
 def common_sizes(curves: Sequence[Curve]) -> Reals | None:
@@ -171,15 +176,17 @@ def sign_flip_test(differences: Reals, errors: Reals) -> float:
     if count == 0 or not np.isfinite(errors).all():
         return 1.0
     if count <= _MOST_ENUMERATED:
-        signs = np.array(list(product((1.0, -1.0), repeat=count)))
+        sums = np.array(list(product((1.0, -1.0), repeat=count))) @ differences
     else:
+        rng, step = np.random.default_rng(_SEED), max(1, _MOST_SIGNS // count)
+        sizes = (min(step, _DRAWS - start) for start in range(0, _DRAWS, step))
+        drawn = [rng.choice((1.0, -1.0), size=(size, count)) @ differences for size in sizes]
         # With the observed signs among them, the p-value is never zero.
-        drawn = np.random.default_rng(_SEED).choice((1.0, -1.0), size=(_DRAWS, count))
-        signs = np.vstack([np.ones(count), drawn])
+        sums = np.concatenate([[differences.sum()], *drawn])
     observed, slack = abs(float(differences.sum())), float(errors.sum())
     # Rounding must not decide between a sum and its mirror image.
     tolerance = 1e-12 * float(np.abs(differences).sum())
-    return float(np.mean(np.abs(signs @ differences) + slack >= observed - slack - tolerance))
+    return float(np.mean(np.abs(sums) + slack >= observed - slack - tolerance))
 
 
 def adjusted(p_values: Reals) -> Reals:

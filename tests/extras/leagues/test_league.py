@@ -12,9 +12,10 @@ import pytest
 from scipy import stats
 
 import sobolev_batch as sb
+from sobolev_batch.extras.leagues import statistics
 from sobolev_batch.extras.leagues.costs import CostLeague, cost_leagues_of, format_cost_leagues
 from sobolev_batch.extras.leagues.league import League, format_league, leagues_of
-from sobolev_batch.extras.leagues.statistics import interval, sign_flip_test, within_objects
+from sobolev_batch.extras.leagues.statistics import filled, interval, sign_flip_test, within_objects
 from tests.support.studies import method_rows
 
 SIZES = (100, 400, 1600)
@@ -49,6 +50,33 @@ def test_factors_between_methods_are_found_whatever_the_objects() -> None:
     # Of 2^6 changes of sign, two are as extreme.
     assert pair["p"] == pytest.approx(2 / 64)
     assert pair["nearer"] == "a"
+
+
+def test_what_methods_lack_takes_no_matrix_of_all_objects(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng, objects, methods = np.random.default_rng(5), 60, 4
+    values = np.where(rng.random((objects, methods)) < 0.4, np.nan, rng.standard_normal((objects, methods)))
+    values[:, 0] = np.where(np.isnan(values).all(axis=1), 0.0, values[:, 0])
+    rows, columns = np.indices(values.shape).reshape(2, -1)
+    design, known = np.hstack([np.eye(objects)[rows], np.eye(methods)[columns]]), np.isfinite(values).ravel()
+    effects = np.linalg.lstsq(design[known], values.ravel()[known])[0]
+    solve, shapes = np.linalg.lstsq, list[tuple[int, ...]]()
+
+    def noted(matrix: Any, side: Any) -> Any:
+        shapes.append(matrix.shape)
+        return solve(matrix, side)
+
+    monkeypatch.setattr(np.linalg, "lstsq", noted)
+    found = filled(values)
+    np.testing.assert_allclose(found.ravel()[~known], (design @ effects)[~known], rtol=1e-10)
+    assert shapes == [(methods, methods)]
+
+
+def test_signs_are_drawn_in_parts_that_memory_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    differences, errors = np.random.default_rng(9).standard_normal(40) + 0.3, np.zeros(40)
+    whole = sign_flip_test(differences, errors)
+    monkeypatch.setattr(statistics, "_MOST_SIGNS", 40 * 300)
+    assert sign_flip_test(differences, errors) == whole
+    assert 0 < whole < 0.1
 
 
 def test_a_number_is_not_compared_at_equal_values_of_itself() -> None:
@@ -298,7 +326,12 @@ def test_the_front_of_an_object_is_what_no_mesh_beats_in_both() -> None:
 def test_no_object_costs_a_look_at_the_meshes_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
     tables = {f"cow {number}": priced({"quick": QUICK}) for number in range(20)}
     iterate, looked = pd.Series.__iter__, list[object]()
-    monkeypatch.setattr(pd.Series, "__iter__", lambda column: looked.append(column.name) or iterate(column))
+
+    def noted(column: Any) -> Any:
+        looked.append(column.name)
+        return iterate(column)
+
+    monkeypatch.setattr(pd.Series, "__iter__", noted)
     assert len(by_cost(tables).objects) == 20
     assert looked.count("object") < 5
 
