@@ -238,7 +238,7 @@ def _references(sizes: Mapping[PurePosixPath, int]) -> dict[str, PurePosixPath]:
     """
     called = [path for path in sizes if _is_called_reference(path)]
     references = {_object_of(path): path for path in called} or _finest_of_names(sizes)
-    owners = {_owner(path, references) for path in sizes if path not in references.values()}
+    owners = {_owner(path, references) for path in sizes.keys() - {*references.values()}}
     are_different = 2 <= len({*map(caseless_key, references)}) == len(called or references)
     is_refused = any(name_problem(name, _LONGEST_NAME, RESERVED) or name.startswith((".", "__")) for name in references)
     return references if are_different and not is_refused and references.keys() <= owners else {}
@@ -276,8 +276,8 @@ def _continued(sizes: Mapping[PurePosixPath, int], ending: str) -> dict[str, Pur
 
 def _families(paths: Iterable[PurePosixPath], references: Mapping[str, PurePosixPath]) -> _Families:
     """Return the files of each object and family, which is that of their folder or of their name."""
-    others = [(path, _owner(path, references)) for path in paths if path not in references.values()]
-    owned = [(path, name) for path, name in others if name is not None]
+    known = {*references.values()}
+    owned = [(path, name) for path in paths if path not in known and (name := _owner(path, references)) is not None]
     # Objects have folders of their own, which say nothing of families.
     own = {name: {name, *(reference.parent.parts if name else ())} for name, reference in references.items()}
     folders = [[part for part in path.parent.parts if part not in own[name]] for path, name in owned]
@@ -295,7 +295,9 @@ def _families(paths: Iterable[PurePosixPath], references: Mapping[str, PurePosix
         # Meshes of one object that are alone, in no folder of their own, are a family together.
         is_alone = not name and not parts[shared:] and counts[family] == 1
         family = "" if is_alone else family
-        families.setdefault((name, names.setdefault(family, _free_name(family, names.values()))), []).append(path)
+        if family not in names:
+            names[family] = _free_name(family, names.values())
+        families.setdefault((name, names[family]), []).append(path)
     return families
 
 

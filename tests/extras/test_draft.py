@@ -6,13 +6,14 @@ import gzip
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import product
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 import pytest
 
 import sobolev_batch as sb
+from sobolev_batch.extras import draft
 from sobolev_batch.sources.files import FileMember
 from sobolev_batch.study.study import StudyObject, as_study
 from tests.support.commands import call
@@ -173,6 +174,21 @@ def test_meshes_of_no_method(tmp_path: Path, template: str, method: str) -> None
         one: [path] for one, path in paths.items()
     }
     assert summary == ("2 objects: big cow, cow", f"method {method}: 2 meshes")
+
+
+def test_a_file_is_not_compared_with_the_references_of_all_objects(monkeypatch: pytest.MonkeyPatch) -> None:
+    named = product(range(40), ("original", "a", "b"))
+    sizes = {PurePosixPath(f"cow {number}/{name}.ply"): 80 + len(name) for number, name in named}
+    equal, compared = PurePosixPath.__eq__, list[object]()
+
+    def noted(path: PurePosixPath, other: object) -> bool:
+        compared.append(other)
+        return equal(path, other)
+
+    monkeypatch.setattr(PurePosixPath, "__eq__", noted)
+    references = draft._references(sizes)
+    assert len(draft._families(sizes, references)) == 80
+    assert len(compared) < 3 * len(sizes)
 
 
 def test_links_to_files_count_and_those_to_folders_do_not(tmp_path: Path) -> None:
