@@ -190,8 +190,8 @@ def carry_out(
             return replace(cluster, notify=partial(beat, name), part=name)
 
         recorded = {} if objects is None else objects.recorded()
-        present = place.names() if recorded else frozenset()
         tabulated = frozenset() if objects is None else objects.tabulated()
+        whole = tabulated & place.names() if recorded else frozenset()
         ended: dict[str, Ended] = {}
 
         def runs() -> Iterator[tuple[str, Stages[Ended]]]:
@@ -200,7 +200,7 @@ def carry_out(
                 if _is_left_out(one):
                     continue
                 before = ended_before(one, recorded.get(name))
-                if before is not None and name in present & tabulated:
+                if before is not None and name in whole:
                     ended[name] = before
                 else:
                     yield name, run_object(one, place.below(name) if name else place, partial(equipped, name), at_hand)

@@ -268,14 +268,15 @@ def _rows(league: League | CostLeague, name: Literal["table", "pairs", "front"])
 
 def _object_rows(tables: Mapping[str, pd.DataFrame], order: float, league: League | None) -> Iterator[TableRow]:
     """Yield the objects with their best methods at one order."""
+    places = {} if league is None else {name: place for place, name in enumerate(league.objects)}
     for name, frame in tables.items():
         meshes = frame[frame["order"] == order]
         row = {"order": order, "object": name, **totals_of(meshes)}
-        if league is None or name not in league.objects:
+        if league is None or name not in places:
             reason = league.left_out.get(name, "no distances") if league else "methods cannot be compared"
             yield {**row, "absent": f"left out: {reason}"}
         else:
-            yield {**row, **_best(league, league.objects.index(name))}
+            yield {**row, **_best(league, places[name])}
 
 
 def _best(league: League, number: int) -> TableRow:
