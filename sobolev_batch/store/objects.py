@@ -33,7 +33,6 @@ class Objects:
     """
 
     root: Store
-    title: str
     name: str
     names: tuple[str, ...]
     table: Mapping[str, Any]
@@ -94,9 +93,7 @@ class Objects:
         for name in study[OBJECTS]:
             if unfit := node_problem(name):
                 raise StoreError(f"{location}: the store is not used: an object has the name {quoted(name)}: {unfit}")
-        return cls(
-            root, root.documents[""]["attributes"]["title"], study["name"], tuple(study[OBJECTS]), study["table"]
-        )
+        return cls(root, study["name"], tuple(study[OBJECTS]), study["table"])
 
     def _require_fields_of(self, study: Study) -> None:
         """Refuse other fields, as stores of objects do, before the root has the table of the other study."""
@@ -139,7 +136,7 @@ class Objects:
         }
         attributes = {"title": study.title, "description": DESCRIPTION, "schema_version": SCHEMA_VERSION}
         root.documents[""] = group_document({**attributes, "study": entry})
-        made = cls(root, study.title, study.name, tuple(study.objects), study.table)
+        made = cls(root, study.name, tuple(study.objects), study.table)
         if present is None or present.names != made.names:
             kept = {} if present is None else present.recorded()
             for name in (RECORD, PAGE):

@@ -124,7 +124,6 @@ def reasons_table(name: str, reasons: Mapping[str, str]) -> PageTable | None:
 
 
 def common_content(
-    title: str,
     study: Mapping[str, Any],
     frames: Mapping[str, pd.DataFrame],
     status: Status,
@@ -136,10 +135,10 @@ def common_content(
     The study is the table of its file, the frames are the rows of `table` of each object, failures have reasons by
     label.
     """
-    rows = pd.concat(frames.values(), ignore_index=True)
+    rows, header = pd.concat(frames.values(), ignore_index=True), study["study"]
     return {
-        "title": title,
-        "name": study["study"]["name"],
+        "title": header.get("title") or header["name"],
+        "name": header["name"],
         "orders": [minus(f"{order:g}") for order in rows["order"].drop_duplicates()],
         "objects_in_all": len(frames) if "object" in study else 0,
         "meshes_in_all": rows[rows["order"].isin(rows["order"].head(1))],
@@ -166,11 +165,10 @@ def study_content(tree: xr.DataTree, status: Status) -> dict[str, Any]:
     frame, study = table(tree), settings["table"]
     missing = meshes.sel(mesh=meshes["status"] != "complete")
     failed = dict(zip(missing["mesh"].values.tolist(), missing["reason"].values.tolist(), strict=True))
-    failed = {label: reason or "not computed" for label, reason in failed.items()}
     sentences, rows, omitted = study_verdict(frame, failed)
     orders = frame["order"].drop_duplicates().tolist()
     return {
-        **common_content(tree.attrs["title"], study, {"": frame}, status, failed, root_attribute(tree, "versions")),
+        **common_content(study, {"": frame}, status, failed, root_attribute(tree, "versions")),
         **cost_content({str(study["study"]["name"]): frame}, families),
         "reference": convergence.attrs["reference"],
         "settings": settings,
@@ -228,7 +226,7 @@ def league_content(objects: Objects, status: Status) -> dict[str, Any]:
     unfinished = {name: "it has no tables yet; run the study again" for name in objects.names if name not in tables}
     missing = unfinished | dict(status.failed)
     return {
-        **common_content(objects.title, objects.table, tables, status, missing, versions),
+        **common_content(objects.table, tables, status, missing, versions),
         **cost_content(tables, methods),
         "leagues": leagues,
         "no_league": no_league,
