@@ -11,7 +11,6 @@ import xarray as xr
 from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, result_from, result_of
 from sobolev_batch.errors import DamageError
 from sobolev_batch.norms.estimate import NormEstimate
-from sobolev_batch.norms.fields import Quality
 from sobolev_batch.store.layout import (
     DISTANCES,
     NUMERICS,
@@ -49,7 +48,7 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> Stages[Tabulated 
     if are_tabulated(workspace, digest):
         return None
     plan, complete = workspace.plan, workspace.complete
-    qualities = {row: Quality.from_json(record.quality) for row, record in complete.items()}
+    qualities = {row: record.quality for row, record in complete.items()}
     checksums = {row: record.checksums for row, record in complete.items()}
     reducer = Reducer.for_fields(
         workspace.store, plan.choice, plan.study.orders, qualities, checksums, workspace.reference

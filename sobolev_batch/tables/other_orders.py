@@ -8,7 +8,6 @@ import xarray as xr
 from sobolev_batch.errors import DamageError, InputError
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
 from sobolev_batch.norms.columns import describe
-from sobolev_batch.norms.fields import Quality
 from sobolev_batch.parameters import as_names
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.store.layout import QUALITY
@@ -50,7 +49,7 @@ def stored_reducer(tree: xr.DataTree, order: Orders, *meshes: str) -> tuple[Redu
         if places.get(mesh) not in complete:
             raise _no_field(tree, mesh, labels[:3])
     rows, reference = [places[mesh] for mesh in meshes], places[store.attributes()["study"]["reference"]]
-    qualities = {row: Quality.from_json(record.quality) for row, record in complete.items()}
+    qualities = {row: record.quality for row, record in complete.items()}
     checksums = {row: record.checksums for row, record in complete.items()}
     compared_with = rows[-1] if rows else None
     return Reducer.for_fields(store, store.choice(), orders, qualities, checksums, reference, compared_with), rows
@@ -68,14 +67,14 @@ def _computed(tree: xr.DataTree, orders: tuple[float, ...], meshes: Meshes = Non
     labels, complete_rows, own_keys = (complete[name].values.tolist() for name in ("mesh", "row", "key"))
     row_of_reference = dict(zip(labels, complete_rows, strict=True)).get(reference, -1)
     keys = spectrum_keys(dict(zip(complete_rows, own_keys, strict=True)), row_of_reference)
-    qualities: dict[int, Quality] = {}
+    qualities: dict[int, str] = {}
     for first, part in store.stores:
         rows = [row for row in sorted(keys) if first <= row < first + part.row_count]
         if stale_chunks(part, {row - first: keys[row] for row in rows}):
             problem = "they are not those of the stored fields"
             raise DamageError(f"{part.path}: radial spectra are damaged ({problem}); run the study again", problem)
         texts = np.asarray(part.read(QUALITY, [row - first for row in rows])).tolist() if rows else []
-        qualities |= {row: Quality.from_json(text) for row, text in zip(rows, texts, strict=True)}
+        qualities |= zip(rows, texts, strict=True)
     reducer = Reducer.for_fields(store, store.choice(), orders, qualities, {}, row_of_reference)
     return Results.from_spectra(reducer, table, reference)
 

@@ -99,12 +99,13 @@ class Reducer:
         store: Store,
         choice: LatticeChoice,
         orders: tuple[float, ...],
-        qualities: Mapping[int, Quality],
+        stored: Mapping[int, str],
         checksums: Mapping[int, tuple[int, ...]],
         reference: int,
         compared_with: int | None = None,
     ) -> Self:
-        """Return the reducer of rows with known qualities; distances are to the reference, or another row."""
+        """Return the reducer of rows with stored qualities; distances are to the reference, or another row."""
+        qualities = {row: Quality.from_json(text) for row, text in stored.items()}
         count = sum(part.row_count for _, part in store.stores)
         known = reference if reference in qualities else None
         extents = [quality.extent for quality in qualities.values()]
