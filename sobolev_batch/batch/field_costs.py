@@ -79,16 +79,16 @@ def size_tasks(
     size: ExpectedSize,
     workers: Workers,
     rows: int,
-    beyond: tuple[Block, float] | None = None,
+    beyond: tuple[Block, float],
 ) -> Sizes:
     """Fit a row's tasks into the memory of workers.
 
     Each task holds the mesh. Its transform adds up batches of points, as large as the memory allows. Every task is kept
     within what a worker has for each of its threads, as long as that leaves a transform enough to work in; a task that
     takes more runs beside fewer others.
-    With what lies beyond the lattice come the largest block that is transformed, and the bytes that are held besides.
+    What is done beyond the lattice is given by the largest block that is transformed, and the bytes that are held besides.
     """
-    block, beyond_bytes = beyond or (blocks[0], 0.0)
+    block, beyond_bytes = beyond
     block_bytes = float(block.size * np.dtype(transform.dtype).itemsize)
     mesh_bytes = MESH_BYTES * size.triangles
     # The mesh, the block, and a block that it is added to or compared with.

@@ -137,7 +137,7 @@ def workers_with(*gigabytes: float, threads: int = 1) -> Workers:
 
 
 def sized(blocks: tuple[Block, ...], triangles: int, workers: Workers, rows: int = 1) -> Any:
-    return size_tasks(blocks, TRANSFORM, ExpectedSize(triangles, 0), workers, rows)
+    return size_tasks(blocks, TRANSFORM, ExpectedSize(triangles, 0), workers, rows, (blocks[0], 0.0))
 
 
 def test_a_task_may_use_what_its_thread_has_and_no_less_than_it_can_work_in() -> None:
@@ -183,7 +183,7 @@ def test_what_fits_into_no_worker_is_refused_with_both_numbers(
 ) -> None:
     needed, most = map(re.escape, numbers)
     with pytest.raises(ClusterError, match=rf"takes about {needed} in one task, and no worker has more than {most}"):
-        size_tasks(blocks, TRANSFORM, size, workers_with(*gigabytes), rows=1)
+        size_tasks(blocks, TRANSFORM, size, workers_with(*gigabytes), 1, (blocks[0], 0.0))
 
 
 @pytest.mark.process
