@@ -66,9 +66,8 @@ class Ended:
         labels, complete = workspace.labels, workspace.complete
         record = workspace.tally(imprecise=_imprecise(workspace))
         if record.complete == record.total and not record.not_compared:
-            one, plan = workspace.plan.study.object, workspace.plan
-            key = object_key(one, one.members, {row.label: row.fingerprint for row in plan.rows})
-            record = replace(record, key=key)
+            one, prints = workspace.plan.study.object, {row.label: row.fingerprint for row in workspace.plan.rows}
+            record = replace(record, key=object_key(one, one.members, prints))
         return cls(
             record,
             tuple(labels[i] for i in workspace.rows if i in computed and i in complete),

@@ -123,8 +123,7 @@ def _joined(trees: Sequence[xr.DataTree]) -> xr.DataTree:
         raise InputError("no store is named")
     first, *others = map(_common, trees)
     for tree, common in zip(trees[1:], others, strict=True):
-        differences = [name for name, value in common.items() if value != first[name]]
-        if differences:
+        if differences := [name for name, value in common.items() if value != first[name]]:
             raise StoreError(
                 f"{source_of(tree)}: it cannot be opened as one with {source_of(trees[0])}: "
                 f"they differ in {', '.join(differences)}"

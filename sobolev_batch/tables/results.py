@@ -71,8 +71,7 @@ class Results:
 
     def distances_table(self) -> xr.Dataset:
         """Return `distance` (mesh, other, order) with its error; the only other is the reference."""
-        named = self.to_reference.named("distance")
-        distances = {name: np.expand_dims(values, 2) for name, values in named.items()}
+        distances = {name: values[:, :, None] for name, values in self.to_reference.named("distance").items()}
         table = table_of(distances, self.meshes, self.orders, "mesh", "other")
         return describe(table.assign_coords(other=("other", np.array([self.reference], dtype=object))))
 
@@ -83,8 +82,7 @@ class Results:
         distances, errors = self.to_reference.values, self.to_reference.errors
         families, ordered_by = (self.meshes[name].values for name in ("family", "ordered_by"))
         rates, rate_errors = rates_in_families(families, ordered_by, distances, errors, sizes)
-        norms = NormEstimate(*self.norms.stacked[..., [reference]])
-        relative, relative_errors = self.to_reference.relative_to(norms)
+        relative, relative_errors = self.to_reference.relative_to(NormEstimate(*self.norms.stacked[..., [reference]]))
         columns = {
             **self.to_reference.named("distance"),
             "relative": relative,

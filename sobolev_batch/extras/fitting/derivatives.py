@@ -106,11 +106,12 @@ class SquaredDistance:
         positions = self._positions(vertices)
         difference = self.transform.transform(positions) - self.target
         gradient = 2 * self.transform.derivative(positions, self.factors * difference)
-        return self._square(difference), gradient.reshape(np.shape(vertices))
+        return float(squares_of(difference, [self.factors])[0]), gradient.reshape(np.shape(vertices))
 
     def value(self, vertices: ArrayLike) -> float:
         """Return the squared distance alone, which takes a third of the time; see `__call__`."""
-        return self._square(self.transform.transform(self._positions(vertices)) - self.target)
+        difference = self.transform.transform(self._positions(vertices)) - self.target
+        return float(squares_of(difference, [self.factors])[0])
 
     def _positions(self, vertices: ArrayLike) -> Reals:
         """Return positions of vertices, given as (n, 3) or (3n,)."""
@@ -119,9 +120,6 @@ class SquaredDistance:
             raise InputError(f"positions of vertices must be real numbers, found {positions.dtype}")
         is_flat = positions.shape == (3 * self.transform.count,)
         return (positions.reshape(-1, 3) if is_flat else positions).astype(np.float64, copy=False)
-
-    def _square(self, difference: Complexes) -> float:
-        return float(squares_of(difference, [self.factors])[0])
 
 
 def factors_of(weights: SobolevWeights) -> Reals:

@@ -86,11 +86,7 @@ class Curve:
 
 
 def errors_of_logarithms(values: Reals, errors: Reals) -> Reals:
-    """Return bounds on the errors of logarithms; infinite where a value is not larger than its error, or that is NaN.
-
-    >>> errors_of_logarithms(np.array([2.0, 1.0, 1.0]), np.array([1.0, 3.0, np.nan]))
-    array([0.69314718,        inf,        inf])
-    """
+    """Return bounds on the errors of logarithms; infinite where a value is no larger than its error, or that is NaN."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(-np.log1p(-np.fmin(errors / values, 1.0)))
 
