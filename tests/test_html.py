@@ -30,7 +30,9 @@ def shown(value: Any) -> tuple[list[str], str]:
 
 def summary() -> sb.result_types.Summary:
     failed = {f"{HOSTILE}/{number}": HOSTILE for number in range(30)}
-    return sb.result_types.Summary(HOSTILE, ("a/1", "a/2"), ("a/3",), failed, {HOSTILE: HOSTILE}, {HOSTILE: 0.25})
+    return sb.result_types.Summary(
+        HOSTILE, ("a/1", "a/2"), ("a/3",), failed, {HOSTILE: HOSTILE}, {HOSTILE: 0.25}, len(failed)
+    )
 
 
 @pytest.mark.parametrize(
@@ -43,7 +45,7 @@ def summary() -> sb.result_types.Summary:
             ["damaged", "3 of 4", f"{HOSTILE}: gone", "run the study again to repair it"],
         ),
         (
-            sb.result_types.Status(HOSTILE, 3, 5, {HOSTILE: HOSTILE}, {}, None, False, 0.0),
+            sb.result_types.Status(HOSTILE, 3, 5, {HOSTILE: HOSTILE}, {}, None, False, 0.0, failures=1),
             ["3 of 5 complete, 1 failed, 1 to go"],
         ),
         (sb.testing.Verdict("same", 9e-5, 1.1e-4, 1e-3, -2.0, 0.0, "lattice"), ["relative distance 0.010 % ± 0.001 %"]),

@@ -40,10 +40,11 @@ class Summary(Shown):
         store: Path or URL of the store.
         computed: Labels of the meshes whose fields were computed now.
         reused: Labels of the meshes whose fields were already stored.
-        failed: Reason for each mesh whose field could not be computed, by its label.
+        failed: Reason for each mesh whose field could not be computed, by its label, or that of an object by its name.
         not_compared: Reason for each mesh whose field is stored, but not the Hausdorff and Chamfer distances that the
             study requests.
         imprecise: Largest relative error of the distances of each mesh that are less accurate than the study requires.
+        failures: Number of meshes whose fields could not be computed, those of whole objects too.
 
     >>> import sobolev_batch as sb
     >>> from sobolev_batch.result_types import Summary
@@ -58,9 +59,10 @@ class Summary(Shown):
     failed: Mapping[str, str]
     not_compared: Mapping[str, str] = field(default_factory=dict)
     imprecise: Mapping[str, float] = field(default_factory=dict)
+    failures: int = 0
 
     def __str__(self) -> str:
-        counts = f"{len(self.computed)} computed, {len(self.reused)} reused, {len(self.failed)} failed"
+        counts = f"{len(self.computed)} computed, {len(self.reused)} reused, {self.failures} failed"
         errors = {label: f"error of {100 * error:.2g} %" for label, error in self.imprecise.items()}
         kinds = {"failed": self.failed, "not compared": self.not_compared, "imprecise": errors}
         lines = [f"{name}: {text}" for name, by_label in kinds.items() for name, text in reasons(name, by_label)]
@@ -212,7 +214,10 @@ def carry_out(
         for name, outcome in side_by_side(runs(), is_fatal):
             if isinstance(outcome, Exception):
                 _log.error("%s: %s", name, outcome)
-                outcome = Ended(ObjectRecord(reason=str(outcome), finished=utc_now()))
+                total = 1
+                with suppress(InputError):
+                    total = len(study.objects[name].members)
+                outcome = Ended(ObjectRecord(reason=str(outcome), total=total, finished=utc_now()))
             ended[name] = outcome
             if objects is not None:
                 objects.records.write(objects.rows[name], outcome.record)
@@ -266,4 +271,5 @@ def _summary(location: Location, ended: Mapping[str, Ended]) -> Summary:
         | labelled({name: record.failed for name, record in records.items()}),
         labelled({name: record.not_compared for name, record in records.items()}),
         labelled({name: record.imprecise for name, record in records.items()}),
+        sum(record.failures for record in records.values()),
     )

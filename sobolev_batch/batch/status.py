@@ -33,7 +33,7 @@ class Status(Shown):
         store: Path or URL of the store.
         complete: Number of surfaces that are computed.
         total: Number of surfaces of the study.
-        failed: Reason for each surface that could not be computed, by label.
+        failed: Reason for each surface that could not be computed, by label, or that of an object by its name.
         not_compared: Reason for each surface that is computed but lacks the Hausdorff and Chamfer distances that the
             study requests.
         run: Record of the latest run, or None.
@@ -43,6 +43,7 @@ class Status(Shown):
         lost_records: Labels of surfaces that the tables list, and whose completion records are gone, or others. A run
             that goes on computes them again.
         not_begun: Names of the objects that no run has come to; how many surfaces they have is not known.
+        failures: Number of surfaces that could not be computed, those of whole objects too.
 
     >>> import sobolev_batch as sb
     >>> status = sb.status("storage/icosphere.zarr")
@@ -61,6 +62,7 @@ class Status(Shown):
     rate: float = math.nan
     lost_records: tuple[str, ...] = ()
     not_begun: tuple[str, ...] = ()
+    failures: int = 0
 
     @classmethod
     def from_store(cls, store: AnyStore) -> Status:
@@ -92,12 +94,13 @@ class Status(Shown):
             math.nan if run is None else _rate(moments, run),
             tuple(labelled({name: dict.fromkeys(one.lost_records) for name, one in tallies.items()})),
             () if objects is None else tuple(name for name in objects.names if name not in tallies),
+            sum(one.failures for one in tallies.values()),
         )
 
     @property
     def waiting(self) -> int:
         """Number of surfaces that are neither computed nor failed."""
-        return self.total - self.complete - len(self.failed)
+        return self.total - self.complete - self.failures
 
     @property
     def seconds_left(self) -> float:
@@ -107,7 +110,7 @@ class Status(Shown):
     @property
     def progress(self) -> str:
         """Progress in one line, as ``sobolev-batch status --follow`` shows it."""
-        parts = [f"{self.total - self.waiting} of {self.total} done", f"{len(self.failed)} failed"]
+        parts = [f"{self.total - self.waiting} of {self.total} done", f"{self.failures} failed"]
         if self.not_begun:
             parts.append(f"objects not begun: {len(self.not_begun):,}")
         if self.run is not None and self.run.state == "submitted":
@@ -143,7 +146,7 @@ class Status(Shown):
     def lines(self) -> Iterator[str]:
         """Yield the lines that ``sobolev-batch status`` prints."""
         objects = f"; objects not begun: {len(self.not_begun):,}" if self.not_begun else ""
-        counts = f"{self.complete} of {self.total} complete, {len(self.failed)} failed, {self.waiting} to go"
+        counts = f"{self.complete} of {self.total} complete, {self.failures} failed, {self.waiting} to go"
         yield f"{self.store}: {counts}{objects}"
         lost = dict.fromkeys(self.lost_records, "its completion record is gone or another one; run the study again")
         for label, reason in (*self.failed.items(), *self.not_compared.items(), *lost.items()):

@@ -183,7 +183,7 @@ class ObjectRecord(_Line):
     Attributes:
         key: Digest of all that its tables depend on, where nothing of it is missing; else empty.
         reason: Why it could not be carried out; empty otherwise.
-        complete, total: Number of its surfaces that are computed, and of all.
+        complete, total: Number of its surfaces that are computed, and of all, or 1 where they cannot be listed.
         failed: Reason for each surface that could not be computed, by label.
         not_compared: Reason for each surface without the Hausdorff and Chamfer distances that the study requests.
         imprecise: Largest relative error of the distances of each mesh that miss the accuracy requested.
@@ -204,6 +204,11 @@ class ObjectRecord(_Line):
     lost_records: tuple[str, ...] = ()
     reduced: bool = False
     finished: Time | Literal[""] = ""
+
+    @property
+    def failures(self) -> int:
+        """Number of surfaces that could not be computed: all of an object that could not be carried out."""
+        return self.total if self.reason else len(self.failed)
 
     def completes(self, key: str) -> bool:
         """Return whether nothing is missing of the object with this key."""

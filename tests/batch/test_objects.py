@@ -50,6 +50,7 @@ def store(threads: Client, tmp_path_factory: pytest.TempPathFactory) -> Path:
     summary = sb.run(study_of([*balls(a=1.0), GONE, *balls(b=1.1)]), path, threads)
     assert set(summary.computed) == {f"{name}/{label}" for name in "ab" for label in LABELS}
     assert list(summary.failed) == ["gone"]
+    assert "10 computed, 0 reused, 5 failed" in str(summary)
     assert "the reference cannot be made: nowhere.ply" in summary.failed["gone"].replace(str(Path.cwd()) + "/", "")
     return path
 
@@ -412,6 +413,7 @@ def test_objects_that_no_run_has_come_to_are_not_begun(tmp_path: Path, threads: 
 def test_an_object_that_cannot_be_carried_out_hides_no_tables(store: Path, tmp_path: Path, threads: Client) -> None:
     found = sb.status(store)
     assert (found.reduced, list(found.failed)) == (True, ["gone"])
+    assert "10 of 15 complete, 5 failed, 0 to go" in str(found)
     assert "no tables" not in str(found)
     sb.run(study_of([GONE]), tmp_path / "gone.zarr", threads)
     assert "no tables yet" in str(sb.status(tmp_path / "gone.zarr"))
