@@ -15,6 +15,7 @@ from sobolev_batch.reduction.limit import Limit, tried
 from sobolev_batch.reduction.recorded import RecordedSearch
 from sobolev_batch.reduction.remesher import Remesher, searched_parameter
 from sobolev_batch.sources.files import number_as_text
+from sobolev_batch.sources.names import quoted
 from sobolev_batch.sources.programs import Cost
 from sobolev_batch.sources.registry import (
     ExpectedSize,
@@ -78,6 +79,8 @@ class SearchedSource(KeepingSource):
         texts = [number_as_text(one) if isinstance(one, float) else one.strip() for one in self.within]
         orders = [self.default_order if text.endswith("%") and self.order is None else self.order for text in texts]
         limits = [Limit.parse(text, order, self.unit) for text, order in zip(texts, orders, strict=True)]
+        if same := [text for text, limit in zip(texts, limits, strict=True) if limits.count(limit) > 1]:
+            raise InputError(f"the tolerances {quoted(same[0])} and {quoted(same[1])} are equal; remove one")
         return {text.replace(" ", ""): limit for text, limit in zip(texts, limits, strict=True)}
 
     def members(self, folder: Path) -> tuple[Member, ...]:

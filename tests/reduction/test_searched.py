@@ -188,6 +188,7 @@ def test_a_command_is_searched_where_it_may_run(folder: Path) -> None:
         ({"within": "1 furlong"}, "furlong"),
         ({"within": -1.0}, "a length is a positive number"),
         ({"within": "110 %"}, "below 1"),
+        ({"within": ["1 %", "2 mm", "1%"]}, "'1 %' and '1%' are equal; remove one"),
         (
             {"within": "1 mm", "order": -2.0},
             "a fraction of the norm below 1, such as 1%, found '1 mm'; a length has no order",
