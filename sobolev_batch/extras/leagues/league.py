@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -12,6 +11,7 @@ from typing import Literal, overload
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError, StoreError
@@ -104,7 +104,8 @@ class League:
         y: What they are compared by, such as "relative" or "hausdorff".
         objects: Names of the objects that have two methods at least.
         methods: Names of the methods.
-        left_out: Why other objects, and single methods of an object (object/method), are not there, by name.
+        left_out: Why other objects, whole methods (method NAME), and single methods of an object (object/method), are
+            not there, by name.
         curves: The meshes of each method, for each object: logarithms of sizes and numbers, and errors of these.
         known: Which methods (objects, methods) each object has.
         sizes: Logarithms of the sizes (objects, sizes) at which the methods are compared.
@@ -263,8 +264,8 @@ def league(
         `CostLeague.means` and `CostLeague.meshes`.
 
     Raises:
-        InputError: There are no tables yet, an order, size or method is unknown, no objects connect all methods, or no
-            mesh has the cost.
+        InputError: There are no tables yet, an order, size or method is unknown, no objects connect methods, or no mesh
+            has the cost.
         StoreError: The location has no store.
 
     >>> import sobolev_batch as sb
@@ -364,11 +365,19 @@ def _league(
     if rows:
         sizes, values, errors, slopes_of = (np.array(parts) for parts in zip(*rows.values(), strict=True))
         is_known = np.isfinite(values).all(axis=2)
-        with suppress(np.linalg.LinAlgError):
+        parts = connected_components(is_known.T.astype(int) @ is_known)[1]
+        counts = np.bincount(parts)
+        if len(counts) == 1:
             values = np.stack([filled(at_size) for at_size in values.transpose(2, 0, 1)], axis=2)
             errors = np.where(np.isnan(errors), np.nanmean(errors, axis=0), errors)
             at_sizes = sizes, values, errors, slopes_of
             return League(order, x, y, tuple(rows), tuple(methods), left_out, of_objects, is_known, *at_sizes)
+        if np.sum(counts == counts.max()) == 1:
+            # Most methods are connected by objects that have two of them at common sizes; a league can have these.
+            connected = [method for method, part in zip(methods, parts, strict=True) if part == counts.argmax()]
+            reason = "no object has it at sizes in common with the others"
+            others = {f"method {method}": reason for method in methods if method not in connected}
+            return _league(tables, order, x, y, connected, {**unfinished, **others})
     reasons = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:3])
     raise InputError(
         f"no objects can serve to compare the methods {', '.join(methods)} ({reasons}); compare fewer methods, "

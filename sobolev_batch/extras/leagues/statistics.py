@@ -109,7 +109,7 @@ def numbers_of(frame: pd.DataFrame, y: str) -> tuple[Reals, Reals]:
 def filled(values: Reals) -> Reals:
     """Return values (objects, methods) with those that are NaN by the sum of an effect of the object and the method.
 
-    Effects are those of least squares. LinAlgError where some methods have no object in common with the others.
+    Effects are those of least squares. Objects must connect all methods.
 
     >>> filled(np.array([[1.0, 2.0, 4.0], [11.0, np.nan, 14.0]]))
     array([[ 1.,  2.,  4.],
@@ -119,8 +119,6 @@ def filled(values: Reals) -> Reals:
     shares = known / known.sum(axis=1, keepdims=True)
     # The equations of least squares, from which the effects of objects are eliminated: methods are few.
     matrix = np.diag(known.sum(axis=0)) - known.T @ shares
-    if np.linalg.matrix_rank(matrix) < len(matrix) - 1:
-        raise np.linalg.LinAlgError
     own = np.where(known, values, 0.0)
     means = (shares * own).sum(axis=1, keepdims=True)
     of_methods = np.linalg.lstsq(matrix, (own - known * means).sum(axis=0))[0]

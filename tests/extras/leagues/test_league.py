@@ -214,6 +214,17 @@ def test_the_picture_has_order_and_interval_of_the_table_and_every_mesh() -> Non
     assert axes.get_legend_handles_labels()[1] == made.table["method"].tolist()
 
 
+def test_methods_that_no_object_connects_with_most_are_left_out_and_named() -> None:
+    tables = {name: of_powers({"a": 1, "b": 2, "far": 3}, 1.0) for name in "xy"}
+    for frame in tables.values():
+        frame.loc[frame["family"] == "far", "triangles"] *= 1000
+    tables["z"] = of_powers({"c": 1, "far": 2}, 1.0)
+    made = ranked({**tables, "w": of_powers({"a": 1, "d": 2}, 1.0)})
+    assert (made.methods, made.objects) == (("a", "b", "d"), ("x", "y", "w"))
+    assert [*made.left_out][:2] == ["method far", "method c"]
+    assert "method far is left out: no object has it at sizes in common with the others." in format_league([made])
+
+
 def test_methods_may_be_chosen_and_must_be_known() -> None:
     one = of_powers({"a": 1}, 1.0)
     assert ranked({"x": POWERS, "y": one}, methods="a").objects == ("x", "y")
