@@ -28,13 +28,14 @@ class SearchRecord:
     """Record of a search: a JSON file that is replaced as a whole after each trial.
 
     Triangles and the radius of the bounding sphere are those of the original. The digests are those of the search,
-    since another one has other trials, and of the file of the best mesh.
+    since another one has other trials, of the file of the best mesh, and of the file that this one replaces.
     """
 
     digest: str
     triangles: int
     radius: float
     mesh_digest: str = ""
+    replaced_digest: str = ""
     trials: tuple[Trial, ...] = ()
 
 
@@ -110,25 +111,24 @@ class RecordedSearch:
         written: dict[str, bytes] = {}
         if mesh is not None and self.bracket(record).best == trial:
             key = self._key_of_mesh(record)
-            written[key] = WRITERS[PurePath(key).suffix](mesh)
-            record = replace(record, mesh_digest=_digest(written[key]))
+            replaced, written[key] = self._read_mesh(record), WRITERS[PurePath(key).suffix](mesh)
+            record = replace(record, mesh_digest=_digest(written[key]), replaced_digest=_digest(replaced))
         # The record first: no mesh lies there that none tells of, and one that is missing is made again.
         self.folder.write({f"{self.name or record.digest}.json": _RECORDS.dump_json(record, exclude_defaults=True)})
         self.folder.write(written)
         return record
 
     def make_room(self) -> None:
-        """Remove the mesh of an earlier search; MeshError where a file lies in its place and no search has a record."""
+        """Remove the mesh of an earlier search; MeshError where another file lies in its place."""
         self.forget()
-        if self.folder.read(self.mesh_key) is not None and self.folder.read(f"{self.name}.json") is None:
-            raise MeshError(f"no search wrote {self.mesh_key} in the output; move it, or name another folder")
+        self._read_mesh(SearchRecord("", 0, 0.0))
 
     def forget(self) -> None:
         """Remove the mesh that an earlier search has left under this name, unless another file has replaced it."""
         record = self._stored()
         # What was searched before may have had another format.
         for key in (f"{self.name}{suffix}" for suffix in WRITERS):
-            if record is not None and _digest(self.folder.read(key) or b"") == record.mesh_digest:
+            if record is not None and _is_of(record, self.folder.read(key)):
                 self.folder.discard(key)
 
     def reason(self, record: SearchRecord) -> str:
@@ -161,7 +161,17 @@ class RecordedSearch:
         return self.mesh_key or f"{record.digest}.ply"
 
     def _read_mesh(self, record: SearchRecord) -> bytes:
-        return self.folder.read(self._key_of_mesh(record)) or b""
+        """Return the file of the best mesh, or nothing; MeshError where a file of somebody else lies in an output."""
+        data = self.folder.read(self._key_of_mesh(record))
+        if self.mesh_key and data is not None and not _is_of(record, data):
+            problem = f"no record says that a search wrote {self.mesh_key} in the output"
+            raise MeshError(f"{problem}; move it, or name another folder")
+        return data or b""
+
+
+def _is_of(record: SearchRecord, data: bytes | None) -> bool:
+    """Tell whether a file is the mesh of a search, or the one that the search was about to replace."""
+    return data is not None and _digest(data) in (record.mesh_digest, record.replaced_digest)
 
 
 def _digest(data: bytes) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ import sobolev_batch as sb
 from sobolev_batch.batch import reduce as module
 from sobolev_batch.batch.reduce import Reduction, format_reductions
 from sobolev_batch.reduction import limit as limits
+from sobolev_batch.store.location import Location
 from tests.geometry.test_deviation import distance_from_triangles, grid
 from tests.support.commands import call, started
 
@@ -209,6 +210,8 @@ def test_what_changed_since_is_tried_again(scan: Path, tmp_path: Path, tried: li
     record = output / "part.json"
     for damage in (b"", b"{", record.read_bytes().replace(b'"size"', b'"sise"')):
         record.write_bytes(damage)
+        assert "no record says that a search wrote part.ply" in found_by(mesh, within=0.1, output=output).reason
+        (output / "part.ply").unlink()
         tried.clear()
         assert found_by(mesh, within=0.1, output=output).bracket.best is not None
         assert len(tried) > 1
@@ -370,10 +373,38 @@ def test_no_file_is_replaced_that_no_search_wrote(scan: Path, tmp_path: Path) ->
     other = tmp_path / scan.name
     other.write_bytes(b"of somebody else")
     found = found_by(scan, within=0.1, output=tmp_path)
-    assert "no search wrote scan.ply" in found.reason
+    assert "no record says that a search wrote scan.ply" in found.reason
     assert not found.trials
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"of somebody else"]
     other.unlink()
+    assert found_by(scan, within=0.1, output=tmp_path).path
+    # Neither where a record tells of another file of this name, nor while the search goes on.
+    other.write_bytes(b"of somebody else")
+    assert "no record says that a search wrote scan.ply" in found_by(scan, within=0.1, output=tmp_path).reason
+
+    def slow(mesh: sb.Mesh, edge: float) -> sb.Mesh:
+        other.write_bytes(b"of somebody else")
+        return disc(mesh, edge)
+
+    other.unlink()
+    found = found_by(scan, within=1e9, method=slow, search={"edge": (0.02, 1.5)}, output=tmp_path)
+    assert "no record says that a search wrote scan.ply" in found.reason
+    assert other.read_bytes() == b"of somebody else"
+
+
+def test_a_search_that_ended_before_it_replaced_its_mesh_goes_on(
+    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = Location.write
+
+    def ended(location: Location, values: Mapping[str, bytes]) -> None:
+        if scan.name in values and (tmp_path / scan.name).exists():
+            raise KeyboardInterrupt
+        write(location, values)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Location, "write", ended)
+        found_by(scan, within=0.1, output=tmp_path)
     assert found_by(scan, within=0.1, output=tmp_path).path
 
 
