@@ -402,9 +402,10 @@ def test_a_search_that_ended_before_it_replaced_its_mesh_goes_on(
             raise KeyboardInterrupt
         write(location, values)
 
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(Location, "write", ended)
+    monkeypatch.setattr(Location, "write", ended)
+    with pytest.raises(KeyboardInterrupt):
         found_by(scan, within=0.1, output=tmp_path)
+    monkeypatch.undo()
     assert found_by(scan, within=0.1, output=tmp_path).path
 
 
