@@ -6,10 +6,10 @@ import re
 import shlex
 import tomllib
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import chain, takewhile
+from itertools import chain, product, takewhile
 from pathlib import Path, PurePosixPath
 from string import Template
 
@@ -33,8 +33,9 @@ _MOST_BYTES = 32 << 20
 _REFERENCE = re.compile(r"(?<![^\W\d_])(original|reference|ref|target|ground[\W_]*truth|gt)(?![^\W\d_])", re.IGNORECASE)
 # These count only in the names of folders that hold the files themselves: objects/cow/ is the folder of one object.
 _REFERENCES = re.compile(r"(originals|references|targets|objects)", re.IGNORECASE)
-# The size of a mesh at the end of its name: cow_500, cow-1k7, cow 20.5.
-_SIZE = re.compile(r"\d+(?:[.,]\d+)?(?:[kKmM]\d*)?$")
+# The size of a mesh at an end of its name: cow_500, cow-1k7, cow 20.5, 500_cow.
+_NUMBER = r"\d+(?:[.,]\d+)?(?:[kKmM]\d*)?"
+_SIZE = re.compile(rf"^{_NUMBER}(?![^\W_])|{_NUMBER}$")
 # A word at the end of a name, of which so many may be that of references.
 _ENDING, _MOST_ENDINGS = re.compile(r"[ _.-][^\W\d_]+$"), 9
 _LONGEST_NAME = 100
@@ -133,7 +134,7 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
         raise StudyError(f"{folder}: its path cannot be in a study file: {problem}; rename it")
     sizes, extents, left_out = _look_at(folder)
     references = _references(sizes) or {"": _reference(folder, sizes, left_out)}
-    families = _families(sizes, references)
+    families = _families(_without_strangers(sizes, references.get("")), references)
     used = {*references.values(), *chain.from_iterable(families.values())}
     doubts = {
         str(path): placement_doubt(extents[path], extents[references[name]])
@@ -141,7 +142,12 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
         for path in paths
         if {path, references[name]} <= extents.keys()
     }
-    left_out |= {str(path): "no other mesh belongs to it by name, nor it to one" for path in sizes if path not in used}
+    lacks = (
+        "its name lacks that of the reference"
+        if "" in references
+        else "no other mesh belongs to it by name, nor it to one"
+    )
+    left_out |= {str(path): lacks for path in sizes if path not in used}
     if "" in references:
         sections, summary = _one_object(references[""], families, sizes, below)
     else:
@@ -238,7 +244,7 @@ def _references(sizes: Mapping[PurePosixPath, int]) -> dict[str, PurePosixPath]:
     """
     called = [path for path in sizes if _is_called_reference(path)]
     references = {_object_of(path): path for path in called} or _finest_of_names(sizes)
-    owners = {_owner(path, references) for path in sizes.keys() - {*references.values()}}
+    owners = {name for name, *_ in _owned(sizes, references)}
     are_different = 2 <= len({*map(caseless_key, references)}) == len(called or references)
     is_refused = any(name_problem(name, _LONGEST_NAME, RESERVED) or name.startswith((".", "__")) for name in references)
     return references if are_different and not is_refused and references.keys() <= owners else {}
@@ -257,12 +263,14 @@ def _continued(sizes: Mapping[PurePosixPath, int], ending: str) -> dict[str, Pur
     There are none if the others of most lack, as outputs that failed, or that of the finest file.
     """
     stems = {path: mesh_stem(path) for path in sorted(sizes, key=lambda path: sizes[path])}
-    finest = {stem.removesuffix(ending): path for path, stem in stems.items() if stem.endswith(ending)}
+    finest = {caseless_key(stem.removesuffix(ending)): path for path, stem in stems.items() if stem.endswith(ending)}
     owners = {}
     for path, size in sizes.items():
         stem = stems[path]
-        beginnings = (stem[:end] for end in range(len(stem) - 1, 0, -1) if not stem[end].isalnum())
-        owners[path] = owner = next((finest[name] for name in beginnings if name in finest), finest.get(stem, path))
+        known = ((name, finest.get(caseless_key(name))) for name, _ in _names_in(path) if name != stem)
+        # A name that does not begin with that of a finer mesh may be of another object.
+        found = (one for name, one in known if one and (stem.startswith(name) or sizes[one] > size))
+        owners[path] = owner = next(found, finest.get(caseless_key(stem), path))
         # Files of one name may be of two methods, unless one is much finer.
         if path != owner and size * (1 + (bool(ending) or stems[owner] == stem)) > sizes[owner]:
             return {}
@@ -274,24 +282,36 @@ def _continued(sizes: Mapping[PurePosixPath, int], ending: str) -> dict[str, Pur
     return {name: path for name, path in own.items() if path in followed} if is_finest else {}
 
 
+def _without_strangers(paths: Iterable[PurePosixPath], reference: PurePosixPath | None) -> Iterable[PurePosixPath]:
+    """Return files without those beside the only reference that lack its name, where others have it."""
+    if reference is None:
+        return paths
+    name = caseless_key(_SIZE.sub("", _object_of(reference)).strip(_BETWEEN))
+    beside = [path for path in paths if path.parent == reference.parent and path != reference]
+    strange = {path for path in beside if name not in (caseless_key(one) for one, _ in _names_in(path))}
+    return [path for path in paths if path not in strange or len(strange) == len(beside)]
+
+
 def _families(paths: Iterable[PurePosixPath], references: Mapping[str, PurePosixPath]) -> _Families:
     """Return the files of each object and family, which is that of their folder or of their name."""
-    known = {*references.values()}
-    owned = [(path, name) for path in paths if path not in known and (name := _owner(path, references)) is not None]
-    # Objects have folders of their own, which say nothing of families.
-    own = {name: {name, *(reference.parent.parts if name else ())} for name, reference in references.items()}
-    folders = [[part for part in path.parent.parts if part not in own[name]] for path, name in owned]
+    owned = _owned(paths, references)
+    # Objects and sizes have folders of their own, which say nothing of families.
+    own = {
+        name: {*map(caseless_key, (name, *(reference.parent.parts if name else ())))}
+        for name, reference in references.items()
+    }
+    folders = [
+        [part for part in path.parent.parts if not _SIZE.fullmatch(part) and caseless_key(part) not in own[name]]
+        for name, path, _ in owned
+    ]
     shared = sum(1 for _ in takewhile(lambda parts: len(set(parts)) == 1, zip(*folders, strict=False)))
     wanted = []
-    for (path, name), parts in zip(owned, folders, strict=True):
-        # What the name of the file says beside object and size; cowboy in the folder of cow is a family.
-        rest = mesh_stem(path).removeprefix(name)
-        rest = _SIZE.sub("", mesh_stem(path) if rest[:1].isalnum() else rest).strip(_BETWEEN)
+    for (_, _, rest), parts in zip(owned, folders, strict=True):
         # With slashes, or the families of a/b and "a b" would be one.
-        wanted.append("/".join(parts[shared:]) or rest or "".join(parts[-1:]))
+        wanted.append("/".join(parts[shared:]) or _SIZE.sub("", rest).strip(_BETWEEN) or "".join(parts[-1:]))
     families: dict[tuple[str, str], list[PurePosixPath]] = {}
     counts, names = Counter(wanted), dict[str, str]()
-    for (path, name), parts, family in zip(owned, folders, wanted, strict=True):
+    for (name, path, _), parts, family in zip(owned, folders, wanted, strict=True):
         # Meshes of one object that are alone, in no folder of their own, are a family together.
         is_alone = not name and not parts[shared:] and counts[family] == 1
         family = "" if is_alone else family
@@ -308,12 +328,35 @@ def _object_of(reference: PurePosixPath) -> str:
     return rest or "".join(own[-1:])
 
 
-def _owner(path: PurePosixPath, references: Mapping[str, PurePosixPath]) -> str | None:
-    """Return the object that a file belongs to: the longest that its name begins with, or that of its folder."""
+def _owned(
+    paths: Iterable[PurePosixPath], references: Mapping[str, PurePosixPath]
+) -> list[tuple[str, PurePosixPath, str]]:
+    """Return the object of each file that has one, the file, and what its name says beside that of the object."""
+    known, others = {caseless_key(name): name for name in references}, dict.fromkeys(paths)
+    for reference in references.values():
+        del others[reference]
+    named = (((known.get(caseless_key(name)), path, rest) for name, rest in _names_in(path)) for path in others)
+    firsts = (next(((name, path, rest) for name, path, rest in one if name is not None), None) for one in named)
+    return [*filter(None, firsts)]
+
+
+def _names_in(path: PurePosixPath) -> Iterator[tuple[str, str]]:
+    """Yield names of objects that a file may belong to, and what its stem says beside them.
+
+    cow_big_500 is of cow_big, not of cow: beginnings of the stem come first, the longest before all, then folders,
+    then other words of the stem, as cow of quick_cow_500.
+    """
     stem = mesh_stem(path)
-    # cow_big_500 is of cow_big, not of cow.
-    beginnings = (stem[:end] for end in range(len(stem), 0, -1) if not stem[end : end + 1].isalnum())
-    return next((name for name in (*beginnings, *path.parent.parts, "") if name in references), None)
+    starts = [i for i in range(1, len(stem)) if stem[i].isalnum() and not stem[i - 1].isalnum()]
+    ends = [i for i in range(len(stem), 0, -1) if not stem[i : i + 1].isalnum()]
+    for end in ends:
+        yield stem[:end], stem[end:]
+    for part in path.parent.parts:
+        yield part, stem
+    for start, end in sorted(product(starts, ends), key=lambda one: one[0] - one[1]):
+        if start < end:
+            yield stem[start:end], stem[:start] + stem[end:]
+    yield "", stem
 
 
 def _one_object(

@@ -59,6 +59,10 @@ SEVERAL_OBJECTS: dict[str, tuple[list[str], str]] = {
         "objects/{object}/{method}_{size}.ply",
     ),
     "names in any folder": (["in/big cow.ply", "in/cow.ply"], "out/{object}_{method}_{size}.ply"),
+    "methods first": (["Big Cow.ply", "COW.ply"], "{method}/{method}_{object}_{size}.ply"),
+    "sizes first": (["in/Big cow.ply", "in/cow.ply"], "{size}_{object}_{method}.ply"),
+    "folders of sizes": (["in/big cow.ply", "in/cow.ply"], "out/{method}/{object}/{size}.ply"),
+    "beside others": (["big cow/big cow.ply", "cow/Cow.ply"], "{object}/{method}_{size}.ply"),
     "hostile": (["[o]/originals/big cow.ply", "[o]/originals/cow.ply"], "[o]/*{method}?/{object}_{size}.ply"),
 }
 
@@ -92,9 +96,9 @@ def files_of(one: StudyObject) -> dict[str, dict[str, str]]:
 
 
 def drafted(folder: Path, *paths: str) -> tuple[Sequence[str], Mapping[str, StudyObject]]:
-    """Return the summary and the objects of a draft for several objects."""
-    for path in paths:
-        write(folder / "meshes" / path, 1)
+    """Return the summary and the objects of a draft for several objects, whose references come last."""
+    for number, path in enumerate(paths):
+        write(folder / "meshes" / path, 1 + (number >= len(paths) - 2))
     draft = sb.init_study(folder / "meshes", folder / "study.toml")
     return draft.summary, as_study(draft.path).objects
 
@@ -123,10 +127,19 @@ def test_several_objects(tmp_path: Path, layout: str) -> None:
         template.format(object=one, method=method, size=size): (one, method)
         for one, method, size in product(("cow", "big cow"), ("even", "quick"), (80, 320))
     }
-    summary, studies = drafted(tmp_path, *references, *own)
+    summary, studies = drafted(tmp_path, *own, *references)
     families = {(one, family): paths for one in studies for family, paths in files_of(studies[one]).items()}
-    found = {path: (one, family.strip("*?")) for (one, family), paths in families.items() for path in paths.values()}
-    assert (found, summary[0]) == (own, "2 objects: big cow, cow")
+    found = {
+        path: (one.lower(), family.strip("*?")) for (one, family), paths in families.items() for path in paths.values()
+    }
+    assert (found, summary[0].lower()) == (own, "2 objects: big cow, cow")
+
+
+def test_meshes_beside_the_reference_that_lack_its_name_are_left_out_where_others_have_it(tmp_path: Path) -> None:
+    for path, level in (("cow_5k.ply", 3), ("cow_80.ply", 1), ("dog_80.ply", 1), ("out/80.ply", 1)):
+        write(tmp_path / path, level)
+    draft = sb.init_study(tmp_path, tmp_path / "study.toml")
+    assert draft.left_out == {"dog_80.ply": "its name lacks that of the reference"}
 
 
 @pytest.mark.parametrize(("level", "is_paired"), [(2, False), (3, True)])
