@@ -192,7 +192,7 @@ def carry_out(
             return replace(cluster, notify=partial(beat, name), part=name)
 
         recorded = {} if objects is None else objects.recorded()
-        tabulated = frozenset() if objects is None else objects.tabulated()
+        tabulated = frozenset() if objects is None else objects.tabulated
         whole = tabulated & place.names() if recorded else frozenset()
         ended: dict[str, Ended] = {}
 
@@ -256,7 +256,7 @@ def _tabulate(objects: Objects, ended: Mapping[str, Ended], present: Set[str]) -
     # Objects that the run left out keep theirs; those that it found to be impossible lose them.
     refused = {name for name, one in ended.items() if one.record.reason}
     kept = present - changed.keys() - refused
-    if changed or kept != objects.tabulated():
+    if changed or kept != objects.tabulated:
         write_all(objects.root, objects.names, changed.values(), kept)
 
 

@@ -188,9 +188,11 @@ def _tallies(objects: Objects) -> Iterator[tuple[str, ObjectRecord]]:
     recorded, present = objects.recorded(), objects.location.names()
     for name in objects.names:
         record = recorded.get(name)
-        if record is None:
+        if record is None and name not in present:
+            continue
+        if record is None or (record.reduced and name not in present):
             try:
-                if name not in present or (place := objects.existing_store(name)) is None:
+                if (place := objects.existing_store(name)) is None:
                     continue
                 record = Contents.of_store(Store.open(place)).tally()
             except DamageError as error:

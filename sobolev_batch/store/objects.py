@@ -56,15 +56,19 @@ class Objects:
         """Return the records of the objects that have one, by name."""
         return {name: one for name, one in zip(self.names, self.records.read(), strict=True) if one is not None}
 
+    @cached_property
     def tabulated(self) -> frozenset[str]:
         """Return the names of the objects that have rows in the tables at the root."""
         rows = self.root.read_strings("meshes/object") if "meshes" in self.root.documents else ()
         return frozenset(rows)
 
     def existing_store(self, name: str) -> Location | None:
-        """Return the store of an object, None before its reference was made; DamageError where it is another's."""
+        """Return the store of an object, None before its reference was made; DamageError if it is lost or another."""
         store = Store(self.location.below(name))
         if not store.exists() or store.is_unfinished:
+            if name in self.tabulated:
+                problem = "its store is gone, and the tables of all objects have its rows"
+                raise DamageError(f"{store.path}: {problem}; run the study again", problem)
             return None
         study = store.attributes()["study"]["name"]
         if study != f"{self.name} {name}":
