@@ -22,7 +22,14 @@ from sobolev_batch.norms.accuracy.problem import (
     sums_on,
 )
 from sobolev_batch.norms.accuracy.solution import Solution, SurfaceValues
-from sobolev_batch.norms.accuracy.tolerance import LEAST_CLEARANCE, Accuracy, first_lattice, lattice_of, refined
+from sobolev_batch.norms.accuracy.tolerance import (
+    LEAST_CLEARANCE,
+    LEAST_OF_OCTAVES,
+    Accuracy,
+    first_lattice,
+    lattice_of,
+    refined,
+)
 from sobolev_batch.norms.bounds import modulus_bound
 from sobolev_batch.norms.budget import Sums, Support
 from sobolev_batch.norms.estimate import NormEstimate, estimate_norms
@@ -35,10 +42,10 @@ from sobolev_batch.transform.lattice import LARGEST_M, Lattice, SobolevWeights, 
 from sobolev_batch.transform.probe import Sample, estimate
 
 _ROUNDS = 6
-# From this rtol on, octaves are cheaper than a larger lattice; below the other one they would take too many samples.
-_OCTAVES_FIRST, _OCTAVES_AT_ALL = 1e-3, 1e-4
+# From this rtol on, octaves are cheaper than a larger lattice.
+_OCTAVES_FIRST = 1e-3
 # What a best effort aims at where more is out of reach.
-_COARSER = (1e-1, 1e-2, 1e-3, _OCTAVES_AT_ALL)
+_COARSER = (1e-1, 1e-2, 1e-3, LEAST_OF_OCTAVES)
 # Coordinates in double precision may be off by this, in radii, if the origin is some 10⁷ of these away. Of distances as
 # small, relative to the norms, the digits are not worth minutes of a best effort.
 _OF_COORDINATES = 1e-8
@@ -125,7 +132,7 @@ def solve(problem: Problem, seed: int = 0) -> Solution:
     if not problem.accuracy.best_effort:
         raise min(refusals, key=attrgetter("reachable"))
     nearest = nearest or [_solve_on_lattices(problem, *first)]
-    if min(map(_largest_share, nearest)) > _OCTAVES_AT_ALL and not any(_is_rounding(strict, one) for one in nearest):
+    if min(map(_largest_share, nearest)) > LEAST_OF_OCTAVES and not any(_is_rounding(strict, one) for one in nearest):
         nearest += _in_coarser_octaves(strict, seed)
     return min(nearest, key=_largest_share)
 
@@ -173,7 +180,7 @@ def prefers_octaves(problem: Problem) -> bool:
     The tail of flat faces follows no law that a lattice could extrapolate, since they may repeat.
     """
     is_regular = max(problem.orders) < _LOW_ORDER or not FaceNormals.from_surfaces(problem.surfaces)
-    least = _OCTAVES_FIRST if is_regular else _OCTAVES_AT_ALL
+    least = _OCTAVES_FIRST if is_regular else LEAST_OF_OCTAVES
     if problem.accuracy.rtol < least:
         return False
     return not is_regular or first_lattice(problem.support, problem.orders, problem.accuracy)[1]
@@ -181,7 +188,7 @@ def prefers_octaves(problem: Problem) -> bool:
 
 def permits_octaves(accuracy: Accuracy) -> bool:
     """Tell whether octaves can give an accuracy with a sensible number of samples."""
-    return accuracy.rtol >= _OCTAVES_AT_ALL
+    return accuracy.rtol >= LEAST_OF_OCTAVES
 
 
 def _near_duplicates(problem: Problem, lattice: Lattice) -> NDArray[np.bool_]:

@@ -39,6 +39,8 @@ _TRUNCATION_FRACTION, _HIGH_ORDER = 0.7, 2.0
 _DEFAULT_BYTES = 2e9
 # A relative distance below this one tells of rounding, of coordinates in files too, and not of the surfaces.
 NEXT_TO_EQUAL = 1e-5
+# Below this rtol, octaves would take too many samples.
+LEAST_OF_OCTAVES = 1e-4
 # Before a pair is measured: how much larger than the kernel alone predicts its images may be, and
 # how much larger its tail than that of two surfaces close to each other.
 _IMAGE_MARGIN, _TAIL_MARGIN = 30.0, 2.0
@@ -126,15 +128,16 @@ class Accuracy:
 
 def unreachable(problem: str, rtol: float, reachable: float) -> AccuracyError:
     """Return the error for an rtol that is out of reach, with advice by the smallest one that is not."""
-    advice = "not even one digit can be reached; take a more negative order, or a best effort"
+    found, advice = "not even one digit can be reached", "take a more negative order, or a best effort"
     if reachable < 1:
         # An estimate has two digits; up, so that it is met.
         unit = 10.0 ** (math.floor(math.log10(reachable)) - 1)
         reachable = min(math.ceil(reachable / unit) * unit, 1.0)
-        advice = (
-            f"about {reachable:.2g} can be reached; ask for that or for a best effort, or take a more negative order"
-        )
-    return AccuracyError(f"{problem}; {advice}", rtol, reachable)
+        found = f"about {reachable:.2g} can be reached"
+        advice = "ask for that or for a best effort, or take a more negative order"
+    if rtol < LEAST_OF_OCTAVES < reachable:
+        found += f" on one lattice; an rtol from {LEAST_OF_OCTAVES:g} on permits octaves, which may reach more"
+    return AccuracyError(f"{problem}; {found}; {advice}", rtol, reachable)
 
 
 def _projected_bytes(intervals: int) -> float:
