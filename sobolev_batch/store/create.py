@@ -127,7 +127,7 @@ def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
     stored = store.labels()
     # Only a row whose mesh the study has lost may serve another one.
     is_kept = set(stored) <= {row.label for row in plan.rows}
-    labels = _labels_for(plan, stored, [None] * len(stored) if is_kept else Records(store).read(), is_trusted=True)
+    labels = labels_for(plan, stored, [None] * len(stored) if is_kept else Records(store).read(), is_trusted=True)
     if labels != list(stored):
         _lay_out(store, plan, labels, store.read_strings(QUALITY))
     similarity = {"scale": plan.similarity.scale, "origin": list(plan.similarity.origin)}
@@ -168,7 +168,7 @@ def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:
     if plan.tail is not None:
         fresh.documents |= documents_in(dataset_keys(OCTAVES_GROUP, xr.Dataset(coords=_sample_columns(plan.tail))))
     _require_same_samples(fresh, plan)
-    labels = _labels_for(plan, (stored + ("",) * count)[:count], records, is_trusted=False)
+    labels = labels_for(plan, (stored + ("",) * count)[:count], records, is_trusted=False)
     _lay_out(fresh, plan, labels, ())
     # Nothing else replaces the record of a row that has lost its label.
     for row in damaged:
@@ -342,7 +342,7 @@ def lattices_text(old: Mapping[str, Any] | None, new: Mapping[str, Any] | None) 
     return "a lattice of", before, now
 
 
-def _labels_for(plan: Plan, stored: Sequence[str], records: Sequence[Record | None], *, is_trusted: bool) -> list[str]:
+def labels_for(plan: Plan, stored: Sequence[str], records: Sequence[Record | None], *, is_trusted: bool) -> list[str]:
     """Return a label for each stored row, followed by the labels of new meshes.
 
     A row whose mesh the study has lost gets the label of a new mesh with the same field. Labels that are not trusted

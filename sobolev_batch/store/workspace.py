@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from sobolev_batch.store.create import prepare_store
+from sobolev_batch.store.create import labels_for, prepare_store
 from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.store.layout import QUALITY, Store, hide_tables, stored_choice, table_attributes
 from sobolev_batch.store.location import Location
@@ -109,9 +109,11 @@ class Workspace(Contents):
     @classmethod
     def for_plan(cls, store: Store, plan: Plan) -> Self:
         """Return the workspace of a store for a plan, whose rows it need not have all."""
-        by_label, labels = {row.label: row for row in plan.rows}, store.labels()
+        by_label, records = {row.label: row for row in plan.rows}, list(Records(store).read())
+        # A run takes the field of a mesh that has another name by now.
+        labels = labels_for(plan, store.labels(), records, is_trusted=True)[: len(records)]
         rows = {i: by_label[label] for i, label in enumerate(labels) if label in by_label}
-        return cls(store, labels, rows, list(Records(store).read()), plan)
+        return cls(store, labels, rows, records, plan)
 
     @classmethod
     def found(cls, location: Location, plan: Plan) -> Self | None:

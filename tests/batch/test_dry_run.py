@@ -235,6 +235,10 @@ def test_a_plan_and_a_status_and_a_run_agree_on_what_is_missing() -> None:
     assert set(sb.plan(more, place).missing) == {missing, "ico/4"}
     assert set(sb.run(more, place).computed) == {missing, "ico/4"}
     assert (sb.status(place).complete, sb.status(place).lost_records) == (6, ())
+    # Those that have another name by now are not.
+    renamed = sb.Study.from_table(small_table(family=[{"name": "new", "source": "icosphere", "levels": levels}]))
+    assert sb.plan(renamed, place).missing == ()
+    assert sb.run(renamed, place).computed == ()
 
 
 def test_a_plan_fits_the_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
