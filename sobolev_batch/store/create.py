@@ -118,10 +118,7 @@ def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
     _check_same_study(store, plan)
     store.location.remove_partial_files()
     if not attributes["study"].items() >= lattice.items():
-        done = sum(record is not None for record in Records(store).read())
-        _log.warning(
-            "%s: another lattice follows from the study now; all of %d fields are computed again", store.path, done
-        )
+        _log.warning("%s: another lattice follows from the study now; all fields are computed again", store.path)
         _create(store, plan)
     _require_same_samples(store, plan)
     stored = store.labels()
