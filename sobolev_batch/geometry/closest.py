@@ -18,6 +18,9 @@ import igl  # it reads the variable once
 
 # Processor seconds of a pair of a point and a triangle in arrays; a compiled loop takes a tenth.
 _PAIR_SECONDS = 4e-7
+# Height of a triangle over its longest side below which libigl may see points of it far too far away: it loses the
+# digits of the square of this number.
+_THIN = 0.01
 
 
 class Triangles:
@@ -45,16 +48,33 @@ class Triangles:
         self._sides = [b - a, c - b, a - c]
         self._normals = np.stack(cross(self._sides[0], c - a))
         self.outward = [np.stack(cross(side, self._normals)) for side in self._sides]
-        sizes = dot(self._normals, self._normals)
-        self._has_area = sizes > 0
-        self._inverse_sizes = _inverse(sizes)
-        self._inverse_lengths = [_inverse(dot(side, side)) for side in self._sides]
+        sizes, lengths = dot(self._normals, self._normals), np.stack([dot(side, side) for side in self._sides])
+        self._has_area, self._thin = sizes > 0, np.flatnonzero(sizes < (_THIN * lengths.max(axis=0)) ** 2)
+        self._inverse_sizes, self._inverse_lengths = _inverse(sizes), _inverse(lengths)
+        self._longest = lengths.argmax(axis=0)
 
     @cached_property
     def _tree(self) -> igl.AABB:
         tree = igl.AABB()
         tree.init(self._vertices, self._triangles)
         return tree
+
+    @cached_property
+    def _boxes_of_thin(self) -> tuple[Indices, Reals]:
+        """Thin triangles (n,), some of them twice, and the boxes (2n, 2 ends, 3) of a tree; see `search`."""
+        order = np.resize(self._thin, (1, 1 << (len(self._thin) - 1).bit_length()))
+        centers = self._by_triangle.mean(axis=1)
+        while order.shape[1] > 1:
+            places = centers[order]
+            widest = np.ptp(places, axis=1).argmax(axis=1)[:, None, None]
+            sorted_along = np.take_along_axis(places, widest, axis=2)[..., 0].argsort(axis=1, kind="stable")
+            order = np.take_along_axis(order, sorted_along, axis=1).reshape(2 * len(order), -1)
+        corners = self._by_triangle[order.ravel()]
+        levels = [np.stack([corners.min(axis=1), corners.max(axis=1)], axis=1)]
+        while len(levels[0]) > 1:
+            pairs = levels[0].reshape(-1, 2, 2, 3)
+            levels.insert(0, np.stack([pairs[:, :, 0].min(axis=1), pairs[:, :, 1].max(axis=1)], axis=1))
+        return order.ravel(), np.concatenate([levels[0], *levels])
 
     @cached_property
     def across(self) -> Indices:
@@ -78,7 +98,12 @@ class Triangles:
         """Return the distance of points (n, 3) from the mesh, exact to rounding, and the triangle closest to each."""
         scaled = np.ascontiguousarray(points / self.scale)
         triangles = np.reshape(self._tree.squared_distance(self._vertices, self._triangles, scaled)[1], -1)
-        return self.scale * np.sqrt(self.squares(scaled.T, triangles)), triangles
+        squares = self.squares(scaled.T, triangles)
+        if len(self._thin):
+            from sobolev_batch.compiled.triangles import search
+
+            search(scaled, self._by_triangle, *self._boxes_of_thin, squares, triangles)
+        return self.scale * np.sqrt(squares), triangles
 
     def squares(self, points: Reals, triangles: Indices) -> Reals:
         """Return the squared distance of points (3, n) from triangles (n,), each from its own, in units of the scale.
@@ -92,15 +117,18 @@ class Triangles:
             fill_squares(points, self._by_triangle, triangles, squares)
             return squares
         is_above = self._has_area[triangles]
-        least = np.full(len(triangles), np.inf)
-        for corners, sides, inverse, outward in zip(
-            self.corners, self._sides, self._inverse_lengths, self.outward, strict=True
+        least, from_longest = np.full(len(triangles), np.inf), np.zeros_like(points)
+        for k, (corners, sides, inverse, outward) in enumerate(
+            zip(self.corners, self._sides, self._inverse_lengths, self.outward, strict=True)
         ):
             arms, along = points - corners[:, triangles], sides[:, triangles]
             rest = arms - np.clip(dot(arms, along) * inverse[triangles], 0.0, 1.0) * along
             least = np.minimum(least, dot(rest, rest))
             is_above &= dot(arms, outward[:, triangles]) <= 0
-        return np.where(is_above, np.minimum(least, self.squared_heights(points, triangles)), least)
+            from_longest = np.where(self._longest[triangles] == k, rest, from_longest)
+        # The normal of a thin triangle has few digits along it, and the rest is at right angles to its longest side.
+        heights = dot(from_longest, self._normals[:, triangles]) ** 2 * self._inverse_sizes[triangles]
+        return np.where(is_above, np.minimum(least, heights), least)
 
     def squared_heights(self, points: Reals, triangles: Indices) -> Reals:
         """Return the squared distance of points (3, n) from the planes of triangles (n,)."""

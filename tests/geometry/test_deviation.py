@@ -162,6 +162,37 @@ def test_triangles_without_area_and_needles_hide_nothing() -> None:
     assert sb.largest_deviation(ball, with_line).forward.upper < 1e-12
 
 
+def wire(radius: float, sides: int, parts: int) -> sb.Mesh:
+    """A wire of length 1 along no axis, cut in parts."""
+    angles, heights = 2 * np.pi * np.arange(sides) / sides, np.repeat(np.linspace(0, 1, parts + 1), sides)
+    ring = radius * np.column_stack([np.cos(angles), np.sin(angles)])
+    vertices = np.column_stack([np.tile(ring, (parts + 1, 1)), heights])
+    first = np.arange(sides * parts)
+    after = first - first % sides + (first + 1) % sides
+    triangles = np.concatenate([[first, after, after + sides], [first, after + sides, first + sides]], axis=1).T
+    return sb.Mesh(vertices @ np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0], triangles)
+
+
+@pytest.mark.parametrize("radius", [1e-5, 1e-7])
+def test_thin_wires_deviate_by_the_height_of_an_arc(radius: float) -> None:
+    pair, height = (wire(radius, 16, 1), wire(radius, 32, 7)), radius * (1 - np.cos(np.pi / 16))
+    found = sb.largest_deviation(*pair)
+    assert found.backward.lower == pytest.approx(height, rel=1e-6)
+    assert found.both.upper <= 1.01 * height
+    assert [sb.largest_deviation(*pair, within=x * height).both.is_within(x * height) for x in (0.95, 1.05)] == [0, 1]
+
+
+@pytest.mark.parametrize("height", 10.0 ** np.arange(-12, 0, 2))
+def test_points_of_a_thin_triangle_have_the_distance_zero(height: float) -> None:
+    rng = np.random.default_rng(3)
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0.4, height, 0]]) @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    triangles, points = Triangles(sb.Mesh(vertices, [[0, 1, 2]])), rng.dirichlet([1, 1, 1], size=100) @ vertices
+    with compiled.by_itself():
+        assert triangles.squares(points.T / triangles.scale, np.zeros(100, dtype=int)).max() < 1e-31
+        compiled.use()
+        assert triangles.closest(points)[0].max() < 3e-16
+
+
 def test_a_clear_question_takes_fewer_pieces(pieces: list[int]) -> None:
     ball, egg = sb.shapes.icosphere(3), sb.shapes.Ellipsoid((1.0, 0.95, 0.9)).mesh(4)
     value = sb.largest_deviation(ball, egg).both.lower
