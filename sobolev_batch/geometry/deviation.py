@@ -35,7 +35,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.closest import Triangles
 from sobolev_batch.geometry.cover import cover_distances
 from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
-from sobolev_batch.geometry.mesh import Mesh, dot
+from sobolev_batch.geometry.mesh import Mesh, cross, dot
 from sobolev_batch.geometry.overlap import ROUNDING, rests_of
 from sobolev_batch.geometry.surface import is_finite_number
 
@@ -55,6 +55,8 @@ _MANY, _MANY_OF_EACH = 1 << 17, 2
 _LEAST_CUT, _LEAST_SHORTER_CUT, _LARGEST_CUT = 0.05, 0.003, 0.97
 # The distance is steep where the square of its change along a side exceeds the square of the side over this.
 _STEEP = 4.0
+# Largest square of a change across a thin triangle over that of its width: its short side may be oblique.
+_ACROSS = 4.0
 # For so many pieces, those with the farthest centers, the closest triangle to the worst corner is worth a search. So
 # many are worth a search of covers.
 _FEW = 300
@@ -371,12 +373,15 @@ def _halves(corners: Reals, distances: Reals, enough: float) -> list[Reals]:
     """Return triangles (3, 3, n) cut at the middles of their longest sides: thin ones become less so.
 
     Within a thin wall the distance changes across thin triangles, and not along them. Where it is steep, and its change
-    is what is too much, the side along which it changes most is cut.
+    is what is too much, the side along which it changes most is cut; but if it changes by more than the width permits,
+    it changes along the triangle.
     """
     lengths, changes = (np.roll(values, -1, axis=0) - values for values in (corners, distances))
     squares, changes = np.stack([dot(side, side) for side in lengths]), changes**2
     is_steep = (_STEEP * changes > squares).any(axis=0)
     is_steep &= changes.max(axis=0) >= (distances.max(axis=0) - enough) ** 2
+    across = np.stack(cross(lengths[0], lengths[1]))
+    is_steep &= changes.max(axis=0) * squares.max(axis=0) <= _ACROSS * dot(across, across)
     first, which = np.where(is_steep, changes, squares).argmax(axis=0), np.arange(corners.shape[2])
     a, b, c = (corners[(first + k) % 3, :, which].T for k in range(3))
     middle = (a + b) / 2

@@ -329,3 +329,15 @@ def test_the_inside_of_a_thin_wall_takes_few_pieces(is_open: bool, pieces: list[
     found = sb.largest_deviation(wall, changed).both
     assert found.upper <= 1.01 * found.lower * (1 + 1e-9)
     assert sum(pieces) < 10_000
+
+
+def test_lines_beside_a_triangle_take_few_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = [[0.4, 0.5, -1.3], [0.7, -0.1, -0.2], [0.2, -1.2, -0.7], [-1.1, -1.0, 1.3]]
+    small, large = (
+        [[0.9, 0.3, 0.3], [-0.2, 1.1, 0.7], [0.5, 0.3, -0.3]],
+        [[0.5, 1.8, 0.0], [-0.2, 0.6, -1.2], [1.5, -1.7, -1.3]],
+    )
+    other = Triangles(sb.Mesh([*lines, *small], [[0, 1, 1], [2, 3, 3], [4, 5, 6]]))
+    monkeypatch.setattr(deviation, "_MOST_PIECES", 1000)
+    found = deviation.directed_deviation(sb.Mesh(large, [[0, 1, 2]]), other)
+    assert found.upper <= 1.01 * found.lower
