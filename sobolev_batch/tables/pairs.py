@@ -22,6 +22,8 @@ from sobolev_batch.store.sealed_chunks import key_in, key_of, missing_chunks, se
 from sobolev_batch.tables.reducer import Reducer
 from sobolev_batch.tables.shells import read_spectra
 
+# Raise it whenever the same fields lead to other distances: tiles of older versions are then made again.
+_TILES_VERSION = 2
 # Meshes along a side of a tile: with fewer, small studies keep their workers busy; with more, there are fewer keys.
 _FEWEST, _MOST, _TILES_OF_A_ROW = 32, 512, 8
 # Arrays of the distances and their errors, as `NormEstimate.named` names them.
@@ -101,7 +103,8 @@ class Pairs:
         """Return the key of what a tile depends on."""
         sides = [[self.keys.get(row, "") for row in self.tile_rows(number)] for number in tile]
         # Products lose no digits but those of the difference to the reference, which is their center.
-        return key_of([*sides[0], "|", *sides[1], "|", self.keys.get(self.reference, ""), *map(repr, self.orders)])
+        ends = self.keys.get(self.reference, ""), *map(repr, self.orders), str(_TILES_VERSION)
+        return key_of([*sides[0], "|", *sides[1], "|", *ends])
 
     def stale(self) -> list[tuple[int, int]]:
         """Return the tiles (i, j), i <= j, that are to be computed. No distance is read."""

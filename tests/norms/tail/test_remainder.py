@@ -117,6 +117,20 @@ def test_between_the_orders_of_a_study_energies_are_interpolated() -> None:
         assert abs(value - other) < 0.03 * other + 0.1 * (error + other_error)
 
 
+@pytest.mark.parametrize("move", [1e-2, 1e-4])
+def test_between_orders_the_energies_of_small_moves_are_close_to_powers(move: float) -> None:
+    pair: list[Surface] = [BOX, Mesh(BOX.vertices + move * np.array([0.6, -0.7, 0.4]), BOX.triangles)]
+    orders = (-0.51, -0.6, -0.8, -0.9, -1.2)
+    found, errors = remainder(pair, [1, -1], 96.0).at(orders)
+    others, other_errors = remainder(pair, [1, -1], 96.0, orders, points=1000, seed=1).at(orders)
+    assert np.all(np.abs(found - others) <= errors + other_errors)
+    assert np.all(errors[:4] < 0.08 * found[:4])
+
+
+def test_between_orders_nothing_is_left_of_equal_meshes() -> None:
+    assert np.all(np.abs(remainder([BOX, BOX], [1, -1], 96.0).at([-0.51, -0.8])[0]) < 1e-12)
+
+
 @pytest.mark.parametrize("size", [1e-6, 1e-3])
 def test_few_points_tell_apart_meshes_that_moved_a_little(size: float) -> None:
     rng = np.random.default_rng(3)
