@@ -86,7 +86,7 @@ def size_tasks(
     Each task holds the mesh. Its transform adds up batches of points, as large as the memory allows. Every task is kept
     within what a worker has for each of its threads, as long as that leaves a transform enough to work in; a task that
     takes more runs beside fewer others.
-    What is done beyond the lattice is given by the largest block that is transformed, and the bytes that are held besides.
+    What lies beyond the lattice is given by the largest block that is transformed, and the bytes that are held besides.
     """
     block, beyond_bytes = beyond
     block_bytes = float(block.size * np.dtype(transform.dtype).itemsize)

@@ -38,6 +38,8 @@ _HELD_BYTES = 128 << 20
 # A sample of octaves takes this many bytes: its frequency, weight and place, values of three fields with their squares,
 # and what moves them to the radii of spectra.
 _SAMPLE_BYTES = 400.0
+# What tasks make anew: it is cheaper than sending it.
+_MADE_ANEW = {"weights", "octave_weights", "axis"}
 # A sample of a row takes this much more while its spectra are computed.
 _SPECTRUM_BYTES = 100.0
 
@@ -152,7 +154,7 @@ class Reducer:
         return RadialAxis(self.lattice, self.sampling)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name not in ("octave_weights", "axis")}
+        return {name: value for name, value in self.__dict__.items() if name not in _MADE_ANEW}
 
     @property
     def task_bytes(self) -> float:
