@@ -24,7 +24,6 @@ from itertools import takewhile
 from typing import NamedTuple, Self
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator, make_interp_spline
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.geometry.surface import Surface
@@ -135,11 +134,13 @@ class Remainder:
         energy, error = (float(np.interp(at, places, values)) for values in (self.energies, self.errors))
         if len(places) == 1 or -at in self.orders or energy <= error:
             return energy, error
+        # It takes a tenth of a second to import, and a first field does without.
+        from scipy.interpolate import PchipInterpolator, make_interp_spline
+
         # Energies below their errors may be negative.
         logs = np.log(np.maximum(self.energies, _OF_ERROR * np.array(self.errors)) + np.finfo(np.float64).tiny)
-        straight, curved = (
-            math.exp(line(at)) for line in (make_interp_spline(places, logs, k=1), PchipInterpolator(places, logs))
-        )
+        lines = make_interp_spline(places, logs, k=1), PchipInterpolator(places, logs)
+        straight, curved = (math.exp(line(at)) for line in lines)
         return curved, error + abs(curved - straight) + _OF_CHANGE * abs(curved - energy)
 
     def seconds(self, points: int) -> float:
