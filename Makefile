@@ -21,7 +21,7 @@ PYTEST := $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder
 # Compiled modules are kept, or each of the processes that tests start would compile the package anew.
 test test-fast test-all durations: export PYTHONDONTWRITEBYTECODE =
 
-test: $(READY)  ## the tests: what must pass before a change is trusted, some five minutes
+test: $(READY)  ## the tests: what must pass before a change is trusted, some ten minutes
 	$(PYTEST) -n 3 -m "not all"
 
 test-fast: $(READY)  ## those that start no process and take less than a second, a minute
