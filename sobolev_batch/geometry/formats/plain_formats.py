@@ -41,8 +41,7 @@ _DIGITS = "%.17g"
 _STL_HEADER_BYTES = 84
 # A text has no zero byte; a binary file of fewer than 16 million triangles has one within this many.
 _STL_START_BYTES = 1024
-# Where a line holds several statements, as some programs write them, and the space before each.
-_STL_SHARED_LINE = re.compile(rb"(?i)(?:[\d.]|loop|facet)[ \t]+(?:vertex|endfacet|endsolid)(?!\S)")
+# The space before a statement of a facet. Some programs write several on a line.
 _STL_STATEMENT = re.compile(rb"(?i)\s(?=(?:facet\s+normal|outer\s+loop|vertex|endloop|endfacet|endsolid)(?!\S))")
 _STL_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
@@ -198,9 +197,10 @@ def parse_stl(data: bytes) -> Raw:
     elif b"\0" not in start:
         if start.lstrip()[:5].lower() != b"solid":
             raise MeshError("the file is a text that does not begin with solid, as STL files in text do")
-        if _STL_SHARED_LINE.search(start + data[-_STL_START_BYTES:]):
-            data = _STL_STATEMENT.sub(b"\n", data)
-        corners = _stl_text_corners(data)
+        try:
+            corners = _stl_text_corners(data)
+        except MeshError:
+            corners = _stl_text_corners(_STL_STATEMENT.sub(b"\n", data))
     else:
         count = max(0, len(data) - _STL_HEADER_BYTES) / _STL_RECORD.itemsize
         raise MeshError(
@@ -286,15 +286,17 @@ def _stl_text_corners(data: bytes) -> Reals:
         match words[0].lower() if words else "":
             case "":
                 continue
-            case "solid" | "endsolid" as word:
-                in_solid = word == "solid"
-            case "facet":
-                facet, facet_corners = facet + 1, 0
             case "vertex":
                 if len(words) != 4:
                     raise MeshError(f"facet {facet} has a vertex of {len(words) - 1} coordinates, expected three")
                 corners.extend(reals(words[1:], f"facet {facet}"))
                 facet_corners += 1
+            case _ if "endfacet" in line.lower().split()[1:]:
+                raise MeshError(f"after facet {facet}: a facet ends within a line")
+            case "solid" | "endsolid" as word:
+                in_solid = word == "solid"
+            case "facet":
+                facet, facet_corners = facet + 1, 0
             case "endfacet":
                 if facet_corners != 3:
                     raise MeshError(f"facet {facet} has {facet_corners} vertices, expected three")

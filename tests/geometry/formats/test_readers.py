@@ -233,6 +233,7 @@ def test_obj_corners_may_count_backwards_from_the_line_they_stand_on(read: Read)
 
 OBJ_BOX = obj(BOX_VERTICES, BOX_TRIANGLES)
 STL_BOX = stl_text(BOX_VERTICES, BOX_TRIANGLES)
+STL_FACETS, FAR = STL_BOX.split(b"facet normal", 3), b"\n" * 1024
 VARIANTS: dict[str, dict[str, bytes]] = {
     ".ply": {
         "lines as on Windows": ply(BOX_VERTICES, BOX_TRIANGLES).replace(b"\n", b"\r\n"),
@@ -292,6 +293,9 @@ VARIANTS: dict[str, dict[str, bytes]] = {
         "capitals": STL_BOX.upper(),
         "two zeros": STL_BOX.replace(b"vertex 0.0 0.0 0.0", b"vertex -0.0 0.0 -0.0", 1),
         "one line": STL_BOX.replace(b"\n", b" "),
+        "one facet on a line, far from both ends": b"facet normal".join(
+            (STL_FACETS[0], STL_FACETS[1] + FAR, STL_FACETS[2].replace(b"\n", b" ") + FAR, STL_FACETS[3])
+        ),
         "one line for each facet": re.sub(rb"\n(?!\s*(facet|endsolid))", b" ", STL_BOX),
         "indented": b"\n  " + STL_BOX.replace(b"\n", b"\n\t "),
         "two solids": stl_text(BOX_VERTICES, BOX_TRIANGLES[:6], "") + stl_text(BOX_VERTICES, BOX_TRIANGLES[6:], ""),
