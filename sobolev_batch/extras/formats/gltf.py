@@ -216,7 +216,7 @@ def _matrix(node: dict[str, Any]) -> Reals:
         return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
     rotation = node.get("rotation", (0.0, 0.0, 0.0, 1.0))
     # Some programs write few digits, which would also stretch.
-    x, y, z, w = np.divide(rotation, np.linalg.norm(rotation), dtype=np.float64)
+    x, y, z, w = np.divide(rotation, np.linalg.norm(rotation) or 1, dtype=np.float64)
     matrix = np.eye(4)
     matrix[:3, :3] = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],

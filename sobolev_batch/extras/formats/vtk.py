@@ -46,7 +46,7 @@ _START = re.compile(
 )
 _LINE = re.compile(rb"\s*([^\n]{0,1000})\n?")
 # What ends the values of a file, which stand before its points, and what is told of an array.
-_SKIPPED = {"field": re.compile(rb"\s(?=POINTS \d+ \w+\s)"), "metadata": re.compile(rb"\n[ \t\r]*\n|\Z")}
+_SKIPPED = {"field": re.compile(rb"\s(?=(?i:points)\s+\d+\s+\w+\s)"), "metadata": re.compile(rb"\n[ \t\r]*\n|\Z")}
 _GHOSTS = re.compile(
     rb"(COLOR_SCALARS )?vtkGhostType(?: 1 \d+)?(?: unsigned_char)?(?: 1)?[ \r]*\n(?:LOOKUP_TABLE \w+[ \r]*\n)?"
 )

@@ -60,6 +60,11 @@ def test_gltf_meshes_may_have_several_primitives_and_no_indices(read: Read) -> N
     assert twice.area == 5 * BOX_AREA
 
 
+def test_a_gltf_rotation_of_zeros_turns_nothing(read: Read) -> None:
+    scene = Gltf([[(BOX_VERTICES, BOX_TRIANGLES, None)]], [{"mesh": 0, "rotation": [0, 0, 0, 0]}])
+    assert read(".glb", scene.glb()).area == pytest.approx(BOX_AREA)
+
+
 def test_gltf_rotations_of_few_digits_do_not_stretch(read: Read) -> None:
     scene = Gltf([[(BOX_VERTICES, BOX_TRIANGLES, None)]], [{"mesh": 0, "rotation": [0.7, 0, 0, 0.7]}])
     assert read(".glb", scene.glb()).area == pytest.approx(BOX_AREA, rel=1e-14)
