@@ -262,12 +262,13 @@ def _beyond_given(job: Job, surface: Surface) -> tuple[float, ...]:
         return ()
     draws = draws_beyond(sum(kind_of(one).triangles for one in (surface, reference)))
     key = job.reference.fingerprint, job.similarity, job.lattice, draws
-    if key not in _references_beyond:
+    if (beyond := _references_beyond.get(key)) is None:
+        beyond = FlatBeyond.of_surface(reference, job.lattice, FaceNormals.from_surfaces([reference]), draws)
+        # Tasks in other threads do so too.
         if len(_references_beyond) >= _KEPT_BEYOND:
             _references_beyond.clear()
-        normals = FaceNormals.from_surfaces([reference])
-        _references_beyond[key] = FlatBeyond.of_surface(reference, job.lattice, normals, draws)
-    return tuple(_references_beyond[key].distance_bound(surface, BEYOND_ORDERS).tolist())
+        _references_beyond[key] = beyond
+    return tuple(beyond.distance_bound(surface, BEYOND_ORDERS).tolist())
 
 
 def _remainder_between(surface: Surface, reference: Surface, cutoff: float, execution: Execution) -> Remainder:

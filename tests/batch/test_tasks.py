@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Mesh, Study, open_store, run
 from sobolev_batch.arrays import ComplexDtype
+from sobolev_batch.batch import field_tasks
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers
 from sobolev_batch.batch.field_costs import size_tasks
@@ -25,6 +26,7 @@ from sobolev_batch.batch.field_tasks import Job, compute_mesh, compute_parts, fi
 from sobolev_batch.errors import ClusterError
 from sobolev_batch.norms.accuracy.solve import DistanceTarget
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
+from sobolev_batch.norms.fields import Quality
 from sobolev_batch.norms.tail.sampling import Octave
 from sobolev_batch.norms.tail.values import settings_on
 from sobolev_batch.shapes import Similarity, icosphere
@@ -103,6 +105,22 @@ def test_what_a_mesh_and_its_reference_cover_is_nothing_beyond_the_octaves(tmp_p
     assert quality.tail is not None
     assert quality.tail.difference is not None
     assert not any(quality.tail.difference.errors)
+
+
+def test_tasks_beside_each_other_may_forget_what_lies_beyond_the_lattice(
+    store_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Forgotten(dict[Any, Any]):
+        def __setitem__(self, key: Any, value: Any) -> None:
+            pass
+
+    monkeypatch.setattr(field_tasks, "_references_beyond", Forgotten())
+    plan = make_plan(Study.from_table(small_table()))
+    job = job_of(plan, store_path, next(row.label for row in plan.rows if row.label != plan.reference))
+    job = replace(job, reference=next(row for row in plan.rows if row.label == plan.reference))
+    record = compute_mesh(job, plan.blocks)
+    assert record.status == "complete", record.reason
+    assert Quality.from_json(record.quality).beyond
 
 
 def test_a_task_whose_record_is_there_writes_nothing(store_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
