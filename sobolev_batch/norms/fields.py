@@ -10,9 +10,9 @@ import xarray as xr
 from pydantic import TypeAdapter
 
 from sobolev_batch.arrays import ComplexDtype, Complexes, Reals
-from sobolev_batch.errors import InputError, LatticeError
+from sobolev_batch.errors import DamageError, InputError, LatticeError
 from sobolev_batch.geometry.formats.conversion import SurfaceLike, as_surface
-from sobolev_batch.geometry.surface import Extent, Surface
+from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Surface
 from sobolev_batch.norms.tail.remainder import Remainder
 from sobolev_batch.transform.backends import backend_named
 from sobolev_batch.transform.fourier import (
@@ -39,8 +39,8 @@ BLOCK_SAMPLES = 1 << 22
 
 # The orders that a field is probed for if none are named.
 PROBED_ORDERS = (-2.0, -5.0, -10.0)
-# Orders at which it is stored how far surfaces may be apart beyond a given lattice. In between, the logarithm is convex
-# in the order, and below the chord.
+# Orders at which it is stored how far surfaces may be apart beyond a given lattice. In between, the logarithm without
+# the pole at -1/2 is at most a tenth above the chord.
 BEYOND_ORDERS = (-100.0, -20.0, -10.0, -6.0, -4.0, -3.0, -2.5, -2.0, -1.5, -1.25, -1.0, -0.75, -0.6, -0.501)
 # The degree of the rule that most triangles get: samples drawn for it serve coarser and equal ones.
 USUAL_DEGREE = 2
@@ -65,9 +65,6 @@ class TailQuality:
     squares: tuple[float, ...]
     own: Remainder
     difference: Remainder | None = None
-
-
-_TAIL_QUALITY = TypeAdapter(TailQuality)
 
 
 @dataclass(frozen=True)
@@ -105,8 +102,10 @@ class Quality:
         """Return the bounds on the squared distance beyond a given lattice (orders,); zero where there are none."""
         if not self.beyond:
             return np.zeros(len(orders))
-        logarithms = np.log(np.maximum(self.beyond, np.finfo(np.float64).tiny))
-        return np.asarray(np.exp(np.interp(orders, BEYOND_ORDERS, logarithms)))
+        # Near -1/2 it grows as what follows the last octave does.
+        growths = [1 / (1 - 2.0 ** (2 * np.array(s) + 1)) for s in (BEYOND_ORDERS, orders)]
+        logarithms = np.log(np.maximum(self.beyond / growths[0], np.finfo(np.float64).tiny))
+        return np.asarray(np.exp(np.interp(orders, BEYOND_ORDERS, logarithms)) * growths[1])
 
     def to_json(self) -> str:
         """Return the quality as one line of JSON."""
@@ -116,10 +115,19 @@ class Quality:
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """Read a quality from a line of `to_json`."""
-        area, lowest, highest, shells, sums, tail, beyond = json.loads(text)
-        extent, probe = Extent(tuple(lowest), tuple(highest)), Probe(tuple(shells), tuple(sums))
-        return cls(area, extent, probe, tail and _TAIL_QUALITY.validate_python(tail), tuple(beyond))
+        """Read a quality from a line of `to_json`; DamageError where it is none."""
+        try:
+            area, lowest, highest, shells, sums, tail, beyond = _STORED.validate_python(json.loads(text))
+            if {len(lowest), len(highest)} != {len(DIRECTIONS)} or len(beyond) not in (0, len(BEYOND_ORDERS)):
+                raise ValueError("some of its lists have another length")
+        except (ValueError, RecursionError) as error:
+            problem = "its quality cannot be read"
+            raise DamageError(f"a field is damaged ({problem}): {text[:80]!r}; compute it again", problem) from error
+        return cls(area, Extent(lowest, highest), Probe(shells, sums), tail, beyond)
+
+
+_Numbers = tuple[float, ...]
+_STORED = TypeAdapter(tuple[float, _Numbers, _Numbers, tuple[int, ...], _Numbers, TailQuality | None, _Numbers])
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import xarray as xr
 
 from sobolev_batch import Lattice, distance, fourier_transform, norm, spectrum, witness
+from sobolev_batch.errors import DamageError
 from sobolev_batch.shapes import Sphere, icosphere
 
 LATTICE = Lattice(2.0, 16)
@@ -32,6 +34,18 @@ def test_every_number_has_a_unit_and_a_name(name: str) -> None:
         assert dataset[variable].attrs["long_name"], variable
         assert dataset[variable].dtype == object or dataset[variable].attrs["units"], variable
     assert dataset["order"].values.tolist() == [-2.0, -3.0]
+
+
+@pytest.mark.parametrize(
+    ("place", "entry"),
+    [(0, "x"), (1, [0.0]), (3, "x"), (5, []), (5, 0), (5, {"radii": []}), (6, None), (6, [1.0]), (6, ["x"] * 14)],
+)
+def test_what_is_no_quality_of_a_field_is_damage(place: int, entry: object) -> None:
+    parts = json.loads(A.attrs["quality"])
+    parts[place] = entry
+    for text in (json.dumps(parts), json.dumps(parts[:6])):
+        with pytest.raises(DamageError, match="its quality cannot be read"):
+            norm(A.assign_attrs(quality=text), -2.0)
 
 
 def test_settings_of_an_accuracy_are_attributes_and_closed_forms_have_none() -> None:

@@ -11,15 +11,17 @@ from scipy.integrate import quad
 
 from sobolev_batch import Lattice, Mesh
 from sobolev_batch.geometry.surface import Surface
+from sobolev_batch.norms.fields import BEYOND_ORDERS, Quality
 from sobolev_batch.norms.spectrum import RadialAxis
 from sobolev_batch.norms.tail.face_normals import FaceNormals
 from sobolev_batch.norms.tail.integrals import OctaveSums, OctaveWeights, integral_over, squared_moduli
 from sobolev_batch.norms.tail.sampling import Octave, OctaveSampling, TailSampling
-from sobolev_batch.norms.tail.values import OctaveValues, SurfaceSize, octave_values
+from sobolev_batch.norms.tail.values import FlatBeyond, OctaveValues, SurfaceSize, octave_values
 from sobolev_batch.shapes import Sphere, Torus, icosphere
 from sobolev_batch.transform.exact import exact_transform
 from sobolev_batch.transform.fourier import ErrorTarget, TransformSettings
 from sobolev_batch.transform.lattice import OctaveLattice, smooth_step
+from sobolev_batch.transform.probe import Probe
 from sobolev_batch.transform.spheres import sphere_transform
 from tests.support.oracles import torus_value
 from tests.support.rectangles import Rectangles
@@ -236,3 +238,13 @@ def test_long_triangles_take_points_like_large_ones(count: int, is_exact: bool) 
     lattice = OctaveLattice.random(40.0, 160.0, 64, np.random.default_rng(0))
     assert (TransformSettings(1e-3).kind_for(square, lattice).expected_points > 1e6) == is_exact
     assert SurfaceSize.from_surface(square).prefers_exact(lattice) == is_exact
+
+
+def test_bounds_beyond_a_given_lattice_hold_at_orders_that_are_not_stored() -> None:
+    orders = (-0.50001, -0.5001, -0.55, -1.7, -3.5, -15.0, -60.0)
+    beyond = FlatBeyond.of_surface(BOX, Lattice(2.0, 16), FaceNormals.from_surfaces([BOX]), 50)
+    stored = tuple(beyond.distance_bound(icosphere(1), BEYOND_ORDERS).tolist())
+    found = Quality(1.0, BOX.extent, Probe(), None, stored).beyond_at(orders)
+    ratios = found / beyond.distance_bound(icosphere(1), orders)
+    assert (ratios > 0.99).all()
+    assert (ratios[:6] < 1.1).all()
