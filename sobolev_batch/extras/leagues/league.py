@@ -373,9 +373,9 @@ def _league(
             at_sizes = sizes, values, errors, slopes_of
             return League(order, x, y, tuple(rows), tuple(methods), left_out, of_objects, is_known, *at_sizes)
         if np.sum(counts == counts.max()) == 1:
-            # Most methods are connected by objects that have two of them at common sizes; a league can have these.
+            # Objects that have two methods at common sizes connect these; the league has the largest group.
             connected = [method for method, part in zip(methods, parts, strict=True) if part == counts.argmax()]
-            reason = "no object has it at sizes in common with the others"
+            reason = "no object connects it with the methods that are compared"
             others = {f"method {method}": reason for method in methods if method not in connected}
             return _league(tables, order, x, y, connected, {**unfinished, **others})
     reasons = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:3])

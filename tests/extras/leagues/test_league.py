@@ -222,7 +222,7 @@ def test_methods_that_no_object_connects_with_most_are_left_out_and_named() -> N
     made = ranked({**tables, "w": of_powers({"a": 1, "d": 2}, 1.0)})
     assert (made.methods, made.objects) == (("a", "b", "d"), ("x", "y", "w"))
     assert [*made.left_out][:2] == ["method far", "method c"]
-    assert "method far is left out: no object has it at sizes in common with the others." in format_league([made])
+    assert "method far is left out: no object connects it with the methods that are compared." in format_league([made])
 
 
 def test_methods_may_be_chosen_and_must_be_known() -> None:
