@@ -196,7 +196,7 @@ def _tallies(objects: Objects) -> Iterator[tuple[str, ObjectRecord]]:
                     continue
                 record = Contents.of_store(Store.open(place)).tally()
             except DamageError as error:
-                record = ObjectRecord(reason=str(error))
+                record = ObjectRecord(reason=str(error), total=1 if record is None else record.total)
         yield name, record
 
 

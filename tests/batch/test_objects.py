@@ -123,12 +123,12 @@ def test_an_object_that_lost_its_root_is_damage(changeable: Path, threads: Clien
 
 
 def test_an_object_whose_store_is_gone_is_damage(changeable: Path, threads: Client) -> None:
-    before = sb.table(changeable)
+    before, total = sb.table(changeable), sb.status(changeable).total
     shutil.rmtree(changeable / "b")
     with pytest.raises(sb.errors.DamageError, match=r"b: its store is gone, .* run the study again"):
         format_table(changeable)
     status = sb.status(changeable)
-    assert ({*status.failed}, status.complete) == ({"b", "gone"}, 5)
+    assert ({*status.failed}, status.complete, status.total) == ({"b", "gone"}, 5, total)
     assert "its store is gone" in sb.verify(changeable).tables["b/zarr.json"]
     assert len(sb.run(study_of([*balls(a=1.0), GONE, *balls(b=1.1)]), changeable, threads).computed) == 5
     pd.testing.assert_frame_equal(sb.table(changeable).drop(columns="seconds"), before.drop(columns="seconds"))
