@@ -132,7 +132,7 @@ class Remainder:
         """
         at, places = -max(order, self.orders[-1]), -np.array(self.orders)
         energy, error = (float(np.interp(at, places, values)) for values in (self.energies, self.errors))
-        if len(places) == 1 or -at in self.orders or energy <= error:
+        if len(places) == 1 or -at in self.orders or not (self.is_known and energy > error):
             return energy, error
         # It takes a tenth of a second to import, and a first field does without.
         from scipy.interpolate import PchipInterpolator, make_interp_spline

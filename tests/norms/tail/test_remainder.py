@@ -12,7 +12,7 @@ from sobolev_batch import Mesh
 from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms.fields import Quality, TailQuality
 from sobolev_batch.norms.tail.close_points import Sheets
-from sobolev_batch.norms.tail.remainder import remainder
+from sobolev_batch.norms.tail.remainder import Remainder, remainder
 from sobolev_batch.shapes import Sphere
 from sobolev_batch.transform.lattice import smooth_step
 from sobolev_batch.transform.probe import Probe
@@ -125,6 +125,12 @@ def test_between_orders_the_energies_of_small_moves_are_close_to_powers(move: fl
     others, other_errors = remainder(pair, [1, -1], 96.0, orders, points=1000, seed=1).at(orders)
     assert np.all(np.abs(found - others) <= errors + other_errors)
     assert np.all(errors[:4] < 0.08 * found[:4])
+
+
+def test_an_error_that_nothing_bounds_at_one_order_leaves_the_others() -> None:
+    found = Remainder(96.0, (-0.6, -1.0, -2.0), (1.0, 1.0, 1.0), (0.1, 0.1, np.inf)).at([-0.8, -1.5])
+    assert np.isfinite(found[0]).all()
+    assert np.isfinite(found[1]).tolist() == [True, False]
 
 
 def test_between_orders_nothing_is_left_of_equal_meshes() -> None:
