@@ -40,7 +40,7 @@ def parse_medit(data: bytes) -> Raw:
     """Return the vertices and triangles of a Medit mesh in text."""
     # Words begin with a letter and have three or more, unlike numbers. Names stand between quotes.
     plain = re.sub(rb'(?<!\S)#[^\n]*|"[^"\n]*"', b"", data)
-    start, *words = re.split(rb"(?<!\S)(?!(?i:nan|inf))([A-Za-z][A-Za-z0-9]{2,})", plain)
+    start, *words = re.split(rb"(?<!\S)(?!(?i:nan|inf|infinity)(?!\S))([A-Za-z][A-Za-z0-9]{2,})", plain)
     names = [word.decode("ascii") for word in words[::2]]
     sections = dict(zip(names, words[1::2], strict=True))
     if start.strip() or names[:1] != ["MeshVersionFormatted"] or len(sections) < len(names):

@@ -322,6 +322,7 @@ CASES |= {
     ),
     "medit, tetrahedra alone": (".mesh", medit(BOX_VERTICES, [], TETRAHEDRA), "2 cells with volume and no faces"),
     "medit, plane": (".mesh", medit(BOX_VERTICES, BOX_QUADS).replace(b"\n3\n", b"\n2\n", 1), "not of dimension 3"),
+    "medit, like no number": (".mesh", medit(BOX_VERTICES, BOX_QUADS, "Corners 1 1 Infos 1 1"), "a section 'Infos'"),
     "medit, curved": (".mesh", medit(BOX_VERTICES, BOX_QUADS, "TrianglesP2 1"), "has TrianglesP2, which are curved"),
     "medit, a face too few": (
         ".mesh",
