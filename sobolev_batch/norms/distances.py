@@ -166,7 +166,7 @@ def distance(
     if has_fields:
         # What a study knows of its fields is how far they are from one reference.
         known = [quality.beyond_at(orders) for quality in map(quality_of, (first, second)) if quality is not None]
-        beyond = np.square(np.sqrt(known).sum(axis=0))
+        beyond = np.square(np.sqrt(known).sum(axis=0)) * squares.any()
     else:
         beyond = flat_beyond(cast(Surface, a), cast(Surface, b), weights.lattice, orders)
     distances, of_second = _estimate(weights, squares, [first, second], beyond), _estimate(weights, own, [second])

@@ -72,6 +72,8 @@ def test_flat_faces_that_repeat_beyond_a_given_lattice_are_in_every_error(store_
     sb.run(sb.Study.from_table(made, folder=store_path.parent), store_path, threads)
     tree, orders = sb.open_store(store_path), [-1.3, *STORED]
     fields = variable(tree, "fourier", "fourier")
+    itself = sb.distance(fields.sel(mesh="f/moved"), fields.sel(mesh="f/moved"), orders)
+    assert (itself["error_part"].sel(part="truncation") == 0).all()
     for mesh, other in (("f/moved", "reference"), ("f/other", "reference"), ("f/moved", "f/other")):
         found = sb.distance(fields.sel(mesh=mesh), fields.sel(mesh=other), orders)
         expected = found["error"].values
