@@ -254,15 +254,15 @@ def _store_octaves(job: Job, surface: Surface, target: ErrorTarget | None) -> St
 
 def _beyond_given(job: Job, surface: Surface) -> tuple[float, ...]:
     """Return how far a surface may be from the reference beyond a given lattice, see `Quality`; empty if not known."""
-    if job.tail is not None or job.reference is None or job.reference.label == job.row.label:
-        return ()
-    reference = job.load_reference()
+    other = job.reference
     # Values of a parametrised surface take long there.
-    if reference is None or isinstance(surface, Smooth):
+    if job.tail is not None or other is None or other.label == job.row.label or isinstance(surface, Smooth):
         return ()
-    draws = draws_beyond(sum(kind_of(one).triangles for one in (surface, reference)))
-    key = job.reference.fingerprint, job.similarity, job.lattice, draws
+    draws = draws_beyond(kind_of(surface).triangles + other.member.expected_size().triangles)
+    key = other.fingerprint, job.similarity, job.lattice, draws
     if (beyond := _references_beyond.get(key)) is None:
+        if (reference := job.load_reference()) is None:
+            return ()
         beyond = FlatBeyond.of_surface(reference, job.lattice, FaceNormals.from_surfaces([reference]), draws)
         # Tasks in other threads do so too.
         if len(_references_beyond) >= _KEPT_BEYOND:
