@@ -278,6 +278,11 @@ def test_a_hole_that_was_closed_is_seen(folder: Path) -> None:
         done = call("compare", "full.off", "hole.off", "--within", length, *unit, folder=folder)
         assert (done.returncode, done.stdout.count("\n")) == (status, 1), done.stderr
         assert done.stdout.startswith(f"full.off: {answer}")
+    (folder / "other").mkdir()
+    sb.write_mesh(plate(True), folder / "other/full.off")
+    for length in ("2", "1e-4 %"):  # Folders tell files of one name apart.
+        done = call("compare", "other/full.off", "full.off", "--within", length, folder=folder)
+        assert done.stdout.startswith("other/full.off: "), done.stderr
     one_way = output("compare", "hole.off", "full.off", "--within", "2", "--one-way", folder=folder)
     assert one_way.startswith("hole.off: within 2: largest deviation ")
     for more in ((), ("--within", "2%")):

@@ -142,10 +142,10 @@ class CompareOptions:
         if (tolerance := self.allowed_fraction) is not None:
             (order,), scaling = self.chosen_orders, not self.no_scaling
             same = same_surface(a, b, tolerance=tolerance, order=order, scaling=scaling, memory=self.memory)
-            return f"{self.a.name}: {same}", vars(same) | numbers | {"distance": same.distance, "error": same.error}
+            return f"{self.names[0]}: {same}", vars(same) | numbers | {"distance": same.distance, "error": same.error}
         near = judge_deviation(a, b, str(self.within), self.unit, one_way=self.one_way)
         numbers |= {"outcome": near.outcome, "length": near.length, "unit": near.unit, "beyond": near.beyond}
-        return f"{self.a.name}: {near}", numbers | asdict(near.largest) | asdict(near.deviations)
+        return f"{self.names[0]}: {near}", numbers | asdict(near.largest) | asdict(near.deviations)
 
     @cached_property
     def meshes(self) -> tuple[Mesh, Mesh]:
