@@ -30,7 +30,7 @@ def _count(of: str) -> dict[str, Any]:
 
 
 # Between orders, numbers fall by powers.
-_BETWEEN = "interp is percents off between orders: sobolev-batch table --order, or tree.sobolev.distance(order)"
+_BETWEEN = "other orders: sobolev-batch table --order, or tree.sobolev.distance(order); interp is off by per cents"
 # Attributes of variables by name, in the results of functions and in stores. The tables of a store have no others, so
 # that the metadata of meshes may have any other name.
 VARIABLES: Mapping[str, Mapping[str, Any]] = {

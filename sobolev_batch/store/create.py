@@ -118,7 +118,7 @@ def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
     _check_same_study(store, plan)
     store.location.remove_partial_files()
     if not attributes["study"].items() >= lattice.items():
-        _log.warning("%s: another lattice follows from the study now; all fields are computed again", store.path)
+        _log.warning("%s: the study needs another lattice than its fields have; all are computed again", store.path)
         _create(store, plan)
     _require_same_samples(store, plan)
     stored = store.labels()
