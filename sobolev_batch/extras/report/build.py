@@ -22,7 +22,7 @@ from sobolev_batch.parameters import path_of
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import utc_now
 from sobolev_batch.store.objects import Objects
-from sobolev_batch.tables.convergence import is_sequence, label_of, table
+from sobolev_batch.tables.convergence import is_sequence, label_of, table, with_remarks
 from sobolev_batch.tables.matrix import pairs_of
 from sobolev_batch.tables.open import (
     AnyStore,
@@ -36,6 +36,7 @@ from sobolev_batch.tables.open import (
     require_unchanged,
     root_attribute,
     study_unit,
+    unit_of,
 )
 from sobolev_batch.tables.text import duration, minus
 from sobolev_batch.visible import visible
@@ -202,6 +203,7 @@ def chart_data(tree: xr.DataTree, spectra: xr.Dataset | None, views: Sequence[Me
         "name": root_attribute(tree, "study")["table"]["study"]["name"],
         "orders": [minus(f"{order:g}") for order in orders],
         "unit": study_unit(tree),
+        "edge_unit": unit_of(tree)[0],
         "families": list(dict.fromkeys(families_of(tree).values())),
         "convergence": _convergence(tree, orders, MOST_POINTS // len(orders)),
         "evolution": _evolution(tree, MOST_POINTS // len(orders)),
@@ -283,7 +285,7 @@ def _convergence(tree: xr.DataTree, orders: list[float], most: int) -> list[list
 
 def _drawable(tree: xr.DataTree) -> pd.DataFrame:
     """Return the rows of `table` that have a place on logarithmic axes."""
-    frame = table(tree).sort_values("edge_length", kind="stable")
+    frame = with_remarks(table(tree)).sort_values("edge_length", kind="stable")
     return frame[(frame["relative"] > 0) & frame["edge_length"].notna()]
 
 

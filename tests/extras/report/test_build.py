@@ -150,6 +150,16 @@ def test_the_order_switches_tables_and_charts(reader: Browser, store: str) -> No
     assert set(reader.texts(".current-order b")) == {"−10"}
 
 
+def test_edges_have_one_unit_in_table_and_chart(store: str) -> None:
+    tree = sb.open_store(store)
+    tree.attrs["similarity"] = json.dumps({"scale": 0.02, "origin": [0, 0, 0]})
+    data = build.chart_data(tree, None, [])
+    frame = sb.table(store, -10).set_index("mesh")
+    assert (data["edge_unit"], data["unit"]) == ("file units", "units of 50 file units")
+    for line in data["convergence"][0]:
+        assert line["x"] == pytest.approx(50 * frame["edge_length"][line["labels"]], rel=1e-3)
+
+
 @pytest.mark.parametrize("width", [360, 390, 768, 1280])
 def test_mesh_and_distance_are_seen_at_every_width(reader: Browser, page: Path, width: int) -> None:
     reader.open(page, width=width, height=740)

@@ -120,7 +120,7 @@
       });
     }
     draw("convergence", traces, {
-      xaxis: { type: "log", ...(all("x").length ? ticks(all("x")) : {}), title: { text: narrow() ? "mean edge length" : `mean edge length in ${plain(data.unit)}` } },
+      xaxis: { type: "log", ...(all("x").length ? ticks(all("x")) : {}), title: { text: narrow() ? "mean edge length" : `mean edge length in ${plain(data.edge_unit)}` } },
       yaxis: { type: "log", ...(slope.length ? ticks([...all("y"), ...slope]) : {}), title: { text: narrow() ? "" : "relative distance" } },
     });
   };
