@@ -125,6 +125,8 @@ def read_mesh_by(path: Path, read: Read) -> Mesh:
         name, command = CONVERTED[suffix]
         raise MeshError(f"{path}: it is a file of the format {name}, which is not read; convert it: {command}")
     if suffix not in BY_SUFFIX:
+        if path.is_dir():
+            raise MeshError(f"{path}: it is a folder; name the files in it")
         known = ", ".join(name for name, form in BY_SUFFIX.items() if form.is_name is None)
         raise MeshError(
             f"{path}: no mesh format that is read has this name; known are {known} and FreeSurfer's names such as "

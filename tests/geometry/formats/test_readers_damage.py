@@ -270,6 +270,7 @@ def test_empty_and_missing_files_and_folders_are_told_apart(tmp_path: Path, endi
     assert refusal(path) == "cannot be read: No such file or directory"
     path.mkdir()
     assert refusal(path) == "cannot be read: it is a folder; name the files in it"
+    assert refusal(tmp_path) == "it is a folder; name the files in it"
     path.rmdir()
     for content in (b"", gzip.compress(b""))[: 1 + ending.endswith(".gz")]:
         path.write_bytes(content)
