@@ -561,6 +561,8 @@ def test_help_imports_nothing_that_computes() -> None:
     assert done.returncode == 0, done.stderr
     assert set(COMMANDS.split()) <= set(done.stderr.split())
     assert max(map(len, done.stdout.splitlines())) <= 80
+    # No line about a command is cut.
+    assert not re.search(r"^  \w.*\.\.\.$", done.stdout, re.MULTILINE)
     # Every option has a sentence.
     for text in re.findall(r"^  -.*(?:\n {10,}.*)*", done.stdout, re.MULTILINE):
         assert re.search(r"\w[)']?\.( |$)", " ".join(text.split())), text

@@ -123,7 +123,7 @@ def prune_command(store: Location, yes: bool) -> None:
 )
 @orders_option("Write the table of this order, for parquet and csv.", "the study's")
 def export_command(store: Location, output: Path, style: ExportFormat | None, orders: tuple[float, ...] | None) -> None:
-    """Write the tables of STORE to the file OUTPUT, with their coordinates."""
+    """Write the tables of STORE to the file OUTPUT. Coordinates go with them."""
     from sobolev_batch.tables.export import BY_ENDING, export
 
     style = style or BY_ENDING.get(output.suffix.lower())

@@ -189,7 +189,7 @@ def _print_league(context: click.Context, place: str) -> None:
 
 @cli.command("schema")
 def schema_command() -> None:
-    """Print the JSON schema of study files, by which editors complete and check them."""
+    """Print the JSON schema of study files. Editors complete and check them by it."""
     from sobolev_batch.study.json_schema import study_schema
 
     echo_lines(json.dumps(study_schema(), indent=2), "json")

@@ -88,7 +88,7 @@ def matrix_command(table: TableOptions) -> None:
 @table_command.command("verdict")
 @table_options
 def verdict_command(table: TableOptions) -> None:
-    """Print the nearest mesh at each size, and the smallest below 5 % and 1 %."""
+    """Print the nearest mesh at each size. Also print the smallest below 5 % and 1 %."""
     from sobolev_batch.tables.conclusion import format_verdict
 
     echo_lines(format_verdict(table.store, table.style, table.orders), table.style)
@@ -97,7 +97,7 @@ def verdict_command(table: TableOptions) -> None:
 @table_command.command("objects")
 @table_options
 def objects_command(table: TableOptions) -> None:
-    """Print the nearest mesh of each object, the worst objects first."""
+    """Print the nearest mesh of each object. The worst objects come first."""
     from sobolev_batch.tables.conclusion import format_objects
 
     echo_lines(format_objects(table.store, table.style, table.orders), table.style)
