@@ -215,7 +215,7 @@
   const spectrum = () => {
     const { labels, bands, shares } = data.spectrum;
     const z = shares[state.order];
-    const crowded = narrow() || bands.length > 6;
+    const [crowded, longest] = [narrow() || bands.length > 6, Math.max(...bands.map((band) => band.length))];
     const percent = (share) => (share === null ? "" : `${(100 * share).toFixed(share < 0.1 ? 1 : 0)} %`);
     draw("spectrum", [{
       type: "heatmap", z, text: z.map((row) => row.map((share) => (share >= 0.005 ? percent(share) : ""))),
@@ -224,11 +224,11 @@
       hovertext: z.map((row, i) => row.map((share, j) => `${plain(labels[i])}<br>wavelengths ${plain(bands[j])}<br>${percent(share)}`)),
       hoverinfo: "text",
     }], {
-      // Slanted labels reach beyond the last column.
-      ...(crowded ? { margin: { l: 10, r: 4 * Math.max(...bands.map((band) => band.length)), t: 30, b: 10 } } : {}),
+      // Slanted labels reach beyond the last column, and leave no room for a title, which the caption repeats.
+      ...(crowded ? { margin: { l: 10, r: 4 * longest, t: 30 + 7 * longest, b: 10 } } : {}),
       xaxis: {
         side: "top", showgrid: false, ticks: "", tickvals: bands.map((_, j) => j), ticktext: bands.map(plain),
-        title: { text: narrow() ? "" : `wavelength in ${plain(data.unit)}` }, tickangle: crowded ? -60 : 0,
+        title: { text: crowded ? "" : `wavelength in ${plain(data.unit)}` }, tickangle: crowded ? -60 : 0,
       },
       yaxis: {
         autorange: "reversed", showgrid: false, zeroline: false, ticks: "", tickvals: labels.map((_, i) => i),
