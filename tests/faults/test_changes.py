@@ -97,9 +97,20 @@ def test_tables_of_fields_that_are_replaced_are_withdrawn_first(
     assert verify(store_path).is_sound
 
 
-def test_distances_are_those_to_the_reference_of_the_study(folder: Path, store_path: Path, client: Client) -> None:
-    trimesh.creation.box((1.0, 1.0, 0.5)).export(folder / "b.off")
-    for name, computed in (("a", ("f/a", "f/b")), ("b", ())):
+@pytest.mark.parametrize(
+    ("meshes", "again"),
+    [
+        # Beyond a given lattice, fields are compared with a reference that has flat faces.
+        ([trimesh.creation.box((1.0, 1.0, height)) for height in (1.0, 0.5)], ("f/a", "f/b")),
+        ([trimesh.creation.icosphere(subdivisions=2, radius=radius) for radius in (0.6, 0.5)], ()),
+    ],
+)
+def test_distances_are_those_to_the_reference_of_the_study(
+    meshes: list[trimesh.Trimesh], again: tuple[str, ...], folder: Path, store_path: Path, client: Client
+) -> None:
+    for name, mesh in zip("ab", meshes, strict=True):
+        mesh.export(folder / f"{name}.off")
+    for name, computed in (("a", ("f/a", "f/b")), ("b", again)):
         reference = {"source": "family", "family": "f", "member": name}
         study = study_of(folder, scaling={"mode": "fixed", "scale": 1.0}, reference=reference)
         assert run(study, store_path, client).computed == computed
