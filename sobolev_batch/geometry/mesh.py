@@ -195,12 +195,11 @@ class Mesh:
         (1, 0)
         """
         unused = len(self.vertices) - len(self.used_vertices)
-        ordered = np.sort(self.triangles, axis=1)
-        ordered = ordered[np.lexsort(ordered.T)]
+        duplicates = _count_duplicates(self.triangles)
         edges, components, boundary, nonmanifold, inconsistent = _edges_of(self.triangles, len(self.vertices))
         return {
             "zero_area_triangles": self._sizes.without_area,
-            "duplicate_triangles": int(np.count_nonzero((ordered[1:] == ordered[:-1]).all(axis=1))),
+            "duplicate_triangles": duplicates,
             "boundary_edges": boundary,
             "nonmanifold_edges": nonmanifold,
             "inconsistent_edges": inconsistent,
@@ -492,10 +491,21 @@ def _edges_of(triangles: Indices, vertex_count: int) -> tuple[int, int, int, int
         keys[3 * start : 3 * start + batch_keys.size] = batch_keys.ravel()
     keys.sort()
     keys = keys[np.searchsorted(keys, 0) :]
-    edges, starts, numbers = np.unique(keys // 3, return_index=True, return_counts=True)
-    links = coo_array((np.ones(len(edges), np.int8), np.divmod(edges, vertex_count)), (vertex_count, vertex_count))
-    components, _ = connected_components(links, directed=False)
+    # Meshes have tens of millions of triangles: what is not needed any more makes room.
+    edges = keys // 3
+    starts = np.flatnonzero(np.diff(edges, prepend=-1))
+    edges, numbers = edges[starts], np.diff(starts, append=len(edges))
     pairs = starts[numbers == 2]
     is_alike = (keys[pairs] == keys[pairs + 1]) & (keys[pairs] % 3 < 2)
     boundary, nonmanifold, alike = (int(np.count_nonzero(one)) for one in (numbers == 1, numbers > 2, is_alike))
+    del keys, starts, numbers, pairs, is_alike
+    links = coo_array((np.ones(len(edges), np.int8), np.divmod(edges, vertex_count)), (vertex_count, vertex_count))
+    components, _ = connected_components(links, directed=False)
     return len(edges), int(components), boundary, nonmanifold, alike
+
+
+def _count_duplicates(triangles: Indices) -> int:
+    """Return how many triangles repeat the three vertices of another one."""
+    ordered = np.sort(triangles, axis=1)
+    ordered = ordered[np.lexsort(ordered.T)]
+    return int(np.count_nonzero((ordered[1:] == ordered[:-1]).all(axis=1)))

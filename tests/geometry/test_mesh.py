@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 import re
+import tracemalloc
 from dataclasses import FrozenInstanceError
 from typing import Any
 
@@ -15,6 +16,7 @@ from sobolev_batch import Mesh
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.overlap import shared_triangles
+from sobolev_batch.shapes import icosphere
 from tests.support.shapes import (
     AWKWARD_VERTICES,
     BOX_AREA,
@@ -91,6 +93,19 @@ def test_a_move_that_leaves_no_area_is_refused_with_its_size(scale: float, origi
     tiny = Mesh(np.array([[0, 0, 0], [1e-12, 0, 0], [0, 1e-12, 0]]), [[0, 1, 2]])
     with pytest.raises(MeshError, match=rf"{what}.*, once a mesh of size 1.41e-12 is scaled by {how}; check the units"):
         tiny.moved(scale, (origin, 0.0, 0.0))
+
+
+def test_counts_take_less_memory_than_a_worker_keeps_for_them() -> None:
+    peaks = []
+    # The first time, modules are imported too.
+    for _ in range(2):
+        mesh = copy.deepcopy(icosphere(5))
+        tracemalloc.start()
+        assert mesh.counts["components"] == 1
+        peaks.append(tracemalloc.get_traced_memory()[1] / len(mesh.triangles))
+        tracemalloc.stop()
+    # 20 million triangles take 3 GB besides the mesh, on a worker of 6 GB.
+    assert peaks[-1] < 150
 
 
 @pytest.mark.parametrize(
