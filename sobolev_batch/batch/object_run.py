@@ -6,7 +6,7 @@ Whoever drives the run computes nothing itself: it hands out tasks, and keeps wh
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -104,22 +104,22 @@ def object_key(one: StudyObject, members: Members, fingerprints: Mapping[str, st
     return digest_of(inputs)
 
 
-def run_object(
-    study: Study, location: Location, equip: Callable[[], Cluster], workspace: Workspace | None = None
-) -> Stages[Ended]:
+def ended_already(workspace: Workspace) -> Ended | None:
+    """Return how an object ended in whose workspace nothing is missing; None where anything is."""
+    if not lacks_nothing(workspace):
+        return None
+    # The last run may have been killed before it did.
+    workspace.put_in_order()
+    return Ended.of(workspace, set())
+
+
+def run_object(study: Study, location: Location, cluster: Cluster, workspace: Workspace | None = None) -> Stages[Ended]:
     """Run a study of one object in a locked store, in its workspace where that is at hand, else as a worker plans it.
 
-    A cluster is asked for if anything is missing. The worker that plans does small work at once.
+    The worker that plans does small work at once.
     """
-    if workspace is not None and lacks_nothing(workspace):
-        # The last run may have been killed before it did.
-        workspace.put_in_order()
-        return Ended.of(workspace, set())
-    cluster = equip()
-    # Asked before anything is computed: a GPU that nobody has would be waited for.
-    workers = cluster.workers.with_backend(study.backend)
-    workers.require_accuracy(study.accuracy)
     if workspace is None:
+        workers = cluster.workers.with_backend(study.backend)
         advance = cluster.count_steps("lattice", 1)
         # Should the worker die, another one leaves the work to tasks.
         careful = Task(begin, (study, location, None), stage="plan")
@@ -154,9 +154,8 @@ def begin(study: Study, location: Location, workers: Workers | None) -> Begun | 
         # Workers plan many.
         compiled.use()
         workspace = Workspace.of_study(study, location)
-    if lacks_nothing(workspace):
-        workspace.put_in_order()
-        return Ended.of(workspace, set()), {}
+    if (before := ended_already(workspace)) is not None:
+        return before, {}
     if workers is None or not _is_small(workspace, workers):
         return workspace
     ended = in_place(_compute(Cluster(None, workers), workspace))

@@ -13,7 +13,7 @@ from sobolev_batch.batch.cluster.clients import local_client, memory_limit, requ
 from sobolev_batch.batch.cluster.execution import Cluster, Notify, Progress, Stages, side_by_side
 from sobolev_batch.batch.cluster.watch import Heartbeat, Watch
 from sobolev_batch.batch.cluster.workers import prepare_workers, require_store_access
-from sobolev_batch.batch.object_run import Ended, ended_before, run_object, workspace_at_hand
+from sobolev_batch.batch.object_run import Ended, ended_already, ended_before, run_object, workspace_at_hand
 from sobolev_batch.batch.start import StoreLike, ready_to_run
 from sobolev_batch.errors import DamageError, InputError, SobolevBatchError, StoreError
 from sobolev_batch.machine import available_cores, require_machine_memory
@@ -189,6 +189,8 @@ def carry_out(
 
         def equipped(name: str) -> Cluster:
             cluster, heartbeat.watch = equip()
+            # Asked before anything is computed: a GPU that nobody has would be waited for.
+            cluster.workers.with_backend(study.backend).require_accuracy(study.accuracy)
             return replace(cluster, notify=partial(beat, name), part=name)
 
         recorded = {} if objects is None else objects.recorded()
@@ -201,11 +203,13 @@ def carry_out(
                 one = study.of_object(name)
                 if _is_left_out(one):
                     continue
-                before = ended_before(one, recorded.get(name))
-                if before is not None and name in whole:
+                record = recorded.get(name) if name in whole else None
+                before = ended_before(one, record) if at_hand is None else ended_already(at_hand)
+                if before is not None:
                     ended[name] = before
                 else:
-                    yield name, run_object(one, place.below(name) if name else place, partial(equipped, name), at_hand)
+                    # What is wrong with the cluster is no fault of an object, and is raised.
+                    yield name, run_object(one, place.below(name) if name else place, equipped(name), at_hand)
 
         def is_fatal(error: Exception) -> bool:
             is_of_all = isinstance(error, StoreError) and not isinstance(error, DamageError)

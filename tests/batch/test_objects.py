@@ -203,6 +203,16 @@ def test_runs_tell_of_themselves_while_they_plan(tmp_path: Path, monkeypatch: py
     assert (ended.going_on, ended.waiting, {*ended.failed}) == (False, 0, {"gone", "too"})
 
 
+def test_what_a_cluster_lacks_is_no_fault_of_its_objects(changeable: Path, threads: Client) -> None:
+    before, objects = sb.table(changeable), [*balls(a=1.0), *balls(b=1.1), *balls(c=1.2)]
+    of_gpu = sb.Study.from_table(
+        small_table(study={"name": "small"}, object=objects, family=methods_of(), transform={"backend": "gpu"})
+    )
+    with pytest.raises(sb.errors.ClusterError, match="requests backend 'gpu'"):
+        sb.run(of_gpu, changeable, threads)
+    pd.testing.assert_frame_equal(sb.table(changeable), before)
+
+
 def test_one_lock_keeps_all_objects(changeable: Path) -> None:
     with locked(Location.parse(changeable), Lock.of_this_process()):
         for use in (sb.verify, sb.unlock):
