@@ -71,12 +71,13 @@ def _require_members(study: Study, only: Sequence[str]) -> None:
     known: dict[str, None] = {}
     unknown = list(only)
     for one in study.objects.values() if only else ():
-        # The run reports what cannot be listed.
-        with suppress(InputError):
+        try:
             known |= dict.fromkeys(
                 [*filter(None, [one.name]), *(family for family, _ in one.members.values()), *one.members]
             )
-            unknown = [name for name in unknown if not one.chosen([name])]
+        except InputError:
+            return  # The run reports what cannot be listed, and may have any name.
+        unknown = [name for name in unknown if not one.chosen([name])]
     if unknown:
         raise StudyError(
             f"no object, family or member of the study is {quoted(unknown[0])}; {known_names(unknown[0], known)}"

@@ -423,6 +423,13 @@ def test_a_run_of_a_part_takes_objects_families_or_members(changeable: Path, thr
         sb.run(study, changeable, threads, only=["r"])
 
 
+def test_a_part_that_cannot_be_listed_says_why(tmp_path: Path, threads: Client) -> None:
+    files = [{"name": "scans", "source": "files", "paths": ["no/*.ply"]}]
+    study = sb.Study.from_table(small_table(object=balls(a=1.0), family=files), folder=tmp_path)
+    failed = sb.run(study, tmp_path / "s.zarr", threads, only=["a"]).failed
+    assert "matches no file" in failed["a"]
+
+
 def test_objects_that_no_run_has_come_to_are_not_begun(tmp_path: Path, threads: Client) -> None:
     path = tmp_path / "s.zarr"
     sb.run(study_of(balls(a=1.0, b=1.1, c=1.2)), path, threads, only=["b", "c/ico"])
