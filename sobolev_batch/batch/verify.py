@@ -126,7 +126,11 @@ def verify(store: str | Path | Location, on_progress: Callable[[int, int], None]
         # It is opened again: the last run may have ended since. Whoever unlocks it may change it.
         own = replace(location, fence=lock.of_holder(root).fence)
         objects = objects and Objects.read(own, is_thorough=True)
-        return _verify_all(own, objects, on_progress, may_write=True)
+        found = _verify_all(own, objects, on_progress, may_write=True)
+        if root != location and not found.is_sound and (above := Objects.read(replace(own, name=root.name))):
+            # Runs pass over objects whose records there say that nothing is missing.
+            above.records.write(above.rows[location.name.rpartition("/")[2]], None)
+        return found
     finally:
         release(root, lock)
 
@@ -144,7 +148,7 @@ def _verify_all(
             if place := objects.existing_store(name):
                 verified[name] = _verify(Store.open(place), on_progress, may_write=may_write)
         except DamageError as error:
-            verified[name] = replace(verified[name], tables={ROOT: error.what}, withdrawn=True)
+            verified[name] = replace(verified[name], tables={ROOT: error.what}, withdrawn=may_write)
         if may_write and not verified[name].is_sound:
             objects.records.write(objects.rows[name], None)
     damaged = [one for one in verified.values() if not one.is_sound]

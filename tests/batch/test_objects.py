@@ -82,6 +82,13 @@ def test_what_is_damaged_is_named_with_its_object(changeable: Path) -> None:
     assert last == "1 surfaces and 0 arrays of tables are damaged; run the study again to repair it"
 
 
+def test_damage_that_is_found_in_one_object_is_repaired_by_a_run_of_all(changeable: Path, threads: Client) -> None:
+    flip(changeable / "b/fourier/fourier/c/1/0/0/0")
+    assert list(sb.verify(changeable / "b").fields) == ["ico/2"]
+    assert sb.run(study_of([*balls(a=1.0), GONE, *balls(b=1.1)]), changeable, threads).computed == ("b/ico/2",)
+    assert sb.verify(changeable).is_sound
+
+
 def test_objects_that_were_altered_or_traded_are_damage(changeable: Path) -> None:
     before, root = sb.table(changeable), changeable / "zarr.json"
     for damaged in ("", root.read_text().replace(r"\"objects\": [\"a\", ", r"\"objects\": [\"../a\", ")):
