@@ -51,10 +51,11 @@ def seconds_of_missing(
     missing = [label for label in predicted if label not in stored]
     if not missing:
         return {}, ""
-    if len(stored) >= _FEWEST_RECORDS:
-        spent = sum(record.seconds for record in stored.values())
-        factor = spent / sum(predicted[label] for label in stored)
-        basis = f"the {len(stored)} fields that are stored"
+    # What programs took is in the time of others, and in no prediction.
+    known = [row.label for row in plan.rows if row.label in stored and is_predictable(row)]
+    if len(known) >= _FEWEST_RECORDS:
+        factor = sum(stored[label].seconds for label in known) / sum(predicted[label] for label in known)
+        basis = f"the {len(known)} fields that are stored"
     elif client is None:
         factor, basis = slowness(), "a transform on this machine"
     else:

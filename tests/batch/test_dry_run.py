@@ -71,6 +71,17 @@ def test_stored_fields_tell_the_speed_of_the_others(plan: Plan) -> None:
     assert basis == "the 3 fields that are stored"
 
 
+def test_what_programs_took_tells_no_speed(plan: Plan) -> None:
+    made = {"name": "made", "source": "command", "mesh": {"source": "icosphere", "levels": [1]}, "n": [1, 2, 3]}
+    families = [made | {"command": ["cp", "{input}", "{output}", "{n}"]}, *small_table()["family"]]
+    both, own = make_plan(sb.Study.from_table(small_table(family=families))), [row.label for row in plan.rows][:3]
+    slow, workers = [row.label for row in both.rows][:3], Workers.of_this_machine(2)
+    stored = records(both, *own, seconds=1.0)
+    found, basis = seconds_of_missing(both, stored | records(both, *slow, seconds=1e4), workers, None)
+    assert basis == "the 3 fields that are stored"
+    assert found == seconds_of_missing(plan, stored, workers, None)[0]
+
+
 def test_nothing_is_foretold_where_nothing_is_missing(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
     def measured() -> float:
         raise AssertionError("nothing needs to be measured")
