@@ -437,6 +437,19 @@ def test_a_part_that_cannot_be_listed_says_why(tmp_path: Path, threads: Client) 
     assert "matches no file" in failed["a"]
 
 
+@pytest.mark.parametrize("orders", [[-4.0], [-4.0, -3.0]])
+def test_a_run_of_a_part_at_other_orders_mixes_none(changeable: Path, threads: Client, orders: list[float]) -> None:
+    other = small_table(
+        study={"name": "small"}, object=balls(a=1.0, b=1.1), family=methods_of(), norm={"orders": orders}
+    )
+    sb.run(sb.Study.from_table(other), changeable, threads, only=["a"])
+    rows = sb.table(changeable)
+    assert rows["object"].unique().tolist() == ["a"]
+    assert rows.drop(columns="object").equals(sb.table(changeable / "a"))
+    sb.run(sb.Study.from_table(other), changeable, threads)
+    assert sb.table(changeable).groupby("object")["order"].unique().map(list).to_dict() == {"a": orders, "b": orders}
+
+
 def test_objects_that_no_run_has_come_to_are_not_begun(tmp_path: Path, threads: Client) -> None:
     path = tmp_path / "s.zarr"
     sb.run(study_of(balls(a=1.0, b=1.1, c=1.2)), path, threads, only=["b", "c/ico"])
