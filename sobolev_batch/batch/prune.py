@@ -5,7 +5,7 @@ from contextlib import nullcontext, suppress
 
 from sobolev_batch.errors import StoreError
 from sobolev_batch.store.encoding import ROOT
-from sobolev_batch.store.layout import FIELD, OCTAVES, RECORDS, TABLES_OF_ALL, TAGS, Store
+from sobolev_batch.store.layout import FIELD, OCTAVES, QUALITY, RECORDS, TABLES_OF_ALL, TAGS, Store
 from sobolev_batch.store.location import PARTIAL_FILE, Location
 from sobolev_batch.store.lock import LOCK_KEYS, Lock, locked
 from sobolev_batch.store.objects import Objects, root_of
@@ -69,6 +69,9 @@ def prune(location: Location, *, is_dry: bool = True) -> dict[str, int]:
             for row in lost:
                 if contents.records[row] is not None:
                     Records(store).write(row, None)
+                    contents.records[row] = None
+            if lost:
+                store.write(QUALITY, [0], contents.qualities)
             location.remove_partial_files()
             for prefix in prefixes:
                 location.remove(prefix)

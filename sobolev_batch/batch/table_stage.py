@@ -105,7 +105,7 @@ def write_results(
     convergence = results.convergence_table(workspace.plan.study.accuracy)
     convergence.attrs |= {"digest": digest, NUMERICS: numerics}
     replaced = [*replaced, *(hide_tables(store) if _pairs(workspace) is None else ())]
-    store.write(QUALITY, [0], [record.quality if record else "" for record in workspace.records])
+    store.write(QUALITY, [0], workspace.qualities)
     write_table(store, "meshes", results.meshes)
     write_table(store, "norms", results.norms_table())
     if PAIRS_KEYS not in store.documents:
@@ -149,8 +149,7 @@ def are_tabulated(workspace: Workspace, digest: str = "") -> bool:
     if pairs is not None and (PAIRS_KEYS not in workspace.store.documents or pairs.stale()):
         return False
     try:
-        qualities = workspace.store.read_strings(QUALITY)
-        return list(qualities) == [record.quality if record else "" for record in workspace.records]
+        return list(workspace.store.read_strings(QUALITY)) == workspace.qualities
     except DamageError:
         return False
 

@@ -50,6 +50,11 @@ class Contents:
         return {i: record for i, record in complete_records(self.records).items() if i in self.rows}
 
     @property
+    def qualities(self) -> list[str]:
+        """Quality of each row's field, of which readers find a copy beside the fields; empty without a field."""
+        return [record.quality if record else "" for record in self.records]
+
+    @property
     def failures(self) -> dict[str, str]:
         """Reason of each row whose field could not be computed, by its label."""
         found = {self.labels[i]: self.records[i] for i in self.rows}
@@ -176,9 +181,7 @@ class Workspace(Contents):
         replaced = {i for i in rows if self.records[i] is not None}
         if replaced:
             hide_tables(self.store)
-            qualities = [
-                record.quality if record and i not in replaced else "" for i, record in enumerate(self.records)
-            ]
+            qualities = ["" if i in replaced else quality for i, quality in enumerate(self.qualities)]
             self.store.write(QUALITY, [0], qualities)
 
 

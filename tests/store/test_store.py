@@ -18,7 +18,7 @@ from distributed import Client
 from zarr.codecs import Crc32cCodec
 from zarr.storage import MemoryStore
 
-from sobolev_batch import Study, open_store, run, unlock, verify
+from sobolev_batch import Study, open_store, plan, run, unlock, verify
 from sobolev_batch.batch.prune import prune
 from sobolev_batch.batch.status import Status
 from sobolev_batch.errors import LockError, StoreError
@@ -307,6 +307,7 @@ def test_what_no_record_needs_is_counted_and_then_removed(copy: Path, threads: C
     assert left.keys() <= sound.keys() | {copy / f"records/record/c/{row}"}
     assert call("prune", copy).stdout == "nothing to remove\n"
     assert verify(copy).is_sound
+    assert not plan(part, copy).object.lacks_tables
     assert run(part, copy, threads).computed == ()
     assert len(run(whole, copy, threads).computed) == 1
     with locked(Location.parse(copy), Lock.of_this_process()), pytest.raises(LockError):
