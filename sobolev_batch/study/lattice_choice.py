@@ -44,7 +44,7 @@ class LatticeChoice:
         basis: Digest of the data that the choice was made from; empty if the lattice was given.
         tail: Sampling of the octaves beyond the lattice; None without octaves.
         compared_with: Digest of the reference that surfaces are compared with beyond a given lattice, where it has flat
-            faces and there are no octaves; else empty.
+            faces or octaves follow; else empty.
     """
 
     lattice: Lattice

@@ -160,11 +160,10 @@ def _lattice_choice(
     earlier: LatticeChoice | None,
 ) -> tuple[LatticeChoice, Look]:
     if study.lattice is not None:
-        given = LatticeChoice(study.lattice, study.transform.dtype, study.transform.dtype)
-        if study.octaves:
-            return replace(given, tail=TailSampling.usual(study.lattice.xi_max, study.octaves, [surface])), Look()
-        is_flat = bool(FaceNormals.from_surfaces([surface]))
-        return replace(given, compared_with=fingerprint_of(reference, members[reference][1]) * is_flat), Look()
+        dtype, own = study.transform.dtype, members[reference][1]
+        tail = TailSampling.usual(study.lattice.xi_max, study.octaves, [surface]) if study.octaves else None
+        compared_with = fingerprint_of(reference, own) if tail or FaceNormals.from_surfaces([surface]) else ""
+        return LatticeChoice(study.lattice, dtype, dtype, tail=tail, compared_with=compared_with), Look()
     if study.accuracy is None:
         raise ValueError("a study has a lattice or an accuracy")
     basis = choice_basis(study, study.accuracy, similarity, members[reference][1].fingerprint())

@@ -98,21 +98,23 @@ def test_tables_of_fields_that_are_replaced_are_withdrawn_first(
 
 
 @pytest.mark.parametrize(
-    ("meshes", "again"),
+    ("meshes", "octaves", "again"),
     [
-        # Beyond a given lattice, fields are compared with a reference that has flat faces.
-        ([trimesh.creation.box((1.0, 1.0, height)) for height in (1.0, 0.5)], ("f/a", "f/b")),
-        ([trimesh.creation.icosphere(subdivisions=2, radius=radius) for radius in (0.6, 0.5)], ()),
+        # Beyond a given lattice, fields are compared with a reference that has flat faces, and beyond octaves.
+        ([trimesh.creation.box((1.0, 1.0, height)) for height in (1.0, 0.5)], 0, ("f/a", "f/b")),
+        ([trimesh.creation.icosphere(subdivisions=2, radius=radius) for radius in (0.6, 0.5)], 0, ()),
+        ([trimesh.creation.icosphere(subdivisions=2, radius=radius) for radius in (0.6, 0.5)], 1, ("f/a", "f/b")),
     ],
 )
 def test_distances_are_those_to_the_reference_of_the_study(
-    meshes: list[trimesh.Trimesh], again: tuple[str, ...], folder: Path, store_path: Path, client: Client
+    meshes: list[trimesh.Trimesh], octaves: int, again: tuple[str, ...], folder: Path, store_path: Path, client: Client
 ) -> None:
+    lattice = {**small_table()["lattice"], "octaves": octaves}
     for name, mesh in zip("ab", meshes, strict=True):
         mesh.export(folder / f"{name}.off")
     for name, computed in (("a", ("f/a", "f/b")), ("b", again)):
         reference = {"source": "family", "family": "f", "member": name}
-        study = study_of(folder, scaling={"mode": "fixed", "scale": 1.0}, reference=reference)
+        study = study_of(folder, scaling={"mode": "fixed", "scale": 1.0}, reference=reference, lattice=lattice)
         assert run(study, store_path, client).computed == computed
         distances = variable(open_store(store_path), "convergence", "distance")
         assert distances.mesh[(distances == 0).all("order")].values.tolist() == [f"f/{name}"]
