@@ -173,16 +173,25 @@ class Workspace(Contents):
         """Withdraw the records of damaged fields, which makes them pending."""
         for i in rows:
             _log.warning("the field of %s is damaged (%s) and is computed again", self.rows[i].label, reason)
-            Records(self.store).write(i, None)
-            self.records[i] = None
+            self._withdraw(i)
+
+    def _withdraw(self, row: int) -> None:
+        Records(self.store).write(row, None)
+        self.records[row] = None
 
     def withdraw_results_of(self, rows: Sequence[int]) -> None:
-        """Withdraw the tables and qualities that follow from fields which are about to be replaced."""
-        replaced = {i for i in rows if self.records[i] is not None}
+        """Withdraw the tables and qualities that follow from fields which are about to be replaced.
+
+        Fields that are not those of the plan, and stay, are as good as missing: no table may mix them with others.
+        """
+        others = self.complete.keys() - self.stored.keys() - set(rows)
+        replaced = others.union(i for i in rows if self.records[i] is not None)
         if replaced:
             hide_tables(self.store)
             qualities = ["" if i in replaced else quality for i, quality in enumerate(self.qualities)]
             self.store.write(QUALITY, [0], qualities)
+        for i in others:
+            self._withdraw(i)
 
 
 def complete_records(records: Sequence[Record | None]) -> dict[int, Record]:

@@ -120,6 +120,18 @@ def test_distances_are_those_to_the_reference_of_the_study(
         assert distances.mesh[(distances == 0).all("order")].values.tolist() == [f"f/{name}"]
 
 
+def test_a_run_of_a_part_mixes_no_fields_of_two_studies(folder: Path, store_path: Path, client: Client) -> None:
+    run(study_of(folder), store_path, client)
+    other = study_of(folder, scaling={"mode": "fixed", "scale": 0.5})
+    assert run(other, store_path, client, only=["f/a"]).computed == ("f/a", "reference")
+    assert dict(zip(ALL, variable(open_store(store_path), "meshes", "status").values, strict=True)) == {
+        **dict.fromkeys(ALL, "complete"),
+        "f/b": "missing",
+    }
+    assert verify(store_path).is_sound
+    assert run(other, store_path, client).computed == ("f/b",)
+
+
 def test_a_changed_file_and_changed_numerics(
     folder: Path, store_path: Path, client: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
