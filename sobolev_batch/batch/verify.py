@@ -49,7 +49,7 @@ class Verification(Shown):
     Attributes:
         store: Path or URL of the store.
         complete: Number of surfaces with a completion record; their fields were read.
-        total: Number of surfaces of the study.
+        total: Number of surfaces of the study, and of those that it has lost whose fields stay.
         fields: Damage of fields and their records, by the label of the surface.
         tables: Damage of tables and coordinates, by the name of the array.
         withdrawn: True if the records of damaged fields were withdrawn, so that the next run makes them again, as it
@@ -174,7 +174,9 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, *, may
     except StoreError as error:
         tables[RECORDS] = error.what if isinstance(error, DamageError) else str(error)
     labels = store.labels() if LABELS not in tables else tuple(f"row {row}" for row in range(len(records)))
-    contents = Contents(store, labels, dict.fromkeys(range(len(labels))), records)
+    removed = store.removed
+    rows = dict.fromkeys(i for i, label in enumerate(labels) if label not in removed or records[i] is not None)
+    contents = Contents(store, labels, rows, records)
     if contents.has_tables:
         if not {"meshes/row", "meshes/status", "meshes/key"} & tables.keys():
             damaged = contents.unlike_tables | damaged
@@ -190,7 +192,7 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, *, may
     complete = contents.complete
     planned = store.attributes().get("versions", {}).get(NUMERICS)
     for row, record in complete.items():
-        if planned is not None and record.numerics != planned:
+        if planned is not None and record.numerics != planned and labels[row] not in removed:
             damaged[row] = f"it was computed by numerics of version {record.numerics}, and the study by {planned}"
     whole = Fields(store).complete_rows() if complete else set()
 
@@ -216,7 +218,7 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, *, may
     return Verification(
         store.path,
         len(complete),
-        len(labels),
+        len(rows),
         {labels[row]: damaged[row] for row in sorted(damaged)},
         tables,
         may_write and bool(damaged or tables),
