@@ -51,7 +51,8 @@ class RunRecord:
         table = document.get("attributes", {}).get(_RUN)
         if table is None:
             return None
-        digest, name = table.pop(DIGEST, ""), f"{store.path}: {RECORDS}/{ROOT}, the record of the latest run,"
+        digest = table.pop(DIGEST, "") if isinstance(table, dict) else ""
+        name = f"{store.path}: {RECORDS}/{ROOT}, the record of the latest run,"
         if digest != document_digest(table):
             raise damaged_record(name, CHANGED, table)
         return record_in(cls, table, name)

@@ -348,12 +348,15 @@ def test_a_root_that_cannot_be_read(damage: Damage, store: Path, threads: Client
 
 def test_the_record_of_a_run_that_was_altered(store: Path, study: Study, threads: Client) -> None:
     path = store / "records/zarr.json"
-    path.write_text(path.read_text().replace('"state": "done"', '"state": "failed"'))
-    with pytest.raises(
-        DamageError, match=r"records/zarr.json, the record of the latest run, is damaged .*run the study"
-    ):
-        status(store)
-    assert list(verify(store).tables) == ["records"]
+    written = json.loads(path.read_text())
+    failed = {**written["attributes"]["run"], "state": "failed"}
+    for altered in (failed, [failed], "failed"):
+        path.write_text(json.dumps({**written, "attributes": {"run": altered}}))
+        with pytest.raises(
+            DamageError, match=r"records/zarr.json, the record of the latest run, is damaged .*run the study"
+        ):
+            status(store)
+        assert list(verify(store).tables) == ["records"]
     RunRecord("running", "process 1", utc_now(), "25:00 o'clock").write(Store.open(store))
     with pytest.raises(DamageError, match=r"records/zarr.json, .* is damaged \(seen: .*o'clock"):
         status(store)
