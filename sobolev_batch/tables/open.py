@@ -351,8 +351,8 @@ def placement_doubts(tree: xr.DataTree) -> dict[str, str]:
     complete, reference = complete_meshes(tree), reference_of(tree)
     if reference not in complete:
         return {}
-    texts = tree["fourier"]["quality"].sel(mesh=complete).load()
-    extents = {label: Quality.from_json(str(texts.sel(mesh=label).item())).extent for label in complete}
+    texts = tree["fourier"].to_dataset()["quality"].sel(mesh=complete).values.tolist()
+    extents = {label: Quality.from_json(text).extent for label, text in zip(complete, texts, strict=True)}
     doubts = {label: placement_doubt(extent, extents[reference]) for label, extent in extents.items()}
     return {label: doubt for label, doubt in doubts.items() if doubt is not None}
 
