@@ -1,7 +1,7 @@
 """A run of a study: its objects side by side on a cluster, in a store that the run has to itself."""
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
@@ -194,8 +194,8 @@ def carry_out(
             return replace(cluster, notify=partial(beat, name), part=name)
 
         recorded = {} if objects is None else objects.recorded()
-        tabulated = frozenset() if objects is None else objects.tabulated
-        whole = tabulated & place.names() if recorded else frozenset()
+        tabulated = () if objects is None else objects.tabulated
+        whole = place.names().intersection(tabulated) if recorded else frozenset()
         ended: dict[str, Ended] = {}
 
         def runs() -> Iterator[tuple[str, Stages[Ended]]]:
@@ -224,11 +224,16 @@ def carry_out(
                 outcome = Ended(ObjectRecord(reason=str(outcome), total=total, finished=utc_now()))
             ended[name] = outcome
             if objects is not None:
-                objects.records.write(objects.rows[name], outcome.record)
+                is_new = outcome.tables is not None and name in tabulated
+                # With its key, the next run would trust the old rows at the root, should this one be killed.
+                objects.records.write(objects.rows[name], replace(outcome.record, key="") if is_new else outcome.record)
         if objects is not None:
+            _tabulate(objects, ended)
+            for name in tabulated:
+                if name in ended and ended[name].tables is not None:
+                    objects.records.write(objects.rows[name], ended[name].record)
             known = {**recorded, **{name: one.record for name, one in ended.items()}}
             objects.records.collect([known.get(name) for name in study.objects])
-            _tabulate(objects, ended, tabulated & study.objects.keys())
             objects.root.remember()
     return _summary(location, {name: ended[name] for name in study.objects if name in ended})
 
@@ -254,12 +259,13 @@ def _is_left_out(study: Study) -> bool:
     return False
 
 
-def _tabulate(objects: Objects, ended: Mapping[str, Ended], present: Set[str]) -> None:
-    """Write the tables of all objects at the root, where rows of any have changed, came or went."""
+def _tabulate(objects: Objects, ended: Mapping[str, Ended]) -> None:
+    """Write the tables of all objects at the root, where rows of any have changed, came, went or have another place."""
     changed = {name: one.tables for name, one in ended.items() if one.tables is not None}
     # Objects that the run left out keep theirs; those that it found to be impossible lose them.
-    refused = {name for name, one in ended.items() if one.record.reason}
-    kept = present - changed.keys() - refused
+    lost = {name for name, one in ended.items() if one.record.reason} | changed.keys()
+    present = {*objects.tabulated} - lost
+    kept = tuple(name for name in objects.names if name in present)
     if changed or kept != objects.tabulated:
         write_all(objects.root, objects.names, changed.values(), kept)
 

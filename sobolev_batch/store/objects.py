@@ -57,10 +57,10 @@ class Objects:
         return {name: one for name, one in zip(self.names, self.records.read(), strict=True) if one is not None}
 
     @cached_property
-    def tabulated(self) -> frozenset[str]:
-        """Return the names of the objects that have rows in the tables at the root."""
+    def tabulated(self) -> tuple[str, ...]:
+        """Return the names of the objects that have rows in the tables at the root, in the order of these."""
         rows = self.root.read_strings("meshes/object") if "meshes" in self.root.documents else ()
-        return frozenset(rows)
+        return tuple(dict.fromkeys(rows))
 
     def existing_store(self, name: str) -> Location | None:
         """Return the store of an object, None before its reference was made; DamageError if it is lost or another."""
