@@ -155,11 +155,16 @@ class Objects:
 
 
 def stores_below(location: Location) -> dict[str, Location]:
-    """Return the stores of all objects that have one, by name; that of an only object without a name is under ""."""
+    """Return the stores of all objects that have one, by name; that of an only object without a name is under "".
+
+    Of objects that the latest run could not carry out, they are of an earlier state of the study, and left out.
+    """
     objects = Objects.read(location)
     if objects is None:
         return {"": location}
-    return {name: place for name in objects.names if (place := objects.existing_store(name)) is not None}
+    refused = {name for name, record in objects.recorded().items() if record.reason}
+    own = (name for name in objects.names if name not in refused)
+    return {name: place for name in own if (place := objects.existing_store(name)) is not None}
 
 
 def root_of(location: Location) -> Location:

@@ -473,6 +473,20 @@ def test_an_object_that_cannot_be_carried_out_hides_no_tables(store: Path, tmp_p
         sb.compare_studies({"a": store / "a"}, tmp_path / "gone.zarr")
 
 
+@pytest.mark.parametrize("left", [{}, {"b": 1.1}])
+def test_no_table_has_an_object_that_could_not_be_carried_out(
+    left: dict[str, float], changeable: Path, threads: Client
+) -> None:
+    """Its store has numbers of an earlier reference."""
+    sb.run(study_of([{**GONE, "name": "a"}, *balls(**left)]), changeable, threads)
+    for order in (None, -4):
+        if left:
+            assert sb.table(changeable, order)["object"].unique().tolist() == ["b"]
+        else:
+            with pytest.raises(sb.errors.InputError, match="there are no tables yet"):
+                sb.table(changeable, order)
+
+
 @pytest.mark.process
 def test_a_run_without_any_tables_says_so_and_ends_with_status_3(tmp_path: Path) -> None:
     (tmp_path / "study.toml").write_text(tomli_w.dumps(study_of([GONE, {**GONE, "name": "lost"}]).table))
