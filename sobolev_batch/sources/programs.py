@@ -34,6 +34,8 @@ PLACEHOLDER = re.compile(r"\{(\w+)\}")
 _LONGEST_TAIL = 300
 # Seconds between looks at a program that runs: at first, and at most.
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.005, 0.1
+# Those of real time have none.
+_NAMES_OF_SIGNALS = {one.value: one.name for one in signal.Signals}
 # Variable of a program's environment with its folder. On Linux it shows which processes left the program's session.
 _MARK = "SOBOLEV_BATCH_FOLDER"
 # It is told the number of a process. When the writer ends, however it does, it kills the session of the process and
@@ -138,8 +140,9 @@ def run_command(mesh: Mesh, words: list[str], suffixes: tuple[str, str], timeout
         status = process.returncode
         cost = Cost(time.perf_counter() - started, cpu_seconds, peak_bytes, status)
         if not problem and status:
-            name = signal.Signals(-status).name if status < 0 else ""
-            problem = f"{words[0]} was ended by {name}" if name else f"{words[0]} ended with exit status {status}"
+            name = _NAMES_OF_SIGNALS.get(-status, f"signal {-status}")
+            problem = f"was ended by {name}" if status < 0 else f"ended with exit status {status}"
+            problem = f"{words[0]} {problem}"
         if not problem and not os.path.isfile(files[OUTPUT]):
             problem = f"{words[0]} wrote no mesh (output{suffixes[1]})"
         if not problem:

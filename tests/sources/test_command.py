@@ -130,6 +130,7 @@ def test_all_that_a_mesh_depends_on_is_in_its_fingerprint(tmp_path: Path) -> Non
     [
         ("echo broken >&2; exit 7", "sh ended with exit status 7: broken"),
         ("kill -9 $$", "sh was ended by SIGKILL"),
+        ("kill -40 $$", "sh was ended by signal 40"),
         ("echo done", r"sh wrote no mesh \(output\.ply\): done"),
         ("echo nonsense > {output}", "sh wrote no mesh: .*"),
         ("sleep 1000 & sleep 1000", r"it was ended after 0\.3 s, its timeout"),
