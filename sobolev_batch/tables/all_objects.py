@@ -60,15 +60,19 @@ def packed_tables(name: str, tables: Tables, unit_length: float) -> bytes:
 def write_all(root: Store, names: Sequence[str], changed: Iterable[bytes], kept: Collection[str]) -> None:
     """Write the tables of all objects in the order of their names: those that changed, and those kept of before.
 
-    Only bytes that `packed_tables` has returned in a run may be given.
+    Only bytes that `packed_tables` has returned in a run may be given. Tables of before go if they lack an order.
     """
-    before = {group: table.sel(mesh=table["object"].isin(list(kept))) for group, table in tables_in(root).items()}
-    if before and before["convergence"]["order"].values.tolist() != root.attributes(of_objects=True)["study"]["orders"]:
-        # Objects that the run left out have no numbers at the orders that the study has now.
-        before = {}
-    parts, waiting = [before], iter(changed)
+    parts, waiting = list[Tables](), iter(changed)
     while batch := [pickle.loads(zlib.decompress(one)) for one in islice(waiting, _MOST_AT_ONCE)]:  # noqa: S301
         parts.append(_joined(batch))
+    before = {group: table.sel(mesh=table["object"].isin(list(kept))) for group, table in tables_in(root).items()}
+    if before and parts:
+        orders = parts[0]["convergence"]["order"].values
+        if np.isin(orders, before["convergence"]["order"]).all():
+            before["convergence"] = before["convergence"].sel(order=orders)
+        else:
+            before = {}
+    parts.append(before)
     rank = {name: place for place, name in enumerate(names)}
     tables = {}
     for group, table in _joined(parts).items():
@@ -106,7 +110,7 @@ def _concatenated(tables: Sequence[xr.Dataset]) -> xr.Dataset:
         else:
             columns[name] = model.dims, model.values
     coordinates = {name for table in tables for name in table.coords}
-    attributes = dict(tables[-1].attrs)
+    attributes = dict(tables[0].attrs)
     for name in {"metadata", NUMERICS} & attributes.keys():
         attributes[name] = list(dict.fromkeys(one for table in tables for one in table.attrs.get(name, ())))
     return describe(xr.Dataset(columns, attrs=attributes).set_coords(list(coordinates)))

@@ -440,17 +440,26 @@ def test_a_part_that_cannot_be_listed_says_why(tmp_path: Path, threads: Client) 
     assert "matches no file" in failed["a"]
 
 
-@pytest.mark.parametrize("orders", [[-4.0], [-4.0, -3.0]])
-def test_a_run_of_a_part_at_other_orders_mixes_none(changeable: Path, threads: Client, orders: list[float]) -> None:
-    other = small_table(
-        study={"name": "small"}, object=balls(a=1.0, b=1.1), family=methods_of(), norm={"orders": orders}
-    )
-    sb.run(sb.Study.from_table(other), changeable, threads, only=["a"])
-    rows = sb.table(changeable)
-    assert rows["object"].unique().tolist() == ["a"]
-    assert rows.drop(columns="object").equals(sb.table(changeable / "a"))
-    sb.run(sb.Study.from_table(other), changeable, threads)
-    assert sb.table(changeable).groupby("object")["order"].unique().map(list).to_dict() == {"a": orders, "b": orders}
+@pytest.mark.parametrize(("orders", "kept"), [([-3.0, -10.0], "ab"), ([-4.0, -2.0], "b")])
+def test_numbers_of_a_part_have_the_orders_of_its_study(
+    orders: list[float], kept: str, changeable: Path, threads: Client
+) -> None:
+    """Those of the objects that it leaves out, at the root, are not taken for numbers at other orders."""
+    study = study_of(balls(a=1.0, b=1.1))
+    changed = sb.Study.from_table({**study.table, "norm": {"orders": orders}})
+    before = sb.table(changeable).set_index(["object", "order", "mesh"])["distance"]
+    sb.run(changed, changeable, threads, only=["b"])
+    rows = sb.table(changeable).set_index(["object", "order", "mesh"])["distance"]
+    assert rows.index.unique("object").tolist() == list(kept)
+    assert rows.index.unique("order").tolist() == orders
+    if kept == "ab":
+        pd.testing.assert_series_equal(rows, before.loc[rows.index])
+    else:
+        pd.testing.assert_series_equal(
+            rows.loc["b"], sb.table(changeable / "b").set_index(["order", "mesh"])["distance"]
+        )
+    sb.run(changed, changeable, threads)
+    require_rows(changeable, "a", "b")
 
 
 def test_objects_that_no_run_has_come_to_are_not_begun(tmp_path: Path, threads: Client) -> None:
