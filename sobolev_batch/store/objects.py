@@ -121,8 +121,10 @@ class Objects:
         with suppress(DamageError):
             present = cls.read(location)
         if present is None:
-            # Where it is damaged, the stores of the objects are still there.
-            location.require_free({ROOT, RECORDS, TAGS, *LOCK_KEYS, *TABLES_OF_ALL, *study.objects})
+            # Where it is damaged, the stores of the objects are still there, and of those that the study has lost.
+            own = {ROOT, RECORDS, TAGS, *LOCK_KEYS, *TABLES_OF_ALL, *study.objects}
+            lost = {name for name in location.names() - own if _is_store_of(study.name, name, location.below(name))}
+            location.require_free(own | lost)
         elif present.name != study.name:
             raise StoreError(
                 f"{location}: it holds the store of another study, {present.name!r}, not {study.name!r}; "
@@ -152,6 +154,13 @@ class Objects:
                     made.records.write(made.rows[name], record)
         root.consolidate()
         return made
+
+
+def _is_store_of(study: str, name: str, location: Location) -> bool:
+    """Tell whether a location has the store of an object of a study."""
+    with suppress(StoreError):
+        return bool(Store(location).attributes()["study"]["name"] == f"{study} {name}")
+    return False
 
 
 def stores_below(location: Location) -> dict[str, Location]:

@@ -129,6 +129,19 @@ def test_an_object_that_lost_its_root_is_damage(changeable: Path, threads: Clien
     pd.testing.assert_frame_equal(sb.table(changeable), before)
 
 
+def test_a_root_that_is_damaged_is_made_again_beside_objects_that_the_study_has_lost(
+    changeable: Path, threads: Client
+) -> None:
+    sb.run(study_of(balls(b=1.1)), changeable, threads)
+    (changeable / "zarr.json").write_text("")
+    assert sb.run(study_of(balls(b=1.1)), changeable, threads).computed == ()
+    require_rows(changeable, "b")
+    (changeable / "zarr.json").write_text("")
+    (changeable / "a").rename(changeable / "c")
+    with pytest.raises(sb.errors.StoreError, match="the folder is not empty and holds no store"):
+        sb.run(study_of(balls(b=1.1)), changeable, threads)
+
+
 def test_an_object_whose_store_is_gone_is_damage(changeable: Path, threads: Client) -> None:
     before, total = sb.table(changeable), sb.status(changeable).total
     shutil.rmtree(changeable / "b")
