@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -160,21 +161,22 @@ class Status(Shown):
         start = f"by {run.driver}, begun {run.started}"
         is_ahead = self.silence_seconds < -LOST_AFTER_SECONDS
         direction = "ahead of the clock here" if is_ahead else "ago"
+        unlock = f"sobolev-batch unlock {shlex.quote(self.store)}"
         age = f"{duration(round(abs(self.silence_seconds)))} {direction}"
         if run.state == "submitted":
             yield f"submitted {age}, no worker has taken it up yet; {start}"
             if self.lost:
-                yield f"if that cluster is gone, submit the study again after: sobolev-batch unlock {self.store}"
+                yield f"if that cluster is gone, submit the study again after: {unlock}"
         elif run.state == "running":
             yield f"running: {run.stage or 'planning'}; {start}, last sign of life {age}"
             if run.error:
                 yield run.error
             if is_ahead:
-                yield f"whether it goes on is unknown; if it is gone: sobolev-batch unlock {self.store} --force"
+                yield f"whether it goes on is unknown; if it is gone: {unlock} --force"
             if self.lost:
                 yield "its process is probably gone, or its clock is behind the one here"
                 yield "run or submit the study again, and it continues from the store"
-                yield f"if the store turns out to be locked: sobolev-batch unlock {self.store}"
+                yield f"if the store turns out to be locked: {unlock}"
         elif run.state == "failed":
             yield f"the latest run failed: {run.error}; {start}, ended {run.seen}"
         elif self.is_incomplete:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import calendar
 import logging
 import os
+import shlex
 import socket
 import time
 from collections.abc import Iterator
@@ -161,7 +162,7 @@ def _take_over(location: Location, lock: Lock, current: Lock) -> None:
     refusal = LockError(
         f"{location}: another run has this store to itself: {current.driver}, since {current.since}. "
         "Wait for it or stop it; if it is gone without having been able to say so, "
-        f"unlock the store with: sobolev-batch unlock {location}"
+        f"unlock the store with: sobolev-batch unlock {shlex.quote(str(location))}"
     )
     if not current.holder_is_gone or not location.create(_TAKEOVER_KEY, lock.to_json()):
         raise refusal
@@ -185,7 +186,8 @@ def release(location: Location, lock: Lock) -> None:
                 with suppress(OSError):  # It holds a store, or is no folder.
                     Path(location.name).rmdir()
     except StoreError as error:
-        _log.warning("the store stays locked, unlock it with: sobolev-batch unlock %s (%s)", location, error)
+        name = shlex.quote(str(location))
+        _log.warning("the store stays locked, unlock it with: sobolev-batch unlock %s (%s)", name, error)
 
 
 def this_process() -> str:

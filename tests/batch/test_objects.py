@@ -40,7 +40,7 @@ LABELS = ("ico/1", "ico/2", "egg/1", "egg/2", "reference")
 
 @pytest.fixture
 def changeable(store: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(store, tmp_path / "copy.zarr"))
+    return Path(shutil.copytree(store, tmp_path / "a copy.zarr"))
 
 
 @pytest.fixture(scope="module")
@@ -239,6 +239,8 @@ def test_one_lock_keeps_all_objects(changeable: Path) -> None:
             for place in (changeable, changeable / "b"):
                 with pytest.raises(sb.errors.LockError):
                     use(place)
+        with pytest.raises(sb.errors.LockError, match=f"sobolev-batch unlock '{changeable}'"):
+            sb.verify(changeable)
     assert sb.verify(changeable / "b").is_sound
 
 
@@ -254,7 +256,7 @@ def test_the_status_is_that_of_the_run(changeable: Path) -> None:
     replace(ended, state="running").write(store)
     lost = sb.status(changeable)
     assert lost.lost
-    assert f"unlock {changeable}" in str(lost)
+    assert f"unlock '{changeable}'" in str(lost)
 
 
 def test_a_second_run_computes_what_is_new(changeable: Path, threads: Client) -> None:
