@@ -493,6 +493,11 @@ def test_an_object_that_cannot_be_carried_out_hides_no_tables(store: Path, tmp_p
     assert "no tables" not in str(found)
     sb.run(study_of([GONE]), tmp_path / "gone.zarr", threads)
     assert "no tables yet" in str(sb.status(tmp_path / "gone.zarr"))
+
+
+@pytest.mark.extras
+def test_stores_without_an_object_in_common_are_not_compared(store: Path, tmp_path: Path, threads: Client) -> None:
+    sb.run(study_of([GONE]), tmp_path / "gone.zarr", threads)
     with pytest.raises(sb.errors.InputError, match=r"the new one has \['a'\], the old one \[\]"):
         sb.compare_studies({"a": store / "a"}, tmp_path / "gone.zarr")
 
