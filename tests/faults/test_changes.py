@@ -104,6 +104,8 @@ def test_tables_of_fields_that_are_replaced_are_withdrawn_first(
         ([trimesh.creation.box((1.0, 1.0, height)) for height in (1.0, 0.5)], 0, ("f/a", "f/b")),
         ([trimesh.creation.icosphere(subdivisions=2, radius=radius) for radius in (0.6, 0.5)], 0, ()),
         ([trimesh.creation.icosphere(subdivisions=2, radius=radius) for radius in (0.6, 0.5)], 1, ("f/a", "f/b")),
+        # Octaves are sampled around the normals of flat faces.
+        ([trimesh.creation.icosphere(subdivisions=2, radius=0.6), trimesh.creation.box()], 1, ("f/a", "f/b")),
     ],
 )
 def test_distances_are_those_to_the_reference_of_the_study(
