@@ -14,7 +14,7 @@ from sobolev_batch.batch.cluster.watch import Heartbeat, Watch
 from sobolev_batch.batch.cluster.workers import prepare_workers, require_store_access
 from sobolev_batch.batch.run import carry_out
 from sobolev_batch.batch.start import StoreLike, ready_to_run
-from sobolev_batch.errors import ClusterError, StoreError
+from sobolev_batch.errors import ClusterError, StoreError, one_line
 from sobolev_batch.store.create import require_usable
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, acquire, release
@@ -89,14 +89,20 @@ def submit(
         workers.with_backend(study.backend)
         workers.require_accuracy(study.accuracy)
         submission = _prepared(study, lock.of_run(location))
-        Heartbeat(location, lock, watch).write("submitted")
+        heartbeat = Heartbeat(location, lock, watch)
+        heartbeat.write("submitted")
         # The worker was started in another folder.
         objects = {name: replace(one, folder=one.folder.absolute()) for name, one in study.objects.items()}
         study, key = replace(study, objects=objects), task_key("drive", study.name, "", "")
         # Before all tasks of other studies, from which it takes no thread: it leaves its own at once.
-        future = client.submit(drive, study, location.name, lock.run, key=key, pure=False, priority=1)
-        fire_and_forget(future)
-        _await_acceptance(client, future)
+        try:
+            future = client.submit(drive, study, location.name, lock.run, key=key, pure=False, priority=1)
+            fire_and_forget(future)
+            _await_acceptance(client, future)
+        except BaseException as error:
+            with suppress(StoreError):  # it must not hide the error
+                heartbeat.write("failed", f"it was not handed over: {one_line(error)}")
+            raise
     except BaseException:
         release(location, lock)
         raise

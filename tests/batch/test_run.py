@@ -263,6 +263,20 @@ def test_what_is_wrong_is_said_before_anything_is_handed_over(
     assert not store_path.exists()
 
 
+def test_a_study_that_no_cluster_has_taken_is_waited_for_by_nobody(
+    store_path: Path, threads: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def lost(*arguments: object, **settings: object) -> None:
+        raise sb.errors.ClusterError("the scheduler was lost")
+
+    monkeypatch.setattr(threads, "submit", lost)
+    with pytest.raises(sb.errors.ClusterError, match="was lost"):
+        sb.submit(sb.Study.from_table(small_table()), store_path, threads)
+    found = sb.status(store_path)
+    assert not found.going_on
+    assert "the latest run failed: it was not handed over: the scheduler was lost" in str(found)
+
+
 @pytest.mark.all
 def test_the_worker_that_drives_is_lost_and_another_takes_over(study_path: Path, store_path: Path) -> None:
     with tcp_cluster([], []) as (address, workers):
