@@ -4,8 +4,6 @@ One task measures those of a mesh, from both meshes and no field, and adds them 
 table is made from the records.
 """
 
-import hashlib
-import json
 import logging
 import time
 from collections.abc import Mapping, Sequence
@@ -29,6 +27,7 @@ from sobolev_batch.geometry.proximity import (
 )
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms.columns import describe
+from sobolev_batch.sources.registry import digest_of
 from sobolev_batch.store.layout import Store, table_attributes, write_table
 from sobolev_batch.store.records import ProximityRecord, Record, Records
 from sobolev_batch.store.workspace import Workspace
@@ -151,13 +150,12 @@ def _keys(workspace: Workspace) -> dict[int, str]:
     if requested is None or reference not in complete:
         return {}
     settings = requested.points, requested.threshold, workspace.plan.similarity.scale
-    inputs = {
-        i: [_VERSION, record.facts.digest, complete[reference].facts.digest, *settings]
+    return {
+        i: digest_of([_VERSION, record.facts.digest, complete[reference].facts.digest, *settings])
         for i, record in complete.items()
         # Closed forms have no triangles.
         if i != reference and record.facts.triangles
     }
-    return {i: hashlib.sha256(json.dumps(parts).encode()).hexdigest() for i, parts in inputs.items()}
 
 
 def _pending(workspace: Workspace) -> dict[int, str]:
@@ -196,4 +194,4 @@ def _dataset(workspace: Workspace, requested: ProximitySection) -> xr.Dataset:
 
 def _digest(workspace: Workspace, requested: ProximitySection) -> str:
     lines = [[label, record and asdict(record)] for label, record in _current(workspace)]
-    return hashlib.sha256(json.dumps([requested.metrics, lines]).encode()).hexdigest()
+    return digest_of([requested.metrics, lines])

@@ -1,7 +1,5 @@
 """Tables from stored fields: the reduction as tasks of the cluster, and its results in the store."""
 
-import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +9,7 @@ import xarray as xr
 from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, result_from, result_of
 from sobolev_batch.errors import DamageError
 from sobolev_batch.norms.estimate import NormEstimate
+from sobolev_batch.sources.registry import digest_of
 from sobolev_batch.store.layout import (
     DISTANCES,
     NUMERICS,
@@ -155,7 +154,7 @@ def are_tabulated(workspace: Workspace, digest: str = "") -> bool:
 
 
 def _digest(workspace: Workspace, placed: Sequence[Placed]) -> str:
-    """Return the SHA-256 of all that the tables depend on."""
+    """Return a digest of all that the tables depend on."""
     plan = workspace.plan
     shown = [(workspace.rows[i], workspace.records[i]) for i, _, _ in placed]
     rows = [
@@ -173,4 +172,4 @@ def _digest(workspace: Workspace, placed: Sequence[Placed]) -> str:
         "reference": plan.reference,
         "order_by": {family.name: family.order_by for family in plan.study.object.families},
     }
-    return hashlib.sha256(json.dumps(inputs).encode()).hexdigest()
+    return digest_of(inputs)
