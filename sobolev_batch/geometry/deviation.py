@@ -8,7 +8,8 @@ triangles t of the other mesh B, some piece has
 and the distance of each of its points from B is a lower bound. A piece whose upper bound exceeds the best lower bound
 by too much is cut. Both bounds hold wherever it is cut, so the cut decides about speed alone. It runs along the plane
 at right angles to the best t, through the side beyond which the worst corner lies. The part on the side of t then has
-its closest points in t, and its bound is the distance itself.
+its closest points in t, and its bound is the distance itself. Where points of a piece are equally far from two
+triangles, along a line, both bound it together: each of them the part that is closer to it.
 
 Where the question is only whether the distance exceeds a length, many triangles of B may answer it together for all of
 a triangle that they cover (see `cover`).
@@ -319,7 +320,10 @@ def _cut(pieces: _Pieces, other: Triangles, bounds: _Bounds) -> _Pieces | None:
 def _parts(
     corners: Reals, best: Indices, distances: Reals, farthest: Indices, other: Triangles, bounds: _Bounds
 ) -> _Pieces:
-    """Cut pieces, of corners at distances (3, n): along the plane through a side of the best triangle, or in two."""
+    """Cut pieces, of corners at distances (3, n): along the plane through a side of the best triangle, or in two.
+
+    Those that two triangles bound together are left out.
+    """
     pieces, worst = np.arange(len(best)), distances.argmax(axis=0)
     # How far each corner lies beyond each side, in lengths of the direction outward.
     starts, outward = (np.stack([each[:, best] for each in sides]) for sides in (other.corners, other.outward))
@@ -328,14 +332,10 @@ def _parts(
     side = (beyond / np.where(lengths > 0, lengths, np.inf)).argmax(axis=0)
     start, outward = starts[side, :, pieces].T, outward[side, :, pieces].T
     heights = np.einsum("kin,in->kn", corners - start, outward)
-    # One corner lies alone on its side of the plane.
-    is_beyond = heights > 0
-    lone = np.where(is_beyond.sum(axis=0) == 1, is_beyond.argmax(axis=0), (~is_beyond).argmax(axis=0))
-    turned = [(lone + k) % 3 for k in range(3)]
+    # Corners that a plane was cut to are in it: another cut there would never end.
+    heights[np.abs(heights) <= bounds.rounding * lengths[side, pieces]] = 0.0
+    turned, shares = _crossings(heights)
     a, b, c = (corners[corner, :, pieces].T for corner in turned)
-    own, *others = (heights[corner, pieces] for corner in turned)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        shares = np.stack([own / (own - height) for height in others])
     fair = (
         (shares.max(axis=0) > _LEAST_CUT)
         & (shares.min(axis=0) > _LEAST_SHORTER_CUT)
@@ -343,21 +343,70 @@ def _parts(
     )
     # Near the plane of the best triangle, the part that is cut away from slivers needs no further look.
     thin = np.max([other.squared_heights(corner, best) for corner in corners], axis=0) <= bounds.enough**2
-    least = bounds.rounding * lengths[side, pieces]
-    thin &= (heights.max(axis=0) > least) & (heights.min(axis=0) < -least)
+    thin &= heights.min(axis=0) < 0
+    is_beyond = heights > 0
     is_cut = is_beyond.any(axis=0) & ~is_beyond.all(axis=0) & (fair | thin)
     parts = [*_beside_plane(a[:, is_cut], b[:, is_cut], c[:, is_cut], shares[:, is_cut])]
-    parts += _halves(corners[..., ~is_cut], distances[:, ~is_cut], bounds.enough)
     # Beyond a side, the triangle across it is likely to be the closest one; of the farthest pieces a search tells.
-    likely, points = other.across[side, best], corners[worst[farthest], :, farthest]
-    depths, likely[farthest] = other.closest(other.scale * points)
+    halved, likely, second = np.flatnonzero(~is_cut), other.across[side, best], best.copy()
+    searched = np.union1d(halved, farthest)
+    points = corners[worst[searched], :, searched]
+    depths, second[searched] = other.closest(other.scale * points)
     bounds.see(points.T, depths / other.scale)
+    likely[farthest] = second[farthest]
+    of_pairs = _bounds_of_pairs(corners[..., halved], distances[:, halved], best[halved], second[halved], other, bounds)
+    is_done = of_pairs <= bounds.enough
+    bounds.upper, halved = max(bounds.upper, of_pairs[is_done].max(initial=0.0)), halved[~is_done]
+    parts += _halves(corners[..., halved], distances[:, halved], bounds)
     near, far = np.stack([best, best]), np.stack([likely, best])
-    is_lone = is_beyond[lone, pieces]
+    is_lone = is_beyond[turned[0], pieces]
     alone, beside = np.where(is_lone, far, near)[:, is_cut], np.where(is_lone, near, far)[:, is_cut]
-    return _Pieces(
-        np.concatenate(parts, axis=2), np.concatenate([alone] + [beside] * 2 + [far[:, ~is_cut]] * 2, axis=1)
-    )
+    return _Pieces(np.concatenate(parts, axis=2), np.concatenate([alone] + [beside] * 2 + [far[:, halved]] * 2, axis=1))
+
+
+def _crossings(values: Reals) -> tuple[Indices, Reals]:
+    """Return where values of the corners (3, n) of pieces change their sign, as if they were linear.
+
+    Returns:
+        The order of corners (3, n), of which the first lies alone on its side, and the shares (2, n) of the sides from
+        it at which they are zero; of no meaning where all corners lie on one side.
+    """
+    is_beyond = values > 0
+    lone = np.where(is_beyond.sum(axis=0) == 1, is_beyond.argmax(axis=0), (~is_beyond).argmax(axis=0))
+    turned = (lone + np.arange(3)[:, None]) % 3
+    own, *others = np.take_along_axis(values, turned, axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return turned, np.stack([own / (own - value) for value in others])
+
+
+def _bounds_of_pairs(
+    corners: Reals, distances: Reals, first: Indices, second: Indices, other: Triangles, bounds: _Bounds
+) -> Reals:
+    """Return upper bounds (n,) by two triangles for each piece, the first of them at distances (3, n) from its corners.
+
+    A line through the piece leaves each of them a part. Any line gives a bound, and a good one has the same distance
+    from both: from their planes, or from corners and parallel sides, where squares have a linear difference. It is
+    infinite where there is no such line.
+    """
+    pieces, worst = np.arange(len(first)), distances.argmax(axis=0)
+    seconds = np.sqrt([other.squares(corner, second) for corner in corners])
+    is_above, differences = np.ones(len(first), dtype=bool), np.zeros_like(distances)
+    for sign, triangles, values in ((1, first, distances), (-1, second, seconds)):
+        heights = np.sqrt([other.squared_heights(corner, triangles) for corner in corners])
+        is_above &= values[worst, pieces] <= heights[worst, pieces] + bounds.rounding
+        differences += sign * heights
+    differences = np.where(is_above, differences, distances**2 - seconds**2)
+    is_beyond = differences > 0
+    is_divided = is_beyond.any(axis=0) & ~is_beyond.all(axis=0)
+    largest = np.where(is_divided, np.where(is_beyond, seconds, distances).max(axis=0), np.inf)
+    tried = np.flatnonzero(largest <= bounds.enough)
+    turned, shares = _crossings(differences[:, tried])
+    a, *ends = (corners[corner, :, tried].T for corner in turned)
+    for end, share in zip(ends, shares, strict=True):
+        point = a + share * (end - a)
+        squares = np.maximum(other.squares(point, first[tried]), other.squares(point, second[tried]))
+        largest[tried] = np.maximum(largest[tried], np.sqrt(squares))
+    return largest
 
 
 def _beside_plane(a: Reals, b: Reals, c: Reals, shares: Reals) -> list[Reals]:
@@ -369,7 +418,7 @@ def _beside_plane(a: Reals, b: Reals, c: Reals, shares: Reals) -> list[Reals]:
     return [np.stack(part) for part in ((a, along_b, along_c), (along_b, b, c), (along_b, c, along_c))]
 
 
-def _halves(corners: Reals, distances: Reals, enough: float) -> list[Reals]:
+def _halves(corners: Reals, distances: Reals, bounds: _Bounds) -> list[Reals]:
     """Return triangles (3, 3, n) cut at the middles of their longest sides: thin ones become less so.
 
     Within a thin wall the distance changes across thin triangles, and not along them. Where it is steep, and its change
@@ -379,7 +428,7 @@ def _halves(corners: Reals, distances: Reals, enough: float) -> list[Reals]:
     lengths, changes = (np.roll(values, -1, axis=0) - values for values in (corners, distances))
     squares, changes = np.stack([dot(side, side) for side in lengths]), changes**2
     is_steep = (_STEEP * changes > squares).any(axis=0)
-    is_steep &= changes.max(axis=0) >= (distances.max(axis=0) - enough) ** 2
+    is_steep &= changes.max(axis=0) >= np.maximum(distances.max(axis=0) - bounds.enough, bounds.rounding) ** 2
     across = np.stack(cross(lengths[0], lengths[1]))
     is_steep &= changes.max(axis=0) * squares.max(axis=0) <= _ACROSS * dot(across, across)
     first, which = np.where(is_steep, changes, squares).argmax(axis=0), np.arange(corners.shape[2])

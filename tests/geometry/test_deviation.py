@@ -341,3 +341,27 @@ def test_lines_beside_a_triangle_take_few_pieces(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(deviation, "_MOST_PIECES", 1000)
     found = deviation.directed_deviation(sb.Mesh(large, [[0, 1, 2]]), other)
     assert found.upper <= 1.01 * found.lower
+
+
+def tube(turn: float, sides: int = 48, parts: int = 10) -> sb.Mesh:
+    """A tube of radius 1, turned by so many of its sides."""
+    angles, heights = 2 * np.pi * (np.arange(sides) + turn) / sides, np.repeat(np.linspace(0, 1, parts + 1), sides)
+    vertices = np.column_stack([np.tile([np.cos(angles), np.sin(angles)], parts + 1).T, heights])
+    first = np.arange(sides * parts)
+    after = first - first % sides + (first + 1) % sides
+    corners = [[first, after, after + sides], [first, after + sides, first + sides]]
+    return sb.Mesh(vertices, np.concatenate(corners, axis=1).T)
+
+
+@pytest.mark.parametrize("turns", [(0.0, 0.5), (0.5, 0.0), (0.3, 0.0)])
+@pytest.mark.parametrize("gap", [1e-3, 1e-6])
+def test_close_bounds_end_where_the_distance_is_the_same_along_lines(
+    turns: tuple[float, float], gap: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(deviation, "_MOST_PIECES", 30_000)
+    pair = [tube(turn) for turn in turns]
+    found = deviation.directed_deviation(pair[0], Triangles(pair[1]), gap)
+    assert found.upper <= (1 + gap) * found.lower * (1 + 1e-9)
+    # Its edges are above the middles of the other one's faces.
+    if 0.5 in turns:
+        assert found.lower == pytest.approx(1 - np.cos(np.pi / 48), rel=gap)
