@@ -3,6 +3,7 @@
 Thousands of objects are queried there without opening thousands of groups. Labels begin with the name of the object.
 """
 
+import logging
 import pickle
 import zlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -16,6 +17,8 @@ from numpy.typing import NDArray
 from sobolev_batch.norms.columns import describe
 from sobolev_batch.store.encoding import with_coordinates
 from sobolev_batch.store.layout import NUMERICS, RECORD, TABLES_OF_ALL, Store, hide_tables, write_table
+
+_log = logging.getLogger(__name__)
 
 # A table for each of these groups that an object has.
 Tables = Mapping[str, xr.Dataset]
@@ -65,13 +68,15 @@ def write_all(root: Store, names: Sequence[str], changed: Iterable[bytes], kept:
     parts, waiting = list[Tables](), iter(changed)
     while batch := [pickle.loads(zlib.decompress(one)) for one in islice(waiting, _MOST_AT_ONCE)]:  # noqa: S301
         parts.append(_joined(batch))
-    before = {group: table.sel(mesh=table["object"].isin(list(kept))) for group, table in tables_in(root).items()}
+    old = tables_in(root) if kept else {}
+    before = {group: table.sel(mesh=table["object"].isin(list(kept))) for group, table in old.items()}
     if before and parts:
         orders = parts[0]["convergence"]["order"].values
         if np.isin(orders, before["convergence"]["order"]).all():
             before["convergence"] = before["convergence"].sel(order=orders)
         else:
             before = {}
+            _log.warning("%s: objects that this run left out lack an order, and rows in the tables of all", root.path)
     parts.append(before)
     rank = {name: place for place, name in enumerate(names)}
     tables = {}

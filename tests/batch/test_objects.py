@@ -457,7 +457,7 @@ def test_a_part_that_cannot_be_listed_says_why(tmp_path: Path, threads: Client) 
 
 @pytest.mark.parametrize(("orders", "kept"), [([-3.0, -10.0], "ab"), ([-4.0, -2.0], "b")])
 def test_numbers_of_a_part_have_the_orders_of_its_study(
-    orders: list[float], kept: str, changeable: Path, threads: Client
+    orders: list[float], kept: str, changeable: Path, threads: Client, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Those of the objects that it leaves out, at the root, are not taken for numbers at other orders."""
     study = study_of(balls(a=1.0, b=1.1))
@@ -466,6 +466,7 @@ def test_numbers_of_a_part_have_the_orders_of_its_study(
     sb.run(changed, changeable, threads, only=["b"])
     rows = sb.table(changeable).set_index(["object", "order", "mesh"])["distance"]
     assert rows.index.unique("object").tolist() == list(kept)
+    assert ("left out lack an order" in caplog.text) == (kept == "b")
     assert rows.index.unique("order").tolist() == orders
     if kept == "ab":
         pd.testing.assert_series_equal(rows, before.loc[rows.index])
@@ -473,8 +474,10 @@ def test_numbers_of_a_part_have_the_orders_of_its_study(
         pd.testing.assert_series_equal(
             rows.loc["b"], sb.table(changeable / "b").set_index(["order", "mesh"])["distance"]
         )
+    caplog.clear()
     sb.run(changed, changeable, threads)
     require_rows(changeable, "a", "b")
+    assert "left out" not in caplog.text
 
 
 def test_objects_that_no_run_has_come_to_are_not_begun(tmp_path: Path, threads: Client) -> None:
