@@ -24,7 +24,7 @@ from sobolev_batch.batch.cluster.execution import (
     side_by_side,
 )
 from sobolev_batch.batch.cluster.workers import prepare_workers
-from sobolev_batch.errors import InputError, MeshError, SobolevBatchError, StoreError, one_line
+from sobolev_batch.errors import ClusterError, InputError, MeshError, SobolevBatchError, StoreError, one_line
 from sobolev_batch.geometry.formats.by_name import WRITERS, mesh_format
 from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
 from sobolev_batch.geometry.mesh import Mesh
@@ -182,7 +182,7 @@ def reduce(
     Raises:
         InputError: A parameter is wrong, or the output would replace a mesh.
         StoreError: The output cannot be written.
-        ClusterError: The scheduler was lost.
+        ClusterError: No cluster could start, or its scheduler was lost.
 
     >>> import sobolev_batch as sb
     >>> found = sb.reduce(sb.shapes.icosphere(3), within="2%", order=-4)["mesh"]
@@ -247,8 +247,13 @@ def _outcomes(
         def at_once() -> int:
             return max(1, min(_MOST_AT_ONCE, cluster().workers.threads // len(left)))
 
+        def is_fatal(error: Exception) -> bool:
+            # Without a cluster, no other mesh fares better.
+            is_unstarted = isinstance(error, ClusterError) and not cluster.cache_info().currsize
+            return is_unstarted or _ends_all(error)
+
         runs = ((search.name, _searched(search, cluster, at_once)) for search in searches)
-        for name, outcome in side_by_side(runs, _ends_all):
+        for name, outcome in side_by_side(runs, is_fatal):
             left.discard(name)
             yield name, outcome
 

@@ -299,6 +299,15 @@ def test_a_mesh_that_cannot_be_reduced_is_told() -> None:
     assert "another method" in " ".join(format_reductions({"lumpy": found}).split())
 
 
+def test_a_cluster_that_cannot_start_is_no_fault_of_a_mesh(threads: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    def differing(*arguments: object) -> None:
+        raise sb.errors.ClusterError("versions differ")
+
+    monkeypatch.setattr(module, "prepare_workers", differing)
+    with pytest.raises(sb.errors.ClusterError, match="versions differ"):
+        sb.reduce({name: sb.shapes.icosphere(1) for name in "ab"}, 0.1, client=threads)
+
+
 def test_several_meshes_on_a_cluster(client: Client, scan: Path, tmp_path: Path) -> None:
     (tmp_path / "more").mkdir()
     sb.write_mesh(lumpy(2), tmp_path / "more" / "other.obj")
