@@ -219,7 +219,8 @@ def _rows(tree: xr.DataTree, order: Orders | None) -> pd.DataFrame:
         columns = {**{key: meshes[key].values[others] for key in _OF_ALL}, **columns}
     nearness = {}
     if "proximity" in tree.children:
-        proximity = finished_group(tree, "proximity").reindex(mesh=labels[others])
+        # Some objects may lack it, and texts have no missing value.
+        proximity = finished_group(tree, "proximity").reset_coords(drop=True).reindex(mesh=labels[others])
         asked = [f"{name}{way}" for name in _metrics_of(tree) for way in ("", "_forward", "_backward")]
         nearness = {name: proximity[name].values for name in asked if name in proximity}
         nearness |= {name: meshes[name].values[others] for name in asked if name in OF_ONE_MESH}

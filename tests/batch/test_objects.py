@@ -480,6 +480,14 @@ def test_numbers_of_a_part_have_the_orders_of_its_study(
     assert "left out" not in caplog.text
 
 
+def test_a_run_of_a_part_may_be_the_first_with_other_distances(tmp_path: Path, threads: Client) -> None:
+    objects = [{"name": name, "reference": {"source": "icosphere", "levels": [2]}} for name in "ab"]
+    table = small_table(object=objects, family=methods_of())
+    sb.run(sb.Study.from_table(table), tmp_path / "s.zarr", threads)
+    sb.run(sb.Study.from_table(table | {"proximity": {"points": 50}}), tmp_path / "s.zarr", threads, only=["b"])
+    assert sb.table(tmp_path / "s.zarr").groupby("object")["hausdorff"].count().to_dict() == {"a": 0, "b": 8}
+
+
 def test_objects_that_no_run_has_come_to_are_not_begun(tmp_path: Path, threads: Client) -> None:
     path = tmp_path / "s.zarr"
     sb.run(study_of(balls(a=1.0, b=1.1, c=1.2)), path, threads, only=["b", "c/ico"])
