@@ -177,7 +177,7 @@ class _Bounds:
     def enough(self) -> float:
         """Upper bound of a piece below which it need not be cut."""
         if self.within is not None:
-            return self.rounding + self.within
+            return max(self.within, self.rounding + self.lower)
         return self.rounding + self.lower + max(self.gap * self.lower, self.least_gap)
 
     @property

@@ -255,6 +255,14 @@ def test_a_question_on_the_edge_is_decided() -> None:
         )
 
 
+def test_a_clear_question_far_from_the_origin_is_decided() -> None:
+    tubes = [tube(turn, sides=12, parts=1) for turn in (0.0, 1e-5)]
+    pair = [sb.Mesh(mesh.vertices + np.array([3e6, -5e6, 4e6]), mesh.triangles) for mesh in tubes]
+    value = sb.largest_deviation(*pair).both.upper
+    for length in value * np.linspace(1.2, 3, 10):
+        assert sb.largest_deviation(*pair, within=length).both.is_within(length)
+
+
 def test_the_compiled_loop_gives_the_distances_of_the_arrays() -> None:
     rng = np.random.default_rng(5)
     corners = rng.normal(size=(300, 3, 3)) * 10.0 ** rng.integers(-6, 6, (300, 1, 1))
