@@ -89,7 +89,10 @@ def give_up(location: Location) -> None:
 def list_records(store: Store) -> None:
     """List the group of records, whose own document has the record of a run that may be going on."""
     store.documents[RECORDS] = group_document({})
-    if store.location.read(f"{RECORDS}/{ROOT}") is None:
+    document = None
+    with suppress(StoreError):  # It is damaged.
+        document = store.stored_document(RECORDS)
+    if document is None:
         store.location.write({f"{RECORDS}/{ROOT}": json.dumps(store.documents[RECORDS]).encode()})
 
 
@@ -132,6 +135,9 @@ def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
         # Tables are in another unit of length, and the run may end before there are others.
         hide_tables(store)
     store.documents[""]["attributes"].update(_attributes(plan, labels))
+    if plan.study.object.name:
+        # The run has its record at the root of all objects, and writes this one nowhere else.
+        list_records(store)
     # Written even if nothing changed: a location that cannot be written must fail before tasks start.
     store.consolidate()
     return store

@@ -119,6 +119,19 @@ def test_tables_of_all_that_another_program_wrote_are_made_again(changeable: Pat
         sb.status(changeable)
 
 
+@pytest.mark.parametrize("text", [None, "[]"])
+def test_an_object_whose_records_are_listed_no_more_is_repaired(
+    text: str | None, changeable: Path, threads: Client
+) -> None:
+    document = changeable / "b/records/zarr.json"
+    document.unlink()
+    if text is not None:
+        document.write_text(text)
+    assert list(sb.verify(changeable).tables) == ["b/records"]
+    assert sb.run(study_of([*balls(a=1.0), GONE, *balls(b=1.1)]), changeable, threads).computed == ()
+    assert sb.verify(changeable).is_sound
+
+
 def test_an_object_that_lost_its_root_is_damage(changeable: Path, threads: Client) -> None:
     before = sb.table(changeable)
     (changeable / "b/zarr.json").unlink()
