@@ -22,6 +22,8 @@ _log = logging.getLogger(__name__)
 
 # A table for each of these groups that an object has.
 Tables = Mapping[str, xr.Dataset]
+# Kinds of numpy's types of texts.
+_TEXTS = "OTU"
 # Tables of objects that are in memory at a time, as datasets: as bytes they take a twentieth.
 _MOST_AT_ONCE = 1000
 
@@ -111,6 +113,10 @@ def _concatenated(tables: Sequence[xr.Dataset]) -> xr.Dataset:
                 table.variables[name].values if name in table.variables else _missing(model, table.sizes["mesh"])
                 for table in tables
             ]
+            # Metadata that are numbers of one object may be texts of another.
+            is_text = [values.dtype.kind in _TEXTS for values in found]
+            if any(is_text):
+                found = [values if text else _as_texts(values) for values, text in zip(found, is_text, strict=True)]
             columns[name] = model.dims, np.concatenate(found)
         else:
             columns[name] = model.dims, model.values
@@ -121,8 +127,12 @@ def _concatenated(tables: Sequence[xr.Dataset]) -> xr.Dataset:
     return describe(xr.Dataset(columns, attrs=attributes).set_coords(list(coordinates)))
 
 
+def _as_texts(numbers: NDArray[Any]) -> NDArray[Any]:
+    return np.array(["" if np.isnan(number) else str(number) for number in numbers.tolist()], dtype=object)
+
+
 def _missing(model: xr.Variable, count: int) -> NDArray[Any]:
     shape = (count, *model.shape[1:])
-    if model.dtype.kind in "OTU":
+    if model.dtype.kind in _TEXTS:
         return np.full(shape, "", dtype=object)
     return np.full(shape, np.datetime64("NaT", "s") if model.dtype.kind == "M" else np.nan)

@@ -425,6 +425,19 @@ def test_the_root_has_the_rows_of_all_objects(changeable: Path, threads: Client)
     assert sb.verify(changeable).is_sound
 
 
+def test_metadata_may_be_numbers_of_one_object_and_texts_of_another(threads: Client, tmp_path: Path) -> None:
+    sb.write_mesh(sb.shapes.icosphere(1), tmp_path / "ball.ply")
+    for name, effort in {"a": "7.5", "b": "high"}.items():
+        (tmp_path / f"{name}.csv").write_text(f"path,effort\nball.ply,{effort}\n")
+    family = [{"name": "f", "source": "files", "meshes": "{object}.csv"}]
+    table = small_table(object=balls(a=1.0, b=1.1, c=1.2), family=family)
+    (tmp_path / "c.csv").write_text("path\nball.ply\n")
+    sb.run(sb.Study.from_table(table, folder=tmp_path), tmp_path / "s.zarr", threads)
+    rows = xr.open_dataset(tmp_path / "s.zarr", group="convergence", engine="zarr")
+    assert rows["effort"].values.tolist() == ["7.5", "", "high", "", "", ""]
+    assert sb.table(tmp_path / "s.zarr/a")["effort"].dtype == float
+
+
 def test_a_run_that_was_killed_before_the_tables_of_all_goes_on(
     changeable: Path, threads: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
