@@ -46,14 +46,17 @@ def _groups_of(store: AnyStore) -> xr.DataTree:
         finished_group(tree, "meshes", load=False)
         groups[name or "/"] = xr.Dataset(attrs=tree.attrs)
         for group in [one for one in _GROUPS if one in tree.children]:
-            groups[f"{name}/{group}".lstrip("/")] = _in_known_units(tree[group].to_dataset().load())
+            groups[f"{name}/{group}".lstrip("/")] = _as_netcdf(tree[group].to_dataset().load())
     groups["/"].attrs |= {"Conventions": "CF-1.11", "history": f"{utc_now()} sobolev-batch export"}
     return xr.DataTree.from_dict(groups)
 
 
-def _in_known_units(dataset: xr.Dataset) -> xr.Dataset:
-    """Return a dataset in which those units are words that UDUNITS, and whoever follows CF, does not know."""
-    copy = dataset.copy().drop_encoding()
+def _as_netcdf(dataset: xr.Dataset) -> xr.Dataset:
+    """Return a dataset in which those units are words that UDUNITS, and whoever follows CF, does not know.
+
+    Coordinates with blanks are variables, which they would be in the file, with a warning.
+    """
+    copy = dataset.reset_coords([name for name in dataset.coords if " " in str(name)]).drop_encoding()
     for variable in copy.variables.values():
         if "unit length" in variable.attrs.get("units", ""):
             variable.attrs["units_in_words"] = variable.attrs.pop("units")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import warnings
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
@@ -26,6 +27,7 @@ from sobolev_batch.store.objects import Objects
 from sobolev_batch.study.plan import Plan, make_plan
 from sobolev_batch.tables.conclusion import format_objects
 from sobolev_batch.tables.convergence import format_table
+from sobolev_batch.tables.export import export
 from tests.support.commands import call
 from tests.support.stores import flip
 from tests.support.studies import GONE, balls, methods_of, small_table
@@ -436,6 +438,19 @@ def test_metadata_may_be_numbers_of_one_object_and_texts_of_another(threads: Cli
     rows = xr.open_dataset(tmp_path / "s.zarr", group="convergence", engine="zarr")
     assert rows["effort"].values.tolist() == ["7.5", "", "high", "", "", ""]
     assert sb.table(tmp_path / "s.zarr/a")["effort"].dtype == float
+
+
+def test_metadata_with_blanks_are_exported_without_a_warning(threads: Client, tmp_path: Path) -> None:
+    pytest.importorskip("h5netcdf", reason="h5netcdf comes with the extra 'export'")
+    sb.write_mesh(sb.shapes.icosphere(1), tmp_path / "ball.ply")
+    family = [{"name": "f", "source": "files", "meshes": [{"path": "ball.ply", "my effort": 7.5}]}]
+    study = sb.Study.from_table(small_table(object=balls(a=1.0), family=family), folder=tmp_path)
+    sb.run(study, tmp_path / "s.zarr", threads)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        export(tmp_path / "s.zarr", tmp_path / "t.nc", "netcdf")
+    with xr.open_dataset(tmp_path / "t.nc", group="a/convergence", engine="h5netcdf") as rows:
+        assert rows["my effort"].values[0] == 7.5
 
 
 def test_a_run_that_was_killed_before_the_tables_of_all_goes_on(
