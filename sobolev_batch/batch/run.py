@@ -203,13 +203,18 @@ def carry_out(
                 one = study.of_object(name)
                 if _is_left_out(one):
                     continue
-                record = recorded.get(name) if name in whole else None
-                before = ended_before(one, record) if at_hand is None else ended_already(at_hand)
+                record = recorded.get(name)
+                known = record if name in whole else None
+                before = ended_before(one, known) if at_hand is None else ended_already(at_hand)
                 if before is not None:
                     ended[name] = before
                 else:
                     # What is wrong with the cluster is no fault of an object, and is raised.
-                    yield name, run_object(one, place.below(name) if name else place, equipped(name), at_hand)
+                    cluster = equipped(name)
+                    if objects is not None and record is not None and record.key:
+                        # Its store may become another one, and this run be killed, and the study be as before again.
+                        objects.records.write(objects.rows[name], replace(record, key=""))
+                    yield name, run_object(one, place.below(name) if name else place, cluster, at_hand)
 
         def is_fatal(error: Exception) -> bool:
             is_of_all = isinstance(error, StoreError) and not isinstance(error, DamageError)

@@ -19,6 +19,7 @@ import zarr
 from distributed import Client
 
 import sobolev_batch as sb
+from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.store.latest_run import RunRecord
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
@@ -467,6 +468,22 @@ def test_a_run_that_was_killed_before_the_tables_of_all_goes_on(
             sb.run(study, changeable, threads)
     assert sb.run(study, changeable, threads).computed == ()
     require_rows(changeable, "a", "e", "b")
+
+
+def test_a_change_that_is_taken_back_after_an_interrupted_run_leaves_no_trace(
+    changeable: Path, threads: Client
+) -> None:
+    study = study_of(balls(a=1.0, b=1.1))
+    sb.run(study, changeable, threads)
+
+    def interrupt(progress: Progress) -> None:
+        if progress.stage == "fields" and progress.done:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sb.run(study_of(balls(a=1.3, b=1.1)), changeable, threads, on_progress=interrupt)
+    assert {label[0] for label in sb.run(study, changeable, threads).computed} == {"a"}
+    require_rows(changeable, "a", "b")
 
 
 def test_a_run_of_a_part_takes_objects_families_or_members(changeable: Path, threads: Client) -> None:
