@@ -322,9 +322,8 @@ def _check_same_study(store: Store, plan: Plan) -> None:
     if not may_change:
         comparisons.append(lattices_text(study["lattice"], _lattice_entry(plan)["lattice"]))
         comparisons.append(("dtype", repr(study["dtype"]), repr(plan.choice.dtype)))
-        # Which frequencies these have follows from the reference.
-        old, new = (len(one["octaves"]) if one else "none" for one in (study.get("octaves"), plan.choice.octaves))
-        comparisons.append(("octaves:", str(old), str(new)))
+        # Their frequencies follow from the reference, which may change.
+        comparisons.append(("octaves:", octaves_in(study), octaves_in(_lattice_entry(plan))))
     # The store of an object lies in that of the whole study.
     require_equal(store.location.beside("") if plan.study.object.name else store.location, comparisons)
 
@@ -336,6 +335,11 @@ def require_equal(location: Location, comparisons: Sequence[tuple[str, str, str]
             f"{location}: it holds a store of another study, with {'; '.join(differences)}. "
             "Name another store, or remove this one"
         )
+
+
+def octaves_in(study: Mapping[str, Any]) -> str:
+    """Return the number of octaves that the fields of a study have, by its entry in the attributes of their store."""
+    return str(len(study["octaves"]["octaves"])) if study.get("octaves") else "none"
 
 
 def lattices_text(old: Mapping[str, Any] | None, new: Mapping[str, Any] | None) -> tuple[str, str, str]:

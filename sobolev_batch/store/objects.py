@@ -11,7 +11,7 @@ from typing import Any, Self, TypeVar
 
 from sobolev_batch.errors import DamageError, InputError, StoreError
 from sobolev_batch.sources.names import node_problem, quoted
-from sobolev_batch.store.create import lattices_text, list_records, record_keys, require_equal
+from sobolev_batch.store.create import lattices_text, list_records, octaves_in, record_keys, require_equal
 from sobolev_batch.store.encoding import ROOT, group_document
 from sobolev_batch.store.layout import DESCRIPTION, OBJECTS, PAGE, RECORD, RECORDS, TABLES_OF_ALL, TAGS, Store
 from sobolev_batch.store.location import Location
@@ -111,7 +111,10 @@ class Objects:
                 held = Store(place).attributes()["study"]
                 dtypes = "dtype", repr(held["dtype"]), repr(study.table.get("transform", {}).get("dtype", "complex128"))
                 if given or not held.get("choice"):
-                    require_equal(self.location, [lattices_text(held["lattice"], given), *([dtypes] if given else [])])
+                    of_given = (
+                        [dtypes, ("octaves:", octaves_in(held), str(given.get("octaves") or "none"))] if given else []
+                    )
+                    require_equal(self.location, [lattices_text(held["lattice"], given), *of_given])
                 return
 
     @classmethod

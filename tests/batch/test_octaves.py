@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from distributed import Client
 
 import sobolev_batch as sb
@@ -146,6 +147,24 @@ def test_octaves_at_other_frequencies_are_not_mixed(store: Path, client: Client)
 
 # Octaves beyond a lattice that is given.
 BEYOND = small_table(lattice={"xi_max": 4.0, "M": 32, "octaves": 2}, norm={"orders": [-1.5, -2.0]})
+
+
+def test_octaves_of_another_reference_are_sampled_anew(threads: Client, tmp_path: Path) -> None:
+    """Their frequencies lie around its normals; other objects keep their fields."""
+    lattice, path = {"xi_max": 2.5, "M": 16, "octaves": 1}, tmp_path / "store.zarr"
+    names = ("a", "b")
+    objects = [{"name": name, "reference": {"source": "files", "paths": [f"{name}.off"]}} for name in names]
+    table = small_table(lattice=lattice, object=objects, compare=None, family=[{"name": "ball", "source": "sphere"}])
+    for heights, computed in (((1.0, 1.0), names), ((1.0, 1.2), ("b",)), ((1.0, 1.2), ())):
+        for name, height in zip(names, heights, strict=True):
+            trimesh.creation.box((1.0, 1.0, height)).export(tmp_path / f"{name}.off")
+        found = sb.run(sb.Study.from_table(table, folder=tmp_path), path, threads).computed
+        assert found == tuple(f"{name}/{label}" for name in computed for label in ("ball/sphere", "reference"))
+    assert sb.verify(path).is_sound
+    before = (path / "zarr.json").read_bytes()
+    with pytest.raises(sb.errors.StoreError, match="another study, with octaves: 1, not 2"):
+        sb.run(sb.Study.from_table({**table, "lattice": {**lattice, "octaves": 2}}, folder=tmp_path), path, threads)
+    assert (path / "zarr.json").read_bytes() == before
 
 
 def test_equal_meshes_have_the_distance_zero(client: Client, store_path: Path) -> None:
