@@ -21,6 +21,9 @@ _PAIR_SECONDS = 4e-7
 # Height of a triangle over its longest side below which libigl may see points of it far too far away: it loses the
 # digits of the square of this number.
 _THIN = 0.01
+# Cosine of the angle to a pseudonormal below which rounding may have chosen the side of a point, and a direction
+# without pattern in which it is then moved.
+_UNCLEAR, _ASIDE = 1e-6, np.array([0.4127, 0.7391, 0.5323])
 
 
 class Triangles:
@@ -150,10 +153,27 @@ def signs(mesh: Mesh, points: Reals) -> Reals | None:
     origin = own.vertices[own.triangles[0, 0]]
     vertices, places = own.vertices - origin, points - origin
     scale = 2.0 ** float(np.frexp(np.abs(vertices).max())[1])
-    by_pseudonormals = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
-    triangles = np.ascontiguousarray(own.triangles, dtype=np.int64)
-    signed = np.reshape(igl.signed_distance(places / scale, vertices / scale, triangles, by_pseudonormals)[0], -1)
+    corners, triangles = vertices / scale, np.ascontiguousarray(own.triangles, dtype=np.int64)
+    signed, arms, cosines = _signed(places / scale, corners, triangles)
+    if not own.counts["boundary_edges"]:
+        # No surface is nearer, so that points between lie on the same side.
+        unclear = np.flatnonzero(np.abs(cosines) < _UNCLEAR)
+        moves = np.sqrt(dot(arms, arms))[unclear, None] / 2 * _ASIDE
+        signed[unclear] = _signed(places[unclear] / scale + moves, corners, triangles)[0]
     return np.where((signed < 0) != (own.volume < 0), -1.0, 1.0)
+
+
+def _signed(points: Reals, vertices: Reals, triangles: Indices) -> tuple[Reals, Reals, Reals]:
+    """Return signed distances (n,) of points (n, 3), arms (3, n) from their closest points, and cosines (n,) of these.
+
+    The cosines are to the pseudonormals: a point in the plane of a face that ends before it has its side by rounding.
+    """
+    by_pseudonormals = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
+    signed, _, closest, normals = igl.signed_distance(points, vertices, triangles, by_pseudonormals)
+    arms, normals = (points - np.reshape(closest, (-1, 3))).T, np.reshape(normals, (-1, 3)).T
+    sizes = np.sqrt(dot(arms, arms) * dot(normals, normals))
+    cosines = np.divide(dot(arms, normals), sizes, out=np.ones(len(points)), where=sizes > 0)
+    return np.reshape(signed, -1), arms, cosines
 
 
 def _inverse(values: Reals) -> Reals:

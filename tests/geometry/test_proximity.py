@@ -10,6 +10,7 @@ import trimesh
 
 import sobolev_batch as sb
 from sobolev_batch.geometry.proximity import MOST_POINTS, proximity, share_beyond
+from tests.support.shapes import CENTRED_BOX
 
 
 def square(side: float, height: float = 0.0, *, stray: tuple[float, float, float] | None = None) -> sb.Mesh:
@@ -240,3 +241,13 @@ def test_wrong_points_and_seeds_are_refused(key: str, values: list[Any], message
     for value in values:
         with pytest.raises(sb.errors.InputError, match=message):
             proximity(square(1.0), square(2.0), **{key: value})
+
+
+def test_points_in_the_planes_of_a_plate_beside_it_are_outside() -> None:
+    plate, rng = CENTRED_BOX.vertices * [1, 0.7, 0.01], np.random.default_rng(0)
+    beside = np.concatenate([plate * factors for factors in ([1.01, 1, 1], [1, 1.01, 1], [1, 1, 1.5])])
+    for _ in range(200):
+        turn, place = np.linalg.qr(rng.normal(size=(3, 3)))[0], 100 * rng.normal(size=3)
+        points = sb.Mesh(beside @ turn + place, np.arange(24).reshape(-1, 3))
+        mesh = sb.Mesh(plate @ turn + place, CENTRED_BOX.triangles)
+        assert sb.vertex_distances(points, mesh, signed=True).min() > 0
