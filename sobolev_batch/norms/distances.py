@@ -217,7 +217,7 @@ def to_accuracy(
         reference = None if is_zero else Reference.for_problem(problem, solution, seed)
         estimate = ReferenceEstimate.of_equal(len(problem.orders)) if reference is None else reference.estimate
         dataset = labelled_distances(order, solution.estimate, estimate, attributes)
-    within = accuracy.met(solution.estimate).reshape(np.shape(order))
+    within = accuracy.met(solution.estimate).reshape(dataset[name].shape)
     return dataset.assign(within=(dataset[name].dims, within, VARIABLES["within"])), reference
 
 

@@ -286,7 +286,7 @@ def gradient(
     for name in ("error", "error_part"):
         dataset[name].attrs = {**dataset[name].attrs, "units": NUMBER}
     dims = (*dataset["error"].dims, "vertex", "axis")
-    values = gradients.reshape(*np.shape(order), *gradients.shape[1:])
+    values = gradients.reshape(*dataset["error"].shape, *gradients.shape[1:])
     return dataset.assign(gradient=(dims, values, VARIABLES["gradient"])).assign_coords(axis=["x", "y", "z"])
 
 
