@@ -104,7 +104,9 @@ def draw(lattice: Lattice, orders: Sequence[float], degree: int, count: int, see
     chances = _shell_chances(lattice, orders, degree, shell_volumes(lattice))
     # One draw in each of P equal intervals of the distribution: fewer gaps than independent draws leave.
     levels = (np.arange(count) + rng.random(count)) / count
-    shells = np.searchsorted(np.cumsum(chances * shell_volumes(lattice)), levels * (1 - 1e-12))
+    # Less than one in the end where weights of very negative orders underflow.
+    cumulative = np.cumsum(chances * shell_volumes(lattice))
+    shells = np.searchsorted(cumulative, levels * (1 - 1e-12) * cumulative[-1])
     indices = _draw_points(lattice, shells, rng)
     frequencies, scales = lattice.spacing * indices.astype(np.float64), 1 / (count * chances[shells])
     return Draws(indices, frequencies, scales, tuple(orders), degree, count, seed)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.special import beta
 
 from sobolev_batch import Lattice, Mesh, distance, fourier_transform, norm
 from sobolev_batch.geometry.surface import Surface
@@ -12,6 +13,7 @@ from sobolev_batch.shapes import Ellipsoid, Sphere, Torus, icosphere
 from sobolev_batch.transform.fourier import TransformSettings, transform_block
 from sobolev_batch.transform.lattice import SobolevWeights, shell_sums
 from sobolev_batch.transform.probe import Sample, draw, estimate, join, measure, with_own
+from tests.support.shapes import CENTRED_BOX
 
 LATTICE = Lattice(3.0, 24)
 ORDERS = (-2.0, -5.0)
@@ -46,6 +48,16 @@ def test_whichever_frequencies_are_drawn_their_probe_covers_the_error(surface: S
 
 
 @pytest.mark.slow
+def test_tiny_surfaces_have_distances_at_orders_whose_weights_underflow() -> None:
+    size, offset, order = 1e-6, 1e-8, -30.0
+    a = Mesh(size * CENTRED_BOX.vertices, CENTRED_BOX.triangles)
+    found = distance(Mesh(a.vertices + np.array([offset, 0, 0]), a.triangles), a, order, rtol=0.1)
+    # So near to zero, the kernel is a parabola: half of its slope is the mean of (2πξ)² along an axis.
+    slope = (2 * np.pi) ** 2 / 3 * 2 * np.pi * beta(2.5, -order - 2.5)
+    assert abs(found["distance"] - np.sqrt(slope) * offset * a.area) < found["error"] + 1e-9 * found["distance"]
+    assert found["within"]
+
+
 def test_draws_among_a_fields_own_values_meet_its_peaks_without_bias() -> None:
     # Pieces whose pitch is that of the lattice: of 18,000 frequencies some fifty are peaks.
     lattice, orders, piece = Lattice(2.5, 32), (-2.0,), icosphere(0)
