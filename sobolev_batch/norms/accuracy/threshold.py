@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -11,6 +12,7 @@ from typing import Literal, Self
 
 import numpy as np
 
+from sobolev_batch.arrays import Complexes
 from sobolev_batch.errors import SobolevBatchError
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Surface
@@ -19,6 +21,7 @@ from sobolev_batch.norms.accuracy.problem import Problem, error_target
 from sobolev_batch.norms.accuracy.solve import difference_on, solve
 from sobolev_batch.norms.accuracy.tolerance import Accuracy, core_lattice, lattice_of
 from sobolev_batch.norms.bounds import area_bound, area_bounds
+from sobolev_batch.norms.budget import outer_windows
 from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.norms.fields import USUAL_DEGREE, Field, compute_field
 from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, choose_settings, transform_block
@@ -32,6 +35,8 @@ _BEYOND, _FIRST_RTOL = 0.7, 0.2
 # M of the first lattice at most, which is enough for surfaces that differ clearly. Where a larger one than the last is
 # needed, octaves are cheaper.
 _FIRST_M, _LARGEST_M = 96, 320
+# Shortest wavelengths of a lattice in the radius of the smallest surface, at least.
+_WAVES = 4.0
 _ROUNDS = 4
 # Most triangles of two meshes that are clipped before a lattice, which takes 0.1 to 0.5 s: clipping takes 15 to 50 µs a
 # triangle where both are one surface cut anew, and ten times that where flat faces also differ.
@@ -130,7 +135,7 @@ class _Search:
         largest = min(_LARGEST_M, self.problem.accuracy.largest_intervals)
         for number in range(_ROUNDS):
             if number:
-                value, bounds = self._on_lattice(lattice_of(self._frequency(beyond), self._period, largest), rtol)
+                value, bounds = self._on_lattice(self._lattice(beyond, largest), rtol)
             if self.is_decided(bounds) or self._is_hopeless(value, bounds):
                 return bounds, "lattice"
             fraction, margin = value / self.threshold.lower, max(self._margin(value), _NARROWEST)
@@ -144,7 +149,15 @@ class _Search:
     def on_first_lattice(self) -> tuple[float, Interval]:
         """Return the part of the distance on the first lattice, and bounds on all of it."""
         most = min(_FIRST_M, self.problem.accuracy.largest_intervals)
-        return self._on_lattice(lattice_of(self._frequency(_BEYOND), self._period, most), _FIRST_RTOL)
+        return self._on_lattice(self._lattice(_BEYOND, most), _FIRST_RTOL)
+
+    def _lattice(self, beyond: float, most: int) -> Lattice:
+        """Return a lattice beyond which no more can lie than a fraction of the threshold, with an M of at most so many.
+
+        The smallest surface spans some wavelengths of it, since longer ones do not show how many layers it has.
+        """
+        smallest = min(surface.bounding_sphere[1] for surface in self.problem.surfaces)
+        return lattice_of(max(self._frequency(beyond), _WAVES / smallest), self._period, most)
 
     @cached_property
     def _period(self) -> float:
@@ -164,7 +177,7 @@ class _Search:
         fields = _fields(problem, lattice, target.tightened(problem.inexact_count))
         found = difference_on(problem, lattice, fields)[0]
         value, error = float(found.values[0]), float((found.aliasing + found.discretisation)[0])
-        return value, _with_beyond(problem, value, error, lattice)
+        return value, _with_beyond(problem, value, error, lattice, [field.values for field in fields])
 
     def _in_octaves(self, seed: int) -> Interval:
         """Return bounds on the distance from what octaves measure."""
@@ -251,7 +264,7 @@ def _norm_on_lattice(reference: _Reference) -> tuple[float, Interval]:
     value = float(weights @ shell_sums(field, None, lattice, lattice.half)) ** 0.5
     # The rules keep the tolerance at every frequency, and so does the NUFFT.
     error = 2 * _NORM_EPS * surface.area * float(weights @ shell_volumes(lattice)) ** 0.5
-    return value, _with_beyond(problem, value, error, lattice)
+    return value, _with_beyond(problem, value, error, lattice, [field])
 
 
 @lru_cache(maxsize=2)  # references stay in memory
@@ -259,8 +272,14 @@ def _exact_norm(reference: _Reference) -> Interval:
     return Interval.of(solve(reference.problem.with_rtol(_EXACT_NORM_RTOL)).estimate)
 
 
-def _with_beyond(problem: Problem, value: float, error: float, lattice: Lattice) -> Interval:
-    """Return bounds on a norm by its part on a lattice, and all that may lie beyond it."""
+def _with_beyond(
+    problem: Problem, value: float, error: float, lattice: Lattice, fields: Sequence[Complexes]
+) -> Interval:
+    """Return bounds on a norm by its part on a lattice, all that may lie beyond it, and the fields of its surfaces."""
     (order,) = problem.orders
-    highest = math.sqrt(value**2 + area_bound(problem.area, order, lattice.xi_max))
+    windows = outer_windows(SobolevWeights(lattice, problem.orders))
+    # One layer has twice its area. The faces of a box have much of it on a few lines of a lattice.
+    energy = sum(float((windows @ shell_sums(values, None, lattice, lattice.half)).max()) for values in fields)
+    layers = max(energy / (2 * problem.area), 1.0)
+    highest = math.sqrt(value**2 + area_bound(problem.area, order, lattice.xi_max, layers))
     return Interval.around(value, error, highest - value + error)

@@ -15,6 +15,8 @@ from sobolev_batch.norms.accuracy.tolerance import Accuracy
 from sobolev_batch.transform.fourier import transform_block
 from tests.support.rectangles import Rectangles
 
+NOTHING = Rectangles(np.zeros((0, 3)), np.zeros((0, 3)))
+
 
 def bounded(surface: Surface, reference: Surface, order: float, threshold: float) -> tuple[Interval, Method]:
     return relative_distance(surface, reference, order, threshold, Accuracy(threshold), 2, 0)
@@ -41,11 +43,22 @@ def test_spheres_against_their_closed_form(order: float, method: str, gap: float
 def test_surfaces_that_repeat_beyond_the_lattice(order: float, threshold: float) -> None:
     # Between the fins of the other one: below a frequency of 12 there is next to nothing of the difference.
     fins = Rectangles.fins(12)
-    between, nothing = fins.moved(0.0, 0.0, 1 / 24), Rectangles(np.zeros((0, 3)), np.zeros((0, 3)))
-    (distance,), (norm,) = fins.distance(between, [order]), fins.distance(nothing, [order])
+    between = fins.moved(0.0, 0.0, 1 / 24)
+    (distance,), (norm,) = fins.distance(between, [order]), fins.distance(NOTHING, [order])
     found, _ = bounded(between.mesh(), fins.mesh(), order, threshold)
     assert found.lower <= distance / norm <= found.upper
     assert (found.upper <= threshold) == (distance / norm <= threshold)
+
+
+@pytest.mark.parametrize("layers", [2, 16])
+def test_layers_in_one_place_weigh_more_beyond_the_lattice(layers: int) -> None:
+    """As of a sheet that is stored with both of its sides, or of scans that overlap."""
+    moved, stack = (Rectangles.from_corners(*(((0, 0, z), (1.4, 1.4, z)) for _ in range(layers))) for z in (0.05, 0.0))
+    # Coincident layers are so many times as far as one.
+    one, other = (Rectangles.from_corners(((0, 0, z), (1.4, 1.4, z))) for z in (0.05, 0.0))
+    (distance,), (norm,) = one.distance(other, [-0.8]), other.distance(NOTHING, [-0.8])
+    (bounds, _) = bounded(moved.mesh(), stack.mesh(), -0.8, 0.98 * distance / norm)
+    assert bounds.lower <= distance / norm <= bounds.upper
 
 
 def test_a_distance_at_the_threshold_is_left_undecided() -> None:
