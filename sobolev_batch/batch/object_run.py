@@ -232,8 +232,9 @@ def _damaged_rows(cluster: Cluster, workspace: Workspace) -> Stages[list[int]]:
 
 
 def lacks_nothing(workspace: Workspace) -> bool:
-    """Return True where nothing of a plan is missing in its store: fields, tables and distances of other kinds."""
-    return not workspace.pending and are_tabulated(workspace) and have_proximities(workspace)
+    """Return True where nothing of a plan is missing in its store, or outdated: fields, tables, other distances."""
+    is_current = not workspace.pending and not workspace.outdated
+    return is_current and are_tabulated(workspace) and have_proximities(workspace)
 
 
 def _rows_of_all(workspace: Workspace, tables: Tables | None) -> bytes | None:

@@ -164,6 +164,12 @@ class Workspace(Contents):
         stored = self.stored
         return [i for i, row in self.rows.items() if row.is_chosen and i not in stored]
 
+    @property
+    def outdated(self) -> list[int]:
+        """Rows whose fields are not those that the plan asks for, and are not to be computed."""
+        stored = self.stored
+        return [i for i in self.complete if i not in stored and not self.rows[i].is_chosen]
+
     def put_in_order(self) -> None:
         """Collect records in pages, and remember what tables hold: later runs take fewer requests."""
         Records(self.store).collect(self.records)
@@ -182,10 +188,10 @@ class Workspace(Contents):
     def withdraw_results_of(self, rows: Sequence[int]) -> None:
         """Withdraw the tables and qualities that follow from fields which are about to be replaced.
 
-        Fields that are not those of the plan, and stay, are as good as missing: no table may mix them with others.
+        Fields that are outdated, and stay, are as good as missing: no table may mix them with others.
         """
-        others = self.complete.keys() - self.stored.keys() - set(rows)
-        replaced = others.union(i for i in rows if self.records[i] is not None)
+        others = self.outdated
+        replaced = {*others, *(i for i in rows if self.records[i] is not None)}
         if replaced:
             hide_tables(self.store)
             qualities = ["" if i in replaced else quality for i, quality in enumerate(self.qualities)]

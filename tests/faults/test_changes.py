@@ -17,7 +17,7 @@ import pytest
 import trimesh
 from distributed import Client
 
-from sobolev_batch import Study, open_store, run, verify
+from sobolev_batch import Study, open_store, run, table, verify
 from sobolev_batch.batch.cluster.clients import local_client, thread_client
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.status import Status
@@ -27,7 +27,7 @@ from sobolev_batch.store.metadata import SCHEMA_VERSION
 from sobolev_batch.store.records import Records
 from sobolev_batch.study import plan as plan_module
 from tests.support.stores import assert_same_results, contents
-from tests.support.studies import small_table, variable
+from tests.support.studies import balls, small_table, variable
 
 ALL = ("f/a", "f/b", "reference")
 
@@ -132,6 +132,24 @@ def test_a_run_of_a_part_mixes_no_fields_of_two_studies(folder: Path, store_path
     }
     assert verify(store_path).is_sound
     assert run(other, store_path, client).computed == ("f/b",)
+
+
+@pytest.mark.parametrize("names", [(), ("o", "p")])
+def test_a_run_of_a_part_leaves_other_meshes_that_changed_to_the_next(
+    names: tuple[str, ...], folder: Path, store_path: Path, client: Client
+) -> None:
+    """Also where it computes nothing itself."""
+    radii = balls(**dict.fromkeys(names, 1.0))
+    study, others = (
+        study_of(folder, **({"object": radii} if radii else {})),
+        {f"{name}/f/b" for name in names} or {"f/b"},
+    )
+    run(study, store_path, client)
+    trimesh.creation.box((1.0, 1.0, 0.5)).export(folder / "b.off")
+    assert run(study, store_path, client, only=["f/a"]).computed == ()
+    rows = table(store_path)
+    assert set(rows["mesh"][rows["status"] == "missing"]) == {"f/b"}
+    assert set(run(study, store_path, client).computed) == others
 
 
 def test_a_changed_file_and_changed_numerics(
