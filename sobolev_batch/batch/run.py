@@ -194,8 +194,10 @@ def carry_out(
             return replace(cluster, notify=partial(beat, name), part=name)
 
         recorded = {} if objects is None else objects.recorded()
-        tabulated = () if objects is None else objects.tabulated
-        whole = place.names().intersection(tabulated) if recorded else frozenset()
+        tabulated: Mapping[str, None] = {} if objects is None else objects.tabulated
+        # A run of a part may have left the others no more than its own orders.
+        has_orders = objects is not None and objects.tabulated_orders == study.orders
+        whole = place.names().intersection(tabulated) if has_orders else frozenset()
         ended: dict[str, Ended] = {}
 
         def runs() -> Iterator[tuple[str, Stages[Ended]]]:
@@ -269,9 +271,8 @@ def _tabulate(objects: Objects, ended: Mapping[str, Ended]) -> None:
     changed = {name: one.tables for name, one in ended.items() if one.tables is not None}
     # Objects that the run left out keep theirs; those that it found to be impossible lose them.
     lost = {name for name, one in ended.items() if one.record.reason} | changed.keys()
-    present = {*objects.tabulated} - lost
-    kept = tuple(name for name in objects.names if name in present)
-    if changed or kept != objects.tabulated:
+    kept = [name for name in objects.names if name in objects.tabulated and name not in lost]
+    if changed or kept != [*objects.tabulated]:
         write_all(objects.root, objects.names, changed.values(), kept)
 
 

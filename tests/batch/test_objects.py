@@ -538,6 +538,14 @@ def test_numbers_of_a_part_have_the_orders_of_its_study(
     assert "left out" not in caplog.text
 
 
+def test_objects_that_a_part_with_fewer_orders_left_out_have_all_again(changeable: Path, threads: Client) -> None:
+    study = study_of(balls(a=1.0, b=1.1))
+    sb.run(study, changeable, threads)
+    sb.run(sb.Study.from_table({**study.table, "norm": {"orders": [-3.0]}}), changeable, threads, only=["b"])
+    assert sb.run(study, changeable, threads).computed == ()
+    require_rows(changeable, "a", "b")
+
+
 def test_a_run_of_a_part_may_be_the_first_with_other_distances(tmp_path: Path, threads: Client) -> None:
     objects = [{"name": name, "reference": {"source": "icosphere", "levels": [2]}} for name in "ab"]
     table = small_table(object=objects, family=methods_of())
