@@ -200,6 +200,9 @@ def carry_out(
         whole = place.names().intersection(tabulated) if has_orders else frozenset()
         ended: dict[str, Ended] = {}
 
+        def has_new_rows(name: str) -> bool:
+            return name in tabulated and name in ended and ended[name].tables is not None
+
         def runs() -> Iterator[tuple[str, Stages[Ended]]]:
             for name in study.objects:
                 one = study.of_object(name)
@@ -231,16 +234,16 @@ def carry_out(
                 outcome = Ended(ObjectRecord(reason=str(outcome), total=total, finished=utc_now()))
             ended[name] = outcome
             if objects is not None:
-                is_new = outcome.tables is not None and name in tabulated
                 # With its key, the next run would trust the old rows at the root, should this one be killed.
-                objects.records.write(objects.rows[name], replace(outcome.record, key="") if is_new else outcome.record)
+                record = replace(outcome.record, key="") if has_new_rows(name) else outcome.record
+                objects.records.write(objects.rows[name], record)
         if objects is not None:
             _tabulate(objects, ended)
-            for name in tabulated:
-                if name in ended and ended[name].tables is not None:
-                    objects.records.write(objects.rows[name], ended[name].record)
             known = {**recorded, **{name: one.record for name, one in ended.items()}}
-            objects.records.collect([known.get(name) for name in study.objects])
+            alone = {*objects.records.collect([known.get(name) for name in objects.names])}
+            for name in filter(has_new_rows, tabulated):
+                if objects.rows[name] in alone:
+                    objects.records.write(objects.rows[name], ended[name].record)
             objects.root.remember()
     return _summary(location, {name: ended[name] for name in study.objects if name in ended})
 

@@ -280,13 +280,17 @@ class Records(Generic[RecordType]):
         line = _WITHDRAWN if record is None else record.to_json(row)
         self.store.write(RECORD, [row], [line])
 
-    def collect(self, records: Sequence[RecordType | None]) -> None:
+    def collect(self, records: Sequence[RecordType | None]) -> list[int]:
         """Collect the records of rows in pages, each of rows that all have one, and remove their own chunks.
 
-        If the process ends in between, a page and the chunks beside it say the same.
+        If the process ends in between, the chunks beside a page count.
+
+        Returns:
+            Rows that keep their own chunks, as these are.
         """
         step = self._rows_per_page
         pages: dict[int, list[int]] = {}
+        kept: list[int] = []
         for row in self.store.stored_chunks(RECORD):
             pages.setdefault(row // step, []).append(row)
         most_bytes = largest_chunk_bytes(self.store.document(PAGE))
@@ -299,6 +303,9 @@ class Records(Generic[RecordType]):
             if fewest <= len(of_page) == len(lines) and sum(map(len, lines)) < most_bytes // 2:
                 self.store.write(PAGE, [page], lines)
                 self.store.location.discard(*(f"{RECORD}/c/{row}" for row in own))
+            else:
+                kept += own
+        return kept
 
     @property
     def _rows_per_page(self) -> int:

@@ -25,6 +25,7 @@ from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, locked
 from sobolev_batch.store.objects import Objects
+from sobolev_batch.store.records import ObjectRecord, Records
 from sobolev_batch.study.plan import Plan, make_plan
 from sobolev_batch.tables.conclusion import format_objects
 from sobolev_batch.tables.convergence import format_table
@@ -484,6 +485,26 @@ def test_a_change_that_is_taken_back_after_an_interrupted_run_leaves_no_trace(
         sb.run(study_of(balls(a=1.3, b=1.1)), changeable, threads, on_progress=interrupt)
     assert {label[0] for label in sb.run(study, changeable, threads).computed} == {"a"}
     require_rows(changeable, "a", "b")
+
+
+def test_records_of_objects_that_changed_are_written_no_more_often_than_is_safe(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    path, keys, write = "memory://written records.zarr", list[bool](), Records.write
+
+    def counted(records: Records[Any], row: int, record: Any) -> None:
+        if isinstance(record, ObjectRecord):
+            keys.append(bool(record.key))
+        write(records, row, record)
+
+    sb.run(study_of(balls(a=1.0, b=1.1)), path)
+    monkeypatch.setattr(Records, "write", counted)
+    sb.run(study_of(balls(a=1.05, b=1.1)), path)
+    # Before it is begun, and before its rows are at the root; then the page of all has its key.
+    assert keys == [False, False]
+    keys.clear()
+    sb.run(study_of(balls(a=1.05, b=1.1)), path)
+    assert keys == []
 
 
 def test_a_run_of_a_part_takes_objects_families_or_members(changeable: Path, threads: Client) -> None:
