@@ -143,6 +143,10 @@ class Store:
                 # zarr repeats in each group what the root has.
                 document.pop("consolidated_metadata", None)
                 self.documents.setdefault(name, document)
+            of_rows = self.documents.keys() & {LABELS, QUALITY, *_OF_ROWS}
+            counts = {tuple(self.documents[name]["shape"][:1]) for name in of_rows}
+            if len(counts) > 1:
+                raise self.damage(ROOT, "its arrays have different numbers of rows")
             try:
                 self.documents[""] = {**root, "attributes": attributes_of(root)}
             except ValueError as error:

@@ -332,6 +332,18 @@ def test_metadata_at_the_root_that_were_altered(
             open_store(store)["meshes"].to_dataset().load()
 
 
+@pytest.mark.parametrize("count", [3, 9])
+@pytest.mark.parametrize("name", ["records/record", "records/page", "fourier/quality", "fourier/mesh"])
+def test_numbers_of_rows_that_were_altered(name: str, count: int, store: Path, mended: Callable[..., None]) -> None:
+    root = json.loads((store / "zarr.json").read_text())
+    root["consolidated_metadata"]["metadata"][name]["shape"] = [count]
+    (store / "zarr.json").write_text(json.dumps(root))
+    for use in (Store.open, open_store, status, verify):
+        with pytest.raises(DamageError, match=r"zarr\.json is damaged \(its arrays have different numbers of rows\)"):
+            use(store)
+    mended()
+
+
 @pytest.mark.parametrize("damage", [truncate, empty, delete])
 def test_a_root_that_cannot_be_read(damage: Damage, store: Path, threads: Client, mended: Callable[..., None]) -> None:
     damage(store / "zarr.json")
