@@ -17,7 +17,7 @@ from sobolev_batch.errors import AccuracyError
 from sobolev_batch.norms.estimate import PARTS
 from tests.coverage.cases import KINDS, Case, all_cases
 
-LEAST_COVERED, LARGEST_MEDIAN = 0.99, 30.0
+LEAST_COVERED, LARGEST_MEDIAN = 0.99, 10.0
 _SLOWEST = 10
 # A case is telling if its true error is more than this many times the uncertainty of the truth.
 _TELLING = 10.0
