@@ -35,7 +35,6 @@ def test_an_order_that_is_named_twice_counts_once() -> None:
         assert ask(field, [-2, -2]).sizes["order"] == 1
         assert "order" not in ask(field, np.float64(-2.0)).dims
     assert sb.distance(BOX, sb.shapes.Sphere(), [-5, -5.0, -6], rtol=0.1)["within"].sizes == {"order": 2}
-    assert sb.fitting.gradient(BOX, field, [-2, -2])["gradient"].sizes["order"] == 1
 
 
 def test_surfaces_take_the_lattice_of_the_field_beside_them() -> None:

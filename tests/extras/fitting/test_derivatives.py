@@ -204,6 +204,11 @@ def test_a_lattice_of_a_few_samples_leaves_most_beyond_it_and_unknown_quality_no
     assert np.isnan(found["error"])
 
 
+def test_an_order_that_is_named_twice_counts_once() -> None:
+    found = sb.fitting.gradient(sb.shapes.icosphere(1), SPHERE, [-2, -2.0], lattice=SMALL)
+    assert found["gradient"].sizes["order"] == 1
+
+
 def test_a_gpu_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     expected = sb.fitting.gradient(sb.shapes.icosphere(2), SPHERE, [-2.0, -4.0], lattice=SMALL)["gradient"]
     monkeypatch.setattr(backends, "gpu_backend", lambda: Device().backend())
