@@ -194,14 +194,11 @@ def carry_out(
             return replace(cluster, notify=partial(beat, name), part=name)
 
         recorded = {} if objects is None else objects.recorded()
-        tabulated: Mapping[str, None] = {} if objects is None else objects.tabulated
+        whole = frozenset[str]()
         # A run of a part may have left the others no more than its own orders.
-        has_orders = objects is not None and objects.tabulated_orders == study.orders
-        whole = place.names().intersection(tabulated) if has_orders else frozenset()
+        if objects is not None and objects.tabulated_orders == study.orders:
+            whole = place.names().intersection(objects.tabulated)
         ended: dict[str, Ended] = {}
-
-        def has_new_rows(name: str) -> bool:
-            return name in tabulated and name in ended and ended[name].tables is not None
 
         def runs() -> Iterator[tuple[str, Stages[Ended]]]:
             for name in study.objects:
@@ -235,15 +232,12 @@ def carry_out(
             ended[name] = outcome
             if objects is not None:
                 # With its key, the next run would trust the old rows at the root, should this one be killed.
-                record = replace(outcome.record, key="") if has_new_rows(name) else outcome.record
+                has_old_rows = outcome.tables is not None and name in objects.tabulated
+                record = replace(outcome.record, key="") if has_old_rows else outcome.record
                 objects.records.write(objects.rows[name], record)
         if objects is not None:
             _tabulate(objects, ended)
-            known = {**recorded, **{name: one.record for name, one in ended.items()}}
-            alone = {*objects.records.collect([known.get(name) for name in objects.names])}
-            for name in filter(has_new_rows, tabulated):
-                if objects.rows[name] in alone:
-                    objects.records.write(objects.rows[name], ended[name].record)
+            _complete_records(objects, recorded, ended)
             objects.root.remember()
     return _summary(location, {name: ended[name] for name in study.objects if name in ended})
 
@@ -267,6 +261,15 @@ def _is_left_out(study: Study) -> bool:
     with suppress(InputError):
         return bool(study.object.name and study.only) and not study.object.chosen(study.only)
     return False
+
+
+def _complete_records(objects: Objects, recorded: Mapping[str, ObjectRecord], ended: Mapping[str, Ended]) -> None:
+    """Collect the records of objects in pages, with the keys of those whose new rows are at the root now."""
+    known = {**recorded, **{name: one.record for name, one in ended.items()}}
+    alone = {*objects.records.collect([known.get(name) for name in objects.names])}
+    for name in objects.tabulated:
+        if name in ended and ended[name].tables is not None and objects.rows[name] in alone:
+            objects.records.write(objects.rows[name], known[name])
 
 
 def _tabulate(objects: Objects, ended: Mapping[str, Ended]) -> None:

@@ -128,7 +128,8 @@ def _concatenated(tables: Sequence[xr.Dataset]) -> xr.Dataset:
 
 
 def _as_texts(numbers: NDArray[Any]) -> NDArray[Any]:
-    return np.array(["" if np.isnan(number) else str(number) for number in numbers.tolist()], dtype=object)
+    texts = ["" if np.isnan(number) else str(number).removesuffix(".0") for number in numbers.tolist()]
+    return np.array(texts, dtype=object)
 
 
 def _missing(model: xr.Variable, count: int) -> NDArray[Any]:
