@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -12,7 +11,7 @@ from sobolev_batch.shown import Shown
 from sobolev_batch.store.latest_run import LOST_AFTER_SECONDS, RunRecord
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
-from sobolev_batch.store.lock import age_seconds
+from sobolev_batch.store.lock import age_seconds, unlock_command
 from sobolev_batch.store.objects import Objects, labelled
 from sobolev_batch.store.records import ObjectRecord
 from sobolev_batch.store.workspace import Contents
@@ -161,7 +160,7 @@ class Status(Shown):
         start = f"by {run.driver}, begun {run.started}"
         is_ahead = self.silence_seconds < -LOST_AFTER_SECONDS
         direction = "ahead of the clock here" if is_ahead else "ago"
-        unlock = f"sobolev-batch unlock {shlex.quote(self.store)}"
+        unlock = unlock_command(self.store)
         age = f"{duration(round(abs(self.silence_seconds)))} {direction}"
         if run.state == "submitted":
             yield f"submitted {age}, no worker has taken it up yet; {start}"

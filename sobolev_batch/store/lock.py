@@ -162,7 +162,7 @@ def _take_over(location: Location, lock: Lock, current: Lock) -> None:
     refusal = LockError(
         f"{location}: another run has this store to itself: {current.driver}, since {current.since}. "
         "Wait for it or stop it; if it is gone without having been able to say so, "
-        f"unlock the store with: sobolev-batch unlock {shlex.quote(str(location))}"
+        f"unlock the store with: {unlock_command(str(location))}"
     )
     if not current.holder_is_gone or not location.create(_TAKEOVER_KEY, lock.to_json()):
         raise refusal
@@ -186,8 +186,12 @@ def release(location: Location, lock: Lock) -> None:
                 with suppress(OSError):  # It holds a store, or is no folder.
                     Path(location.name).rmdir()
     except StoreError as error:
-        name = shlex.quote(str(location))
-        _log.warning("the store stays locked, unlock it with: sobolev-batch unlock %s (%s)", name, error)
+        _log.warning("the store stays locked, unlock it with: %s (%s)", unlock_command(str(location)), error)
+
+
+def unlock_command(store: str) -> str:
+    """Return the command that unlocks a store, for a shell."""
+    return f"sobolev-batch unlock {shlex.quote(store)}"
 
 
 def this_process() -> str:

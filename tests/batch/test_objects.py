@@ -431,14 +431,14 @@ def test_the_root_has_the_rows_of_all_objects(changeable: Path, threads: Client)
 
 def test_metadata_may_be_numbers_of_one_object_and_texts_of_another(threads: Client, tmp_path: Path) -> None:
     sb.write_mesh(sb.shapes.icosphere(1), tmp_path / "ball.ply")
-    for name, effort in {"a": "7.5", "b": "high"}.items():
+    for name, effort in {"a": "7.5", "b": "high", "d": "8"}.items():
         (tmp_path / f"{name}.csv").write_text(f"path,effort\nball.ply,{effort}\n")
     family = [{"name": "f", "source": "files", "meshes": "{object}.csv"}]
-    table = small_table(object=balls(a=1.0, b=1.1, c=1.2), family=family)
+    table = small_table(object=balls(a=1.0, b=1.1, c=1.2, d=1.3), family=family)
     (tmp_path / "c.csv").write_text("path\nball.ply\n")
     sb.run(sb.Study.from_table(table, folder=tmp_path), tmp_path / "s.zarr", threads)
     rows = xr.open_dataset(tmp_path / "s.zarr", group="convergence", engine="zarr")
-    assert rows["effort"].values.tolist() == ["7.5", "", "high", "", "", ""]
+    assert rows["effort"].values.tolist() == ["7.5", "", "high", "", "", "", "8", ""]
     assert sb.table(tmp_path / "s.zarr/a")["effort"].dtype == float
 
 
