@@ -19,10 +19,10 @@ from sobolev_batch.geometry.surface import DIRECTIONS
 from sobolev_batch.norms.bounds import bessel_logs
 from sobolev_batch.transform.lattice import STEP_MIDDLE, STEP_WIDTH, SobolevWeights
 
-# Both laws were measured on spheres, boxes, sticks and icospheres, near and far: the truncation was
-# 0.5 to 8 times, the aliasing 0.25 to 2 times the true loss.
+# Both laws were measured on spheres, boxes, sticks and icospheres, near and far: the truncation was 0.5 to 8 times, the
+# aliasing 0.25 to 2 times the true loss, and less by the narrower kernel of another order.
 TRUNCATION_CAUTION = 2.5
-ALIASING_CAUTION = 5.0
+_ALIASING_CAUTION = 5.0
 # With this many periods of the energy within xi_max, a trough was measured to hide no more than the tail again.
 _TROUGH_PERIODS = 3.0
 # Two outer ranges of |ξ|, in fractions of xi_max. The energy of a difference is extrapolated from them. Where it is
@@ -48,23 +48,25 @@ class Sums:
     """Sums of squared fields: enough for their norms of each order and the errors of these.
 
     Attributes:
-        squares: Squared norms (orders, 4, ...), split by |k|² mod 4. A residue of 0 means that all
-            entries of k are even, 1 and 2 that one or two are odd, 3 that all are.
+        totals: Squared norms (orders, ...).
+        by_residue: Squared norms of the orders of `SobolevWeights.narrower` (orders, 4, ...), split by |k|² mod 4. A
+            residue of 0 means that all entries of k are even, 1 and 2 that one or two are odd, 3 that all are.
         outer: Mean energy ∫_{|ξ|=r} |field|² dS over two outer ranges of r, (2, ...).
     """
 
-    squares: Reals
+    totals: Reals
+    by_residue: Reals
     outer: Reals
 
     @classmethod
     def zeros(cls, orders: int, *shape: int) -> Sums:
         """Return sums of zero for fields of a shape."""
-        return cls(np.zeros((orders, 4, *shape)), np.zeros((2, *shape)))
+        return cls(np.zeros((orders, *shape)), np.zeros((orders, 4, *shape)), np.zeros((2, *shape)))
 
     @property
-    def totals(self) -> Reals:
-        """Squared norms (orders, ...)."""
-        return np.asarray(self.squares.sum(axis=1))
+    def arrays(self) -> tuple[Reals, Reals, Reals]:
+        """All sums."""
+        return self.totals, self.by_residue, self.outer
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,15 +86,17 @@ class Support:
 
 def add_sums(sums: Sequence[Sums]) -> Sums:
     """Return the sums of a whole field from those of its blocks."""
-    return Sums(np.sum([one.squares for one in sums], axis=0), np.sum([one.outer for one in sums], axis=0))
+    return Sums(*(np.sum(parts, axis=0) for parts in zip(*(one.arrays for one in sums), strict=True)))
 
 
 def sums_of_shells(shell_sums: Reals, weights: SobolevWeights) -> Sums:
     """Return the sums of fields from their sums per shell (..., shell_count)."""
-    residues = np.arange(weights.lattice.shell_count) % 4
-    by_residue = np.stack([weights.per_shell * (residues == residue) for residue in range(4)], axis=1)
-    squares = np.tensordot(by_residue, shell_sums, axes=(2, -1))
-    return Sums(squares, np.tensordot(outer_windows(weights), shell_sums, axes=(1, -1)))
+    orders, residues = len(weights.orders), np.arange(weights.lattice.shell_count) % 4
+    by_residue = [weights.narrower.per_shell * (residues == residue) for residue in range(4)]
+    # One product for all: few rows would be summed in another order than many.
+    sums = np.tensordot(np.concatenate([weights.per_shell, *by_residue, outer_windows(weights)]), shell_sums, (1, -1))
+    split = sums[orders:-2].reshape(4, orders, *sums.shape[1:])
+    return Sums(sums[:orders], np.moveaxis(split, 0, 1), sums[-2:])
 
 
 def outer_windows(weights: SobolevWeights) -> Reals:
@@ -146,17 +150,22 @@ def truncated(
 def aliased(sums: Sums, weights: SobolevWeights, widths: Reals) -> Reals:
     """Estimate the contribution of images to the squared norm (orders, ...).
 
-    A sum over a sublattice alone brings in further images, at fractions of the period. The change shows
-    their size. The kernel's decay from there to the full period gives the size of the remaining images. Under a step
-    the kernel has a tail in which it oscillates, and which may reach images that are not close: see `step_images`.
+    A sum over a sublattice alone brings in further images, at fractions of the period. The change shows their size. The
+    kernel's decay from there to the full period gives the size of the remaining images. Near-duplicates meet
+    derivatives of the kernel, whose signs change within a wide peak, so that images may cancel by chance: these are
+    seen with a narrower one. Under a step the kernel has a tail in which it oscillates, and which may reach images that
+    are not close: see `step_images`.
     """
-    spacing = weights.lattice.spacing
-    estimates = []
+    spacing, whole, estimates = weights.lattice.spacing, sums.by_residue.sum(axis=1), []
+    orders = list(zip(weights.orders, weights.narrower.orders, strict=True))
     for residues, index, fractions in _SUBLATTICES:
-        change = np.abs(index * sums.squares[:, residues].sum(axis=1) - sums.totals)
-        decay = [decay_to_period(spacing, order, widths, fractions) for order in weights.orders]
+        change = np.abs(index * sums.by_residue[:, residues].sum(axis=1) - whole)
+        decay = [
+            narrower / order * image_weight(spacing, order, widths) / image_weight(spacing, narrower, widths, fractions)
+            for order, narrower in orders
+        ]
         estimates.append(change * np.reshape(decay, (-1, *[1] * (change.ndim - 1))))
-    return np.asarray(ALIASING_CAUTION * np.max(estimates, axis=0) + step_images(sums, weights, widths))
+    return np.asarray(_ALIASING_CAUTION * np.max(estimates, axis=0) + step_images(sums, weights, widths))
 
 
 def step_images(sums: Sums, weights: SobolevWeights, widths: Reals) -> Reals:
@@ -174,9 +183,9 @@ def step_images(sums: Sums, weights: SobolevWeights, widths: Reals) -> Reals:
     return np.asarray(np.multiply.outer(factors, np.abs(sums.outer[1])))
 
 
-def decay_to_period(spacing: float, order: float, widths: Reals, fractions: Reals = _SUBLATTICES[-1][2]) -> float:
-    """Return the size of images at the period over that at fractions of it, by default halves (even indices alone)."""
-    return image_weight(spacing, order, widths) / image_weight(spacing, order, widths, fractions)
+def decay_to_period(spacing: float, order: float, widths: Reals) -> float:
+    """Return the size of images at the period over that at halves of it."""
+    return image_weight(spacing, order, widths) / image_weight(spacing, order, widths, _SUBLATTICES[-1][2])
 
 
 def image_weight(spacing: float, order: float, widths: Reals, images: Reals = _PERIOD) -> float:

@@ -8,7 +8,8 @@ reported; their differences must be summed directly.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +43,8 @@ class Arrangement:
             and the outer range that they represent, or None.
         shells: |k|² of each sample, int32 (block.size,).
         trapezoid: Weight of each sample in the sum over the lattice (block.size,).
-        by_order: Weights of the shells for each order (orders, lattice.shell_count).
+        by_order: Weights of the shells for each order, and for narrower ones (rows, lattice.shell_count).
+        places: Rows of these that `Sums.totals` and `Sums.by_residue` take.
         by_window: Weights of the shells for the outer ranges (2, lattice.shell_count), raised to make up for
             the samples left out.
     """
@@ -52,6 +54,7 @@ class Arrangement:
     shells: NDArray[np.int32]
     trapezoid: Reals
     by_order: Reals
+    places: tuple[list[int], list[int]]
     by_window: Reals
 
     @classmethod
@@ -75,18 +78,22 @@ class Arrangement:
             if end > start
         )
         trapezoid = lattice.trapezoid_weights(block).ravel()[order]
-        return cls(order, runs, shells[order], trapezoid, weights.per_shell, windows)
+        parts = weights.orders, weights.narrower.orders
+        every = list(dict.fromkeys(chain(*parts)))
+        by_order = replace(weights, orders=tuple(every)).per_shell
+        places = [every.index(s) for s in parts[0]], [every.index(s) for s in parts[1]]
+        return cls(order, runs, shells[order], trapezoid, by_order, places, windows)
 
     def zeros(self, *shape: int) -> Sums:
         """Return sums of zero for squares or products of fields."""
-        return Sums.zeros(len(self.by_order), *shape)
+        return Sums.zeros(len(self.places[0]), *shape)
 
     def products(self, first: Complexes, second: Complexes) -> Sums:
         """Return the contributions of this block to the inner products Re <a_i, b_j>_s of fields.
 
         The fields are complex128 (m, block.size) and (n, block.size), arranged, each row contiguous; preferably the
-        second ones are fewer. The inner products are (orders, 4, m, n) and (2, m, n), as `Sums` has squares. The
-        contributions of all blocks of the half lattice add up to the whole.
+        second ones are fewer. The arrays end in (m, n). The contributions of all blocks of the half lattice add up to
+        the whole.
         """
         m, n = len(first), len(second)
         left, right = first.view(np.float64), second.view(np.float64)
@@ -101,7 +108,7 @@ class Arrangement:
         return sums
 
     def squares(self, fields: Complexes) -> Sums:
-        """Return the products of fields (m, block.size) with themselves: (orders, 4, m) and (2, m)."""
+        """Return the products of fields (m, block.size) with themselves, in arrays that end in (m,)."""
         values = fields.view(np.float64)
         sums = self.zeros(len(fields))
         buffer = np.empty(len(fields) * 2 * _COLUMNS)
@@ -112,7 +119,7 @@ class Arrangement:
         return sums
 
     def _column_batches(self) -> Iterator[tuple[Run, slice, Reals]]:
-        """Yield columns of real and imaginary parts that stay in cache, with weights (orders or one more, columns)."""
+        """Yield columns of real and imaginary parts that stay in cache, with weights (rows or one more, columns)."""
         for run in self.runs:
             samples, _, window = run
             rows = self.by_order if window is None else np.vstack([self.by_order, self.by_window[window]])
@@ -123,22 +130,21 @@ class Arrangement:
 
     def _add(self, sums: Sums, run: Run, products: Reals) -> None:
         _, residue, window = run
-        orders = len(self.by_order)
-        sums.squares[:, residue] += products[:orders]
+        of_totals, of_residues = self.places
+        sums.totals[...] += products[of_totals]
+        sums.by_residue[:, residue] += products[of_residues]
         if window is not None:
-            sums.outer[window] += products[orders]
+            sums.outer[window] += products[-1]
 
 
 def differences(products: Sums, first: Sums, second: Sums) -> tuple[Sums, NDArray[np.bool_]]:
     """Return squared differences of pairs from their inner products, and a mask of those that cancelled.
 
-    The products are those of the differences to the center, (orders, 4, m, n) and (2, m, n). The others are squares of
-    these differences, (orders, 4, m) and (orders, 4, n). The mask (m, n) is True for pairs that lost more than about
-    six digits at any order.
+    The products are those of the differences to the center, in arrays that end in (m, n). The others are squares of
+    these differences, and end in (m,) and (n,). The mask (m, n) is True for pairs that lost more than about six digits
+    at any order.
     """
-    sums = first.squares[..., :, None] + second.squares[..., None, :]
-    squares = sums - 2 * products.squares
-    total, scale = squares.sum(axis=1), sums.sum(axis=1)
-    outer = np.maximum(first.outer[:, :, None] + second.outer[:, None, :] - 2 * products.outer, 0.0)
-    cancelled: NDArray[np.bool_] = np.any(total <= _CANCELLATION * scale, axis=0)
-    return Sums(squares, outer), cancelled
+    scales = [a[..., :, None] + b[..., None, :] for a, b in zip(first.arrays, second.arrays, strict=True)]
+    squares = Sums(*(scale - 2 * both for scale, both in zip(scales, products.arrays, strict=True)))
+    cancelled: NDArray[np.bool_] = np.any(squares.totals <= _CANCELLATION * scales[0], axis=0)
+    return replace(squares, outer=np.maximum(squares.outer, 0.0)), cancelled

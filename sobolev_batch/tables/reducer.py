@@ -285,10 +285,12 @@ class Reducer:
             pair = rows[i], others[j]
             shells = np.zeros(self.lattice.shell_count) if pair[0] == pair[1] else self.sums_over_shells(pair)
             direct = sums_of_shells(shells, self.weights)
-            sums.squares[:, :, i, j], sums.outer[:, i, j] = direct.squares, direct.outer
+            for array, found in zip(sums.arrays, direct.arrays, strict=True):
+                array[..., i, j] = found
         if shared:
-            for square in (sums.squares[..., :shared], sums.outer[..., :shared]):
-                square[...] = np.triu(square) + np.swapaxes(np.triu(square, 1), -1, -2)
+            for array in sums.arrays:
+                square = np.triu(array[..., :shared])
+                array[..., :shared] = square + np.swapaxes(np.triu(square, 1), -1, -2)
         areas = self.areas[list(rows)][:, None] + self.areas[list(others)]
         errors = np.hypot(self.errors[:, list(rows)][:, :, None], self.errors[:, list(others)][:, None, :])
         errors *= np.not_equal.outer(rows, others)
@@ -332,9 +334,10 @@ class Reducer:
         products, right = arrangement.zeros(len(rows), len(others)), arrangement.zeros(len(others))
 
         def multiply(group: slice, fields: Complexes, above: int) -> None:
-            sums, squares = arrangement.products(held[:above], fields), arrangement.squares(fields)
-            products.squares[:, :, :above, group], products.outer[:, :above, group] = sums.squares, sums.outer
-            right.squares[..., group], right.outer[..., group] = squares.squares, squares.outer
+            for array, found in zip(products.arrays, arrangement.products(held[:above], fields).arrays, strict=True):
+                array[..., :above, group] = found
+            for array, found in zip(right.arrays, arrangement.squares(fields).arrays, strict=True):
+                array[..., group] = found
 
         for group in _slices(shared, self._group):
             multiply(group, held[group], group.stop)

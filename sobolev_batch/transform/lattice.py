@@ -32,6 +32,8 @@ _BALL = (6 / math.pi) ** (1 / 3)
 # Layers of an octave's lattice with ξ_z < 0, over which it fades out, and the width of the fading in layers.
 _FADED_LAYERS, _FADING_LAYERS = 3, 1.2
 _LOWEST_ORDER = -100.0
+# Kernels of orders above this have a narrow peak.
+_NARROW = -2.0
 # The smooth step falls from one to zero between this fraction of the cutoff and the cutoff.
 STEP_START = 0.5
 # At the ends of the fall it is off by erfc(3)/2 = 1e-5, on both sides of the cut: a partition by steps stays one.
@@ -322,6 +324,11 @@ class SobolevWeights:
         squares = self.lattice.spacing**2 * np.arange(self.lattice.shell_count, dtype=np.float64)
         step = 1.0 if self.cutoff is None else smooth_step(np.sqrt(squares), self.cutoff)
         return np.stack([(1 + squares) ** s * step for s in self.orders])
+
+    @cached_property
+    def narrower(self) -> SobolevWeights:
+        """Weights of half of each order, but none above -2 that was not: kernels narrower than theirs, or the same."""
+        return SobolevWeights(self.lattice, tuple(max(s, min(s / 2, _NARROW)) for s in self.orders), self.cutoff)
 
     def __getstate__(self) -> dict[str, Any]:
         # Tasks carry these weights: it is cheaper to compute them again than to send them.

@@ -31,10 +31,11 @@ def test_blocks_of_products_give_every_distance() -> None:
     for i in range(4):
         for j in range(i):
             expected = distance(fields[i], fields[j], ORDERS)["distance"].values
-            assert np.sqrt(sums.squares.sum(axis=1)[:, i, j]) == pytest.approx(expected, rel=1e-10)
+            assert np.sqrt(sums.totals[:, i, j]) == pytest.approx(expected, rel=1e-10)
             shells = shell_sums((fields[i] - fields[j]).values, None, LATTICE, LATTICE.half)
             direct = sums_of_shells(shells, WEIGHTS)
-            assert sums.squares[:, :, i, j] == pytest.approx(direct.squares, rel=1e-9)
+            assert sums.totals[:, i, j] == pytest.approx(direct.totals, rel=1e-9)
+            assert sums.by_residue[:, :, i, j] == pytest.approx(direct.by_residue, rel=1e-9)
             assert sums.outer[:, i, j] == pytest.approx(direct.outer, rel=0.1)  # blocks this small are sampled in part
     assert not cancelled[~np.eye(4, dtype=bool)].any()
     assert cancelled.diagonal().all()

@@ -15,7 +15,7 @@ from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Extent
 from sobolev_batch.norms import DEFAULT_ORDER
-from sobolev_batch.norms.budget import ALIASING_CAUTION, Support, decay_to_period, sums_of_shells, truncated
+from sobolev_batch.norms.budget import Support, decay_to_period, sums_of_shells, truncated
 from sobolev_batch.norms.columns import NUMBER, VARIABLES, labelled, lattice_attributes
 from sobolev_batch.norms.estimate import PARTS
 from sobolev_batch.norms.fields import (
@@ -37,9 +37,9 @@ from sobolev_batch.transform.nufft_costs import FINEST_EPS
 _REFINEMENT = 30.0
 # The derivative's tail was measured to be at most this many times what the tail of the squared distance suggests.
 _TRUNCATION_CAUTION = 3.0
-# Images change derivatives by more than what the change at half the period suggests: up to 5 times were measured
-# beyond the caution for distances, where surfaces fill three quarters of the period.
-_ALIASING_CAUTION = 8 * ALIASING_CAUTION
+# Images change derivatives by more than what the change at half the period suggests: up to 25 times were measured
+# where surfaces fill three quarters of the period.
+_ALIASING_CAUTION = 40.0
 # Steps to find the largest change of the transform by a movement, which comes out too small by this factor at most.
 _POWER_STEPS, _POWER_CAUTION = 4, 1.5
 # Movement of vertices in a difference, relative to the mean edge.

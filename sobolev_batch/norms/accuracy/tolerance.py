@@ -18,7 +18,6 @@ from scipy.special import betainc
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import AccuracyError, InputError
 from sobolev_batch.norms.budget import (
-    ALIASING_CAUTION,
     TRUNCATION_CAUTION,
     Sums,
     Support,
@@ -43,7 +42,7 @@ NEXT_TO_EQUAL = 1e-5
 LEAST_OF_OCTAVES = 1e-4
 # Before a pair is measured: how much larger than the kernel alone predicts its images may be, and
 # how much larger its tail than that of two surfaces close to each other.
-_IMAGE_MARGIN, _TAIL_MARGIN = 30.0, 2.0
+_IMAGE_MARGIN, _TAIL_MARGIN = 150.0, 2.0
 # If those laws ask for more than this, a pilot lattice of this size measures the pair first.
 _PILOT_M = 64
 _HIGHEST_FREQUENCY = 1e4
@@ -252,7 +251,7 @@ def _refined_period(sums: Sums, weights: SobolevWeights, widths: Reals, accuracy
 
 def _first_period(support: Support, orders: Sequence[float], accuracy: Accuracy) -> float:
     """Return the period 1/h that holds surfaces, and at which the kernel predicts images that are small enough."""
-    allowed = accuracy.aliasing_part / (ALIASING_CAUTION * _IMAGE_MARGIN / 2)
+    allowed = accuracy.aliasing_part / (_IMAGE_MARGIN / 2)
     widths, widest = support.widths, float(support.widths.max())
 
     def suffices(period: float) -> bool:
