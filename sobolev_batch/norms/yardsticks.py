@@ -21,6 +21,7 @@ from sobolev_batch.norms.accuracy.problem import support_of
 from sobolev_batch.norms.accuracy.solution import SurfaceValues
 from sobolev_batch.norms.columns import labelled
 from sobolev_batch.norms.distances import accuracy_of, distance, to_accuracy
+from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.parameters import as_names, check_seed
 from sobolev_batch.sources.derived import decimated, with_noise
 from sobolev_batch.transform.fourier import ErrorTarget, Execution
@@ -35,6 +36,8 @@ _ROUNDING = 1e-13
 _CLOSENESS, _MOST_STEPS, _FAILED = 0.02, 8, 0.1
 # Largest factor from one changed mesh to the next.
 _LARGEST_STEP = math.log(16.0)
+# Factor by which the error of an amount grows until it is confirmed.
+_WIDER = 1.5
 # Secants that are flatter, relative to what is usual, are noise.
 _LEAST_POWER = 0.1
 # Least and largest moves and noise, as fractions of the radius, and the fewest triangles.
@@ -78,7 +81,7 @@ def yardsticks(
         square over all of them), and `noise`, the standard deviation of Gaussian noise at its vertices along its
         normals, both as fractions of the radius of its bounding sphere; `decimated`, the number of triangles left by
         quadric edge collapse. All are float64, NaN where no such change is as far away, and where the distance is not
-        larger than its error. `moved_error`, `noise_error` and `decimated_error` tell what the error of the distance
+        larger than its error. `moved_error`, `noise_error` and `decimated_error` tell what the errors of distances
         and the end of the search leave open.
 
     Raises:
@@ -103,8 +106,9 @@ def yardsticks(
         accuracy = accuracy_of(rtol, memory, best_effort=best_effort)
         found, solved = to_accuracy("distance", (a, b), order, lattice, accuracy, seed, on_progress)
     distances, errors, relative = (np.atleast_1d(found[name].values) for name in ("distance", "error", "relative"))
+    estimate = NormEstimate(distances, *np.reshape(found["error_part"].values, (len(orders), -1)).T)
     columns = {name: np.full(len(orders), np.nan) for change in wanted for name in (change, f"{change}_error")}
-    if distances.any():
+    if (resolved := np.flatnonzero(distances > errors)).size:
         values_errors = np.maximum(_VALUES_ACCURACY * np.maximum(distances, errors), _ROUNDING * b.area)
         target = ErrorTarget(orders, tuple(values_errors.tolist()))
         if solved is not None:
@@ -113,12 +117,12 @@ def yardsticks(
             # Without an accuracy there is one.
             frequencies = Frequencies(cast(Lattice, lattice), (), orders, support_of([a, b]).widths)
             values = frequencies.values(b, target, Execution(threads=available_cores()))
-        curves = _curves(b, frequencies, values, target, float(relative.min()), seed)
-        for i in np.flatnonzero(distances > errors).tolist():
+        curves = _curves(b, frequencies, values, target, float(relative[resolved].min()), seed)
+        for i in resolved.tolist():
             for change in wanted:
                 (on_progress or str)(f"order {orders[i]:g}: {change} as far")
                 curve = curves[change]
-                columns[change][i], columns[f"{change}_error"][i] = curve.equivalent(i, distances[i], errors[i])
+                columns[change][i], columns[f"{change}_error"][i] = curve.equivalent(i, estimate)
     return found.assign(labelled(order, columns, {}).data_vars)
 
 
@@ -127,20 +131,25 @@ def _curves(
 ) -> dict[Change, _Curve]:
     """Return the distance of a mesh from itself by the amount of each change; searches begin with a relative one."""
 
-    def apart(changed: Mesh) -> Reals:
+    def apart(changed: Mesh) -> NormEstimate:
         others = frequencies.values(changed, target, Execution(threads=available_cores()))
-        return frequencies.norms([others, values], [changed, mesh], [1, -1]).values
+        return frequencies.norms([others, values], [changed, mesh], [1, -1])
+
+    def moved(amount: float) -> NormEstimate:
+        # The same values make up both of its ends, whose errors are alike.
+        return NormEstimate(frequencies.moved(values, mesh, amount * radius), *[np.zeros(len(target.orders))] * 3)
 
     _, radius = mesh.bounding_sphere
     bounds, count = (_LEAST, _MOST), len(mesh.triangles)
     return {
-        "moved": _Curve(lambda amount: frequencies.moved(values, mesh, amount * radius), start, bounds, 1.0),
+        "moved": _Curve(moved, start, bounds, 1.0, is_cheap=True),
         "noise": _Curve(lambda amount: apart(with_noise(mesh, amount * radius, seed)), start, bounds, 1.0),
         "decimated": _Curve(
             lambda amount: apart(decimated(mesh, round(amount))),
             max(count // 4, _FEWEST_TRIANGLES),
-            (_FEWEST_TRIANGLES, max(count - 1, _FEWEST_TRIANGLES)),
+            (_FEWEST_TRIANGLES, count - 1),
             -1.0,
+            unit=1.0,
         ),
     }
 
@@ -150,21 +159,26 @@ class _Curve:
     """Distances (orders,) to the reference by the amount of a change, each computed once.
 
     The search begins with a start between bounds. The distance usually grows like the amount to the power of the slope.
+    Where a distance takes hardly any time, it is computed at both ends of what an amount is found to be, too. Amounts
+    may be whole multiples of a unit.
     """
 
-    distances: Callable[[float], Reals]
+    distances: Callable[[float], NormEstimate]
     start: float
     bounds: tuple[float, float]
     slope: float
-    known: dict[float, Reals] = field(default_factory=dict)
+    is_cheap: bool = False
+    unit: float = 0.0
+    known: dict[float, NormEstimate] = field(default_factory=dict)
 
-    def equivalent(self, order: int, wanted: float, error: float) -> tuple[float, float]:
+    def equivalent(self, order: int, wanted: NormEstimate) -> tuple[float, float]:
         """Return the amount at which the distance of an order is the one wanted, and how far off the amount may be.
 
         Both are NaN if there is none. The search follows secants of the logarithms.
         """
-        least = np.finfo(np.float64).tiny
-        gaps = {one: math.log(max(found[order], least) / wanted) for one, found in self.known.items()}
+        if self.bounds[0] > self.bounds[1]:
+            return math.nan, math.nan
+        gaps = {one: self._gap(one, order, wanted) for one in self.known}
         amount = min(gaps, key=lambda one: abs(gaps[one]), default=self.start)
         for _ in range(_MOST_STEPS):
             if amount not in gaps:
@@ -172,7 +186,7 @@ class _Curve:
                     self.known[amount] = self.distances(amount)
                 except (LatticeError, MeshError):
                     return math.nan, math.nan
-                gaps[amount] = math.log(max(self.known[amount][order], least) / wanted)
+                gaps[amount] = self._gap(amount, order, wanted)
             power = self._power(gaps)
             nearest = min(gaps, key=lambda one: abs(gaps[one]))
             if abs(gaps[nearest]) <= _CLOSENESS:
@@ -185,7 +199,30 @@ class _Curve:
         if abs(gaps[nearest]) > _FAILED:
             return math.nan, math.nan
         found = nearest * math.exp(-gaps[nearest] / power)
-        return found, found * (error / wanted + abs(gaps[nearest])) / abs(power)
+        error = _error_of_both(wanted, self.known[nearest])[order] / wanted.values[order]
+        uncertain = self.unit + found * (error + abs(gaps[nearest])) / abs(power)
+        return self._confirmed(order, wanted, found, uncertain) if self.is_cheap else (found, uncertain)
+
+    def _gap(self, amount: float, order: int, wanted: NormEstimate) -> float:
+        """Return the logarithm of the distance of a known amount over the one wanted."""
+        distance = max(self.known[amount].values[order], np.finfo(np.float64).tiny)
+        return math.log(distance / wanted.values[order])
+
+    def _confirmed(self, order: int, wanted: NormEstimate, found: float, uncertain: float) -> tuple[float, float]:
+        """Return an amount, and how far off it may be: so much that the distance surely passes the one wanted.
+
+        Both are NaN where it does not up to the largest amount: far moves are all as far.
+        """
+        value, error = wanted.values[order], wanted.errors[order]
+        for _ in range(_MOST_STEPS):
+            if found + uncertain > self.bounds[1]:
+                break
+            ends = max(found - uncertain, 0.0), found + uncertain
+            lower, higher = (self.distances(amount).values[order] for amount in ends)
+            if lower <= value - error and value + error <= higher:
+                return found, uncertain
+            uncertain *= _WIDER
+        return math.nan, math.nan
 
     def _power(self, gaps: dict[float, float]) -> float:
         """Return the power of the amount that the distance grows with near the one wanted."""
@@ -197,3 +234,12 @@ class _Curve:
             if power / self.slope > _LEAST_POWER:
                 return power
         return self.slope
+
+
+def _error_of_both(first: NormEstimate, second: NormEstimate) -> Reals:
+    """Return bounds on the error (orders,) of the difference of two distances at the same frequencies.
+
+    Truncation may only add to both: then the larger one bounds what it changes between them.
+    """
+    truncation = np.maximum(first.truncation, second.truncation)
+    return np.asarray(truncation + sum(one.errors - one.truncation for one in (first, second)))

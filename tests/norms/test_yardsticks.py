@@ -92,3 +92,37 @@ def test_changes_are_chosen() -> None:
     assert not {"noise", "decimated_error"} & set(found)
     with pytest.raises(InputError, match="'turned'"):
         yardsticks(moved(0.1), BALL, lattice=LATTICE, changes=["turned"])  # type: ignore[list-item]
+
+
+@pytest.mark.parametrize("order", [-1.0, -2.0])
+def test_the_error_of_a_move_grows_where_far_moves_are_all_as_far(order: float) -> None:
+    lattice = Lattice(2.0, 48)
+    ball = icosphere(1)
+    lengths = (1.0, 1.3, 1.6, 2.0)
+    meshes = [Mesh(ball.vertices + np.array([length, 0, 0]), ball.triangles) for length in lengths]
+    for length, mesh in zip(lengths, meshes, strict=True):
+        found = yardsticks(mesh, ball, order, lattice=lattice, changes="moved")
+        assert not abs(found["moved"].item() - length) > found["moved_error"].item()
+    beyond = Mesh(ball.vertices + np.array([3.5, 0, 0]), ball.triangles)
+    assert np.isnan(yardsticks(beyond, ball, order, lattice=lattice, changes="moved")["moved"].item())
+
+
+@pytest.mark.slow
+def test_errors_of_noise_hold_those_of_its_distance() -> None:
+    """Most of both surfaces cancels, so that distances are less exact than the one wanted."""
+    ball = icosphere(2)
+    part = Mesh(ball.vertices, ball.triangles[:-20])
+    found = yardsticks(part, ball, -1.2, rtol=0.03, best_effort=True, changes="noise")
+    amount, error = found["noise"].item(), found["noise_error"].item()
+    ends = [distance(with_noise(ball, one, 0), ball, -1.2, rtol=0.02) for one in (amount - error, amount + error)]
+    lower, higher = ((one["distance"] + sign * one["error"]).item() for one, sign in zip(ends, (-1, 1), strict=True))
+    assert lower <= found["distance"].item() <= higher
+
+
+@pytest.mark.parametrize("triangles", [1, 4])
+def test_meshes_of_few_triangles_have_no_fewer(triangles: int) -> None:
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    few = Mesh(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])[:triangles])
+    found = yardsticks(Mesh(few.vertices + 0.1, few.triangles), few, -2.0, lattice=LATTICE)
+    assert np.isnan(found["decimated"].item())
+    assert 0.05 < found["moved"].item() < 0.5
