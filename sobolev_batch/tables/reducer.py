@@ -31,7 +31,8 @@ _READ_AT_ONCE = 8
 _FEWEST_ROWS = 4
 # Two surfaces may not have been compared beyond the octaves. Their mean energy there is at least this fraction of the
 # last measured one. It exceeds the sum of both own ones by no more than this multiple of the last distance from it; or
-# this fraction of it, where the energy has just grown by more than a factor from octave to octave.
+# this fraction of it, where the energy has just grown by more than a factor from octave to octave. Below the sum, it is
+# by no more than that multiple of the last excess.
 _LEAST_LIMIT, _SWING, _RISE, _STEEPEST_GROWTH = 0.7, 1.25, 0.9, 2.5
 # Rows of a tile whose values in octaves are held at a time take this many bytes.
 _HELD_BYTES = 128 << 20
@@ -397,9 +398,10 @@ class Reducer:
             return Remainder.between(0.0, 0.0, cutoff)
         # Between parallel surfaces the energy grows like |ξ|², rises through the sum to twice it, and swings about it.
         total = sum(energies)
-        largest = sum(math.sqrt(energy) for energy in energies) ** 2
+        least, largest = ((math.sqrt(energies[0]) + sign * math.sqrt(energies[1])) ** 2 for sign in (-1, 1))
         swing = max(_SWING * abs(total - last), _RISE * total if last > _STEEPEST_GROWTH * before else 0.0)
-        return Remainder.between(min(_LEAST_LIMIT * last, total), max(total, min(total + swing, largest)), cutoff)
+        lowest = min(_LEAST_LIMIT * last, total, max(total - _SWING * (last - total), least))
+        return Remainder.between(lowest, max(total, min(total + swing, largest)), cutoff)
 
     def sums_over_shells(self, rows: Sequence[int]) -> Reals:
         """Return the sums of |a|² over shells, see `shell_sums`, of the field of a row or the difference of two."""
