@@ -100,15 +100,19 @@ class CostLeague:
         Columns: method; member; the cost by its name, relative and relative_error, geometric means over the objects;
         fronts, the number of objects on whose front it is; front, True unless another member beats both of its means.
         """
-        logarithms = self.meshes.assign(
-            share=self.meshes["relative_error"] / self.meshes["relative"],
-            **{name: np.log(self.meshes[name]) for name in (self.x, "relative")},
-        )
+        share = (self.meshes["relative_error"] / self.meshes["relative"]).fillna(np.inf)
+        with np.errstate(divide="ignore"):
+            logarithms = self.meshes.assign(
+                fall=np.log1p(-share.clip(upper=1.0)),
+                rise=np.log1p(share),
+                **{name: np.log(self.meshes[name]) for name in (self.x, "relative")},
+            )
         # A member may be there twice for an object whose names do not tell its meshes apart.
         members = logarithms.groupby(["method", "member"], sort=False)
-        found = members[[self.x, "relative", "share"]].mean()
-        found[[self.x, "relative"]] = np.exp(found[[self.x, "relative"]])
-        found["relative_error"] = found["relative"] * found.pop("share")
+        found = np.exp(members[[self.x, "relative", "fall", "rise"]].mean())
+        # The mean where all distances are as small, or as large, as their errors allow.
+        widest = np.maximum(1 - found.pop("fall"), found.pop("rise") - 1)
+        found["relative_error"] = found["relative"] * widest
         found["fronts"] = members["front"].sum()
         found = found[members["object"].nunique() == len(self.objects)].sort_values([self.x, "relative"], kind="stable")
         return found.assign(front=_is_unbeaten(found[self.x], found["relative"], found["relative"])).reset_index()

@@ -393,6 +393,17 @@ def test_objects_count_the_fronts_of_a_method_and_its_members() -> None:
     assert format_cost_leagues([made], "csv").startswith("order,object,method,member,mesh,make_seconds,relative")
 
 
+def test_the_errors_of_means_hold_all_that_those_of_the_objects_allow() -> None:
+    errors, rng = {"cow": 0.3, "egg": 0.01, "bell": 0.9}, np.random.default_rng(1)
+    tables = {name: priced({"quick": {1: 0.4}}).assign(relative_error=0.4 * error) for name, error in errors.items()}
+    made = by_cost(tables).means.iloc[0]
+    shares = 1 + np.array([*errors.values()]) * np.vstack([rng.uniform(-1, 1, (50, 3)), *product((-1, 1), repeat=3)])
+    gaps = abs(0.4 * shares.prod(axis=1) ** (1 / 3) - made["relative"])
+    assert gaps.max() <= made["relative_error"] * (1 + 1e-12) <= 0.4
+    unknown = {**tables, "egg": tables["egg"].assign(relative_error=np.nan)}
+    assert np.isinf(by_cost(unknown).means.iloc[0]["relative_error"])
+
+
 def test_names_that_hold_the_object_are_members_of_all_objects() -> None:
     tables = {name: priced({"quick": QUICK}, label=name + "_{:g}") for name in ("cow", "egg")}
     assert by_cost(tables).means["member"].tolist() == ["{object}_1", "{object}_2", "{object}_3"]
