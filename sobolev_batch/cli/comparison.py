@@ -48,6 +48,8 @@ _FAR_UNIT = 10.0
 _DEFAULT_RTOL = 1e-2
 # A turn by less, in degrees, or a shift by less than this fraction of the largest one, is rounding.
 _NO_MOTION = 1e-9
+# Digits of a motion near the origin, and those of a double.
+_MOTION_DIGITS, _MOST_DIGITS = 6, 16
 # Surfaces whose distance, relative to the reference, is certainly smaller differ by rounding.
 _ROUNDING, _OF_FILES = 1e-10, 1e-5
 # A share of area is told if its error is no larger, and to whole per cents.
@@ -138,7 +140,7 @@ class CompareOptions:
         a, b = self.meshes
         if self.motion is not None:
             a, numbers["motion"] = _moved(a, self.motion), self.motion.tolist()
-            echo(f"note: {_motion_text(self.motion)}", err=True)
+            echo(f"note: {motion_text(self.motion, self.meshes[0])}", err=True)
         if (tolerance := self.allowed_fraction) is not None:
             (order,), scaling = self.chosen_orders, not self.no_scaling
             same = same_surface(a, b, tolerance=tolerance, order=order, scaling=scaling, memory=self.memory)
@@ -292,7 +294,7 @@ class Comparison:
         if self.options.motion is not None and self.before is not None:
             relative, error = (self.before[name].item() for name in ("relative", "relative_error"))
             yield f"where it is in the file: {percent(relative, error)}"
-            yield _motion_text(self.options.motion)
+            yield motion_text(self.options.motion, self.options.meshes[0])
         yield from dict.fromkeys(answer(*self.options.names, result, self.area_change) for result in by_order)
         # Of equal meshes there is no more to tell.
         unequal = [result for result in by_order if result["distance"] > 0]
@@ -357,16 +359,19 @@ def _moved(mesh: Mesh, motion: Reals) -> Mesh:
     return mesh.moved(1.0, (x, y, z), turn)
 
 
-def _motion_text(motion: Reals) -> str:
-    """Return a rigid motion (4, 4) in words, with its numbers."""
+def motion_text(motion: Reals, mesh: Mesh) -> str:
+    """Return a rigid motion (4, 4) of a mesh in words, with numbers that move it to a millionth of its radius or so."""
+    center, radius = mesh.bounding_sphere
+    # A rotation moves what is far from the origin by more.
+    digits = min(_MOTION_DIGITS + math.ceil(math.log10(max(math.hypot(*center) / radius, 1.0))), _MOST_DIGITS)
     vector = Rotation.from_matrix(motion[:3, :3]).as_rotvec(degrees=True)
     angle = math.hypot(*vector)
     # What rounding makes of zero would be read as a motion.
     moved = np.where(np.abs(motion[:3, 3]) < _NO_MOTION * np.abs(motion[:3, 3]).max(), 0.0, motion[:3, 3])
-    axis, shift = (" ".join(f"{x:.6g}" for x in numbers) for numbers in (vector / (angle or 1.0), moved))
+    axis, shift = (" ".join(f"{x:.{digits}g}" for x in numbers) for numbers in (vector / (angle or 1.0), moved))
     if angle < _NO_MOTION:
         return f"moved: shifted by ({shift})"
-    return f"moved: rotated by {angle:.6g} degrees around ({axis}) through the origin, then shifted by ({shift})"
+    return f"moved: rotated by {angle:.{digits}g} degrees around ({axis}) through the origin, then shifted by ({shift})"
 
 
 def _remarks(options: CompareOptions, first: Mesh, second: Mesh, doubt: str | None) -> Iterator[str]:

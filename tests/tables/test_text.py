@@ -6,11 +6,15 @@ import math
 import re
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
-from sobolev_batch.cli.comparison import answer
+from sobolev_batch import Mesh
+from sobolev_batch.cli.comparison import answer, motion_text
+from sobolev_batch.shapes import icosphere
 from sobolev_batch.tables.text import bound, percent, with_error
 
 _NAN = float("nan")
@@ -107,3 +111,16 @@ def test_distances_that_cannot_be_told_from_zero_and_unknown_errors() -> None:
     assert "by 1.020 % ± ? at order -2" in said(relative_error=_NAN)
     unknown = "a.obj differs from b.obj by an unknown amount at order -2: not resolved."
     assert said(error=_NAN, relative_error=_NAN) == unknown
+
+
+@pytest.mark.parametrize("away", [0.0, 1e3, 1e7])
+def test_a_motion_can_be_repeated_from_its_words_however_far_the_mesh_is(away: float) -> None:
+    mesh, matrix = icosphere(1), np.eye(4)
+    mesh = Mesh(5 * mesh.vertices + away * np.array([3.0, -4.0, 12.0]), mesh.triangles)
+    matrix[:3, :3] = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
+    matrix[:3, 3] = [1.0 / 3, away / 7, -2.0]
+    angle, *numbers = (float(one) for one in re.findall(r"-?\d[\d.e+-]*", motion_text(matrix, mesh)))
+    turn = Rotation.from_rotvec(angle * np.array(numbers[:3]), degrees=True)
+    repeated = mesh.vertices @ turn.as_matrix().T + numbers[3:]
+    gaps = repeated - (mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3])
+    assert np.abs(gaps).max() < 1e-5 * mesh.bounding_sphere[1]
