@@ -73,12 +73,16 @@ class NormEstimate:
 
 
 def quotients(values: tuple[Reals, Reals], norms: tuple[Reals, Reals]) -> tuple[Reals, Reals]:
-    """Return values over norms, and bounds on the errors, from both with their errors; NaN up to a norm's own error."""
+    """Return values over norms, and bounds on the errors, from both with their errors; NaN up to a norm's own error.
+
+    What is certainly zero is so over any norm.
+    """
     (value, error), (norm, norm_error) = values, norms
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = value / norm
         errors = (error + relative * norm_error) / (norm - norm_error)
-    return relative, np.where(norm_error < norm, errors, np.nan)
+        errors = np.where(norm_error < norm, errors, np.where((value == 0) & (error == 0), 0.0, np.nan))
+    return relative, errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +225,8 @@ class ReferenceEstimate:
         products, norms, error = np.abs(self.products), self.norms, self.product_errors
         with np.errstate(divide="ignore", invalid="ignore"):
             lowest = np.maximum(products - error, 0.0) / (norms.values + norms.errors)
-            return lowest, (products + error) / np.maximum(norms.values - norms.errors, 0.0)
+            highest = (products + error) / np.maximum(norms.values - norms.errors, 0.0)
+        return lowest, np.where(products + error == 0, 0.0, highest)
 
     def area_and_shape(self, distances: NormEstimate) -> dict[str, Reals]:
         """Return two orthogonal parts of distances, that of area and the rest, by name, and bounds on their errors.

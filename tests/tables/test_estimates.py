@@ -104,3 +104,14 @@ def test_with_octaves_stored_spectra_fields_and_tiles_of_pairs_agree(store_path:
     assert found[:, :4] == pytest.approx(expected[:, :4], rel=1e-7)
     # Of stored spectra the largest sample is known at some orders, and bounded between them.
     assert found[:, 4] == pytest.approx(expected[:, 4], rel=0.05)
+
+
+def test_what_is_certainly_zero_is_so_over_a_norm_that_is_not_resolved(store_path: Path, threads: Client) -> None:
+    sb.run(sb.Study.from_table(small_table(norm={"orders": [-0.51]})), store_path, threads)
+    tree = sb.open_store(store_path)
+    norm = tree["norms"].to_dataset().sel(mesh="reference").squeeze()
+    assert norm["error"].item() > norm["norm"].item()
+    found = tree["convergence"].to_dataset().squeeze("order")
+    names = ["distance", "error", "relative", "relative_error", *AREA_AND_SHAPE]
+    assert not any(found[name].sel(mesh="reference").item() for name in names)
+    assert np.isnan(found["relative_error"].sel(mesh="ico/1").item())
