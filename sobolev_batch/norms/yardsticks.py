@@ -135,14 +135,12 @@ def _curves(
         others = frequencies.values(changed, target, Execution(threads=available_cores()))
         return frequencies.norms([others, values], [changed, mesh], [1, -1])
 
-    def moved(amount: float) -> NormEstimate:
-        # The same values make up both of its ends, whose errors are alike.
-        return NormEstimate(frequencies.moved(values, mesh, amount * radius), *[np.zeros(len(target.orders))] * 3)
-
     _, radius = mesh.bounding_sphere
     bounds, count = (_LEAST, _MOST), len(mesh.triangles)
     return {
-        "moved": _Curve(moved, start, bounds, 1.0, is_cheap=True),
+        "moved": _Curve(
+            lambda amount: frequencies.moved(values, mesh, amount * radius), start, bounds, 1.0, is_cheap=True
+        ),
         "noise": _Curve(lambda amount: apart(with_noise(mesh, amount * radius, seed)), start, bounds, 1.0),
         "decimated": _Curve(
             lambda amount: apart(decimated(mesh, round(amount))),
@@ -199,21 +197,23 @@ class _Curve:
         if abs(gaps[nearest]) > _FAILED:
             return math.nan, math.nan
         found = nearest * math.exp(-gaps[nearest] / power)
-        error = _error_of_both(wanted, self.known[nearest])[order] / wanted.values[order]
-        uncertain = self.unit + found * (error + abs(gaps[nearest])) / abs(power)
-        return self._confirmed(order, wanted, found, uncertain) if self.is_cheap else (found, uncertain)
+        value, error = wanted.values[order], _error_of_both(wanted, self.known[nearest])[order]
+        uncertain = self.unit + found * (error / value + abs(gaps[nearest])) / abs(power)
+        return self._confirmed(order, (value, error), found, uncertain) if self.is_cheap else (found, uncertain)
 
     def _gap(self, amount: float, order: int, wanted: NormEstimate) -> float:
         """Return the logarithm of the distance of a known amount over the one wanted."""
         distance = max(self.known[amount].values[order], np.finfo(np.float64).tiny)
         return math.log(distance / wanted.values[order])
 
-    def _confirmed(self, order: int, wanted: NormEstimate, found: float, uncertain: float) -> tuple[float, float]:
+    def _confirmed(
+        self, order: int, wanted: tuple[float, float], found: float, uncertain: float
+    ) -> tuple[float, float]:
         """Return an amount, and how far off it may be: so much that the distance surely passes the one wanted.
 
         Both are NaN where it does not up to the largest amount: far moves are all as far.
         """
-        value, error = wanted.values[order], wanted.errors[order]
+        value, error = wanted
         for _ in range(_MOST_STEPS):
             if found + uncertain > self.bounds[1]:
                 break

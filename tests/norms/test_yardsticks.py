@@ -107,6 +107,16 @@ def test_the_error_of_a_move_grows_where_far_moves_are_all_as_far(order: float) 
     assert np.isnan(yardsticks(beyond, ball, order, lattice=lattice, changes="moved")["moved"].item())
 
 
+def test_the_error_of_a_move_holds_what_a_lattice_leaves_out() -> None:
+    """A move is at higher frequencies than a face that is missing."""
+    ball = icosphere(0)
+    part = Mesh(ball.vertices, ball.triangles[1:])
+    coarse = yardsticks(part, ball, -2.5, lattice=Lattice(4.0, 64), changes="moved")
+    fine = yardsticks(part, ball, -2.5, rtol=0.01, changes="moved")
+    gap = abs(coarse["moved"] - fine["moved"]).item()
+    assert fine["moved_error"].item() < gap <= coarse["moved_error"].item()
+
+
 @pytest.mark.slow
 def test_errors_of_noise_hold_those_of_its_distance() -> None:
     """Most of both surfaces cancels, so that distances are less exact than the one wanted."""

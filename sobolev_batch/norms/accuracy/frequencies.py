@@ -88,20 +88,28 @@ class Frequencies:
         measure = Measure.from_values(values, signs)
         return self.norms_of(measure, surfaces, self.errors(values), self.tail(measure, surfaces, signs))
 
-    def moved(self, values: SurfaceValues, surface: Surface, length: float) -> Reals:
-        """Return the distance (orders,) of a surface to itself moved by a length: the rms over all directions."""
+    def moved(self, values: SurfaceValues, surface: Surface, length: float) -> NormEstimate:
+        """Return the distance (orders,) of a surface to itself moved by a length: the rms over all directions.
+
+        Its errors are what a lattice without a tail leaves out. Others are alike for all that these values are part of.
+        """
         # ∫ |1 - exp(-2πi ξ·v)|² over directions of v, on average: 2 - 2 sin(2π|ξ||v|)/(2π|ξ||v|).
         own = Measure.from_values([values], [1])
         radii = self.lattice.spacing * np.sqrt(np.arange(self.lattice.shell_count))
         shells = shell_sums(own.lattice, None, self.lattice, self.lattice.half)
-        squares = self.weights.per_shell @ (shells * (2 - 2 * np.sinc(2 * radii * length)))
+        shells *= 2 - 2 * np.sinc(2 * radii * length)
+        none = np.zeros(len(self.orders))
+        if not self.has_tail:
+            support = Support(2 * support_of([surface]).areas, self.widths)
+            return estimate_norms(sums_of_shells(shells, self.weights), self.weights, support, none)
+        squares = self.weights.per_shell @ shells
         for weights, octave in zip(self._octave_weights, own.octaves, strict=True):
             factors = 2 - 2 * np.sinc(2 * weights.sampling.radii * length)
             squares = squares + weights.integrals(squared_moduli(octave) * factors)
         if (tail := self.tail(own, [surface], [1])) is not None:
             means = np.array([mean_sinc(self._cutoff, order, length) for order in self.orders])
             squares = squares + (2 - 2 * means) * tail.remainder
-        return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
+        return NormEstimate(np.sqrt(np.maximum(squares, 0.0)), none, none, none)
 
     def errors(self, values: Sequence[SurfaceValues]) -> Reals:
         """Return the norms of the own errors (orders,) of all values together."""
