@@ -15,6 +15,7 @@ import xarray as xr
 from scipy.spatial.transform import Rotation
 
 from sobolev_batch.arrays import Reals
+from sobolev_batch.cli.options import ChosenOrders
 from sobolev_batch.cli.output import echo, show_step
 from sobolev_batch.errors import require_writable
 from sobolev_batch.geometry.deviation import Deviations, largest_deviation
@@ -74,7 +75,7 @@ class CompareOptions:
 
     a: Path
     b: Path
-    orders: tuple[float, ...] | None
+    orders: ChosenOrders
     rtol: float | None
     memory: int | None
     best_effort: bool

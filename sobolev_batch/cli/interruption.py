@@ -32,8 +32,8 @@ class Deadline:
 
     _current: ClassVar[Deadline | None] = None
 
-    def __init__(self, remark: str = "", seconds: float = SECONDS_TO_END) -> None:
-        self._remark, self._seconds = remark, seconds
+    def __init__(self) -> None:
+        self.expect("", SECONDS_TO_END)
         self.request = 0
         self._has_results: Callable[[], bool] | None = None
         self._is_met = threading.Event()

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 PATH = click.Path(path_type=Path)
 Callback = TypeVar("Callback", bound=Callable[..., Any])
+# The value of the option --order.
+ChosenOrders = tuple[float, ...] | None
 
 
 def _numbers(value: Any) -> tuple[float, ...]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sobolev_batch.cli.options import PATH, json_option, orders_option, store_argument
+from sobolev_batch.cli.options import PATH, ChosenOrders, json_option, orders_option, store_argument
 from sobolev_batch.cli.output import echo, echo_result, progress_bar, replace_line
 from sobolev_batch.cli.program import EXIT_OTHER, EXIT_SOME_FAILED, cli
 
@@ -122,7 +122,7 @@ def prune_command(store: Location, yes: bool) -> None:
     "[default: by the ending of OUTPUT: .parquet, .nc, .csv]",
 )
 @orders_option("Write the table of this order, for parquet and csv.", "the study's")
-def export_command(store: Location, output: Path, style: ExportFormat | None, orders: tuple[float, ...] | None) -> None:
+def export_command(store: Location, output: Path, style: ExportFormat | None, orders: ChosenOrders) -> None:
     """Write the tables of STORE to the file OUTPUT. Coordinates go with them."""
     from sobolev_batch.tables.export import BY_ENDING, export
 

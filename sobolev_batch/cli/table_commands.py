@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import wraps
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
-from sobolev_batch.cli.options import below_option, format_option, orders_option, store_argument
+from sobolev_batch.cli.options import Callback, ChosenOrders, below_option, format_option, orders_option, store_argument
 from sobolev_batch.cli.output import echo_lines
 from sobolev_batch.cli.program import NamedCommands, cli
 
@@ -30,24 +27,10 @@ class _Tables(NamedCommands):
         return super().parse_args(ctx, args if is_named else [_DEFAULT, *args])
 
 
-@dataclass(frozen=True)
-class TableOptions:
-    """Options that all tables take: the store, the format, and the orders; None for those of the study."""
-
-    store: Location
-    style: Format
-    orders: tuple[float, ...] | None
-
-
-def table_options(command: Callable[..., int | None]) -> Callable[..., int | None]:
-    """Add the argument and the options of all tables to a command, which takes them as one value."""
-
-    @wraps(command)
-    def with_options(store: Location, style: Format, orders: tuple[float, ...] | None, **more: Any) -> int | None:
-        return command(TableOptions(store, style, orders), **more)
-
+def table_options(command: Callback) -> Callback:
+    """Add what all tables take to a command: the store, the format as its style, and orders; None for the study's."""
     order = orders_option("Print the table of this order, which may be any below -1/2.", "the study's")
-    return store_argument(format_option(order(with_options)))
+    return store_argument(format_option(order(command)))
 
 
 @cli.group("table", cls=_Tables, no_args_is_help=False, subcommand_metavar="[KIND] STORE")
@@ -66,48 +49,48 @@ def table_command() -> None:
     show_default=True,
     help="Observe rates in edge_length, triangles, vertices, seconds, or a number among the metadata of the meshes.",
 )
-def convergence_command(table: TableOptions, x: str) -> None:
+def convergence_command(store: Location, style: Format, orders: ChosenOrders, x: str) -> None:
     """Print distances to the reference, with rates.
 
     The rows of several objects follow each other.
     """
     from sobolev_batch.tables.convergence import format_table
 
-    echo_lines(format_table(table.store, table.style, table.orders, x=x), table.style)
+    echo_lines(format_table(store, style, orders, x=x), style)
 
 
 @table_command.command("matrix")
 @table_options
-def matrix_command(table: TableOptions) -> None:
+def matrix_command(store: Location, style: Format, orders: ChosenOrders) -> None:
     """Print distances of all pairs of meshes."""
     from sobolev_batch.tables.matrix import format_matrix
 
-    echo_lines(format_matrix(table.store, table.style, table.orders), table.style)
+    echo_lines(format_matrix(store, style, orders), style)
 
 
 @table_command.command("verdict")
 @table_options
-def verdict_command(table: TableOptions) -> None:
+def verdict_command(store: Location, style: Format, orders: ChosenOrders) -> None:
     """Print the nearest mesh at each size. Also print the smallest below 5 % and 1 %."""
     from sobolev_batch.tables.conclusion import format_verdict
 
-    echo_lines(format_verdict(table.store, table.style, table.orders), table.style)
+    echo_lines(format_verdict(store, style, orders), style)
 
 
 @table_command.command("objects")
 @table_options
-def objects_command(table: TableOptions) -> None:
+def objects_command(store: Location, style: Format, orders: ChosenOrders) -> None:
     """Print the nearest mesh of each object. The worst objects come first."""
     from sobolev_batch.tables.conclusion import format_objects
 
-    echo_lines(format_objects(table.store, table.style, table.orders), table.style)
+    echo_lines(format_objects(store, style, orders), style)
 
 
 @table_command.command("smallest")
 @table_options
 @below_option("Take what is below FRACTION, such as 1%, of the norm of the reference.", required=True)
-def smallest_command(table: TableOptions, below: float) -> None:
+def smallest_command(store: Location, style: Format, orders: ChosenOrders, below: float) -> None:
     """Print the smallest mesh below a bound."""
     from sobolev_batch.tables.smallest import format_smallest
 
-    echo_lines(format_smallest(table.store, table.style, table.orders, below=below), table.style)
+    echo_lines(format_smallest(store, style, orders, below=below), style)

@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from sobolev_batch.cli.interruption import Deadline
-from sobolev_batch.cli.options import PATH, Callback, location, orders_option, store_argument
+from sobolev_batch.cli.options import PATH, Callback, ChosenOrders, location, orders_option, store_argument
 from sobolev_batch.cli.output import echo, echo_lines, progress_bar
 from sobolev_batch.cli.program import EXIT_SOME_FAILED, Command
-from sobolev_batch.cli.table_commands import TableOptions, table_options
+from sobolev_batch.cli.table_commands import table_options
 from sobolev_batch.errors import InputError, MeshError, SobolevBatchError, StoreError, from_extra, require_writable
 from sobolev_batch.extras.fitting import DEFAULT_SMOOTHING, DEFAULT_STEPS
 from sobolev_batch.norms import DEFAULT_ORDER
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from sobolev_batch.geometry.mesh import Mesh
     from sobolev_batch.geometry.surface import Similarity
     from sobolev_batch.store.location import Location
+    from sobolev_batch.tables import Format
 
 # A fit may lose this fraction of the radius of its target to rounding; distances have about as many digits.
 _MOST_ROUNDING = 1e-6
@@ -253,7 +254,7 @@ class _PlotOptions:
     store: Location
     output: Path
     formats: tuple[PictureFormat, ...]
-    orders: tuple[float, ...] | None
+    orders: ChosenOrders
     families: tuple[str, ...]
     x: str | None
     meshes: tuple[str, ...]
@@ -333,7 +334,7 @@ def witness_command(
     context: click.Context,
     store: Location,
     meshes: tuple[str, ...],
-    orders: tuple[float, ...] | None,
+    orders: ChosenOrders,
     style: str,
     distances: bool,
     output: Path,
@@ -399,11 +400,11 @@ def report_command(store: Location, output: Path, folder: Path, up: Axis | None,
     show_default=True,
     help="Report when the distance has grown by this factor.",
 )
-def time_command(table: TableOptions, truth: str | None, factor: float) -> None:
+def time_command(store: Location, style: Format, orders: ChosenOrders, truth: str | None, factor: float) -> None:
     """Print distances of moving meshes over time."""
     from sobolev_batch.extras.leagues.evolution import format_evolution
 
-    echo_lines(format_evolution(table.store, table.style, table.orders, truth=truth, factor=factor), table.style)
+    echo_lines(format_evolution(store, style, orders, truth=truth, factor=factor), style)
 
 
 @click.command("league")
@@ -430,7 +431,9 @@ def time_command(table: TableOptions, truth: str | None, factor: float) -> None:
     "--most", type=click.FloatRange(min=1.0), metavar="RATIO", help="A mean ratio to the earlier study above it fails."
 )
 def league_command(
-    table: TableOptions,
+    store: Location,
+    style: Format,
+    orders: ChosenOrders,
     by: str,
     x: str | None,
     columns: tuple[str, ...],
@@ -450,16 +453,16 @@ def league_command(
 
     is_worse = False
     if against is not None:
-        changes = compare_studies(table.store, against, table.orders, y=columns)
+        changes = compare_studies(store, against, orders, y=columns)
         lost = changes.attrs["lost"]
         changes = changes[changes["method"].isin(families or changes["method"])]
         is_worse = bool(lost or (changes["verdict"] == "farther").any() or (most and (changes["ratio"] > most).any()))
-        text = format_changes(changes, table.style)
+        text = format_changes(changes, style)
     elif by == "cost":
-        by_cost = league(table.store, table.orders, by="cost", x=x, methods=families or None)
-        text = format_cost_leagues(by_cost, table.style)
+        by_cost = league(store, orders, by="cost", x=x, methods=families or None)
+        text = format_cost_leagues(by_cost, style)
     else:
-        by_size = [league(table.store, table.orders, x=x, y=y, methods=families or None) for y in columns]
-        text = format_league([one for leagues in by_size for one in leagues], table.style)
-    echo_lines(text, table.style)
+        by_size = [league(store, orders, x=x, y=y, methods=families or None) for y in columns]
+        text = format_league([one for leagues in by_size for one in leagues], style)
+    echo_lines(text, style)
     return int(is_worse)
