@@ -288,13 +288,11 @@ def _displaced(
 
 
 def _moved(mesh: Mesh, amount: float, direction: Point) -> Mesh:
-    _, radius = mesh.bounding_sphere
-    return Mesh(mesh.vertices + amount * radius * np.asarray(direction), mesh.triangles)
+    return Mesh(mesh.vertices + amount * mesh.bounding_sphere[1] * np.asarray(direction), mesh.triangles)
 
 
 def _noisy(mesh: Mesh, amount: float, seed: int) -> Mesh:
-    _, radius = mesh.bounding_sphere
-    return with_noise(mesh, amount * radius, seed)
+    return with_noise(mesh, amount * mesh.bounding_sphere[1], seed)
 
 
 def with_noise(mesh: Mesh, amplitude: float, seed: int) -> Mesh:

@@ -91,9 +91,9 @@ class RuleUse:
             return _merged_points(faces, self.rule)
         corners, areas = (faces.at(0), faces.at(1), faces.at(2)), faces.areas / 4 ** len(self.path)
         for quarter in self.path:
-            corners = _quarters(corners)[quarter]
+            corners = quarters(corners)[quarter]
         for _ in range(self.splits):
-            a, b, c = (np.concatenate(quarters, axis=1) for quarters in zip(*_quarters(corners), strict=True))
+            a, b, c = (np.concatenate(parts, axis=1) for parts in zip(*quarters(corners), strict=True))
             corners, areas = (a, b, c), np.tile(areas / 4, 4)
         coordinates = np.empty((3, self.rule.node_count * len(areas)), like=areas)
         combine(self.rule.barycentric, np.stack(corners, axis=1), out=coordinates.reshape(3, self.rule.node_count, -1))
@@ -140,7 +140,7 @@ def assign_rules(
     )
 
 
-def _quarters(corners: _Corners) -> tuple[_Corners, _Corners, _Corners, _Corners]:
+def quarters(corners: _Corners) -> tuple[_Corners, _Corners, _Corners, _Corners]:
     """Return the four similar triangles that edge midpoints split each triangle into."""
     a, b, c = corners
     ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2

@@ -1,6 +1,6 @@
 """What plots show of a store: orders, families, and the spectra of their meshes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
@@ -75,48 +75,45 @@ class Selection:
 
     @cached_property
     def spectra(self) -> xr.Dataset:
-        """Spectra of the chosen families, see `spectra_of`; InputError where the store has no mesh to compare."""
-        if not self.compared:
+        """Squared distances of some meshes to the reference by wavelength, evenly through the chosen families.
+
+        `share` (mesh, order, band) of each squared distance; `energy` (mesh, band), ∫_{|ξ|=r} |a^ - b^|² dS of the
+        difference as a fraction of twice both areas, with its standard error `energy_error`, zero for bands of a
+        lattice; `wavelength` (band), that of the middle frequency in the study's unit; and `text` (band), its range.
+        The attribute `omission` is a note on the meshes that were not chosen, empty where all were. InputError where
+        the store has no mesh to compare.
+        """
+        tree, orders, meshes = self.tree, self.orders, self.compared
+        if not meshes:
             raise InputError("the store has no mesh to compare: the reference or all others are not computed")
-        return spectra_of(self.tree, self.orders, self.compared)
+        reference, fields = reference_of(tree), tree["fourier"].to_dataset()["fourier"]
+        affordable = _MOST_SAMPLES // int(np.prod(fields.shape[1:]))
+        labels = spread(meshes, max(1, min(MOST_SPECTRA, affordable)))
+        if "octaves" in tree:
+            found = [StoreAccessor(tree).spectrum(orders, label, reference) for label in labels]
+        else:
+            of_reference = fields.sel(mesh=reference).load()
+            found = [spectrum(fields.sel(mesh=label), of_reference, orders) for label in labels]
+            found = [bands.assign(energy_error=xr.zeros_like(bands["energy"])) for bands in found]
+        along = pd.Index(labels, name="mesh")
+        spectra = xr.concat(
+            [bands[["share", "energy", "energy_error"]] for bands in found], along, coords="minimal", compat="override"
+        ).drop_attrs()
+        areas = finished_group(tree, "meshes")["area"].reset_coords(drop=True)
+        limits = 2 * (areas.sel(mesh=labels) + areas.sel(mesh=reference, drop=True))
+        longest, shortest = (spectra[f"{name}_wavelength"].to_numpy() for name in ("longest", "shortest"))
+        texts = [
+            f"> {short:.3g}" if np.isinf(long) else f"{long:.3g} – {short:.3g}"
+            for long, short in zip(longest, shortest, strict=True)
+        ]
+        return spectra.assign(
+            energy=spectra["energy"] / limits,
+            energy_error=spectra["energy_error"] / limits,
+            wavelength=("band", 2 / (1 / longest + 1 / shortest)),
+            text=("band", texts),
+        ).assign_attrs(omission=f"{len(labels)} of {len(meshes)} meshes" if len(labels) < len(meshes) else "")
 
     @property
     def has_spectra(self) -> bool:
         """True if the store has a mesh to compare, of the chosen families."""
         return "similarity" in self.tree.attrs and bool(self.compared)
-
-
-def spectra_of(tree: xr.DataTree, orders: Sequence[float], meshes: Sequence[str]) -> xr.Dataset:
-    """Return the squared distances of some meshes to the reference by wavelength, evenly through the study.
-
-    `share` (mesh, order, band) of each squared distance; `energy` (mesh, band), ∫_{|ξ|=r} |a^ - b^|² dS of the
-    difference as a fraction of twice both areas, with its standard error `energy_error`, zero for bands of a lattice;
-    `wavelength` (band), that of the middle frequency in the study's unit; and `text` (band), its range. The attribute
-    `omission` is a note on the meshes that were not chosen, empty where all were.
-    """
-    reference, fields = reference_of(tree), tree["fourier"].to_dataset()["fourier"]
-    affordable = _MOST_SAMPLES // int(np.prod(fields.shape[1:]))
-    labels = spread(meshes, max(1, min(MOST_SPECTRA, affordable)))
-    if "octaves" in tree:
-        found = [StoreAccessor(tree).spectrum(orders, label, reference) for label in labels]
-    else:
-        of_reference = fields.sel(mesh=reference).load()
-        found = [spectrum(fields.sel(mesh=label), of_reference, orders) for label in labels]
-        found = [bands.assign(energy_error=xr.zeros_like(bands["energy"])) for bands in found]
-    along = pd.Index(labels, name="mesh")
-    spectra = xr.concat(
-        [bands[["share", "energy", "energy_error"]] for bands in found], along, coords="minimal", compat="override"
-    ).drop_attrs()
-    areas = finished_group(tree, "meshes")["area"].reset_coords(drop=True)
-    limits = 2 * (areas.sel(mesh=labels) + areas.sel(mesh=reference, drop=True))
-    longest, shortest = (spectra[f"{name}_wavelength"].to_numpy() for name in ("longest", "shortest"))
-    texts = [
-        f"> {short:.3g}" if np.isinf(long) else f"{long:.3g} – {short:.3g}"
-        for long, short in zip(longest, shortest, strict=True)
-    ]
-    return spectra.assign(
-        energy=spectra["energy"] / limits,
-        energy_error=spectra["energy_error"] / limits,
-        wavelength=("band", 2 / (1 / longest + 1 / shortest)),
-        text=("band", texts),
-    ).assign_attrs(omission=f"{len(labels)} of {len(meshes)} meshes" if len(labels) < len(meshes) else "")

@@ -15,17 +15,7 @@ from sobolev_batch.transform.fourier import ON_CPU, Execution, TransformSettings
 from sobolev_batch.transform.lattice import Lattice
 from sobolev_batch.transform.nufft import transform_points
 from sobolev_batch.transform.nufft_costs import NufftSpec
-from sobolev_batch.transform.quadrature import RuleUse, WeightedPoints, assign_rules
-
-# The corners of the four similar triangles of a triangle, in its barycentric coordinates.
-_QUARTERS: Reals = np.array(
-    [
-        [[1, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.5]],
-        [[0.5, 0.5, 0], [0, 1, 0], [0, 0.5, 0.5]],
-        [[0.5, 0, 0.5], [0, 0.5, 0.5], [0, 0, 1]],
-        [[0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5]],
-    ]
-)
+from sobolev_batch.transform.quadrature import RuleUse, WeightedPoints, assign_rules, quarters
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,8 +138,9 @@ def _node_matrices(mesh: Mesh, use: RuleUse) -> Iterator[tuple[csr_array, csr_ar
 
     if use.splits:
         inner, inner_weights = rule.barycentric, rule.weights
+        x, y, z = np.eye(3)
         for _ in range(use.splits):
-            inner = np.concatenate([inner @ quarter for quarter in _QUARTERS])
+            inner = np.concatenate([inner @ quarter for quarter in quarters((x, y, z))])
             inner_weights = np.tile(inner_weights / 4, 4)
     elif rule.shares:
         edges = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1), axis=2)

@@ -14,7 +14,7 @@ from sobolev_batch.extras.fitting.adjoint import MeshTransform
 from sobolev_batch.extras.fitting.derivatives import SquaredDistance, factors_of, squares_of
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.subdivision import Edges
-from sobolev_batch.geometry.surface import Extent, Similarity, Surface, centering, is_finite_number
+from sobolev_batch.geometry.surface import Extent, Similarity, centering, is_finite_number
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.accuracy.tolerance import Accuracy, core_lattice, lattice_of
 from sobolev_batch.norms.budget import Support
@@ -125,8 +125,12 @@ class FitProblem:
             move = centering([start, target]) if lattice is None else move
             start, target = move.apply(start), move.apply(target)
             orders = tuple(dict.fromkeys((settings.order, settings.coarse_order)))
-            own = common or fit_lattice(start, target, orders)
-            draws = draws_for([start, target], own, orders, USUAL_DEGREE)
+            if common is None:
+                extent = Extent.union([start.extent, target.extent])
+                support = Support(np.array(start.area + target.area), _ROOM * extent.widths, _ROOM * extent.reach)
+                period = 2 * core_lattice(support, orders, Accuracy(_ALIASING)).half_period
+                common = lattice_of(1 / start.edge_length_range[0], period, _MOST_INTERVALS)
+            own, draws = common, draws_for([start, target], common, orders, USUAL_DEGREE)
             distances = estimate([Sample.from_surface(surface, draws) for surface in (start, target)], orders)
             rounding = np.finfo(np.float64).eps * target.area
             accuracy = ErrorTarget(orders, tuple(np.maximum(_TARGET_FRACTION * distances, rounding).tolist()))
@@ -214,11 +218,3 @@ def welded(mesh: Mesh) -> tuple[Mesh, Indices]:
     # Zero has two signs.
     places, place = np.unique(mesh.vertices + 0.0, axis=0, return_inverse=True)
     return Mesh(places, place.reshape(-1)[mesh.triangles]), place.reshape(-1)
-
-
-def fit_lattice(mesh: Mesh, target: Surface, orders: tuple[float, ...]) -> Lattice:
-    """Return a lattice for fits: it reaches to wavelengths of an edge, or to those that a moderate M allows."""
-    extent = Extent.union([mesh.extent, target.extent])
-    support = Support(np.array(mesh.area + target.area), _ROOM * extent.widths, _ROOM * extent.reach)
-    period = 2 * core_lattice(support, orders, Accuracy(_ALIASING)).half_period
-    return lattice_of(1 / mesh.edge_length_range[0], period, _MOST_INTERVALS)

@@ -54,8 +54,6 @@ _GHOSTS = re.compile(
 _NAMES = {"celldata vtkghosttype": "ghosts", "celldata vtkghostlevels": "ghosts", "cells types": "types"}
 _APPENDED = re.compile(rb"<AppendedData[^>]{0,200}encoding\s{0,9}=\s{0,9}[\"'](raw|base64)[\"'][^>]{0,200}>\s{0,99}_")
 _END, _END_OF_DATA = b"</VTKFile>", b"</AppendedData>"
-# Usual bytes of a number in text.
-_WORD_BYTES = 16
 _PACKERS = "vtkZLibDataCompressor", "vtkLZMADataCompressor"
 # Memory that a block packed by LZMA may take: VTK's own take 9 MB, and a damaged one asks for gigabytes.
 _LZMA_BYTES = 1 << 27
@@ -122,12 +120,8 @@ class _Legacy:
             if count and self.data[self.place : self.place + 1] not in (b"", b"\n", b"\r"):
                 raise MeshError("its data in binary do not end where a line does: bytes are missing, or too many")
             return np.frombuffer(self.data, dtype, count, self.place - count * dtype.itemsize)
-        # Each word is followed by another, or by the end: longer pieces are split until that is so.
-        words, width = list[str](), 0
-        while len(words) <= count and width < left:
-            width = min(max(2 * width, _WORD_BYTES * (count + 1)), left)
-            words = self.data[self.place : self.place + width].decode("ascii", "replace").split(None, count)
-        self.place += width - sum(map(len, words[count:]))
+        words = self.data[self.place :].decode("ascii", "replace").split(None, count)
+        self.place = len(self.data) - sum(map(len, words[count:]))
         if len(words) < count:
             raise MeshError(f"the file breaks off: it announces {count} numbers, and has {len(words)}")
         return typed(words[:count], dtype.newbyteorder("="), "the file")

@@ -22,7 +22,7 @@ from sobolev_batch.tables.rendering import Column
 from sobolev_batch.testing.difference import picture_fields
 
 with from_extra("report", "a report needs"):
-    from sobolev_batch.extras.figures.views import FRONT, MeshView, distance_view, upwards
+    from sobolev_batch.extras.figures.views import FRONT, distance_view, upwards
     from sobolev_batch.extras.report.build import filled, numbers, view_data, write_page
     from sobolev_batch.extras.report.content import PageTable
 
@@ -79,7 +79,11 @@ def comparison_page(path: Path, comparison: Comparison, verdict: str = "") -> No
         "versions": {"sobolev-batch": version("sobolev-batch")},
         "sentences": [f"{verdict}."] * bool(verdict) + list(comparison.sentences),
         "names": comparison.options.names,
-        "triangles": [_count_text(view) for view in views],
+        "triangles": [
+            f"{view.original_triangles:,} triangles"
+            + (f", shown with {count:,}" if (count := len(view.triangles)) < view.original_triangles else "")
+            for view in views
+        ],
         "limit": f"{length:.3g}",
         "is_cut": length < largest.lower,
         "distances": PageTable("distances", columns, rows, is_sortable=False),
@@ -88,11 +92,6 @@ def comparison_page(path: Path, comparison: Comparison, verdict: str = "") -> No
         "omissions": [],
     }
     write_page(path, filled("comparison", content, charts)[0])
-
-
-def _count_text(view: MeshView) -> str:
-    shown = f", shown with {len(view.triangles):,}" if len(view.triangles) < view.original_triangles else ""
-    return f"{view.original_triangles:,} triangles{shown}"
 
 
 def _histogram(meshes: Sequence[Mesh], largest: float, *, signed: bool) -> tuple[dict[str, Any], float]:
