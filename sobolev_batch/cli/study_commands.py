@@ -21,8 +21,8 @@ from sobolev_batch.cli.options import (
 )
 from sobolev_batch.cli.output import echo, echo_lines, echo_result, progress_reports, show_step
 from sobolev_batch.cli.program import EXIT_SOME_FAILED, cli
-from sobolev_batch.cli.table_commands import table_command
 from sobolev_batch.errors import InputError
+from sobolev_batch.plugins import COMMANDS, extra
 from sobolev_batch.visible import visible
 
 if TYPE_CHECKING:
@@ -95,7 +95,11 @@ def run_command(
     if "" in parsed.objects:
         echo_lines(format_verdict(summary.store))
     else:
-        _print_league(context, summary.store)
+        try:
+            league = extra(COMMANDS, "table league", "the command 'table league'")
+            context.invoke(league, store=location(summary.store), orders=None)
+        except InputError as problem:
+            echo(f"no league: {problem}")
         with suppress(InputError):  # As the league says, no object has tables.
             objects = format_objects(summary.store, most=_MOST_OBJECTS)
             echo()
@@ -175,16 +179,6 @@ def plan_command(
     echo_result(style, made, made.to_table())
     if made.refused:
         context.exit(EXIT_SOME_FAILED)
-
-
-def _print_league(context: click.Context, place: str) -> None:
-    """Print the league of several objects as `table league` does, or why there is none."""
-    try:
-        command = table_command.get_command(context, "league")
-        if command is not None:
-            context.invoke(command, store=location(place), orders=None)
-    except InputError as error:
-        echo(f"no league: {error}")
 
 
 @cli.command("schema")

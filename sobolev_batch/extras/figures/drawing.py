@@ -1,7 +1,7 @@
 """What each plot draws on axes, and the table of plots."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -338,20 +338,15 @@ def clustered_order(distances: Reals) -> NDArray[np.intp]:
     return np.asarray(leaves_list(linkage(pairs, method="average", optimal_ordering=True)), dtype=np.intp)
 
 
-def _orders_if(has: Callable[[Selection], object]) -> Callable[[Selection], Sequence[float]]:
-    """Return a function that returns the orders of a selection which has what a plot shows, else none."""
-    return lambda selection: selection.orders if has(selection) else ()
-
-
 LEAGUE = Plot(draw_league, lambda leagues: leagues, 3.6)
 COST_LEAGUE = Plot(draw_cost_league, lambda leagues: leagues, 3.6)
 RATES = Plot(draw_rates, lambda found: found["order"].values.ravel(), 3.6)
 # The plots have the names of their files. Each panel shows one order.
 PLOTS: dict[str, Plot] = {
     "convergence": Plot(draw_convergence, lambda selection: selection.orders, 3.6),
-    "over-time": Plot(draw_evolution, _orders_if(moving_families), 3.6),
-    "matrix": Plot(draw_matrix, _orders_if(has_pairs), 5.6),
-    "spectrum": Plot(draw_spectrum, _orders_if(lambda selection: selection.has_spectra), 4.0),
+    "over-time": Plot(draw_evolution, lambda selection: selection.orders if moving_families(selection) else (), 3.6),
+    "matrix": Plot(draw_matrix, lambda selection: selection.orders if has_pairs(selection) else (), 5.6),
+    "spectrum": Plot(draw_spectrum, lambda selection: selection.orders if selection.has_spectra else (), 4.0),
     "energy": Plot(draw_energy, lambda selection: (None,) if selection.has_spectra else (), 3.6),
 }
 

@@ -315,16 +315,14 @@ def _matrices(tree: xr.DataTree, orders: list[float]) -> Json | None:
     return {
         "labels": matrices[0]["mesh"].values.tolist(),
         "total": len(complete_meshes(tree)),
-        "orders": [_matrix(matrix) for matrix in matrices],
-    }
-
-
-def _matrix(pairs: xr.Dataset) -> Json:
-    distances = pairs["distance"].values
-    return {
-        "values": [numbers(row[:i]) for i, row in enumerate(distances)],
-        "errors": [numbers(row[:i], digits=2) for i, row in enumerate(pairs["error"].values)],
-        "clustered": clustered_order(distances).tolist(),
+        "orders": [
+            {
+                "values": [numbers(row[:i]) for i, row in enumerate(pairs["distance"].values)],
+                "errors": [numbers(row[:i], digits=2) for i, row in enumerate(pairs["error"].values)],
+                "clustered": clustered_order(pairs["distance"].values).tolist(),
+            }
+            for pairs in matrices
+        ],
     }
 
 

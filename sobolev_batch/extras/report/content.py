@@ -42,13 +42,7 @@ from sobolev_batch.tables.convergence import (
     unit_notes,
     with_remarks,
 )
-from sobolev_batch.tables.open import (
-    finished_group,
-    open_store,
-    placement_doubts,
-    root_attribute,
-    similarity_of,
-)
+from sobolev_batch.tables.open import finished_group, open_store, placement_doubts, root_attribute, similarity_of
 from sobolev_batch.tables.rendering import Column
 from sobolev_batch.tables.text import minus, percent
 from sobolev_batch.transform.lattice import Lattice
