@@ -27,14 +27,19 @@ _LINE_LENGTH, _LONGEST_PROSE, SHORTEST_TEXT = 100, 100, 20
 def with_error(value: float, error: float = math.nan, unit: str = "") -> str:
     """Return a number with the digits that its error leaves it, and its error; both have one power of ten.
 
-    The error, unknown for NaN, has one digit and is rounded up, so that it stays a bound. NaN gives an empty text.
+    The error, unknown for NaN, has one digit. It is rounded up and holds the rounding of the number, so that it stays a
+    bound. NaN gives an empty text.
+
+    >>> with_error(2.3149, 0.0033), with_error(2.3145, 0.0038)
+    ('2.315 ± 0.004', '2.314 ± 0.005')
     """
     if not math.isfinite(value):
         return ""
     shown = rounded(value, error, unit)
     if not math.isfinite(error) or error == 0:
         return f"{shown} ± {'0' if error == 0 else '?'}"
-    above, last = _rounded_up(error, 1), _last_digit(value, error)
+    last = _last_digit(value, error)
+    above = _rounded_up(error + abs(value - round(value, -last)), 1)
     if POWER in shown and above < abs(value) * 1e3 and _magnitude(above) >= last:
         power = _magnitude(round(value, -last))
         size, decimals = 10.0**power, max(0, power - last)
