@@ -22,11 +22,11 @@ from sobolev_batch.geometry.smooth import Counts, Smooth
 from sobolev_batch.transform.backends import CPU, Backend, compute_on
 from sobolev_batch.transform.exact import exact_transform, sampled_transform
 from sobolev_batch.transform.faces import FaceArrays
-from sobolev_batch.transform.lattice import Block, FrequencyLattice
+from sobolev_batch.transform.lattice import FrequencyLattice
 from sobolev_batch.transform.quadrature import RuleUse, WeightedPoints, assign_rules
 from sobolev_batch.transform.resolution import direct_transform, exact_counts, resolution_of
 from sobolev_batch.transform.rule_errors import loosest_tolerance, weight_masses
-from sobolev_batch.transform.spheres import sphere_block, sphere_transform
+from sobolev_batch.transform.spheres import sphere_transform
 
 # Nodes of a parametrised surface that are made at a time: their temporaries take 4 MB.
 _NODES = 1 << 14
@@ -112,13 +112,10 @@ class SurfaceKind(ABC):
         """Return the transform at frequencies (P, 3) by the fastest formula, complex128 (P,)."""
         return self.exact_values(frequencies)
 
-    def block_values(self, lattice: FrequencyLattice, block: Block) -> Complexes:
-        """Return the transform of a closed form on a block of a lattice, complex128 (block.shape)."""
-        raise TypeError(f"{type(self).__name__} has no closed form")
-
     def loosest_tolerance(self, lattice: FrequencyLattice, orders: Sequence[float], norms: Reals) -> float:
         """Return the largest tolerance of points whose error is predicted to have at most some norms (orders,)."""
-        raise TypeError(f"{type(self).__name__} has no quadrature")
+        # Usually it bounds the error at every single frequency: assume it at all of them.
+        return float(np.min(norms / (self.surface.area * np.sqrt(weight_masses(lattice, orders)))))
 
 
 class _Triangles(SurfaceKind):
@@ -233,10 +230,6 @@ class _Parametrised(SurfaceKind):
         highest = float(np.linalg.norm(frequencies, axis=1).max(initial=0.0))
         return direct_transform(self.surface, exact_counts(self.surface, highest), frequencies)
 
-    def loosest_tolerance(self, lattice: FrequencyLattice, orders: Sequence[float], norms: Reals) -> float:
-        # The tolerance bounds the error at every single frequency: assume it at all of them.
-        return float(np.min(norms / (self.surface.area * np.sqrt(weight_masses(lattice, orders)))))
-
 
 class _ClosedForm(SurfaceKind):
     is_closed_form = True
@@ -247,9 +240,6 @@ class _ClosedForm(SurfaceKind):
 
     def exact_values(self, frequencies: Reals, threads: int = 1, backend: Backend = CPU) -> Complexes:
         return sphere_transform(self.surface, frequencies)
-
-    def block_values(self, lattice: FrequencyLattice, block: Block) -> Complexes:
-        return sphere_block(self.surface, lattice, block)
 
 
 _KINDS: Mapping[type, type[SurfaceKind]] = {Mesh: _Triangles, Smooth: _Parametrised, Sphere: _ClosedForm}

@@ -129,6 +129,11 @@ class FrequencyLattice:
         x, y, z = (self.spacing * (block.indices(axis).astype(np.float64) + self.shift[axis]) for axis in range(3))
         return x, y, z
 
+    def points(self, block: Block) -> Reals:
+        """Return all frequencies of a block along the axes of surfaces (block.size, 3), in cycles per unit length."""
+        along = np.stack([axis.ravel() for axis in np.meshgrid(*self.frequencies(block), indexing="ij")])
+        return np.asarray((along if self.rotation is None else np.einsum("kq,kn->qn", self.rotation, along)).T)
+
     def split(self, largest_size: int) -> tuple[Block, ...]:
         """Return equal blocks that make up the lattice: see `Block.split`."""
         return self.half.split(largest_size)
