@@ -136,7 +136,7 @@ class Triangles:
     def squared_heights(self, points: Reals, triangles: Indices) -> Reals:
         """Return the squared distance of points (3, n) from the planes of triangles (n,)."""
         arms = points - self.corners[0][:, triangles]
-        return dot(arms, self._normals[:, triangles]) ** 2 * self._inverse_sizes[triangles]
+        return np.asarray(dot(arms, self._normals[:, triangles]) ** 2 * self._inverse_sizes[triangles])
 
 
 def signs(mesh: Mesh, points: Reals) -> Reals | None:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from sobolev_batch.arrays import Indices, Reals
+from sobolev_batch.arrays import Array, Indices, Reals
 from sobolev_batch.errors import MeshError, from_extra
 from sobolev_batch.geometry.surface import LARGEST_LENGTH, Extent, Point
 
@@ -351,10 +351,10 @@ class Mesh:
         return Mesh, (self.vertices, self.triangles, self.notes)
 
 
-def dot(first: Vectors, second: Vectors) -> Reals:
-    """Return the products (...) of vectors (3, ...)."""
+def dot(first: Vectors | Array, second: Vectors | Array) -> Array:
+    """Return the products (...) of vectors (3, ...) of any backend, without a BLAS and its threads."""
     # Products that are added one by one have the same digits in a compiled loop.
-    return np.asarray(first[0] * second[0] + first[1] * second[1] + first[2] * second[2])
+    return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
 
 
 def cross(first: Vectors, second: Vectors) -> tuple[Reals, Reals, Reals]:

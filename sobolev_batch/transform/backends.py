@@ -66,13 +66,6 @@ def combine(coefficients: Reals, rows: Array, out: Array | None = None) -> Array
     return out
 
 
-def row_dots(first: Array, second: Array) -> Array:
-    """Return the dot product of each row of one array (k, n) with that of another, without cuBLAS on a GPU."""
-    if isinstance(first, np.ndarray):
-        return np.einsum("ij,ij->i", first, second)
-    return (first * second).sum(axis=1)
-
-
 def sums_at(places: Array, values: Array, length: int) -> Array:
     """Return the sums (length,) of the float64 values (n,) at each place.
 

@@ -21,13 +21,11 @@ import numpy as np
 
 from sobolev_batch.arrays import Array, Complexes, Reals
 from sobolev_batch.compiled import pays
-from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.transform.backends import CPU, Backend, combine, compute_on, cosine_and_sine, row_dots, sums_at
+from sobolev_batch.geometry.mesh import Mesh, dot
+from sobolev_batch.transform.backends import CPU, Backend, combine, compute_on, cosine_and_sine, sums_at
 
 # A number as a rounded value and what it lacks.
 Pair = tuple[Array, Array]
-# Vertices (3, n), indices of corners (3, m), twice the areas (m,), and the first two edges (2, 3, m).
-_Faces = tuple[Array, Array, Array, Array]
 
 # Gaps below this (radians) go through the series: at most 19 terms, and a fraction of the time of the quotient.
 _SERIES_GAP = 2.0
@@ -200,7 +198,7 @@ def _contributions(
     The points are centroids and the three corners, the edges those from the first corner, (3, k) each. Phases are
     plain dot products if these are good enough; all gaps are at most the widest one, in radians.
     """
-    ab, ac = (_dots(-2 * np.pi * frequency, edge) for edge in edges)
+    ab, ac = (dot(-2 * np.pi * frequency, edge) for edge in edges)
     if widest < _SERIES_GAP:
         return _near(doubled, _phases(points[0], frequency, plain), ab, ac, widest)
     real, imaginary = np.empty_like(doubled), np.empty_like(doubled)
@@ -224,15 +222,10 @@ def _near(doubled: Array, phases: Array, ab: Array, ac: Array, widest: float) ->
     return cosines * real - sines * imaginary, cosines * imaginary + sines * real
 
 
-def _dots(direction: Array, points: Array) -> Array:
-    """Return dot products of points (3, k) with one vector (3,) or one each (3, k), without a BLAS and its threads."""
-    return direction[0] * points[0] + direction[1] * points[1] + direction[2] * points[2]
-
-
 def _phases(points: Array, frequency: Array, plain: bool) -> Array:
     """Return -2π ξ·p at points (3, k), in radians; unless ``plain``, whole cycles are subtracted before rounding."""
     if plain:
-        return _dots(-2 * np.pi * frequency, points)
+        return dot(-2 * np.pi * frequency, points)
     cycles: Pair = (np.zeros_like(points[0]), np.zeros_like(points[0]))
     for axis in range(3):
         high, low = _two_product(points[axis], frequency[axis])
@@ -351,7 +344,10 @@ def sampled_transform(mesh: Mesh, frequencies: Reals, threads: int = 1, backend:
     def sums(backend: Backend) -> Complexes:
         total, size = np.zeros(len(others), dtype=np.complex128), _SAMPLED_PAIRS[backend.name]
         for number, batch in mesh.batches(size):
-            faces = _faces(batch, doubled[number * size :][: len(batch.triangles)], backend)
+            corners, areas = np.ascontiguousarray(batch.triangles.T), doubled[number * size :][: len(batch.triangles)]
+            a, b, c = np.moveaxis(batch.vertices.T[:, corners], 1, 0)
+            arrays = np.ascontiguousarray(batch.vertices.T), corners, areas, np.stack([b - a, c - b])
+            faces = tuple(map(backend.upload, arrays))
             step = max(1, size // len(batch.triangles))
             groups = (others[first : first + step] for first in range(0, len(others), step))
             total += np.concatenate([backend.download(_group_sums(faces, group)) for group in groups])
@@ -362,15 +358,8 @@ def sampled_transform(mesh: Mesh, frequencies: Reals, threads: int = 1, backend:
     return values
 
 
-def _faces(mesh: Mesh, doubled: Reals, backend: Backend) -> _Faces:
-    corners = np.ascontiguousarray(mesh.triangles.T)
-    a, b, c = np.moveaxis(mesh.vertices.T[:, corners], 1, 0)
-    arrays = np.ascontiguousarray(mesh.vertices.T), corners, doubled, np.stack([b - a, c - b])
-    vertices, indices, areas, edges = map(backend.upload, arrays)
-    return vertices, indices, areas, edges
-
-
-def _group_sums(faces: _Faces, frequencies: Reals) -> Array:
+def _group_sums(faces: tuple[Array, ...], frequencies: Reals) -> Array:
+    """Return sums (P,) over faces: vertices (3, n), corners (3, m), twice the areas (m,), and two edges (2, 3, m)."""
     vertices, (a, b, c), doubled, edges = faces
     directions = -2 * np.pi * frequencies
     phases = combine(directions, vertices)
@@ -392,7 +381,8 @@ def _group_sums(faces: _Faces, frequencies: Reals) -> Array:
         after -= middle
         after *= first
         before += after
-        parts.append(row_dots(before, factors))
+        before *= factors
+        parts.append(before.sum(axis=1))
     sums = -(parts[0] + 1j * parts[1])
     rows, columns = np.nonzero(close)
     gaps = first[rows, columns], both[rows, columns]

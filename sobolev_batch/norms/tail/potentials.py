@@ -26,7 +26,7 @@ from scipy.special import beta, betainc
 from sobolev_batch import compiled
 from sobolev_batch.arrays import Array, Indices, Reals
 from sobolev_batch.geometry.closed_forms import Sphere
-from sobolev_batch.geometry.mesh import cross
+from sobolev_batch.geometry.mesh import cross, dot
 from sobolev_batch.transform.backends import CPU, Backend, combine, compute_on, sums_at
 from sobolev_batch.transform.fourier import ON_CPU, Execution
 from sobolev_batch.transform.lattice import smooth_step
@@ -330,9 +330,9 @@ def of_triangles(points: Array, corners: Array, kernels: Kernels) -> Array:
     rows = np.ascontiguousarray((corners - points[:, None]).T, like=points)
     a, b, c = rows[:, 0], rows[:, 1], rows[:, 2]
     normals, center = np.stack(cross(b - a, c - a)), (a + b + c) / 3
-    doubled, distances = np.sqrt(_dots(normals, normals)), np.sqrt(_dots(center, center))
+    doubled, distances = np.sqrt(dot(normals, normals)), np.sqrt(dot(center, center))
     arms = [corner - center for corner in (a, b, c)]
-    squares = [_dots(arm, arm) for arm in arms]
+    squares = [dot(arm, arm) for arm in arms]
     radii, fineness = np.sqrt(np.maximum(np.maximum(squares[0], squares[1]), squares[2])), kernels.fineness
     degrees = np.zeros(len(points), dtype=np.int64, like=points)
     for degree, farthest, largest in _RULES:
@@ -343,7 +343,7 @@ def of_triangles(points: Array, corners: Array, kernels: Kernels) -> Array:
         rule = symmetric_rule(degree)
         for here in _pieces(np.flatnonzero(degrees == degree), _NODES_AT_ONCE // rule.node_count):
             nodes = combine(rule.barycentric, np.ascontiguousarray(rows[:, :, here], like=points))
-            at_nodes = kernels.looked_up(kernels.values, _dots(nodes, nodes)).reshape(rule.node_count, -1)
+            at_nodes = kernels.looked_up(kernels.values, dot(nodes, nodes)).reshape(rule.node_count, -1)
             values[here] = (doubled[here] / 2)[:, None] * combine(rule.weights, at_nodes).reshape(len(here), -1)
     for near in _pieces(np.flatnonzero(degrees == 0), _NEAR_AT_ONCE):
         values[near] = _over_edges(rows[:, :, near], normals[:, near] / doubled[near], kernels)
@@ -360,10 +360,10 @@ def _over_edges(corners: Array, normals: Array, kernels: Kernels) -> Array:
     # Axes, edges, pairs.
     ends = np.roll(corners, -1, axis=1)
     along = ends - corners
-    along /= np.sqrt(_dots(along, along))
-    first, last = _dots(corners, along), _dots(ends, along)
-    offsets = _dots(normals[:, None], cross(corners, along))
-    heights = np.repeat(_dots(normals, corners[:, 0])[None], 3, axis=0)
+    along /= np.sqrt(dot(along, along))
+    first, last = dot(corners, along), dot(ends, along)
+    offsets = dot(normals[:, None], cross(corners, along))
+    heights = np.repeat(dot(normals, corners[:, 0])[None], 3, axis=0)
     # From the foot on the line of an edge to both ends, or between the two where they are on one side of it.
     one_side, first, last = first * last > 0, np.abs(first), np.abs(last)
     near = np.where(one_side, np.minimum(first, last), 0.0)
@@ -399,11 +399,6 @@ def _of_span(offsets: Array, heights: Array, near: Array, far: Array, *, kernels
         begun[active] = high
         active = active[np.flatnonzero(high < last[active])]
     return np.sign(offsets)[:, None] * result
-
-
-def _dots(first: Array, second: Array) -> Array:
-    """Return the products (...) of vectors (3, ...)."""
-    return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
 
 
 def centers_and_radii(corners: Reals) -> tuple[Reals, Reals]:
