@@ -53,8 +53,7 @@ class Sphere:
     def __post_init__(self) -> None:
         if not (is_finite_number(self.radius) and 0 < float(self.radius) <= LARGEST_LENGTH):
             raise InputError(f"a sphere's radius must be positive, at most {LARGEST_LENGTH:g}, found {self.radius}")
-        object.__setattr__(self, "radius", float(self.radius))
-        object.__setattr__(self, "center", checked_point(self.center, "a sphere's center"))
+        vars(self).update(radius=float(self.radius), center=checked_point(self.center, "a sphere's center"))
 
     @property
     def area(self) -> float:
@@ -106,8 +105,8 @@ class Ellipsoid(Smooth):
                 f"an ellipsoid's semi-axes must be three numbers between {shortest:g} and {LARGEST_LENGTH:g}, "
                 f"found {self.axes}"
             )
-        object.__setattr__(self, "axes", tuple(map(float, self.axes)))
-        object.__setattr__(self, "center", checked_point(self.center, "an ellipsoid's center"))
+        center = checked_point(self.center, "an ellipsoid's center")
+        vars(self).update(axes=tuple(map(float, self.axes)), center=center)
 
     @property
     def intervals(self) -> tuple[Interval, Interval]:
@@ -192,9 +191,7 @@ class Torus(Smooth):
             raise InputError(
                 f"a torus needs radii with 0 < r < R, R at most {LARGEST_LENGTH:g}, found R = {self.R} and r = {self.r}"
             )
-        object.__setattr__(self, "R", float(self.R))
-        object.__setattr__(self, "r", float(self.r))
-        object.__setattr__(self, "center", checked_point(self.center, "a torus's center"))
+        vars(self).update(R=float(self.R), r=float(self.r), center=checked_point(self.center, "a torus's center"))
 
     @property
     def intervals(self) -> tuple[Interval, Interval]:

@@ -180,11 +180,6 @@ class _Bounds:
             return max(self.within, self.rounding + self.lower)
         return self.rounding + self.lower + max(self.gap * self.lower, self.least_gap)
 
-    @property
-    def is_over(self) -> bool:
-        """True where no piece need be cut any more, whatever its bound."""
-        return self.count > _MOST_PIECES or (self.within is not None and self.lower > self.within + self.rounding)
-
     def see(self, points: Reals, distances: Reals) -> None:
         """Take the distances (n,) of points (3, n) as lower bounds."""
         farthest = int(distances.argmax())
@@ -302,7 +297,8 @@ def _cut(pieces: _Pieces, other: Triangles, bounds: _Bounds) -> _Pieces | None:
         depths, near = np.zeros(count), np.zeros(count, dtype=np.int64)
         depths[left], near[left] = distances, closest
         left = look(closest)
-    if bounds.is_over:
+    # No piece need be cut any more, whatever its bound.
+    if bounds.count > _MOST_PIECES or (bounds.within is not None and bounds.lower > bounds.within + bounds.rounding):
         left = left[:0]
     is_searched = pieces.is_searched
     if bounds.within is not None and not is_searched and len(left) >= _FEW:

@@ -73,9 +73,8 @@ class Mesh:
     notes: tuple[str, ...] = ()
 
     def __init__(self, vertices: ArrayLike, triangles: ArrayLike, notes: tuple[str, ...] = ()) -> None:
-        object.__setattr__(self, "vertices", _checked_vertices(vertices))
-        object.__setattr__(self, "triangles", _checked_triangles(triangles, len(self.vertices)))
-        object.__setattr__(self, "notes", tuple(notes))
+        checked = _checked_vertices(vertices)
+        vars(self).update(vertices=checked, triangles=_checked_triangles(triangles, len(checked)), notes=tuple(notes))
         self._require_sizes()
 
     def _require_sizes(self) -> None:
@@ -95,9 +94,7 @@ class Mesh:
     def from_checked(cls, vertices: Reals, triangles: Indices, notes: tuple[str, ...] = ()) -> Mesh:
         """Return a mesh of arrays that were checked before, without a copy; they become read-only."""
         mesh = object.__new__(cls)
-        object.__setattr__(mesh, "vertices", _frozen(vertices))
-        object.__setattr__(mesh, "triangles", _frozen(triangles))
-        object.__setattr__(mesh, "notes", notes)
+        vars(mesh).update(vertices=_frozen(vertices), triangles=_frozen(triangles), notes=notes)
         return mesh
 
     def corners(self, selection: slice | Indices = _ALL) -> Corners:
@@ -462,9 +459,8 @@ def _owned(array: NDArray[Any], dtype: type[_Scalar]) -> NDArray[_Scalar]:
     return array if unchangeable and array.dtype == dtype else np.array(array, dtype=dtype, order="C")
 
 
-def _listed(rows: NDArray[np.intp], values: NDArray[np.generic], limit: int = 3) -> str:
-    entries = ", ".join(f"#{row} = {values[row].tolist()}" for row in rows[:limit])
-    return entries + (", ..." if len(rows) > limit else "")
+def _listed(rows: NDArray[np.intp], values: NDArray[np.generic]) -> str:
+    return ", ".join([*(f"#{row} = {values[row].tolist()}" for row in rows[:3]), *["..."] * (len(rows) > 3)])
 
 
 def _frozen(array: NDArray[_Scalar]) -> NDArray[_Scalar]:

@@ -70,8 +70,7 @@ class Interval:
             raise InputError(f"an interval needs two finite ends in ascending order, found {self.low} and {self.high}")
         if not isinstance(self.periodic, bool):
             raise InputError(f"an interval is periodic or not: expected True or False, found {self.periodic!r}")
-        object.__setattr__(self, "low", float(self.low))
-        object.__setattr__(self, "high", float(self.high))
+        vars(self).update(low=float(self.low), high=float(self.high))
         if not math.isfinite(self.length):
             raise InputError(f"an interval's length must be finite, found {self.low} to {self.high}")
 

@@ -135,8 +135,7 @@ class Similarity:
     def __post_init__(self) -> None:
         if not (is_finite_number(self.scale) and self.scale > 0):
             raise InputError(f"a similarity's scale must be positive and finite, found {self.scale}")
-        object.__setattr__(self, "scale", float(self.scale))
-        object.__setattr__(self, "origin", checked_point(self.origin, "a similarity's origin"))
+        vars(self).update(scale=float(self.scale), origin=checked_point(self.origin, "a similarity's origin"))
 
     @classmethod
     def to_unit_ball(cls, surface: Surface) -> Similarity:

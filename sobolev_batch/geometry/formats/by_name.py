@@ -57,16 +57,11 @@ _PLAIN = (
 )
 
 
-def _known() -> dict[str, Format]:
-    """Return the formats by suffix; the first one that has a suffix keeps it."""
-    known: dict[str, Format] = {}
-    for form in (*_PLAIN, *(form for point in registered(FORMATS) for form in point.load())):
-        for suffix in form.suffixes:
-            known.setdefault(suffix, form)
-    return known
-
-
-BY_SUFFIX = _known()
+# The first format that has a suffix keeps it.
+BY_SUFFIX: dict[str, Format] = {}
+for _form in (*_PLAIN, *(form for point in registered(FORMATS) for form in point.load())):
+    for _suffix in _form.suffixes:
+        BY_SUFFIX.setdefault(_suffix, _form)
 # What makes the contents of a file from a mesh, by suffix.
 WRITERS = {suffix: form.write for suffix, form in BY_SUFFIX.items() if form.write is not None}
 
