@@ -1,7 +1,5 @@
 """Whether the triangles of a mesh are those of another one, cut into smaller ones and rounded, as files round them."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from sobolev_batch.arrays import Reals
@@ -14,32 +12,22 @@ _THIN = 8.0
 _DIRECTION = np.array([0.4862, -0.3817, 0.7863])
 
 
-@dataclass(frozen=True)
-class Refinement:
-    """Differences of a mesh from a coarser one of which it has all triangles, cut into smaller ones.
-
-    Attributes:
-        distance: Largest distance of a triangle from the one in which it lies, in units of length.
-        missing: Root of the sum of squares, over the triangles of the coarser mesh, of the area that is bare or covered
-            twice, in squared units of length.
-    """
-
-    distance: float
-    missing: float
-
-
-def refinement_of(fine: Mesh, coarse: Mesh, tolerance: float) -> Refinement | None:
+def refinement_of(fine: Mesh, coarse: Mesh, tolerance: float) -> tuple[float, float] | None:
     """Return how a mesh differs from a coarser one whose triangles it has, cut into smaller ones; None if it has not.
 
     The corners of a triangle lie within the tolerance of the other one, and those in one triangle have together its
     area, centre and moment of inertia, to what the tolerance, a length, permits along its edges. Parts that are covered
     twice while others are bare change these.
 
+    Returns:
+        Largest distance of a triangle from the one in which it lies, in units of length; and the root of the sum of
+        squares, over the triangles of the coarser mesh, of the area that is bare or covered twice, in squared units.
+
     >>> from sobolev_batch.geometry.mesh import Mesh
     >>> square = Mesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
     >>> cut = Mesh([*square.vertices, [0.5, 0.5, 1e-9]], [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
     >>> refinement_of(cut, square, 1e-8)
-    Refinement(distance=1e-09, missing=0.0)
+    (1e-09, 0.0)
     """
     whole = coarse.vertices[coarse.triangles]
     centers, widths = whole.mean(axis=1), coarse.edge_lengths.max(axis=1)
@@ -61,7 +49,7 @@ def refinement_of(fine: Mesh, coarse: Mesh, tolerance: float) -> Refinement | No
         missing[number] -= np.bincount(of, moments, len(whole))
     if np.any(np.abs(missing) > allowed):
         return None
-    return Refinement(min(float(distances.max()), tolerance), float(np.linalg.norm(missing[0])))
+    return min(float(distances.max()), tolerance), float(np.linalg.norm(missing[0]))
 
 
 def _moments(corners: Reals, widths: Reals, areas: Reals) -> Reals:

@@ -85,10 +85,8 @@ def norm(
     [4.39, 3.258]
     """
     orders = check_orders(order)
-    if rtol is not None:
-        accuracy = accuracy_of(rtol, memory, best_effort=best_effort)
+    if (accuracy := accuracy_of(rtol, memory, best_effort=best_effort)) is not None:
         return to_accuracy("norm", (a,), order, lattice, accuracy, seed, on_progress)[0]
-    _refuse_settings_of_rtol(memory, best_effort=best_effort)
     if spheres := _spheres(a, lattice=lattice):
         values = np.array([sphere_norm(spheres[0], s) for s in orders])
         return labelled(order, _closed_form(values, values**2).named("norm"), {})
@@ -149,10 +147,8 @@ def distance(
     """
     orders = check_orders(order)
     a, b = as_operand(a), as_operand(b)
-    if rtol is not None:
-        accuracy = accuracy_of(rtol, memory, best_effort=best_effort)
+    if (accuracy := accuracy_of(rtol, memory, best_effort=best_effort)) is not None:
         return to_accuracy("distance", (a, b), order, lattice, accuracy, seed, on_progress)[0]
-    _refuse_settings_of_rtol(memory, best_effort=best_effort)
     if spheres := _spheres(a, b, lattice=lattice):
         return _distance_of_spheres(spheres[0], spheres[1], order)
     has_fields = isinstance(a, xr.DataArray) or isinstance(b, xr.DataArray)
@@ -176,17 +172,16 @@ def distance(
     return labelled_distances(order, distances, reference, lattice_attributes(weights.lattice, first, second))
 
 
-def accuracy_of(rtol: float, memory: float | str | None, *, best_effort: bool = False) -> Accuracy:
-    """Return the accuracy that parameters of the public functions ask for."""
-    accuracy = Accuracy(rtol, best_effort=best_effort)
-    return accuracy if memory is None else replace(accuracy, allowed_bytes=available(memory))
-
-
-def _refuse_settings_of_rtol(memory: float | str | None, *, best_effort: bool) -> None:
+def accuracy_of(rtol: float | None, memory: float | str | None, *, best_effort: bool = False) -> Accuracy | None:
+    """Return the accuracy that parameters of the public functions ask for; None without an rtol."""
+    if rtol is not None:
+        accuracy = Accuracy(rtol, best_effort=best_effort)
+        return accuracy if memory is None else replace(accuracy, allowed_bytes=available(memory))
     if memory is not None:
         raise InputError("memory limits the computation for an rtol; pass an rtol with it, or leave memory out")
     if best_effort:
         raise InputError("a best effort is made for an rtol; pass an rtol with it, or leave best_effort out")
+    return None
 
 
 def to_accuracy(

@@ -100,10 +100,9 @@ def yardsticks(
     if unknown := {*as_names(changes)} - {*CHANGES}:
         raise InputError(f"changes must be among {', '.join(CHANGES)}, found {', '.join(map(repr, sorted(unknown)))}")
     orders, solved, wanted = check_orders(order), None, [one for one in CHANGES if one in as_names(changes)]
-    if rtol is None:
-        found = distance(a, b, order, lattice=lattice, memory=memory, best_effort=best_effort)
+    if (accuracy := accuracy_of(rtol, memory, best_effort=best_effort)) is None:
+        found = distance(a, b, order, lattice=lattice)
     else:
-        accuracy = accuracy_of(rtol, memory, best_effort=best_effort)
         found, solved = to_accuracy("distance", (a, b), order, lattice, accuracy, seed, on_progress)
     distances, errors, relative = (np.atleast_1d(found[name].values) for name in ("distance", "error", "relative"))
     estimate = NormEstimate(distances, *np.reshape(found["error_part"].values, (len(orders), -1)).T)

@@ -14,7 +14,7 @@ from sobolev_batch.geometry.deviation import largest_deviation
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms import DEFAULT_ORDER
-from sobolev_batch.norms.accuracy.threshold import Interval, relative_distance
+from sobolev_batch.norms.accuracy.threshold import relative_distance
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
 from sobolev_batch.parameters import fraction, length_in
 from sobolev_batch.reduction.search import Trial
@@ -71,13 +71,9 @@ class Limit:
         to_unit = Similarity.to_unit_ball(reference)
         pair = to_unit.apply(mesh), to_unit.apply(reference)
         found, _ = relative_distance(*pair, self.order, self.value, _ANY_ACCURACY, _THREADS, _SEED)
-        return self._estimate(found), found.lower, found.upper
-
-    def _estimate(self, found: Interval) -> float:
-        """Return a guess at a distance by its bounds: of one that is too large, hardly any lies beyond the lattice."""
-        if found.lower > self.value:
-            return found.lower
-        return found.upper if found.upper > self.value else (found.lower + found.upper) / 2
+        # Of a distance that is too large, hardly any lies beyond the lattice.
+        guess = found.upper if found.upper > self.value else (found.lower + found.upper) / 2
+        return found.lower if found.lower > self.value else guess, found.lower, found.upper
 
 
 def tried(reference_member: Member, member: Member, limit: Limit, size: float) -> tuple[Trial, Mesh | None]:

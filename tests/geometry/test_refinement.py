@@ -33,7 +33,7 @@ def test_cut_and_rounded_meshes_are_refinements(coarse: Mesh, times: int) -> Non
     found = refinement_of(fine, coarse, ROUNDING * size)
     assert found is not None
     # Half a unit in the last place along three axes, in both meshes.
-    assert found.distance <= 2 * 3**0.5 * 2.0**-25 * size
+    assert found[0] <= 2 * 3**0.5 * 2.0**-25 * size
 
 
 def changed(fine: Mesh, how: str) -> Mesh:
@@ -65,7 +65,7 @@ def test_a_hole_as_small_as_the_rounding_permits_is_told_by_its_area() -> None:
     assert fine.area == pytest.approx(0.5 - width**2 / 2, abs=1e-12)
     found = refinement_of(fine, coarse, ROUNDING)
     assert found is not None
-    assert found.missing == pytest.approx(width**2 / 2, rel=1e-6)
+    assert found[1] == pytest.approx(width**2 / 2, rel=1e-6)
     assert refinement_of(fine, coarse, ROUNDING / 10) is None
 
 

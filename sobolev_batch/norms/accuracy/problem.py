@@ -118,13 +118,13 @@ class Problem:
         if not meshes or not rounding or not self.surfaces:
             return self
         coarse, fine = sorted(meshes, key=lambda mesh: len(mesh.triangles))
-        refinement = refinement_of(fine, coarse, rounding)
-        if refinement is None:
+        if (found := refinement_of(fine, coarse, rounding)) is None:
             return self
+        distance, missing = found
         # Moves within a plane show at folds alone.
-        distance = max(refinement.distance, _LEAST_MOVE * rounding)
+        distance = max(distance, _LEAST_MOVE * rounding)
         norms = replace(self, surfaces=self.pair[:1], signs=self.signs[:1]).rough_values
-        moved = norm_of_rounding(fine.area, distance, refinement.missing, self.orders, norms)
+        moved = norm_of_rounding(fine.area, distance, missing, self.orders, norms)
         return replace(self, surfaces=(), moved=moved) if np.all(moved <= _ROUNDED * norms) else self
 
     @classmethod

@@ -113,7 +113,8 @@ def relative_distance(
         first = first if problem.area == whole.area else None
     if not problem.surfaces:
         return Interval(0.0, 0.0), "identical"
-    norm = _rough_norm(known)
+    value, norm = _norm_on_lattice(known)
+    norm = norm if norm.upper <= (1 + _NORM_RTOL) * value else _exact_norm(known)
     search = _Search(problem, norm.times(threshold))
     bounds, method = search.bounds(seed, first)
     if not search.is_decided(bounds) and (exact := _exact_norm(known)) != norm:
@@ -243,12 +244,6 @@ class _Reference:
     order: float
     accuracy: Accuracy
     problem: Problem = field(compare=False)
-
-
-def _rough_norm(reference: _Reference) -> Interval:
-    """Return bounds on the norm of a reference from a small lattice, if that is enough."""
-    value, bounds = _norm_on_lattice(reference)
-    return bounds if bounds.upper <= (1 + _NORM_RTOL) * value else _exact_norm(reference)
 
 
 @lru_cache(maxsize=2)  # references stay in memory
