@@ -1,5 +1,6 @@
-"""Types of arrays, for annotations. Shapes are in docstrings."""
+"""Types of arrays, for annotations, whose shapes are in docstrings; and slices of long ones."""
 
+from collections.abc import Iterator
 from typing import Any, Literal
 
 import numpy as np
@@ -13,3 +14,8 @@ Complexes = NDArray[np.complexfloating[Any, Any]]
 ComplexDtype = Literal["complex128", "complex64"]
 # Of the backend that computes: NumPy's, or CuPy's, which may not be installed.
 Array = Any
+
+
+def slices(count: int, size: int) -> Iterator[slice]:
+    """Yield the slices, of at most a size each, that make up a count of entries."""
+    return (slice(start, min(start + size, count)) for start in range(0, count, size))

@@ -10,7 +10,7 @@ Each piece is drawn together first, so that the mesh may turn away a little befo
 
 import numpy as np
 
-from sobolev_batch.arrays import Indices, Reals
+from sobolev_batch.arrays import Indices, Reals, slices
 from sobolev_batch.geometry.closest import Triangles
 from sobolev_batch.geometry.mesh import cross, dot
 
@@ -28,7 +28,7 @@ def cover_distances(corners: Reals, other: Triangles, starts: Indices, most: flo
     none, or where that distance may exceed `most`.
     """
     if len(starts) > _PIECES:
-        groups = [slice(start, start + _PIECES) for start in range(0, len(starts), _PIECES)]
+        groups = slices(len(starts), _PIECES)
         return np.concatenate([cover_distances(corners[..., group], other, starts[group], most) for group in groups])
     center = corners.mean(axis=0)
     reach = np.sqrt(np.max([dot(arm, arm) for arm in corners - center], axis=0))

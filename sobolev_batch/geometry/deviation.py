@@ -31,7 +31,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sobolev_batch.arrays import Indices, Reals
+from sobolev_batch.arrays import Indices, Reals, slices
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.closest import Triangles
 from sobolev_batch.geometry.cover import cover_distances
@@ -201,8 +201,7 @@ class _Pieces:
 
     def batches(self) -> Iterator[_Pieces]:
         """Yield them in groups that memory holds."""
-        for start in range(0, self.corners.shape[2], _BATCH):
-            group = slice(start, start + _BATCH)
+        for group in slices(self.corners.shape[2], _BATCH):
             yield _Pieces(self.corners[..., group], self.close[:, group], self.is_searched)
 
 
@@ -260,8 +259,8 @@ def _cut_all(mesh: Mesh, other: Triangles, bounds: _Bounds) -> Iterator[None]:
     # The farthest come first: with a high lower bound, fewer of the others are cut. Those of a batch are in the order
     # of the mesh, in which searches are twice as fast.
     order = np.argsort(-distances[mesh.triangles].max(axis=1), kind="stable")
-    for start in range(0, len(order), _BATCH):
-        corners = mesh.triangles[np.sort(order[start : start + _BATCH])].T
+    for batch in slices(len(order), _BATCH):
+        corners = mesh.triangles[np.sort(order[batch])].T
         pending = [_Pieces(np.stack([vertices[:, corner] for corner in corners]), closest[corners])]
         while pending:
             # The last ones are cut to their end before the others, so that few are in memory.

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from sobolev_batch.arrays import Array, Indices, Reals
+from sobolev_batch.arrays import Array, Indices, Reals, slices
 from sobolev_batch.errors import MeshError, from_extra
 from sobolev_batch.geometry.surface import LARGEST_LENGTH, Extent, Point
 
@@ -256,8 +256,8 @@ class Mesh:
         # From a point nearby: far from the origin, the parts cancel.
         origin = self.vertices[self.triangles[0, 0]]
         parts = []
-        for start in range(0, len(self.triangles), _BATCH):
-            a, b, c = (corner - origin for corner in self.corners(slice(start, start + _BATCH)))
+        for batch in slices(len(self.triangles), _BATCH):
+            a, b, c = (corner - origin for corner in self.corners(batch))
             parts.append(float(np.einsum("ij,ij->", a, np.cross(b, c))))
         return math.fsum(parts) / 6
 
@@ -281,10 +281,10 @@ class Mesh:
         Batches without area are left out: they add nothing to a transform.
         """
         new_indices = np.empty(len(self.vertices), dtype=np.int64)
-        for number, start in enumerate(range(0, len(self.triangles), size)):
-            triangles = self.triangles[start : start + size]
-            if not np.any(self.areas[start : start + size] > 0):
+        for number, batch in enumerate(slices(len(self.triangles), size)):
+            if not np.any(self.areas[batch] > 0):
                 continue
+            triangles = self.triangles[batch]
             used = _used(triangles, len(self.vertices))
             new_indices[used] = np.arange(len(used))
             yield number, Mesh.from_checked(self.vertices[used], new_indices[triangles])
@@ -321,8 +321,7 @@ class Mesh:
         areas, radii = np.empty((2, len(self.triangles)))
         total, longest, without_area = 0.0, 0.0, 0
         with np.errstate(over="ignore", invalid="ignore"):
-            for number, squares in enumerate(map(_squared_sizes, self._edges())):
-                batch = slice(number * _BATCH, (number + 1) * _BATCH)
+            for batch, squares in zip(slices(len(areas), _BATCH), map(_squared_sizes, self._edges()), strict=True):
                 twice_areas, thrice_radii, *sides = np.sqrt(squares, out=squares)
                 areas[batch], radii[batch] = twice_areas / 2, thrice_radii / 3
                 longest_sides = np.maximum.reduce(sides)
@@ -337,8 +336,8 @@ class Mesh:
     def _edges(self) -> Iterator[_Edges]:
         """Yield the edges of each batch of triangles."""
         axes = np.ascontiguousarray(self.vertices.T)
-        for start in range(0, len(self.triangles), _BATCH):
-            a, b, c = (axes.take(corner, axis=1) for corner in self.triangles[start : start + _BATCH].T)
+        for batch in slices(len(self.triangles), _BATCH):
+            a, b, c = (axes.take(corner, axis=1) for corner in self.triangles[batch].T)
             yield b - a, c - a
 
     def __repr__(self) -> str:

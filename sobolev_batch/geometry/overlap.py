@@ -16,7 +16,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely.errors import GEOSException
 
-from sobolev_batch.arrays import Indices, Reals
+from sobolev_batch.arrays import Indices, Reals, slices
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Extent, Surface
 
@@ -87,8 +87,7 @@ class _Side:
         """Measure the triangles of a mesh, batch by batch."""
         count = len(mesh.triangles)
         side = cls(mesh, center, size, np.zeros((count, 4)), np.zeros(count), np.zeros(count))
-        for start in range(0, count, _BATCH):
-            part = slice(start, start + _BATCH)
+        for part in slices(count, _BATCH):
             corners = side.corners(part)
             normals, side.areas[part], side.heights[part] = _measured(corners)
             side.planes[part, :3] = normals * np.where(normals @ _SIDE < 0, -1, 1)[:, None]
@@ -152,8 +151,8 @@ def _shared_planes(sides: Sequence[_Side], tolerance: float) -> tuple[Reals, lis
     for side, which, own, half, plane in zip(sides, members, corners, halves, of, strict=True):
         plane[which] = np.where(_heights_above(own, planes[cluster[half]]) <= tolerance, cluster[half], -1)
         small = np.flatnonzero((side.heights < 8 * width) & (side.areas > 0))
-        for start in range(0, len(small) if len(small) * len(planes) <= _MOST_PAIRS else 0, step):
-            some = small[start : start + step]
+        small = small if len(small) * len(planes) <= _MOST_PAIRS else small[:0]
+        for some in (small[part] for part in slices(len(small), step)):
             is_in = _heights_above(side.corners(some)[:, None], planes) <= tolerance
             is_in &= np.abs(side.planes[some, :3] @ planes[:, :3].T) >= _LEAST_COSINE
             plane[some] = np.where(is_in.any(axis=1), is_in.argmax(axis=1), -1)
@@ -378,11 +377,11 @@ def _triangle_hashes(corners: Reals) -> NDArray[np.uint64]:
     from pandas.util import hash_array
 
     sums = np.empty(len(corners), dtype=np.uint64)
-    for start in range(0, len(corners), _BATCH):
+    for part in slices(len(corners), _BATCH):
         # Zero has two signs.
-        columns = np.ascontiguousarray((corners[start : start + _BATCH] + 0.0).reshape(-1, 3).T).view(np.uint64)
+        columns = np.ascontiguousarray((corners[part] + 0.0).reshape(-1, 3).T).view(np.uint64)
         mixed = np.zeros(columns.shape[1], dtype=np.uint64)
         for column in columns:
             mixed = hash_array(mixed ^ column)
-        sums[start : start + _BATCH] = mixed.reshape(-1, 3).sum(axis=1)
+        sums[part] = mixed.reshape(-1, 3).sum(axis=1)
     return sums

@@ -14,7 +14,7 @@ from typing import Any, Self
 import numpy as np
 from scipy.special import roots_legendre
 
-from sobolev_batch.arrays import Reals
+from sobolev_batch.arrays import Reals, slices
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.mesh import cross_lengths
 from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Point, checked_point, is_finite_number
@@ -138,17 +138,15 @@ class Smooth(ABC):
             interval.rule(count) for interval, count in zip(self.intervals, counts, strict=True)
         )
         whole = self._on_grid(u, v) if self.tangents(u[:1], v[:1]) is None else None
-        rows = max(1, most // counts[1])
-        for first_row in range(0, counts[0], rows):
-            batch = slice(first_row, first_row + rows)
+        for batch in slices(counts[0], max(1, most // counts[1])):
             parts = self._on_grid(u[batch], v) if whole is None else tuple(values[:, batch] for values in whole)
             positions, *tangents = parts
             weights = cross_lengths(*tangents)
             weights *= along_u[batch, None]
             weights *= along_v
             points, flat_weights = positions.reshape(3, -1), weights.ravel()
-            for start in range(0, len(flat_weights), most):
-                yield np.ascontiguousarray(points[:, start : start + most]), flat_weights[start : start + most]
+            for part in slices(len(flat_weights), most):
+                yield np.ascontiguousarray(points[:, part]), flat_weights[part]
 
     def _on_grid(self, u: Reals, v: Reals) -> tuple[Reals, Reals, Reals]:
         """Return positions and their derivatives (3, n, m) on a grid; those of an interpolant need it whole."""

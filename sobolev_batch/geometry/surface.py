@@ -12,7 +12,7 @@ from typing import Protocol, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.arrays import Reals
+from sobolev_batch.arrays import Reals, slices
 from sobolev_batch.errors import InputError
 
 Point = tuple[float, float, float]
@@ -70,7 +70,7 @@ class Extent:
     def of_points(cls, coordinates: Reals) -> Self:
         """Return the extent of points (3, n), n > 0."""
         # Products with -1, 0 and 1 have no rounding.
-        batches = (_NEIGHBOURS @ coordinates[:, i : i + _BATCH] for i in range(0, coordinates.shape[1], _BATCH))
+        batches = (_NEIGHBOURS @ coordinates[:, part] for part in slices(coordinates.shape[1], _BATCH))
         ends = [(along.min(axis=1), along.max(axis=1)) for along in batches]
         lowest, highest = np.min([low for low, _ in ends], axis=0), np.max([high for _, high in ends], axis=0)
         return cls(tuple((lowest / _LENGTHS).tolist()), tuple((highest / _LENGTHS).tolist()))

@@ -5,7 +5,7 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from sobolev_batch.arrays import Complexes, Indices, Reals
+from sobolev_batch.arrays import Complexes, Indices, Reals, slices
 from sobolev_batch.compiled import pays
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.transform.backends import CPU, Backend, combine, compute_on, cosine_and_sine
@@ -129,9 +129,9 @@ def _sample(mesh: Mesh, highest: float, faces: FaceArrays) -> tuple[Indices, Rea
 def _boxes(mesh: Mesh, low: Reals, side: float) -> Indices:
     """Return the number of the box that holds the centroid of each triangle (m,)."""
     numbers = np.empty(len(mesh.triangles), dtype=np.int64)
-    for first in range(0, len(numbers), _BATCH):
-        centers = mesh.vertices[mesh.triangles[first : first + _BATCH]].mean(axis=1)
-        numbers[first : first + _BATCH] = ((centers - low) / side).astype(np.int64) @ [1, 1 << 20, 1 << 40]
+    for part in slices(len(numbers), _BATCH):
+        centers = mesh.vertices[mesh.triangles[part]].mean(axis=1)
+        numbers[part] = ((centers - low) / side).astype(np.int64) @ [1, 1 << 20, 1 << 40]
     return np.unique(numbers, return_inverse=True)[1]
 
 

@@ -19,7 +19,7 @@ from functools import cache
 
 import numpy as np
 
-from sobolev_batch.arrays import Array, Complexes, Reals
+from sobolev_batch.arrays import Array, Complexes, Reals, slices
 from sobolev_batch.compiled import pays
 from sobolev_batch.geometry.mesh import Mesh, dot
 from sobolev_batch.transform.backends import CPU, Backend, combine, compute_on, cosine_and_sine, sums_at
@@ -71,7 +71,7 @@ def exact_transform(mesh: Mesh, frequencies: Reals, backend: Backend = CPU, thre
         if backend is CPU and pays(_PAIR_SECONDS * len(mesh.triangles) * len(frequencies)):
             return _compiled_exact_transform(mesh, frequencies, threads)
         doubled, parts = doubled_areas(mesh), []
-        for batch in _slices(mesh, _BATCH[backend.name]):
+        for batch in slices(len(mesh.triangles), _BATCH[backend.name]):
             rows = np.ascontiguousarray(mesh.triangles[batch].T)
             corners = np.stack([[column[index] for column in columns] for index in rows])
             parts.append(_sums(corners, doubled[batch], frequencies, backend))
@@ -85,7 +85,8 @@ def _compiled_exact_transform(mesh: Mesh, frequencies: Reals, threads: int) -> C
 
     doubled = doubled_areas(mesh)
     # Sums of sums round less often.
-    faces = [(mesh.vertices, mesh.triangles[batch], doubled[batch]) for batch in _slices(mesh, _COMPILED_BATCH)]
+    batches = slices(len(doubled), _COMPILED_BATCH)
+    faces = [(mesh.vertices, mesh.triangles[batch], doubled[batch]) for batch in batches]
     return _by_threads(exact_sums, faces, frequencies, threads)
 
 
@@ -97,10 +98,6 @@ def _compiled_sampled_transform(mesh: Mesh, frequencies: Reals, threads: int) ->
         faces = batch.vertices, batch.triangles, doubled[number * _COMPILED_BATCH :][: len(batch.triangles)]
         total += _by_threads(sampled_sums, [faces], frequencies, threads)
     return total
-
-
-def _slices(mesh: Mesh, size: int) -> list[slice]:
-    return [slice(start, start + size) for start in range(0, len(mesh.triangles), size)]
 
 
 def _by_threads(
@@ -152,7 +149,7 @@ def doubled_areas(mesh: Mesh) -> Reals:
     """
     doubled = 2 * mesh.areas
     is_flat, y, z = mesh.areas < _FLATNESS * mesh.centroid_radii**2, [1, 2, 0], [2, 0, 1]
-    for batch in _slices(mesh, _BATCH["cpu"]):
+    for batch in slices(len(doubled), _BATCH["cpu"]):
         flat = batch.start + np.flatnonzero(is_flat[batch])
         a, b, c = (corner.T for corner in mesh.corners(flat))
         (p, p_low), (q, q_low) = _two_sum(b, -a), _two_sum(c, -a)
@@ -175,8 +172,7 @@ def _sums(corners: Reals, doubled: Reals, frequencies: Reals, backend: Backend) 
     parts = []
     # For few triangles, take several frequencies at a time.
     step = max(1, _PAIRS[backend.name] // len(doubled))
-    for first in range(0, len(frequencies), step):
-        group = frequencies[first : first + step]
+    for group in (frequencies[part] for part in slices(len(frequencies), step)):
         plain = farthest * float(np.abs(group).sum(axis=1).max()) <= _PLAIN_CYCLES
         widest = 2 * np.pi * float(np.linalg.norm(group, axis=1).max()) * longest
         if len(group) == 1:
@@ -349,8 +345,8 @@ def sampled_transform(mesh: Mesh, frequencies: Reals, threads: int = 1, backend:
             arrays = np.ascontiguousarray(batch.vertices.T), corners, areas, np.stack([b - a, c - b])
             faces = tuple(map(backend.upload, arrays))
             step = max(1, size // len(batch.triangles))
-            groups = (others[first : first + step] for first in range(0, len(others), step))
-            total += np.concatenate([backend.download(_group_sums(faces, group)) for group in groups])
+            sums_of_groups = (_group_sums(faces, others[part]) for part in slices(len(others), step))
+            total += np.concatenate([backend.download(found) for found in sums_of_groups])
         return total
 
     faster = backend if len(mesh.triangles) * len(others) >= _FEWEST_FOR_GPU else CPU

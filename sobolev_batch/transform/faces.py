@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from sobolev_batch.arrays import Array, Indices
+from sobolev_batch.arrays import Array, Indices, slices
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.transform.backends import CPU, Backend
 
@@ -55,7 +55,6 @@ class FaceArrays:
         return np.take(self.columns, self.corners[corner], axis=1)
 
     def batches(self, size: int) -> Iterator[FaceArrays]:
-        """Yield the triangles in batches: of a size on the processor, where temporaries stay in its cache."""
+        """Return the triangles in batches: of a size on the processor, where temporaries stay in its cache."""
         step = size if self.backend is CPU else _HELD
-        for start in range(0, len(self), step):
-            yield self.part(slice(start, start + step))
+        return map(self.part, slices(len(self), step))

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from sobolev_batch.arrays import Complexes, Reals
+from sobolev_batch.arrays import Complexes, Reals, slices
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.closed_forms import Sphere
 from sobolev_batch.geometry.mesh import Mesh
@@ -180,8 +180,7 @@ class _Triangles(SurfaceKind):
         for _, group in groupby(zip(numbers, triangles, strict=True), key=itemgetter(0)):
             points = WeightedPoints.concatenated([batch.points(faces) for _, batch in group])
             # Where neighbours share fewer nodes than those of a closed mesh, there are more points than expected.
-            for first in range(0, len(points.weights), capacity):
-                yield points.part(slice(first, first + capacity))
+            yield from map(points.part, slices(len(points.weights), capacity))
 
     def exact_values(self, frequencies: Reals, threads: int = 1, backend: Backend = CPU) -> Complexes:
         return exact_transform(self.surface, frequencies, backend, threads)

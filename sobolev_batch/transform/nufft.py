@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from sobolev_batch.arrays import Array, ComplexDtype, Complexes, Reals
+from sobolev_batch.arrays import Array, ComplexDtype, Complexes, Reals, slices
 from sobolev_batch.transform.backends import CPU, Backend, combine, cosine_and_sine
 from sobolev_batch.transform.lattice import Block, FrequencyLattice, Lattice
 from sobolev_batch.transform.nufft_costs import NufftSpec
@@ -79,8 +79,7 @@ def evaluate_at(coordinates: Reals, coefficients: Complexes, lattice: Lattice, b
     spec = CPU.costs.with_oversampling(spec, count)
     plan = CPU.plan(spec, adjoint=True)
     scale = 2 * np.pi * lattice.spacing
-    for first in range(0, count, spec.batch):
-        batch = slice(first, min(first + spec.batch, count))
+    for batch in slices(count, spec.batch):
         angles = scale * coordinates[:, batch]
         ones = np.ones(angles.shape[1])
         plan.setpts(*(np.ascontiguousarray(row, dtype=spec.real_dtype) for row in angles))
@@ -111,8 +110,7 @@ def _shifted_strengths(weights: Array, angles: Array, shift: Reals, dtype: Compl
         strengths.imag = 0
         return strengths
     step = _CACHED if isinstance(weights, np.ndarray) else len(weights)
-    for first in range(0, len(weights), step):
-        part = slice(first, first + step)
+    for part in slices(len(weights), step):
         cosines, sines = cosine_and_sine(combine(shift[axes], angles[axes, part]))
         np.multiply(cosines, weights[part], out=strengths.real[part], casting="same_kind")
         np.multiply(sines, -weights[part], out=strengths.imag[part], casting="same_kind")

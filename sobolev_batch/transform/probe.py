@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.arrays import Complexes, Indices, Reals
+from sobolev_batch.arrays import Complexes, Indices, Reals, slices
 from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.transform.fourier import ON_CPU, Execution, TransformSettings
 from sobolev_batch.transform.kinds import kind_of
@@ -192,8 +192,8 @@ def _draw_points(lattice: Lattice, shells: Indices, rng: np.random.Generator) ->
     x = x[lattice.M // 2 :] * np.where(axis > 0, 2, 1)
     drawn = []
     step = max(1, _CANDIDATES // len(axis) ** 2)
-    for first in range(0, len(shells), step):
-        rest = shells[first : first + step, None, None] - (axis[:, None] ** 2 + axis**2)
+    for part in slices(len(shells), step):
+        rest = shells[part, None, None] - (axis[:, None] ** 2 + axis**2)
         k = np.sqrt(np.maximum(rest, 0)).round().astype(np.int64)
         numbers, i, j = np.nonzero((rest >= 0) & (k * k == rest) & (k <= axis[-1]))
         points = np.stack([i, j, k[numbers, i, j]], axis=1)

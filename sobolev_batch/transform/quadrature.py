@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.arrays import Array, Indices, Reals
+from sobolev_batch.arrays import Array, Indices, Reals, slices
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.transform.backends import CPU, Backend, combine, sums_at, sums_of_runs
 from sobolev_batch.transform.faces import FaceArrays
@@ -81,8 +81,8 @@ class RuleUse:
             return
         count = int(most / points_each)
         step = max(1, count if self.rule.shares else min(_TRIANGLES, count))
-        for first in range(0, len(self.members), step):
-            yield RuleUse(self.rule, self.splits, self.members[first : first + step], self.path)
+        for part in slices(len(self.members), step):
+            yield RuleUse(self.rule, self.splits, self.members[part], self.path)
 
     def points(self, mesh: FaceArrays) -> WeightedPoints:
         """Return the points, on the backend of the faces of the whole mesh."""
@@ -132,8 +132,8 @@ def assign_rules(
     if low == high:
         return (RuleUse(rules[low % len(rules)], low // len(rules), np.arange(len(sizes), dtype=np.uint32)),)
     # Meshes have tens of millions of triangles: temporaries are small, and four bytes for each are kept.
-    for first in range(0, len(sizes), _TRIANGLES):
-        keys[first : first + _TRIANGLES] = numbers(sizes[first : first + _TRIANGLES])
+    for part in slices(len(sizes), _TRIANGLES):
+        keys[part] = numbers(sizes[part])
     return tuple(
         RuleUse(rules[key % len(rules)], key // len(rules), np.flatnonzero(keys == key).astype(np.uint32))
         for key in np.flatnonzero(np.bincount(keys)).tolist()

@@ -7,7 +7,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from sobolev_batch.arrays import Indices, Reals
+from sobolev_batch.arrays import Indices, Reals, slices
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.closed_forms import Sphere
 from sobolev_batch.geometry.mesh import Mesh
@@ -136,9 +136,8 @@ class Sheets:
             yield self._few
             return
         for mesh, sign in self.meshes:
-            for start in range(0, len(mesh.triangles), _HELD):
-                corners = mesh.vertices[mesh.triangles[start : start + _HELD]]
-                yield SignedTriangles.with_area(corners, sign)
+            for part in slices(len(mesh.triangles), _HELD):
+                yield SignedTriangles.with_area(mesh.vertices[mesh.triangles[part]], sign)
 
     @cached_property
     def _few(self) -> SignedTriangles | None:
@@ -242,11 +241,10 @@ def _ordered(mesh: Mesh, spacing: float) -> Mesh:
     low, high = mesh.extent.box
     width = max(spacing, float(np.max(high - low)) / ((1 << _AXIS_BITS) - 1))
     keys = np.empty(len(triangles), dtype=np.int64)
-    for start in range(0, len(triangles), _HELD):
-        part = triangles[start : start + _HELD]
-        centers = (vertices[part[:, 0]] + vertices[part[:, 1]] + vertices[part[:, 2]]) / 3
-        x, y, z = ((centers - low) / width).astype(np.int64).T
-        keys[start : start + _HELD] = (((x << _AXIS_BITS) | y) << _AXIS_BITS) | z
+    for part in slices(len(triangles), _HELD):
+        a, b, c = triangles[part].T
+        x, y, z = (((vertices[a] + vertices[b] + vertices[c]) / 3 - low) / width).astype(np.int64).T
+        keys[part] = (((x << _AXIS_BITS) | y) << _AXIS_BITS) | z
     return Mesh.from_checked(vertices, np.ascontiguousarray(triangles[np.argsort(keys, kind="stable")]))
 
 

@@ -6,7 +6,7 @@ from typing import Self
 
 import numpy as np
 
-from sobolev_batch.arrays import Reals
+from sobolev_batch.arrays import Reals, slices
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.transform.backends import combine
@@ -90,8 +90,7 @@ def _main_normals(mesh: Mesh) -> tuple[Reals, Reals, Reals]:
     count, areas = len(mesh.triangles), mesh.areas
     normals, keys = np.empty((count, 3)), np.empty(count, dtype=np.int32)
     # The corners and temporaries of all triangles of a fine mesh would take gigabytes.
-    for start in range(0, count, _BATCH):
-        part = slice(start, start + _BATCH)
+    for part in slices(count, _BATCH):
         a, b, c = mesh.corners(part)
         crosses = np.cross(b - a, c - a)
         # A normal and its opposite are one direction. Triangles without area have none.

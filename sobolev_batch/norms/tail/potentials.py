@@ -24,7 +24,7 @@ from numpy.polynomial.legendre import leggauss
 from scipy.special import beta, betainc
 
 from sobolev_batch import compiled
-from sobolev_batch.arrays import Array, Indices, Reals
+from sobolev_batch.arrays import Array, Indices, Reals, slices
 from sobolev_batch.geometry.closed_forms import Sphere
 from sobolev_batch.geometry.mesh import cross, dot
 from sobolev_batch.transform.backends import CPU, Backend, combine, compute_on, sums_at
@@ -256,8 +256,8 @@ def add_of_triangles(
         if compiled.pays(len(rows) * (_ON_ARRAYS[0] + _ON_ARRAYS[1] * len(kernels.totals))):
             add_compiled(potentials, points, triangles, (rows, columns), kernels, execution.threads)
             continue
-        for start in range(0, len(rows), _BATCH):
-            row, column = rows[start : start + _BATCH], columns[start : start + _BATCH]
+        for part in slices(len(rows), _BATCH):
+            row, column = rows[part], columns[part]
             of_pairs = of_triangles(points[row], triangles.corners[column], kernels)
             np.add.at(potentials, row, triangles.signs[column, None] * of_pairs)
     return count
@@ -275,15 +275,15 @@ def _on_device(points: Reals, triangles: SignedTriangles, kernels: Kernels, back
     kernels = replace(kernels, **tables)
     step, count = max(1, _PAIRS_ON_DEVICE // len(centers)), 0
     totals = np.zeros((len(kernels.orders), len(points)), like=points)
-    for start in range(0, len(points), step):
-        here = points[start : start + step]
+    for some in slices(len(points), step):
+        here = points[some]
         rows, columns = np.nonzero(_are_close(here, centers, farthest))
         count += len(rows)
-        for first in range(0, len(rows), _BATCH_ON_DEVICE):
-            row, column = rows[first : first + _BATCH_ON_DEVICE], columns[first : first + _BATCH_ON_DEVICE]
+        for part in slices(len(rows), _BATCH_ON_DEVICE):
+            row, column = rows[part], columns[part]
             found = of_triangles(here[row], corners[column], kernels) * signs[column][:, None]
             for order, total in enumerate(totals):
-                total[start : start + step] += sums_at(row, found[:, order], len(here))
+                total[some] += sums_at(row, found[:, order], len(here))
     return np.ascontiguousarray(backend.download(totals).T), count
 
 
@@ -341,18 +341,16 @@ def of_triangles(points: Array, corners: Array, kernels: Kernels) -> Array:
     values = np.empty((len(points), len(kernels.orders)), like=points)
     for degree, _, _ in _RULES:
         rule = symmetric_rule(degree)
-        for here in _pieces(np.flatnonzero(degrees == degree), _NODES_AT_ONCE // rule.node_count):
+        chosen = np.flatnonzero(degrees == degree)
+        for part in slices(len(chosen), _NODES_AT_ONCE // rule.node_count):
+            here = chosen[part]
             nodes = combine(rule.barycentric, np.ascontiguousarray(rows[:, :, here], like=points))
             at_nodes = kernels.looked_up(kernels.values, dot(nodes, nodes)).reshape(rule.node_count, -1)
             values[here] = (doubled[here] / 2)[:, None] * combine(rule.weights, at_nodes).reshape(len(here), -1)
-    for near in _pieces(np.flatnonzero(degrees == 0), _NEAR_AT_ONCE):
+    chosen = np.flatnonzero(degrees == 0)
+    for near in (chosen[part] for part in slices(len(chosen), _NEAR_AT_ONCE)):
         values[near] = _over_edges(rows[:, :, near], normals[:, near] / doubled[near], kernels)
     return values
-
-
-def _pieces(numbers: Array, size: int) -> Iterator[Array]:
-    for start in range(0, len(numbers), size):
-        yield numbers[start : start + size]
 
 
 def _over_edges(corners: Array, normals: Array, kernels: Kernels) -> Array:
@@ -428,9 +426,9 @@ def _close_pairs(
 
     if share > _OFTEN_CLOSE:
         step = max(1, _PAIRS_AT_ONCE // len(centers))
-        for start in range(0, len(points), step):
-            rows, columns = np.nonzero(_are_close(points[start : start + step], centers, reach + radii))
-            yield rows + start, columns
+        for some in slices(len(points), step):
+            rows, columns = np.nonzero(_are_close(points[some], centers, reach + radii))
+            yield rows + some.start, columns
         return
     # Triangles of like size at a time.
     sizes = np.maximum(np.ceil(np.log2(radii / reach)), -2.0)
