@@ -165,15 +165,9 @@ class _Segment:
 
     def peaks_at(self, peaks: Reals, orders: Sequence[float]) -> Reals:
         """Return bounds on the largest terms (orders, fields) from peaks (fields, orders of peaks)."""
-        logarithms = np.log(np.maximum(peaks, np.finfo(np.float64).tiny))
-        found = []
-        for order in orders:
-            after = max(int(np.searchsorted(-_PEAK_ORDERS, -order)), 1)
-            first, last = _PEAK_ORDERS[after - 1 : after + 1]
-            low, high = logarithms[:, after - 1], logarithms[:, after]
-            chord = low + (order - first) / (last - first) * (high - low)
-            found.append(np.exp(chord + order * np.log(self.least_length)))
-        return np.stack(found)
+        logarithms, falling = np.log(np.maximum(peaks, np.finfo(np.float64).tiny)), -np.array(orders)
+        chords = [np.interp(falling, -_PEAK_ORDERS, row) for row in logarithms]
+        return np.exp(np.reshape(chords, (len(peaks), len(orders))).T - np.log(self.least_length) * falling[:, None])
 
     def scatter(self, sums: Reals, moments: Reals, peaks: Reals, orders: Sequence[float]) -> Scatter:
         """Return how sums over these samples vary (orders, fields), from the segment's columns of `Spectra`.

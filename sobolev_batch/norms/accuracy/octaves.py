@@ -30,10 +30,9 @@ from sobolev_batch.norms.fields import Field
 from sobolev_batch.norms.tail.face_normals import FaceNormals
 from sobolev_batch.norms.tail.integrals import OctaveSums, OctaveWeights, integral_over, squared_moduli
 from sobolev_batch.norms.tail.potentials import tail_integral
-from sobolev_batch.norms.tail.remainder import MOSTLY, Remainder, remainder
+from sobolev_batch.norms.tail.remainder import MOSTLY, Remainder
 from sobolev_batch.norms.tail.sampling import Octave, OctaveSampling
 from sobolev_batch.norms.tail.values import POINTS_PER_SQUARE, OctaveValues, SurfaceSize, octave_values
-from sobolev_batch.transform.fourier import Execution
 from sobolev_batch.transform.lattice import Lattice, OctaveLattice, SobolevWeights
 from sobolev_batch.transform.probe import estimate as estimate_from
 
@@ -147,7 +146,7 @@ class State:
         """Return what a small lattice shows, and what lies beyond it."""
         lattice = core_lattice(problem.support, problem.orders, problem.accuracy)
         core = Core.on_lattice(problem, lattice, lattice.xi_max)
-        beyond = Remainder.unknown(lattice.xi_max) if for_others else _beyond(problem, lattice.xi_max, seed)
+        beyond = Remainder.unknown(lattice.xi_max) if for_others else problem.beyond(lattice.xi_max, seed)
         return cls(problem, seed, core, (), (beyond,), for_others, beyond.seconds(beyond.points))
 
     @property
@@ -262,7 +261,7 @@ class State:
         """Return the state after a step that estimates one remainder from new points."""
         problem, known = self.problem, list(self.remainders)
         cutoff, seconds, seed = known[number].cutoff, known[number].seconds(points or 0), self.seed + self.steps + 1
-        known[number] = _beyond(problem, cutoff, seed, points)
+        known[number] = problem.beyond(cutoff, seed, points)
         return self.advanced(seconds, remainders=tuple(known))
 
     def advanced(self, seconds: float, **changes: object) -> State:
@@ -332,7 +331,7 @@ def farther_out(state: State) -> State | None:
     if sampling is None:
         return _looked_at(state)
     measured = _measured(state, sampling)
-    outer = Remainder.unknown(octave.highest) if state.for_others else _beyond(problem, octave.highest, state.seed)
+    outer = Remainder.unknown(octave.highest) if state.for_others else problem.beyond(octave.highest, state.seed)
     return state.advanced(seconds, octaves=(*state.octaves, measured), remainders=(*state.remainders, outer))
 
 
@@ -464,19 +463,6 @@ def _finer_sampling(state: State, octave: MeasuredOctave, order: int, permitted:
         return replace(sampling, draws=count, seed=int(rng.integers(2**53)))
     intervals = 2 * round(sampling.lattices[-1].M * np.clip(excess**0.5, 1.25, 2.0) / 2)
     return replace(sampling, lattices=(*sampling.lattices, _lattice(state, sampling.octave, intervals, rng)))
-
-
-def _beyond(problem: Problem, cutoff: float, seed: int, points: int | None = None) -> Remainder:
-    """Return what lies beyond a cutoff, from new points."""
-    return remainder(
-        problem.surfaces,
-        problem.signs,
-        cutoff,
-        problem.orders,
-        points,
-        seed=seed,
-        execution=Execution(threads=problem.threads),
-    )
 
 
 def _lattice(state: State, octave: Octave, intervals: int, rng: np.random.Generator) -> OctaveLattice:

@@ -25,6 +25,7 @@ from sobolev_batch.norms.bounds import APART_FRACTION, norm_of_moves, norm_of_ro
 from sobolev_batch.norms.budget import Sums, Support, sums_of_shells
 from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.norms.fields import USUAL_DEGREE, Field, field_for
+from sobolev_batch.norms.tail.remainder import Remainder, remainder
 from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, cheapest_dtype
 from sobolev_batch.transform.lattice import Lattice, SobolevWeights, shell_sums
 from sobolev_batch.transform.probe import Sample, draws_for, estimate, needs_probe
@@ -214,6 +215,13 @@ class Problem:
             field_for(surface, lattice, target, settings, execution, sample=sample)
             for surface, sample in zip(self.surfaces, self.samples(lattice), strict=True)
         )
+
+    def beyond(
+        self, cutoff: float, seed: int = 0, points: int | None = None, orders: Sequence[float] = ()
+    ) -> Remainder:
+        """Return what lies beyond a cutoff at the orders, or at other ones; see `remainder`."""
+        execution = Execution(threads=self.threads)
+        return remainder(self.surfaces, self.signs, cutoff, orders or self.orders, points, seed, execution)
 
     def require_above_rounding(self, values: Reals) -> None:
         """Refuse an accuracy of norms (orders,) below the rounding of fields, unless it is a best effort."""

@@ -35,8 +35,8 @@ from sobolev_batch.norms.budget import Sums, Support
 from sobolev_batch.norms.estimate import NormEstimate, estimate_norms
 from sobolev_batch.norms.fields import Field
 from sobolev_batch.norms.tail.face_normals import FaceNormals
-from sobolev_batch.norms.tail.remainder import LOWEST_ORDER, remainder
-from sobolev_batch.transform.fourier import ErrorTarget, Execution
+from sobolev_batch.norms.tail.remainder import LOWEST_ORDER
+from sobolev_batch.transform.fourier import ErrorTarget
 from sobolev_batch.transform.kinds import kind_of
 from sobolev_batch.transform.lattice import LARGEST_M, Lattice, SobolevWeights, shell_sums
 from sobolev_batch.transform.probe import Sample, estimate
@@ -336,9 +336,7 @@ def _beyond_lattice(problem: Problem, solution: Solution) -> tuple[Reals, Reals]
     # What the lattice shows of the range in which the step falls.
     shown = SobolevWeights(lattice, known).per_shell - SobolevWeights(lattice, known, lattice.xi_max).per_shell
     shells = shell_sums(difference, None, lattice, lattice.half)
-    values, errors = remainder(
-        problem.surfaces, problem.signs, lattice.xi_max, known, execution=Execution(threads=problem.threads)
-    ).at(known)
+    values, errors = problem.beyond(lattice.xi_max, orders=known).at(known)
     # No frequency beyond the lattice weighs more than this at lower orders.
     factors = (1 + lattice.xi_max**2) ** (np.array(problem.orders) - known)
     return factors * (values - shown @ shells), factors * errors
