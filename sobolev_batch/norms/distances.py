@@ -32,7 +32,7 @@ from sobolev_batch.norms.tail.values import flat_beyond
 from sobolev_batch.parameters import check_seed
 from sobolev_batch.shown import progress_line
 from sobolev_batch.transform.lattice import Lattice, Orders, SobolevWeights, check_orders
-from sobolev_batch.transform.spheres import sphere_distance, sphere_inner_product, sphere_norm
+from sobolev_batch.transform.spheres import sphere_inner_product, sphere_norm
 
 # Relative accuracy of the closed forms of spheres.
 _CLOSED_FORM_ACCURACY = 1e-13
@@ -247,12 +247,13 @@ def _spheres(*operands: OperandLike, lattice: Lattice | None) -> tuple[Sphere, .
 
 def _distance_of_spheres(a: Sphere, b: Sphere, order: Orders) -> xr.Dataset:
     orders = check_orders(order)
-    values = np.array([sphere_distance(a, b, s) for s in orders])
-    norms = np.array([sphere_norm(b, s) for s in orders])
-    squares = np.array([sphere_norm(a, s) ** 2 for s in orders]) + norms**2
-    products = np.array([sphere_inner_product(a, b, s) for s in orders]) - norms**2
-    reference = ReferenceEstimate(_closed_form(norms, norms**2), products, _CLOSED_FORM_ACCURACY * squares)
-    return labelled_distances(order, _closed_form(values, squares), reference, {})
+    own, other, product = (
+        np.array([sphere_inner_product(*pair, s) for s in orders]) for pair in ((a, a), (b, b), (a, b))
+    )
+    distances = _closed_form(np.sqrt(np.maximum(own + other - 2 * product, 0.0)), own + other)
+    errors = _CLOSED_FORM_ACCURACY * (own + other)
+    reference = ReferenceEstimate(_closed_form(np.sqrt(other), other), product - other, errors)
+    return labelled_distances(order, distances, reference, {})
 
 
 def _closed_form(values: Reals, squares: Reals) -> NormEstimate:

@@ -1,15 +1,17 @@
 """Errors of a mesh's triangles that add up at some frequency: all of them in arrays, whose pieces repeat."""
 
 import math
-from functools import lru_cache, partial
+from functools import lru_cache
 
 import numpy as np
 
 from sobolev_batch.arrays import Complexes, Indices, Reals, slices
 from sobolev_batch.compiled import pays
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.transform.backends import CPU, Backend, combine, compute_on, cosine_and_sine
+from sobolev_batch.transform.backends import CPU, Backend, combine, compute_on
 from sobolev_batch.transform.faces import FaceArrays
+from sobolev_batch.transform.lattice import Lattice
+from sobolev_batch.transform.nufft import WeightedPoints, transform_points
 from sobolev_batch.transform.nufft_costs import NufftSpec
 
 # Triangles at a time: their temporaries stay in cache.
@@ -90,8 +92,14 @@ def coherence(mesh: Mesh, highest: float, faces: FaceArrays | None = None, backe
     limit = highest / math.sqrt(3)
     count = math.ceil(2 * _PADDING * (float(np.abs(centers).max()) + length) * limit)
     points = np.concatenate([centers, *(centers + corners)], axis=1)
-    angles, weights = points * (2 * np.pi * limit / count), np.concatenate([-areas, np.tile(areas / 3, 3)])
-    values = compute_on(backend, partial(_transform, angles, weights, count))
+    weights, lattice = np.concatenate([-areas, np.tile(areas / 3, 3)]), Lattice(limit, 2 * count)
+
+    def transform(backend: Backend) -> Complexes:
+        uploaded = WeightedPoints(backend.upload(points), backend.upload(weights))
+        spec = NufftSpec(lattice.shape, _EPS, "complex64")
+        return backend.download(transform_points([uploaded], lattice, lattice.half, spec, backend)[0])
+
+    values = compute_on(backend, transform)
     places, numbers, radii = _ranges(count)
     squares = np.square(np.abs(values.ravel()[places]) / (np.square(_PHASE * radii) / 4 * areas.sum())) / _MEAN_SQUARE
     largest = np.zeros(RANGES)
@@ -133,19 +141,6 @@ def _boxes(mesh: Mesh, low: Reals, side: float) -> Indices:
         centers = mesh.vertices[mesh.triangles[part]].mean(axis=1)
         numbers[part] = ((centers - low) / side).astype(np.int64) @ [1, 1 << 20, 1 << 40]
     return np.unique(numbers, return_inverse=True)[1]
-
-
-def _transform(angles: Reals, weights: Reals, count: int, backend: Backend) -> Complexes:
-    """Return Σ w exp(-i k·x) of points x (3, n) for |k_x|, |k_y| and 0 <= k_z up to a count."""
-    shape = 2 * count + 1, 2 * count + 1, count + 1
-    plan = backend.plan(backend.costs.with_oversampling(NufftSpec(shape, _EPS, "complex64"), len(weights)))
-    rows = [backend.upload(np.ascontiguousarray(row, dtype=np.float32)) for row in angles]
-    plan.setpts(*rows)
-    # Modes of an axis of n samples start at -(n // 2).
-    cosines, sines = cosine_and_sine((shape[2] // 2) * angles[2])
-    strengths = (weights * (cosines - 1j * sines)).astype(np.complex64)
-    values: Complexes = backend.download(plan.execute(backend.upload(strengths)))
-    return values
 
 
 @lru_cache(maxsize=4)

@@ -23,7 +23,8 @@ from sobolev_batch.transform.backends import CPU, Backend, compute_on
 from sobolev_batch.transform.exact import exact_transform, sampled_transform
 from sobolev_batch.transform.faces import FaceArrays
 from sobolev_batch.transform.lattice import FrequencyLattice
-from sobolev_batch.transform.quadrature import RuleUse, WeightedPoints, assign_rules
+from sobolev_batch.transform.nufft import WeightedPoints
+from sobolev_batch.transform.quadrature import RuleUse, assign_rules
 from sobolev_batch.transform.resolution import direct_transform, exact_counts, resolution_of
 from sobolev_batch.transform.rule_errors import loosest_tolerance, weight_masses
 from sobolev_batch.transform.spheres import sphere_transform

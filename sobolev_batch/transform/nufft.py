@@ -1,6 +1,9 @@
 """The primitive of all fields: weighted points transformed onto a block of the lattice; and its adjoint."""
 
-from collections.abc import Iterable
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -9,10 +12,34 @@ from sobolev_batch.arrays import Array, ComplexDtype, Complexes, Reals, slices
 from sobolev_batch.transform.backends import CPU, Backend, combine, cosine_and_sine
 from sobolev_batch.transform.lattice import Block, FrequencyLattice, Lattice
 from sobolev_batch.transform.nufft_costs import NufftSpec
-from sobolev_batch.transform.quadrature import WeightedPoints
 
 # Points at a time whose phases stay in the processor's cache: half the time of all at once.
 _CACHED = 1 << 14
+
+
+@dataclass(frozen=True)
+class WeightedPoints:
+    """A sum of Dirac masses in arrays of one backend.
+
+    Coordinates are float64 (3, n), one contiguous row per axis, in units of length; weights (n,) in squared units.
+    """
+
+    coordinates: Array
+    weights: Array
+
+    def part(self, part: slice) -> WeightedPoints:
+        """Return some of the points, which share their memory with these."""
+        return WeightedPoints(self.coordinates[:, part], self.weights[part])
+
+    @staticmethod
+    def concatenated(batches: Sequence[WeightedPoints]) -> WeightedPoints:
+        """Return the points of several batches as one."""
+        if len(batches) == 1:
+            return batches[0]
+        return WeightedPoints(
+            np.concatenate([points.coordinates for points in batches], axis=1),
+            np.concatenate([points.weights for points in batches]),
+        )
 
 
 def transform_points(

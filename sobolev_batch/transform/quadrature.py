@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +12,7 @@ from sobolev_batch.arrays import Array, Indices, Reals, slices
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.transform.backends import CPU, Backend, combine, sums_at, sums_of_runs
 from sobolev_batch.transform.faces import FaceArrays
+from sobolev_batch.transform.nufft import WeightedPoints
 from sobolev_batch.transform.rule_errors import shares_vertices, tolerance_for
 from sobolev_batch.transform.rules import TriangleRule, choose_rules, fixed_rule, rule_ranges
 
@@ -21,31 +22,6 @@ _Corners = tuple[Array, Array, Array]
 _TRIANGLES = 1 << 17
 # An edge and its triangle are sorted as one integer, which takes twice the bits of a vertex and those of a triangle.
 _BITS = 63
-
-
-@dataclass(frozen=True)
-class WeightedPoints:
-    """A sum of Dirac masses in arrays of one backend.
-
-    Coordinates are float64 (3, n), one contiguous row per axis, in units of length; weights (n,) in squared units.
-    """
-
-    coordinates: Array
-    weights: Array
-
-    def part(self, part: slice) -> WeightedPoints:
-        """Return some of the points, which share their memory with these."""
-        return WeightedPoints(self.coordinates[:, part], self.weights[part])
-
-    @staticmethod
-    def concatenated(batches: Sequence[WeightedPoints]) -> WeightedPoints:
-        """Return the points of several batches as one."""
-        if len(batches) == 1:
-            return batches[0]
-        return WeightedPoints(
-            np.concatenate([points.coordinates for points in batches], axis=1),
-            np.concatenate([points.weights for points in batches]),
-        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -64,16 +64,6 @@ def sphere_norm(sphere: Sphere, order: float) -> float:
     return math.sqrt(sphere_inner_product(sphere, sphere, order))
 
 
-def sphere_distance(first: Sphere, second: Sphere, order: float) -> float:
-    """Return the Sobolev distance of two spheres' area measures; its square is off by 1e-13 of the squared norms."""
-    squared = (
-        sphere_inner_product(first, first, order)
-        + sphere_inner_product(second, second, order)
-        - 2 * sphere_inner_product(first, second, order)
-    )
-    return math.sqrt(max(squared, 0.0))
-
-
 def _matern_difference(nu: float, shorter: float, longer: float) -> float:
     """Return C(2π shorter) - C(2π longer), without cancellation if the arguments are close.
 

@@ -13,9 +13,9 @@ from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import normals
 from sobolev_batch.transform.fourier import ON_CPU, Execution, TransformSettings, require_points_inside
 from sobolev_batch.transform.lattice import Lattice
-from sobolev_batch.transform.nufft import transform_points
+from sobolev_batch.transform.nufft import WeightedPoints, transform_points
 from sobolev_batch.transform.nufft_costs import NufftSpec
-from sobolev_batch.transform.quadrature import RuleUse, WeightedPoints, assign_rules, quarters
+from sobolev_batch.transform.quadrature import RuleUse, assign_rules, quarters
 
 
 @dataclass(frozen=True, eq=False)

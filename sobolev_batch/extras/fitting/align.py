@@ -12,9 +12,8 @@ from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.transform.fourier import TransformSettings
 from sobolev_batch.transform.lattice import Lattice, SobolevWeights, single_order
-from sobolev_batch.transform.nufft import transform_points
+from sobolev_batch.transform.nufft import WeightedPoints, transform_points
 from sobolev_batch.transform.nufft_costs import NufftSpec
-from sobolev_batch.transform.quadrature import WeightedPoints
 
 # Stages: highest frequency on each axis, in cycles per radius, most points of each mesh, motions that go on to the next
 # stage, and steps.

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms.tail.face_normals import FaceNormals
-from sobolev_batch.transform.backends import combine
 from sobolev_batch.transform.lattice import STEP_START, OctaveLattice, smooth_step
 
 # Samples along an axis of the lattice of each octave, and draws beside it where surfaces have flat faces.
@@ -137,12 +136,8 @@ class OctaveSampling:
     @cached_property
     def frequencies(self) -> Reals:
         """ξ along the axes of the surfaces, float64 (n, 3), in cycles per unit length; drawn ones come last."""
-        found = []
-        for lattice, sample_set in zip(self.lattices, self.sample_sets, strict=False):
-            indices = np.unravel_index(sample_set.places, lattice.half.shape)
-            own = np.stack([axis[i] for axis, i in zip(lattice.frequencies(lattice.half), indices, strict=True)])
-            found.append(combine(lattice.rotation.T, own).T)
-        return np.concatenate([*found, self._drawn()])
+        on_lattices = zip(self.lattices, self.sample_sets, strict=False)
+        return np.concatenate([*(one.points(one.half)[its.places] for one, its in on_lattices), self._drawn()])
 
     @cached_property
     def radii(self) -> Reals:
