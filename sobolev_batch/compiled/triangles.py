@@ -1,39 +1,7 @@
-"""Loops over the triangles of a mesh: what their errors have in common, and distances from them."""
-
-import math
+"""Loops over the triangles of a mesh: distances of points from them."""
 
 from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.compiled import loop, part
-
-
-@part
-def _edges(vertices: Reals, triangle: Indices) -> tuple[float, float, float, float, float, float]:
-    """Return the edges from the first corner to the second and to the third."""
-    a, b, c = vertices[triangle[0]], vertices[triangle[1]], vertices[triangle[2]]
-    return b[0] - a[0], b[1] - a[1], b[2] - a[2], c[0] - a[0], c[1] - a[1], c[2] - a[2]
-
-
-@loop
-def third_moments(vertices: Reals, triangles: Indices, areas: Reals) -> tuple[float, float]:
-    """Return the norm of the sum of third moments, times areas, and the sum of their norms, in one unit of moments."""
-    total = s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = s9 = 0.0
-    for i in range(len(triangles)):
-        ux, uy, uz, vx, vy, vz = _edges(vertices, triangles[i])
-        x, y, z = ux + vx, uy + vy, uz + vz
-        bx, by, bz, cx, cy, cz = 3 * ux - x, 3 * uy - y, 3 * uz - z, 3 * vx - x, 3 * vy - y, 3 * vz - z
-        xx, yy, zz = bx * cx, by * cy, bz * cz
-        xy, yz, zx = bx * cy + by * cx, by * cz + bz * cy, bz * cx + bx * cz
-        m0, m1, m2 = 3 * x * xx, 3 * y * yy, 3 * z * zz
-        m3, m4, m5 = x * xy + y * xx, y * yz + z * yy, z * zx + x * zz
-        m6, m7, m8 = x * zx + z * xx, y * xy + x * yy, z * yz + y * zz
-        m9 = x * yz + y * zx + z * xy
-        square = m3 * m3 + m4 * m4 + m5 * m5 + m6 * m6 + m7 * m7 + m8 * m8
-        weight = areas[i]
-        total += weight * math.sqrt(m0 * m0 + m1 * m1 + m2 * m2 + 3 * square + 1.5 * m9 * m9)
-        s0, s1, s2, s3, s4 = s0 + weight * m0, s1 + weight * m1, s2 + weight * m2, s3 + weight * m3, s4 + weight * m4
-        s5, s6, s7, s8, s9 = s5 + weight * m5, s6 + weight * m6, s7 + weight * m7, s8 + weight * m8, s9 + weight * m9
-    square = s3 * s3 + s4 * s4 + s5 * s5 + s6 * s6 + s7 * s7 + s8 * s8
-    return math.sqrt(s0 * s0 + s1 * s1 + s2 * s2 + 3 * square + 1.5 * s9 * s9), total
 
 
 @part

@@ -6,7 +6,6 @@ from functools import lru_cache
 import numpy as np
 
 from sobolev_batch.arrays import Complexes, Indices, Reals, slices
-from sobolev_batch.compiled import pays
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.transform.backends import CPU, Backend, combine, compute_on
 from sobolev_batch.transform.faces import FaceArrays
@@ -16,8 +15,6 @@ from sobolev_batch.transform.nufft_costs import NufftSpec
 
 # Triangles at a time: their temporaries stay in cache.
 _BATCH = 1 << 13
-# Processor time on arrays of the third moments of a triangle.
-_SECONDS = 4e-8
 # Number of ranges of |ξ| up to the highest one, the first that counts, and triangles that stand for all.
 RANGES, _FIRST, _SAMPLE = 32, 10, 1 << 11
 # The phase (radians) of a triangle's farthest corner at the highest frequency, once all are equally large.
@@ -39,11 +36,6 @@ def unpaired(mesh: Mesh, faces: FaceArrays | None = None) -> float:
 
     The leading odd error is that of third moments about the centroid: of products of the three corners.
     """
-    if faces is None and pays(_SECONDS * len(mesh.triangles)):
-        from sobolev_batch.compiled.triangles import third_moments
-
-        norm, amount = third_moments(mesh.vertices, mesh.triangles, mesh.areas)
-        return norm / amount if amount else 0.0
     total, amount = np.zeros(len(_MULTIPLES)), 0.0
     for batch in (faces or FaceArrays.of_mesh(mesh)).batches(_BATCH):
         moments, norms = _third_moments(batch)

@@ -17,8 +17,10 @@ FINEST_CHANGE = 1e-13
 COARSEST_CHANGE = 1e-4
 # Nodes that the spacing on a surface is measured with, and nodes beyond two for each wavelength.
 _SPACING_NODES, _MARGIN, _EXTRA = 31, 1.1, 12
-# Number of probe directions that are neither axes nor diagonals, and shorter lengths that are probed too.
-_RANDOM_DIRECTIONS, _FRACTIONS = 9, (0.0, 0.3, 0.7)
+# Probe frequencies (25, 3): of unit length along axes, diagonals and nine other directions, and a few shorter ones.
+_OTHERS = np.random.default_rng(20).normal(size=(9, 3))
+_OTHERS /= np.linalg.norm(_OTHERS, axis=1, keepdims=True)
+_UNIT_FREQUENCIES = np.concatenate([DIRECTIONS, _OTHERS, *(fraction * _OTHERS[:1] for fraction in (0.0, 0.3, 0.7))])
 # Pairs of a node and a frequency at a time: their temporaries stay in cache.
 _PAIRS = 1 << 18
 # The change that exact values are resolved to, and the nodes that may be spent on them.
@@ -72,7 +74,7 @@ def _refined(surface: Smooth, highest: float, tolerance: float, most: int) -> tu
     counts = _first_counts(surface, highest)
     if _too_many(surface, counts, most):  # even the first
         return counts, math.inf
-    frequencies = highest * _unit_frequencies()
+    frequencies = highest * _UNIT_FREQUENCIES
     values = direct_transform(surface, counts, frequencies)
     while True:
         twice = doubled(counts)
@@ -105,12 +107,3 @@ def _first_counts(surface: Smooth, highest: float) -> Counts:
         count = min(_MARGIN * _SPACING_NODES * widest * 2 * highest, float(MOST_NODES))
         counts.append(math.ceil(count) + _EXTRA | 1)
     return counts[0], counts[1]
-
-
-@lru_cache(maxsize=1)
-def _unit_frequencies() -> Reals:
-    """Return probe frequencies (25, 3): of unit length in all directions, and a few shorter ones."""
-    rng = np.random.default_rng(20)
-    random = rng.normal(size=(_RANDOM_DIRECTIONS, 3))
-    random /= np.linalg.norm(random, axis=1, keepdims=True)
-    return np.concatenate([DIRECTIONS, random, *(fraction * random[:1] for fraction in _FRACTIONS)])

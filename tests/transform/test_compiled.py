@@ -8,23 +8,19 @@ import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from sobolev_batch import Lattice, Mesh
+from sobolev_batch import Mesh
 from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.shapes import icosphere
-from sobolev_batch.transform import coherence, exact
+from sobolev_batch.transform import exact
 from sobolev_batch.transform.exact import exact_transform, sampled_transform
-from sobolev_batch.transform.fourier import TransformSettings, transform_block
 from tests.support.shapes import box
 from tests.transform.test_exact import SHAPES, oracle
 
 Transform = Callable[[Mesh, Reals], Complexes]
-Result = TypeVar("Result")
 
 
 def _soup(corners: Reals) -> Mesh:
@@ -105,34 +101,6 @@ def test_threads_change_nothing() -> None:
     alone = values(sampled_transform, mesh, frequencies, compiled=True)
     shared = values(partial(sampled_transform, threads=3), mesh, frequencies, compiled=True)
     assert np.array_equal(alone, shared)
-
-
-def both_ways(work: Callable[[], Result]) -> tuple[Result, Result]:
-    """Return what work on meshes gives on arrays, and by compiled loops."""
-    found = []
-    for compiled in (False, True):
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(coherence, "pays", lambda seconds, compiled=compiled: compiled)
-            found.append(work())
-    return found[0], found[1]
-
-
-@pytest.mark.parametrize("name", MESHES)
-def test_loops_find_what_errors_have_in_common(name: str) -> None:
-    mesh = MESHES[name]()
-    unpaired, by_loop = both_ways(lambda: coherence.unpaired(mesh))
-    assert by_loop == pytest.approx(unpaired, rel=1e-10, abs=1e-13)
-
-
-@pytest.mark.parametrize("eps", [1e-3, 1e-9])
-def test_fields_do_not_depend_on_loops(eps: float) -> None:
-    lattice, sphere = Lattice(5.0, 16), icosphere(3)
-    stretched = sphere.vertices * np.exp(sphere.vertices[:, :1]) / 4
-
-    def field() -> NDArray[np.complexfloating]:
-        return transform_block(Mesh(stretched, sphere.triangles), lattice, lattice.half, TransformSettings(eps)).values
-
-    assert np.array_equal(*both_ways(field))
 
 
 SMALL_WORK = """

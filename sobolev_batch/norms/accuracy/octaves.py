@@ -15,13 +15,7 @@ import numpy as np
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.geometry.smooth import Smooth
-from sobolev_batch.norms.accuracy.problem import (
-    ESTIMATE_CAUTION,
-    Problem,
-    error_target,
-    only_or_difference,
-    sums_on,
-)
+from sobolev_batch.norms.accuracy.problem import ESTIMATE_CAUTION, Problem, error_target, only_or_difference, sums_on
 from sobolev_batch.norms.accuracy.solution import Solution, SurfaceValues
 from sobolev_batch.norms.accuracy.tolerance import FINER_LATTICE, core_lattice, good_intervals
 from sobolev_batch.norms.budget import Sums, aliased
@@ -228,11 +222,6 @@ class State:
         fraction = _ALONE_FRACTION if is_alone and not self.for_others else _REMAINDER_FRACTION
         return float(np.max(errors / (fraction * self.permitted)))
 
-    @property
-    def rng(self) -> np.random.Generator:
-        """Generator of the next step's frequencies."""
-        return np.random.default_rng([self.seed, self.steps])
-
     @cached_property
     def sizes(self) -> list[SurfaceSize]:
         """Sizes of the surfaces, which times follow from."""
@@ -393,7 +382,8 @@ def _measured(state: State, sampling: OctaveSampling, known: MeasuredOctave | No
 
 def _first_sampling(state: State, octave: Octave) -> OctaveSampling:
     """Return the sampling of an octave that is predicted to be the cheapest one."""
-    normals, rng, count = state.normals, state.rng, _draws_needed(state, octave)
+    normals, count = state.normals, _draws_needed(state, octave)
+    rng = np.random.default_rng([state.seed, state.steps])
     # As many samples as draws would need.
     intervals = int(np.clip(good_intervals((count / _FILLED) ** (1 / 3)), _FEWEST_M, _FIRST_M))
     lattice = _lattice(state, octave, intervals, rng)

@@ -14,13 +14,7 @@ from sobolev_batch.errors import AccuracyError
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms.accuracy.octaves import solve_in_octaves
-from sobolev_batch.norms.accuracy.problem import (
-    ESTIMATE_CAUTION,
-    Problem,
-    error_target,
-    only_or_difference,
-    sums_on,
-)
+from sobolev_batch.norms.accuracy.problem import ESTIMATE_CAUTION, Problem, error_target, only_or_difference, sums_on
 from sobolev_batch.norms.accuracy.solution import Solution, SurfaceValues
 from sobolev_batch.norms.accuracy.tolerance import (
     LEAST_CLEARANCE,

@@ -123,11 +123,6 @@ class Kernels:
         reach, step = fineness * max(map(reach_of, orders)) / cutoff, (end - start) / (len(drops) - 1)
         return cls(cutoff, tuple(orders), fineness, reach, start, step, totals, drops, values)
 
-    @property
-    def finer(self) -> Kernels:
-        """The same kernels up to twice their reach, with twice the nodes."""
-        return self.of_orders(self.cutoff, self.orders, 2 * self.fineness)
-
     def looked_up(self, table: Array, squares: Array) -> Array:
         """Return a table's values at each d², (..., orders)."""
         squares = np.minimum(np.maximum(squares, (_LEAST / self.cutoff) ** 2), self.reach**2)

@@ -335,7 +335,8 @@ class _Seen:
         """
         count = min(_CONTROLS, n := draw.weights.shape[1])
         chosen = np.sort(rng.choice(n, count, replace=False))
-        finer = _Seen(self.sheets, self.kernels.finer, self.execution)
+        kernels = Kernels.of_orders(self.kernels.cutoff, self.kernels.orders, fineness=2)
+        finer = _Seen(self.sheets, kernels, self.execution)
         changes = finer.potentials(draw.points[:, chosen].reshape(-1, 3))[0]
         changes = changes.reshape(-1, count, changes.shape[1]) - potentials[:, chosen]
         changes = n * (draw.weights[:, chosen, None] * changes).sum(axis=0)
