@@ -138,42 +138,35 @@ def exact_sums(vertices: Reals, triangles: Indices, doubled: Reals, frequencies:
     for first in range(0, len(sums), _LANES):
         last = min(first + _LANES, len(sums))
         u, v, w = frequencies[0, first:last], frequencies[1, first:last], frequencies[2, first:last]
-        _exact_group(vertices, triangles, doubled, u, v, w, sums[first:last])
-    return sums
-
-
-@loop
-def _exact_group(
-    vertices: Reals, triangles: Indices, doubled: Reals, u: Reals, v: Reals, w: Reals, sums: Complexes
-) -> None:
-    # Of two rows of one array LLVM would make no vectors.
-    reals, imaginaries = np.zeros(len(u)), np.zeros(len(u))
-    for i in range(len(triangles)):
-        edges, area, apart = _edges(vertices, triangles[i]), doubled[i], 0
-        a, b, c = vertices[triangles[i, 0]], vertices[triangles[i, 1]], vertices[triangles[i, 2]]
-        px, py, pz, qx, qy, qz = edges
-        # The centroid, from the second corner.
-        x, y, z = b[0] + (qx - px) / 3, b[1] + (qy - py) / 3, b[2] + (qz - pz) / 3
-        for f in range(len(u)):
-            ab, bc, ac = _gaps(edges, u[f], v[f], w[f])
-            is_close = _are_close(ab, bc, ac)
-            apart += not is_close
-            cosine, sine = _exponential(x, y, z, u[f], v[f], w[f])
-            real, imaginary = _series(ab, ac)
-            reals[f] += area * (cosine * real - sine * imaginary) if is_close else 0.0
-            imaginaries[f] += area * (cosine * imaginary + sine * real) if is_close else 0.0
-        if apart:
+        # Of two rows of one array LLVM would make no vectors.
+        reals, imaginaries = np.zeros(len(u)), np.zeros(len(u))
+        for i in range(len(triangles)):
+            edges, area, apart = _edges(vertices, triangles[i]), doubled[i], 0
+            a, b, c = vertices[triangles[i, 0]], vertices[triangles[i, 1]], vertices[triangles[i, 2]]
+            px, py, pz, qx, qy, qz = edges
+            # The centroid, from the second corner.
+            x, y, z = b[0] + (qx - px) / 3, b[1] + (qy - py) / 3, b[2] + (qz - pz) / 3
             for f in range(len(u)):
                 ab, bc, ac = _gaps(edges, u[f], v[f], w[f])
-                if not _are_close(ab, bc, ac):
-                    at_a = complex(*_exponential(a[0], a[1], a[2], u[f], v[f], w[f]))
-                    at_b = complex(*_exponential(b[0], b[1], b[2], u[f], v[f], w[f]))
-                    at_c = complex(*_exponential(c[0], c[1], c[2], u[f], v[f], w[f]))
-                    value = area * _quotient(at_a, at_b, at_c, ab, ac)
-                    reals[f] += value.real
-                    imaginaries[f] += value.imag
-    for f in range(len(u)):
-        sums[f] = complex(reals[f], imaginaries[f])
+                is_close = _are_close(ab, bc, ac)
+                apart += not is_close
+                cosine, sine = _exponential(x, y, z, u[f], v[f], w[f])
+                real, imaginary = _series(ab, ac)
+                reals[f] += area * (cosine * real - sine * imaginary) if is_close else 0.0
+                imaginaries[f] += area * (cosine * imaginary + sine * real) if is_close else 0.0
+            if apart:
+                for f in range(len(u)):
+                    ab, bc, ac = _gaps(edges, u[f], v[f], w[f])
+                    if not _are_close(ab, bc, ac):
+                        at_a = complex(*_exponential(a[0], a[1], a[2], u[f], v[f], w[f]))
+                        at_b = complex(*_exponential(b[0], b[1], b[2], u[f], v[f], w[f]))
+                        at_c = complex(*_exponential(c[0], c[1], c[2], u[f], v[f], w[f]))
+                        value = area * _quotient(at_a, at_b, at_c, ab, ac)
+                        reals[f] += value.real
+                        imaginaries[f] += value.imag
+        for f in range(len(u)):
+            sums[first + f] = complex(reals[f], imaginaries[f])
+    return sums
 
 
 @loop
@@ -188,42 +181,27 @@ def sampled_sums(vertices: Reals, triangles: Indices, doubled: Reals, frequencie
             x, y, z = vertices[i]
             for f in range(len(u)):
                 cosines[i, f], sines[i, f] = _cosine_and_sine(-(u[f] * x + v[f] * y + w[f] * z))
-        _sampled_group(vertices, triangles, doubled, u, v, w, cosines, sines, sums[first:last])
-    return sums
-
-
-@loop
-def _sampled_group(
-    vertices: Reals,
-    triangles: Indices,
-    doubled: Reals,
-    u: Reals,
-    v: Reals,
-    w: Reals,
-    cosines: Reals,
-    sines: Reals,
-    sums: Complexes,
-) -> None:
-    reals, imaginaries = np.zeros(len(u)), np.zeros(len(u))
-    for i in range(len(triangles)):
-        a, b, c = triangles[i]
-        edges, area, close = _edges(vertices, triangles[i]), doubled[i], 0
-        for f in range(len(u)):
-            ab, bc, ac = _gaps(edges, u[f], v[f], w[f])
-            product = ab * bc * ac
-            is_apart = abs(product) >= _LEAST_PRODUCT
-            close += not is_apart
-            factor = area / product if is_apart else 0.0
-            middle, imaginary = cosines[b, f], sines[b, f]
-            reals[f] -= ((cosines[a, f] - middle) * bc + (cosines[c, f] - middle) * ab) * factor
-            imaginaries[f] -= ((sines[a, f] - imaginary) * bc + (sines[c, f] - imaginary) * ab) * factor
-        if close:
+        reals, imaginaries = np.zeros(len(u)), np.zeros(len(u))
+        for i in range(len(triangles)):
+            a, b, c = triangles[i]
+            edges, area, close = _edges(vertices, triangles[i]), doubled[i], 0
             for f in range(len(u)):
                 ab, bc, ac = _gaps(edges, u[f], v[f], w[f])
-                if not abs(ab * bc * ac) >= _LEAST_PRODUCT:
-                    at_a, at_b = complex(cosines[a, f], sines[a, f]), complex(cosines[b, f], sines[b, f])
-                    value = area * _stable(at_a, at_b, complex(cosines[c, f], sines[c, f]), ab, bc, ac)
-                    reals[f] += value.real
-                    imaginaries[f] += value.imag
-    for f in range(len(u)):
-        sums[f] = complex(reals[f], imaginaries[f])
+                product = ab * bc * ac
+                is_apart = abs(product) >= _LEAST_PRODUCT
+                close += not is_apart
+                factor = area / product if is_apart else 0.0
+                middle, imaginary = cosines[b, f], sines[b, f]
+                reals[f] -= ((cosines[a, f] - middle) * bc + (cosines[c, f] - middle) * ab) * factor
+                imaginaries[f] -= ((sines[a, f] - imaginary) * bc + (sines[c, f] - imaginary) * ab) * factor
+            if close:
+                for f in range(len(u)):
+                    ab, bc, ac = _gaps(edges, u[f], v[f], w[f])
+                    if not abs(ab * bc * ac) >= _LEAST_PRODUCT:
+                        at_a, at_b = complex(cosines[a, f], sines[a, f]), complex(cosines[b, f], sines[b, f])
+                        value = area * _stable(at_a, at_b, complex(cosines[c, f], sines[c, f]), ab, bc, ac)
+                        reals[f] += value.real
+                        imaginaries[f] += value.imag
+        for f in range(len(u)):
+            sums[first + f] = complex(reals[f], imaginaries[f])
+    return sums

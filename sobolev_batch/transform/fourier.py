@@ -208,9 +208,13 @@ def transform_block(
     fill = min(1.0, float(np.prod((high - low) / (2 * lattice.half_period))))
 
     kind.choose_points(execution.backend)
-    workload = Workload(kind.expected_points, kind.largest_points, kind.triangles, fill)
+    points = kind.expected_points if isinstance(execution.backend, Gpu) else math.inf
 
     def fitting(costs: Costs, allowed_bytes: float) -> tuple[NufftSpec, int]:
+        workload = Workload(points, triangles=kind.triangles, fill=fill)
+        if costs.projected_bytes(whole, workload) > allowed_bytes:
+            # Only now do the points need counting.
+            workload = replace(workload, points=kind.expected_points, largest_points=kind.largest_points)
         spec = fastest_spec(whole, workload, costs, allowed_bytes)
         return spec, costs.projected_bytes(spec, workload)
 
