@@ -221,7 +221,8 @@ class Problem:
     ) -> Remainder:
         """Return what lies beyond a cutoff at the orders, or at other ones; see `remainder`."""
         execution = Execution(threads=self.threads)
-        return remainder(self.surfaces, self.signs, cutoff, orders or self.orders, points, seed, execution)
+        orders = orders or self.orders
+        return remainder(self.surfaces, self.signs, cutoff, orders, points, seed=seed, execution=execution)
 
     def require_above_rounding(self, values: Reals) -> None:
         """Refuse an accuracy of norms (orders,) below the rounding of fields, unless it is a best effort."""

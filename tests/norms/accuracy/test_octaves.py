@@ -13,7 +13,7 @@ import pytest
 from sobolev_batch import Mesh, distance, norm
 from sobolev_batch.errors import AccuracyError, InputError
 from sobolev_batch.geometry.subdivision import subdivided
-from sobolev_batch.norms.accuracy import octaves
+from sobolev_batch.norms.accuracy import problem
 from sobolev_batch.norms.tail.remainder import Remainder, remainder
 from sobolev_batch.shapes import Sphere, icosphere
 from sobolev_batch.study.plan import make_plan
@@ -136,7 +136,7 @@ def test_a_remainder_that_inner_ones_contradict_is_no_accuracy(monkeypatch: pyte
         # No more points are drawn.
         return replace(beyond, energies=(energy,), errors=(error,), points=10**9)
 
-    monkeypatch.setattr(octaves, "remainder", misjudged)
+    monkeypatch.setattr(problem, "remainder", misjudged)
     with pytest.raises(AccuracyError, match="out of reach"):
         distance(a.mesh(), b.mesh(), -1.0, rtol=0.01)
 
@@ -148,7 +148,7 @@ def test_points_that_see_less_than_is_there_already_are_no_accuracy(monkeypatch:
         beyond = remainder(*given, **options)
         return replace(beyond, energies=(0.0,), errors=(0.0,), points=10**8, covering=10**9, hidden=0.0)
 
-    monkeypatch.setattr(octaves, "remainder", blind)
+    monkeypatch.setattr(problem, "remainder", blind)
     with pytest.raises(AccuracyError, match="out of reach"):
         distance(MOVED_BOX[0].mesh(), MOVED_BOX[1].mesh(), -1.0, rtol=0.1)
 
@@ -171,7 +171,7 @@ def test_other_points_confirm_a_disagreement_or_show_that_it_was_chance(
         energy = usual.energies[0] if is_chance and len(seeds) > 1 else usual.energies[0] + 1.5 * error
         return replace(beyond, energies=(energy,), errors=(error * np.sqrt(usual.points / beyond.points),))
 
-    monkeypatch.setattr(octaves, "remainder", shifted)
+    monkeypatch.setattr(problem, "remainder", shifted)
     if is_chance:
         found, exact = distance(a.mesh(), b.mesh(), -1.0, rtol=0.02), a.distance(b, [-1.0]).item()
         assert abs(found["distance"].item() - exact) <= found["error"].item() <= 0.02 * exact
@@ -188,7 +188,7 @@ def test_pilots_look_beyond_their_octaves_only_where_these_may_be_enough(monkeyp
         looked_at.append(cutoff)
         return remainder(surfaces, signs, cutoff, *others, **options)
 
-    monkeypatch.setattr(octaves, "remainder", counted)
+    monkeypatch.setattr(problem, "remainder", counted)
     study: dict[str, Any] = {
         "study": {"name": "spheres"},
         "accuracy": {"rtol": 0.02},
