@@ -23,7 +23,7 @@ from sobolev_batch.norms.columns import (
 from sobolev_batch.norms.fields import OperandLike, field_of, pair_of, read_blocks, shells_of
 from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.transform.fourier import TransformSettings, require_points_inside, thread_count
-from sobolev_batch.transform.lattice import Block, Lattice, Orders, SobolevWeights, check_orders, shell_volumes
+from sobolev_batch.transform.lattice import Lattice, Orders, SobolevWeights, check_orders, shell_volumes
 from sobolev_batch.transform.nufft import evaluate_at
 from sobolev_batch.transform.nufft_costs import NufftSpec
 
@@ -222,7 +222,12 @@ def witness(
     values = np.zeros((len(orders), coordinates.shape[1]))
     # FINUFFT refuses to evaluate nothing.
     for block, (of_a, of_b) in read_blocks(lattice, first, second) if values.size else ():
-        values += _block_values(coordinates, weights, block, of_a - of_b, settings, threads)
+        weighted, shells = (of_a - of_b) * lattice.trapezoid_weights(block), lattice.shells(block)
+        coefficients = np.empty((len(orders), *block.shape), dtype=dtype)
+        for row, weight in zip(coefficients, weights.per_shell, strict=True):
+            np.multiply(weighted, weight[shells], out=row, casting="same_kind")
+        spec = NufftSpec(block.shape, settings.eps, dtype, threads=threads)
+        values += evaluate_at(coordinates, coefficients, lattice, block, spec)
     dims, labels, _ = axis = order_axis(order)
     values = values.astype(np.float32 if dtype == "complex64" else np.float64)
     places = {name: ("point", row, described(name, LENGTH)) for name, row in zip("xyz", coordinates, strict=True)}
@@ -239,25 +244,6 @@ def witness(
             "shortest_wavelength": 1 / lattice.xi_max,
         },
     )
-
-
-def _block_values(
-    coordinates: Reals,
-    weights: SobolevWeights,
-    block: Block,
-    difference: NDArray[np.complexfloating],
-    settings: TransformSettings,
-    threads: int,
-) -> Reals:
-    """Return the contribution of a block of the difference of two fields to the witness functions, (orders, n)."""
-    lattice = weights.lattice
-    weighted = difference * lattice.trapezoid_weights(block)
-    shells = lattice.shells(block)
-    coefficients = np.empty((len(weights.orders), *block.shape), dtype=settings.dtype)
-    for row, weight in zip(coefficients, weights.per_shell, strict=True):
-        np.multiply(weighted, weight[shells], out=row, casting="same_kind")
-    spec = NufftSpec(block.shape, settings.eps, settings.dtype, threads=threads)
-    return evaluate_at(coordinates, coefficients, lattice, block, spec)
 
 
 def _coordinates(points: ArrayLike) -> Reals:

@@ -28,7 +28,7 @@ from sobolev_batch.transform.fourier import (
 from sobolev_batch.transform.kinds import kind_of
 from sobolev_batch.transform.lattice import AXES, Block, Lattice, Orders, SobolevWeights, check_orders, shell_sums
 from sobolev_batch.transform.nufft_costs import FINEST_EPS
-from sobolev_batch.transform.probe import COMMON, Probe, Sample, draws_for, needs_probe, norms_of_checks, probe_block
+from sobolev_batch.transform.probe import COMMON, Probe, Sample, draws_for, norms_of_checks, probe_block
 
 Operand = Surface | xr.DataArray
 # What people pass as an operand: see `as_mesh`.
@@ -218,17 +218,11 @@ def compute_field(
 
     A sample of the surface, drawn for these orders and `USUAL_DEGREE`, saves time.
     """
-    block = lattice.half
     kind = settings.kind_for(surface, lattice)
-    transformed = transform_block(surface, lattice, block, settings, execution, kind)
-    values = transformed.values
-    if not needs_probe(surface, settings):
-        probe = Probe()
-    elif sample is not None and kind.lowest_degree <= USUAL_DEGREE:
-        probe = probe_block(surface, lattice, settings, block, values, sample.draws, execution, sample)
-    else:
-        draws = draws_for([surface], lattice, orders, kind.lowest_degree, COMMON)
-        probe = probe_block(surface, lattice, settings, block, values, draws, execution)
+    transformed = transform_block(surface, lattice, lattice.half, settings, execution, kind)
+    values, sample = transformed.values, sample if kind.lowest_degree <= USUAL_DEGREE else None
+    draws = sample.draws if sample else draws_for([surface], lattice, orders, kind.lowest_degree, COMMON)
+    probe = probe_block(surface, lattice, settings, lattice.half, values, draws, execution, sample)
     quality = Quality.from_surface(surface, probe)
     return Field(values, transformed.points, transformed.backend, quality, settings)
 

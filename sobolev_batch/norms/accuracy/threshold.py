@@ -26,7 +26,7 @@ from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.norms.fields import USUAL_DEGREE, Field, compute_field
 from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, choose_settings, transform_block
 from sobolev_batch.transform.lattice import Lattice, SobolevWeights, shell_sums, shell_volumes
-from sobolev_batch.transform.probe import Sample, draws_for, needs_probe
+from sobolev_batch.transform.probe import Sample, draws_for
 
 Method = Literal["identical", "lattice", "octaves"]
 
@@ -216,9 +216,8 @@ def _fields(problem: Problem, lattice: Lattice, target: ErrorTarget) -> tuple[Fi
 
     def computed(surface: Surface) -> Field:
         sample, settings = Sample.from_surface(surface, draws), TransformSettings(dtype=dtype)
-        if needs_probe(surface, TransformSettings()):
-            # Where the prediction fails, bounds are wider, and the next lattice gets a stricter target.
-            settings = choose_settings(surface, lattice, target.tightened(_PREDICTION_CAUTION), settings)
+        # Where the prediction fails, bounds are wider, and the next lattice gets a stricter target.
+        settings = choose_settings(surface, lattice, target.tightened(_PREDICTION_CAUTION), settings)
         return compute_field(surface, lattice, settings, problem.orders, execution, sample=sample)
 
     with ThreadPoolExecutor(len(problem.surfaces)) as pool:
