@@ -167,7 +167,8 @@ class _Segment:
         """Return bounds on the largest terms (orders, fields) from peaks (fields, orders of peaks)."""
         logarithms, falling = np.log(np.maximum(peaks, np.finfo(np.float64).tiny)), -np.array(orders)
         chords = [np.interp(falling, -_PEAK_ORDERS, row) for row in logarithms]
-        return np.exp(np.reshape(chords, (len(peaks), len(orders))).T - np.log(self.least_length) * falling[:, None])
+        logarithms = np.reshape(chords, (len(peaks), len(orders))).T - np.log(self.least_length) * falling[:, None]
+        return np.asarray(np.exp(logarithms))
 
     def scatter(self, sums: Reals, moments: Reals, peaks: Reals, orders: Sequence[float]) -> Scatter:
         """Return how sums over these samples vary (orders, fields), from the segment's columns of `Spectra`.

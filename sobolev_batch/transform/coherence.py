@@ -89,7 +89,7 @@ def coherence(mesh: Mesh, highest: float, faces: FaceArrays | None = None, backe
     def transform(backend: Backend) -> Complexes:
         uploaded = WeightedPoints(backend.upload(points), backend.upload(weights))
         spec = NufftSpec(lattice.shape, _EPS, "complex64")
-        return backend.download(transform_points([uploaded], lattice, lattice.half, spec, backend)[0])
+        return np.asarray(backend.download(transform_points([uploaded], lattice, lattice.half, spec, backend)[0]))
 
     values = compute_on(backend, transform)
     places, numbers, radii = _ranges(count)
