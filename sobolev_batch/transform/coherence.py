@@ -83,8 +83,9 @@ def coherence(mesh: Mesh, highest: float, faces: FaceArrays | None = None, backe
     centers -= (centers.min(axis=1, keepdims=True) + centers.max(axis=1, keepdims=True)) / 2
     limit = highest / math.sqrt(3)
     count = math.ceil(2 * _PADDING * (float(np.abs(centers).max()) + length) * limit)
-    points = np.concatenate([centers, *(centers + corners)], axis=1)
-    weights, lattice = np.concatenate([-areas, np.tile(areas / 3, 3)]), Lattice(limit, 2 * count)
+    # In units in which the spacing is one.
+    points = np.concatenate([centers, *(centers + corners)], axis=1) * (limit / count)
+    weights, lattice = np.concatenate([-areas, np.tile(areas / 3, 3)]), Lattice(count, 2 * count)
 
     def transform(backend: Backend) -> Complexes:
         uploaded = WeightedPoints(backend.upload(points), backend.upload(weights))
