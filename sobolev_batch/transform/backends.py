@@ -131,20 +131,16 @@ class Backend:
         oversampling must be set. cuFINUFFT raises RuntimeError without a reason.
         """
         # FINUFFT warns of thread counts and of tolerances, which are checked before.
-        return finufft.Plan(
-            2 if adjoint else 1,
-            spec.shape,
-            eps=spec.eps,
-            isign=1 if adjoint else -1,
-            dtype=spec.dtype,
-            modeord=0,
-            nthreads=spec.threads,
-            upsampfac=spec.oversampling,
-            showwarn=0,
-        )
+        options = _common_options(spec, adjoint)
+        return finufft.Plan(2 if adjoint else 1, spec.shape, **options, nthreads=spec.threads, showwarn=0)
 
     def __reduce__(self) -> str | tuple[object, ...]:
         return "CPU"
+
+
+def _common_options(spec: NufftSpec, adjoint: bool) -> dict[str, Any]:
+    options = {"eps": spec.eps, "dtype": spec.dtype, "upsampfac": spec.oversampling}
+    return {**options, "isign": 1 if adjoint else -1, "modeord": 0}
 
 
 CPU = Backend()
@@ -266,12 +262,8 @@ class Gpu(Backend):
         return _plan_class(self.cufinufft)(
             2 if adjoint else 1,
             spec.shape,
+            **_common_options(spec, adjoint),
             n_trans=1,
-            eps=spec.eps,
-            isign=1 if adjoint else -1,
-            dtype=spec.dtype,
-            modeord=0,
-            upsampfac=spec.oversampling,
             gpu_method=method,
             gpu_sort=1,
             gpu_kerevalmeth=1,

@@ -105,7 +105,7 @@ class Frequencies:
         squares = self.weights.per_shell @ shells
         for weights, octave in zip(self._octave_weights, own.octaves, strict=True):
             factors = 2 - 2 * np.sinc(2 * weights.sampling.radii * length)
-            squares = squares + weights.integrals(squared_moduli(octave) * factors)
+            squares = squares + weights.by_order[:-1] @ (squared_moduli(octave) * factors)
         if (tail := self.tail(own, [surface], [1])) is not None:
             means = np.array([mean_sinc(self._cutoff, order, length) for order in self.orders])
             squares = squares + (2 - 2 * means) * tail.remainder

@@ -62,10 +62,6 @@ class OctaveWeights:
         """Integral of the octave's window over |ξ|."""
         return self.sampling.octave.integral(0.0)
 
-    def integrals(self, products: Reals) -> Reals:
-        """Return ∫ window (1+|ξ|²)^s products for each order (orders,), from values at all samples (n,)."""
-        return np.asarray(self.by_order[:-1] @ products)
-
     def sums(self, squares: Reals) -> OctaveSums:
         """Return the integrals of |field|², or of products of two fields, with variances, from all samples (n,)."""
         sums, scatters = np.zeros(len(self.by_order)), []
