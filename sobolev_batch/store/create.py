@@ -41,6 +41,7 @@ from sobolev_batch.store.lock import LOCK_KEYS
 from sobolev_batch.store.metadata import SCHEMA_VERSION, chunk_shape
 from sobolev_batch.store.records import Record, Records
 from sobolev_batch.study.plan import Plan
+from sobolev_batch.study.study import Study
 from sobolev_batch.transform.fourier import NUMERICS_VERSION
 from sobolev_batch.transform.lattice import AXES, smooth_step
 
@@ -52,6 +53,7 @@ _SPECTRA_BYTES, _MOST_SPECTRA = 2 << 20, 512
 # Records that lie together once a run has ended.
 ROWS_PER_PAGE = 100
 _RECORDED_VERSIONS = ("sobolev-batch", "finufft", "numpy", "scipy", "xarray", "zarr")
+_version = cache(version)
 
 
 class OtherStudyError(StoreError):
@@ -118,7 +120,9 @@ def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
         is_same = attributes["study"].items() >= {"name": plan.name, **lattice}.items()
         altered = DamageError("the metadata at the root are damaged", "they are not what was written")
         return _mended(store, plan, None if is_same else altered)
-    _check_same_study(store, plan)
+    # The store of an object lies in that of the whole study.
+    place = store.location.beside("") if plan.study.object.name else store.location
+    require_same_study(place, attributes["study"], plan.name, plan.study)
     store.location.remove_partial_files()
     if not attributes["study"].items() >= lattice.items():
         _log.warning("%s: the study needs another lattice than its fields have; all are computed again", store.path)
@@ -314,38 +318,28 @@ def _require_same_samples(store: Store, plan: Plan) -> None:
         )
 
 
-def _check_same_study(store: Store, plan: Plan) -> None:
-    study = store.attributes()["study"]
-    # A chosen lattice may be chosen anew; a given one is part of the study.
-    may_change = plan.study.accuracy is not None and study.get("choice")
-    comparisons = [("the study", repr(study["name"]), repr(plan.name))]
-    if not may_change:
-        comparisons.append(lattices_text(study["lattice"], _lattice_entry(plan)["lattice"]))
-        comparisons.append(("dtype", repr(study["dtype"]), repr(plan.choice.dtype)))
-        # Their frequencies follow from the reference, which may change.
-        comparisons.append(("octaves:", octaves_in(study), octaves_in(_lattice_entry(plan))))
-    # The store of an object lies in that of the whole study.
-    require_equal(store.location.beside("") if plan.study.object.name else store.location, comparisons)
+def require_same_study(location: Location, held: Mapping[str, Any], name: str, study: Study) -> None:
+    """Refuse a study, by an OtherStudyError, of another name or of other fields than the entry in a store's attributes.
 
-
-def require_equal(location: Location, comparisons: Sequence[tuple[str, str, str]]) -> None:
-    """Refuse a store of another study, in which something is this and not that, by an OtherStudyError."""
-    if differences := [f"{what} {old}, not {new}" for what, old, new in comparisons if old != new]:
+    A lattice that an accuracy has chosen may be chosen anew; a given one is part of the study.
+    """
+    compared = [("the study", repr(held["name"]), repr(name))]
+    lattice = f"xi_max {held['lattice']['xi_max']:.6g} and M {held['lattice']['M']}"
+    if study.lattice is not None:
+        # The frequencies of octaves follow from the reference, which may change.
+        octaves = len(held["octaves"]["octaves"]) if held.get("octaves") else 0
+        compared += [
+            ("a lattice of", lattice, f"xi_max {study.lattice.xi_max:.6g} and M {study.lattice.M}"),
+            ("dtype", repr(held["dtype"]), repr(study.transform.dtype)),
+            ("octaves:", str(octaves or "none"), str(study.octaves or "none")),
+        ]
+    elif not held.get("choice"):
+        compared.append(("a lattice of", lattice, "an accuracy"))
+    if differences := [f"{what} {old}, not {new}" for what, old, new in compared if old != new]:
         raise OtherStudyError(
             f"{location}: it holds a store of another study, with {'; '.join(differences)}. "
             "Name another store, or remove this one"
         )
-
-
-def octaves_in(study: Mapping[str, Any]) -> str:
-    """Return the number of octaves that the fields of a study have, by its entry in the attributes of their store."""
-    return str(len(study["octaves"]["octaves"])) if study.get("octaves") else "none"
-
-
-def lattices_text(old: Mapping[str, Any] | None, new: Mapping[str, Any] | None) -> tuple[str, str, str]:
-    """Return the comparison of the lattices of two studies; None is one that an accuracy chooses."""
-    before, now = (f"xi_max {one['xi_max']:.6g} and M {one['M']}" if one else "an accuracy" for one in (old, new))
-    return "a lattice of", before, now
 
 
 def labels_for(plan: Plan, stored: Sequence[str], records: Sequence[Record | None], *, is_trusted: bool) -> list[str]:
@@ -393,13 +387,8 @@ def _attributes(plan: Plan, labels: Sequence[str]) -> dict[str, Any]:
         },
         REMOVED: [label for label in labels if label not in planned],
         "similarity": {"scale": plan.similarity.scale, "origin": list(plan.similarity.origin)},
-        "versions": {**_versions(), NUMERICS: NUMERICS_VERSION},
+        "versions": {**{name: _version(name) for name in _RECORDED_VERSIONS}, NUMERICS: NUMERICS_VERSION},
     }
-
-
-@cache
-def _versions() -> dict[str, str]:
-    return {name: version(name) for name in _RECORDED_VERSIONS}
 
 
 def _lattice_entry(plan: Plan) -> dict[str, Any]:

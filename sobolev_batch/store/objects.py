@@ -11,7 +11,7 @@ from typing import Any, Self, TypeVar
 
 from sobolev_batch.errors import DamageError, InputError, StoreError
 from sobolev_batch.sources.names import node_problem, quoted
-from sobolev_batch.store.create import lattices_text, list_records, octaves_in, record_keys, require_equal
+from sobolev_batch.store.create import list_records, record_keys, require_same_study
 from sobolev_batch.store.encoding import ROOT, group_document
 from sobolev_batch.store.layout import DESCRIPTION, OBJECTS, PAGE, RECORD, RECORDS, TABLES_OF_ALL, TAGS, Store
 from sobolev_batch.store.location import Location
@@ -107,19 +107,12 @@ class Objects:
         """Refuse other fields, as stores of objects do, before the root has the table of the other study."""
         if all(self.table.get(section) == study.table.get(section) for section in ("lattice", "transform")):
             return
-        given = study.table.get("lattice")
         for name in self.recorded():
             with suppress(DamageError):
-                if (place := self.existing_store(name)) is None:
-                    continue
-                held = Store(place).attributes()["study"]
-                dtypes = "dtype", repr(held["dtype"]), repr(study.table.get("transform", {}).get("dtype", "complex128"))
-                if given or not held.get("choice"):
-                    of_given = (
-                        [dtypes, ("octaves:", octaves_in(held), str(given.get("octaves") or "none"))] if given else []
-                    )
-                    require_equal(self.location, [lattices_text(held["lattice"], given), *of_given])
-                return
+                if (place := self.existing_store(name)) is not None:
+                    held = Store(place).attributes()["study"]
+                    require_same_study(self.location, held, held["name"], study)
+                    return
 
     @classmethod
     def prepared(cls, location: Location, study: Study) -> Self:
