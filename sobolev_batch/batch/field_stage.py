@@ -7,9 +7,9 @@ from dataclasses import replace
 from itertools import repeat
 from typing import Any
 
-from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, describe_failure
+from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, describe_failure, outcomes_here
 from sobolev_batch.batch.field_costs import BlockGroups, is_predictable, reference_in_tasks, row_seconds, size_rows
-from sobolev_batch.batch.field_tasks import Job, compute_group, compute_mesh, compute_parts, finish_mesh
+from sobolev_batch.batch.field_tasks import Job, compute_mesh, compute_parts, finish_mesh
 from sobolev_batch.store.lock import utc_now
 from sobolev_batch.store.records import Record, Records
 from sobolev_batch.store.workspace import Workspace
@@ -91,8 +91,9 @@ def _grouped(tasks: Sequence[Task]) -> Task:
         return first
     return replace(
         first,
-        function=compute_group,
-        arguments=([task.arguments for task in tasks],),
+        function=outcomes_here,
+        # A list of tasks would be done before, each by itself.
+        arguments=(tuple(tasks),),
         projected_bytes=max(task.projected_bytes for task in tasks),
         label=f"{first.label} and {len(others)} more",
         divided=tuple(tasks),

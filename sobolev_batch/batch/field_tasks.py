@@ -182,19 +182,6 @@ def compute_mesh(job: Job, blocks: Sequence[Block]) -> Record:
     return stored if isinstance(stored, Record) else _finished(job, stored)
 
 
-def compute_group(meshes: Sequence[tuple[Job, Sequence[Block]]]) -> list[Record | Exception]:
-    """Do `compute_mesh` for several small meshes; return the record of each, or its exception."""
-    outcomes: list[Record | Exception] = []
-    for job, blocks in meshes:
-        try:
-            outcomes.append(compute_mesh(job, blocks))
-        except StoreError:
-            raise
-        except Exception as error:
-            outcomes.append(error)
-    return outcomes
-
-
 def compute_parts(job: Job, blocks: Sequence[Block] = (), octaves: bool = False) -> list[StoredBlocks] | Record:
     """Compute and store some blocks of a mesh's field, and its values in octaves; see `compute_mesh`.
 

@@ -123,11 +123,6 @@ class Cluster:
     study: str = ""
     part: str = ""
 
-    @property
-    def most_in_flight(self) -> int:
-        """Number of tasks that the scheduler knows of at a time."""
-        return max(_FEWEST_IN_FLIGHT, _IN_FLIGHT_PER_THREAD * self.workers.threads)
-
     def count_steps(self, stage: Stage, total: int) -> Callable[[str, Record | None], None]:
         """Report the start of a stage with its number of steps, and return a function that reports each by label."""
         done = count(1)
@@ -172,11 +167,6 @@ class Wave:
     take: Callable[[Task, Any], None]
     projected_bytes: float = 0.0
 
-    @property
-    def claims_memory(self) -> bool:
-        """True where the scheduler has to count the memory of the tasks."""
-        return self.projected_bytes > self.cluster.workers.allowed_bytes_per_task
-
 
 # A run, or a part of one, as a generator: it yields the waves that it waits for, and returns its result.
 Stages = Generator[Wave, None, Result]
@@ -205,7 +195,7 @@ def in_place(stages: Stages[Result]) -> Result:
             error = None
             try:
                 for task in wave.tasks:
-                    wave.take(task, _outcome_here(task))
+                    wave.take(task, *outcomes_here([task]))
             except Exception as failure:
                 error = failure
     except StopIteration as end:
@@ -213,20 +203,23 @@ def in_place(stages: Stages[Result]) -> Result:
         return result
 
 
-def _outcome_here(task: Task) -> Any:
-    """Return the result of a task, or its exception."""
+def outcomes_here(tasks: Sequence[Task]) -> list[Any]:
+    """Do tasks one after the other, and return the result of each, or its exception; a StoreError ends it."""
 
     def done(argument: Any) -> Any:
         if isinstance(argument, list):
             return [done(one) for one in argument]
         return argument.function(*map(done, argument.arguments)) if isinstance(argument, Task) else argument
 
-    try:
-        return done(task)
-    except StoreError:
-        raise
-    except Exception as error:
-        return error
+    outcomes = []
+    for task in tasks:
+        try:
+            outcomes.append(done(task))
+        except StoreError:
+            raise
+        except Exception as error:
+            outcomes.append(error)
+    return outcomes
 
 
 def side_by_side(
@@ -307,7 +300,8 @@ class _Loop(Generic[Result]):
             if not self._ready:
                 continue
             run = self._ready[0]
-            if len(self._running) >= run.wave.cluster.most_in_flight:
+            threads = run.wave.cluster.workers.threads
+            if len(self._running) >= max(_FEWEST_IN_FLIGHT, _IN_FLIGHT_PER_THREAD * threads):
                 return
             self._ready.rotate(-1)
             try:
@@ -341,7 +335,8 @@ class _Loop(Generic[Result]):
         if self._completed is None:
             self._completed = as_completed(loop=cluster.client.loop)
             self._most_runs = max(_FEWEST_RUNS, _RUNS_PER_THREAD * cluster.workers.threads)
-        future = cluster.submit(task, run.wave.claims_memory)
+        claims_memory = run.wave.projected_bytes > cluster.workers.allowed_bytes_per_task
+        future = cluster.submit(task, claims_memory)
         self._running[future] = run, task
         run.in_flight += 1
         self._completed.add(future)
