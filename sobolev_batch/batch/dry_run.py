@@ -276,14 +276,6 @@ def _task_lines(plan: Plan, sizes: Mapping[str, Sizes]) -> Iterator[tuple[str, s
         yield "all pairs", f"{tile_count(len(plan.rows))} tiles, {format_bytes(needed)} on disk"
 
 
-def _workers_text(workers: Workers) -> str:
-    gpus = sum(member.backend == "gpu" for member in workers.members)
-    return (
-        f"{len(workers.members)}, with {workers.threads} threads and {gpus} GPUs together; for tasks, "
-        f"{format_bytes(workers.allowed_bytes_per_task)} or more of memory a thread"
-    )
-
-
 def plan(
     study: StudyLike,
     store: StoreLike = None,
@@ -399,7 +391,7 @@ def _plan(study: Study, location: Location, workers: Workers, client: Client | N
     stored = {} if workspace is None else {workspace.labels[i]: record for i, record in workspace.stored.items()}
     seconds, basis = seconds_of_missing(study_plan, stored, workers, client)
     bases.update(filter(None, [basis]))
-    doubtful, count = _doubts_of(study_plan, stored), len(study_plan.rows)
+    doubtful, gpus = _doubts_of(study_plan, stored), sum(one.backend == "gpu" for one in workers.members)
     return ObjectPlan(
         store=str(location),
         labels=tuple(row.label for row in study_plan.rows),
@@ -419,11 +411,15 @@ def _plan(study: Study, location: Location, workers: Workers, client: Client | N
         lacks_tables=not seconds and (workspace is None or not lacks_nothing(workspace)),
         lines=(
             *_task_lines(study_plan, sizes),
-            ("store", f"{location}, {len(stored)} of {count} already stored"),
+            ("store", f"{location}, {len(stored)} of {len(study_plan.rows)} already stored"),
             *reasons("refused", refused),
             *reasons("doubtful", doubtful),
             *_study_lines(study_plan),
-            ("workers", _workers_text(workers)),
+            (
+                "workers",
+                f"{len(workers.members)}, with {workers.threads} threads and {gpus} GPUs together; for tasks, "
+                f"{format_bytes(workers.allowed_bytes_per_task)} or more of memory a thread",
+            ),
         ),
     )
 

@@ -144,34 +144,33 @@ def _load(row: Row, digest: str, similarity: Similarity) -> Mesh:
     return surface
 
 
-def _keys(workspace: Workspace) -> dict[int, str]:
-    """Return the key of the distances of each mesh that the study requests: a digest of all they depend on."""
+def _requested(workspace: Workspace) -> dict[int, tuple[str, ProximityRecord | None]]:
+    """Return the key of the distances of each mesh that the study requests, and what was measured of them, by row.
+
+    The key is a digest of all that they depend on.
+    """
     requested, complete, reference = workspace.plan.study.proximity, workspace.complete, workspace.reference
     if requested is None or reference not in complete:
         return {}
     settings = requested.points, requested.threshold, workspace.plan.similarity.scale
-    return {
-        i: digest_of([_VERSION, record.facts.digest, complete[reference].facts.digest, *settings])
-        for i, record in complete.items()
+    found = {}
+    for i, record in complete.items():
         # Closed forms have no triangles.
-        if i != reference and record.facts.triangles
-    }
+        if i != reference and record.facts.triangles:
+            key = digest_of([_VERSION, record.facts.digest, complete[reference].facts.digest, *settings])
+            found[i] = key, record.proximity if record.proximity and record.proximity.key == key else None
+    return found
 
 
 def _pending(workspace: Workspace) -> dict[int, str]:
     """Return the keys of the distances that are to be measured, by the rows of their meshes."""
-    measured = {i: record.proximity for i, record in workspace.complete.items()}
-    return {
-        i: key for i, key in _keys(workspace).items() if (record := measured[i]) is None or not record.completes(key)
-    }
+    return {i: key for i, (key, record) in _requested(workspace).items() if record is None or record.reason}
 
 
 def _current(workspace: Workspace) -> list[tuple[str, ProximityRecord | None]]:
     """Return the labels of the meshes in the order of tables, and the distances that belong to what they are now."""
-    keys, complete = _keys(workspace), workspace.complete
-    measured = {i: complete[i].proximity for i in keys}
-    current = {i: record for i, record in measured.items() if record and record.key == keys[i]}
-    return [(workspace.labels[i], current.get(i)) for i, _, _ in table_order(workspace)]
+    measured = _requested(workspace)
+    return [(workspace.labels[i], measured.get(i, ("", None))[1]) for i, _, _ in table_order(workspace)]
 
 
 def _dataset(workspace: Workspace, requested: ProximitySection) -> xr.Dataset:

@@ -203,8 +203,9 @@ def carry_out(
         def runs() -> Iterator[tuple[str, Stages[Ended]]]:
             for name in study.objects:
                 one = study.of_object(name)
-                if _is_left_out(one):
-                    continue
+                with suppress(InputError):  # Its run says what cannot be listed.
+                    if name and study.only and not one.object.chosen(study.only):
+                        continue
                 record = recorded.get(name)
                 known = record if name in whole else None
                 before = ended_before(one, known) if at_hand is None else ended_already(at_hand)
@@ -253,14 +254,6 @@ def _own_cluster(
         memory_limit(memory, workers or available_cores())
     # In threads, where no other process would see the store.
     return thread_client(workers) if location.is_in_memory else local_client(workers, memory)
-
-
-def _is_left_out(study: Study) -> bool:
-    """Tell whether a run of a part of a study takes nothing of an object."""
-    # Its run says what cannot be listed.
-    with suppress(InputError):
-        return bool(study.object.name and study.only) and not study.object.chosen(study.only)
-    return False
 
 
 def _complete_records(objects: Objects, recorded: Mapping[str, ObjectRecord], ended: Mapping[str, Ended]) -> None:

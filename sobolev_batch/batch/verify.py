@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -188,7 +188,13 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, *, may
         if tables.keys().isdisjoint(store.keyed_arrays()):
             chunks = dict(damaged_chunks(store))
         if not tables:
-            chunks = dict.fromkeys(_stale(store), "it is not that of the stored fields") | chunks
+            pairs = Pairs.tabulated(store)
+            stale: list[tuple[str, Index]] = [
+                (SPECTRA_KEYS, (n,)) for n in stale_chunks(store, spectrum_keys(pairs.keys, pairs.reference))
+            ]
+            stale += [(PAIRS_KEYS, tile) for tile in (pairs.stale() if PAIRS_KEYS in store.documents else ())]
+            # Their fields are others by now.
+            chunks = dict.fromkeys(stale, "it is not that of the stored fields") | chunks
     complete = contents.complete
     planned = store.attributes().get("versions", {}).get(NUMERICS)
     for row, record in complete.items():
@@ -242,11 +248,3 @@ def _damaged_tables(store: Store) -> dict[str, str]:
             except DamageError as error:
                 damage[name] = error.what
     return damage
-
-
-def _stale(store: Store) -> Iterator[tuple[str, Index]]:
-    """Yield the places of chunks of spectra, and of distances of pairs, whose fields are others by now."""
-    pairs = Pairs.tabulated(store)
-    yield from ((SPECTRA_KEYS, (n,)) for n in stale_chunks(store, spectrum_keys(pairs.keys, pairs.reference)))
-    if PAIRS_KEYS in store.documents:
-        yield from ((PAIRS_KEYS, tile) for tile in pairs.stale())

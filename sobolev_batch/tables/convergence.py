@@ -185,13 +185,10 @@ def tables_of(
         tree = as_tree(store)
         if not has_objects(tree):
             return {"": _table(tree, order, x)}
-        stored = (
-            finished_group(tree, "convergence", load=False)["order"].values
-            if "convergence" in tree.children
-            else np.empty(0)
-        )
-        if stored.size and (order is None or np.isin(order, stored).all()):
-            return _divided(_rows(tree, order), x)
+        if "convergence" in tree.children:
+            stored = finished_group(tree, "convergence", load=False)["order"].values
+            if order is None or np.isin(order, stored).all():
+                return _divided(_rows(tree, order), x)
     trees = {name: as_tree(place) for name, place in stores_of(store).items()}
     finished = {name: tree for name, tree in trees.items() if "convergence" in tree.children}
     if not finished:
