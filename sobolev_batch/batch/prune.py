@@ -1,14 +1,13 @@
 """Pruning: what a store keeps and no record needs, counted and removed."""
 
 from collections import Counter
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 
-from sobolev_batch.errors import StoreError
 from sobolev_batch.store.encoding import ROOT
-from sobolev_batch.store.layout import FIELD, OCTAVES, QUALITY, RECORDS, TABLES_OF_ALL, TAGS, Store
+from sobolev_batch.store.layout import FIELD, OCTAVES, QUALITY, TAGS, Store
 from sobolev_batch.store.location import PARTIAL_FILE, Location
 from sobolev_batch.store.lock import LOCK_KEYS, Lock, locked
-from sobolev_batch.store.objects import Objects, root_of
+from sobolev_batch.store.objects import Objects, lost_objects, root_of
 from sobolev_batch.store.records import Records
 from sobolev_batch.store.workspace import Contents
 
@@ -25,16 +24,10 @@ def prune_lost_objects(location: Location, *, is_dry: bool = True) -> int:
     if objects is None:
         return 0
     with nullcontext() if is_dry else locked(location, Lock.of_this_process()):
-        own = {*objects.names, *TABLES_OF_ALL, RECORDS, ROOT, TAGS, *LOCK_KEYS}
-        for name in sorted(location.names() - own):
-            # Whatever else lies there is not ours, and another store least of all.
-            place = None
-            with suppress(StoreError):
-                place = objects.existing_store(name)
-            if place is not None:
-                total += sum(place.sizes("").values())
-                if not is_dry:
-                    location.remove(name)
+        for name in lost_objects(location, objects.name, objects.names):
+            total += sum(location.below(name).sizes("").values())
+            if not is_dry:
+                location.remove(name)
     return total
 
 

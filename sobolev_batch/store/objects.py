@@ -3,7 +3,7 @@
 A study that names no object has its only one at the root itself.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,6 +21,8 @@ from sobolev_batch.store.records import ObjectRecord, Records
 from sobolev_batch.study.study import Study
 
 Result = TypeVar("Result")
+# What a root has beside its objects.
+_AT_ROOT = frozenset({ROOT, RECORDS, TAGS, *LOCK_KEYS, *TABLES_OF_ALL})
 
 
 @dataclass(frozen=True)
@@ -122,9 +124,7 @@ class Objects:
             present = cls.read(location)
         if present is None:
             # Where it is damaged, the stores of the objects are still there, and of those that the study has lost.
-            own = {ROOT, RECORDS, TAGS, *LOCK_KEYS, *TABLES_OF_ALL, *study.objects}
-            lost = {name for name in location.names() - own if _is_store_of(study.name, name, location.below(name))}
-            location.require_free(own | lost)
+            location.require_free(_AT_ROOT.union(study.objects, lost_objects(location, study.name, study.objects)))
         elif present.name != study.name:
             raise StoreError(
                 f"{location}: it holds the store of another study, {present.name!r}, not {study.name!r}; "
@@ -156,11 +156,17 @@ class Objects:
         return made
 
 
-def _is_store_of(study: str, name: str, location: Location) -> bool:
-    """Tell whether a location has the store of an object of a study."""
-    with suppress(StoreError):
-        return bool(Store(location).attributes()["study"]["name"] == f"{study} {name}")
-    return False
+def lost_objects(location: Location, study: str, known: Iterable[str]) -> list[str]:
+    """Return the names at a root, sorted, that have stores of objects of a study, but for those of known objects.
+
+    Whatever else lies there is not ours, and another store least of all.
+    """
+    lost = []
+    for name in sorted(location.names() - _AT_ROOT.union(known)):
+        with suppress(StoreError):
+            if Store(location.below(name)).attributes()["study"]["name"] == f"{study} {name}":
+                lost.append(name)
+    return lost
 
 
 def stores_below(location: Location) -> dict[str, Location]:

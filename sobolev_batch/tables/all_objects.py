@@ -7,12 +7,11 @@ import logging
 import pickle
 import zlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from itertools import islice
+from itertools import chain, islice
 from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from sobolev_batch.norms.columns import describe
 from sobolev_batch.store.encoding import with_coordinates
@@ -97,43 +96,45 @@ def _joined(parts: Sequence[Tables]) -> dict[str, xr.Dataset]:
     of_groups = {
         group: [part[group] for part in parts if group in part and part[group].sizes["mesh"]] for group in TABLES_OF_ALL
     }
-    return {group: _concatenated(tables) for group, tables in of_groups.items() if tables}
+    return {group: concatenated(tables) for group, tables in of_groups.items() if tables}
 
 
-def _concatenated(tables: Sequence[xr.Dataset]) -> xr.Dataset:
+def concatenated(tables: Sequence[xr.Dataset]) -> xr.Dataset:
     """Return tables after each other, with NaN or empty texts where only others have a column.
 
-    xarray's own function takes milliseconds for each column of each table.
+    Of attributes that differ, those stay that are lists: with what is in any of them. Dask arrays stay lazy. xarray's
+    own function takes milliseconds for each column of each table.
     """
     known = {name: variable for table in reversed(tables) for name, variable in table.variables.items()}
-    columns: dict[Any, tuple[tuple[Any, ...], NDArray[Any]]] = {}
+    columns: dict[Any, xr.Variable] = {}
     for name, model in known.items():
+        columns[name] = model.drop_encoding()
         if "mesh" in model.dims:
             found = [
-                table.variables[name].values if name in table.variables else _missing(model, table.sizes["mesh"])
+                table.variables[name] if name in table.variables else _missing(model, table.sizes["mesh"])
                 for table in tables
             ]
             # Metadata that are numbers of one object may be texts of another.
-            is_text = [values.dtype.kind in _TEXTS for values in found]
-            if any(is_text):
-                found = [values if text else _as_texts(values) for values, text in zip(found, is_text, strict=True)]
-            columns[name] = model.dims, np.concatenate(found)
-        else:
-            columns[name] = model.dims, model.values
+            if any(one.dtype.kind in _TEXTS for one in found):
+                found = [one if one.dtype.kind in _TEXTS else _as_texts(one) for one in found]
+            columns[name] = xr.Variable(model.dims, np.concatenate([one.data for one in found]), model.attrs)
     coordinates = {name for table in tables for name in table.coords}
-    attributes = dict(tables[0].attrs)
-    for name in {"metadata", NUMERICS} & attributes.keys():
-        attributes[name] = list(dict.fromkeys(one for table in tables for one in table.attrs.get(name, ())))
+    attributes = {}
+    for name, value in tables[0].attrs.items():
+        values = [table.attrs.get(name, value) for table in tables]
+        if name in ("metadata", NUMERICS):
+            attributes[name] = list(dict.fromkeys(chain(*values)))
+        elif all(one == value for one in values):
+            attributes[name] = value
     return describe(xr.Dataset(columns, attrs=attributes).set_coords(list(coordinates)))
 
 
-def _as_texts(numbers: NDArray[Any]) -> NDArray[Any]:
-    texts = ["" if np.isnan(number) else str(number).removesuffix(".0") for number in numbers.tolist()]
-    return np.array(texts, dtype=object)
+def _as_texts(numbers: xr.Variable) -> xr.Variable:
+    texts = ["" if np.isnan(number) else str(number).removesuffix(".0") for number in numbers.values.tolist()]
+    return xr.Variable("mesh", np.array(texts, dtype=object))
 
 
-def _missing(model: xr.Variable, count: int) -> NDArray[Any]:
-    shape = (count, *model.shape[1:])
-    if model.dtype.kind in _TEXTS:
-        return np.full(shape, "", dtype=object)
-    return np.full(shape, np.datetime64("NaT", "s") if model.dtype.kind == "M" else np.nan)
+def _missing(model: xr.Variable, count: int) -> xr.Variable:
+    kind, shape = model.dtype.kind, (count, *model.shape[1:])
+    absent = np.datetime64("NaT", "s") if kind == "M" else "" if kind in _TEXTS else np.nan
+    return xr.Variable(model.dims, np.full(shape, absent, model.dtype if kind in _TEXTS else None), model.attrs)

@@ -15,7 +15,6 @@ import xarray as xr
 
 from sobolev_batch.errors import DamageError, InputError, StoreError, one_line
 from sobolev_batch.geometry.surface import Similarity, placement_doubt
-from sobolev_batch.norms.columns import describe
 from sobolev_batch.norms.fields import Quality
 from sobolev_batch.parameters import as_names
 from sobolev_batch.sources.names import quoted
@@ -36,6 +35,7 @@ from sobolev_batch.store.layout import (
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.metadata import mapping_in
 from sobolev_batch.store.objects import stores_below
+from sobolev_batch.tables.all_objects import concatenated
 from sobolev_batch.visible import FILE_UNITS
 
 _log = logging.getLogger(__name__)
@@ -133,13 +133,12 @@ def _joined(trees: Sequence[xr.DataTree]) -> xr.DataTree:
     orders = [s for s in study["orders"] if all(s in others for others in stored)]
     firsts = [*accumulate((store_of(tree).row_count for tree in trees), initial=0)]
     groups = {
-        group: _concatenated(
+        group: concatenated(
             [_part(tree, group, own, first, orders) for tree, own, first in zip(trees, names, firsts, strict=False)]
         )
         for group in trees[0].children
         if group != RECORDS and all(group in tree.children for tree in trees)
     }
-    groups["meshes"].attrs["metadata"] = list(dict.fromkeys(chain(*map(metadata_of, trees))))
     groups["convergence"].attrs["reference"] = reference_of(trees[0])
     title = " + ".join(str(tree.attrs["title"]) for tree in trees)
     joined = xr.DataTree.from_dict(groups)
@@ -184,26 +183,8 @@ def _part(tree: xr.DataTree, group: str, names: Mapping[str, str], first: int, o
         columns["family"] = [f"{begin}{family}" for begin, family in zip(begins, part["family"].values, strict=True)]
     if "row" in part:
         part = part.assign(row=part["row"] + first)
-    return part.assign_coords({name: ("mesh", np.array(texts, dtype=object)) for name, texts in columns.items()})
-
-
-def _concatenated(parts: Sequence[xr.Dataset]) -> xr.Dataset:
-    """Return parts one after the other, with NaN or empty texts where only others have a coordinate."""
-    known = {name: column for part in parts for name, column in part.coords.items() if column.dims == ("mesh",)}
-    filled = []
-    for part in parts:
-        lacking = {
-            name: np.nan if known[name].dtype.kind in "fiu" else "" for name in known.keys() - part.coords.keys()
-        }
-        columns = {name: ("mesh", np.full(part.sizes["mesh"], absent, object)) for name, absent in lacking.items()}
-        same = {"other": parts[0]["other"]} if "other" in part.dims else {}
-        filled.append(part.assign_coords({**columns, **same}))
-    return describe(
-        xr.concat(
-            filled, "mesh", data_vars="minimal", coords="minimal", compat="override", join="exact",
-            combine_attrs="drop_conflicts",
-        )
-    )  # fmt: skip
+    dtype = part["mesh"].dtype
+    return part.assign_coords({name: ("mesh", np.array(texts, dtype)) for name, texts in columns.items()})
 
 
 def store_of(tree: xr.DataTree) -> Store:
