@@ -203,8 +203,8 @@ def compute_parts(job: Job, blocks: Sequence[Block] = (), octaves: bool = False)
                 stored.append(
                     _store_whole(job, surface, target) if is_whole else _store_blocks(job, surface, blocks, target)
                 )
-            if octaves:
-                stored.append(_store_octaves(job, surface, target))
+            if octaves and job.tail is not None:
+                stored.append(_store_octaves(job, job.tail, surface, target))
             elif blocks and blocks[0].start == job.lattice.half.start and (quality := stored[0].quality) is not None:
                 stored[0] = replace(stored[0], quality=replace(quality, beyond=_beyond_given(job, surface)))
     except StoreError:
@@ -220,19 +220,22 @@ def finish_mesh(job: Job, parts: Sequence[list[StoredBlocks] | Record]) -> Recor
     return record or _finished(job, [stored for part in parts if isinstance(part, list) for stored in part])
 
 
-def _store_octaves(job: Job, surface: Surface, target: ErrorTarget | None) -> StoredBlocks:
+def _store_octaves(job: Job, tail: TailSampling, surface: Surface, target: ErrorTarget | None) -> StoredBlocks:
     """Compute and store a surface's values at all samples of octaves."""
-    tail = job.tail
-    if tail is None:
-        raise ValueError("the study has no octaves")
     settings = target.tightened(_OCTAVES_TIGHTENING) if target else job.transform
     values = [octave_values(surface, octave, job.orders, settings, job.execution) for octave in tail.octaves]
-    cutoff, reference = tail.highest_frequency, job.load_reference()
+    cutoff, difference = tail.highest_frequency, None
+    if (reference := job.load_reference()) is not None:
+        # Only what they do not have in common counts.
+        rests = without_common_parts((surface, reference))
+        difference = Remainder.between(0.0, 0.0, cutoff)
+        if rests:
+            difference = remainder(list(rests.values()), list(rests), cutoff, execution=job.execution)
     quality = TailQuality(
         tuple(float(radius) for octave in values for radius in octave.radii),
         tuple(float(square) for octave in values for square in octave.squares),
         remainder([surface], [1], cutoff, execution=job.execution, is_scale=True),
-        None if reference is None else _remainder_between(surface, reference, cutoff, job.execution),
+        difference,
     )
     samples = np.concatenate([octave.values for octave in values])
     checksum = Fields(job.store).write(job.index, (slice(0, len(samples)),), samples)
@@ -256,14 +259,6 @@ def _beyond_given(job: Job, surface: Surface) -> tuple[float, ...]:
             _references_beyond.clear()
         _references_beyond[key] = beyond
     return tuple(beyond.distance_bound(surface, BEYOND_ORDERS).tolist())
-
-
-def _remainder_between(surface: Surface, reference: Surface, cutoff: float, execution: Execution) -> Remainder:
-    """Return what lies beyond a cutoff between two surfaces: only what they do not have in common counts."""
-    rests = without_common_parts((surface, reference))
-    if not rests:
-        return Remainder.between(0.0, 0.0, cutoff)
-    return remainder(list(rests.values()), list(rests), cutoff, execution=execution)
 
 
 def _store_whole(job: Job, surface: Surface, target: ErrorTarget | None) -> StoredBlocks:

@@ -67,7 +67,12 @@ class CheckedStore(WrapperStore[ZarrStore]):
         document = self._documents.get(array) if place.split("/")[0] == "c" else None
         if byte_range is not None or document is None:
             return await super().get(key, prototype, byte_range)
-        problem = await self._problem_of_size(key, document)
+        problem = ""
+        # A file may be sparse, and larger than the memory. On object storage this would be one more request.
+        if isinstance(self._store, LocalStore):
+            with suppress(FileNotFoundError):
+                size, most = await self._store.getsize(key), largest_chunk_bytes(document)
+                problem = f"it has {size} bytes, more than {most}" if size > most else ""
         content = None if problem else await super().get(key, prototype)
         if content is not None:
             problem = problem_of_chunk(content.as_numpy_array(), document)
@@ -87,14 +92,6 @@ class CheckedStore(WrapperStore[ZarrStore]):
                 problem,
             )
         return content
-
-    async def _problem_of_size(self, key: str, document: Mapping[str, Any]) -> str:
-        # A file may be sparse, and larger than the memory. On object storage this would be one more request.
-        if isinstance(self._store, LocalStore):
-            with suppress(FileNotFoundError):
-                size, most = await self._store.getsize(key), largest_chunk_bytes(document)
-                return f"it has {size} bytes, more than {most}" if size > most else ""
-        return ""
 
 
 def largest_chunk_bytes(document: Mapping[str, Any]) -> int:

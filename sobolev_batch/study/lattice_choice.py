@@ -111,15 +111,12 @@ def _larger_lattice(
     lattice: Lattice, truncation: Reals, aliasing: Reals, orders: Sequence[float], accuracy: Accuracy
 ) -> tuple[Lattice, None] | None:
     """Return a larger or finer lattice for errors (orders,) relative to distances, if that helps and fits."""
-    highest, period = lattice.xi_max, 1 / lattice.spacing
-    tails, folded = truncation / accuracy.truncation_parts(orders), aliasing / accuracy.aliasing_part
-    for order, tail, images in zip(orders, tails.tolist(), folded.tolist(), strict=True):
-        if tail > 1 and order < -1.5:
-            # The squared norm beyond ξ_max of two near surfaces falls like its power 2s + 3.
-            growth = min(tail ** (1 / (-2 * order - 3)) * 1.02, _LARGEST_GROWTH)
-            highest = max(highest, lattice.xi_max * growth)
-        if images > 1:
-            period = max(period, 1 / lattice.spacing + math.log(images) / (2 * math.pi) * 1.1)
+    tails = (truncation / accuracy.truncation_parts(orders)).tolist()
+    # The squared norm beyond ξ_max of two near surfaces falls like its power 2s + 3.
+    needed = [tail ** (1 / (-2 * s - 3)) * 1.02 for s, tail in zip(orders, tails, strict=True) if tail > 1 and s < -1.5]
+    highest = lattice.xi_max * min(max(needed, default=1.0), _LARGEST_GROWTH)
+    images = max(1.0, *(aliasing / accuracy.aliasing_part).tolist())
+    period = 1 / lattice.spacing + math.log(images) / (2 * math.pi) * 1.1
     is_same = (highest, period) == (lattice.xi_max, 1 / lattice.spacing)
     if is_same or 2 * highest * period > accuracy.largest_intervals:
         return None

@@ -79,7 +79,14 @@ class StudyObject:
             raise StudyError("[[family]] must have at least 1 item, found []")
         if reference is None:
             raise StudyError("[reference] must be a table, found None")
-        _require_distinct(names)
+        if same := duplicate_names(names):
+            twice = ", ".join(quoted(name) for group in same[:3] for name in group[:3])
+            raise StudyError(
+                "family: names must differ by more than case and the spelling of accents, "
+                f"found {twice} twice; rename one"
+            )
+        if any(caseless_key(name) == REFERENCE_LABEL for name in names):
+            raise StudyError(f"family: no family can be named {REFERENCE_LABEL!r}: it is the label of the reference")
         if isinstance(reference, FamilyReference) and reference.family not in names:
             hint = known_names(reference.family, names)
             raise StudyError(f"[reference]: no family is named {quoted(reference.family)}; {hint}")
@@ -337,14 +344,3 @@ def _as_written(values: Mapping[str, Any]) -> dict[str, Any]:
         json.dumps(values, default=lambda value: function_name(value) if callable(value) else str(value))
     )
     return written
-
-
-def _require_distinct(families: Sequence[str]) -> None:
-    same = duplicate_names(families)
-    if same:
-        names = ", ".join(quoted(name) for group in same[:3] for name in group[:3])
-        raise StudyError(
-            f"family: names must differ by more than case and the spelling of accents, found {names} twice; rename one"
-        )
-    if any(caseless_key(name) == REFERENCE_LABEL for name in families):
-        raise StudyError(f"family: no family can be named {REFERENCE_LABEL!r}: it is the label of the reference")

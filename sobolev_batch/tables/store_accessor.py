@@ -208,20 +208,15 @@ class StoreAccessor:
 
 
 def _inner_bands(reducer: Reducer, rows: list[int]) -> list[Band]:
-    lattice, orders = reducer.lattice, reducer.orders
-    sums = reducer.sums_over_shells(rows)
+    lattice = reducer.lattice
+    count = max(1, (lattice.M // (2 * _FEWEST_SPACINGS)).bit_length())
+    upper = lattice.xi_max / 2.0 ** np.arange(count)[::-1]
     radii = lattice.spacing * np.sqrt(np.arange(lattice.shell_count))
-    bands: list[Band] = []
-    upper = lattice.xi_max
-    while True:
-        is_last = upper / 2 < _FEWEST_SPACINGS * lattice.spacing
-        window = smooth_step(radii, upper) - (0.0 if is_last else smooth_step(radii, upper / 2))
-        squares = np.array([np.sum(window * sums * (1 + radii**2) ** order) for order in orders])
-        width = upper * (0.75 if is_last else 0.375)
-        bands.insert(0, (upper, squares, float(np.sum(window * sums)) / width, 0.0))
-        if is_last:
-            return bands
-        upper /= 2
+    windows = np.diff([smooth_step(radii, cutoff) for cutoff in upper], axis=0, prepend=0.0)
+    sums = windows * reducer.sums_over_shells(rows)
+    squares = sums @ (1 + radii[:, None] ** 2) ** reducer.orders
+    energies = sums.sum(axis=1) / (_HALF_WEIGHT * np.diff(upper, prepend=0.0))
+    return [(*ends, 0.0) for ends in zip(upper.tolist(), squares, energies.tolist(), strict=True)]
 
 
 def _octaves(reducer: Reducer, rows: list[int]) -> list[Band]:
