@@ -15,13 +15,7 @@ from sobolev_batch.errors import StudyError, naming
 from sobolev_batch.sources.files import MeshTable, matching_files, number_as_text, read_mesh_list
 from sobolev_batch.sources.names import caseless_key, duplicate_names, natural_key, quoted
 from sobolev_batch.study.refusals import validated
-from sobolev_batch.study.schema import (
-    REFERENCE_LABEL,
-    ObjectSection,
-    StudyDocument,
-    SurfaceSections,
-    with_named_meshes,
-)
+from sobolev_batch.study.schema import REFERENCE_LABEL, ObjectSection, StudyDocument, SurfaceSections, with_named_meshes
 
 OBJECT, METHOD = "{object}", "{method}"
 
