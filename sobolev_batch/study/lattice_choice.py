@@ -11,13 +11,10 @@ from typing import Any, Self
 import numpy as np
 
 from sobolev_batch.arrays import ComplexDtype, Reals
-from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms.accuracy.tolerance import FINER_LATTICE, Accuracy, good_intervals, lattice_of
 from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.norms.tail.sampling import TailSampling
-from sobolev_batch.sources.registry import digest_of
 from sobolev_batch.study.schema import MOST_OCTAVES
-from sobolev_batch.study.study import Study
 from sobolev_batch.transform.lattice import Lattice
 
 _log = logging.getLogger(__name__)
@@ -138,15 +135,3 @@ def _finer_octaves(
     # Another seed than that of the samples before.
     refined = tail.refined(factor, more_octaves, accuracy.largest_intervals, seed=tail.size)
     return (Lattice(lattice.xi_max, intervals), refined) if refined.size <= _MOST_SAMPLES else None
-
-
-def choice_basis(study: Study, accuracy: Accuracy, similarity: Similarity, reference: Mapping[str, Any]) -> str:
-    """Return a digest of the data that the choice for a study is made from, except families, which may gain meshes."""
-    data = {
-        "accuracy": [accuracy.rtol, float(accuracy.allowed_bytes), accuracy.best_effort],
-        "orders": study.orders,
-        "dtype": study.dtype,
-        "similarity": [similarity.scale, *similarity.origin],
-        "reference": dict(reference),
-    }
-    return digest_of(data)

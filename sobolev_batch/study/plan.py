@@ -18,7 +18,7 @@ from sobolev_batch.norms.tail.face_normals import FaceNormals
 from sobolev_batch.norms.tail.sampling import TailSampling
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.sources.registry import Member, digest_of
-from sobolev_batch.study.lattice_choice import LatticeChoice, choice_basis
+from sobolev_batch.study.lattice_choice import LatticeChoice
 from sobolev_batch.study.pilots import Look, choose_lattice
 from sobolev_batch.study.schema import REFERENCE_LABEL, FamilyReference
 from sobolev_batch.study.study import Members, Study
@@ -164,13 +164,23 @@ def _lattice_choice(
         tail = TailSampling.usual(study.lattice.xi_max, study.octaves, [surface]) if study.octaves else None
         compared_with = fingerprint_of(reference, own) if tail or FaceNormals.from_surfaces([surface]) else ""
         return LatticeChoice(study.lattice, dtype, dtype, tail=tail, compared_with=compared_with), Look()
-    if study.accuracy is None:
+    accuracy = study.accuracy
+    if accuracy is None:
         raise ValueError("a study has a lattice or an accuracy")
-    basis = choice_basis(study, study.accuracy, similarity, members[reference][1].fingerprint())
+    # What the choice is made from, except families, which may gain meshes.
+    basis = digest_of(
+        {
+            "accuracy": [accuracy.rtol, float(accuracy.allowed_bytes), accuracy.best_effort],
+            "orders": study.orders,
+            "dtype": study.dtype,
+            "similarity": [similarity.scale, *similarity.origin],
+            "reference": dict(members[reference][1].fingerprint()),
+        }
+    )
     if earlier is not None and earlier.basis == basis:
         return earlier, Look()
     others = {label: member for label, member in members.items() if label != reference}
-    choice, look = choose_lattice(study, study.accuracy, similarity, surface, others)
+    choice, look = choose_lattice(study, accuracy, similarity, surface, others)
     return replace(choice, basis=basis), look
 
 
