@@ -33,7 +33,7 @@ from sobolev_batch.store.records import ProximityRecord, Record, Records
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.plan import Row
 from sobolev_batch.study.schema import ProximitySection
-from sobolev_batch.tables.mesh_table import table_order
+from sobolev_batch.tables.results import table_order
 
 _log = logging.getLogger(__name__)
 

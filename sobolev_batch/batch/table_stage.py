@@ -22,10 +22,9 @@ from sobolev_batch.store.layout import (
 )
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.tables.all_objects import Tables
-from sobolev_batch.tables.mesh_table import Placed, meshes_table, table_order
 from sobolev_batch.tables.pairs import Pairs, fill_tile
 from sobolev_batch.tables.reducer import Reducer
-from sobolev_batch.tables.results import Results, coordinates_of
+from sobolev_batch.tables.results import Placed, Results, coordinates_of, meshes_table, table_order
 from sobolev_batch.tables.shells import fill_chunk, spectrum_keys, stale_chunks
 
 # Raise it whenever tables hold something that those of older versions lack: they are then made again.
