@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from glob import has_magic
 from importlib.metadata import PackageNotFoundError, distribution
+from io import BufferedReader
 from numbers import Real
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -22,7 +23,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from sobolev_batch.errors import MeshError, StudyError
 from sobolev_batch.geometry.formats.by_name import mesh_format, mesh_stem
 from sobolev_batch.geometry.formats.parsing import checked_length, open_regular
-from sobolev_batch.geometry.formats.readers import expected_size, files_beside, read_mesh
+from sobolev_batch.geometry.formats.readers import expected_size, files_beside, read_mesh_by
 from sobolev_batch.geometry.surface import Surface, is_finite_number
 from sobolev_batch.sources.names import (
     caseless_key,
@@ -41,9 +42,11 @@ _LONGEST_TEXT = 1000
 _LARGEST_FILE_BYTES = 64 << 20
 # By how much the length of a file may mislead about its triangles: it may have normals, colours or few digits.
 _LENGTH_FACTOR = 4.0
-# Digests of the last files, by what the file system says of them, since many meshes may be made of one. A file that
-# was changed within this time may be changed again without a trace there.
-_digests: dict[tuple[Path | int, ...], str] = {}
+# What the file system says of a file.
+_State = tuple[str | int, ...]
+# Digests of the last files that were read; a file that was changed within this time may be changed again without a
+# trace in the file system. A plan reads many files, and asks for their digests afterwards.
+_digests: dict[_State, str] = {}
 _SETTLED_NS, _MOST_DIGESTS = 2 * 10**9, 10_000
 # What a list says of a mesh: its path, and perhaps a name, a time and metadata.
 MeshTable = dict[str, Any]
@@ -210,8 +213,8 @@ class FileMember(Member):
     is_quickly_loaded: ClassVar[bool] = True
 
     def load(self) -> Surface:
-        """Read the file."""
-        return read_mesh(self.path)
+        """Read the file; its digest is then known without reading it again."""
+        return read_mesh_by(self.path, _read_once)
 
     def fingerprint(self) -> Fingerprint:
         """Return the format, and the digest of the file and of those beside it that it needs."""
@@ -339,16 +342,34 @@ def file_digest(path: Path) -> str:
     try:
         with open_regular(path) as file:
             checked_length(file)
-            now, status = time.time_ns(), os.fstat(file.fileno())
-            times = status.st_mtime_ns, status.st_ctime_ns
-            state = path, status.st_dev, status.st_ino, status.st_size, *times
-            digest = _digests.get(state) or hashlib.file_digest(file, "sha256").hexdigest()
+            state = _settled_state(path, file)
+            known = _digests.get(state)
+            return known or _remembered(state, hashlib.file_digest(file, "sha256").hexdigest())
     except MeshError as error:
         raise MeshError(f"{path}: {error}") from error
     except (OSError, ValueError) as error:
         raise MeshError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+
+
+def _read_once(file: BufferedReader, length: int) -> bytes:
+    """Read an open file, and remember its digest."""
+    state, data = _settled_state(Path(file.name), file), file.read(length)
+    _remembered(state, hashlib.sha256(data).hexdigest())
+    return data
+
+
+def _settled_state(path: Path, file: BufferedReader) -> _State:
+    """Return what the file system says of an open file; nothing where a change of the file might not show in it."""
+    now, status = time.time_ns(), os.fstat(file.fileno())
+    times = status.st_mtime_ns, status.st_ctime_ns
+    is_settled = max(times) + _SETTLED_NS < now
+    return (str(path), status.st_dev, status.st_ino, status.st_size, *times) if is_settled else ()
+
+
+def _remembered(state: _State, digest: str) -> str:
+    """Return a digest, and remember it for a state of its file."""
     if len(_digests) >= _MOST_DIGESTS:
         _digests.clear()
-    if max(times) + _SETTLED_NS < now:
+    if state:
         _digests[state] = digest
     return digest

@@ -40,7 +40,6 @@ from sobolev_batch.geometry.proximity import point_distances
 from sobolev_batch.geometry.subdivision import subdivided
 from sobolev_batch.geometry.surface import normals
 from sobolev_batch.norms.causes import witness
-from sobolev_batch.sources.derived import decimated
 from sobolev_batch.sources.names import file_stem
 from sobolev_batch.tables.convergence import table
 from sobolev_batch.tables.open import Families, chosen_families, finished_group
@@ -258,10 +257,12 @@ def _shown(label: str, mesh: Mesh, most: int, enough: int = _ENOUGH_TRIANGLES) -
     vertices, triangles = mesh.vertices[used], number[mesh.triangles]
     # Without this extra, large meshes take longer to draw.
     if len(triangles) > most and find_spec("fast_simplification"):
-        simplified = decimated(Mesh(vertices, triangles), most)
+        import fast_simplification
+
+        simplified = fast_simplification.simplify(vertices, triangles, target_count=most)
         # Collapsed edges may leave the period by a hair where the mesh fills it.
-        vertices = np.clip(simplified.vertices, vertices.min(axis=0), vertices.max(axis=0))
-        triangles = simplified.triangles.astype(np.int32)
+        vertices = np.clip(simplified[0].astype(np.float64), vertices.min(axis=0), vertices.max(axis=0))
+        triangles = simplified[1].astype(np.int32)
     else:
         while 4 * len(triangles) <= enough:
             finer = subdivided(Mesh(vertices, triangles))

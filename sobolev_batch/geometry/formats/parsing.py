@@ -11,7 +11,7 @@ import re
 import stat
 import zlib
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from io import BufferedReader
 from pathlib import Path, PurePath
 from typing import IO, Any, Literal, NamedTuple, cast
@@ -33,6 +33,9 @@ class Raw(NamedTuple):
     triangles: NDArray[Any]
     notes: tuple[str, ...] = ()
 
+
+# How the bytes of an open file are read, of which so many are wanted.
+Read = Callable[[BufferedReader, int], bytes]
 
 # No larger file is read; 8 GiB hold some 160 million binary STL triangles.
 _LARGEST_BYTES = 8 << 30
@@ -105,14 +108,14 @@ def require_memory_to_read(needed_bytes: float) -> None:
         )
 
 
-def read_unpacked(path: Path, factor: float) -> bytes:
+def read_unpacked(path: Path, factor: float, read: Read = BufferedReader.read) -> bytes:
     """Return a file's bytes without a byte-order mark, unpacked from .gz, each of which takes a factor of memory."""
     try:
         with open_regular(path) as file:
             length, packed = checked_length(file), is_packed(path, file)
             if not packed:
                 require_memory_to_read(factor * length)
-            data = file.read(length)
+            data = read(file, length)
         if packed:
             data = _unpacked_bounded(data, factor)
     except (OSError, EOFError, ValueError, zlib.error) as error:

@@ -7,6 +7,7 @@ import json
 import re
 import zlib
 from collections.abc import Iterable
+from io import BufferedReader
 from pathlib import Path
 from xml.parsers.expat import ExpatError
 from zipfile import BadZipFile
@@ -17,6 +18,7 @@ from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.formats.by_name import BY_SUFFIX, CONVERTED, mesh_format
 from sobolev_batch.geometry.formats.parsing import (
     Raw,
+    Read,
     checked_length,
     is_packed,
     open_regular,
@@ -87,47 +89,7 @@ def read_mesh(path: str | Path) -> Mesh:
     ...     sb.read_mesh(path)
     Mesh(3 vertices, 1 triangles)
     """
-    path = path_of(path)
-    suffix = mesh_format(path)
-    if suffix in CONVERTED:
-        name, command = CONVERTED[suffix]
-        raise MeshError(f"{path}: it is a file of the format {name}, which is not read; convert it: {command}")
-    if suffix not in BY_SUFFIX:
-        if path.is_dir():
-            raise MeshError(f"{path}: it is a folder; name the files in it")
-        known = ", ".join(name for name, form in BY_SUFFIX.items() if form.is_name is None)
-        raise MeshError(
-            f"{path}: no mesh format that is read has this name; known are {known} and FreeSurfer's names such as "
-            "lh.pial, each also with .gz. docs/formats.md shows how to convert others"
-        )
-    form, start = BY_SUFFIX[suffix], b""
-    factor = form.memory_bytes / form.file_bytes
-    try:
-        # The header of a PLY file tells more than its length.
-        require_memory_to_read(expected_size(path)[1])
-        data = [read_unpacked(path, factor)]
-        start = data[0][:_START_BYTES]
-        # Numbers that overflow become infinite, which the mesh refuses.
-        with np.errstate(all="ignore"):
-            beside = []
-            if form.files_beside is not None:
-                parts = _files_beside(path, form.files_beside(data[0]))
-                require_memory_to_read(factor * (len(data[0]) + sum(part.stat().st_size for part in parts.values())))
-                beside = [{name: read_unpacked(part, factor) for name, part in parts.items()}]
-            # Only the parser holds the bytes, so that it can free them early.
-            raw = _without_unused(Raw(*form.parse(data.pop(), *beside)))
-            for array in (raw.vertices, raw.triangles):
-                array.setflags(write=False)
-            return _with_lost_digits(Mesh(*raw), raw.vertices.dtype.newbyteorder("=") == np.float32)
-    except MeshError as error:
-        raise MeshError(f"{path}: {_mistaken(start, suffix) or _shortened(error)}") from error
-    except MemoryError as error:
-        raise MeshError(f"{path}: reading it takes more memory than there is: {_shortened(error)}") from error
-    except Exception as error:
-        # On damaged input parsers raise anything from struct.error to RecursionError.
-        damage = next(what for kind, what in _DAMAGES.items() if isinstance(error, kind))
-        reason = _mistaken(start, suffix) or f"{damage}: {_shortened(error)}"
-        raise MeshError(f"{path}: not a readable {suffix.removeprefix('.')} file: {reason}") from error
+    return read_mesh_by(path_of(path), BufferedReader.read)
 
 
 def files_beside(path: Path) -> tuple[Path, ...]:
@@ -154,6 +116,50 @@ def _files_beside(path: Path, names: Iterable[str]) -> dict[str, Path]:
                 f"it needs {name[:80]!r}, which is no file in its folder; put it there, or export both as one file"
             )
     return found
+
+
+def read_mesh_by(path: Path, read: Read) -> Mesh:
+    """Read a mesh as `read_mesh` does, by a function that reads the bytes of its file."""
+    suffix = mesh_format(path)
+    if suffix in CONVERTED:
+        name, command = CONVERTED[suffix]
+        raise MeshError(f"{path}: it is a file of the format {name}, which is not read; convert it: {command}")
+    if suffix not in BY_SUFFIX:
+        if path.is_dir():
+            raise MeshError(f"{path}: it is a folder; name the files in it")
+        known = ", ".join(name for name, form in BY_SUFFIX.items() if form.is_name is None)
+        raise MeshError(
+            f"{path}: no mesh format that is read has this name; known are {known} and FreeSurfer's names such as "
+            "lh.pial, each also with .gz. docs/formats.md shows how to convert others"
+        )
+    form, start = BY_SUFFIX[suffix], b""
+    factor = form.memory_bytes / form.file_bytes
+    try:
+        # The header of a PLY file tells more than its length.
+        require_memory_to_read(expected_size(path)[1])
+        data = [read_unpacked(path, factor, read)]
+        start = data[0][:_START_BYTES]
+        # Numbers that overflow become infinite, which the mesh refuses.
+        with np.errstate(all="ignore"):
+            beside = []
+            if form.files_beside is not None:
+                parts = _files_beside(path, form.files_beside(data[0]))
+                require_memory_to_read(factor * (len(data[0]) + sum(part.stat().st_size for part in parts.values())))
+                beside = [{name: read_unpacked(part, factor, read) for name, part in parts.items()}]
+            # Only the parser holds the bytes, so that it can free them early.
+            raw = _without_unused(Raw(*form.parse(data.pop(), *beside)))
+            for array in (raw.vertices, raw.triangles):
+                array.setflags(write=False)
+            return _with_lost_digits(Mesh(*raw), raw.vertices.dtype.newbyteorder("=") == np.float32)
+    except MeshError as error:
+        raise MeshError(f"{path}: {_mistaken(start, suffix) or _shortened(error)}") from error
+    except MemoryError as error:
+        raise MeshError(f"{path}: reading it takes more memory than there is: {_shortened(error)}") from error
+    except Exception as error:
+        # On damaged input parsers raise anything from struct.error to RecursionError.
+        damage = next(what for kind, what in _DAMAGES.items() if isinstance(error, kind))
+        reason = _mistaken(start, suffix) or f"{damage}: {_shortened(error)}"
+        raise MeshError(f"{path}: not a readable {suffix.removeprefix('.')} file: {reason}") from error
 
 
 def expected_size(path: Path) -> tuple[int, float]:
