@@ -112,7 +112,7 @@ class CostLeague:
         found = np.exp(members[[self.x, "relative", "fall", "rise"]].mean())
         # The mean where all distances are as small, or as large, as their errors allow.
         widest = np.maximum(1 - found.pop("fall"), found.pop("rise") - 1)
-        found["relative_error"] = found["relative"] * widest
+        found["relative_error"] = found["relative"] * widest.where(np.isfinite(widest))
         found["fronts"] = members["front"].sum()
         found = found[members["object"].nunique() == len(self.objects)].sort_values([self.x, "relative"], kind="stable")
         return found.assign(front=_is_unbeaten(found[self.x], found["relative"], found["relative"])).reset_index()
