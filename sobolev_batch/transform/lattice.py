@@ -33,7 +33,7 @@ _BALL = (6 / math.pi) ** (1 / 3)
 _FADED_LAYERS, _FADING_LAYERS = 3, 1.2
 _LOWEST_ORDER = -100.0
 # Kernels of orders above this have a narrow peak.
-_NARROW = -2.0
+_NARROW = -3.0
 # The smooth step falls from one to zero between this fraction of the cutoff and the cutoff.
 STEP_START = 0.5
 # At the ends of the fall it is off by erfc(3)/2 = 1e-5, on both sides of the cut: a partition by steps stays one.
@@ -332,7 +332,7 @@ class SobolevWeights:
 
     @cached_property
     def narrower(self) -> SobolevWeights:
-        """Weights of half of each order, but none above -2 that was not: kernels narrower than theirs, or the same."""
+        """Weights of half of each order, but none above -3 that was not: kernels narrower than theirs, or the same."""
         return SobolevWeights(self.lattice, tuple(max(s, min(s / 2, _NARROW)) for s in self.orders), self.cutoff)
 
     def __getstate__(self) -> dict[str, Any]:

@@ -40,8 +40,9 @@ _POINTS_ROUGH, _POINTS_SMOOTH = 15_000, 10_000
 # their images away.
 _FINE_ROUGH, _FINE_SMOOTH = Lattice(16.0, 160), Lattice(10.0, 120)
 _WIDEST_ON_LATTICE = 2.2
-# The last change of an extrapolation was seen to be half of its error where levels are few.
-_EXTRAPOLATION_CAUTION = 3.0
+# The last change of an extrapolation was seen to be half of its error where levels are few, and an eighth where the
+# kernel has a kink and surfaces are near-duplicates.
+_EXTRAPOLATION_CAUTION, _KINK_CAUTION = 3.0, 10.0
 # Two outer rules were seen to agree by chance: so much of the square is uncertain anyway, more at infinite kernels.
 _RULE_SLACK, _SINGULAR_SLACK = 2e-7, 5e-5
 # Accuracy, seed and memory of a distance that others are compared with.
@@ -247,7 +248,8 @@ def summed_in_real_space(
         last = table[-1]
         table.append([fine + (fine - coarse) / (rate - 1) for coarse, fine in pairwise(last)])
     best, before = table[-1][-1], table[-2][-1]
-    slack = _EXTRAPOLATION_CAUTION * np.abs(best - before) + _ROUNDING * scale
+    caution = np.where(np.array(orders) > _SMOOTH, _KINK_CAUTION, _EXTRAPOLATION_CAUTION)
+    slack = caution * np.abs(best - before) + _ROUNDING * scale
     return tuple(map(Truth.of_square, best.tolist(), slack.tolist()))
 
 
