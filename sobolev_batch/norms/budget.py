@@ -20,7 +20,7 @@ from sobolev_batch.norms.bounds import bessel_logs
 from sobolev_batch.transform.lattice import STEP_MIDDLE, STEP_WIDTH, SobolevWeights
 
 # Both laws were measured on spheres, boxes, sticks and icospheres, near and far: the truncation was 0.5 to 8 times, the
-# aliasing 0.25 to 2 times the true loss, and less by the narrower kernel of another order.
+# aliasing 0.25 to 2 times the true loss, or less where the narrower kernel of another order shows it.
 TRUNCATION_CAUTION = 2.5
 _ALIASING_CAUTION = 5.0
 # With this many periods of the energy within xi_max, a trough was measured to hide no more than the tail again.
