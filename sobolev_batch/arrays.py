@@ -17,5 +17,5 @@ Array = Any
 
 
 def slices(count: int, size: int) -> Iterator[slice]:
-    """Yield the slices, of at most a size each, that make up a count of entries."""
+    """Return the slices, of at most a size each, that make up a count of entries."""
     return (slice(start, min(start + size, count)) for start in range(0, count, size))

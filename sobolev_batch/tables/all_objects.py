@@ -102,8 +102,8 @@ def _joined(parts: Sequence[Tables]) -> dict[str, xr.Dataset]:
 def concatenated(tables: Sequence[xr.Dataset]) -> xr.Dataset:
     """Return tables after each other, with NaN or empty texts where only others have a column.
 
-    Of attributes that differ, those stay that are lists: with what is in any of them. Dask arrays stay lazy. xarray's
-    own function takes milliseconds for each column of each table.
+    Attributes that differ are left out, but for the lists of metadata and of versions of the numerics, which have what
+    is in any of them. Dask arrays stay lazy. xarray's own function takes milliseconds for each column of each table.
     """
     known = {name: variable for table in reversed(tables) for name, variable in table.variables.items()}
     columns: dict[Any, xr.Variable] = {}
