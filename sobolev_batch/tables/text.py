@@ -15,6 +15,8 @@ Item = TypeVar("Item")
 # More digits are hard to read, whatever the error.
 _MOST_DIGITS = 7
 _DIGITS_WITHOUT_ERROR = 4
+# An error that grows by more than this factor where it holds the rounding of its number has a digit more.
+_ROUNDED = 1.5
 # Beyond these, powers of ten are easier to read.
 _SMALLEST_PLAIN, _LARGEST_PLAIN, _LAST_PLAIN = 1e-3, 1e5, -6
 POWER = " × 10"
@@ -28,23 +30,30 @@ def with_error(value: float, error: float = math.nan, unit: str = "") -> str:
     """Return a number with the digits that its error leaves it, and its error; both have one power of ten.
 
     The error, unknown for NaN, has one digit. It is rounded up and holds the rounding of the number, so that it stays a
-    bound. NaN gives an empty text.
+    bound; where that would double it, both have a digit more. NaN gives an empty text.
 
-    >>> with_error(2.3149, 0.0033), with_error(2.3145, 0.0038)
-    ('2.315 ± 0.004', '2.314 ± 0.005')
+    >>> with_error(2.3149, 0.0033), with_error(2.3145, 0.0038), with_error(6.4, 0.95)
+    ('2.315 ± 0.004', '2.314 ± 0.005', '6.4 ± 1.0')
     """
     if not math.isfinite(value):
         return ""
-    shown = rounded(value, error, unit)
     if not math.isfinite(error) or error == 0:
-        return f"{shown} ± {'0' if error == 0 else '?'}"
-    last = _last_digit(value, error)
-    above = _rounded_up(error + abs(value - round(value, -last)), 1)
-    if POWER in shown and above < abs(value) * 1e3 and _magnitude(above) >= last:
+        return f"{rounded(value, error, unit)} ± {'0' if error == 0 else '?'}"
+    last, above = _last_digit(value, error), _rounded_up(error, 1)
+    last_of_error = _magnitude(above)
+    # Of numbers that are known to more digits than anybody reads, errors are as they are.
+    if last_of_error >= last and (held := error + abs(value - round(value, -last))) > above:
+        if _rounded_up(held, 1) > _ROUNDED * above:
+            last -= 1
+            held = error + abs(value - round(value, -last))
+        above = _rounded_up(held, max(1, _magnitude(held) - last + 1))
+        last_of_error = min(last, _magnitude(above))
+    shown = f"{_shown(value, last)}{unit}"
+    if POWER in shown and above < abs(value) * 1e3 and last_of_error >= last:
         power = _magnitude(round(value, -last))
         size, decimals = 10.0**power, max(0, power - last)
         return f"({value / size:.{decimals}f} ± {above / size:.{decimals}f}){_power(power)}{unit}"
-    return f"{shown} ± {_shown(above, _magnitude(above))}{unit}"
+    return f"{shown} ± {_shown(above, last_of_error)}{unit}"
 
 
 def rounded(value: float, error: float = math.nan, unit: str = "") -> str:
