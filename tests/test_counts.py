@@ -69,8 +69,8 @@ WORK: dict[str, tuple[Callable[[], object], int, int, int, str]] = {
     ),
     "distance to a high accuracy": (
         lambda: sb.distance(sb.shapes.icosphere(4), SPHERE, -10.0, rtol=7e-4),
-        *(2, 23_040, 655_360),
-        "one field, and a coarse one of the frequencies beyond, probed at as many of their own as of the common ones",
+        *(2, 23_040, 491_520),
+        "a field, probed at common frequencies and at as many of its own, and a coarse one beyond, probed at few",
     ),
     "gradient": (
         lambda: sb.fitting.gradient(COARSE, SPHERE, -4.0, lattice=SMALL_LATTICE),

@@ -211,9 +211,11 @@ class Problem:
         """Return the fields of all surfaces, each with an error within a target, by default in the cheapest dtype."""
         settings = TransformSettings(dtype=dtype or self.dtype(lattice, target))
         execution = Execution(threads=self.threads)
+        # Samples are drawn where the error weighs most at the problem's orders.
+        samples = self.samples(lattice) if target.orders == self.orders else (None,) * len(self.surfaces)
         return tuple(
             field_for(surface, lattice, target, settings, execution, sample=sample)
-            for surface, sample in zip(self.surfaces, self.samples(lattice), strict=True)
+            for surface, sample in zip(self.surfaces, samples, strict=True)
         )
 
     def beyond(
