@@ -21,9 +21,9 @@ _PAIR_SECONDS = 4e-7
 # Height of a triangle over its longest side below which libigl may see points of it far too far away: it loses the
 # digits of the square of this number.
 _THIN = 0.01
-# Cosine of the angle to a pseudonormal below which rounding may have chosen the side of a point, and a direction
-# without pattern in which it is then moved.
-_UNCLEAR, _ASIDE = 1e-6, np.array([0.4127, 0.7391, 0.5323])
+# Cosine of the angle to a pseudonormal below which rounding may have chosen the side of a point, and aspect ratio of a
+# triangle beyond which rounding may have turned it.
+_UNCLEAR, _SLIVER = 1e-6, 1e4
 
 
 class Triangles:
@@ -154,26 +154,22 @@ def signs(mesh: Mesh, points: Reals) -> Reals | None:
     vertices, places = own.vertices - origin, points - origin
     scale = 2.0 ** float(np.frexp(np.abs(vertices).max())[1])
     corners, triangles = vertices / scale, np.ascontiguousarray(own.triangles, dtype=np.int64)
-    signed, arms, cosines = _signed(places / scale, corners, triangles)
-    if not own.counts["boundary_edges"]:
-        # No surface is nearer, so that points between lie on the same side.
-        unclear = np.flatnonzero(np.abs(cosines) < _UNCLEAR)
-        moves = np.sqrt(dot(arms, arms))[unclear, None] / 2 * _ASIDE
-        signed[unclear] = _signed(places[unclear] / scale + moves, corners, triangles)[0]
-    return np.where((signed < 0) != (own.volume < 0), -1.0, 1.0)
-
-
-def _signed(points: Reals, vertices: Reals, triangles: Indices) -> tuple[Reals, Reals, Reals]:
-    """Return signed distances (n,) of points (n, 3), arms (3, n) from their closest points, and cosines (n,) of these.
-
-    The cosines are to the pseudonormals: a point in the plane of a face that ends before it has its side by rounding.
-    """
     by_pseudonormals = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
-    signed, _, closest, normals = igl.signed_distance(points, vertices, triangles, by_pseudonormals)
-    arms, normals = (points - np.reshape(closest, (-1, 3))).T, np.reshape(normals, (-1, 3)).T
-    sizes = np.sqrt(dot(arms, arms) * dot(normals, normals))
-    cosines = np.divide(dot(arms, normals), sizes, out=np.ones(len(points)), where=sizes > 0)
-    return np.reshape(signed, -1), arms, cosines
+    signed, faces, closest, across = igl.signed_distance(places / scale, corners, triangles, by_pseudonormals)
+    is_inside = (np.reshape(signed, -1) < 0) != (own.volume < 0)
+    # In the plane of a face that ends before, and beside a sliver that may be folded back, a normal tells no side.
+    arms, across = (places / scale - np.reshape(closest, (-1, 3))).T, np.reshape(across, (-1, 3)).T
+    is_unclear = np.abs(dot(arms, across)) < _UNCLEAR * np.sqrt(dot(arms, arms) * dot(across, across))
+    if own.counts["boundary_edges"]:
+        # Beyond the border of a flat sheet is outside.
+        is_inside &= ~is_unclear
+    else:
+        thin = triangles[own.aspect_ratios > _SLIVER]
+        is_unclear |= np.isin(triangles[np.reshape(faces, -1)], thin).any(axis=1)
+        if is_unclear.any():
+            turns = igl.fast_winding_number(corners, triangles, places[is_unclear] / scale)
+            is_inside[is_unclear] = np.abs(np.reshape(turns, -1)) > 1 / 2
+    return np.where(is_inside, -1.0, 1.0)
 
 
 def _inverse(values: Reals) -> Reals:

@@ -251,3 +251,27 @@ def test_points_in_the_planes_of_a_plate_beside_it_are_outside() -> None:
         points = sb.Mesh(beside @ turn + place, np.arange(24).reshape(-1, 3))
         mesh = sb.Mesh(plate @ turn + place, CENTRED_BOX.triangles)
         assert sb.vertex_distances(points, mesh, signed=True).min() > 0
+
+
+def test_beside_the_border_of_a_flat_sheet_is_outside() -> None:
+    rng, beside = np.random.default_rng(0), np.array([[2, 0, 0], [1.5, 1.2, 0], [-1.001, 0.3, 0]])
+    for _ in range(50):
+        turn, place = np.linalg.qr(rng.normal(size=(3, 3)))[0], 100 * rng.normal(size=3)
+        points = sb.Mesh(beside @ turn + place, [[0, 1, 2]])
+        sheet = sb.Mesh(square(2.0).vertices @ turn + place, square(2.0).triangles)
+        assert sb.vertex_distances(points, sheet, signed=True).min() > 0
+
+
+@pytest.mark.parametrize("width", [0.0, 1e-16, 1e-12, 1e-9, 1e-6])
+def test_sides_do_not_depend_on_triangles_without_area(width: float) -> None:
+    # A corner divides one side of an edge of a box, and a sliver closes the gap to the other side.
+    rng, box, faces = np.random.default_rng(3), BOX.vertices, BOX.triangles
+    for number, (a, b, c) in enumerate(faces.tolist()):
+        slit = [[a, 8, c], [8, b, c], [b, 8, a]]
+        corners = np.vstack([box, (box[a] + box[b]) / 2 + width * rng.normal(size=3)])
+        points, turn = corners[8] + 0.2 * rng.normal(size=(300, 3)), np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        points = points[np.abs(np.abs(points).max(axis=1) - 0.5) > 1e-4][:297]
+        cloud = sb.Mesh(points @ turn, np.arange(len(points) // 3 * 3).reshape(-1, 3))
+        mesh = sb.Mesh(corners @ turn, np.vstack([np.delete(faces, number, axis=0), slit]))
+        found = sb.vertex_distances(cloud, mesh, signed=True)
+        np.testing.assert_array_equal(found[cloud.used_vertices] < 0, in_box(points)[cloud.used_vertices])
