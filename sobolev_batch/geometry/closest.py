@@ -143,8 +143,9 @@ def signs(mesh: Mesh, points: Reals) -> Reals | None:
     """Return 1 for each point (n, 3) outside of a mesh, and -1 for each one inside; None where the mesh has no sides.
 
     It has some if its triangles are oriented consistently, once vertices of the same place are one. Outside of an open
-    mesh is the side that triangles face. Source: J. A. Baerentzen, H. Aanaes, "Signed distance computation using the
-    angle weighted pseudonormal" (2005), doi:10.1109/TVCG.2005.49.
+    mesh is the side that triangles face, and what lies beyond its border in its plane. Sources: J. A. Baerentzen, H.
+    Aanaes, "Signed distance computation using the angle weighted pseudonormal" (2005), doi:10.1109/TVCG.2005.49; G.
+    Barill et al., "Fast winding numbers for soups and clouds" (2018), doi:10.1145/3197517.3201337, beside slivers.
     """
     own = mesh.merged or mesh
     if any(own.counts[f"{kind}_edges"] for kind in ("nonmanifold", "inconsistent")):
