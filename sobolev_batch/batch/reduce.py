@@ -12,7 +12,7 @@ import pandas as pd
 from distributed import Client
 from pydantic import ValidationError
 
-from sobolev_batch.batch.cluster.clients import local_client, require_blocking
+from sobolev_batch.batch.cluster.clients import check_cluster, local_client
 from sobolev_batch.batch.cluster.execution import (
     Cluster,
     Stages,
@@ -29,7 +29,6 @@ from sobolev_batch.geometry.formats.by_name import WRITERS, mesh_format
 from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.machine import available_cores
-from sobolev_batch.parameters import check_workers
 from sobolev_batch.reduction.limit import Limit, tried
 from sobolev_batch.reduction.recorded import RecordedSearch
 from sobolev_batch.reduction.remesher import Method, Range, Remesher
@@ -189,9 +188,7 @@ def reduce(
     >>> found.bracket.best.triangles < 1280, found.bracket.best.upper <= 0.02 < found.bracket.failed.upper
     (True, True)
     """
-    if client is not None:
-        require_blocking(client)
-    check_workers(workers)
+    check_cluster(client, workers)
     limit, remesher = Limit.parse(within, order, unit), _permitted(method, search)
     # It refuses a wrong precision.
     remesher.search(limit, 1, 1.0, precision)

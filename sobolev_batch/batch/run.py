@@ -9,7 +9,7 @@ from importlib.util import find_spec
 
 from distributed import Client
 
-from sobolev_batch.batch.cluster.clients import local_client, memory_limit, require_blocking, thread_client
+from sobolev_batch.batch.cluster.clients import check_cluster, local_client, memory_limit, thread_client
 from sobolev_batch.batch.cluster.execution import Cluster, Notify, Progress, Stages, side_by_side
 from sobolev_batch.batch.cluster.watch import Heartbeat, Watch
 from sobolev_batch.batch.cluster.workers import prepare_workers, require_store_access
@@ -17,7 +17,6 @@ from sobolev_batch.batch.object_run import Ended, ended_already, ended_before, r
 from sobolev_batch.batch.start import StoreLike, ready_to_run
 from sobolev_batch.errors import DamageError, InputError, SobolevBatchError, StoreError
 from sobolev_batch.machine import available_cores, require_machine_memory
-from sobolev_batch.parameters import check_workers
 from sobolev_batch.reduction.searched import SearchedSource
 from sobolev_batch.shown import Shown, reasons
 from sobolev_batch.store.create import give_up, require_usable, reserve
@@ -108,7 +107,8 @@ def run(
         StoreError: The store cannot be reached or written, belongs to another study, or is being written by another run
             (LockError).
         ClusterError: No worker has the GPU or the memory that the study requests; or the scheduler was lost.
-        InputError: The memory is no size, or not there; or the client is none of Dask's, or asynchronous.
+        InputError: The memory is no size, or not there; or the client is none of Dask's, or asynchronous, or given
+            beside workers or memory.
 
     >>> import sobolev_batch as sb
     >>> study = sb.Study.from_table({
@@ -124,9 +124,7 @@ def run(
     >>> sb.run(study, "memory://run-example.zarr").reused
     ('ball/sphere', 'reference')
     """
-    if client is not None:
-        require_blocking(client)
-    check_workers(workers)
+    check_cluster(client, workers, memory)
     study, location = ready_to_run(study, store, allow_commands=allow_commands, only=only)
     location = location if client is None else location.absolute()
     notify, lock = on_progress or (lambda progress: None), Lock.of_this_process()

@@ -13,7 +13,7 @@ import pytest
 from distributed import Client, Event, Future, KilledWorker, LocalCluster, as_completed
 from distributed.utils import key_split
 
-from sobolev_batch import Study, plan, run, shapes, submit
+from sobolev_batch import Study, plan, reduce, run, shapes, submit
 from sobolev_batch.batch.cluster import execution
 from sobolev_batch.batch.cluster.execution import (
     Cluster,
@@ -335,6 +335,15 @@ def test_an_asynchronous_client_and_an_address_are_refused_before_anything_is_ma
             InputError, match=rf"client must be a dask\.distributed\.Client, found '{address}'; for the"
         ):
             act(Study.from_table(small_table()), "memory://asynchronous.zarr", address)
+
+
+@pytest.mark.parametrize("own", [{"workers": 2}, {"memory": "4GB"}])
+def test_processes_to_start_and_a_client_are_not_taken_together(own: dict[str, Any], threads: Client) -> None:
+    with pytest.raises(InputError, match="workers and memory are for processes that are started here, and those of a"):
+        run(Study.from_table(small_table()), "memory://both.zarr", threads, **own)
+    if "workers" in own:
+        with pytest.raises(InputError, match="leave them out, or the client"):
+            reduce(shapes.icosphere(1), "1%", client=threads, **own)
 
 
 def test_a_run_prints_its_progress(capsys: pytest.CaptureFixture[str]) -> None:
