@@ -8,6 +8,7 @@ import re
 import reprlib
 import unicodedata
 from collections.abc import Iterable
+from fnmatch import fnmatchcase
 
 # A file's stem has up to 255 bytes; a path in its place may be longer.
 _LONGEST_LABEL = 1000
@@ -80,6 +81,17 @@ def node_problem(name: object) -> str | None:
 def caseless_key(name: str) -> str:
     """Return a key that is equal for names that differ only in case and the encoding of accents (Unicode's D145)."""
     return unicodedata.normalize("NFD", unicodedata.normalize("NFD", name).casefold())
+
+
+def fits(name: str, pattern: str) -> bool:
+    r"""Tell whether a name is another one or matches it as a pattern, however accents are encoded.
+
+    >>> fits("caf\N{LATIN SMALL LETTER E WITH ACUTE}", "cafe\N{COMBINING ACUTE ACCENT}"), fits("mmg/0.1", "mmg/*")
+    (True, True)
+    """
+    name, pattern = (unicodedata.normalize("NFC", text) for text in (name, pattern))
+    # A name may have characters that mean something else in a pattern.
+    return name == pattern or fnmatchcase(name, pattern)
 
 
 def known_names(name: str, known: Iterable[str]) -> str:

@@ -4,7 +4,6 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 from functools import cached_property
 from numbers import Real
 from pathlib import Path
@@ -20,7 +19,7 @@ from sobolev_batch.parameters import path_of
 from sobolev_batch.reduction.searched import SearchedSource
 from sobolev_batch.sources.command import function_name
 from sobolev_batch.sources.mesh_cache import MeshCache
-from sobolev_batch.sources.names import caseless_key, duplicate_names, known_names, node_problem, quoted
+from sobolev_batch.sources.names import caseless_key, duplicate_names, fits, known_names, node_problem, quoted
 from sobolev_batch.sources.registry import Member, Source, single_member
 from sobolev_batch.study.schema import (
     REFERENCE_LABEL,
@@ -140,7 +139,7 @@ class StudyObject:
         return {
             label
             for label, (family, _) in self.members.items()
-            if any(name == one or fnmatchcase(name, one) for one in only for name in names_of(label, family))
+            if any(fits(name, one) for one in only for name in names_of(label, family))
         }
 
     @property

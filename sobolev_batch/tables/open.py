@@ -4,7 +4,6 @@ import json
 import logging
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from fnmatch import fnmatchcase
 from functools import lru_cache
 from itertools import accumulate, chain
 from pathlib import Path
@@ -17,7 +16,7 @@ from sobolev_batch.errors import DamageError, InputError, StoreError, one_line
 from sobolev_batch.geometry.surface import Similarity, placement_doubt
 from sobolev_batch.norms.fields import Quality
 from sobolev_batch.parameters import as_names
-from sobolev_batch.sources.names import quoted
+from sobolev_batch.sources.names import fits, quoted
 from sobolev_batch.store.encoding import with_coordinates
 from sobolev_batch.store.layout import (
     DIGEST,
@@ -303,7 +302,7 @@ def chosen_families(tree: xr.DataTree, family: Families) -> list[str]:
     chosen: set[str] = set()
     for pattern in as_names(family):
         # A name may have characters that mean something else in a glob.
-        fitting = [pattern] if pattern in known else [name for name in known if fnmatchcase(name, pattern)]
+        fitting = [pattern] if pattern in known else [name for name in known if fits(name, pattern)]
         if not fitting:
             raise InputError(f"the study has no family {quoted(pattern)}, only {', '.join(known)}")
         chosen.update(fitting)

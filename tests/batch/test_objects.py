@@ -30,6 +30,7 @@ from sobolev_batch.study.plan import Plan, make_plan
 from sobolev_batch.tables.conclusion import format_objects
 from sobolev_batch.tables.convergence import format_table
 from sobolev_batch.tables.export import export
+from sobolev_batch.tables.open import chosen_families
 from tests.support.commands import call
 from tests.support.stores import flip
 from tests.support.studies import GONE, balls, methods_of, small_table
@@ -557,6 +558,16 @@ def test_numbers_of_a_part_have_the_orders_of_its_study(
     sb.run(changed, changeable, threads)
     require_rows(changeable, "a", "b")
     assert "left out" not in caplog.text
+
+
+def test_a_part_is_found_however_its_accents_are_encoded(tmp_path: Path, threads: Client) -> None:
+    composed, decomposed = "caf\u00e9", "cafe\u0301"
+    table = small_table(object=balls(**{composed: 1.0}), family=methods_of(decomposed))
+    study = sb.Study.from_table(table)
+    for only, count in ((decomposed, 5), (f"{decomposed}/{composed}/1", 2), (f"*/{composed}/?", 3)):
+        path = tmp_path / f"{count}.zarr"
+        assert len(sb.run(study, path, threads, only=[only]).computed) == count
+    assert len(chosen_families(sb.open_store(path / composed), composed)) == 1
 
 
 def test_objects_that_a_part_with_fewer_orders_left_out_have_all_again(changeable: Path, threads: Client) -> None:

@@ -5,7 +5,6 @@ import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
 from typing import Self
@@ -18,7 +17,7 @@ from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.parameters import as_names, path_of
 from sobolev_batch.sources.mesh_cache import MeshCache
-from sobolev_batch.sources.names import file_stem
+from sobolev_batch.sources.names import file_stem, fits
 from sobolev_batch.sources.registry import Member
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.objects import root_of
@@ -126,15 +125,14 @@ def matching_labels(tree: xr.DataTree, names: Sequence[str]) -> tuple[str, ...]:
     candidates: list[str] = meshes["mesh"].values[usable.values].tolist()
     chosen, labels = list[str](), set(known)
     for name in as_names(names):
-        if name in labels:
-            chosen.append(name)
-        elif any(character in name for character in "*?["):
-            matches = [label for label in candidates if fnmatchcase(label, name)]
-            if not matches:
-                such = f"its labels are such as {_listed(candidates or known)}"
-                raise InputError(f"the store has no computed mesh with triangles that matches {name!r}; {such}")
-            chosen += matches
-        else:
+        is_pattern = name not in labels and any(character in name for character in "*?[")
+        among = candidates if is_pattern else known
+        matches = [name] if name in labels else [label for label in among if fits(label, name)]
+        chosen += matches
+        if is_pattern and not matches:
+            such = f"its labels are such as {_listed(candidates or known)}"
+            raise InputError(f"the store has no computed mesh with triangles that matches {name!r}; {such}")
+        if not matches:
             similar = difflib.get_close_matches(name, known, n=1)
             remedy = f"did you mean {similar[0]!r}?" if similar else f"its labels are such as {_listed(known)}"
             raise InputError(f"the store has no mesh {name!r}, {remedy}")
