@@ -73,6 +73,10 @@ class StoreError(InputError):
     """A store cannot be read or written, or belongs to another study."""
 
 
+class ForeignError(StoreError):
+    """At the place of a store is something that no run has written, or that belongs to another study."""
+
+
 class SpaceError(StoreError):
     """A disk is full, or a quota is used up; the same command goes on once there is room."""
 

@@ -113,10 +113,10 @@ def ended_already(workspace: Workspace) -> Ended | None:
     return Ended.of(workspace, set())
 
 
-def run_object(study: Study, location: Location, cluster: Cluster, workspace: Workspace | None = None) -> Stages[Ended]:
+def run_object(study: Study, root: Location, cluster: Cluster, workspace: Workspace | None = None) -> Stages[Ended]:
     """Run a study of one object in a locked store, in its workspace where that is at hand, else as a worker plans it.
 
-    The worker that plans does small work at once.
+    The worker that plans does small work at once. The store of an object with a name lies in that of all.
     """
     if workspace is None:
         workers = cluster.workers.with_backend(study.backend)
@@ -134,6 +134,7 @@ def run_object(study: Study, location: Location, cluster: Cluster, workspace: Wo
                 advance(label, record)
             return ended
         workspace = begun
+        location = root.below(study.object.name) if study.object.name else root
     return (yield from _compute(cluster, workspace))
 
 

@@ -15,14 +15,14 @@ from sobolev_batch.batch.cluster.watch import Heartbeat, Watch
 from sobolev_batch.batch.cluster.workers import prepare_workers, require_store_access
 from sobolev_batch.batch.object_run import Ended, ended_already, ended_before, run_object, workspace_at_hand
 from sobolev_batch.batch.start import StoreLike, ready_to_run
-from sobolev_batch.errors import DamageError, InputError, SobolevBatchError, StoreError
+from sobolev_batch.errors import InputError, SobolevBatchError
 from sobolev_batch.machine import available_cores, require_machine_memory
 from sobolev_batch.reduction.searched import SearchedSource
 from sobolev_batch.shown import Shown, reasons
 from sobolev_batch.store.create import give_up, require_usable, reserve
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, locked, utc_now
-from sobolev_batch.store.objects import Objects, labelled
+from sobolev_batch.store.objects import Objects, ends_all, labelled
 from sobolev_batch.store.records import ObjectRecord
 from sobolev_batch.study.study import Study, StudyLike
 from sobolev_batch.tables.all_objects import write_all
@@ -168,8 +168,7 @@ def carry_out(
 ) -> Summary:
     """Run a study in a store that this process has locked; a cluster is asked for once, if anything is missing.
 
-    What ends the run of an only object without a name is raised. Of others, a StoreError ends all: the stores of the
-    next ones would not fare better.
+    What ends the run of an only object without a name is raised, and what ends those of all objects.
     """
     place = lock.of_run(location)
     numbers, equip = {name: n for n, name in enumerate(study.objects, 1)}, cache(equip)
@@ -215,11 +214,10 @@ def carry_out(
                     if objects is not None and record is not None and record.key:
                         # Its store may become another one, and this run be killed, and the study be as before again.
                         objects.records.write(objects.rows[name], replace(record, key=""))
-                    yield name, run_object(one, place.below(name) if name else place, cluster, at_hand)
+                    yield name, run_object(one, place, cluster, at_hand)
 
         def is_fatal(error: Exception) -> bool:
-            is_of_all = isinstance(error, StoreError) and not isinstance(error, DamageError)
-            return objects is None or is_of_all or not isinstance(error, SobolevBatchError)
+            return objects is None or ends_all(error) or not isinstance(error, SobolevBatchError)
 
         for name, outcome in side_by_side(runs(), is_fatal):
             if isinstance(outcome, Exception):

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from sobolev_batch.errors import DamageError, LockError, StoreError
+from sobolev_batch.errors import DamageError, ForeignError, LockError, StoreError
 from sobolev_batch.machine import available_cores
 from sobolev_batch.shown import Shown
 from sobolev_batch.store.encoding import ROOT
@@ -143,12 +143,13 @@ def _verify_all(
         return _verify(Store.open(location), on_progress, may_write=may_write)
     verified: dict[str, Verification] = {}
     for name in objects.names:
-        verified[name] = Verification(str(objects.location.below(name)), 0, 0, {}, {}, withdrawn=False)
+        verified[name] = Verification(f"{objects.location}/{name}", 0, 0, {}, {}, withdrawn=False)
         try:
             if place := objects.existing_store(name):
                 verified[name] = _verify(Store.open(place), on_progress, may_write=may_write)
-        except DamageError as error:
-            verified[name] = replace(verified[name], tables={ROOT: error.what}, withdrawn=may_write)
+        except (DamageError, ForeignError) as error:
+            what = error.what if isinstance(error, DamageError) else str(error)
+            verified[name] = replace(verified[name], tables={ROOT: what}, withdrawn=may_write)
         if may_write and not verified[name].is_sound:
             objects.records.write(objects.rows[name], None)
     damaged = [one for one in verified.values() if not one.is_sound]

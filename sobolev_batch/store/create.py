@@ -15,7 +15,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Reals
-from sobolev_batch.errors import DamageError, StoreError
+from sobolev_batch.errors import DamageError, ForeignError, StoreError
 from sobolev_batch.norms.spectrum import RadialAxis
 from sobolev_batch.norms.tail.sampling import TailSampling
 from sobolev_batch.store.encoding import ROOT, array_keys, dataset_keys, documents_in, group_document
@@ -54,10 +54,6 @@ _SPECTRA_BYTES, _MOST_SPECTRA = 2 << 20, 512
 ROWS_PER_PAGE = 100
 _RECORDED_VERSIONS = ("sobolev-batch", "finufft", "numpy", "scipy", "xarray", "zarr")
 _version = cache(version)
-
-
-class OtherStudyError(StoreError):
-    """A store belongs to another study: giving the same command again would not help."""
 
 
 def require_usable(location: Location, *, of_objects: bool = False) -> None:
@@ -319,7 +315,7 @@ def _require_same_samples(store: Store, plan: Plan) -> None:
 
 
 def require_same_study(location: Location, held: Mapping[str, Any], name: str, study: Study) -> None:
-    """Refuse a study, by an OtherStudyError, of another name or of other fields than the entry in a store's attributes.
+    """Refuse a study, by a ForeignError, of another name or of other fields than the entry in a store's attributes.
 
     A lattice that an accuracy has chosen may be chosen anew; a given one is part of the study.
     """
@@ -336,7 +332,7 @@ def require_same_study(location: Location, held: Mapping[str, Any], name: str, s
     elif not held.get("choice"):
         compared.append(("a lattice of", lattice, "an accuracy"))
     if differences := [f"{what} {old}, not {new}" for what, old, new in compared if old != new]:
-        raise OtherStudyError(
+        raise ForeignError(
             f"{location}: it holds a store of another study, with {'; '.join(differences)}. "
             "Name another store, or remove this one"
         )

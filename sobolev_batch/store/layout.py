@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 from zarr.abc.store import Store as ZarrStore
 from zarr.storage import StorePath
 
-from sobolev_batch.errors import DamageError, StoreError
+from sobolev_batch.errors import DamageError, ForeignError, StoreError
 from sobolev_batch.store.checked import CheckedStore, largest_chunk_bytes
 from sobolev_batch.store.encoding import LARGEST_CHUNK_BYTES, ROOT, chunk_key, chunks_of, dataset_keys, documents_in
 from sobolev_batch.store.location import Location
@@ -161,26 +161,26 @@ class Store:
         if not self.exists() or self.documents[""].get("node_type") != "group":
             is_absent = not self.location.scheme and not os.path.lexists(self.path)
             problem = "it does not exist" if is_absent else "it holds no store of a study"
-            raise StoreError(f"{self.path}: {problem}")
+            raise ForeignError(f"{self.path}: {problem}")
         attributes: dict[str, Any] = self.documents[""].get("attributes", {})
         if self.is_unfinished:
             raise StoreError(
                 f"{self.path}: the store is being laid out, or whoever did that was interrupted; run the study again"
             )
         if "schema_version" not in attributes or "study" not in attributes:
-            raise StoreError(f"{self.path}: a zarr store, but not one of a study")
+            raise ForeignError(f"{self.path}: a zarr store, but not one of a study")
         version = attributes["schema_version"]
         if version != SCHEMA_VERSION:
-            raise StoreError(
+            raise ForeignError(
                 f"{self.path}: its schema has version {version}, this program reads {SCHEMA_VERSION}; "
                 "run the study again into another store, or read this one with the version that has written it"
             )
         has_objects = OBJECTS in attributes["study"]
         if of_objects and not has_objects:
-            raise StoreError(f"{self.path}: the store of one object, and the study names several; name another store")
+            raise ForeignError(f"{self.path}: the store of one object, and the study names several; name another store")
         if has_objects and of_objects is False:
             first = next(iter(attributes["study"][OBJECTS]), "NAME")
-            raise StoreError(
+            raise ForeignError(
                 f"{self.path}: the store of several objects; name that of one, such as {self.path}/{first}"
             )
         return attributes
@@ -243,7 +243,7 @@ class Store:
         problems = list(problems_of({name: document}))
         for node, problem in problems:
             if name or not _is_of_tables(node):
-                raise StoreError(f"{self.path}: the store is not used: {problem}; this program did not write that")
+                raise ForeignError(f"{self.path}: the store is not used: {problem}; this program did not write that")
         if problems:
             # A run makes them from the fields.
             self.lacks_tables = True

@@ -30,7 +30,14 @@ from zarr.core.common import AccessModeLiteral
 from zarr.core.sync import sync
 from zarr.storage import FsspecStore, LocalStore
 
-from sobolev_batch.errors import DamageError, SobolevBatchError, SpaceError, StoreError, is_for_want_of_space
+from sobolev_batch.errors import (
+    DamageError,
+    ForeignError,
+    SobolevBatchError,
+    SpaceError,
+    StoreError,
+    is_for_want_of_space,
+)
 from sobolev_batch.parameters import path_of
 
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)(://|::)(.*)", re.DOTALL)
@@ -97,8 +104,8 @@ class Location:
         return self if self.scheme else replace(self, name=str(Path(self.name).absolute()))
 
     def below(self, name: str) -> Location:
-        """Return the location of a name below this one."""
-        return replace(self, name=f"{self.name}/{name}" if self.scheme else str(Path(self.name) / name))
+        """Return the location of a name below this one; ForeignError where it is a link."""
+        return replace(self, name=f"{self.name}/{name}" if self.scheme else str(path_in(self.name, name)))
 
     def beside(self, name: str) -> Location:
         """Return the location of a name in the folder of this one; the empty name is the folder itself."""
@@ -197,13 +204,13 @@ class Location:
         if not self.scheme:
             path = Path(self.name)
             if path.exists() and not path.is_dir():
-                raise StoreError(f"{path}: it is a file; name a folder that is new or holds a store")
+                raise ForeignError(f"{path}: it is a file; name a folder that is new or holds a store")
             parent = path.absolute().parent
             if not parent.is_dir():
                 raise StoreError(f"{path}: there is no folder {parent} to hold the store; make it first")
         # A driver that was killed while it wrote the first key leaves a partial file.
         if any(name not in besides and not PARTIAL_FILE.search(name) for name in self.names()):
-            raise StoreError(f"{self}: the folder is not empty and holds no store; name another")
+            raise ForeignError(f"{self}: the folder is not empty and holds no store; name another")
 
     @contextmanager
     def access(self, verb: str) -> Iterator[None]:
@@ -283,9 +290,9 @@ def path_in(root: str | Path, key: str) -> Path:
         except (FileNotFoundError, NotADirectoryError):
             break
         if stat.S_ISLNK(mode):
-            raise StoreError(f"{path}: a link, which may lead out of the store; put what it leads to in its place")
+            raise ForeignError(f"{path}: a link, which may lead out of the store; put what it leads to in its place")
         if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-            raise StoreError(f"{path}: neither a file nor a folder, in a store; remove it")
+            raise ForeignError(f"{path}: neither a file nor a folder, in a store; remove it")
     return Path(root) / key
 
 

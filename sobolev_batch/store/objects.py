@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Self, TypeVar
 
-from sobolev_batch.errors import DamageError, InputError, StoreError
+from sobolev_batch.errors import DamageError, ForeignError, InputError, StoreError
 from sobolev_batch.sources.names import node_problem, quoted
 from sobolev_batch.store.create import list_records, record_keys, require_same_study
 from sobolev_batch.store.encoding import ROOT, group_document
@@ -70,13 +70,17 @@ class Objects:
 
     def existing_store(self, name: str) -> Location | None:
         """Return the store of an object, None before its reference was made; DamageError if it is lost or another."""
-        store = Store(self.location.below(name))
-        if not store.exists() or store.is_unfinished:
+        try:
+            store = Store(self.location.below(name))
+            present = store.exists() and not store.is_unfinished
+            study = store.attributes()["study"]["name"] if present else None
+        except ForeignError as error:
+            raise DamageError(f"{error} (the object {name!r} was there)", str(error)) from error
+        if study is None:
             if name in self.tabulated:
                 problem = "its store is gone, and the tables of all objects have its rows"
                 raise DamageError(f"{store.path}: {problem}; run the study again", problem)
             return None
-        study = store.attributes()["study"]["name"]
         if study != f"{self.name} {name}":
             problem = f"it holds the study {study!r}, not that of the object {name!r}"
             problem += "; put the store of this object back, or remove it"
@@ -193,23 +197,25 @@ def root_of(location: Location) -> Location:
     return location
 
 
+def ends_all(error: Exception) -> bool:
+    """Tell whether an error at one object would come at all: their storage fails, or is another run's."""
+    return isinstance(error, StoreError) and not isinstance(error, DamageError | ForeignError)
+
+
 def for_each_object(
     study: Study, location: Location, act: Callable[[Study, Location], Result]
 ) -> tuple[dict[str, Result], dict[str, str]]:
     """Act on the study and the store of each object; return results, and why others have none, by name.
 
-    Errors of an only object without a name are raised. Of others, a StoreError ends it: the store of the next one would
-    not fare better.
+    Errors of an only object without a name are raised, and those that end the work at all objects.
     """
     results: dict[str, Result] = {}
     refused: dict[str, str] = {}
     for name in study.objects:
         try:
             results[name] = act(study.of_object(name), location.below(name) if name else location)
-        except StoreError:
-            raise
         except InputError as error:
-            if not name:
+            if not name or ends_all(error):
                 raise
             refused[name] = str(error)
     return results, refused

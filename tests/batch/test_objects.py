@@ -137,6 +137,38 @@ def test_an_object_whose_records_are_listed_no_more_is_repaired(
     assert sb.verify(changeable).is_sound
 
 
+@pytest.mark.parametrize("kind", ["array", "group", "objects", "link", "file"])
+def test_what_lies_at_the_place_of_an_object_and_is_not_its_store_is_named(
+    kind: str, changeable: Path, threads: Client
+) -> None:
+    before, place, study = sb.table(changeable), changeable / "b", study_of(balls(a=1.0, b=1.1, c=1.2))
+    elsewhere = place.rename(changeable.parent / "elsewhere")
+    if kind == "array":
+        zarr.create_array(place, shape=(2,), dtype="float64")
+    elif kind == "group":
+        zarr.create_group(place)
+    elif kind == "objects":
+        shutil.copytree(changeable, place)
+    elif kind == "link":
+        place.symlink_to(elsewhere)
+    else:
+        place.write_text("")
+    inside = {path: path.stat().st_mtime_ns for path in elsewhere.rglob("*")}
+    found = sb.verify(changeable)
+    assert ([*found.tables], found.objects["a"].is_sound) == (["b/zarr.json"], True)
+    assert {*sb.status(changeable).failed} >= {"b"}
+    assert [*sb.plan(study, changeable, threads).objects] == ["a", "c"]
+    done = sb.run(study, changeable, threads)
+    assert ({label[0] for label in done.computed}, [*done.failed]) == ({"c"}, ["b"])
+    assert str(place) in done.failed["b"]
+    assert {path: path.stat().st_mtime_ns for path in elsewhere.rglob("*")} == inside
+    shutil.rmtree(place) if kind in ("array", "group", "objects") else place.unlink()
+    elsewhere.rename(place)
+    assert sb.run(study, changeable, threads).computed == ()
+    after = sb.table(changeable)
+    pd.testing.assert_frame_equal(after[after["object"] != "c"].reset_index(drop=True), before)
+
+
 def test_an_object_that_lost_its_root_is_damage(changeable: Path, threads: Client) -> None:
     before = sb.table(changeable)
     (changeable / "b/zarr.json").unlink()
