@@ -188,7 +188,9 @@ def _compute(cluster: Cluster, workspace: Workspace) -> Stages[Ended]:
         choice = workspace.plan.choice.grown(tabulated.distances, study.orders, study.accuracy)
         if choice is None:
             break
-        arguments = workspace.store.location, workspace.plan.with_choice(choice)
+        # Fields that a run of a part leaves out would be lost.
+        stored = {workspace.labels[i] for i in workspace.complete}
+        arguments = workspace.store.location, workspace.plan.with_choice(choice, stored)
         workspace = yield from result_from(cluster, Task(Workspace.prepared, arguments, stage="layout"))
         rows = workspace.pending
     yield from measure_proximities(cluster, workspace)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
 
+from sobolev_batch.errors import DamageError, StoreError
 from sobolev_batch.store.create import labels_for, prepare_store
 from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.store.layout import QUALITY, Store, hide_tables, stored_choice, table_attributes
@@ -131,7 +133,19 @@ class Workspace(Contents):
 
     @classmethod
     def prepared(cls, location: Location, plan: Plan) -> Self:
-        """Create or open the store of a plan, and withdraw the records of lost fields; see `prepare_store`."""
+        """Create or open the store of a plan, and withdraw the records of lost fields; see `prepare_store`.
+
+        StoreError where a run of a part, with other settings, would lose the fields that it leaves out.
+        """
+        with suppress(DamageError):  # It is made again.
+            present = None if all(row.is_chosen for row in plan.rows) else cls.found(location, plan)
+            # None has the settings of now, and not only some have another file.
+            if present is not None and present.outdated and not present.stored:
+                raise StoreError(
+                    f"{location}: settings or the reference have changed, and {len(present.outdated)} fields that this "
+                    f"run of a part leaves out would be lost, such as {present.labels[present.outdated[0]]}; run all "
+                    "of the study, or name another store"
+                )
         workspace = cls.for_plan(prepare_store(location, plan), plan)
         complete = workspace.complete
         if complete:

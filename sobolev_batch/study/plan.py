@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -111,10 +112,17 @@ class Plan:
         sample, closest = (None, self.choice.closest) if row.label == self.reference else (self.sample, ())
         return DistanceTarget(self.study.orders, self.study.accuracy, sample, closest)
 
-    def with_choice(self, choice: LatticeChoice) -> Plan:
-        """Return the plan of the same study on another lattice."""
-        rows = tuple(replace(row, key=_key(self.study, self.similarity, choice, row.fingerprint)) for row in self.rows)
-        return replace(self, rows=rows, choice=choice)
+    def with_choice(self, choice: LatticeChoice, also: Collection[str] = ()) -> Plan:
+        """Return the plan of the same study on another lattice, where a run computes some more labels."""
+        rows = (
+            replace(
+                row,
+                key=_key(self.study, self.similarity, choice, row.fingerprint),
+                is_chosen=row.is_chosen or row.label in also,
+            )
+            for row in self.rows
+        )
+        return replace(self, rows=tuple(rows), choice=choice)
 
 
 def make_plan(study: Study, earlier_choice: LatticeChoice | None = None) -> Plan:

@@ -13,6 +13,7 @@ from subprocess import PIPE
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import trimesh
 from distributed import Client
@@ -122,16 +123,35 @@ def test_distances_are_those_to_the_reference_of_the_study(
         assert distances.mesh[(distances == 0).all("order")].values.tolist() == [f"f/{name}"]
 
 
-def test_a_run_of_a_part_mixes_no_fields_of_two_studies(folder: Path, store_path: Path, client: Client) -> None:
-    run(study_of(folder), store_path, client)
-    other = study_of(folder, scaling={"mode": "fixed", "scale": 0.5})
-    assert run(other, store_path, client, only=["f/a"]).computed == ("f/a", "reference")
-    assert dict(zip(ALL, variable(open_store(store_path), "meshes", "status").values, strict=True)) == {
-        **dict.fromkeys(ALL, "complete"),
-        "f/b": "missing",
-    }
+@pytest.mark.parametrize(
+    ("names", "first", "changes"),
+    [
+        ((), {}, {"scaling": {"mode": "fixed", "scale": 0.5}}),
+        (("o", "p"), {}, {"transform": {"eps": 1e-7}}),
+        ((), {"lattice": None, "accuracy": {"rtol": 0.3}}, {"accuracy": {"rtol": 0.1}}),
+    ],
+)
+def test_a_run_of_a_part_loses_no_field_that_it_leaves_out(
+    names: tuple[str, ...],
+    first: dict[str, Any],
+    changes: dict[str, Any],
+    folder: Path,
+    store_path: Path,
+    threads: Client,
+) -> None:
+    """Nor does any table mix those of two studies."""
+    of_objects = {"object": balls(**dict.fromkeys(names, 1.0))} if names else {}
+    study, other = study_of(folder, **of_objects, **first), study_of(folder, **of_objects, **first | changes)
+    run(study, store_path, threads)
+    before = table(store_path)
+    with pytest.raises(StoreError, match="1 fields that this run of a part leaves out would be lost, such as f/b; run"):
+        run(other, store_path, threads, only=["f/a"])
     assert verify(store_path).is_sound
-    assert run(other, store_path, client).computed == ("f/b",)
+    assert run(study, store_path, threads).computed == ()
+    pd.testing.assert_frame_equal(table(store_path), before)
+    # Who names all that has a field loses nothing.
+    again = {label.rpartition("/")[2] for label in run(other, store_path, threads, only=["f/*"]).computed}
+    assert again == {"a", "b", "reference"}
 
 
 @pytest.mark.parametrize("names", [(), ("o", "p")])
