@@ -43,6 +43,9 @@ _MOST_REPAIRS = 3
 # The worker that plans an object does all its work where that is predicted to take less: a task costs the scheduler and
 # the driver some milliseconds.
 _SMALL_SECONDS = 2.0
+# Sections of a study on which all numbers of an object depend; it may gain others.
+_SETTINGS = ("accuracy", "lattice", "transform", "scaling", "reference")
+_VERSIONS = (SCHEMA_VERSION, NUMERICS_VERSION, TABLES_VERSION)
 
 
 @dataclass(frozen=True)
@@ -64,9 +67,10 @@ class Ended:
     def of(cls, workspace: Workspace, computed: set[int], tables: Tables | None = None) -> Ended:
         """Return how a run ended that has computed some rows, by what its workspace holds now, and new tables."""
         labels, complete = workspace.labels, workspace.complete
-        record = workspace.tally(imprecise=_imprecise(workspace))
+        one = workspace.plan.study.object
+        record = replace(workspace.tally(imprecise=_imprecise(workspace)), settings=_settings_of(one))
         if record.complete == record.total and not record.not_compared:
-            one, prints = workspace.plan.study.object, {row.label: row.fingerprint for row in workspace.plan.rows}
+            prints = {row.label: row.fingerprint for row in workspace.plan.rows}
             record = replace(record, key=object_key(one, one.members, prints))
         return cls(
             record,
@@ -92,6 +96,17 @@ def ended_before(study: Study, record: ObjectRecord | None) -> Ended | None:
     return None
 
 
+def _settings_of(one: StudyObject) -> dict[str, Any]:
+    own = dict.fromkeys(_SETTINGS) | {name: one.table[name] for name in (*_SETTINGS, "proximity") if name in one.table}
+    return {"versions": [*_VERSIONS], **own}
+
+
+def has_rows_of_now(one: StudyObject, record: ObjectRecord | None) -> bool:
+    """Tell whether the rows of an object in the tables of all were made by the settings that its study has now."""
+    settings = {} if record is None else record.settings
+    return bool(settings) and settings.items() <= {"proximity": None, **_settings_of(one)}.items()
+
+
 def object_key(one: StudyObject, members: Members, fingerprints: Mapping[str, str]) -> str:
     """Return a digest of all that the tables of an object depend on; empty where a file of it cannot be read."""
     if not all(fingerprints.values()):
@@ -100,7 +115,7 @@ def object_key(one: StudyObject, members: Members, fingerprints: Mapping[str, st
         [label, family, member.time, member.metadata, fingerprints[label]]
         for label, (family, member) in members.items()
     ]
-    inputs = [SCHEMA_VERSION, NUMERICS_VERSION, TABLES_VERSION, one.table, surfaces]
+    inputs = [*_VERSIONS, one.table, surfaces]
     return digest_of(inputs)
 
 
@@ -119,6 +134,7 @@ def run_object(study: Study, root: Location, cluster: Cluster, workspace: Worksp
     The worker that plans does small work at once. The store of an object with a name lies in that of all.
     """
     if workspace is None:
+        location = root.below(study.object.name) if study.object.name else root
         workers = cluster.workers.with_backend(study.backend)
         advance = cluster.count_steps("lattice", 1)
         # Should the worker die, another one leaves the work to tasks.
@@ -134,7 +150,6 @@ def run_object(study: Study, root: Location, cluster: Cluster, workspace: Worksp
                 advance(label, record)
             return ended
         workspace = begun
-        location = root.below(study.object.name) if study.object.name else root
     return (yield from _compute(cluster, workspace))
 
 

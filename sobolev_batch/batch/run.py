@@ -13,12 +13,20 @@ from sobolev_batch.batch.cluster.clients import check_cluster, local_client, mem
 from sobolev_batch.batch.cluster.execution import Cluster, Notify, Progress, Stages, side_by_side
 from sobolev_batch.batch.cluster.watch import Heartbeat, Watch
 from sobolev_batch.batch.cluster.workers import prepare_workers, require_store_access
-from sobolev_batch.batch.object_run import Ended, ended_already, ended_before, run_object, workspace_at_hand
+from sobolev_batch.batch.object_run import (
+    Ended,
+    ended_already,
+    ended_before,
+    has_rows_of_now,
+    run_object,
+    workspace_at_hand,
+)
 from sobolev_batch.batch.start import StoreLike, ready_to_run
 from sobolev_batch.errors import InputError, SobolevBatchError
 from sobolev_batch.machine import available_cores, require_machine_memory
 from sobolev_batch.reduction.searched import SearchedSource
 from sobolev_batch.shown import Shown, reasons
+from sobolev_batch.sources.names import quoted
 from sobolev_batch.store.create import give_up, require_usable, reserve
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, locked, utc_now
@@ -230,10 +238,10 @@ def carry_out(
             if objects is not None:
                 # With its key, the next run would trust the old rows at the root, should this one be killed.
                 has_old_rows = outcome.tables is not None and name in objects.tabulated
-                record = replace(outcome.record, key="") if has_old_rows else outcome.record
+                record = replace(outcome.record, key="", settings={}) if has_old_rows else outcome.record
                 objects.records.write(objects.rows[name], record)
         if objects is not None:
-            _tabulate(objects, ended)
+            _tabulate(objects, ended, lambda name: has_rows_of_now(study.objects[name], recorded.get(name)))
             _complete_records(objects, recorded, ended)
             objects.root.remember()
     return _summary(location, {name: ended[name] for name in study.objects if name in ended})
@@ -261,11 +269,21 @@ def _complete_records(objects: Objects, recorded: Mapping[str, ObjectRecord], en
             objects.records.write(objects.rows[name], known[name])
 
 
-def _tabulate(objects: Objects, ended: Mapping[str, Ended]) -> None:
-    """Write the tables of all objects at the root, where rows of any have changed, came, went or have another place."""
+def _tabulate(objects: Objects, ended: Mapping[str, Ended], is_current: Callable[[str], bool]) -> None:
+    """Write the tables of all objects at the root, where rows of any have changed, came, went or have another place.
+
+    Objects that the run left out keep theirs if these are of the study's settings now.
+    """
     changed = {name: one.tables for name, one in ended.items() if one.tables is not None}
-    # Objects that the run left out keep theirs; those that it found to be impossible lose them.
+    # Those that it found to be impossible lose them.
     lost = {name for name, one in ended.items() if one.record.reason} | changed.keys()
+    left_out = (name for name in objects.tabulated if name in objects.rows and name not in ended)
+    if others := [name for name in left_out if not is_current(name)]:
+        _log.warning(
+            "%s: %d objects that this run left out, such as %s, have rows of other settings, and none in the tables of "
+            "all until a run of them", *(objects.location, len(others), quoted(others[0])),
+        )  # fmt: skip
+        lost.update(others)
     kept = [name for name in objects.names if name in objects.tabulated and name not in lost]
     if changed or kept != [*objects.tabulated]:
         write_all(objects.root, objects.names, changed.values(), kept)

@@ -189,6 +189,7 @@ class ObjectRecord(_Line):
         imprecise: Largest relative error of the distances of each mesh that miss the accuracy requested.
         lost_records: Labels of surfaces that the tables list, and whose completion records are gone, or others.
         reduced: True if it has tables.
+        settings: Settings of the study by which its rows in the tables of all were made.
         finished: Time at which its run ended, in UTC.
     """
 
@@ -203,6 +204,7 @@ class ObjectRecord(_Line):
     imprecise: Mapping[str, float] = field(default_factory=dict)
     lost_records: tuple[str, ...] = ()
     reduced: bool = False
+    settings: Mapping[str, Any] = field(default_factory=dict)
     finished: Time | Literal[""] = ""
 
     @property

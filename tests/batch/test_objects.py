@@ -560,6 +560,16 @@ def test_a_run_of_a_part_takes_objects_families_or_members(changeable: Path, thr
         sb.run(study, changeable, threads, only=["r"])
 
 
+def test_a_part_is_found_however_its_accents_are_encoded(tmp_path: Path, threads: Client) -> None:
+    composed, decomposed = "caf\u00e9", "cafe\u0301"
+    table = small_table(object=balls(**{composed: 1.0}), family=methods_of(decomposed))
+    study = sb.Study.from_table(table)
+    for only, count in ((decomposed, 5), (f"{decomposed}/{composed}/1", 2), (f"*/{composed}/?", 3)):
+        path = tmp_path / f"{count}.zarr"
+        assert len(sb.run(study, path, threads, only=[only]).computed) == count
+    assert len(chosen_families(sb.open_store(path / composed), composed)) == 1
+
+
 def test_a_part_that_cannot_be_listed_says_why(tmp_path: Path, threads: Client) -> None:
     files = [{"name": "scans", "source": "files", "paths": ["no/*.ply"]}]
     study = sb.Study.from_table(small_table(object=balls(a=1.0), family=files), folder=tmp_path)
@@ -592,14 +602,27 @@ def test_numbers_of_a_part_have_the_orders_of_its_study(
     assert "left out" not in caplog.text
 
 
-def test_a_part_is_found_however_its_accents_are_encoded(tmp_path: Path, threads: Client) -> None:
-    composed, decomposed = "caf\u00e9", "cafe\u0301"
-    table = small_table(object=balls(**{composed: 1.0}), family=methods_of(decomposed))
-    study = sb.Study.from_table(table)
-    for only, count in ((decomposed, 5), (f"{decomposed}/{composed}/1", 2), (f"*/{composed}/?", 3)):
-        path = tmp_path / f"{count}.zarr"
-        assert len(sb.run(study, path, threads, only=[only]).computed) == count
-    assert len(chosen_families(sb.open_store(path / composed), composed)) == 1
+@pytest.mark.parametrize("own", [{"scaling": {"mode": "fixed", "scale": 0.5}}, {"transform": {"eps": 1e-7}}])
+def test_no_table_mixes_rows_of_other_settings(
+    own: dict[str, Any], changeable: Path, threads: Client, caplog: pytest.LogCaptureFixture
+) -> None:
+    objects = [{**one, "scaling": own["scaling"]} if "scaling" in own else one for one in balls(a=1.0, b=1.1)]
+    changed = {**study_of(objects).table, **own}
+    study, other = study_of(balls(a=1.0, b=1.1)), sb.Study.from_table(changed)
+    sb.run(study, changeable, threads)
+    before = sb.table(changeable).drop(columns="seconds")
+    sb.run(other, changeable, threads, only=["b"])
+    assert "1 objects that this run left out, such as 'a', have rows of other settings" in caplog.text
+    require_rows(changeable, "b")
+    caplog.clear()
+    assert {label[0] for label in sb.run(other, changeable, threads).computed} == {"a"}
+    require_rows(changeable, "a", "b")
+    # What is of the same settings stays.
+    sb.run(other, changeable, threads, only=["a"])
+    require_rows(changeable, "a", "b")
+    assert "left out" not in caplog.text
+    sb.run(study, changeable, threads)
+    pd.testing.assert_frame_equal(sb.table(changeable).drop(columns="seconds"), before)
 
 
 def test_objects_that_a_part_with_fewer_orders_left_out_have_all_again(changeable: Path, threads: Client) -> None:
