@@ -246,6 +246,7 @@ def _study_lines(plan: Plan) -> Iterator[tuple[str, str]]:
     else:
         allowed = f"{format_bytes(accuracy.allowed_bytes)} for a transform, M <= {accuracy.largest_intervals}"
         yield "accuracy", f"rtol {accuracy.rtol:g} of every distance to {plan.reference}; {allowed}"
+        yield "", "a run goes on with a larger lattice, or more octaves, where a distance misses it"
         yield from (("chosen", reason) for reason in plan.choice.reasons)
         yield "transform", f"{transform.dtype}, eps and quadrature for each surface from its distance"
     yield "backend", study.backend
