@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,8 +27,8 @@ from sobolev_batch.parameters import format_bytes
 
 INPUT, OUTPUT = "input", "output"
 _NOTHING_KNOWN = float("nan")
-# Time after which a command that prints a version is ended.
-_VERSION_SECONDS = 60.0
+# Time and bytes after which a command that prints a version is ended.
+_VERSION_SECONDS, _LONGEST_VERSION = 60.0, 1_000_000
 PLACEHOLDER = re.compile(r"\{(\w+)\}")
 # Characters of what a program said last, in the reason of its failure.
 _LONGEST_TAIL = 300
@@ -80,22 +80,24 @@ def environment() -> dict[str, str]:
 
 
 def printed(words: Sequence[str]) -> str:
-    """Return what a program prints, such as its version; StudyError where it fails."""
+    """Return what a program prints, such as its version; StudyError where it fails, or prints without an end."""
     try:
-        done = subprocess.run(  # noqa: S603 -- the user permitted it
-            words,
-            env=environment(),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            timeout=_VERSION_SECONDS,
-            check=True,
-        )
-    except FileNotFoundError as error:
-        raise StudyError(f"version: {shlex.join(words)}: {words[0]} is not installed, or not on the PATH") from error
-    except (OSError, subprocess.SubprocessError) as error:
-        raise StudyError(f"version: {shlex.join(words)}: {one_line(error)}") from error
-    return done.stdout.decode(errors="replace").strip()
+        with tempfile.TemporaryFile() as said:
+            process = subprocess.Popen(  # noqa: S603 -- the user permitted it
+                words, env=environment(), stdin=subprocess.DEVNULL, stdout=said, stderr=subprocess.STDOUT
+            )
+            problem, *_ = _awaited(process, lambda: _size(said), _VERSION_SECONDS, _LONGEST_VERSION)
+            said.seek(0)
+            text = said.read(_LONGEST_VERSION).decode(errors="replace").strip()
+    except (OSError, ValueError) as error:
+        is_absent = getattr(error, "filename", None) == words[0]
+        problem = f"{words[0]} is not installed, or not on the PATH" if is_absent else one_line(error)
+    else:
+        if process.returncode and not problem:
+            problem = f"it ended with exit status {process.returncode}"
+    if problem:
+        raise StudyError(f"version: {shlex.join(words)}: {problem}")
+    return text
 
 
 def run_command(mesh: Mesh, words: list[str], suffixes: tuple[str, str], timeout: float, largest_output: int) -> Made:
@@ -136,7 +138,11 @@ def run_command(mesh: Mesh, words: list[str], suffixes: tuple[str, str], timeout
             return Cost(), f"{words[0]} cannot be started on this machine: {one_line(error)}"
         if guard.stdin is not None:
             guard.stdin.write(b"%d\n" % process.pid)
-        problem, cpu_seconds, peak_bytes = _awaited(process, folder, (out, err), timeout, largest_output)
+
+        def written() -> int:
+            return _bytes_below(folder) + _size(out) + _size(err)
+
+        problem, cpu_seconds, peak_bytes = _awaited(process, written, timeout, largest_output)
         status = process.returncode
         cost = Cost(time.perf_counter() - started, cpu_seconds, peak_bytes, status)
         if not problem and status:
@@ -154,7 +160,7 @@ def run_command(mesh: Mesh, words: list[str], suffixes: tuple[str, str], timeout
 
 
 def _awaited(
-    process: subprocess.Popen[bytes], folder: Path, said: tuple[IO[bytes], ...], timeout: float, largest_output: int
+    process: subprocess.Popen[bytes], written: Callable[[], int], timeout: float, largest_output: int
 ) -> tuple[str, float, float]:
     """Wait for a program, and return why it was ended before its time, its processor time and its largest memory."""
     problem, pause, deadline, peak_bytes = "", _FIRST_PAUSE, time.monotonic() + timeout, float("nan")
@@ -168,8 +174,8 @@ def _awaited(
         peak_bytes = float(np.fmax(peak_bytes, _resident_bytes(process.pid)))
         if time.monotonic() > deadline:
             problem = f"it was ended after {timeout:g} s, its timeout"
-        elif (written := _bytes_below(folder) + sum(map(_size, said))) > largest_output:
-            problem = f"it was ended after it had written {format_bytes(written)}"
+        elif (count := written()) > largest_output:
+            problem = f"it was ended after it had written {format_bytes(count)}"
         if problem:
             # What else is in its session ends with the guard.
             os.kill(process.pid, signal.SIGKILL)

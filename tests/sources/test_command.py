@@ -190,11 +190,14 @@ def test_a_program_without_a_scratch_folder_says_so(tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.process
-def test_a_program_that_is_not_there_is_named(tmp_path: Path) -> None:
+def test_a_program_that_is_not_there_or_prints_no_version_is_named(tmp_path: Path) -> None:
     with pytest.raises(sb.errors.MeshError, match="no-such-remesher cannot be started on this machine"):
         made({**COPY, "command": ["no-such-remesher", "{output}"]}, tmp_path)[0].load()
     with pytest.raises(sb.errors.StudyError, match="no-such-remesher is not installed, or not on the PATH"):
         made({**COPY, "version": ["no-such-remesher"]}, tmp_path)
+    for words, problem in ((["yes"], "it was ended after it had written"), (["false"], "ended with exit status 1")):
+        with pytest.raises(sb.errors.StudyError, match=f"version: {words[0]}: .*{problem}"):
+            made({**COPY, "version": words}, tmp_path)
 
 
 @pytest.mark.process
