@@ -157,7 +157,7 @@ def test_what_lies_at_the_place_of_an_object_and_is_not_its_store_is_named(
     found = sb.verify(changeable)
     assert ([*found.tables], found.objects["a"].is_sound) == (["b/zarr.json"], True)
     assert {*sb.status(changeable).failed} >= {"b"}
-    assert [*sb.plan(study, changeable, threads).objects] == ["a", "c"]
+    assert {*sb.plan(study, changeable, threads).objects} >= {"a", "c"}
     done = sb.run(study, changeable, threads)
     assert ({label[0] for label in done.computed}, [*done.failed]) == ({"c"}, ["b"])
     assert str(place) in done.failed["b"]
