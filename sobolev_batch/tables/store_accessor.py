@@ -164,7 +164,8 @@ class StoreAccessor:
     def spectrum(self, order: Orders, mesh: str, other: str | None = None) -> xr.Dataset:
         """Return the squared distance of two meshes, or the squared norm of one, by octaves of the frequency |ξ|.
 
-        Neighbouring bands overlap smoothly; at its two ends a band has half of its weight.
+        Neighbouring bands overlap smoothly; at its two ends a band has half of its weight. Without octaves, the last
+        band has all of its weight up to the end of the lattice.
 
         Args:
             order: One order s < -1/2, or several.
@@ -188,7 +189,6 @@ class StoreAccessor:
         reducer, indices = stored_reducer(self._tree, order, *([mesh] if other is None else [mesh, other]))
         bands = [*_inner_bands(reducer, indices), *_octaves(reducer, indices)]
         upper, squares, energies, deviations = (np.array(column) for column in zip(*bands, strict=True))
-        upper *= _HALF_WEIGHT
         lower = np.array([0.0, *upper[:-1]])
         dims, values, _ = axis = order_axis(order)
         squared = squares.T.reshape(*values.shape, -1)
@@ -210,12 +210,15 @@ class StoreAccessor:
 def _inner_bands(reducer: Reducer, rows: list[int]) -> list[Band]:
     lattice = reducer.lattice
     count = max(1, (lattice.M // (2 * _FEWEST_SPACINGS)).bit_length())
-    upper = lattice.xi_max / 2.0 ** np.arange(count)[::-1]
+    cutoffs = lattice.xi_max / 2.0 ** np.arange(count)[::-1]
     radii = lattice.spacing * np.sqrt(np.arange(lattice.shell_count))
-    windows = np.diff([smooth_step(radii, cutoff) for cutoff in upper], axis=0, prepend=0.0)
-    sums = windows * reducer.sums_over_shells(rows)
-    squares = sums @ (1 + radii[:, None] ** 2) ** reducer.orders
-    energies = sums.sum(axis=1) / (_HALF_WEIGHT * np.diff(upper, prepend=0.0))
+    windows = np.diff([smooth_step(radii, cutoff) for cutoff in cutoffs], axis=0, prepend=0.0)
+    sums, upper = reducer.sums_over_shells(rows), _HALF_WEIGHT * cutoffs
+    energies = windows @ sums / np.diff(upper, prepend=0.0)
+    if reducer.sampling is None:
+        # No octave takes over from the last band.
+        windows[-1], upper[-1] = 1 - windows[:-1].sum(axis=0), lattice.xi_max
+    squares = windows * sums @ (1 + radii[:, None] ** 2) ** reducer.orders
     return [(*ends, 0.0) for ends in zip(upper.tolist(), squares, energies.tolist(), strict=True)]
 
 
@@ -225,6 +228,6 @@ def _octaves(reducer: Reducer, rows: list[int]) -> list[Band]:
     values = [reducer.read_octaves(row) for row in rows]
     sums = reducer.octave_sums(values[0] - values[1] if len(rows) > 1 else values[0])
     return [
-        (sampling.octave.highest, one.squares, one.energy, one.energy_deviation)
+        (_HALF_WEIGHT * sampling.octave.highest, one.squares, one.energy, one.energy_deviation)
         for sampling, one in zip(reducer.sampling.octaves, sums, strict=True)
     ]

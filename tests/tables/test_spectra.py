@@ -53,6 +53,9 @@ def test_a_weighted_sum_of_a_spectrum_is_a_squared_norm_or_distance(
             found = (spectra[name] * weights).sum("shell") + tree[group]["beyond"].sel(order=order)
             expected = tree[group][name].sel(order=order) ** 2
             assert found.sel(mesh=expected["mesh"]).values == pytest.approx(expected.values, rel=1e-12)
+    bands = open_store(store_path).sobolev.spectrum(-3.0, "ball-0/sphere", "reference")
+    rows = tree["convergence"].sel(mesh="ball-0/sphere", order=-3.0)
+    assert bands["squared"].sum() + rows["beyond"] == pytest.approx(float(rows["distance"]) ** 2, rel=1e-12)
 
 
 @pytest.mark.slow
