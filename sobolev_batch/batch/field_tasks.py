@@ -20,7 +20,7 @@ from sobolev_batch.geometry.smooth import Smooth
 from sobolev_batch.geometry.surface import Similarity, Surface
 from sobolev_batch.norms.accuracy.solve import DistanceTarget
 from sobolev_batch.norms.fields import BEYOND_ORDERS, Quality, TailQuality, compute_field, field_for
-from sobolev_batch.norms.tail.face_normals import FaceNormals
+from sobolev_batch.norms.tail.face_normals import FacesAndEdges
 from sobolev_batch.norms.tail.remainder import Remainder, remainder
 from sobolev_batch.norms.tail.sampling import TailSampling
 from sobolev_batch.norms.tail.values import FlatBeyond, draws_beyond, octave_values
@@ -253,7 +253,7 @@ def _beyond_given(job: Job, surface: Surface) -> tuple[float, ...]:
     if (beyond := _references_beyond.get(key)) is None:
         if (reference := job.load_reference()) is None:
             return ()
-        beyond = FlatBeyond.of_surface(reference, job.lattice, FaceNormals.from_surfaces([reference]), draws)
+        beyond = FlatBeyond.of_surface(reference, job.lattice, FacesAndEdges.from_surfaces([reference]), draws)
         # Tasks in other threads do so too.
         if len(_references_beyond) >= _KEPT_BEYOND:
             _references_beyond.clear()

@@ -21,6 +21,8 @@ _BATCH = 1 << 14
 _LEAST_SHARE, _MOST_DIRECTIONS = 0.01, 64
 # κ as a fraction of 2π |ξ| · size of the faces: the spots around normals are about 1/κ wide.
 _SPOT_FRACTION = 0.5
+# The part of directions that `FacesAndEdges` draws across edges.
+_ACROSS_EDGES = 0.5
 # No direction of small whole numbers is orthogonal to this one, where rounding would decide.
 _UPWARDS = np.array([1.0, np.sqrt(2.0), np.pi])
 _NO_NORMALS = (np.zeros((0, 3)), np.zeros(0), np.zeros(0))
@@ -61,14 +63,7 @@ class FaceNormals:
         squares = self._concentrations(radii, self.sizes[chosen])
         levels = rng.random(len(radii))
         # The distribution of u = |cos θ| is u / √(1 + κ² - κ² u²), which inverts in closed form.
-        cosines = levels * np.sqrt((1 + squares) / (1 + squares * levels**2))
-        sines = np.sqrt(np.maximum(1 - cosines**2, 0.0))
-        turns = 2 * np.pi * rng.random(len(radii))
-        across = np.cross(axes, np.eye(3)[np.abs(axes).argmin(axis=1)])
-        across /= np.linalg.norm(across, axis=1, keepdims=True)
-        sideways = np.cos(turns)[:, None] * across + np.sin(turns)[:, None] * np.cross(axes, across)
-        # A direction stands for its opposite too, since all integrands are even.
-        return np.asarray(cosines[:, None] * axes + sines[:, None] * sideways)
+        return _around(axes, levels * np.sqrt((1 + squares) / (1 + squares * levels**2)), rng)
 
     def density(self, directions: Reals, radii: Reals) -> Reals:
         """Return the density per solid angle (n,) at unit directions (n, 3), for their |ξ| (n,)."""
@@ -83,6 +78,95 @@ class FaceNormals:
     def _concentrations(radii: Reals, sizes: Reals | float) -> Reals:
         """Return κ² of the density."""
         return np.asarray((_SPOT_FRACTION * 2 * np.pi * radii * sizes) ** 2)
+
+
+@dataclass(frozen=True, eq=False)
+class FacesAndEdges(FaceNormals):
+    """Directions of the flat faces of some surfaces and of the edges of these, and a density that follows both.
+
+    The transform of a face falls off least in the plane across each of its edges, in a band as wide as the inverse
+    length of the edge. Where faces repeat, as in folds, most of it may lie there, far from all normals. The density
+    around each edge is κ / (4π arctan κ (1 + κ² cos²θ)) at an angle θ to it.
+
+    Attributes:
+        edges: Directions of edges, their shares of the length of all, and their typical lengths as sizes.
+    """
+
+    edges: FaceNormals
+
+    @classmethod
+    def from_surfaces(cls, surfaces: Sequence[Surface]) -> Self:
+        """Return the normals and edges of the flat faces of surfaces; none for curved ones."""
+        faces = FaceNormals.from_surfaces(surfaces)
+        found = [_main_edges(mesh, faces.directions) for mesh in surfaces if isinstance(mesh, Mesh)]
+        directions, lengths, sizes = (np.concatenate(rows) for rows in zip(_NO_NORMALS, *found, strict=True))
+        edges = FaceNormals(directions, lengths / max(float(lengths.sum()), np.finfo(np.float64).tiny), sizes)
+        return cls(faces.directions, faces.shares, faces.sizes, edges)
+
+    def draw(self, radii: Reals, rng: np.random.Generator) -> Reals:
+        """Draw a unit direction around a normal or across an edge for each |ξ| (n,), float64 (n, 3)."""
+        directions, edges = super().draw(radii, rng), self.edges
+        if edges:
+            across = np.flatnonzero(rng.random(len(radii)) < _ACROSS_EDGES)
+            chosen = rng.choice(len(edges.shares), len(across), p=edges.shares)
+            widths = np.sqrt(self._concentrations(radii[across], edges.sizes[chosen]))
+            cosines = np.tan(np.arctan(widths) * (2 * rng.random(len(across)) - 1)) / widths
+            directions[across] = _around(edges.directions[chosen], cosines, rng)
+        return directions
+
+    def density(self, directions: Reals, radii: Reals) -> Reals:
+        """Return the density per solid angle (n,); see `FaceNormals.density`."""
+        total, edges = super().density(directions, radii), self.edges
+        if not edges:
+            return total
+        total, columns = (1 - _ACROSS_EDGES) * total, np.ascontiguousarray(directions.T)
+        for axis, share, size in zip(edges.directions, edges.shares, edges.sizes, strict=True):
+            widths = np.sqrt(self._concentrations(radii, size))
+            spread = 4 * np.pi * np.arctan(widths) * (1 + (widths * combine(axis, columns)) ** 2)
+            total += _ACROSS_EDGES * share * widths / spread
+        return total
+
+
+def _around(axes: Reals, cosines: Reals, rng: np.random.Generator) -> Reals:
+    """Return unit directions (n, 3) whose angles to unit axes have some cosines, turned around these at random."""
+    sines = np.sqrt(np.maximum(1 - cosines**2, 0.0))
+    turns = 2 * np.pi * rng.random(len(axes))
+    across = np.cross(axes, np.eye(3)[np.abs(axes).argmin(axis=1)])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    sideways = np.cos(turns)[:, None] * across + np.sin(turns)[:, None] * np.cross(axes, across)
+    # A direction stands for its opposite too, since all integrands are even.
+    return np.asarray(cosines[:, None] * axes + sines[:, None] * sideways)
+
+
+def _main_edges(mesh: Mesh, normals: Reals) -> tuple[Reals, Reals, Reals]:
+    """Return directions, lengths together and typical lengths of the edges around a mesh's faces along some normals."""
+    if not len(normals):
+        return _NO_NORMALS
+    a, b, c = mesh.corners()
+    crosses = np.cross(b - a, c - a)
+    crosses /= np.maximum(np.linalg.norm(crosses, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    vectors: list[Reals] = [np.zeros((0, 3))]
+    for normal in normals:
+        cosines = crosses @ normal
+        face = np.abs(cosines) > 1 - _DIRECTION_PARTS**-2.0
+        corners = mesh.triangles[face].astype(np.int64)
+        sides = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+        # Along a side between two triangles of the face, both go opposite ways.
+        ways = np.tile(np.sign(cosines[face]), 3) * np.sign(sides[:, 1] - sides[:, 0])
+        names = sides.min(axis=1) * len(mesh.vertices) + sides.max(axis=1)
+        _, first, members = np.unique(names, return_index=True, return_inverse=True)
+        ends = mesh.vertices[sides[first[np.bincount(members.ravel(), weights=ways) != 0]]]
+        vectors.append(ends[:, 1] - ends[:, 0])
+    edges = np.concatenate(vectors)
+    lengths = np.linalg.norm(edges, axis=1)
+    edges, lengths = edges[lengths > 0], lengths[lengths > 0]
+    edges /= lengths[:, None]
+    edges[edges @ _UPWARDS < 0] *= -1
+    _, first, members = np.unique(np.round(edges * _DIRECTION_PARTS), axis=0, return_index=True, return_inverse=True)
+    sums, squares = (np.bincount(members.ravel(), weights=weights) for weights in (lengths, lengths**2))
+    largest = np.argsort(-sums)[:_MOST_DIRECTIONS]
+    largest = largest[sums[largest] > _LEAST_SHARE * sums.sum()]
+    return edges[first[largest]], sums[largest], (squares / sums)[largest]
 
 
 def _main_normals(mesh: Mesh) -> tuple[Reals, Reals, Reals]:

@@ -12,7 +12,7 @@ from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.smooth import Smooth
 from sobolev_batch.geometry.surface import Surface
-from sobolev_batch.norms.tail.face_normals import FaceNormals
+from sobolev_batch.norms.tail.face_normals import FaceNormals, FacesAndEdges
 from sobolev_batch.norms.tail.integrals import squared_moduli
 from sobolev_batch.norms.tail.sampling import Octave, OctaveSampling
 from sobolev_batch.transform.backends import Backend
@@ -110,10 +110,10 @@ def octave_values(
 
 @dataclass(frozen=True, eq=False)
 class FlatBeyond:
-    """A surface beyond the cube of a given lattice, at few random frequencies around the normals of flat faces.
+    """A surface beyond the cube of a given lattice, at few random frequencies around normals and edges of flat faces.
 
-    Where flat faces repeat, all that two surfaces differ by is in peaks along these, of which the lattice may show
-    nothing.
+    Where flat faces repeat, all that two surfaces differ by is in peaks along these or across their edges, of which the
+    lattice may show nothing.
 
     Attributes:
         frequencies: ξ, float64 (n, 3), in cycles per unit length.
@@ -156,7 +156,7 @@ def flat_beyond(a: Surface, b: Surface, lattice: Lattice, orders: Sequence[float
 
     It is zero where no faces are flat, or beside a parametrised surface, whose values there take long.
     """
-    normals = FaceNormals.from_surfaces((a, b))
+    normals = FacesAndEdges.from_surfaces((a, b))
     if not normals or isinstance(a, Smooth) or isinstance(b, Smooth):
         return np.zeros(len(orders))
     draws = draws_beyond(sum(kind_of(surface).triangles for surface in (a, b)))

@@ -13,10 +13,10 @@ from sobolev_batch import Lattice, Mesh
 from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms.fields import BEYOND_ORDERS, Quality
 from sobolev_batch.norms.spectrum import RadialAxis
-from sobolev_batch.norms.tail.face_normals import FaceNormals
+from sobolev_batch.norms.tail.face_normals import FaceNormals, FacesAndEdges
 from sobolev_batch.norms.tail.integrals import OctaveSums, OctaveWeights, integral_over, squared_moduli
 from sobolev_batch.norms.tail.sampling import Octave, OctaveSampling, TailSampling
-from sobolev_batch.norms.tail.values import FlatBeyond, OctaveValues, SurfaceSize, octave_values
+from sobolev_batch.norms.tail.values import FlatBeyond, OctaveValues, SurfaceSize, flat_beyond, octave_values
 from sobolev_batch.shapes import Sphere, Torus, icosphere
 from sobolev_batch.transform.exact import exact_transform
 from sobolev_batch.transform.fourier import ErrorTarget, TransformSettings
@@ -112,11 +112,12 @@ def test_errors_of_a_lattice_hold_where_images_touch_a_ball_that_no_sublattice_s
     assert missed <= 1
 
 
-def test_draws_follow_their_density() -> None:
-    assert FaceNormals.from_surfaces([icosphere(0)])
+@pytest.mark.parametrize("kind", [FaceNormals, FacesAndEdges])
+def test_draws_follow_their_density(kind: type[FaceNormals]) -> None:
+    assert kind.from_surfaces([icosphere(0)])
     # Curved surfaces have none.
-    assert not FaceNormals.from_surfaces([icosphere(4), Sphere()])
-    normals = FaceNormals.from_surfaces([BOX])
+    assert not kind.from_surfaces([icosphere(4), Sphere()])
+    normals = kind.from_surfaces([BOX])
     assert len(normals.shares) == 3
     assert normals.shares.sum() == pytest.approx(1)
     rng = np.random.default_rng(0)
@@ -238,6 +239,15 @@ def test_long_triangles_take_points_like_large_ones(count: int, is_exact: bool) 
     lattice = OctaveLattice.random(40.0, 160.0, 64, np.random.default_rng(0))
     assert (TransformSettings(1e-3).kind_for(square, lattice).expected_points > 1e6) == is_exact
     assert SurfaceSize.from_surface(square).prefers_exact(lattice) == is_exact
+
+
+def test_strips_that_repeat_beyond_a_given_lattice_are_bounded_closely() -> None:
+    # Half a pitch of 1/16 apart, they hardly differ below |ξ| = 16; above it, in planes across their sides.
+    a, b = (Rectangles.strips(16, offset, 1.0, 0.5) for offset in (0.0, 0.5))
+    bounds = flat_beyond(a.mesh(), b.mesh(), Lattice(3.0, 24), (-0.75, -1.0))
+    ratios = bounds / a.squared_distance(b, (-0.75, -1.0))[0]
+    assert (ratios > 1).all()
+    assert (ratios < 4).all()
 
 
 def test_bounds_beyond_a_given_lattice_hold_at_orders_that_are_not_stored() -> None:
