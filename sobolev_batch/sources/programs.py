@@ -90,7 +90,7 @@ def printed(words: Sequence[str]) -> str:
             said.seek(0)
             text = said.read(_LONGEST_VERSION).decode(errors="replace").strip()
     except (OSError, ValueError) as error:
-        is_absent = getattr(error, "filename", None) == words[0]
+        is_absent = isinstance(error, FileNotFoundError) and error.filename == words[0]
         problem = f"{words[0]} is not installed, or not on the PATH" if is_absent else one_line(error)
     else:
         if process.returncode and not problem:
