@@ -5,8 +5,9 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sobolev_batch.arrays import Reals, slices
+from sobolev_batch.arrays import Indices, Reals, slices
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.transform.backends import combine
@@ -23,6 +24,8 @@ _LEAST_SHARE, _MOST_DIRECTIONS = 0.01, 64
 _SPOT_FRACTION = 0.5
 # The part of directions that `FacesAndEdges` draws across edges.
 _ACROSS_EDGES = 0.5
+# Edges of one direction are on one line where they are this much of the largest coordinate apart, or less.
+_ONE_LINE = 1e-5
 # No direction of small whole numbers is orthogonal to this one, where rounding would decide.
 _UPWARDS = np.array([1.0, np.sqrt(2.0), np.pi])
 _NO_NORMALS = (np.zeros((0, 3)), np.zeros(0), np.zeros(0))
@@ -142,45 +145,61 @@ def _main_edges(mesh: Mesh, normals: Reals) -> tuple[Reals, Reals, Reals]:
     """Return directions, lengths together and typical lengths of the edges around a mesh's faces along some normals."""
     if not len(normals):
         return _NO_NORMALS
-    a, b, c = mesh.corners()
-    crosses = np.cross(b - a, c - a)
-    crosses /= np.maximum(np.linalg.norm(crosses, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    vectors: list[Reals] = [np.zeros((0, 3))]
+    units = _unit_normals(mesh)
+    borders = []
     for normal in normals:
-        cosines = crosses @ normal
+        cosines = units @ normal
         face = np.abs(cosines) > 1 - _DIRECTION_PARTS**-2.0
-        corners = mesh.triangles[face].astype(np.int64)
-        sides = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
-        # Along a side between two triangles of the face, both go opposite ways.
-        ways = np.tile(np.sign(cosines[face]), 3) * np.sign(sides[:, 1] - sides[:, 0])
-        names = sides.min(axis=1) * len(mesh.vertices) + sides.max(axis=1)
-        _, first, members = np.unique(names, return_index=True, return_inverse=True)
-        ends = mesh.vertices[sides[first[np.bincount(members.ravel(), weights=ways) != 0]]]
-        vectors.append(ends[:, 1] - ends[:, 0])
-    edges = np.concatenate(vectors)
+        borders.append(_borders(mesh, face, np.sign(cosines[face]).astype(np.int8)))
+    ends = mesh.vertices[np.concatenate(borders)]
+    edges = ends[:, 1] - ends[:, 0]
     lengths = np.linalg.norm(edges, axis=1)
-    edges, lengths = edges[lengths > 0], lengths[lengths > 0]
+    ends, edges, lengths = (rows[lengths > 0] for rows in (ends, edges, lengths))
     edges /= lengths[:, None]
     edges[edges @ _UPWARDS < 0] *= -1
     _, first, members = np.unique(np.round(edges * _DIRECTION_PARTS), axis=0, return_index=True, return_inverse=True)
-    sums, squares = (np.bincount(members.ravel(), weights=weights) for weights in (lengths, lengths**2))
+    sums = np.bincount(members.ravel(), weights=lengths)
     largest = np.argsort(-sums)[:_MOST_DIRECTIONS]
     largest = largest[sums[largest] > _LEAST_SHARE * sums.sum()]
-    return edges[first[largest]], sums[largest], (squares / sums)[largest]
+    sizes, cell = np.empty(len(largest)), _ONE_LINE * float(np.abs(ends).max(initial=0.0))
+    for number, group in enumerate(largest):
+        # Those on one line are one edge, into however many it is cut.
+        along, centres = members.ravel() == group, ends[members.ravel() == group].mean(axis=1)
+        offsets = centres - np.outer(centres @ edges[first[group]], edges[first[group]])
+        _, lines = np.unique(np.round(offsets / cell), axis=0, return_inverse=True)
+        of_lines = np.bincount(lines.ravel(), weights=lengths[along])
+        sizes[number] = of_lines @ of_lines / sums[group]
+    return edges[first[largest]], sums[largest], sizes
+
+
+def _borders(mesh: Mesh, face: NDArray[np.bool_], ways: NDArray[np.int8]) -> Indices:
+    """Return the vertices (n, 2) of the edges around faces whose normals point one way, 1, or the other, -1."""
+    from scipy.sparse import coo_array, triu
+
+    sides = mesh.triangles[face][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    one_way = coo_array((np.repeat(ways, 3), sides.T), shape=(len(mesh.vertices),) * 2).tocsr()
+    # Along a side between two triangles of a face, both go opposite ways.
+    return np.stack(triu(one_way - one_way.T).nonzero(), axis=1)
+
+
+def _unit_normals(mesh: Mesh) -> Reals:
+    """Return the normals of triangles (T, 3); zeros for those without area."""
+    normals = np.empty((len(mesh.triangles), 3))
+    # The corners and temporaries of all triangles of a fine mesh would take gigabytes.
+    for part in slices(len(normals), _BATCH):
+        a, b, c = mesh.corners(part)
+        crosses, lengths = np.cross(b - a, c - a), 2 * mesh.areas[part]
+        normals[part] = crosses / np.where(lengths > 0, lengths, 1.0)[:, None]
+    return normals
 
 
 def _main_normals(mesh: Mesh) -> tuple[Reals, Reals, Reals]:
     """Return the normals, areas and face sizes of the directions that hold much of a mesh's area."""
-    count, areas = len(mesh.triangles), mesh.areas
-    normals, keys = np.empty((count, 3)), np.empty(count, dtype=np.int32)
-    # The corners and temporaries of all triangles of a fine mesh would take gigabytes.
-    for part in slices(count, _BATCH):
-        a, b, c = mesh.corners(part)
-        crosses = np.cross(b - a, c - a)
-        # A normal and its opposite are one direction. Triangles without area have none.
-        crosses[combine(_UPWARDS, crosses.T) < 0] *= -1
-        lengths = 2 * areas[part]
-        normals[part] = crosses / np.where(lengths > 0, lengths, 1.0)[:, None]
+    areas, normals = mesh.areas, _unit_normals(mesh)
+    keys = np.empty(len(areas), dtype=np.int32)
+    for part in slices(len(areas), _BATCH):
+        # A normal and its opposite are one direction.
+        normals[part][combine(_UPWARDS, normals[part].T) < 0] *= -1
         # A number for each normal, the same for those that count as one direction.
         x, y, z = np.round(normals[part] * _DIRECTION_PARTS).astype(np.int32).T
         keys[part] = (x * _KEYS_PER_AXIS + y) * _KEYS_PER_AXIS + z
