@@ -15,15 +15,13 @@ import numpy as np
 from sobolev_batch import compiled
 from sobolev_batch.batch.cluster.workers import this_worker, worker_backend
 from sobolev_batch.errors import InputError, LatticeError, MemoryLimitError, MeshError, StoreError, one_line
-from sobolev_batch.geometry.overlap import without_common_parts
-from sobolev_batch.geometry.smooth import Smooth
 from sobolev_batch.geometry.surface import Similarity, Surface
 from sobolev_batch.norms.accuracy.solve import DistanceTarget
-from sobolev_batch.norms.fields import BEYOND_ORDERS, Quality, TailQuality, compute_field, field_for
-from sobolev_batch.norms.tail.face_normals import FacesAndEdges
-from sobolev_batch.norms.tail.remainder import Remainder, remainder
+from sobolev_batch.norms.fields import Quality, TailQuality, compute_field, field_for
+from sobolev_batch.norms.tail.face_normals import FaceNormals
+from sobolev_batch.norms.tail.remainder import Remainder, remainder, remainder_between
 from sobolev_batch.norms.tail.sampling import TailSampling
-from sobolev_batch.norms.tail.values import FlatBeyond, draws_beyond, octave_values
+from sobolev_batch.norms.tail.values import octave_values
 from sobolev_batch.parameters import format_bytes
 from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.store.layout import Store
@@ -51,9 +49,6 @@ _OCTAVES_TIGHTENING = 5.0
 # it would take much of a worker's memory.
 _KEPT_TRIANGLES = 1 << 20
 _reference: dict[tuple[str, Similarity], Surface] = {}
-# A few references beyond given lattices, by these and the draws: for large ones their values take longer than a field.
-_KEPT_BEYOND = 16
-_references_beyond: dict[tuple[str, Similarity, Lattice, int], FlatBeyond] = {}
 
 
 @dataclass(frozen=True)
@@ -206,7 +201,7 @@ def compute_parts(job: Job, blocks: Sequence[Block] = (), octaves: bool = False)
             if octaves and job.tail is not None:
                 stored.append(_store_octaves(job, job.tail, surface, target))
             elif blocks and blocks[0].start == job.lattice.half.start and (quality := stored[0].quality) is not None:
-                stored[0] = replace(stored[0], quality=replace(quality, beyond=_beyond_given(job, surface)))
+                stored[0] = replace(stored[0], quality=replace(quality, beyond=_beyond_lattice(job, surface)))
     except StoreError:
         raise
     except Exception as error:
@@ -226,11 +221,7 @@ def _store_octaves(job: Job, tail: TailSampling, surface: Surface, target: Error
     values = [octave_values(surface, octave, job.orders, settings, job.execution) for octave in tail.octaves]
     cutoff, difference = tail.highest_frequency, None
     if (reference := job.load_reference()) is not None:
-        # Only what they do not have in common counts.
-        rests = without_common_parts((surface, reference))
-        difference = Remainder.between(0.0, 0.0, cutoff)
-        if rests:
-            difference = remainder(list(rests.values()), list(rests), cutoff, execution=job.execution)
+        difference = remainder_between((surface, reference), cutoff, execution=job.execution)
     quality = TailQuality(
         tuple(float(radius) for octave in values for radius in octave.radii),
         tuple(float(square) for octave in values for square in octave.squares),
@@ -242,23 +233,18 @@ def _store_octaves(job: Job, tail: TailSampling, surface: Surface, target: Error
     return StoredBlocks(quality=replace(Quality.from_surface(surface, Probe()), tail=quality), checksums=(checksum,))
 
 
-def _beyond_given(job: Job, surface: Surface) -> tuple[float, ...]:
-    """Return how far a surface may be from the reference beyond a given lattice, see `Quality`; empty if not known."""
-    other = job.reference
-    # Values of a parametrised surface take long there.
-    if job.tail is not None or other is None or other.label == job.row.label or isinstance(surface, Smooth):
-        return ()
-    draws = draws_beyond(kind_of(surface).triangles + other.member.expected_size().triangles)
-    key = other.fingerprint, job.similarity, job.lattice, draws
-    if (beyond := _references_beyond.get(key)) is None:
-        if (reference := job.load_reference()) is None:
-            return ()
-        beyond = FlatBeyond.of_surface(reference, job.lattice, FacesAndEdges.from_surfaces([reference]), draws)
-        # Tasks in other threads do so too.
-        if len(_references_beyond) >= _KEPT_BEYOND:
-            _references_beyond.clear()
-        _references_beyond[key] = beyond
-    return tuple(beyond.distance_bound(surface, BEYOND_ORDERS).tolist())
+def _beyond_lattice(job: Job, surface: Surface) -> Remainder | None:
+    """Return what lies beyond a lattice in the distance from the reference; None where it is extrapolated."""
+    cutoff = job.lattice.xi_max
+    if job.reference is None or job.tail is not None:
+        return None
+    if job.reference.label == job.row.label:
+        return Remainder.between(0.0, 0.0, cutoff)
+    reference = job.load_reference()
+    # The tail of flat faces follows no law that a lattice could extrapolate, since they may repeat.
+    if reference is None or not FaceNormals.from_surfaces((surface, reference)):
+        return None
+    return remainder_between((surface, reference), cutoff, execution=job.execution, is_bound=True)
 
 
 def _store_whole(job: Job, surface: Surface, target: ErrorTarget | None) -> StoredBlocks:

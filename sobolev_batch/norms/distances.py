@@ -28,7 +28,8 @@ from sobolev_batch.norms.budget import Support, sums_of_shells
 from sobolev_batch.norms.columns import VARIABLES, labelled, labelled_distances, lattice_attributes
 from sobolev_batch.norms.estimate import NormEstimate, ReferenceEstimate, estimate_norms
 from sobolev_batch.norms.fields import OperandLike, as_operand, field_of, pair_of, quality_of, shells_against, shells_of
-from sobolev_batch.norms.tail.values import flat_beyond
+from sobolev_batch.norms.tail.face_normals import FaceNormals
+from sobolev_batch.norms.tail.remainder import remainder_between
 from sobolev_batch.parameters import check_seed
 from sobolev_batch.shown import progress_line
 from sobolev_batch.transform.lattice import Lattice, Orders, SobolevWeights, check_orders
@@ -158,14 +159,16 @@ def distance(
     first, second = pair_of(a, b, lattice, orders)
     weights = SobolevWeights(Lattice.from_field(first), orders)
     squares, products, own = shells_against(first, second, weights.lattice)
+    beyond: Reals | float = np.nan
     # The tail of flat faces follows no law that a lattice could extrapolate, since they may repeat.
-    if has_fields:
-        # What a study knows of its fields is how far they are from one reference.
-        known = [quality.beyond_at(orders) for quality in map(quality_of, (first, second)) if quality is not None]
-        beyond = np.square(np.sqrt(known).sum(axis=0)) * squares.any()
-    else:
-        beyond = flat_beyond(cast(Surface, a), cast(Surface, b), weights.lattice, orders)
+    if not has_fields and FaceNormals.from_surfaces(surfaces := (cast(Surface, a), cast(Surface, b))):
+        beyond = remainder_between(surfaces, weights.lattice.xi_max, orders, is_bound=True).bounds(orders)
     distances, of_second = _estimate(weights, squares, [first, second], beyond), _estimate(weights, own, [second])
+    known = [quality.beyond_at(orders) for quality in map(quality_of, (first, second)) if quality is not None]
+    if known and squares.any():
+        # A study knows how far its fields are from its reference, which may not be that of both.
+        least = np.hypot(distances.values, np.sqrt(known).sum(axis=0)) - distances.values
+        distances = replace(distances, truncation=np.fmax(distances.truncation, least))
     reference = ReferenceEstimate.from_products(
         sums_of_shells(products, weights), weights, _widths([first, second]), distances, of_second
     )
@@ -217,11 +220,11 @@ def to_accuracy(
 
 
 def _estimate(
-    weights: SobolevWeights, sums: Reals, fields: Sequence[xr.DataArray], beyond: Reals | float = 0.0
+    weights: SobolevWeights, sums: Reals, fields: Sequence[xr.DataArray], beyond: Reals | float = np.nan
 ) -> NormEstimate:
     """Return a norm or distance from shell sums, with the errors that follow from the fields' qualities.
 
-    What is known to lie beyond the lattice, a squared norm (orders,), counts too.
+    A bound on the squared norm beyond the lattice (orders,) may be known.
     """
     qualities = [quality for quality in map(quality_of, fields) if quality is not None]
     areas = np.array(sum(quality.area for quality in qualities))

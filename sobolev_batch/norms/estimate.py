@@ -130,18 +130,19 @@ def estimate_norms(
     tail: Tail | None = None,
     *,
     is_given: bool = False,
-    beyond: Reals | float = 0.0,
+    beyond: Reals | float = np.nan,
 ) -> NormEstimate:
     """Return norms (orders, ...) from sums over the lattice, and the tail beyond it where octaves measured that.
 
     The discretisation is the norm of the values' own errors (orders, ...), of a difference that of both together. The
-    lattice is chosen for an accuracy, or given. Squared norms (orders, ...) beyond it may be known not to be less.
+    lattice is chosen for an accuracy, or given. Bounds on the squared norms beyond it (orders, ...) may be known, else
+    NaN.
     """
     squares: Reals = np.maximum(sums.totals, 0.0)
     images = aliased(sums, weights, support.widths)
     if tail is None:
         values = np.sqrt(squares)
-        beyond = np.maximum(truncated(sums, weights, support, is_given=is_given), beyond)
+        beyond = np.where(np.isnan(beyond), truncated(sums, weights, support, is_given=is_given), beyond)
         truncation = np.sqrt(squares + beyond) - values
         return NormEstimate(values, truncation, change_of_root(squares, images), discretisation)
     squares = np.maximum(squares + tail.totals, 0.0)

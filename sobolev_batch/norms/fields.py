@@ -39,9 +39,6 @@ BLOCK_SAMPLES = 1 << 22
 
 # The orders that a field is probed for if none are named.
 PROBED_ORDERS = (-2.0, -5.0, -10.0)
-# Orders at which it is stored how far surfaces may be apart beyond a given lattice. In between, the logarithm without
-# the pole at -1/2 is at most a tenth above the chord.
-BEYOND_ORDERS = (-100.0, -20.0, -10.0, -6.0, -4.0, -3.0, -2.5, -2.0, -1.5, -1.25, -1.0, -0.75, -0.6, -0.501)
 # The degree of the rule that most triangles get: samples drawn for it serve coarser and equal ones.
 USUAL_DEGREE = 2
 _ATTEMPTS = 3
@@ -75,15 +72,15 @@ class Quality:
         area: Area of the surface, in squared units of length.
         probe: Measured error of the field itself; empty for a closed form.
         tail: Quality of the values in octaves; None without octaves.
-        beyond: Bounds on the squared distance from the study's reference beyond a given lattice, at `BEYOND_ORDERS`;
-            empty where these are extrapolated.
+        beyond: What lies beyond a lattice without octaves in the distance from the study's reference; None where that
+            is extrapolated.
     """
 
     area: float
     extent: Extent
     probe: Probe
     tail: TailQuality | None = None
-    beyond: tuple[float, ...] = ()
+    beyond: Remainder | None = None
 
     @classmethod
     def from_surface(cls, surface: Surface, probe: Probe) -> Self:
@@ -99,26 +96,21 @@ class Quality:
         return np.asarray(np.hypot(norms, tails))
 
     def beyond_at(self, orders: Sequence[float]) -> Reals:
-        """Return the bounds on the squared distance beyond a given lattice (orders,); zero where there are none."""
-        if not self.beyond:
-            return np.zeros(len(orders))
-        # Near -1/2 it grows as what follows the last octave does.
-        growths = [1 / (1 - 2.0 ** (2 * np.array(s) + 1)) for s in (BEYOND_ORDERS, orders)]
-        logarithms = np.log(np.maximum(self.beyond / growths[0], np.finfo(np.float64).tiny))
-        return np.asarray(np.exp(np.interp(orders, BEYOND_ORDERS, logarithms)) * growths[1])
+        """Return bounds on the squared distance from the reference beyond the lattice (orders,); NaN if not known."""
+        return np.full(len(orders), np.nan) if self.beyond is None else self.beyond.bounds(orders)
 
     def to_json(self) -> str:
         """Return the quality as one line of JSON."""
-        tail = None if self.tail is None else asdict(self.tail)
+        tail, beyond = (None if part is None else asdict(part) for part in (self.tail, self.beyond))
         extent, probe = self.extent, self.probe
-        return json.dumps([self.area, extent.lowest, extent.highest, probe.shells, probe.sums, tail, self.beyond])
+        return json.dumps([self.area, extent.lowest, extent.highest, probe.shells, probe.sums, tail, beyond])
 
     @classmethod
     def from_json(cls, text: str) -> Self:
         """Read a quality from a line of `to_json`; DamageError where it is none."""
         try:
             area, lowest, highest, shells, sums, tail, beyond = _STORED.validate_python(json.loads(text))
-            if {len(lowest), len(highest)} != {len(DIRECTIONS)} or len(beyond) not in (0, len(BEYOND_ORDERS)):
+            if {len(lowest), len(highest)} != {len(DIRECTIONS)}:
                 raise ValueError("some of its lists have another length")
         except (ValueError, RecursionError) as error:
             problem = "its quality cannot be read"
@@ -127,7 +119,7 @@ class Quality:
 
 
 _Numbers = tuple[float, ...]
-_STORED = TypeAdapter(tuple[float, _Numbers, _Numbers, tuple[int, ...], _Numbers, TailQuality | None, _Numbers])
+_STORED = TypeAdapter(tuple[float, _Numbers, _Numbers, tuple[int, ...], _Numbers, TailQuality | None, Remainder | None])
 
 
 @dataclass(frozen=True, eq=False)

@@ -68,8 +68,8 @@ class Reducer:
         reference: Row of the reference, or None if it has no field.
         areas: Area of every row's surface (rows,), NaN without a field.
         errors: Norms of the fields' own errors (orders, rows), likewise.
-        beyond: Bounds on the distances from the study's reference beyond a given lattice (orders, rows), likewise; zero
-            where these are extrapolated.
+        beyond: Bounds on the distances from the study's reference beyond a lattice (orders, rows), NaN where these are
+            extrapolated.
         widths: Widths of all surfaces together (13,), see `Extent`.
         checksums: Checksums of the blocks of each field, by its row, and of its values in octaves.
         sampling: Samples of the octaves; None where the fields are all there is.
@@ -302,11 +302,11 @@ class Reducer:
         return self._estimate(sums, tail, areas, errors, unseen)
 
     def _estimate(
-        self, sums: Sums, tail: Tail | None, areas: Reals, errors: Reals, unseen: Reals | float = 0.0
+        self, sums: Sums, tail: Tail | None, areas: Reals, errors: Reals, unseen: Reals | float = np.nan
     ) -> NormEstimate:
         """Return norms; areas and norms of the fields' own errors are those of both surfaces of a pair together.
 
-        The norms beyond a given lattice may be known not to be less than what it leaves unseen.
+        Bounds on the norms that the lattice leaves unseen may be known.
         """
         support, beyond = Support(areas, self.widths), unseen**2
         return estimate_norms(sums, self.weights, support, errors, tail, is_given=self.is_given, beyond=beyond)

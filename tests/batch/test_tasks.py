@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from sobolev_batch import Lattice, Mesh, Study, open_store, run
 from sobolev_batch.arrays import ComplexDtype
-from sobolev_batch.batch import field_tasks
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.workers import WorkerInfo, Workers
 from sobolev_batch.batch.field_costs import size_tasks
@@ -107,20 +106,16 @@ def test_what_a_mesh_and_its_reference_cover_is_nothing_beyond_the_octaves(tmp_p
     assert not any(quality.tail.difference.errors)
 
 
-def test_tasks_beside_each_other_may_forget_what_lies_beyond_the_lattice(
-    store_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Forgotten(dict[Any, Any]):
-        def __setitem__(self, key: Any, value: Any) -> None:
-            pass
-
-    monkeypatch.setattr(field_tasks, "_references_beyond", Forgotten())
+def test_tasks_measure_what_lies_beyond_a_given_lattice_where_faces_are_flat(store_path: Path) -> None:
     plan = make_plan(Study.from_table(small_table()))
-    job = job_of(plan, store_path, next(row.label for row in plan.rows if row.label != plan.reference))
-    job = replace(job, reference=next(row for row in plan.rows if row.label == plan.reference))
-    record = compute_mesh(job, plan.blocks)
-    assert record.status == "complete", record.reason
-    assert Quality.from_json(record.quality).beyond
+    reference = next(row for row in plan.rows if row.label == plan.reference)
+    for row in plan.rows[:2]:
+        record = compute_mesh(replace(job_of(plan, store_path, row.label), reference=reference), plan.blocks)
+        assert record.status == "complete", record.reason
+        bounds = Quality.from_json(record.quality).beyond_at([-1.0, -2.0])
+        assert np.isfinite(bounds).all()
+        # The reference is not apart from itself.
+        assert (bounds > 0).all() == (row is not reference)
 
 
 def test_a_task_whose_record_is_there_writes_nothing(store_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

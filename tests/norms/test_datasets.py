@@ -38,7 +38,7 @@ def test_every_number_has_a_unit_and_a_name(name: str) -> None:
 
 @pytest.mark.parametrize(
     ("place", "entry"),
-    [(0, "x"), (1, [0.0]), (3, "x"), (5, []), (5, 0), (5, {"radii": []}), (6, None), (6, [1.0]), (6, ["x"] * 14)],
+    [(0, "x"), (1, [0.0]), (3, "x"), (5, []), (5, 0), (5, {"radii": []}), (6, 0), (6, [1.0]), (6, {"cutoff": 1.0})],
 )
 def test_what_is_no_quality_of_a_field_is_damage(place: int, entry: object) -> None:
     parts = json.loads(A.attrs["quality"])

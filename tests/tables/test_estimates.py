@@ -76,15 +76,15 @@ def test_flat_faces_that_repeat_beyond_a_given_lattice_are_in_every_error(store_
     assert (itself["error_part"].sel(part="truncation") == 0).all()
     for mesh, other in (("f/moved", "reference"), ("f/other", "reference"), ("f/moved", "f/other")):
         found = sb.distance(fields.sel(mesh=mesh), fields.sel(mesh=other), orders)
-        expected = found["error"].values
+        expected = tree.sobolev.distance(orders, mesh, other)["error"].values
         assert (np.abs(found["distance"] - surfaces[mesh].distance(surfaces[other], orders)) <= expected).all()
-        pairs = distances_at(tree, orders).sel(mesh=mesh, other=other)
-        for errors in (pairs["error"].values, tree.sobolev.distance(orders, mesh, other)["error"].values):
-            assert errors == pytest.approx(expected, rel=1e-6)
+        assert distances_at(tree, orders).sel(mesh=mesh, other=other)["error"].values == pytest.approx(expected, 1e-6)
+        # Fields may come from two studies.
+        assert (found["error"].values >= (1 - 1e-6) * expected).all()
         if other == "reference":
             meshes = surfaces[mesh].mesh(), surfaces[other].mesh()
             given = sb.distance(*meshes, orders, lattice=sb.Lattice(4.0, 24))["error"].values
-            # Other random frequencies.
+            # The orders between which it is interpolated are others.
             assert expected == pytest.approx(given, rel=0.2)
 
 

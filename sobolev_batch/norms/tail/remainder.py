@@ -26,6 +26,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from sobolev_batch.arrays import Reals
+from sobolev_batch.geometry.overlap import without_common_parts
 from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms.tail.close_points import Draw, Moved, Sheets
 from sobolev_batch.norms.tail.integrals import quantile
@@ -41,9 +42,9 @@ from sobolev_batch.norms.tail.potentials import (
 )
 from sobolev_batch.transform.fourier import ON_CPU, Execution
 
-# Random points of the first estimate: usually, at least, at most, and of a scale. Pairs of a point and a triangle that
-# they may take, and those of points from which nothing is hidden.
-_USUAL_POINTS, _FEWEST_POINTS, _MOST_POINTS, _POINTS_OF_SCALES = 256, 40, 1024, 64
+# Random points of the first estimate: usually, at least, at most, and where it is a scale or a bound. Pairs of a point
+# and a triangle that they may take, and those of points from which nothing is hidden.
+_USUAL_POINTS, _FEWEST_POINTS, _MOST_POINTS, _FEW_POINTS = 256, 40, 1024, 64
 # The most on a surface alone in large units, below a cutoff of 1: edges are narrow there, and few points meet them.
 _MOST_POINTS_ALONE = 16_384
 _USUAL_PAIRS, _MOST_PAIRS = 150_000, 500_000
@@ -125,6 +126,13 @@ class Remainder:
                 values[number] /= 2
         return values, errors
 
+    def bounds(self, orders: Sequence[float]) -> Reals:
+        """Bound the squared norm of all beyond the cutoff, where a lattice ends that has no step (orders,)."""
+        known = np.maximum(orders, LOWEST_ORDER)
+        values, errors = self.at(known.tolist())
+        # No frequency there weighs more than this at a lower order.
+        return np.asarray((1 + self.cutoff**2) ** (orders - known) * (np.maximum(values, 0.0) + errors))
+
     def _interpolated(self, order: float) -> tuple[float, float]:
         """Return the mean energy at an order between others, or near one, and how far off it may be.
 
@@ -158,12 +166,13 @@ def remainder(
     execution: Execution = ON_CPU,
     *,
     is_scale: bool = False,
+    is_bound: bool = False,
 ) -> Remainder:
     """Estimate what lies beyond a cutoff in the norm of a signed sum of surfaces, in units of length.
 
     The cutoff is the |ξ| at which the `smooth_step` ends, in cycles per unit length. By default there are enough orders
     to interpolate between. What too few random points may miss is not most of a large error, if more of them take at
-    most about a second. For a norm that only serves as a scale, few points will do.
+    most about a second. For a norm that only serves as a scale, and for a bound, few points will do.
     """
     # The order whose weight falls at the cutoff as that of the lowest one does far out.
     lowest = LOWEST_ORDER * (1 + cutoff**-2)
@@ -171,8 +180,9 @@ def remainder(
     sheets = Sheets.from_surfaces(surfaces, signs, cutoff)
     seen_by, rng = _Seen(sheets, Kernels.of_orders(cutoff, known), execution), np.random.default_rng(seed)
     if points is not None or is_scale:
-        return _estimate(seen_by, points or _POINTS_OF_SCALES, rng, is_exact=not is_scale)
-    found = _estimate(seen_by, seen_by.affordable(rng), rng)
+        return _estimate(seen_by, points or _FEW_POINTS, rng, is_exact=not is_scale)
+    affordable = seen_by.affordable(rng)
+    found = _estimate(seen_by, min(affordable, _FEW_POINTS) if is_bound else affordable, rng, is_bound=is_bound)
     if found.hidden > MOSTLY and np.any(np.array(found.errors) > _ROUGH * np.abs(found.energies)):
         # Nothing is hidden from more of them.
         count = min(found.covering, _MOST_PAIRS * found.points // max(found.pairs, 1))
@@ -180,7 +190,24 @@ def remainder(
     return found
 
 
-def _estimate(seen_by: _Seen, count: int, rng: np.random.Generator, *, is_exact: bool = True) -> Remainder:
+def remainder_between(
+    pair: Sequence[Surface],
+    cutoff: float,
+    orders: Sequence[float] = (),
+    execution: Execution = ON_CPU,
+    *,
+    is_bound: bool = False,
+) -> Remainder:
+    """Estimate what lies beyond a cutoff in the distance of two surfaces; see `remainder`."""
+    # Only what they do not have in common counts.
+    if rests := without_common_parts(pair):
+        return remainder(list(rests.values()), list(rests), cutoff, orders, execution=execution, is_bound=is_bound)
+    return Remainder.between(0.0, 0.0, cutoff)
+
+
+def _estimate(
+    seen_by: _Seen, count: int, rng: np.random.Generator, *, is_exact: bool = True, is_bound: bool = False
+) -> Remainder:
     """Return an estimate from some points."""
     little = seen_by.moved
     found = _from_pairs(seen_by, *little, count, rng) if little else _from_points(seen_by, count, rng)
@@ -194,7 +221,8 @@ def _estimate(seen_by: _Seen, count: int, rng: np.random.Generator, *, is_exact:
     scale = seen_by.sheets.area * seen_by.alone
     # A move changes what tables leave in proportion to itself, and smooth kernels in proportion to its square.
     cut, left = _CUT * found.share * scale, _CUT_LEFT * np.sqrt(found.share) * scale
-    if is_exact and np.any(cut > _CUT_FRACTION * errors):
+    # A bound is little more where the cut is little of all.
+    if is_exact and np.any(cut > _CUT_FRACTION * (errors + (np.abs(means) if is_bound else 0.0))):
         corrections, cut = seen_by.corrections(found.draw, found.potentials, rng)
         means += corrections
     # Facets of smooth surfaces are off by up to 6e-5 of the area, most of the error where nothing cancels.

@@ -8,13 +8,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sobolev_batch.arrays import Complexes, Reals
+from sobolev_batch.arrays import Reals
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.geometry.smooth import Smooth
 from sobolev_batch.geometry.surface import Surface
-from sobolev_batch.norms.tail.face_normals import FaceNormals, FacesAndEdges
-from sobolev_batch.norms.tail.integrals import squared_moduli
-from sobolev_batch.norms.tail.sampling import Octave, OctaveSampling
+from sobolev_batch.norms.tail.sampling import OctaveSampling
 from sobolev_batch.transform.backends import Backend
 from sobolev_batch.transform.fourier import (
     ON_CPU,
@@ -26,7 +23,7 @@ from sobolev_batch.transform.fourier import (
     transform_block,
 )
 from sobolev_batch.transform.kinds import kind_of
-from sobolev_batch.transform.lattice import Lattice, OctaveLattice
+from sobolev_batch.transform.lattice import OctaveLattice
 from sobolev_batch.transform.probe import norms_of_checks
 
 # Samples at which values on a lattice are checked: for small meshes, for huge ones, and in between as many as make this
@@ -44,10 +41,6 @@ _EQUILATERAL = 0.75 * math.sqrt(3)
 _OVERHEAD_TRIANGLES = 50
 # Draws of an octave, for the time that one of them takes.
 _USUAL_DRAWS = 20_000
-# Octaves beyond a given lattice that are looked at, the fraction of uniform directions there, and the standard errors
-# by which what is found is raised. Draws of each for small meshes, for huge ones, and pairs with triangles in between.
-_OCTAVES_BEYOND, _UNIFORM_BEYOND, _DEVIATIONS_BEYOND = 5, 0.4, 8.0
-_MOST_BEYOND, _FEWEST_BEYOND, _PAIRS_BEYOND = 800, 32, 250_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,61 +99,6 @@ def octave_values(
             values.append(block.ravel()[sample_set.places])
     joined = np.concatenate(values)
     return OctaveValues(sampling, joined, *_compared(surface, sampling, joined, orders, execution.backend))
-
-
-@dataclass(frozen=True, eq=False)
-class FlatBeyond:
-    """A surface beyond the cube of a given lattice, at few random frequencies around normals and edges of flat faces.
-
-    Where flat faces repeat, all that two surfaces differ by is in peaks along these or across their edges, of which the
-    lattice may show nothing.
-
-    Attributes:
-        frequencies: ξ, float64 (n, 3), in cycles per unit length.
-        weights: Weight of each in the integral beyond the cube (n,); the last ones, ``draws``, are the last octave's.
-        values: Exact transform there, complex128 (n,).
-    """
-
-    frequencies: Reals
-    weights: Reals
-    values: Complexes
-    draws: int
-
-    @classmethod
-    def of_surface(cls, surface: Surface, lattice: Lattice, normals: FaceNormals, draws: int) -> Self:
-        """Return a surface at ``draws`` frequencies of each octave."""
-        octaves = (Octave(lattice.xi_max, index) for index in range(1, _OCTAVES_BEYOND + 1))
-        samplings = [OctaveSampling(one, (), draws, one.index, normals, _UNIFORM_BEYOND) for one in octaves]
-        frequencies = np.concatenate([sampling.frequencies for sampling in samplings])
-        weights = np.concatenate([sampling.weights for sampling in samplings])
-        weights *= np.abs(frequencies).max(axis=1) > lattice.xi_max
-        return cls(frequencies, weights, kind_of(surface).sampled_values(frequencies, ON_CPU.threads), draws)
-
-    def distance_bound(self, other: Surface, orders: Sequence[float]) -> Reals:
-        """Bound the squared distance from another surface there (orders,)."""
-        differences = self.values - kind_of(other).sampled_values(self.frequencies, ON_CPU.threads)
-        lengths = 1 + np.square(self.frequencies).sum(axis=1)
-        terms = self.weights * squared_moduli(differences) * np.array([lengths**order for order in orders])
-        # The last octave stands for all that follow, with as much energy.
-        terms[:, -self.draws :] /= 1 - 2.0 ** (2 * np.array(orders)[:, None] + 1)
-        return np.asarray(terms.sum(axis=1) + _DEVIATIONS_BEYOND * np.sqrt(np.square(terms).sum(axis=1)))
-
-
-def draws_beyond(triangles: int) -> int:
-    """Return the frequencies of each octave that `FlatBeyond` takes; few different numbers, for any two surfaces."""
-    return int(np.clip(_PAIRS_BEYOND // (1 << triangles.bit_length()), _FEWEST_BEYOND, _MOST_BEYOND))
-
-
-def flat_beyond(a: Surface, b: Surface, lattice: Lattice, orders: Sequence[float]) -> Reals:
-    """Bound the squared distance of two surfaces beyond the cube of a lattice (orders,); see `FlatBeyond`.
-
-    It is zero where no faces are flat, or beside a parametrised surface, whose values there take long.
-    """
-    normals = FacesAndEdges.from_surfaces((a, b))
-    if not normals or isinstance(a, Smooth) or isinstance(b, Smooth):
-        return np.zeros(len(orders))
-    draws = draws_beyond(sum(kind_of(surface).triangles for surface in (a, b)))
-    return FlatBeyond.of_surface(b, lattice, normals, draws).distance_bound(a, orders)
 
 
 def settings_on(
