@@ -88,6 +88,20 @@ def _sharing_parts(parts: int, nodes: int) -> bytes:
     return scene.glb()
 
 
+def _sharing_nodes(count: int, **node: Any) -> bytes:
+    """As many nodes that share a mesh and a skin, of as many parts without triangles and joints."""
+    tree = {
+        "asset": {"version": "2.0"},
+        "nodes": [{"mesh": 0, **node}] * count,
+        "meshes": [{"primitives": [{"mode": 0 if not node else 4, "attributes": {"POSITION": 0}}] * count}],
+        "skins": [{"joints": [*range(count)]}],
+        "accessors": [{"count": 0, "componentType": 5126, "type": "VEC3", "bufferView": 0}],
+        "bufferViews": [{"buffer": 0, "byteLength": 0}],
+        "buffers": [{"byteLength": 0, "uri": "data:,"}],
+    }
+    return json.dumps(tree).encode()
+
+
 def _scene(part: str, **entries: Any) -> bytes:
     scene = box_scene()
     scene.tree[part][0].update(entries)
@@ -186,6 +200,9 @@ ATTACKS: dict[str, Attack] = {
     **{f"one long word {ending}": _file(ending, b"9" * 2 * _MEGABYTE) for ending in _FORMATS},
     **{f"newlines {ending}": _file(ending, b"\n" * 2 * _MEGABYTE) for ending in _FORMATS},
     "obj, face of many corners": _file(".obj", b"v 0 0 0\nv 1 0 0\nf" + b" 1" * _MEGABYTE + b" 0\n"),
+    "obj, a face that goes around and around": _file(
+        ".obj", _OBJ + b"v nan 0 0\nf 1 2 -1\nf" + b" 1 2 3" * 100_000 + b"\n"
+    ),
     "obj, continued lines": _file(".obj", b"v 0 0 0\nf 1 \\\n" + b"1 \\\n" * 500_000),
     "obj, long index": _file(".obj", _OBJ + b"f 1 2 " + _DIGITS + b"\n"),
     "obj, huge index": _file(".obj", _OBJ + b"f 1 2 9223372036854775808\n"),
@@ -227,6 +244,9 @@ ATTACKS: dict[str, Attack] = {
     "glb, count of many digits": _file(".glb", _scene("accessors", count=10**400)),
     "glb, one array in many parts": _file(".glb", partial(_sharing_parts, 10_000, 1)),
     "glb, one part in many nodes": _file(".glb", partial(_sharing_parts, 1, 10_000)),
+    "gltf, points in many nodes": _file(".gltf", partial(_sharing_nodes, 20_000)),
+    "gltf, empty parts in many nodes": _file(".gltf", partial(_sharing_nodes, 2000, name="node")),
+    "gltf, a skin of many nodes": _file(".gltf", partial(_sharing_nodes, 300, skin=0)),
     "glb, huge matrix": _file(".glb", _scene("nodes", scale=[1e308, 1e308, 1e308])),
     "glb, rotation of strings": _file(".glb", _scene("nodes", rotation=["1"] * 4)),
     "glb, chunk that lies": _file(".glb", struct.pack("<4sIIII", b"glTF", 2, 20, 2**32 - 1, 0)),
@@ -321,6 +341,9 @@ ATTACKS: dict[str, Attack] = {
         for what in ("blocks", "nodes", "cells")
         for number in (2**31, 2**62, 2**64 - 1)
     },
+    "gmsh, sections that begin again": _file(".msh", b"$MeshFormat\n2.2 0 8\n$EndMeshFormat\n" + b"$Nodes\n" * 100_000),
+    # VTK.
+    "vtk, many pieces": _file(".vtp", b'<VTKFile type="PolyData">' + b"<Piece/>" * 30_000 + b"</VTKFile>"),
     # FreeSurfer.
     "freesurfer, endless line": _file("_lh.pial", b"\xff\xff\xfe" + b"x" * 2 * _MEGABYTE),
     "freesurfer, sparse": _sparse("_lh.pial", b"\xff\xff\xfe\n\n" + b"\x7f\xff\xff\xff" * 2),

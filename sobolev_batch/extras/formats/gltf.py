@@ -35,6 +35,8 @@ _HARMLESS = re.compile(
 )
 # Vertices (n, 3) and triangles (m, 3).
 _Part = tuple[Reals, Indices]
+# What a part takes at least.
+_PART_BYTES = 1000
 _PLAIN = "export it without; a compression by npx @gltf-transform/cli copy scan.glb plain.glb"
 
 
@@ -48,9 +50,16 @@ def parse_gltf(data: bytes, beside: Mapping[str, bytes]) -> Raw:
     if required:
         raise MeshError(f"it requires the glTF extension {', '.join(required)}; {_PLAIN}")
     file = _File(tree, _loaded_buffers(tree, binary, beside))
-    most = unpacked_limit(len(data) + sum(map(len, beside.values())))
+    most, total = unpacked_limit(len(data) + sum(map(len, beside.values()))), 0
+
+    def grow(size: int) -> None:
+        """Refuse what takes so many bytes more: nodes may share a mesh or a skin, and primitives an array."""
+        nonlocal total
+        total += max(size, _PART_BYTES)
+        if total > most:
+            raise MeshError(f"its scene repeats parts until they take over {most} bytes; export it unfolded")
+
     parts: list[_Part] = []
-    total = 0
     matrices = _node_matrices(tree)
     for index, matrix in matrices.items():
         node = tree["nodes"][index]
@@ -58,20 +67,19 @@ def parse_gltf(data: bytes, beside: Mapping[str, bytes]) -> Raw:
             continue
         mesh = _entry(tree, "meshes", node["mesh"])
         for primitive in mesh["primitives"]:
+            grow(0)
             if primitive.get("mode", _TRIANGLES) < _TRIANGLES:
                 continue
             part = vertices, triangles = _primitive(file, primitive, node.get("weights", mesh.get("weights", [])))
             if "skin" in node:
                 skin = _entry(tree, "skins", node["skin"])
+                grow(matrix.nbytes * len(skin["joints"]))
                 vertices = _skinned(file, primitive["attributes"], skin, matrices, part)
             for instance in _instances(file, node):
+                grow(vertices.nbytes + triangles.nbytes)
                 # Its joints alone place a skin.
                 one = np.eye(4) if "skin" in node else matrix @ instance
                 parts.append(placed(vertices, triangles, one[:3, :3].T, one[:3, 3]))
-                total += vertices.nbytes + triangles.nbytes
-                # Any number of nodes may place one mesh, and any number of primitives use one array.
-                if total > most:
-                    raise MeshError(f"its scene repeats parts until they take over {most} bytes; export it unfolded")
     if not parts:
         raise MeshError("the file's scene has no faces")
     others = sum("mesh" in node for index, node in enumerate(tree["nodes"]) if index not in matrices)

@@ -89,11 +89,13 @@ class _Numbers:
     """The numbers of a section of a Gmsh mesh, one after the other: in text, or in binary of some order of bytes."""
 
     def __init__(self, data: bytes, name: bytes, order: str) -> None:
-        section = re.search(rb"\$%s[ \t]*\r?\n(.*)\$End%s" % (name, name), data, re.DOTALL)
-        if section is None:
+        # One pattern for both ends would look for the last one behind each first one.
+        end = data.rfind(b"$End" + name)
+        start = re.compile(rb"\$%s[ \t]*\r?\n" % name).search(data, 0, end)
+        if start is None:
             raise MeshError(f"it has no section ${name.decode()} that ends")
-        self.order, self.place = order, 0
-        self.values: Any = section[1] if order else np.array(_numbers(section[1], name.decode()))
+        self.order, self.place, section = order, 0, data[start.end() : end]
+        self.values: Any = section if order else np.array(_numbers(section, name.decode()))
 
     def take(self, count: int, code: str = "u8") -> NDArray[Any]:
         """Return so many numbers more, in binary of a type of NumPy."""

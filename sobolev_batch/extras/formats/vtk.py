@@ -72,7 +72,7 @@ def parse_vtk(data: bytes, suffix: str) -> Raw:
             "the file has ghost cells, which belong to other parts of a surface; remove them: in PyVista by "
             "mesh.remove_ghost_cells()"
         )
-    cells, points = [(_NONE, _NONE, _NONE)], [np.zeros((0, 3), np.float32)]
+    cells, points, before = [(_NONE, _NONE, _NONE)], [np.zeros((0, 3), np.float32)], 0
     for piece in pieces:
         coordinates = piece.get("points", points[0])
         for name, cell_type in zip(_FACES, (_POLYGON, _STRIP, None), strict=True):
@@ -87,8 +87,9 @@ def parse_vtk(data: bytes, suffix: str) -> Raw:
                 raise MeshError(f"it has {len(sizes)} cells and the types of {len(kinds)}")
             if len(pieces) > 1 and corners.size and not 0 <= corners.min() <= corners.max() < len(coordinates) // 3:
                 raise MeshError(f"a piece has an index outside 0..{len(coordinates) // 3 - 1}")
-            cells.append((kinds, corners + sum(map(len, points)), sizes))
+            cells.append((kinds, corners + before, sizes))
         points.append(coordinates.reshape(-1, 3))
+        before += len(points[-1])
     kinds, corners, sizes = map(np.concatenate, zip(*cells, strict=True))
     corners, sizes, notes = _faces(kinds, corners, sizes, suffix)
     raw = cut_polygons(np.concatenate(points), corners, sizes)

@@ -24,6 +24,8 @@ _AXES = (1.0, 0.618, 0.414)
 _FLAT, _EQUAL_AREAS, _NO_AREA = 1e-6, 1e-6, 1e-12
 # The largest turn to the wrong side of a convex polygon, in radians, and error of the sum of all, in whole turns.
 _WRONG_TURN, _WRONG_SUM = 1e-9, 1e-4
+# Corners of an outline up to which it is cut by ears although it goes around itself: these take their cube in time.
+_MOST_WINDING = 300
 # Of faces: heights above and below their planes, areas, those with another cut, and whether they cross themselves.
 _Measures = list[tuple[Reals, Reals, Reals, NDArray[np.bool_]]]
 
@@ -160,8 +162,10 @@ def _cut_others(axes: list[Reals], corners: Indices, sizes: Indices, found: _Mea
     turns = _turns(plane, following, np.sign(twice)[polygon])
     whole_turns = np.add.reduceat(turns, starts) / (2 * np.pi)
     is_convex = (np.minimum.reduceat(turns, starts) > -_WRONG_TURN) & (np.abs(whole_turns - 1) < _WRONG_SUM)
-    # Coordinates that are no numbers are refused later.
-    is_convex |= ~np.isfinite(np.add.reduceat(np.abs(points).sum(axis=0), starts))
+    # Where an outline turns back by half a turn, nothing tells the side to which it turns.
+    winds = whole_turns - np.add.reduceat(turns > np.pi - _WRONG_TURN, starts) > 3 / 2
+    # Coordinates that are no numbers are refused later. Ears of what goes around many times take long.
+    is_convex |= ~np.isfinite(np.add.reduceat(np.abs(points).sum(axis=0), starts)) | (winds & (sizes > _MOST_WINDING))
     triangles, owners = _fans_and_ears(plane, sizes, is_convex, twice)
     lengths = np.sqrt(dot(normals, normals))
     offsets = dot(points, normals[:, polygon] / np.where(lengths > 0, lengths, 1.0)[polygon])
@@ -170,9 +174,7 @@ def _cut_others(axes: list[Reals], corners: Indices, sizes: Indices, found: _Mea
     areas = np.bincount(owners, cross_lengths(b - a, c - a), len(sizes)) / 2
     u, v = plane[:, triangles[:, 1:]] - plane[:, triangles[:, :1]]
     in_plane = np.bincount(owners, np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]), len(sizes))
-    # Where an outline turns back by half a turn, nothing tells the side to which it turns.
-    tips = np.add.reduceat(turns > np.pi - _WRONG_TURN, starts)
-    is_crossed = (np.abs(in_plane - np.abs(twice)) > _EQUAL_AREAS * in_plane) | (whole_turns - tips > 3 / 2)
+    is_crossed = (np.abs(in_plane - np.abs(twice)) > _EQUAL_AREAS * in_plane) | winds
     found.append((heights, areas, lengths / 2, is_crossed))
     return corners[triangles], owners
 
