@@ -135,7 +135,7 @@ class Search:
             for one in trials
             if math.isfinite(one.estimate)
         }
-        places = self._places(points, bracket, start, end, count)
+        places = self._places(points, len(trials), bracket, start, end, count)
         if self.first is not None and not trials:
             places = [sign * math.log(self.first) + _FIRST_APART * (k - (count - 1) / 2) for k in range(count)]
         tried = {one.size for one in trials}
@@ -158,17 +158,20 @@ class Search:
         return end - start > math.log1p(self.precision) * (1 + _EQUAL) and not is_adjacent
 
     def _places(
-        self, points: Mapping[float, float], bracket: Bracket, start: float, end: float, count: int
+        self, points: Mapping[float, float], tried: int, bracket: Bracket, start: float, end: float, count: int
     ) -> Sequence[float]:
-        """Return where to try next between the ends of a bracket, from the excess of the distance at some places."""
+        """Return where to try next between the ends of a bracket, from the excess of the distance at some places.
+
+        Of the trials so far, those that made no mesh have no distance.
+        """
         width = math.log1p(self.precision)
         if not points:
             # Where nothing could be made, halves arrive at the finest size.
             is_last = bracket.failed is not None and end - start < 2 * width
             return [start] if is_last else [start + (end - start) * k / (count + 1) for k in range(1, count + 1)]
         # Steps towards an end that was not tried double, and arrive there.
-        least = _BESIDE * width * 2.0 ** len(points)
-        reach = _CLOSED * max(math.log1p(PRECISION) * 2.0 ** (_FEW_TRIALS - 1 - len(points)), width)
+        least = _BESIDE * width * 2.0**tried
+        reach = _CLOSED * max(math.log1p(PRECISION) * 2.0 ** (_FEW_TRIALS - 1 - tried), width)
         if bracket.best is None or bracket.failed is None:
             (near, far), side = ((end, start), -1) if bracket.best is None else ((start, end), 1)
             step = side * (_extrapolated(points, near) - near) + _BESIDE * width
@@ -176,7 +179,7 @@ class Search:
             guess = far if side * (far - guess) < width else guess
         else:
             # Sobolev distances follow a power closely; the first secant step then arrives.
-            is_first = len(points) == 2
+            is_first = len(points) == tried == 2
             guess = _extrapolated(points, start) if is_first else _interpolated(points, start, end)
             guess += _BESIDE * width * (1 if 2 * guess < start + end else -1)
             is_hopeless = end - start > 2 * reach

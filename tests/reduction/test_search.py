@@ -160,6 +160,20 @@ def test_a_size_that_cannot_be_made_counts_as_failed() -> None:
     assert search.bracket(nothing).best is None
 
 
+@pytest.mark.parametrize("seed", range(40))
+def test_sizes_that_cannot_be_made_do_not_hold_up_the_search(seed: int) -> None:
+    # None of a whole range of sizes, up to seven times wide, can be made, but the finest one can.
+    rng = np.random.default_rng(seed)
+    fewest, low, wide = np.exp(rng.uniform(np.log([6, 4, 1.1]), np.log([9e3, 1e3, 7])))
+    search = Search(3 / fewest, 4, 10_000, True, larger_is_coarser=False, first=fewest * np.exp(rng.uniform(-1.2, 1.2)))
+    trials = trials_of(search, lambda n: math.nan if low <= n <= low * wide else 3 / n)
+    found = search.bracket(trials)
+    assert found.best is not None
+    assert len(trials) < 14
+    if found.failed is not None:
+        assert found.best.size <= max(1.0501 * found.failed.size, found.failed.size + 1)
+
+
 def test_a_closer_bracket_goes_on_from_the_same_trials() -> None:
     wide = Search(1.0, 4, 10_000, is_whole=True, larger_is_coarser=False)
     trials = trials_of(wide, lambda n: 500 / n)
