@@ -174,7 +174,7 @@ def _cut_others(axes: list[Reals], corners: Indices, sizes: Indices, found: _Mea
     areas = np.bincount(owners, cross_lengths(b - a, c - a), len(sizes)) / 2
     u, v = plane[:, triangles[:, 1:]] - plane[:, triangles[:, :1]]
     in_plane = np.bincount(owners, np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]), len(sizes))
-    is_crossed = (np.abs(in_plane - np.abs(twice)) > _EQUAL_AREAS * in_plane) | winds
+    is_crossed = (np.abs(in_plane - np.abs(twice)) > _EQUAL_AREAS * in_plane) | winds | (twice == 0)
     found.append((heights, areas, lengths / 2, is_crossed))
     return corners[triangles], owners
 

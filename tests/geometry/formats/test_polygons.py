@@ -137,6 +137,13 @@ def test_outlines_that_cross_themselves_are_noted(outline: Any) -> None:
         assert [note[:25] for note in raw.notes] == ["1 of 1 faces cross themse"]
 
 
+@pytest.mark.parametrize("axis", range(3))
+def test_an_outline_whose_lobes_cancel_out_is_noted_in_each_plane(axis: int) -> None:
+    lobes = [(1, 1, 0), (2, 0, 0), (1, -1, 0), (-1, 1, 0), (-2, 0, 0), (-1, -1, 0)]
+    raw = cut_polygons(np.roll(np.array(lobes, float), axis, 1), np.arange(6), np.array([6]))
+    assert [note[:25] for note in raw.notes] == ["1 of 1 faces cross themse"]
+
+
 def test_faces_of_all_sizes_keep_their_order() -> None:
     parts = [FLAT[name][0] for name in ("L", "square", "pentagon", "arrow")] + [[(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]]
     parts = [parts[i] for i in np.random.default_rng(1).integers(0, 5, 50)]
