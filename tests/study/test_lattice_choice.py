@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import trimesh
 from distributed import Client
@@ -113,6 +114,22 @@ def test_a_lattice_that_turns_out_too_small_grows(
     assert grown.lattice.xi_max > small.xi_max
     assert variable(sb.open_store(store_path), "convergence", "within").all()
     assert len(summary.computed) == 5
+
+
+def test_a_lattice_that_grows_in_a_run_of_a_part_takes_the_other_fields_along(
+    threads: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study = asking(norm={"orders": [-4.0]})
+    chosen = make_plan(study).choice.lattice
+    monkeypatch.setattr(search_module, "run_pilot", on_lattice(sb.Lattice(0.6 * chosen.xi_max, chosen.M)))
+    tables = []
+    for parts in ([[]], [["ico/0"], ["ico/3"], []]):
+        path = tmp_path / f"{len(parts)}.zarr"
+        computed = [set(sb.run(study, path, threads, only=only).computed) for only in parts]
+        assert sb.verify(path).is_sound
+        tables.append(sb.table(path).drop(columns="seconds"))
+    assert computed == [{"ico/0", "reference"}, {"ico/0", "ico/3", "reference"}, {"ico/1", "ico/2"}]
+    pd.testing.assert_frame_equal(*tables, rtol=1e-12, atol=0)
 
 
 def test_what_falls_short_in_the_end_is_marked(
