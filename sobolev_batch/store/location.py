@@ -168,10 +168,13 @@ class Location:
         with self.access("written"), suppress(NotADirectoryError):
             sync(store.delete(prefix) if isinstance(store, FolderStore) else store.delete_dir(prefix))
 
-    def remove_partial_files(self) -> None:
-        """Remove what writers left behind that were killed in the middle of a key. No other run may be writing."""
+    def remove_partial_files(self, besides: Collection[str] = ()) -> None:
+        """Remove what writers left behind that were killed in the middle of a key. No other run may be writing.
+
+        Folders of some names are left out.
+        """
         with self.access("read"):
-            files = () if self.scheme else _files_below(self.name)
+            files = () if self.scheme else _files_below(self.name, {os.path.join(self.name, name) for name in besides})
             partial = [file.path for file in files if PARTIAL_FILE.search(file.name)]
         for path in partial:
             with self.access("written"):
@@ -357,17 +360,17 @@ class FolderStore(LocalStore):
         return sizes
 
 
-def _files_below(folder: str | Path) -> Iterator[os.DirEntry[str]]:
-    """Yield what lies below a folder and is no folder: in half of the time that os.walk takes for many small ones."""
+def _files_below(folder: str | Path, besides: Collection[str] = ()) -> Iterator[os.DirEntry[str]]:
+    """Yield what lies below a folder, and not some others, and is no folder: twice as fast as os.walk for many."""
     folders = [os.fspath(folder)]
     while folders:
         # It may be removed meanwhile, or be no folder. What cannot be read is not missing.
         with suppress(*_ABSENT), os.scandir(folders.pop()) as entries:
             for entry in entries:
-                if entry.is_dir(follow_symlinks=False):
-                    folders.append(entry.path)
-                else:
+                if not entry.is_dir(follow_symlinks=False):
                     yield entry
+                elif entry.path not in besides:
+                    folders.append(entry.path)
 
 
 def _in_time(size_bytes: int = 0) -> asyncio.Timeout:

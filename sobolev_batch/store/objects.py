@@ -136,6 +136,7 @@ class Objects:
             )
         else:
             present._require_fields_of(study)
+        location.remove_partial_files(besides=location.names() - _AT_ROOT)
         root = Store(location) if present is None else present.root
         entry = {
             "name": study.name,

@@ -84,10 +84,11 @@ def write_all(root: Store, names: Sequence[str], changed: Iterable[bytes], kept:
     for group, table in _joined(parts).items():
         order = np.argsort([rank[name] for name in table["object"].values.tolist()], kind="stable")
         tables[group] = table.isel(mesh=order)
-    replaced = hide_tables(root)
+    # A run that was killed may have left some that are not listed.
+    replaced = {*hide_tables(root), *TABLES_OF_ALL}
     for group, table in tables.items():
         write_table(root, group, table)
-    for name in set(replaced) - root.documents.keys():
+    for name in replaced - root.documents.keys():
         root.location.remove(name)
     root.consolidate()
 

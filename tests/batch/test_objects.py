@@ -500,8 +500,15 @@ def test_a_run_that_was_killed_before_the_tables_of_all_goes_on(
         patch.setattr("sobolev_batch.batch.run.write_all", killed)
         with pytest.raises(KeyboardInterrupt):
             sb.run(study, changeable, threads)
+    # Nor does what it left between a file and its name, or listed no more, stay for ever.
+    partial = f"zarr.{32 * '0'}.partial"
+    leftovers = [changeable / name for name in (partial, f"meshes/{partial}", "proximity/zarr.json")]
+    for path in leftovers:
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
     assert sb.run(study, changeable, threads).computed == ()
     require_rows(changeable, "a", "e", "b")
+    assert not any(path.exists() for path in leftovers)
 
 
 def test_a_change_that_is_taken_back_after_an_interrupted_run_leaves_no_trace(
