@@ -9,6 +9,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -43,9 +44,11 @@ _MOST_REPAIRS = 3
 # The worker that plans an object does all its work where that is predicted to take less: a task costs the scheduler and
 # the driver some milliseconds.
 _SMALL_SECONDS = 2.0
-# Sections of a study on which all numbers of an object depend; it may gain others.
+# Sections of a study on which all numbers of an object depend; it may gain others, families and named meshes.
 _SETTINGS = ("accuracy", "lattice", "transform", "scaling", "reference")
 _VERSIONS = (SCHEMA_VERSION, NUMERICS_VERSION, TABLES_VERSION)
+# Keys of a family whose numbers are no sizes.
+_VECTORS = ("axes", "center", "direction")
 
 
 @dataclass(frozen=True)
@@ -98,7 +101,19 @@ def ended_before(study: Study, record: ObjectRecord | None) -> Ended | None:
 
 def _settings_of(one: StudyObject) -> dict[str, Any]:
     own = dict.fromkeys(_SETTINGS) | {name: one.table[name] for name in (*_SETTINGS, "proximity") if name in one.table}
-    return {"versions": [*_VERSIONS], **own}
+    if "accuracy" in one.table:
+        own["norm"] = one.table.get("norm")
+    named = {f"mesh {name}": digest_of(entry) for name, entry in one.table.get("mesh", {}).items()}
+    # A family may gain sizes.
+    named |= {f"family {family['name']}": digest_of(_without_sizes(family)) for family in one.table["family"]}
+    return {"versions": [*_VERSIONS], **own, **named}
+
+
+def _without_sizes(family: Mapping[str, Any]) -> dict[str, Any]:
+    def is_size(key: str, value: Any) -> bool:
+        return key not in _VECTORS and isinstance(value, list) and all(isinstance(one, Real) for one in value)
+
+    return {key: value for key, value in family.items() if not is_size(key, value)}
 
 
 def has_rows_of_now(one: StudyObject, record: ObjectRecord | None) -> bool:

@@ -177,13 +177,14 @@ def lost_objects(location: Location, study: str, known: Iterable[str]) -> list[s
 def stores_below(location: Location) -> dict[str, Location]:
     """Return the stores of all objects that have one, by name; that of an only object without a name is under "".
 
-    Of objects that the latest run could not carry out, they are of an earlier state of the study, and left out.
+    Of objects that the latest run could not carry out, they are of an earlier state of the study, and left out; and so
+    are those without rows in the tables at the root, where there are any: they are of other settings, or not finished.
     """
     objects = Objects.read(location)
     if objects is None:
         return {"": location}
     refused = {name for name, record in objects.recorded().items() if record.reason}
-    own = (name for name in objects.names if name not in refused)
+    own = (name for name in objects.tabulated or objects.rows if name not in refused)
     return {name: place for name in own if (place := objects.existing_store(name)) is not None}
 
 

@@ -609,18 +609,38 @@ def test_numbers_of_a_part_have_the_orders_of_its_study(
     assert "left out" not in caplog.text
 
 
-@pytest.mark.parametrize("own", [{"scaling": {"mode": "fixed", "scale": 0.5}}, {"transform": {"eps": 1e-7}}])
+NOISY = [{"name": "noisy", "source": "noisy", "mesh": "ball", "amplitudes": [0.1]}]
+
+
+@pytest.mark.parametrize(
+    ("first", "own"),
+    [
+        ({}, {"scaling": {"mode": "fixed", "scale": 0.5}}),
+        ({}, {"transform": {"eps": 1e-7}}),
+        *(
+            ({"mesh": {"ball": {"source": "icosphere", "levels": [1]}}, "family": NOISY}, own)
+            for own in (
+                {"mesh": {"ball": {"source": "icosphere", "levels": [2]}}},
+                {"family": [NOISY[0] | {"seed": 1}]},
+            )
+        ),
+    ],
+)
 def test_no_table_mixes_rows_of_other_settings(
-    own: dict[str, Any], changeable: Path, threads: Client, caplog: pytest.LogCaptureFixture
+    first: dict[str, Any], own: dict[str, Any], changeable: Path, threads: Client, caplog: pytest.LogCaptureFixture
 ) -> None:
     objects = [{**one, "scaling": own["scaling"]} if "scaling" in own else one for one in balls(a=1.0, b=1.1)]
-    changed = {**study_of(objects).table, **own}
-    study, other = study_of(balls(a=1.0, b=1.1)), sb.Study.from_table(changed)
+    study, other = (
+        sb.Study.from_table({**study_of(ones).table, **first, **changes})
+        for ones, changes in ((balls(a=1.0, b=1.1), {}), (objects, own))
+    )
     sb.run(study, changeable, threads)
     before = sb.table(changeable).drop(columns="seconds")
     sb.run(other, changeable, threads, only=["b"])
     assert "1 objects that this run left out, such as 'a', have rows of other settings" in caplog.text
     require_rows(changeable, "b")
+    # Nor do those of orders that are computed from the stores of objects.
+    assert set(sb.table(changeable, -5.0)["object"]) == {"b"}
     caplog.clear()
     assert {label[0] for label in sb.run(other, changeable, threads).computed} == {"a"}
     require_rows(changeable, "a", "b")
