@@ -178,12 +178,13 @@ def stores_below(location: Location) -> dict[str, Location]:
     """Return the stores of all objects that have one, by name; that of an only object without a name is under "".
 
     Of objects that the latest run could not carry out, they are of an earlier state of the study, and left out; and so
-    are those without rows in the tables at the root, where there are any: they are of other settings, or not finished.
+    are those without rows in the tables at the root, where there are any: they are of other settings, or not finished;
+    and those whose stores a run has changed that was killed before these tables.
     """
     objects = Objects.read(location)
     if objects is None:
         return {"": location}
-    refused = {name for name, record in objects.recorded().items() if record.reason}
+    refused = {name for name, one in objects.recorded().items() if one.reason or not (one.key or one.settings)}
     own = (name for name in objects.tabulated or objects.rows if name not in refused)
     return {name: place for name in own if (place := objects.existing_store(name)) is not None}
 

@@ -500,6 +500,8 @@ def test_a_run_that_was_killed_before_the_tables_of_all_goes_on(
         patch.setattr("sobolev_batch.batch.run.write_all", killed)
         with pytest.raises(KeyboardInterrupt):
             sb.run(study, changeable, threads)
+    # Rows of a at other orders would be those of another state than its rows at the root.
+    assert set(sb.table(changeable, -5.0)["object"]) == {"b"}
     # Nor does what it left between a file and its name, or listed no more, stay for ever.
     partial = f"zarr.{32 * '0'}.partial"
     leftovers = [changeable / name for name in (partial, f"meshes/{partial}", "proximity/zarr.json")]
