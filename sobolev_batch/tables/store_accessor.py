@@ -109,9 +109,10 @@ class StoreAccessor:
         return self._chosen(table, order, mesh if isinstance(mesh, str) else labels)
 
     def nearest(self, mesh: str, count: int = 10, order: float = DEFAULT_ORDER) -> xr.Dataset:
-        """Return the meshes nearest to one, nearest first, with their distances.
+        """Return the meshes with the smallest distances from one, the smallest first.
 
-        Spectra bound each distance from below, so that only the fields of near meshes are read.
+        Spectra bound each distance from below, so that only the fields of near meshes are read. Where errors overlap,
+        another mesh may truly be nearer, also one that is left out.
 
         Args:
             mesh: Label of a mesh.
