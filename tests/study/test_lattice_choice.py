@@ -123,7 +123,8 @@ def test_a_lattice_that_grows_in_a_run_of_a_part_takes_the_other_fields_along(
     chosen = make_plan(study).choice.lattice
     monkeypatch.setattr(search_module, "run_pilot", on_lattice(sb.Lattice(0.6 * chosen.xi_max, chosen.M)))
     tables = []
-    for parts in ([[]], [["ico/0"], ["ico/3"], []]):
+    runs: tuple[list[list[str]], ...] = [[]], [["ico/0"], ["ico/3"], []]
+    for parts in runs:
         path = tmp_path / f"{len(parts)}.zarr"
         computed = [set(sb.run(study, path, threads, only=only).computed) for only in parts]
         assert sb.verify(path).is_sound
