@@ -84,7 +84,7 @@ def unlock(store: str | Path | Location, *, force: bool = False) -> Lock | None:
     >>> sb.unlock("memory://new.zarr")
     Traceback (most recent call last):
         ...
-    sobolev_batch.errors.StoreError: memory://new.zarr: it holds no store of a study
+    sobolev_batch.errors.ForeignError: memory://new.zarr: it holds no store of a study
     """
     location = root_of(Location.parse(store))
     lock = Lock.read(location)
