@@ -18,8 +18,7 @@ from sobolev_batch.errors import InputError, LatticeError, MemoryLimitError, Mes
 from sobolev_batch.geometry.surface import Similarity, Surface
 from sobolev_batch.norms.accuracy.solve import DistanceTarget
 from sobolev_batch.norms.fields import Quality, TailQuality, compute_field, field_for
-from sobolev_batch.norms.tail.face_normals import FaceNormals
-from sobolev_batch.norms.tail.remainder import Remainder, remainder, remainder_between
+from sobolev_batch.norms.tail.remainder import Remainder, remainder, remainder_between, remainder_of_flat
 from sobolev_batch.norms.tail.sampling import TailSampling
 from sobolev_batch.norms.tail.values import octave_values
 from sobolev_batch.parameters import format_bytes
@@ -241,10 +240,7 @@ def _beyond_lattice(job: Job, surface: Surface) -> Remainder | None:
     if job.reference.label == job.row.label:
         return Remainder.between(0.0, 0.0, cutoff)
     reference = job.load_reference()
-    # The tail of flat faces follows no law that a lattice could extrapolate, since they may repeat.
-    if reference is None or not FaceNormals.from_surfaces((surface, reference)):
-        return None
-    return remainder_between((surface, reference), cutoff, execution=job.execution, is_bound=True)
+    return None if reference is None else remainder_of_flat((surface, reference), cutoff, execution=job.execution)
 
 
 def _store_whole(job: Job, surface: Surface, target: ErrorTarget | None) -> StoredBlocks:

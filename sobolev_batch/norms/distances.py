@@ -28,8 +28,7 @@ from sobolev_batch.norms.budget import Support, sums_of_shells
 from sobolev_batch.norms.columns import VARIABLES, labelled, labelled_distances, lattice_attributes
 from sobolev_batch.norms.estimate import NormEstimate, ReferenceEstimate, estimate_norms
 from sobolev_batch.norms.fields import OperandLike, as_operand, field_of, pair_of, quality_of, shells_against, shells_of
-from sobolev_batch.norms.tail.face_normals import FaceNormals
-from sobolev_batch.norms.tail.remainder import remainder_between
+from sobolev_batch.norms.tail.remainder import remainder_of_flat
 from sobolev_batch.parameters import check_seed
 from sobolev_batch.shown import progress_line
 from sobolev_batch.transform.lattice import Lattice, Orders, SobolevWeights, check_orders
@@ -160,9 +159,10 @@ def distance(
     weights = SobolevWeights(Lattice.from_field(first), orders)
     squares, products, own = shells_against(first, second, weights.lattice)
     beyond: Reals | float = np.nan
-    # The tail of flat faces follows no law that a lattice could extrapolate, since they may repeat.
-    if not has_fields and FaceNormals.from_surfaces(surfaces := (cast(Surface, a), cast(Surface, b))):
-        beyond = remainder_between(surfaces, weights.lattice.xi_max, orders, is_bound=True).bounds(orders)
+    if not has_fields and (
+        found := remainder_of_flat((cast(Surface, a), cast(Surface, b)), weights.lattice.xi_max, orders)
+    ):
+        beyond = found.bounds(orders)
     distances, of_second = _estimate(weights, squares, [first, second], beyond), _estimate(weights, own, [second])
     known = [quality.beyond_at(orders) for quality in map(quality_of, (first, second)) if quality is not None]
     if known and squares.any():

@@ -14,9 +14,10 @@ from sobolev_batch.geometry.subdivision import subdivided
 from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms.distances import distance
 from sobolev_batch.norms.spectrum import RadialAxis
+from sobolev_batch.norms.tail import remainder as remainder_module
 from sobolev_batch.norms.tail.face_normals import FaceNormals
 from sobolev_batch.norms.tail.integrals import OctaveSums, OctaveWeights, integral_over, squared_moduli
-from sobolev_batch.norms.tail.remainder import remainder_between
+from sobolev_batch.norms.tail.remainder import remainder_between, remainder_of_flat
 from sobolev_batch.norms.tail.sampling import Octave, OctaveSampling, TailSampling
 from sobolev_batch.norms.tail.values import OctaveValues, SurfaceSize, octave_values
 from sobolev_batch.shapes import Sphere, Torus, icosphere
@@ -252,6 +253,13 @@ def test_strips_that_repeat_beyond_a_given_lattice_are_off_by_about_their_error(
     ratios = found["error"] / (np.sqrt(a.squared_distance(b, orders)[0]) - found["distance"])
     assert (ratios > 1).all()
     assert (ratios < 1.2).all()
+
+
+def test_large_meshes_are_not_looked_at_beyond_a_given_lattice(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(remainder_module, "_MOST_FLAT", 11)
+    monkeypatch.delattr(remainder_module, "without_common_parts")
+    assert remainder_of_flat((BOX, BOX), 2.0) is None
+    assert np.isfinite(distance(BOX, Sphere(), -2.0, lattice=Lattice(2.0, 24))["error"])
 
 
 def test_bounds_beyond_a_cutoff_hold_at_any_order() -> None:
