@@ -165,7 +165,7 @@ def distance(
         beyond = found.bounds(orders)
     distances, of_second = _estimate(weights, squares, [first, second], beyond), _estimate(weights, own, [second])
     known = [quality.beyond_at(orders) for quality in map(quality_of, (first, second)) if quality is not None]
-    if known and squares.any():
+    if len(known) == len((first, second)) and squares.any():
         # A study knows how far its fields are from its reference, which may not be that of both.
         least = np.hypot(distances.values, np.sqrt(known).sum(axis=0)) - distances.values
         distances = replace(distances, truncation=np.fmax(distances.truncation, least))

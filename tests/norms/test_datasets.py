@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ import xarray as xr
 
 from sobolev_batch import Lattice, distance, fourier_transform, norm, spectrum, witness
 from sobolev_batch.errors import DamageError
+from sobolev_batch.norms.fields import Quality
+from sobolev_batch.norms.tail.remainder import Remainder
 from sobolev_batch.shapes import Sphere, icosphere
 
 LATTICE = Lattice(2.0, 16)
@@ -46,6 +49,12 @@ def test_what_is_no_quality_of_a_field_is_damage(place: int, entry: object) -> N
     for text in (json.dumps(parts), json.dumps(parts[:6])):
         with pytest.raises(DamageError, match="its quality cannot be read"):
             norm(A.assign_attrs(quality=text), -2.0)
+
+
+def test_errors_beside_a_field_of_unknown_quality_are_all_unknown() -> None:
+    quality = replace(Quality.from_json(A.attrs["quality"]), beyond=Remainder.between(0.0, 1.0, 2.0))
+    found = distance(A.assign_attrs(quality=quality.to_json()), (2 * A).drop_attrs(), -2.0)
+    assert found["error_part"].isnull().all()
 
 
 def test_settings_of_an_accuracy_are_attributes_and_closed_forms_have_none() -> None:
