@@ -28,6 +28,7 @@ from sobolev_batch.norms.budget import Support, sums_of_shells
 from sobolev_batch.norms.columns import VARIABLES, labelled, labelled_distances, lattice_attributes
 from sobolev_batch.norms.estimate import NormEstimate, ReferenceEstimate, estimate_norms
 from sobolev_batch.norms.fields import OperandLike, as_operand, field_of, pair_of, quality_of, shells_against, shells_of
+from sobolev_batch.norms.images import images_at
 from sobolev_batch.norms.tail.remainder import remainder_of_flat
 from sobolev_batch.parameters import check_seed
 from sobolev_batch.shown import progress_line
@@ -157,13 +158,15 @@ def distance(
         return labelled_distances(order, nothing, reference, {"xi_max": lattice.xi_max, "M": lattice.M})
     first, second = pair_of(a, b, lattice, orders)
     weights = SobolevWeights(Lattice.from_field(first), orders)
-    squares, products, own = shells_against(first, second, weights.lattice)
+    (squares, products, own), near_axes = shells_against(first, second, weights.lattice)
+    images = images_at(near_axes.images(), orders)[:, 0]
     beyond: Reals | float = np.nan
     if not has_fields and (
         found := remainder_of_flat((cast(Surface, a), cast(Surface, b)), weights.lattice.xi_max, orders)
     ):
         beyond = found.bounds(orders)
-    distances, of_second = _estimate(weights, squares, [first, second], beyond), _estimate(weights, own, [second])
+    distances = _estimate(weights, squares, [first, second], beyond, images)
+    of_second = _estimate(weights, own, [second])
     known = [quality.beyond_at(orders) for quality in map(quality_of, (first, second)) if quality is not None]
     if len(known) == len((first, second)) and squares.any():
         # A study knows how far its fields are from its reference, which may not be that of both.
@@ -220,17 +223,22 @@ def to_accuracy(
 
 
 def _estimate(
-    weights: SobolevWeights, sums: Reals, fields: Sequence[xr.DataArray], beyond: Reals | float = np.nan
+    weights: SobolevWeights,
+    sums: Reals,
+    fields: Sequence[xr.DataArray],
+    beyond: Reals | float = np.nan,
+    images: Reals | float = np.nan,
 ) -> NormEstimate:
     """Return a norm or distance from shell sums, with the errors that follow from the fields' qualities.
 
-    A bound on the squared norm beyond the lattice (orders,) may be known.
+    What lies beyond the lattice in the squared norm, and what images add to it, (orders,) may be known.
     """
     qualities = [quality for quality in map(quality_of, fields) if quality is not None]
     areas = np.array(sum(quality.area for quality in qualities))
     errors = np.hypot.reduce([quality.probe.norms(weights) for quality in qualities])
     support = Support(areas, _widths(fields))
-    estimate = estimate_norms(sums_of_shells(sums, weights), weights, support, errors, is_given=True, beyond=beyond)
+    found = sums_of_shells(sums, weights)
+    estimate = estimate_norms(found, weights, support, errors, is_given=True, beyond=beyond, images=images)
     if len(qualities) == len(fields):
         return estimate
     return NormEstimate(estimate.values, *[np.full_like(estimate.values, np.nan)] * 4)

@@ -131,15 +131,17 @@ def estimate_norms(
     *,
     is_given: bool = False,
     beyond: Reals | float = np.nan,
+    images: Reals | float = np.nan,
 ) -> NormEstimate:
     """Return norms (orders, ...) from sums over the lattice, and the tail beyond it where octaves measured that.
 
     The discretisation is the norm of the values' own errors (orders, ...), of a difference that of both together. The
-    lattice is chosen for an accuracy, or given. Bounds on the squared norms beyond it (orders, ...) may be known, else
-    NaN.
+    lattice is chosen for an accuracy, or given. Bounds on the squared norms beyond it, and on what images add to these,
+    (orders, ...) may be known, else NaN.
     """
     squares: Reals = np.maximum(sums.totals, 0.0)
-    images = aliased(sums, weights, support.widths)
+    # Sublattices do not show images of ends that are farther apart at fractions of the period than at all of it.
+    images = np.fmax(aliased(sums, weights, support.widths), images)
     if tail is None:
         values = np.sqrt(squares)
         beyond = np.where(np.isnan(beyond), truncated(sums, weights, support, is_given=is_given), beyond)
@@ -194,9 +196,12 @@ class ReferenceEstimate:
         """Return the estimate from the sums of <a - b, b> over the lattice, its tail, and the norms of both factors."""
         values = products.totals
         if tail is None:
-            # By Schwarz's inequality the product beyond the lattice is at most that of both norms there.
-            squares = [(one.values + one.truncation) ** 2 - one.values**2 for one in (distances, norms)]
-            errors = np.sqrt(squares[0] * squares[1])
+            # By Schwarz's inequality the product beyond the lattice is at most that of both norms there, and images
+            # change it by about as much as theirs.
+            errors = np.zeros_like(values)
+            for part in ("truncation", "aliasing"):
+                unseen = [(one.values + getattr(one, part)) ** 2 - one.values**2 for one in (distances, norms)]
+                errors = errors + np.sqrt(unseen[0] * unseen[1])
         else:
             values = values + tail.totals
             errors = tail.octaves_error + tail.remainder_error

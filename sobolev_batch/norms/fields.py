@@ -13,6 +13,7 @@ from sobolev_batch.arrays import ComplexDtype, Complexes, Reals
 from sobolev_batch.errors import DamageError, InputError, LatticeError
 from sobolev_batch.geometry.formats.conversion import SurfaceLike, as_surface
 from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Surface
+from sobolev_batch.norms.images import NearAxes
 from sobolev_batch.norms.tail.remainder import Remainder
 from sobolev_batch.transform.backends import backend_named
 from sobolev_batch.transform.fourier import (
@@ -315,17 +316,18 @@ def read_blocks(
         yield block, [np.asarray(field.isel(places).transpose(*AXES).values) for field in fields]
 
 
-def shells_against(a: xr.DataArray, b: xr.DataArray, lattice: Lattice) -> Reals:
-    """Return the shell sums of |a - b|², Re((a - b) conj b) and |b|², (3, lattice.shell_count)."""
-    sums = np.zeros((3, lattice.shell_count))
+def shells_against(a: xr.DataArray, b: xr.DataArray, lattice: Lattice) -> tuple[Reals, NearAxes]:
+    """Return the shell sums of |a - b|², Re((a - b) conj b) and |b|², (3, shells), and a - b near the axes."""
+    sums, near_axes = np.zeros((3, lattice.shell_count)), NearAxes(lattice, 1)
     for block, (values, others) in read_blocks(lattice, a, b):
         difference = values - others
+        near_axes.take(slice(1), block, difference[None])
         sums += [
             shell_sums(difference, None, lattice, block),
             shell_sums(difference, others, lattice, block),
             shell_sums(others, None, lattice, block),
         ]
-    return sums
+    return sums, near_axes
 
 
 def shells_of(a: xr.DataArray, b: xr.DataArray | None, lattice: Lattice) -> Reals:

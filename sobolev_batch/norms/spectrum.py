@@ -17,6 +17,7 @@ from typing import Any, Self
 import numpy as np
 
 from sobolev_batch.arrays import Indices, Reals
+from sobolev_batch.norms.images import IMAGE_ORDERS, images_at
 from sobolev_batch.norms.tail.integrals import Scatter, deviations_by_images, error_of_sum, pooled
 from sobolev_batch.norms.tail.sampling import OctaveSampling, SampleSet, TailSampling
 from sobolev_batch.transform.lattice import Lattice, smooth_step
@@ -71,6 +72,11 @@ class ComparedSpectra:
     def __getitem__(self, chosen: Any) -> ComparedSpectra:
         """Return the spectra of some fields."""
         return ComparedSpectra({name: values[chosen] for name, values in self.arrays.items()})
+
+    def images(self, orders: Sequence[float]) -> Reals:
+        """Return what images add to the squared distances (orders, fields); NaN where that is not measured."""
+        images = self.arrays.get("images")
+        return np.full((len(orders), 1), np.nan) if images is None else images_at(images, orders)
 
     @property
     def norm(self) -> Spectra:
@@ -233,6 +239,9 @@ class RadialAxis:
                 f"{name}_moments": (moments, "moment", "squared terms of drawn samples, by radius"),
                 f"{name}_peaks": (peaks, "peak", "largest term of each part of an octave, and images, at some orders"),
             }
+        if self.sampling is None:
+            meaning = "bound on what images at the period add to the squared distance to the reference, by the order"
+            arrays["images"] = len(IMAGE_ORDERS), "image_order", meaning
         return {name: array for name, array in arrays.items() if array[0]}
 
     @cached_property

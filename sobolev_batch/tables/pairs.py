@@ -23,7 +23,7 @@ from sobolev_batch.tables.reducer import Reducer
 from sobolev_batch.tables.shells import read_spectra
 
 # Raise it whenever the same fields lead to other distances: tiles of older versions are then made again.
-_TILES_VERSION = 3
+_TILES_VERSION = 4
 # Meshes along a side of a tile: with fewer, small studies keep their workers busy; with more, there are fewer keys.
 _FEWEST, _MOST, _TILES_OF_A_ROW = 32, 512, 8
 # Arrays of the distances and their errors, as `NormEstimate.named` names them.
@@ -156,12 +156,18 @@ def known_distances(reducer: Reducer, rows: Sequence[int], others: Sequence[int]
 
 def pair_distances(reducer: Reducer, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
     """Return distances over (orders, rows, others), the same or no rows; those to the reference come from spectra."""
-    distances = reducer.pairs(rows, others).stacked
-    reference = reducer.reference
-    if reference is not None:
-        of_reference = read_spectra(reducer.store, [reference]).norm
-        for side, opposite, axis in ((rows, others, 2), (others, rows, 3)):
-            if reference in side:
-                found = reducer.norms_of(opposite, read_spectra(reducer.store, opposite), of_reference).distances
-                distances.swapaxes(2, axis)[:, :, side.index(reference)] = found.stacked
+    reference, sides = reducer.reference, {*rows, *others}
+    if reference is None or not (reducer.sampling is None or reference in sides):
+        return reducer.pairs(rows, others)
+    read = sorted(sides | {reference})
+    spectra, places, images = read_spectra(reducer.store, read), {row: k for k, row in enumerate(read)}, reducer.images
+    if reducer.sampling is None:
+        images = images.copy()
+        images[:, read] = np.sqrt(spectra.images(reducer.orders))
+    distances = replace(reducer, images=images).pairs(rows, others).stacked
+    of_reference = spectra[[places[reference]]].norm
+    for side, opposite, axis in ((rows, others, 2), (others, rows, 3)):
+        if reference in side:
+            found = reducer.norms_of(opposite, spectra[[places[row] for row in opposite]], of_reference).distances
+            distances.swapaxes(2, axis)[:, :, side.index(reference)] = found.stacked
     return NormEstimate(*distances)

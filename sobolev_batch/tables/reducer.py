@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.geometry.surface import DIRECTIONS, Extent
-from sobolev_batch.norms.budget import Sums, Support, add_sums, sums_of_shells
+from sobolev_batch.norms.budget import Sums, Support, add_sums, image_weight, sums_of_shells
 from sobolev_batch.norms.estimate import NormEstimate, ReferenceEstimate, Tail, estimate_norms
 from sobolev_batch.norms.fields import Quality, TailQuality
 from sobolev_batch.norms.gram import Arrangement, differences
+from sobolev_batch.norms.images import IMAGE_ORDERS, NearAxes
 from sobolev_batch.norms.spectrum import ComparedSpectra, RadialAxis, Spectra
 from sobolev_batch.norms.tail.integrals import OctaveSums, OctaveWeights, integral_over, squared_moduli
 from sobolev_batch.norms.tail.remainder import Remainder
@@ -70,6 +71,8 @@ class Reducer:
         errors: Norms of the fields' own errors (orders, rows), likewise.
         beyond: Bounds on the distances from the study's reference beyond a lattice (orders, rows), NaN where these are
             extrapolated.
+        images: Roots of what images add to the squared distances from the reference (orders, rows), NaN where that is
+            not known.
         widths: Widths of all surfaces together (13,), see `Extent`.
         checksums: Checksums of the blocks of each field, by its row, and of its values in octaves.
         sampling: Samples of the octaves; None where the fields are all there is.
@@ -88,6 +91,7 @@ class Reducer:
     areas: Reals
     errors: Reals
     beyond: Reals
+    images: Reals
     widths: Reals
     checksums: Mapping[int, tuple[int, ...]]
     sampling: TailSampling | None = None
@@ -121,6 +125,7 @@ class Reducer:
             areas=np.full(count, np.nan),
             errors=np.full((len(orders), count), np.nan),
             beyond=np.full((len(orders), count), np.nan),
+            images=np.full((len(orders), count), np.nan),
             widths=Extent.union(extents).widths if extents else np.zeros(len(DIRECTIONS)),
             checksums=checksums,
             sampling=choice.tail,
@@ -203,7 +208,8 @@ class Reducer:
         # The reference's distance to itself is zero, and nothing is uncertain about that.
         errors *= np.not_equal(rows, b)
         unseen = (self.beyond[:, rows] + self.beyond[:, [b]]) * np.not_equal(rows, b)
-        distances = self._estimate(self._sums(spectra.distance), of_difference, areas, errors, unseen)
+        images = spectra.images(self.orders)
+        distances = self._estimate(self._sums(spectra.distance), of_difference, areas, errors, unseen, images)
         products = spectra.product(reference)
         of_product = Tail.of_product(self.axis.octave_integrals(products, self.orders), tail, of_b, of_difference)
         against = ReferenceEstimate.from_products(
@@ -237,6 +243,7 @@ class Reducer:
         rows = list(rows)
         own = np.zeros((len(rows), self.lattice.shell_count))
         differences, products = (np.zeros_like(own) if self.reference is not None else own * np.nan for _ in range(2))
+        near_axes = NearAxes(self.lattice, len(rows)) if self.sampling is None else None
         for number, block in enumerate(self.blocks):
             reference = None if self.reference is None else self.read([self.reference], number)
             for batch in _slices(len(rows), self._read_at_once):
@@ -244,8 +251,15 @@ class Reducer:
                 own[batch] += shell_sums(values, None, self.lattice, block)
                 if reference is not None:
                     values -= reference
+                    if near_axes is not None:
+                        near_axes.take(batch, block, values)
                     differences[batch] += shell_sums(values, None, self.lattice, block)
                     products[batch] += shell_sums(values, np.broadcast_to(reference, values.shape), self.lattice, block)
+        images = None
+        if near_axes is not None:
+            images = (
+                near_axes.images() if self.reference is not None else np.full((len(rows), len(IMAGE_ORDERS)), np.nan)
+            )
         samples = 0 if self.sampling is None else self.sampling.size
         reference_octaves = np.full(samples, np.nan, dtype=np.complex128)
         if self.reference is not None:
@@ -258,6 +272,8 @@ class Reducer:
             arrays |= self.axis.spectra(differences[batch], squared_moduli(octaves)).named("distance")
             inner = (octaves * reference_octaves.conj()).real
             arrays |= self.axis.spectra(products[batch], inner, is_square=False).named("product")
+            if images is not None:
+                arrays["images"] = images[batch]
             parts.append(ComparedSpectra(arrays))
         return ComparedSpectra.joined(parts)
 
@@ -299,17 +315,35 @@ class Reducer:
         unseen = self.beyond[:, list(rows)][:, :, None] + self.beyond[:, list(others)][:, None, :]
         unseen *= np.not_equal.outer(rows, others)
         tail = None if self.sampling is None else self._tails_of_pairs(self.sampling, rows, others, shared)
-        return self._estimate(sums, tail, areas, errors, unseen)
+        return self._estimate(sums, tail, areas, errors, unseen, self._images_of_pairs(sums, rows, others))
+
+    def _images_of_pairs(self, sums: Sums, rows: Sequence[int], others: Sequence[int]) -> Reals:
+        """Return bounds on what images add to squared distances of pairs (orders, rows, others), NaN if not known.
+
+        They add no more than what those of both differences from the reference add, and no more than all of the
+        difference would, at the least distance of faces to their images.
+        """
+        roots = self.images[:, list(rows)][:, :, None] + self.images[:, list(others)][:, None, :]
+        most = [image_weight(self.lattice.spacing, order - 1, self.widths) for order in self.orders]
+        return np.minimum(roots**2, np.array(most)[:, None, None] * sums.totals)
 
     def _estimate(
-        self, sums: Sums, tail: Tail | None, areas: Reals, errors: Reals, unseen: Reals | float = np.nan
+        self,
+        sums: Sums,
+        tail: Tail | None,
+        areas: Reals,
+        errors: Reals,
+        unseen: Reals | float = np.nan,
+        images: Reals | float = np.nan,
     ) -> NormEstimate:
         """Return norms; areas and norms of the fields' own errors are those of both surfaces of a pair together.
 
-        Bounds on the norms that the lattice leaves unseen may be known.
+        Bounds on the norms that the lattice leaves unseen, and on what images add to the squared norms, may be known.
         """
-        support, beyond = Support(areas, self.widths), unseen**2
-        return estimate_norms(sums, self.weights, support, errors, tail, is_given=self.is_given, beyond=beyond)
+        support, given = Support(areas, self.widths), self.is_given
+        return estimate_norms(
+            sums, self.weights, support, errors, tail, is_given=given, beyond=unseen**2, images=images
+        )
 
     def _block_sums(
         self, rows: Sequence[int], others: Sequence[int], number: int, shared: int

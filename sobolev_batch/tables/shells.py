@@ -14,7 +14,7 @@ from sobolev_batch.store.sealed_chunks import arrays_of, key_in, key_of, missing
 from sobolev_batch.tables.reducer import Reducer
 
 # Raise it whenever the same fields lead to other spectra: those of older versions are then made again.
-_SPECTRA_VERSION = 2
+_SPECTRA_VERSION = 3
 # Rounding may raise a lower bound by this fraction of it.
 _ROUNDING = 1e-9
 

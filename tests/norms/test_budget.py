@@ -13,6 +13,7 @@ from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms.budget import Sums, Support, truncated
 from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.norms.fields import Quality
+from sobolev_batch.norms.images import NearAxes
 from sobolev_batch.shapes import Sphere, icosphere
 from sobolev_batch.transform.lattice import SobolevWeights
 from sobolev_batch.transform.probe import draw
@@ -85,6 +86,44 @@ def test_images_of_near_duplicates_that_cancel_by_chance_are_in_the_error() -> N
         shares.append(np.abs(found["distance"].values - wide["distance"].values) / found["error"].values)
     assert np.max(shares) < 1
     assert np.median(shares) > 0.05
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("period", [2.5, 3.0, 4.0])
+def test_ends_that_moved_meet_their_images_nearer_than_at_half_the_period(period: float, axis: int) -> None:
+    # At half the period these ends are farther apart than at all of it.
+    a, orders, offset = Rectangles.sheets(2, 2.2, -1.1), (-2.0, -3.0, -4.0, -6.0), 0.03
+    truth = a.distance(a.moved(0, 0, offset), orders)
+    mesh, moved = (
+        Mesh(np.roll(one.vertices, axis + 1, axis=1), one.triangles) for one in (a.mesh(), a.moved(0, 0, offset).mesh())
+    )
+    found = distance(mesh, moved, orders, lattice=Lattice(8.0, int(16 * period)))
+    ratios = found["error"].values / np.abs(found["distance"].values - truth)
+    assert (ratios > 1).all()
+    assert np.median(ratios) < 4
+
+
+def test_ends_meet_their_images_along_a_diagonal() -> None:
+    turn = np.array([[1, -1, 0], [1, 1, 0], [0, 0, np.sqrt(2)]]) / np.sqrt(2)
+    a, orders = Rectangles.sheets(2, 3.6, -1.8, (0.4, 0.4)), (-2.0, -3.0, -4.0)
+    b = a.moved(0, 0, 0.03)
+    mesh, moved = (Mesh(one.mesh().vertices[:, [2, 0, 1]] @ turn.T, one.mesh().triangles) for one in (a, b))
+    found = distance(mesh, moved, orders, lattice=Lattice(8.0, 48))
+    ratios = found["error"].values / np.abs(found["distance"].values - a.distance(b, orders))
+    assert (ratios > 1).all()
+    assert (ratios < 10).all()
+
+
+def test_values_near_axes_are_the_same_block_by_block() -> None:
+    lattice = Lattice(4.0, 24)
+    values = np.random.default_rng(0).normal(size=(2, *lattice.shape)) + 0j
+    whole, gathered = NearAxes(lattice, 2), NearAxes(lattice, 2)
+    whole.take(slice(2), lattice.half, values)
+    for block in lattice.split(500):
+        x, y, z = lattice.place(block)
+        gathered.take(slice(1, 2), block, values[1:, x, y, z])
+    assert whole.images()[1].tolist() == gathered.images()[1].tolist()
+    assert not gathered.images()[0].any()
 
 
 @pytest.mark.parametrize("xi_max", [5.0, 6.0])

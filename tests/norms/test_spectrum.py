@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sobolev_batch import Lattice
+from sobolev_batch.norms.images import NearAxes
 from sobolev_batch.norms.spectrum import ComparedSpectra, RadialAxis, Spectra
 from sobolev_batch.norms.tail.integrals import OctaveWeights, integral_over
 from sobolev_batch.norms.tail.sampling import TailSampling
@@ -66,6 +67,8 @@ def test_spectra_have_the_arrays_that_the_axis_describes_and_come_back_from_them
         ones = np.ones((2, LATTICE.shell_count)), np.ones((2, samples))
         norm, product = radial_axis.spectra(*ones), radial_axis.spectra(*ones, is_square=False)
         arrays = {**norm.named("norm"), **norm.named("distance"), **product.named("product")}
+        if radial_axis.sampling is None:
+            arrays["images"] = NearAxes(LATTICE, 2).images()
         assert {name: values.shape[1] for name, values in arrays.items()} == {
             name: width for name, (width, *_) in radial_axis.arrays().items()
         }

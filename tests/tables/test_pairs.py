@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,11 @@ from distributed import Client
 
 from sobolev_batch import Study, matrix, open_store, run, table, verify
 from sobolev_batch.errors import DamageError
+from sobolev_batch.geometry.formats.writing import write_mesh
 from sobolev_batch.store.layout import Store
 from sobolev_batch.tables import pairs
 from sobolev_batch.tables.reducer import Reducer
+from tests.support.rectangles import Rectangles
 from tests.support.studies import small_table
 
 Tile = tuple[tuple[int, ...], tuple[int, ...]]
@@ -62,6 +65,25 @@ def test_tiles_have_the_numbers_of_a_single_one(
     to_reference = table(store_path).pivot(index="mesh", columns="order", values="distance")
     stored = distances["distance"].sel(mesh=to_reference.index, other="reference", order=to_reference.columns)
     assert np.array_equal(stored.values, to_reference.to_numpy())
+
+
+def test_images_of_ends_are_in_the_errors_of_studies(store_path: Path, threads: Client, tmp_path: Path) -> None:
+    # Two squares at both ends, moved along the line through them: their images are nearest at the whole period.
+    surfaces = [Rectangles.sheets(2, 2.2, -1.1 + 0.03 * k) for k in range(3)]
+    for k, surface in enumerate(surfaces):
+        write_mesh(surface.mesh(), tmp_path / f"{k}.ply")
+    family = [{"name": "moved", "source": "files", "paths": ["[12].ply"]}]
+    reference, lattice = {"source": "files", "paths": ["0.ply"]}, {"xi_max": 8.0, "M": 48}
+    orders, unscaled = [-3.0, -4.0], {"mode": "none"}
+    changes = {"family": family, "reference": reference, "lattice": lattice, "scaling": unscaled}
+    run(Study.from_table(small_table(norm={"orders": orders}, **changes), folder=tmp_path), store_path, threads)
+    for order in (*orders, -5.0):
+        distances, errors = (matrix(store_path, order, name).to_numpy() for name in ("distance", "error"))
+        labels = matrix(store_path, order).index.tolist()
+        places = [0 if label == "reference" else int(label[-1]) for label in labels]
+        for i, j in combinations(range(3), 2):
+            truth = surfaces[places[i]].distance(surfaces[places[j]], [order])[0]
+            assert 1 < errors[i, j] / abs(distances[i, j] - truth) < 8, (order, labels[i], labels[j])
 
 
 def test_new_meshes_cost_new_tiles(store_path: Path, threads: Client, tiles: list[Tile]) -> None:

@@ -55,6 +55,7 @@ def reducer(store_path: Path, fields: NDArray[np.complex128]) -> Reducer:
         areas=np.ones(ROWS),
         errors=np.zeros((2, ROWS)),
         beyond=np.zeros((2, ROWS)),
+        images=np.zeros((2, ROWS)),
         widths=np.ones(13),
         checksums=checksums,
         tile_bytes=5 * 16 * plan.blocks[0].size,
