@@ -92,7 +92,9 @@ class Reduction:
     def to_row(self) -> dict[str, Any]:
         """Return the row of a table; bounds are lengths in the unit of the meshes, or fractions of the norm."""
         best, failed = self.bracket.best, self.bracket.failed
+        crash = f"size {failed.size:g} failed: {failed.reason}" if failed and failed.reason else ""
         notes = {
+            crash: crash,
             "not monotone: a finer mesh was farther away": not self.bracket.is_monotone,
             "no smaller one holds; another method may make one": best and best.triangles >= self.original_triangles,
         }

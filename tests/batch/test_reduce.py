@@ -266,6 +266,9 @@ def test_a_remesher_that_fails_at_a_size() -> None:
     assert failed is not None
     assert (best.triangles, failed.triangles) == (14, 0)
     assert "thirteen edges are refused" in failed.reason
+    # The empty cell has a reason.
+    shown = " ".join(format_reductions({"disc": found}, "markdown").split())
+    assert f"size {failed.size:g} failed: tests.batch.test_reduce.disc: ValueError: thirteen edges are refused" in shown
     # One that fails at each size says why.
     wrong = found_by(original, within=0.1, method=lambda mesh, edge: edge / 0, search={"edge": (0.1, 1.0)})
     assert "ZeroDivisionError" in wrong.reason
@@ -448,7 +451,9 @@ def test_the_command_goes_on_after_it_was_killed(tmp_path: Path) -> None:
     assert done.returncode == 3
     assert json.loads(record.read_bytes())["trials"][: len(before)] == before
     broken, flat = sorted(json.loads(done.stdout), key=lambda row: str(row["object"]))
-    assert (flat["object"], flat["original_triangles"], flat["note"]) == ("flat", 500, "")
+    assert (flat["object"], flat["original_triangles"]) == ("flat", 500)
+    assert "failed: " in flat["note"]
+    assert "thirteen edges are refused" in flat["note"]
     # 1 - cos(π/n) is at most 0.03 from n = 13 on, which the remesher refuses.
     assert (flat["triangles"], flat["failed_triangles"]) == (14, 0)
     assert flat["upper"] <= 0.03
