@@ -1,5 +1,6 @@
 """Distances of two meshes from point to closest point: Hausdorff, mean, RMS, percentiles, Chamfer, F-score, normals."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,10 +19,12 @@ MOST_POINTS = 10_000_000
 # The threshold of the F-score, in radii of the bounding sphere of the reference.
 DEFAULT_THRESHOLD = 0.01
 _PERCENTILES = (50, 95, 99)
+# The error of a percentile is what so many standard errors of its rank, those of 99 %, move it by, over this number (R.
+# S. Woodruff, "Confidence intervals for medians and other position measures", 1952): no gap of distances is missed.
+_RANKS = 2.57
 _WAYS = ("_forward", "_backward")
 
 _SYMMETRIC = ("hausdorff", "hausdorff_upper", "mean", "rms", *(f"p{percent}" for percent in _PERCENTILES))
-_BOTH_WAYS = (*_SYMMETRIC, "normal_mean", "normal_max")
 LENGTHS = (
     *(f"{name}{way}" for name in _SYMMETRIC for way in ("", *_WAYS)),
     *("mean_error", "rms_error", "bias", "bias_error", "chamfer", "chamfer_error", "threshold"),
@@ -123,53 +126,68 @@ def proximity_and_deviations(
         raise InputError(f"threshold must be a positive number, found {threshold!r}")
     check_seed(seed)
     meshes = as_mesh(a), as_mesh(b)
-    limit = DEFAULT_THRESHOLD * meshes[1].bounding_sphere[1] if threshold is None else float(threshold)
-    searches = [Triangles(mesh) for mesh in meshes]
-    seeds = np.random.SeedSequence(seed).spawn(2)
-    numbers: dict[str, float] = {"threshold": limit}
-    deviations = []
-    ways = zip(_WAYS, meshes, meshes[::-1], searches[::-1], seeds, strict=True)
-    for way, own, other, search, own_seed in ways:
-        drawn, triangles = _drawn(own, points, np.random.default_rng(own_seed))
-        distances, closest = search.closest(drawn)
+    searches = Triangles(meshes[0]), Triangles(meshes[1])
+    numbers, deviations = sampled_numbers(*searches, points, threshold, seed), []
+    for own, search in zip(meshes, searches[::-1], strict=True):
         found = directed_deviation(own, search)
         if within is not None and found.lower < within < found.upper:
             found = replace(found, upper=min(found.upper, directed_deviation(own, search, within=within).upper))
         deviations.append(found)
+    largest = Deviations(*deviations)
+    for way, found in zip(("", *_WAYS), (largest.both, *deviations), strict=True):
+        numbers |= {f"hausdorff{way}": found.lower, f"hausdorff_upper{way}": found.upper}
+    return {name: numbers[name] for name in NUMBERS}, largest
+
+
+def sampled_numbers(
+    a: Triangles, b: Triangles, points: int = DEFAULT_POINTS, threshold: float | None = None, seed: int = 0
+) -> dict[str, float]:
+    """Return the numbers of `proximity` that random points have, most of them with a standard error: NAME_error."""
+    limit = DEFAULT_THRESHOLD * b.mesh.bounding_sphere[1] if threshold is None else float(threshold)
+    numbers: dict[str, float] = {"threshold": limit}
+    percents = np.array(_PERCENTILES)
+    beside = _RANKS * np.sqrt(percents * (100 - percents) / points)
+    of_ways: list[dict[str, Sequence[float]]] = []
+    for search, other, own_seed in zip((a, b), (b, a), np.random.SeedSequence(seed).spawn(2), strict=True):
+        drawn, triangles = _drawn(search.mesh, points, np.random.default_rng(own_seed))
+        distances, closest = other.closest(drawn)
         # Powers of two lose no digit, and keep squares of lengths within the range of doubles.
         scale = 2.0 ** np.frexp(distances.max(initial=np.finfo(float).tiny))[1]
         squares = (distances / scale) ** 2
         rms = float(np.sqrt(squares.mean()))
-        across, facing = _normals(own, triangles), _normals(other, closest)
+        across, facing = _normals(search.mesh, triangles), _normals(other.mesh, closest)
         angles = np.degrees(np.arctan2(cross_lengths(across, facing), np.abs(dot(across, facing))))
-        of_way = {
-            "hausdorff": deviations[-1].lower,
-            "hausdorff_upper": deviations[-1].upper,
-            "mean": distances.mean(),
-            "mean_error": distances.std(ddof=1) / np.sqrt(points),
-            "rms": scale * rms,
-            "rms_error": scale * squares.std(ddof=1) / (2 * rms * np.sqrt(points)) if rms else 0.0,
-            **{f"p{percent}": np.percentile(distances, percent) for percent in _PERCENTILES},
-            "normal_mean": angles.mean(),
-            "normal_max": angles.max(),
-            "matched": np.mean(distances <= limit),
+        low, middle, high = (np.percentile(distances, np.clip(percents + k * beside, 0, 100)) for k in (-1, 0, 1))
+        moves = np.maximum(high - middle, middle - low)
+        of_way: dict[str, Sequence[float]] = {
+            "mean": _mean(distances),
+            "rms": (scale * rms, scale * squares.std(ddof=1) / (2 * rms * np.sqrt(points)) if rms else 0.0),
+            **{f"p{percent}": pair for percent, *pair in zip(_PERCENTILES, middle, moves / _RANKS, strict=True)},
+            "normal_mean": _mean(angles),
+            "normal_max": (angles.max(), np.nan),
+            "matched": (float(np.mean(distances <= limit)), np.nan),
         }
-        numbers |= {f"{name}{way}": float(value) for name, value in of_way.items()}
-        if own is meshes[0]:
-            sides = signs(other, drawn)
-            signed = distances * (np.nan if sides is None else sides)
-            numbers |= {"bias": float(signed.mean()), "bias_error": float(signed.std(ddof=1)) / np.sqrt(points)}
-    for name in (*_BOTH_WAYS, "mean_error", "rms_error"):
-        numbers[name] = max(numbers[f"{name}{way}"] for way in _WAYS)
+        of_ways.append(of_way)
+        if search is a:
+            sides = signs(other.mesh, drawn)
+            numbers["bias"], numbers["bias_error"] = _mean(distances * (np.nan if sides is None else sides))
+    for name in of_ways[0]:
+        found = [of_way[name] for of_way in of_ways]
+        for way, (value, error) in zip(("", *_WAYS), (np.max(found, axis=0), *found), strict=True):
+            numbers |= {f"{name}{way}": float(value), f"{name}{way}_error": float(error)}
     precision, recall = (numbers[f"matched{way}"] for way in _WAYS)
-    numbers |= {
+    return numbers | {
         "chamfer": numbers["mean_forward"] + numbers["mean_backward"],
-        "chamfer_error": float(np.hypot(numbers["mean_error_forward"], numbers["mean_error_backward"])),
+        "chamfer_error": float(np.hypot(numbers["mean_forward_error"], numbers["mean_backward_error"])),
         "fscore": 2 * precision * recall / (precision + recall) if precision + recall else 0.0,
         "precision": precision,
         "recall": recall,
     }
-    return {name: numbers[name] for name in NUMBERS}, Deviations(*deviations)
+
+
+def _mean(values: Reals) -> tuple[float, float]:
+    """Return the mean of independent values and its standard error."""
+    return float(values.mean()), float(values.std(ddof=1)) / np.sqrt(len(values))
 
 
 def share_beyond(

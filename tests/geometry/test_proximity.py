@@ -9,7 +9,8 @@ import pytest
 import trimesh
 
 import sobolev_batch as sb
-from sobolev_batch.geometry.proximity import MOST_POINTS, proximity, share_beyond
+from sobolev_batch.geometry.closest import Triangles
+from sobolev_batch.geometry.proximity import MOST_POINTS, proximity, sampled_numbers, share_beyond
 from tests.support.shapes import CENTRED_BOX
 
 
@@ -88,6 +89,27 @@ def test_the_error_is_that_of_the_drawing() -> None:
     deviations = np.array([found["chamfer"] - exact for found in drawn]) / [found["chamfer_error"] for found in drawn]
     assert 0.7 < deviations.std() < 1.4
     assert abs(deviations.mean()) < 0.5
+
+
+def test_numbers_of_random_points_are_within_their_errors() -> None:
+    a, b = Triangles(sb.shapes.icosphere(0)), Triangles(sb.shapes.icosphere(2))
+    many, drawn = sampled_numbers(a, b, 60_000, seed=99), [sampled_numbers(a, b, 900, seed=seed) for seed in range(80)]
+    for name in ("mean", "rms_forward", "p50_backward", "p95", "bias", "chamfer", "normal_mean"):
+        errors = np.array([found[f"{name}_error"] for found in drawn])
+        # 99 % are expected of these.
+        assert np.mean(np.abs([found[name] - many[name] for found in drawn]) <= 2.58 * errors) >= 0.95, name
+        assert (errors < 0.03 * abs(many[name])).all(), name
+    # Half of the area is 0.25 off, so the median is zero or 0.25, by chance.
+    corners, sides = square(2.0).vertices, [[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]]
+    flat, raised = (Triangles(sb.Mesh(np.vstack([corners, corners + np.array([5, 0, z])]), sides)) for z in (0.0, 0.25))
+    steps = [sampled_numbers(raised, flat, 400, seed=seed) for seed in range(100)]
+    assert {0.0, 0.25} <= {found["p50_forward"] for found in steps}
+    covered = [
+        abs(found["p50_forward"] - height) <= 2.58 * found["p50_forward_error"]
+        for found in steps
+        for height in (0.0, 0.25)
+    ]
+    assert np.mean(covered) >= 0.95
 
 
 def test_distances_of_vertices_as_another_search_finds_them() -> None:
