@@ -29,7 +29,8 @@ from sobolev_batch.geometry.formats.by_name import WRITERS, mesh_format
 from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.machine import available_cores
-from sobolev_batch.reduction.limit import Limit, tried
+from sobolev_batch.norms.columns import ANGLE, FILE_LENGTH, VARIABLES
+from sobolev_batch.reduction.limit import HAUSDORFF, RELATIVE, Limit, tried
 from sobolev_batch.reduction.recorded import RecordedSearch
 from sobolev_batch.reduction.remesher import Method, Range, Remesher
 from sobolev_batch.reduction.search import PRECISION, Bracket, Trial
@@ -57,7 +58,7 @@ class Reduction:
 
     Attributes:
         name: Name of the mesh.
-        limit: The tolerance: its ``value``, and its ``order`` if it is a Sobolev distance.
+        limit: The tolerance: its ``value``, its ``measure`` and, of a Sobolev distance, its ``order``.
         original_triangles: Number of triangles of the mesh; 0 if it cannot be read.
         trials: What was tried, in this order.
         bracket: The ``best`` mesh, of the fewest triangles within the tolerance, and the next coarser one that
@@ -90,7 +91,7 @@ class Reduction:
         return f"{self.name}: {best.triangles:,} of {self.original_triangles:,} triangles, {len(self.trials)} trials"
 
     def to_row(self) -> dict[str, Any]:
-        """Return the row of a table; bounds are lengths in the unit of the meshes, or fractions of the norm."""
+        """Return the row of a table; bounds are lengths in the unit of the meshes, degrees or fractions."""
         best, failed = self.bracket.best, self.bracket.failed
         crash = f"size {failed.size:g} failed: {failed.reason}" if failed and failed.reason else ""
         notes = {
@@ -100,6 +101,7 @@ class Reduction:
         }
         return {
             "object": self.name,
+            "measure": self.limit.measure,
             "original_triangles": self.original_triangles,
             **{name: getattr(best, name, None) for name in _OF_TRIALS},
             **{f"failed_{name}": getattr(failed, name, None) for name in _OF_TRIALS},
@@ -114,14 +116,16 @@ class Reduction:
 def format_reductions(found: Mapping[str, Reduction], style: Format = "text", unit: str | None = None) -> str:
     """Return a row for each mesh, as text, Markdown or LaTeX for people, or as CSV or JSON for programs."""
     limit = next(iter(found.values())).limit
-    factor, sign = (1, f" {unit}" if unit else "") if limit.order is None else (100, " %")
+    signs = {FILE_LENGTH: f" {unit}" if unit else "", ANGLE: "°"}
+    factor, sign = (1, signs[limit.units]) if limit.units in signs else (100, " %")
+    headers = {HAUSDORFF: "deviation", RELATIVE: "distance", "area": "change of area", "volume": "change of volume"}
     columns = [
         Column("object", "object", kind="label"),
         Column("original_triangles", "original", count),
         Column("triangles", "triangles", count),
         Column(
             "lower",
-            "deviation" if limit.order is None else "distance",
+            headers.get(limit.measure, limit.measure),
             lambda lower, upper: between(factor * lower, factor * upper, sign),
             error="upper",
         ),
@@ -132,8 +136,9 @@ def format_reductions(found: Mapping[str, Reduction], style: Format = "text", un
     ]
     frame = pd.DataFrame([one.to_row() for one in found.values()])
     frame = frame.astype({"triangles": "Int64", "failed_triangles": "Int64"})
-    order = "" if limit.order is None else f" at order {limit.order:g}"
-    caption = f"fewest triangles within {factor * limit.value:.6g}{sign}{order}"
+    title = VARIABLES[limit.measure]["long_name"].removeprefix("lower bound of the ")
+    of = {HAUSDORFF: "", RELATIVE: f" at order {limit.order or 0:g}"}.get(limit.measure, f": {title}")
+    caption = f"fewest triangles within {factor * limit.value:.6g}{sign}{of}"
     return rendered(style, frame, [Section(caption, [(columns, frame)])], [])
 
 
@@ -142,6 +147,7 @@ def reduce(
     within: float | str,
     *,
     order: float | None = None,
+    measure: str | None = None,
     unit: str | None = None,
     method: Method = "decimate",
     search: Range | None = None,
@@ -153,14 +159,19 @@ def reduce(
 ) -> dict[str, Reduction]:
     """Find the fewest triangles with which each mesh is still within a tolerance of itself.
 
-    Bounds decide, and no sample. A mesh that is not certainly within the tolerance counts as one that is not. What was
-    tried is recorded in the output, so that the same call goes on where it was ended.
+    Bounds decide, and a sample only of measures that have no others. A mesh that is not certainly within the tolerance
+    counts as one that is not. What was tried is recorded in the output, so that the same call goes on where it was
+    ended.
 
     Args:
         meshes: A mesh, the path of a file or a glob, a list of these paths, or meshes by name. Files are in one unit.
         within: The tolerance: a length for the largest deviation, as a number in the unit of the files or a text such
             as "0.1 mm"; or a text such as "1%" for the Sobolev distance over the norm of the original.
         order: Order s < -1/2 of this distance; default -2.
+        measure: What is to be within the tolerance, by its column in tables: "hausdorff", the largest deviation;
+            "relative", this distance; "area" or "volume", of which the change counts; or another number of `proximity`,
+            such as "rms", "mean_forward", "p95", "bias" or "normal_mean" (in degrees), with its error at 99 %: those of
+            10,000 points, which may miss a spot.
         unit: Name of the unit of the files, which a length with a unit needs.
         method: Name of a source that makes meshes of a number of triangles ("decimate", "remesh"); a command with
             {input}, {output} and a parameter, which thereby is permitted to run; a function of a mesh and a parameter;
@@ -191,7 +202,7 @@ def reduce(
     (True, True)
     """
     check_cluster(client, workers)
-    limit, remesher = Limit.parse(within, order, unit), _permitted(method, search)
+    limit, remesher = Limit.parse(within, order, unit, measure), _permitted(method, search)
     # It refuses a wrong precision.
     remesher.search(limit, 1, 1.0, precision)
     folder = None if output is None else Location.parse(output).absolute()

@@ -240,6 +240,7 @@ def _range(context: click.Context, param: click.Parameter, value: str | None) ->
     help="Keep the largest deviation within a length, such as 0.1mm, or the distance within 1% of the norm.",
 )
 @click.option("--order", type=float, help=f"Measure this fraction at an order below -1/2. [default: {DEFAULT_ORDER:g}]")
+@click.option("--measure", metavar="COLUMN", help="Keep rms, mean, p95, area or another column within the tolerance.")
 @click.option("--unit", metavar="NAME", help="Name the unit of length of the files, such as mm.")
 @click.option(
     *("--with", "method"),
@@ -273,8 +274,8 @@ def reduce_command(
     """Find the fewest triangles of each mesh within a tolerance.
 
     Each mesh is made with more or fewer triangles and compared with its file, until the coarsest one within the
-    tolerance is known. Bounds decide. The same command goes on where it was ended. A command in METHOD runs here, or
-    on the workers.
+    tolerance is known. Bounds decide, or samples with their errors. The same command goes on where it was ended. A
+    command in METHOD runs here, or on the workers.
 
     The exit status is 3 if nothing within the tolerance was found for some.
     """

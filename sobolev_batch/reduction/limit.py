@@ -4,20 +4,26 @@ A question that is clear is answered early: bounds are only as close as it needs
 """
 
 import math
+import re
 import time
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Self
 
-from sobolev_batch.errors import InputError, one_line
+from sobolev_batch.errors import InputError, MeshError, one_line
+from sobolev_batch.geometry.closest import Triangles
 from sobolev_batch.geometry.deviation import largest_deviation
 from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.geometry.proximity import DEFAULT_POINTS, NUMBERS, sampled_numbers
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.accuracy.threshold import relative_distance
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
+from sobolev_batch.norms.columns import ANGLE, FILE_LENGTH, VARIABLES
+from sobolev_batch.norms.tail.integrals import quantile
 from sobolev_batch.parameters import fraction, length_in
 from sobolev_batch.reduction.search import Trial
+from sobolev_batch.sources.names import known_names, quoted
 from sobolev_batch.sources.registry import Member, load_mesh
 from sobolev_batch.transform.lattice import single_order
 
@@ -27,45 +33,79 @@ _ANY_ACCURACY = Accuracy(1e-2)
 _THREADS, _SEED = 1, 0
 # A limit that is met up to this fraction is met.
 _EQUAL = 1e-9
+# The measures that are taken where none is named, those whose change counts, and all: what is zero for the reference
+# itself, and has bounds or an error.
+HAUSDORFF, RELATIVE, _OF_ONE_MESH = "hausdorff", "relative", ("area", "volume")
+_OTHERS = re.compile("upper|error|threshold|fscore|precision|recall|normal_max")
+_MEASURES = (RELATIVE, *(name for name in NUMBERS if not _OTHERS.search(name)), *_OF_ONE_MESH)
 
 
 @dataclass(frozen=True)
 class Limit:
-    """Largest distance of a mesh from the one that it was made of.
+    """Largest distance of a mesh from the one that it was made of, by one measure.
 
     Attributes:
-        value: Largest deviation, of each point of either mesh from the closest one of the other, in the unit of the
-            meshes. With an order, largest Sobolev distance over the norm of the original, in the unit in which its
-            bounding sphere has the radius 1.
-        order: Order s < -1/2 of the Sobolev distance; None for the deviation.
+        value: Largest value of the measure, whatever its sign: a length in the unit of the meshes, an angle in degrees,
+            or a fraction.
+        measure: Column of tables: "hausdorff", the largest deviation, of each point of either mesh from the closest one
+            of the other; "relative", the Sobolev distance over the norm of the original, in the unit in which its
+            bounding sphere has the radius 1; "area" or "volume", its change over that of the original; or another one
+            of `proximity`, such as "rms", by random points, as far as it may be off at 99 %.
+        order: Order s < -1/2 of the Sobolev distance; None for the others.
     """
 
     value: float
+    measure: str = HAUSDORFF
     order: float | None = None
 
     @classmethod
-    def parse(cls, within: float | str, order: float | None = None, unit: str | None = None) -> Self:
-        """Return the limit that is meant: a length, or with a per cent sign or an order a fraction of the norm.
+    def parse(
+        cls,
+        within: float | str,
+        order: float | None = None,
+        unit: str | None = None,
+        measure: str | None = None,
+        default_order: float = DEFAULT_ORDER,
+    ) -> Self:
+        """Return the limit that is meant: by default a length, or with a per cent sign or an order, of the norm.
 
-        >>> Limit.parse("0.1 mm", unit="m"), Limit.parse("1%")
-        (Limit(value=0.0001, order=None), Limit(value=0.01, order=-2.0))
+        >>> Limit.parse("0.1 mm", unit="m"), Limit.parse("1%"), Limit.parse(0.1, measure="rms").measure
+        (Limit(value=0.0001, measure='hausdorff', order=None), Limit(value=0.01, measure='relative', order=-2.0), 'rms')
         """
-        if order is None and not str(within).rstrip().endswith("%"):
-            return cls(length_in(within, unit))
-        value = math.inf
+        is_relative = order is not None or str(within).rstrip().endswith("%")
+        column = (RELATIVE if is_relative else HAUSDORFF) if measure is None else str(measure)
+        if column not in _MEASURES:
+            raise InputError(f"no measure is named {quoted(column)}; {known_names(column, _MEASURES)}")
+        if order is not None and column != RELATIVE:
+            raise InputError(f"{column} has no order; take out one of them")
+        unit_of, units = {FILE_LENGTH: unit, ANGLE: ANGLE}, VARIABLES[column]["units"]
+        if units in unit_of:
+            return cls(length_in(within, unit_of[units]), column)
+        value, whole = math.inf, "norm" if column == RELATIVE else column
         with suppress(InputError):
             value = fraction(within)
         if value >= 1:
             raise InputError(
-                "in per cent or with an order, a tolerance is a fraction of the norm below 1, such as 1%, found "
+                f"in per cent or with an order, a tolerance is a fraction of the {whole} below 1, such as 1%, found "
                 f"{within!r}; a length has no order"
             )
-        return cls(value, single_order(DEFAULT_ORDER if order is None else order))
+        orders = {RELATIVE: single_order(default_order if order is None else order)}
+        return cls(value, column, orders.get(column))
+
+    @property
+    def units(self) -> str:
+        """Units of the column: `FILE_LENGTH`, `ANGLE`, or others, in which the value is a fraction."""
+        return str(VARIABLES[self.measure]["units"])
 
     def bounds(self, mesh: Mesh, reference: Mesh) -> tuple[float, float, float]:
         """Return an estimate of the distance of a mesh from a reference, a lower and an upper bound."""
+        if self.order is None and not self.measure.startswith(HAUSDORFF):
+            value, error = self._value(mesh, reference)
+            # What decides.
+            return value + error, max(0.0, value - error), value + error
         if self.order is None:
-            deviation = largest_deviation(mesh, reference, within=self.value).both
+            ways = largest_deviation(mesh, reference, within=self.value)
+            deviation = getattr(ways, self.measure.removeprefix(HAUSDORFF).removeprefix("_") or "both")
             # The lower bound is the largest distance of a vertex at least; the upper one is hardly below the limit.
             return deviation.lower, deviation.lower, deviation.upper
         to_unit = Similarity.to_unit_ball(reference)
@@ -74,6 +114,20 @@ class Limit:
         # Of a distance that is too large, hardly any lies beyond the lattice.
         guess = found.upper if found.upper > self.value else (found.lower + found.upper) / 2
         return found.lower if found.lower > self.value else guess, found.lower, found.upper
+
+    def _value(self, mesh: Mesh, reference: Mesh) -> tuple[float, float]:
+        """Return the size of the measure and how far it may be off at 99 %; MeshError where it is not known."""
+        if self.measure in _OF_ONE_MESH:
+            own, other = (getattr(one, self.measure) for one in (mesh, reference))
+            value, error = abs(own - other) / (abs(other) or math.nan), 0.0
+        else:
+            numbers = sampled_numbers(Triangles(mesh), Triangles(reference))
+            value = abs(numbers[self.measure])
+            error = float(quantile(DEFAULT_POINTS - 1)) * numbers[f"{self.measure}_error"]
+        if math.isnan(value):
+            causes = reference.defects or mesh.defects or ("it is zero, or vertices are double",)
+            raise MeshError(f"no {self.measure} is known: {', '.join(causes)}")
+        return value, error
 
 
 def tried(reference_member: Member, member: Member, limit: Limit, size: float) -> tuple[Trial, Mesh | None]:

@@ -11,7 +11,7 @@ from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.formats.by_name import WRITERS
 from sobolev_batch.geometry.formats.ply import parse_ply
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.reduction.limit import Limit
+from sobolev_batch.reduction.limit import HAUSDORFF, RELATIVE, Limit
 from sobolev_batch.reduction.remesher import Remesher
 from sobolev_batch.reduction.search import PRECISION, Bracket, Search, Trial
 from sobolev_batch.sources.mesh_cache import Folder
@@ -66,8 +66,10 @@ class RecordedSearch:
     @property
     def digest(self) -> str:
         """SHA-256 of all that trials depend on; MeshError where a file of it cannot be read."""
-        about = [self.remesher.fingerprint(self.original), self.reference.fingerprint(), repr(self.limit)]
-        return digest_of([_VERSION, *about])
+        about = [self.remesher.fingerprint(self.original), self.reference.fingerprint()]
+        # The order tells the first two measures apart.
+        limit = f"Limit(value={self.limit.value!r}, order={self.limit.order!r})"
+        return digest_of([_VERSION, *about, limit, *({self.limit.measure} - {HAUSDORFF, RELATIVE})])
 
     def projected_bytes(self, triangles: int) -> float:
         """Return the memory that a trial takes with an original of some triangles; without any, that to read it."""
@@ -136,7 +138,7 @@ class RecordedSearch:
         if self.bracket(record).best is not None:
             return ""
         nearest = min(self._counted(record), key=lambda one: one.upper)
-        found = f"{nearest.triangles:,} triangles, at most {nearest.upper:.4g} away"
+        found = f"{nearest.triangles:,} triangles, at most {nearest.upper:.4g} away ({self.limit.measure})"
         return nearest.reason or f"nothing is within the tolerance of {self.limit.value:.4g}; nearest are {found}"
 
     def mesh(self, record: SearchRecord) -> Mesh:

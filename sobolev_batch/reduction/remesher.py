@@ -10,6 +10,7 @@ from typing import Any, Self
 import numpy as np
 
 from sobolev_batch.errors import InputError
+from sobolev_batch.norms.columns import ANGLE, FILE_LENGTH
 from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.reduction.limit import Limit
 from sobolev_batch.reduction.search import PRECISION, Search
@@ -109,10 +110,9 @@ class Remesher:
         low, high = self.ends or (min(_FEWEST, triangles), triangles)
         if self.parameter != _TRIANGLES:
             return Search(limit.value, low, high, self.is_whole, precision=precision)
-        fraction = limit.value / (radius if limit.order is None else 1.0)
-        return Search(
-            limit.value, low, high, self.is_whole, False, max(low, min(_FIRST / fraction, high / 2)), precision
-        )
+        fraction = limit.value / {FILE_LENGTH: radius, ANGLE: 90.0}.get(limit.units, 1.0)
+        first = max(low, min(_FIRST / fraction, high / 2))
+        return Search(limit.value, low, high, self.is_whole, False, first, precision)
 
     def keeps(self, size: float, triangles: float) -> bool:
         """Tell whether the mesh of one size is the original itself, which has no more triangles."""

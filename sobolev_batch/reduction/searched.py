@@ -43,7 +43,7 @@ class SearchedSource(KeepingSource):
     """Meshes of one other mesh, of as few triangles as each of several tolerances permits.
 
     Attributes:
-        within: Largest distances from the reference, as `Limit.parse` takes them with the order.
+        within: Largest distances from the reference, as `Limit.parse` takes them with the order and the measure.
         search: Name of the parameter, and between which two values to search; None for triangles.
         template: Source that makes them, from its table without its mesh and the parameter that is searched.
         mesh: Mesh to start from; None for the reference.
@@ -54,6 +54,7 @@ class SearchedSource(KeepingSource):
 
     within: Tolerances
     order: float | None = None
+    measure: str | None = None
     search: Searched | None = None
     template: Annotated[SerializeAsAny[Source], BeforeValidator(_template)]
     mesh: SerializeAsAny[Source] | None = None
@@ -77,8 +78,7 @@ class SearchedSource(KeepingSource):
     def limits(self) -> dict[str, Limit]:
         """Return the tolerances by their names; InputError where they are none."""
         texts = [number_as_text(one) if isinstance(one, float) else one.strip() for one in self.within]
-        orders = [self.default_order if text.endswith("%") and self.order is None else self.order for text in texts]
-        limits = [Limit.parse(text, order, self.unit) for text, order in zip(texts, orders, strict=True)]
+        limits = [Limit.parse(text, self.order, self.unit, self.measure, self.default_order) for text in texts]
         if same := [text for text, limit in zip(texts, limits, strict=True) if limits.count(limit) > 1]:
             raise InputError(f"the tolerances {quoted(same[0])} and {quoted(same[1])} are equal; remove one")
         return {text.replace(" ", ""): limit for text, limit in zip(texts, limits, strict=True)}
@@ -95,7 +95,7 @@ class SearchedSource(KeepingSource):
             SearchedMember(
                 name,
                 -1,
-                metadata=(("target_tolerance", limit.value),),
+                metadata=(("target_tolerance", limit.value), ("target_measure", limit.measure)),
                 search=RecordedSearch(original, reference, limit, remesher, self._cache.folder),
                 may_run=self._cache.may_run,
             )

@@ -40,7 +40,7 @@ Metric = Literal[
 _MOST_ORDERS, _MOST_OBJECTS = 100, 100_000
 MOST_OCTAVES = 24
 # Keys of a family that are none of its source, and those with which its meshes are searched.
-KEYS_OF_FAMILY, KEYS_OF_SEARCH = ("name", "order_by"), ("within", "order", "search")
+KEYS_OF_FAMILY, KEYS_OF_SEARCH = ("name", "order_by"), ("within", "order", "measure", "search")
 # The label of a reference that is no member of a family.
 REFERENCE_LABEL = "reference"
 # Characters of globs and templates, which the names of objects and methods cannot have.

@@ -17,6 +17,7 @@ import sobolev_batch as sb
 from sobolev_batch.batch import reduce as module
 from sobolev_batch.batch.reduce import Reduction, format_reductions
 from sobolev_batch.reduction import limit as limits
+from sobolev_batch.sources.registry import SurfaceMember
 from sobolev_batch.store.location import Location
 from tests.geometry.test_deviation import distance_from_triangles, grid
 from tests.support.commands import call, started
@@ -130,6 +131,62 @@ def test_a_fraction_of_the_norm_does_not_depend_on_the_unit(tmp_path: Path) -> N
     assert sb.testing.same_surface(mesh, lumpy(), tolerance=0.02, order=-4).outcome == "same"
 
 
+@pytest.mark.parametrize(
+    ("measure", "limit"),
+    [("rms", 0.03), ("mean", 0.03), ("mean_backward", 0.03), ("p95", 0.05), ("chamfer", 0.05), ("normal_mean", 8.0)],
+)
+def test_a_number_of_random_points_is_within_the_tolerance_with_its_error(measure: str, limit: float) -> None:
+    original, found = lumpy(3), found_by(lumpy(3), limit, measure=measure)
+    best, failed = found.bracket.best, found.bracket.failed
+    assert best is not None
+    assert failed is not None
+    assert best.triangles < 640
+    assert best.size <= 1.05 * failed.size + 1
+    assert best.lower < best.upper <= limit < failed.upper
+    assert found.mesh is not None
+    # Those of `compare --proximity`, and of more other points.
+    numbers, more = sb.proximity(found.mesh, original), sb.proximity(found.mesh, original, points=50_000, seed=1)
+    assert best.lower < more[measure] < best.upper
+    assert numbers[measure] == pytest.approx((best.lower + best.upper) / 2)
+    if f"{measure}_error" in numbers:
+        assert (best.upper - best.lower) / 2 == pytest.approx(2.5763 * numbers[f"{measure}_error"], rel=1e-4)
+    again = found_by(lumpy(3), limit, measure=measure).bracket.best
+    assert again is not None
+    assert again.upper == best.upper
+    text = format_reductions({"lumpy": found}, unit="mm" if measure != "normal_mean" else None)
+    assert f"{measure} " in text
+    assert f"within {limit:g}{'°' if measure == 'normal_mean' else ' mm'}: " in text
+
+
+def test_an_open_question_is_not_within() -> None:
+    reference, mesh = (SurfaceMember("", -1, lumpy(level), {}) for level in (3, 1))
+    numbers = sb.proximity(lumpy(1), lumpy(3))
+    value, error = numbers["rms"], numbers["rms_error"]
+    for limit, held in ((value + 2.7 * error, True), (value + 2.5 * error, False), (value - 2.7 * error, False)):
+        trial, kept = limits.tried(reference, mesh, limits.Limit(limit, "rms"), 80.0)
+        assert (trial.is_within, kept is not None) == (held, held)
+        assert (trial.lower <= limit) == (limit > value)
+
+
+def test_one_way_area_and_volume() -> None:
+    # A disc of n edges has n sin(2π/n) / 2π of the area of the circle; it covers no farther point of its own.
+    circle, ends = disc(lumpy(1), 2 * np.pi / 1000), {"edge": (0.02, 1.5)}
+    shares = [count / 1000 * np.sin(2 * np.pi / count) / np.sin(2 * np.pi / 1000) for count in range(3, 100)]
+    fewest = 3 + next(k for k, share in enumerate(shares) if share >= 1 - 0.01)
+    found = found_by(circle, "1 %", measure="area", method=disc, search=ends)
+    assert rows(found)[0] in range(fewest, round(1.06 * fewest))
+    assert found.bracket.best is not None
+    assert found.bracket.best.upper == pytest.approx(1 - shares[rows(found)[0] - 3])
+    assert "1 %: area" in format_reductions({"disc": found})
+    assert rows(found_by(circle, 1e-5, measure="hausdorff_forward", method=disc, search=ends))[0] < 6
+    assert rows(found_by(circle, 1e-2, measure="hausdorff_backward", method=disc, search=ends))[0] in range(23, 26)
+    assert "no volume is known: 1,000 open edges" in found_by(circle, "1%", measure="volume").reason
+    within = found_by(lumpy(3), "1%", measure="volume")
+    assert within.mesh is not None
+    assert 0.98 < within.mesh.volume / lumpy(3).volume < 1
+    assert rows(within)[0] < 640
+
+
 def test_lengths_are_converted_into_the_unit_of_the_files() -> None:
     in_mm = found_by(lumpy(scale=30.0), "0.1cm", unit="mm")
     in_m = found_by(lumpy(scale=0.03), "1 mm", unit="m")
@@ -199,8 +256,13 @@ def test_what_changed_since_is_tried_again(scan: Path, tmp_path: Path, tried: li
     assert tried == [found.bracket.best.size]
     assert (output / "part.ply").read_bytes() == written
     assert again.bracket.failed == found.bracket.failed
-    # Another tolerance, another remesher, another mesh: all of it.
-    for change in ({"within": 0.2}, {"within": 0.2, "method": disc, "search": {"edge": (0.5, 1.0)}}):
+    # Another tolerance, another measure, another remesher, another mesh: all of it.
+    for change in (
+        {"within": 0.2},
+        {"within": 0.2, "measure": "mean"},
+        {"within": 0.2, "measure": "rms"},
+        {"within": 0.2, "method": disc, "search": {"edge": (0.5, 1.0)}},
+    ):
         tried.clear()
         assert found_by(mesh, **change, output=output).trials
         assert len(tried) > 1
@@ -344,6 +406,16 @@ def test_several_meshes_on_a_cluster(client: Client, scan: Path, tmp_path: Path)
     [
         ({"within": "110%"}, "below 1"),
         ({"within": 0.0}, "a positive number"),
+        ({"within": 1.0, "measure": "rsm"}, "no measure is named 'rsm'; did you mean rms?"),
+        (
+            {"within": 1.0, "measure": "fscore"},
+            "no measure is named 'fscore'; known are relative, hausdorff, .*, volume",
+        ),
+        ({"within": 1.0, "measure": 3}, "no measure is named '3'; known are"),
+        ({"within": "1%", "measure": "rms"}, "'1%' has the unit '%'"),
+        ({"within": "1%", "measure": "area", "order": -2.0}, "area has no order"),
+        ({"within": "1 mm", "measure": "area"}, "a fraction of the area below 1, such as 1%, found '1 mm'"),
+        ({"within": "1 mm", "measure": "normal_mean"}, "'1 mm' cannot be converted into 'degree'"),
         ({"within": "1%", "order": 0.0}, "order"),
         ({"within": 1, "method": "nothing"}, "no source is named 'nothing'"),
         ({"within": 1, "method": "x {input} {output} {hausd}"}, "{hausd}"),
@@ -451,7 +523,7 @@ def test_the_command_goes_on_after_it_was_killed(tmp_path: Path) -> None:
     assert done.returncode == 3
     assert json.loads(record.read_bytes())["trials"][: len(before)] == before
     broken, flat = sorted(json.loads(done.stdout), key=lambda row: str(row["object"]))
-    assert (flat["object"], flat["original_triangles"]) == ("flat", 500)
+    assert (flat["object"], flat["original_triangles"], flat["measure"]) == ("flat", 500, "hausdorff")
     assert "failed: " in flat["note"]
     assert "thirteen edges are refused" in flat["note"]
     # 1 - cos(π/n) is at most 0.03 from n = 13 on, which the remesher refuses.

@@ -88,8 +88,11 @@ def test_the_first_size_is_that_of_the_tolerance_whatever_the_unit() -> None:
     remesher = Remesher.parse("decimate")
     for scale in (1e-3, 1.0, 1e3):
         (size,) = remesher.search(Limit(0.002 * scale), 100_000, scale).next([])
-        assert 1000 < size == remesher.search(Limit(0.002, -2.0), 100_000, scale).next([])[0] < 10_000
+        assert 1000 < size == remesher.search(Limit(0.002, "relative", -2.0), 100_000, scale).next([])[0] < 10_000
         assert size / remesher.search(Limit(0.02 * scale), 100_000, scale).next([])[0] == pytest.approx(10)
+        assert size == remesher.search(Limit(0.002 * scale, "rms"), 100_000, scale).next([])[0]
+        assert size == remesher.search(Limit(0.002 * 90, "normal_mean"), 100_000, scale).next([])[0]
+        assert size == remesher.search(Limit(0.002, "area"), 100_000, scale).next([])[0]
     # Not the mesh itself, of which nothing is learned.
     assert remesher.search(Limit(1e-6), 5000, 1.0).next([])[0] < 4000
 
@@ -97,7 +100,7 @@ def test_the_first_size_is_that_of_the_tolerance_whatever_the_unit() -> None:
 def test_the_estimate_of_a_sobolev_distance_guides_where_bounds_are_wide() -> None:
     coarse, fine = sb.shapes.icosphere(3), sb.shapes.icosphere(5)
     exact = sb.distance(coarse, fine, order=-2, rtol=0.05)["relative"].item()
-    estimate, lower, upper = Limit(0.7 * exact, -2.0).bounds(coarse, fine)
+    estimate, lower, upper = Limit(0.7 * exact, "relative", -2.0).bounds(coarse, fine)
     assert 0.7 * exact < lower <= exact
     assert upper > 2 * exact
     assert estimate == pytest.approx(exact, rel=0.1)

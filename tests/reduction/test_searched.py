@@ -151,9 +151,31 @@ def test_another_mesh_is_judged_against_the_reference(folder: Path) -> None:
 def test_a_fraction_is_that_of_the_first_order(folder: Path) -> None:
     own = {**DECIMATED, "within": ["10 %"]}
     one, other = member(folder, own), member(folder, {**own, "order": -8})
-    assert one.metadata == (("target_tolerance", 0.1),)
+    assert one.metadata == (("target_tolerance", 0.1), ("target_measure", "relative"))
     assert sb.testing.same_surface(load_mesh(one), lumpy(2), tolerance=0.1, order=-4.0).outcome == "same"
     assert len(load_mesh(other).triangles) < len(load_mesh(one).triangles) < 320
+
+
+def test_the_measure_of_a_family_is_in_the_tables(client: Client, folder: Path) -> None:
+    families = [
+        {**DECIMATED, "name": measure, "within": within, "measure": measure}
+        for measure, within in (("rms", "0.5 mm"), ("mean", "0.5 mm"), ("area", "2 %"), ("relative", 0.1))
+    ]
+    study = sb.Study.from_table(table(*families, name="a", proximity={"metrics": ["rms", "mean"]}), folder=folder)
+    assert not sb.run(study, folder / "scans.zarr", client=client).failed
+    rows = sb.table(folder / "scans.zarr").set_index("family")
+    assert rows["target_measure"].to_dict() == {name: name for name in ("rms", "mean", "area", "relative")}
+    # What the table says of them is what the searches have compared.
+    for name in ("rms", "mean"):
+        found = found_by(folder / "scans" / "a.ply", within=0.05, measure=name)
+        assert found.bracket.best is not None
+        assert rows.loc[name, "triangles"] == found.bracket.best.triangles < 320
+        upper = rows.loc[name, name] + 2.5763 * rows.loc[name, f"{name}_error"]
+        assert upper == pytest.approx(found.bracket.best.upper, rel=0.01)
+        assert upper <= 0.05
+    assert rows.loc["mean", "triangles"] < rows.loc["rms", "triangles"]
+    same = load_mesh(member(folder, {**DECIMATED, "within": "10 %"}))
+    assert rows.loc["relative", "triangles"] == len(same.triangles)
 
 
 @pytest.mark.process
@@ -193,6 +215,9 @@ def test_a_command_is_searched_where_it_may_run(folder: Path) -> None:
             {"within": "1 mm", "order": -2.0},
             "a fraction of the norm below 1, such as 1%, found '1 mm'; a length has no order",
         ),
+        ({"measure": "rmse"}, "no measure is named 'rmse'; did you mean rms?"),
+        ({"measure": "x"}, "no measure is named 'x'; known are relative, hausdorff"),
+        ({"measure": "rms", "order": -2.0}, "rms has no order"),
         ({"triangles": [100]}, "triangles is searched"),
         ({"search": {"levels": [1, 2]}}, "levels"),
         ({"search": {"triangles": [9, 4]}}, "the smaller one first"),
