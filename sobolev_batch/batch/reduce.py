@@ -200,6 +200,8 @@ def reduce(
     >>> found = sb.reduce(sb.shapes.icosphere(3), within="2%", order=-4)["mesh"]
     >>> found.bracket.best.triangles < 1280, found.bracket.best.upper <= 0.02 < found.bracket.failed.upper
     (True, True)
+    >>> sb.reduce(sb.shapes.icosphere(3), within=0.02, measure="rms")["mesh"].bracket.best.triangles < 640
+    True
     """
     check_cluster(client, workers)
     limit, remesher = Limit.parse(within, order, unit, measure), _permitted(method, search)
