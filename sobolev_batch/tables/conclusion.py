@@ -35,6 +35,8 @@ VERDICT_COLUMNS = (
     Column("remark", "remark", kind="text"),
 )
 _TOTALS = ("meshes", "missing", "above_rtol")
+# What an object is judged by: to cut it from all columns of `table` takes much longer.
+_OF_OBJECTS = ["order", "mesh", "distance", "relative", "relative_error", "resolved", "within"]
 _OBJECT_COLUMNS = (
     Column("object", "object", kind="label"),
     Column("mesh", "nearest mesh", kind="text"),
@@ -195,8 +197,13 @@ def _doubtful_rows(rows: pd.DataFrame, failed: Mapping[str, str]) -> Iterator[Ta
 
 def totals_of(rows: pd.DataFrame) -> dict[str, int]:
     """Return how many rows of `table` have a distance, how many lack one, and how many have one above rtol."""
-    known, short = rows["distance"].notna(), _is_above_rtol(rows)
-    return {"meshes": int(known.sum()), "missing": int((~known).sum()), "above_rtol": int(short.sum())}
+    return {name: int(number) for name, number in _counted(rows).sum().items()}
+
+
+def _counted(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the columns `_TOTALS` of rows, which tell what each counts as."""
+    known = rows["distance"].notna()
+    return pd.DataFrame(dict(zip(_TOTALS, (known, ~known, _is_above_rtol(rows)), strict=True)))
 
 
 def _is_above_rtol(rows: pd.DataFrame) -> pd.Series:
@@ -247,17 +254,16 @@ def format_objects(
 
     Those are first that lack most meshes, and then those whose nearest mesh is farthest from its reference.
     """
-    rows: list[TableRow] = []
-    for name, frame in tables_of(store, orders).items():
-        for order, of_order in frame.groupby("order", sort=False):
-            known = of_order[of_order["distance"].notna()]
-            numbers: TableRow = {"mesh": "", "relative": math.nan}
-            if len(known):
-                numbers = known.loc[known["relative"].idxmin(), ["mesh", "relative", "relative_error"]].to_dict()
-            rows.append({"order": order, "object": name, **numbers, **totals_of(of_order)})
-    names = ["order", "object", "mesh", "relative", "relative_error", *_TOTALS]
-    frame = pd.DataFrame(rows, columns=names).sort_values(["missing", "relative"], ascending=False, kind="stable")
-    sections, notes = [] if rows else [Section(sentences=[ALONE])], []
+    rows = pd.concat({name: frame[_OF_OBJECTS] for name, frame in tables_of(store, orders).items()}, names=["object"])
+    rows = rows.reset_index("object").reset_index(drop=True)
+    keys = ["order", "object"]
+    totals = rows[keys].join(_counted(rows)).groupby(keys, sort=False).sum()
+    known = rows[rows["relative"].notna()]
+    nearest = known.loc[known.groupby(keys)["relative"].idxmin()].set_index(keys)
+    frame = totals.join(nearest[["mesh", "relative", "relative_error"]]).fillna({"mesh": ""}).reset_index()
+    frame = frame[[*keys, "mesh", "relative", "relative_error", *_TOTALS]]
+    frame = frame.sort_values(["missing", "relative"], ascending=False, kind="stable")
+    sections, notes = [] if len(frame) else [Section(sentences=[ALONE])], []
     for order, of_order in frame.groupby("order", sort=False):
         shown = of_order.to_dict(orient="records")[:most]
         columns = [one for one in _OBJECT_COLUMNS if one.format is not count or any(row[one.name] for row in shown)]

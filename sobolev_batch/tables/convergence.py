@@ -241,16 +241,19 @@ def _rows(tree: xr.DataTree, order: Orders | None) -> pd.DataFrame:
 
 def _divided(rows: pd.DataFrame, x: str) -> dict[str, pd.DataFrame]:
     """Return the rows of each object by its name, without what others alone have."""
-    frames = {}
-    for name, of_object in rows.groupby("object", sort=False):
-        begin = len(f"{name}/")
-        frame = of_object.drop(columns=list(_OF_ALL)).reset_index(drop=True)
-        frame["mesh"] = frame["mesh"].str[begin:].astype(rows["mesh"].dtype)
-        reference, unit_length = (of_object[key].iloc[0] for key in ("reference", "unit_length"))
-        own = [key for key in rows.attrs.get("metadata", ()) if not frame[key].isin(["", np.nan]).all()]
-        frame = frame.drop(columns=[key for key in rows.attrs.get("metadata", ()) if key not in own])
-        frame.attrs = {**rows.attrs, "reference": reference[begin:], "unit_length": float(unit_length)}
-        if "metadata" in frame.attrs:
+    frames, known = {}, rows.attrs.get("metadata", ())
+    objects, references, unit_lengths = (rows[key].tolist() for key in _OF_ALL)
+    labels = [label[len(f"{name}/") :] for label, name in zip(rows["mesh"], objects, strict=True)]
+    # A copy has all columns of a type in one array, from which rows are taken at once.
+    without = rows.drop(columns=[*_OF_ALL]).assign(mesh=pd.Series(labels, dtype=rows["mesh"].dtype)).copy()
+    for name, places in rows.groupby("object", sort=False).indices.items():
+        frame = without.take(places).reset_index(drop=True)
+        begin, first = len(f"{name}/"), places[0]
+        own = [key for key in known if not frame[key].isin(["", np.nan]).all()]
+        if len(own) < len(known):
+            frame = frame.drop(columns=[key for key in known if key not in own])
+        frame.attrs = {**rows.attrs, "reference": references[first][begin:], "unit_length": float(unit_lengths[first])}
+        if known:
             frame.attrs["metadata"] = own
         frames[str(name)] = frame if x == EDGE_LENGTH else _with_rates(frame, x)
     return frames

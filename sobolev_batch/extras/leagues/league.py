@@ -22,6 +22,7 @@ from sobolev_batch.extras.leagues.statistics import (
     common_sizes,
     filled,
     interval,
+    numbers_of,
     sign_flip_test,
     within_objects,
 )
@@ -33,7 +34,7 @@ from sobolev_batch.store.location import Location
 from sobolev_batch.store.objects import Objects
 from sobolev_batch.study.comparable import SIGNIFICANCE, gap_of, least_objects
 from sobolev_batch.tables import Format
-from sobolev_batch.tables.convergence import EDGE_LENGTH, tables_of
+from sobolev_batch.tables.convergence import EDGE_LENGTH, sizes_of, tables_of
 from sobolev_batch.tables.open import AnyStore, as_tree, root_attribute
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.text import wrapped
@@ -343,8 +344,7 @@ def _league(
     of_objects: dict[str, dict[str, Curve]] = {}
     left_out, least = dict(unfinished), np.log(NEXT_TO_EQUAL) if y == RELATIVE else -np.inf
     for name, frame in tables.items():
-        at_order = frame[frame["order"] == order]
-        found = _curves(at_order, x, y, methods)
+        found = _curves(frame, order, x, y, methods)
         curves = {method: curve for method, curve in found.items() if np.all(curve.values >= least)}
         of_objects[name], in_common = curves, _with_common_sizes(curves)
         lacking = [method for method in methods if method not in in_common]
@@ -360,7 +360,7 @@ def _league(
         at = {method: curve.at(common) for method, curve in in_common.items()}
         missing = np.full((2, len(common)), np.nan)
         values, errors = np.array([at.get(method, missing) for method in methods]).swapaxes(0, 1)
-        slopes = {method: curve.slope() for method, curve in _curves(at_order, EDGE_LENGTH, y, methods).items()}
+        slopes = {method: curve.slope() for method, curve in _curves(frame, order, EDGE_LENGTH, y, methods).items()}
         rows[name] = common, values, errors, np.array([slopes.get(method, (np.nan, np.nan)) for method in methods])
     if rows:
         sizes, values, errors, slopes_of = (np.array(parts) for parts in zip(*rows.values(), strict=True))
@@ -395,10 +395,17 @@ def _with_common_sizes(curves: Mapping[str, Curve]) -> dict[str, Curve]:
     return kept
 
 
-def _curves(frame: pd.DataFrame, x: str, y: str, methods: Sequence[str]) -> dict[str, Curve]:
-    """Return the curve of each method that has numbers for an object."""
-    curves = {method: Curve.from_rows(frame[frame["family"] == method], x, y) for method in methods}
-    return {method: curve for method, curve in curves.items() if curve is not None}
+def _curves(frame: pd.DataFrame, order: float, x: str, y: str, methods: Sequence[str]) -> dict[str, Curve]:
+    """Return the curve at an order of each method that has numbers for an object."""
+    sizes, (values, errors) = sizes_of(frame, x), numbers_of(frame, y)
+    families, is_known = frame["family"].to_numpy(), np.isfinite(sizes) & np.isfinite(values)
+    is_known &= frame["order"].to_numpy() == order
+    of_methods = {method: is_known & (families == method) for method in methods}
+    return {
+        method: Curve.from_numbers(sizes[own], values[own], errors[own])
+        for method, own in of_methods.items()
+        if own.any()
+    }
 
 
 def format_league(leagues: Sequence[League], style: Format = "text") -> str:

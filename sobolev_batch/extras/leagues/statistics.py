@@ -14,7 +14,6 @@ from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.study.comparable import Range, common_range
-from sobolev_batch.tables.convergence import sizes_of
 
 # Sizes at which curves are compared, evenly spaced on a logarithmic axis.
 _SIZES = 5
@@ -44,16 +43,12 @@ class Curve:
     errors: Reals
 
     @classmethod
-    def from_rows(cls, rows: pd.DataFrame, x: str, y: str = "relative") -> Self | None:
-        """Return the curve of some rows of `table`, of one order and family; None where no mesh has the numbers."""
-        sizes, (values, errors) = sizes_of(rows, x), numbers_of(rows, y)
-        known = np.isfinite(sizes) & np.isfinite(values)
-        if not known.any():
-            return None
-        order = np.argsort(sizes[known], kind="stable")
-        values, errors = values[known][order], errors[known][order]
+    def from_numbers(cls, sizes: Reals, values: Reals, errors: Reals) -> Self:
+        """Return the curve of some meshes, by their finite sizes and distances in any order."""
+        order = np.argsort(sizes, kind="stable")
         with np.errstate(divide="ignore"):
-            return cls(np.log(sizes[known][order]), np.log(values), errors_of_logarithms(values, errors))
+            logarithms = np.log(sizes[order]), np.log(values[order])
+        return cls(*logarithms, errors_of_logarithms(values[order], errors[order]))
 
     @property
     def range(self) -> Range:
