@@ -29,7 +29,7 @@ from sobolev_batch.store.layout import (
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, acquire, release
 from sobolev_batch.store.objects import Objects, labelled, root_of
-from sobolev_batch.store.records import Records
+from sobolev_batch.store.records import Record, Records
 from sobolev_batch.store.sealed_chunks import Index, damaged_chunks, withdraw_chunk
 from sobolev_batch.store.workspace import Contents
 from sobolev_batch.tables.pairs import Pairs
@@ -168,12 +168,6 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, *, may
     records, unread = Records(store).examine()
     damaged = {row: f"its completion record is damaged ({what})" for row, what in unread.items()}
     tables, chunks = _damaged_tables(store), dict[tuple[str, Index], str]()
-    if not tables and not store.has_digest(is_thorough=True):
-        tables[ROOT] = "tables, coordinates or metadata are not what was written together"
-    try:
-        RunRecord.read(store)
-    except StoreError as error:
-        tables[RECORDS] = error.what if isinstance(error, DamageError) else str(error)
     labels = store.labels() if LABELS not in tables else tuple(f"row {row}" for row in range(len(records)))
     removed = store.removed
     rows = dict.fromkeys(i for i, label in enumerate(labels) if label not in removed or records[i] is not None)
@@ -187,31 +181,12 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, *, may
             if any(record is not None and quality not in ("", record.quality) for record, quality in stored):
                 tables[QUALITY] = "it is not what records have"
         if tables.keys().isdisjoint(store.keyed_arrays()):
-            chunks = dict(damaged_chunks(store))
-        if not tables:
-            pairs = Pairs.tabulated(store)
-            stale: list[tuple[str, Index]] = [
-                (SPECTRA_KEYS, (n,)) for n in stale_chunks(store, spectrum_keys(pairs.keys, pairs.reference))
-            ]
-            stale += [(PAIRS_KEYS, tile) for tile in (pairs.stale() if PAIRS_KEYS in store.documents else ())]
-            # Their fields are others by now.
-            chunks = dict.fromkeys(stale, "it is not that of the stored fields") | chunks
-    complete = contents.complete
+            chunks = _damaged_chunks(store, are_tables_sound=not tables)
     planned = store.attributes().get("versions", {}).get(NUMERICS)
-    for row, record in complete.items():
+    for row, record in contents.complete.items():
         if planned is not None and record.numerics != planned and labels[row] not in removed:
             damaged[row] = f"it was computed by numerics of version {record.numerics}, and the study by {planned}"
-    whole = Fields(store).complete_rows() if complete else set()
-
-    def damage_of(row: int) -> str:
-        return Fields(store).damage(row, complete[row]) if row in whole else "it is not there, or of another length"
-
-    with ThreadPoolExecutor(_THREADS_PER_CORE * available_cores()) as pool:
-        for done, (row, damage) in enumerate(zip(complete, pool.map(damage_of, complete), strict=True), 1):
-            if damage:
-                damaged[row] = damage
-            if on_progress is not None:
-                on_progress(done, len(complete))
+    damaged |= _damaged_fields(store, contents.complete, on_progress)
     if may_write:
         for row in damaged:
             Records(store).write(row, None)
@@ -224,7 +199,7 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, *, may
         tables[f"chunk {'/'.join(map(str, index))} of {keys.split('/')[0]}"] = what
     return Verification(
         store.path,
-        len(complete),
+        len(contents.complete),
         len(rows),
         {labels[row]: damaged[row] for row in sorted(damaged)},
         tables,
@@ -232,8 +207,39 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, *, may
     )
 
 
+def _damaged_chunks(store: Store, *, are_tables_sound: bool) -> dict[tuple[str, Index], str]:
+    """Return the damage of each chunk of spectra and distances; by sound tables, some are not those of the fields."""
+    chunks = dict(damaged_chunks(store))
+    if not are_tables_sound:
+        return chunks
+    pairs = Pairs.tabulated(store)
+    spectra = stale_chunks(store, spectrum_keys(pairs.keys, pairs.reference))
+    stale: list[tuple[str, Index]] = [(SPECTRA_KEYS, (number,)) for number in spectra]
+    stale += [(PAIRS_KEYS, tile) for tile in (pairs.stale() if PAIRS_KEYS in store.documents else ())]
+    return dict.fromkeys(stale, "it is not that of the stored fields") | chunks
+
+
+def _damaged_fields(
+    store: Store, complete: Mapping[int, Record], on_progress: Callable[[int, int], None] | None
+) -> dict[int, str]:
+    """Return the damage of each field, by its row."""
+    whole = Fields(store).complete_rows() if complete else set()
+
+    def damage_of(row: int) -> str:
+        return Fields(store).damage(row, complete[row]) if row in whole else "it is not there, or of another length"
+
+    damaged = {}
+    with ThreadPoolExecutor(_THREADS_PER_CORE * available_cores()) as pool:
+        for done, (row, damage) in enumerate(zip(complete, pool.map(damage_of, complete), strict=True), 1):
+            if damage:
+                damaged[row] = damage
+            if on_progress is not None:
+                on_progress(done, len(complete))
+    return damaged
+
+
 def _damaged_tables(store: Store) -> dict[str, str]:
-    """Return the damage of each small array, of tables and coordinates, that cannot be read."""
+    """Return the damage of each small array, of tables and coordinates, of what they say together, and of the run."""
     keyed, names = store.keyed_arrays(), store.whole_arrays()
     expected = [*names, QUALITY, *keyed] if table_names(store) else names
     groups = {name: name.split("/")[0] for name in expected}
@@ -248,4 +254,10 @@ def _damaged_tables(store: Store) -> dict[str, str]:
                 store.read(name)
             except DamageError as error:
                 damage[name] = error.what
+    if not damage and not store.has_digest(is_thorough=True):
+        damage[ROOT] = "tables, coordinates or metadata are not what was written together"
+    try:
+        RunRecord.read(store)
+    except StoreError as error:
+        damage[RECORDS] = error.what if isinstance(error, DamageError) else str(error)
     return damage
