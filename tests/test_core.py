@@ -68,14 +68,14 @@ def test_commands_of_the_core_work_and_others_say_what_is_missing(copy: Path, tm
 
 def test_tests_of_the_core_that_call_an_extra_are_marked() -> None:
     """The next test finds more, and takes minutes. Tests with a client start processes."""
-    stub = ast.parse((PACKAGE / "__init__.pyi").read_text())
+    stub = ast.parse((PACKAGE / "__init__.pyi").read_bytes())
     imports = [one for one in stub.body if isinstance(one, ast.ImportFrom) and str(one.module).startswith("extras")]
     names = {alias.asname or alias.name for one in imports for alias in one.names}
     assert {"fit", "fitting", "league", "plot"} <= names
     for folder in FOLDERS:
         place = ROOT / "tests" / folder
         for file in [place] if place.is_file() else place.rglob("test_*.py"):
-            module = ast.parse(file.read_text())
+            module = ast.parse(file.read_bytes())
             for test in [one for one in module.body if isinstance(one, ast.FunctionDef)]:
                 marks = " ".join(map(ast.unparse, [*test.decorator_list, test.args]))
                 used = {one.attr for one in ast.walk(test) if isinstance(one, ast.Attribute) and is_package(one.value)}
