@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import io
 import json
+import locale
 import struct
 import zipfile
 from collections.abc import Callable, Sequence
@@ -23,6 +24,17 @@ from sobolev_batch import Mesh
 from tests.support.shapes import BOX_TRIANGLES, BOX_VERTICES
 
 Faces = Sequence[Sequence[int]]
+
+
+def write_with(writer: Any) -> bool:
+    """Let a writer of VTK write its file: older ones leave the locale at C, in which text is ASCII to all later tests."""
+    before = locale.setlocale(locale.LC_ALL)
+    try:
+        return bool(writer.Write())
+    finally:
+        locale.setlocale(locale.LC_ALL, before)
+
+
 # Writes contents to a file whose name has an ending, and reads the mesh: see the fixture `read`.
 Read = Callable[[str, bytes], Mesh]
 

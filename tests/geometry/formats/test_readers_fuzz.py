@@ -31,7 +31,18 @@ from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter, vtkXMLUnstructuredGridWrit
 from sobolev_batch import Mesh, read_mesh
 from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.formats.readers import expected_size
-from tests.support.mesh_files import BOXES, LITTLE, Content, gmsh, gmsh_first_binary, obj, off, off_binary, ply
+from tests.support.mesh_files import (
+    BOXES,
+    LITTLE,
+    Content,
+    gmsh,
+    gmsh_first_binary,
+    obj,
+    off,
+    off_binary,
+    ply,
+    write_with,
+)
 from tests.support.shapes import BOX_MIXED, BOX_VERTICES
 
 # Of this process alone. Reading the box takes milliseconds.
@@ -79,7 +90,7 @@ def _of_vtk() -> Iterator[tuple[str, Content]]:
             path = Path(folder, f"box{suffix}")
             writer.SetInputData(box.cast_to_unstructured_grid() if suffix == ".vtu" else box)
             writer.SetFileName(str(path))
-            writer.Write()
+            write_with(writer)
             yield name, (suffix, path.read_bytes())
 
 
