@@ -27,7 +27,7 @@ Faces = Sequence[Sequence[int]]
 
 
 def write_with(writer: Any) -> bool:
-    """Let a writer of VTK write its file: older ones leave the locale at C, in which text is ASCII to all later tests."""
+    """Let a writer of VTK write its file: older ones leave the locale at C, in which text is ASCII to later tests."""
     before = locale.setlocale(locale.LC_ALL)
     try:
         return bool(writer.Write())
