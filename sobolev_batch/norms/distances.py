@@ -93,7 +93,8 @@ def norm(
         return labelled(order, _closed_form(values, values**2).named("norm"), {})
     field = field_of(a, lattice, orders)
     weights = SobolevWeights(Lattice.from_field(field), orders)
-    estimate = _estimate(weights, shells_of(field, None, weights.lattice), [field])
+    sums, near_axes = shells_of(field, None, weights.lattice)
+    estimate = _estimate(weights, sums, [field], images=images_at(near_axes.images(), orders)[:, 0])
     return labelled(order, estimate.named("norm"), lattice_attributes(weights.lattice, field))
 
 
@@ -159,14 +160,14 @@ def distance(
     first, second = pair_of(a, b, lattice, orders)
     weights = SobolevWeights(Lattice.from_field(first), orders)
     (squares, products, own), near_axes = shells_against(first, second, weights.lattice)
-    images = images_at(near_axes.images(), orders)[:, 0]
+    images, images_of_second = images_at(near_axes.images(), orders).T
     beyond: Reals | float = np.nan
     if not has_fields and (
         found := remainder_of_flat((cast(Surface, a), cast(Surface, b)), weights.lattice.xi_max, orders)
     ):
         beyond = found.bounds(orders)
     distances = _estimate(weights, squares, [first, second], beyond, images)
-    of_second = _estimate(weights, own, [second])
+    of_second = _estimate(weights, own, [second], images=images_of_second)
     known = [quality.beyond_at(orders) for quality in map(quality_of, (first, second)) if quality is not None]
     if len(known) == len((first, second)) and squares.any():
         # A study knows how far its fields are from its reference, which may not be that of both.

@@ -317,11 +317,11 @@ def read_blocks(
 
 
 def shells_against(a: xr.DataArray, b: xr.DataArray, lattice: Lattice) -> tuple[Reals, NearAxes]:
-    """Return the shell sums of |a - b|², Re((a - b) conj b) and |b|², (3, shells), and a - b near the axes."""
-    sums, near_axes = np.zeros((3, lattice.shell_count)), NearAxes(lattice, 1)
+    """Return the shell sums of |a - b|², Re((a - b) conj b) and |b|², (3, shells), and a - b and b near the axes."""
+    sums, near_axes = np.zeros((3, lattice.shell_count)), NearAxes(lattice, 2)
     for block, (values, others) in read_blocks(lattice, a, b):
         difference = values - others
-        near_axes.take(slice(1), block, difference[None])
+        near_axes.take(slice(2), block, np.stack([difference, others]))
         sums += [
             shell_sums(difference, None, lattice, block),
             shell_sums(difference, others, lattice, block),
@@ -330,9 +330,11 @@ def shells_against(a: xr.DataArray, b: xr.DataArray, lattice: Lattice) -> tuple[
     return sums, near_axes
 
 
-def shells_of(a: xr.DataArray, b: xr.DataArray | None, lattice: Lattice) -> Reals:
-    """Return the shell sums of |a|², or of |a - b|²."""
-    sums = np.zeros(lattice.shell_count)
+def shells_of(a: xr.DataArray, b: xr.DataArray | None, lattice: Lattice) -> tuple[Reals, NearAxes]:
+    """Return the shell sums of |a|², or of |a - b|², and a or a - b near the axes."""
+    sums, near_axes = np.zeros(lattice.shell_count), NearAxes(lattice, 1)
     for block, (values, *others) in read_blocks(lattice, *((a,) if b is None else (a, b))):
-        sums += shell_sums(values - others[0] if others else values, None, lattice, block)
-    return sums
+        difference = values - others[0] if others else values
+        sums += shell_sums(difference, None, lattice, block)
+        near_axes.take(slice(1), block, difference[None])
+    return sums, near_axes

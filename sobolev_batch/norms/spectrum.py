@@ -9,7 +9,7 @@ doi:10.1137/S0036144502417715).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any, Self
@@ -42,16 +42,22 @@ class Spectra:
             weights are the squared ones.
         peaks: Deviation of each part of an octave that the scatter of its groups does not show, at some orders, float64
             (fields, peaks): the largest term, and images that all groups have.
+        images: What images at the period add, float64 (fields, `IMAGE_ORDERS`); no columns where there are octaves.
     """
 
     sums: Reals
     moments: Reals
     peaks: Reals
+    images: Reals
 
     def named(self, name: str) -> dict[str, Reals]:
         """Return the arrays by the names that `RadialAxis.arrays` describes; those without entries are left out."""
-        arrays = {name: self.sums, f"{name}_moments": self.moments, f"{name}_peaks": self.peaks}
-        return {key: values for key, values in arrays.items() if values.shape[1]}
+        parts = {"moments": self.moments, "peaks": self.peaks, "images": self.images}
+        return {name: self.sums} | {f"{name}_{part}": values for part, values in parts.items() if values.shape[1]}
+
+    def images_at(self, orders: Sequence[float]) -> Reals:
+        """Return what images add to the squared norms (orders, fields); NaN where that is not measured."""
+        return images_at(self.images, orders) if self.images.shape[1] else np.full((len(orders), 1), np.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,11 +79,6 @@ class ComparedSpectra:
         """Return the spectra of some fields."""
         return ComparedSpectra({name: values[chosen] for name, values in self.arrays.items()})
 
-    def images(self, orders: Sequence[float]) -> Reals:
-        """Return what images add to the squared distances (orders, fields); NaN where that is not measured."""
-        images = self.arrays.get("images")
-        return np.full((len(orders), 1), np.nan) if images is None else images_at(images, orders)
-
     @property
     def norm(self) -> Spectra:
         """Spectra of the norms."""
@@ -91,12 +92,13 @@ class ComparedSpectra:
     def product(self, reference: Spectra) -> Spectra:
         """Return the spectra of the products, whose moments and peaks are bounded by Schwarz's inequality."""
         moments = _geometric_means(self.distance.moments, reference.moments)
-        return Spectra(self.arrays["product"], moments, _geometric_means(self.distance.peaks, reference.peaks))
+        peaks = _geometric_means(self.distance.peaks, reference.peaks)
+        return replace(self._spectra("product"), moments=moments, peaks=peaks)
 
     def _spectra(self, name: str) -> Spectra:
         sums = self.arrays[name]
         none = np.zeros((len(sums), 0))
-        return Spectra(sums, self.arrays.get(f"{name}_moments", none), self.arrays.get(f"{name}_peaks", none))
+        return Spectra(sums, *(self.arrays.get(f"{name}_{part}", none) for part in ("moments", "peaks", "images")))
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,17 +233,15 @@ class RadialAxis:
     def arrays(self) -> dict[str, tuple[int, str, str]]:
         """Return for each array of `ComparedSpectra` its length, and what it goes over and means."""
         moments = _NODES * sum(segment.sample_set.is_drawn for segment in self.segments)
-        peaks = len(_PEAK_ORDERS) * len(self.segments)
+        peaks, images = len(_PEAK_ORDERS) * len(self.segments), len(IMAGE_ORDERS) * (self.sampling is None)
         arrays = {"product": (len(self), "shell", "radial spectrum of the product <a - b, b> with the reference b")}
         for name, meaning in (("norm", "norm"), ("distance", "distance to the reference")):
             arrays |= {
                 name: (len(self), "shell", f"radial spectrum of the {meaning}"),
                 f"{name}_moments": (moments, "moment", "squared terms of drawn samples, by radius"),
                 f"{name}_peaks": (peaks, "peak", "largest term of each part of an octave, and images, at some orders"),
+                f"{name}_images": (images, "image_order", "what images at the period add, at some orders"),
             }
-        if self.sampling is None:
-            meaning = "bound on what images at the period add to the squared distance to the reference, by the order"
-            arrays["images"] = len(IMAGE_ORDERS), "image_order", meaning
         return {name: array for name, array in arrays.items() if array[0]}
 
     @cached_property
@@ -269,13 +269,16 @@ class RadialAxis:
             lattices[segment.place] = -1 if segment.sample_set.is_drawn else segment.number
         return {"octave": octaves, "lattice": lattices}
 
-    def spectra(self, shell_sums: Reals, octaves: Reals, *, is_square: bool = True) -> Spectra:
+    def spectra(
+        self, shell_sums: Reals, octaves: Reals, images: Reals | None = None, *, is_square: bool = True
+    ) -> Spectra:
         """Return the spectra of fields from sums over the shells of the lattice (fields, shells).
 
         At all samples of octaves they have |field|² (fields, samples), or a product of two fields, which needs no
-        errors, and has no moments and peaks.
+        errors, and has no moments, peaks and images.
         """
-        sums, moments, peaks = [shell_sums], [np.zeros((len(shell_sums), 0))], [np.zeros((len(shell_sums), 0))]
+        none = np.zeros((len(shell_sums), 0))
+        sums, moments, peaks = [shell_sums], [none], [none]
         for segment in self.segments:
             terms = segment.sampling.weights[segment.sample_set.samples] * octaves[:, segment.samples]
             sums.append(segment.moved(terms))
@@ -286,10 +289,11 @@ class RadialAxis:
                 largest = np.stack([(sizes * weights).max(axis=1) for weights in segment.peak_weights])
                 if not segment.sample_set.is_drawn:
                     sampling, number = segment.sampling, segment.number
-                    images = deviations_by_images(sampling, number, terms, _PEAK_ORDERS, segment.least_length)
-                    largest = np.hypot(largest, images)
+                    alike = deviations_by_images(sampling, number, terms, _PEAK_ORDERS, segment.least_length)
+                    largest = np.hypot(largest, alike)
                 peaks.append(largest.T)
-        return Spectra(*(np.concatenate(columns, axis=1) for columns in (sums, moments, peaks)))
+        columns = sums, moments, peaks, [none if images is None else images]
+        return Spectra(*(np.concatenate(arrays, axis=1) for arrays in columns))
 
     def energies(self, spectra: Spectra) -> Reals:
         """Return the mean of ∫_{|ξ|=r} |field|² dS over each octave (fields, octaves)."""

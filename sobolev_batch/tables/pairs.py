@@ -163,7 +163,7 @@ def pair_distances(reducer: Reducer, rows: Sequence[int], others: Sequence[int])
     spectra, places, images = read_spectra(reducer.store, read), {row: k for k, row in enumerate(read)}, reducer.images
     if reducer.sampling is None:
         images = images.copy()
-        images[:, read] = np.sqrt(spectra.images(reducer.orders))
+        images[:, read] = np.sqrt(spectra.distance.images_at(reducer.orders))
     distances = replace(reducer, images=images).pairs(rows, others).stacked
     of_reference = spectra[[places[reference]]].norm
     for side, opposite, axis in ((rows, others, 2), (others, rows, 3)):

@@ -15,7 +15,7 @@ from sobolev_batch.norms.budget import Sums, Support, add_sums, image_weight, su
 from sobolev_batch.norms.estimate import NormEstimate, ReferenceEstimate, Tail, estimate_norms
 from sobolev_batch.norms.fields import Quality, TailQuality
 from sobolev_batch.norms.gram import Arrangement, differences
-from sobolev_batch.norms.images import IMAGE_ORDERS, NearAxes
+from sobolev_batch.norms.images import NearAxes
 from sobolev_batch.norms.spectrum import ComparedSpectra, RadialAxis, Spectra
 from sobolev_batch.norms.tail.integrals import OctaveSums, OctaveWeights, integral_over, squared_moduli
 from sobolev_batch.norms.tail.remainder import Remainder
@@ -195,21 +195,20 @@ class Reducer:
         """
         rows, b = list(rows), self.reference
         tail = self._tail(spectra.norm, lambda row, _: self.qualities[row].own, rows)
-        norms = self._estimate(self._sums(spectra.norm), tail, self.areas[rows], self.errors[:, rows])
+        norms = self._estimate_by(spectra.norm, tail, self.areas[rows], self.errors[:, rows])
         zeros, unknown = np.zeros_like(norms.values), np.full_like(norms.values, np.nan)
         beyond = zeros if tail is None else tail.remainder
         if b is None or reference is None:
             nothing = NormEstimate(*[unknown] * 5)
             return Compared(norms, nothing, ReferenceEstimate(nothing, unknown, unknown), (beyond, unknown))
         of_b = self._tail(reference, lambda row, _: self.qualities[row].own, [b])
-        norm_of_b = self._estimate(self._sums(reference), of_b, self.areas[[b]], self.errors[:, [b]])
+        norm_of_b = self._estimate_by(reference, of_b, self.areas[[b]], self.errors[:, [b]])
         of_difference = self._tail(spectra.distance, lambda row, energies: self._remainder(row, b, energies), rows)
         areas, errors = self.areas[rows] + self.areas[b], np.hypot(self.errors[:, rows], self.errors[:, [b]])
         # The reference's distance to itself is zero, and nothing is uncertain about that.
         errors *= np.not_equal(rows, b)
         unseen = (self.beyond[:, rows] + self.beyond[:, [b]]) * np.not_equal(rows, b)
-        images = spectra.images(self.orders)
-        distances = self._estimate(self._sums(spectra.distance), of_difference, areas, errors, unseen, images)
+        distances = self._estimate_by(spectra.distance, of_difference, areas, errors, unseen)
         products = spectra.product(reference)
         of_product = Tail.of_product(self.axis.octave_integrals(products, self.orders), tail, of_b, of_difference)
         against = ReferenceEstimate.from_products(
@@ -243,23 +242,23 @@ class Reducer:
         rows = list(rows)
         own = np.zeros((len(rows), self.lattice.shell_count))
         differences, products = (np.zeros_like(own) if self.reference is not None else own * np.nan for _ in range(2))
-        near_axes = NearAxes(self.lattice, len(rows)) if self.sampling is None else None
+        near_axes = [NearAxes(self.lattice, len(rows)) for _ in range(2)] if self.sampling is None else ()
         for number, block in enumerate(self.blocks):
             reference = None if self.reference is None else self.read([self.reference], number)
             for batch in _slices(len(rows), self._read_at_once):
                 values = self.read(rows[batch], number)
                 own[batch] += shell_sums(values, None, self.lattice, block)
+                for near in near_axes[:1]:
+                    near.take(batch, block, values)
                 if reference is not None:
                     values -= reference
-                    if near_axes is not None:
-                        near_axes.take(batch, block, values)
+                    for near in near_axes[1:]:
+                        near.take(batch, block, values)
                     differences[batch] += shell_sums(values, None, self.lattice, block)
                     products[batch] += shell_sums(values, np.broadcast_to(reference, values.shape), self.lattice, block)
-        images = None
-        if near_axes is not None:
-            images = (
-                near_axes.images() if self.reference is not None else np.full((len(rows), len(IMAGE_ORDERS)), np.nan)
-            )
+        images = [near.images() for near in near_axes] or [np.zeros((len(rows), 0))] * 2
+        if self.reference is None:
+            images[1] = images[1] * np.nan
         samples = 0 if self.sampling is None else self.sampling.size
         reference_octaves = np.full(samples, np.nan, dtype=np.complex128)
         if self.reference is not None:
@@ -267,13 +266,12 @@ class Reducer:
         parts = []
         for batch in _slices(len(rows), max(1, int(_HELD_BYTES // (_SPECTRUM_BYTES * max(samples, 1))))):
             octaves = np.stack([self.read_octaves(row) for row in rows[batch]]).astype(np.complex128)
-            arrays = self.axis.spectra(own[batch], squared_moduli(octaves)).named("norm")
+            arrays = self.axis.spectra(own[batch], squared_moduli(octaves), images[0][batch]).named("norm")
             octaves -= reference_octaves
-            arrays |= self.axis.spectra(differences[batch], squared_moduli(octaves)).named("distance")
+            of_difference = self.axis.spectra(differences[batch], squared_moduli(octaves), images[1][batch])
+            arrays |= of_difference.named("distance")
             inner = (octaves * reference_octaves.conj()).real
             arrays |= self.axis.spectra(products[batch], inner, is_square=False).named("product")
-            if images is not None:
-                arrays["images"] = images[batch]
             parts.append(ComparedSpectra(arrays))
         return ComparedSpectra.joined(parts)
 
@@ -326,6 +324,11 @@ class Reducer:
         roots = self.images[:, list(rows)][:, :, None] + self.images[:, list(others)][:, None, :]
         most = [image_weight(self.lattice.spacing, order - 1, self.widths) for order in self.orders]
         return np.minimum(roots**2, np.array(most)[:, None, None] * sums.totals)
+
+    def _estimate_by(
+        self, spectra: Spectra, tail: Tail | None, areas: Reals, errors: Reals, unseen: Reals | float = np.nan
+    ) -> NormEstimate:
+        return self._estimate(self._sums(spectra), tail, areas, errors, unseen, spectra.images_at(self.orders))
 
     def _estimate(
         self,

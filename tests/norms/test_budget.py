@@ -103,6 +103,21 @@ def test_ends_that_moved_meet_their_images_nearer_than_at_half_the_period(period
     assert np.median(ratios) < 4
 
 
+@pytest.mark.parametrize("M", [40, 48, 64])
+def test_norms_of_ends_meet_their_images_too(M: int) -> None:
+    mesh, orders = Rectangles.sheets(2, 2.2, -1.1).mesh(), (-2.0, -3.0, -4.0, -6.0)
+    found, wide = (norm(mesh, orders, lattice=Lattice(8.0, intervals)) for intervals in (M, 3 * M))
+    images = found["error_part"].sel(part="aliasing").values
+    ratios = images / np.abs(found["norm"].values - wide["norm"].values)
+    assert (ratios > 1).all()
+    assert np.median(ratios) < 4
+    of_reference = distance(mesh, Sphere(0.9), orders, lattice=Lattice(8.0, M))
+    truth = distance(mesh, Sphere(0.9), orders, lattice=Lattice(8.0, 3 * M))
+    for name in ("relative", "area_share"):
+        off = np.abs(of_reference[name] - truth[name])
+        assert not (off > of_reference[f"{name}_error"] + truth[f"{name}_error"]).any()
+
+
 def test_ends_meet_their_images_along_a_diagonal() -> None:
     turn = np.array([[1, -1, 0], [1, 1, 0], [0, 0, np.sqrt(2)]]) / np.sqrt(2)
     a, orders = Rectangles.sheets(2, 3.6, -1.8, (0.4, 0.4)), (-2.0, -3.0, -4.0)

@@ -65,10 +65,9 @@ def test_spectra_have_the_arrays_that_the_axis_describes_and_come_back_from_them
     for radial_axis in (RadialAxis(LATTICE), axis):
         samples = 0 if radial_axis.sampling is None else radial_axis.sampling.size
         ones = np.ones((2, LATTICE.shell_count)), np.ones((2, samples))
-        norm, product = radial_axis.spectra(*ones), radial_axis.spectra(*ones, is_square=False)
+        images = NearAxes(LATTICE, 2).images() if radial_axis.sampling is None else None
+        norm, product = radial_axis.spectra(*ones, images), radial_axis.spectra(*ones, is_square=False)
         arrays = {**norm.named("norm"), **norm.named("distance"), **product.named("product")}
-        if radial_axis.sampling is None:
-            arrays["images"] = NearAxes(LATTICE, 2).images()
         assert {name: values.shape[1] for name, values in arrays.items()} == {
             name: width for name, (width, *_) in radial_axis.arrays().items()
         }
