@@ -319,11 +319,12 @@ class Reducer:
         """Return bounds on what images add to squared distances of pairs (orders, rows, others), NaN if not known.
 
         They add no more than what those of both differences from the reference add, and no more than all of the
-        difference would, at the least distance of faces to their images.
+        difference would, at the least distance of faces to their images, of which the sum may have lost as much.
         """
         roots = self.images[:, list(rows)][:, :, None] + self.images[:, list(others)][:, None, :]
-        most = [image_weight(self.lattice.spacing, order - 1, self.widths) for order in self.orders]
-        return np.minimum(roots**2, np.array(most)[:, None, None] * sums.totals)
+        parts = np.array([image_weight(self.lattice.spacing, order - 1, self.widths) for order in self.orders])
+        most = np.divide(parts, 1 - parts, where=parts < 1, out=np.full_like(parts, 1e100))
+        return np.asarray(np.minimum(roots**2, most[:, None, None] * sums.totals))
 
     def _estimate_by(
         self, spectra: Spectra, tail: Tail | None, areas: Reals, errors: Reals, unseen: Reals | float = np.nan

@@ -78,9 +78,9 @@ def test_flat_faces_that_repeat_beyond_a_given_lattice_are_in_every_error(store_
         found = sb.distance(fields.sel(mesh=mesh), fields.sel(mesh=other), orders)
         expected = tree.sobolev.distance(orders, mesh, other)["error"].values
         assert (np.abs(found["distance"] - surfaces[mesh].distance(surfaces[other], orders)) <= expected).all()
-        assert distances_at(tree, orders).sel(mesh=mesh, other=other)["error"].values == pytest.approx(expected, 1e-6)
+        assert distances_at(tree, orders).sel(mesh=mesh, other=other)["error"].values == pytest.approx(expected, 1e-4)
         # Fields may come from two studies.
-        assert (found["error"].values >= (1 - 1e-6) * expected).all()
+        assert (found["error"].values >= (1 - 1e-4) * expected).all()
         if other == "reference":
             meshes = surfaces[mesh].mesh(), surfaces[other].mesh()
             given = sb.distance(*meshes, orders, lattice=sb.Lattice(4.0, 24))["error"].values

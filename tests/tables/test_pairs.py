@@ -86,6 +86,25 @@ def test_images_of_ends_are_in_the_errors_of_studies(store_path: Path, threads: 
             assert 1 < errors[i, j] / abs(distances[i, j] - truth) < 8, (order, labels[i], labels[j])
 
 
+def test_a_period_shorter_than_a_unit_is_in_the_errors_of_pairs(
+    store_path: Path, threads: Client, tmp_path: Path
+) -> None:
+    # The sum holds next to nothing of the difference of two that are far from the reference, so it bounds no image.
+    half = np.array([0.1, 0.08, 0.06])
+    box = Rectangles.box(-half, half)
+    surfaces = [Rectangles.box(-half / 2, half), box, box.moved(0.01, 0, 0)]
+    for k, surface in enumerate(surfaces):
+        write_mesh(surface.mesh(), tmp_path / f"{k}.ply")
+    family = [{"name": "moved", "source": "files", "paths": ["[12].ply"]}]
+    reference, lattice = {"source": "files", "paths": ["0.ply"]}, {"xi_max": 6.0, "M": 4}
+    changes = {"family": family, "reference": reference, "lattice": lattice, "scaling": {"mode": "none"}}
+    run(Study.from_table(small_table(norm={"orders": [-4.0, -12.0]}, **changes), folder=tmp_path), store_path, threads)
+    for order in (-4.0, -12.0):
+        distances, errors = (matrix(store_path, order, name).to_numpy() for name in ("distance", "error"))
+        i, j = (k for k, label in enumerate(matrix(store_path, order).index) if label != "reference")
+        assert abs(distances[i, j] - surfaces[1].distance(surfaces[2], [order])[0]) < errors[i, j]
+
+
 def test_new_meshes_cost_new_tiles(store_path: Path, threads: Client, tiles: list[Tile]) -> None:
     run(balls(3), store_path, threads)
     assert sorted(tiles) == [((0, 1), (0, 1)), ((0, 1), (2, 3)), ((2, 3), (2, 3))]
