@@ -80,7 +80,8 @@ class Limit:
             raise InputError(f"{column} has no order; take out one of them")
         unit_of, units = {FILE_LENGTH: unit, ANGLE: ANGLE}, VARIABLES[column]["units"]
         if units in unit_of:
-            return cls(length_in(within, unit_of[units]), column)
+            text = str(within).replace("°", ANGLE) if units == ANGLE else within
+            return cls(length_in(text, unit_of[units]), column)
         value, whole = math.inf, "norm" if column == RELATIVE else column
         with suppress(InputError):
             value = fraction(within)
@@ -137,6 +138,9 @@ def tried(reference_member: Member, member: Member, limit: Limit, size: float) -
     that failed; what is wrong with the reference is raised as a MeshError.
     """
     reference, started = load_mesh(reference_member), time.perf_counter()
+    if limit.measure in _OF_ONE_MESH:
+        # What is not known of the reference is known of no mesh.
+        limit.bounds(reference, reference)
     mesh, reason, bounds = None, "", (math.inf,) * 3
     try:
         mesh = load_mesh(member)

@@ -158,6 +158,10 @@ def test_a_number_of_random_points_is_within_the_tolerance_with_its_error(measur
     assert f"within {limit:g}{'°' if measure == 'normal_mean' else ' mm'}: " in text
 
 
+def test_degrees_are_read_as_they_are_written() -> None:
+    assert limits.Limit.parse("8 °", measure="normal_mean") == limits.Limit(8.0, "normal_mean")
+
+
 def test_an_open_question_is_not_within() -> None:
     reference, mesh = (SurfaceMember("", -1, lumpy(level), {}) for level in (3, 1))
     numbers = sb.proximity(lumpy(1), lumpy(3))
@@ -180,7 +184,9 @@ def test_one_way_area_and_volume() -> None:
     assert "1 %: area" in format_reductions({"disc": found})
     assert rows(found_by(circle, 1e-5, measure="hausdorff_forward", method=disc, search=ends))[0] < 6
     assert rows(found_by(circle, 1e-2, measure="hausdorff_backward", method=disc, search=ends))[0] in range(23, 26)
-    assert "no volume is known: 1,000 open edges" in found_by(circle, "1%", measure="volume").reason
+    unknown = found_by(circle, "1%", measure="volume")
+    assert "no volume is known: 1,000 open edges" in unknown.reason
+    assert not unknown.trials
     within = found_by(lumpy(3), "1%", measure="volume")
     assert within.mesh is not None
     assert 0.98 < within.mesh.volume / lumpy(3).volume < 1
