@@ -38,7 +38,7 @@ class Rectangles:
         return cls(np.array([low for low, _ in corners], float), np.array([high for _, high in corners], float))
 
     @classmethod
-    def box(cls, low: Sequence[float], high: Sequence[float]) -> Self:
+    def box(cls, low: Sequence[float] | Reals, high: Sequence[float] | Reals) -> Self:
         lows, highs = [], []
         for axis, value in product(range(3), (0, 1)):
             first, last = np.array(low, float), np.array(high, float)
