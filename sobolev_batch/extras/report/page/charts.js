@@ -63,7 +63,7 @@
     const config = { responsive: true, displaylogo: false, modeBarButtons, displayModeBar: narrow() ? false : "hover" };
     const width = place.closest(".columns") ? 310 : 640;
     const height = Number(place.dataset.height);
-    const size = isPrinted() ? { height: isSheet ? 0.72 * height : height, width } : { height };
+    const size = isPrinted() ? { height: isSheet ? 0.62 * height : height, width } : { height };
     Plotly.react(place, traces, layout({ ...size, ...changes }), config);
   };
 
@@ -297,7 +297,7 @@
   const pair = () => {
     const { views, place: [x, y, z], eye, limit, signed } = data.pair;
     const place = document.getElementById("chart-pair");
-    const [height, beside] = [isPrinted() ? 230 : narrow() ? 640 : 440, !narrow() || isPrinted()];
+    const [height, beside] = [isPrinted() ? 210 : narrow() ? 640 : 440, !narrow() || isPrinted()];
     const width = isPrinted() ? 640 : place.clientWidth;
     const colors = signed ? diverging() : [[0, color("neutral")], [1, color("more")]];
     const traces = views.flatMap((view, i) => {
@@ -308,12 +308,15 @@
           text: ["largest deviation"], marker: { size: 9, symbol: "circle-open", color: color("ink"), line: { width: 3 } } },
       ];
     });
+    // On paper the labels of the colours need room of their own.
+    const share = isPrinted() ? 0.44 : 0.5;
+    if (isPrinted()) traces[0].colorbar.x = 2 * share;
     const scenes = views.map(({ extent }, i) => ({
-      ...scene(extent, beside ? width / 2 : width, beside ? height : height / 2),
+      ...scene(extent, beside ? share * width : width, beside ? height : height / 2),
       camera: { eye: { x: 1.8 * eye[0], y: 1.8 * eye[1], z: 1.8 * eye[2] } },
-      domain: beside ? { x: [i / 2, (i + 1) / 2], y: [0, 1] } : { x: [0, 1], y: [(1 - i) / 2, (2 - i) / 2] },
+      domain: beside ? { x: [share * i, share * (i + 1)], y: [0, 1] } : { x: [0, 1], y: [(1 - i) / 2, (2 - i) / 2] },
     }));
-    draw("pair", traces, { height, margin: { l: 0, r: isPrinted() ? 30 : 0, t: 0, b: 0 }, scene: scenes[0], scene2: scenes[1] }, space);
+    draw("pair", traces, { height, margin: { l: 0, r: 0, t: 0, b: 0 }, scene: scenes[0], scene2: scenes[1] }, space);
     if (!place.dataset.tied) {
       place.dataset.tied = "yes";
       place.on("plotly_relayout", (changed) => {
