@@ -84,7 +84,7 @@ def test_what_is_damaged_is_named_with_its_object(changeable: Path) -> None:
         "b: 5 of 5 surfaces complete, their fields read back",
     ]
     assert damaged.startswith("b/ico/2: ")
-    assert last == "1 surfaces and 0 arrays of tables are damaged; run the study again to repair it"
+    assert last == "damaged: 1 surface and 0 arrays of tables; run the study again to repair it"
 
 
 def test_damage_that_is_found_in_one_object_is_repaired_by_a_run_of_all(changeable: Path, threads: Client) -> None:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
@@ -10,6 +10,7 @@ from typing import Literal, overload
 
 import numpy as np
 import pandas as pd
+import xarray as xr
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
@@ -30,12 +31,13 @@ from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.parameters import as_names
 from sobolev_batch.shown import shown_tables
 from sobolev_batch.sources.names import quoted
+from sobolev_batch.store.layout import OBJECTS
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.objects import Objects
 from sobolev_batch.study.comparable import SIGNIFICANCE, gap_of, least_objects
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.convergence import EDGE_LENGTH, sizes_of, tables_of
-from sobolev_batch.tables.open import AnyStore, as_tree, root_attribute
+from sobolev_batch.tables.open import AnyStore, as_tree, root_attribute, source_of
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.text import wrapped
 from sobolev_batch.transform.lattice import Orders
@@ -127,12 +129,12 @@ class League:
     objects: tuple[str, ...]
     methods: tuple[str, ...]
     left_out: Mapping[str, str]
-    curves: Mapping[str, Mapping[str, Curve]]
-    known: NDArray[np.bool_]
-    sizes: Reals
-    values_at: Reals
-    errors_at: Reals
-    slopes: Reals
+    curves: Mapping[str, Mapping[str, Curve]] = field(repr=False)
+    known: NDArray[np.bool_] = field(repr=False)
+    sizes: Reals = field(repr=False)
+    values_at: Reals = field(repr=False)
+    errors_at: Reals = field(repr=False)
+    slopes: Reals = field(repr=False)
 
     @property
     def values(self) -> Reals:
@@ -280,23 +282,32 @@ def league(
     if by not in ("size", "cost"):
         raise InputError(f'methods are compared by "size" or "cost", found {by!r}')
     stores: AnyStores = store
-    if isinstance(store, Mapping):
+    if isinstance(store, Mapping) and not isinstance(store, xr.DataTree):
         objects = tuple(store)
-    elif (found := Objects.read(Location.parse(store))) is not None:
-        objects = found.names
+    elif found := _objects_of(store):
+        objects = found
     elif by == "cost":
         tree = as_tree(store)
         objects = (str(root_attribute(tree, "study")["name"]),)
         stores = {objects[0]: tree}
     else:
+        place = source_of(store) if isinstance(store, xr.DataTree) else store
         raise StoreError(
-            f"{store}: it holds the store of one object; run a study with several objects, or give the stores of "
+            f"{place}: it holds the store of one object; run a study with several objects, or give the stores of "
             "single objects by their names"
         )
     tables = tables_of(stores, order)
     if by == "cost":
         return cost_leagues_of(tables, objects, x or DEFAULT_COST, _chosen(tables, methods))
     return leagues_of(tables, objects, x=x or "triangles", y=y, methods=methods)
+
+
+def _objects_of(store: AnyStore) -> tuple[str, ...]:
+    """Return the names of a store's objects; none where it is that of an only one."""
+    if isinstance(store, xr.DataTree):
+        return tuple(root_attribute(store, "study").get(OBJECTS, ()))
+    found = Objects.read(Location.parse(store))
+    return () if found is None else found.names
 
 
 def leagues_of(
