@@ -83,7 +83,9 @@ class Verification(Shown):
             if self.withdrawn
             else "the store cannot be written from here, so nothing was withdrawn"
         )
-        found = f"{len(self.fields)} surfaces and {len(self.tables)} arrays of tables are damaged; {remedy}"
+        surfaces = f"{len(self.fields)} surface{'s' * (len(self.fields) != 1)}"
+        arrays = f"{len(self.tables)} array{'s' * (len(self.tables) != 1)} of tables"
+        found = f"damaged: {surfaces} and {arrays}; {remedy}"
         return "\n".join(map(visible, [*lines, "nothing is damaged" if self.is_sound else found]))
 
     @property

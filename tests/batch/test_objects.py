@@ -335,6 +335,8 @@ def test_a_league_needs_no_more_than_the_store(store: Path, monkeypatch: pytest.
     assert [one.order for one in leagues] == [-10.0, -3.0]
     assert leagues[1].table["method"].tolist() == ["ico", "egg"]
     assert leagues[1].objects[:2] == ("a", "b")
+    # A tree that is open is a mapping too, whose groups are no objects.
+    assert [repr(one) for one in sb.league(sb.open_store(store))] == [repr(one) for one in leagues]
     frame = sb.compare_studies(store, store, -3)
     assert frame["ratio"].tolist() == [1.0, 1.0]
     with pytest.raises(sb.errors.StoreError, match="it does not exist"):

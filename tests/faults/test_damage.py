@@ -388,6 +388,6 @@ def test_the_command_says_what_is_damaged(store: Path, tmp_path: Path) -> None:
     _, field, table_of_norms, last = found.stdout.splitlines()
     assert field.startswith("ico/2: ")
     assert table_of_norms.startswith("table norms/norm: ")
-    assert last == "1 surfaces and 1 arrays of tables are damaged; run the study again to repair it"
+    assert last == "damaged: 1 surface and 1 array of tables; run the study again to repair it"
     assert call("run", write_toml(tmp_path), "--store", store, "--workers", "1").returncode == 0
     assert call("verify", store).returncode == 0
