@@ -67,8 +67,13 @@ def convergence(
     if not named:
         raise InputError("there are no meshes; pass one or more")
     converted, found = {label: as_mesh(mesh) for label, mesh in named.items()}, []
-    for done, mesh in enumerate(converted.values(), start=1):
-        found.append(distance(mesh, reference, order, rtol=rtol, lattice=lattice, best_effort=best_effort, seed=seed))
+    for done, (label, mesh) in enumerate(converted.items(), start=1):
+        try:
+            one = distance(mesh, reference, order, rtol=rtol, lattice=lattice, best_effort=best_effort, seed=seed)
+        except InputError as error:
+            error.add_note(f"This is mesh {label!r}, number {done} of {len(named)}.")
+            raise
+        found.append(one)
         on_progress(done, len(named))
     table = xr.concat(found, "mesh", combine_attrs="drop_conflicts").assign_coords(
         mesh=("mesh", np.array(list(converted), dtype=object)),

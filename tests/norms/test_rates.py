@@ -46,6 +46,12 @@ def test_one_mesh_is_no_list_of_meshes(meshes: Any) -> None:
         sb.convergence(meshes, Sphere(), rtol=1e-2)
 
 
+def test_a_mesh_that_is_refused_is_named() -> None:
+    with pytest.raises(sb.errors.AccuracyError) as caught:
+        sb.convergence({"coarse": icosphere(1), "fine": icosphere(2)}, Sphere(), rtol=1e-9)
+    assert caught.value.__notes__ == ["This is mesh 'coarse', number 1 of 2."]
+
+
 def test_no_meshes_are_refused() -> None:
     with pytest.raises(sb.errors.InputError, match="no meshes"):
         sb.convergence([], Sphere(), rtol=1e-2)
