@@ -275,7 +275,7 @@ def reduce_command(
 
     Each mesh is made with more or fewer triangles and compared with its file, until the coarsest one within the
     tolerance is known. Bounds decide, or samples with their errors. The same command goes on where it was ended. A
-    command in METHOD runs here, or on the workers.
+    command in METHOD runs in a folder of its own, here or on the workers; {folder} in it is the current one.
 
     The exit status is 3 if nothing within the tolerance was found for some.
     """

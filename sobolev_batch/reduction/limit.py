@@ -80,6 +80,11 @@ class Limit:
             raise InputError(f"{column} has no order; take out one of them")
         unit_of, units = {FILE_LENGTH: unit, ANGLE: ANGLE}, VARIABLES[column]["units"]
         if units in unit_of:
+            if is_relative:
+                kind = "an angle in degrees" if units == ANGLE else "a length"
+                raise InputError(
+                    f"{column} is {kind}, found {within!r}; percentages are for the distance, area and volume"
+                )
             text = str(within).replace("°", ANGLE) if units == ANGLE else within
             return cls(length_in(text, unit_of[units]), column)
         value, whole = math.inf, "norm" if column == RELATIVE else column

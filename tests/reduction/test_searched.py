@@ -229,6 +229,7 @@ def test_a_command_is_searched_where_it_may_run(folder: Path) -> None:
         ({"measure": "rmse"}, "no measure is named 'rmse'; did you mean rms?"),
         ({"measure": "x"}, "no measure is named 'x'; known are relative, hausdorff"),
         ({"measure": "rms", "order": -2.0}, "rms has no order"),
+        ({"measure": "rms", "within": "1 %"}, "rms is a length, found '1 %'"),
         ({"triangles": [100]}, "triangles is searched"),
         ({"search": {"levels": [1, 2]}}, "levels"),
         ({"search": {"triangles": [9, 4]}}, "the smaller one first"),
