@@ -13,7 +13,7 @@ from sobolev_batch.errors import DamageError, ForeignError, InputError, StoreErr
 from sobolev_batch.sources.names import node_problem, quoted
 from sobolev_batch.store.create import list_records, record_keys, require_same_study
 from sobolev_batch.store.encoding import ROOT, group_document
-from sobolev_batch.store.layout import DESCRIPTION, OBJECTS, PAGE, RECORD, RECORDS, TABLES_OF_ALL, TAGS, Store
+from sobolev_batch.store.layout import OBJECTS, PAGE, RECORD, RECORDS, TABLES_OF_ALL, TAGS, Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import LOCK_KEYS
 from sobolev_batch.store.metadata import SCHEMA_VERSION
@@ -23,6 +23,12 @@ from sobolev_batch.study.study import Study
 Result = TypeVar("Result")
 # What a root has beside its objects.
 _AT_ROOT = frozenset({ROOT, RECORDS, TAGS, *LOCK_KEYS, *TABLES_OF_ALL})
+# What a reader finds first.
+_DESCRIPTION = (
+    "Begin with the group convergence: distances of all objects' meshes to their references. Each object has a store "
+    'of its own below this one. To read all its groups: xarray.open_datatree(store + "/NAME", engine="zarr"), or '
+    'sobolev_batch.open_store(store + "/NAME"), with a name from "objects" in the attribute study'
+)
 
 
 @dataclass(frozen=True)
@@ -145,7 +151,7 @@ class Objects:
             "lacking": {name: list(one.lacking) for name, one in study.objects.items() if one.lacking},
             "table": dict(study.table),
         }
-        attributes = {"title": study.title, "description": DESCRIPTION, "schema_version": SCHEMA_VERSION}
+        attributes = {"title": study.title, "description": _DESCRIPTION, "schema_version": SCHEMA_VERSION}
         root.documents[""] = group_document({**attributes, "study": entry})
         made = cls(root, study.name, tuple(study.objects), study.table)
         if present is None or present.names != made.names:
