@@ -25,6 +25,7 @@ from sobolev_batch.store.records import Record
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.pilots import Look
 from sobolev_batch.study.plan import Plan, make_plan
+from sobolev_batch.study.schema import REFERENCE_LABEL
 from sobolev_batch.study.study import Study, StudyLike
 from sobolev_batch.tables.pairs import PAIR_BYTES, tile_count
 from sobolev_batch.tables.rendering import printed_table
@@ -254,10 +255,8 @@ def _study_lines(plan: Plan) -> Iterator[tuple[str, str]]:
     if study.commands:
         yield "", "they run only with --allow-commands (in Python: allow_commands=True)"
     if study.proximity is not None:
-        yield (
-            "proximity",
-            f"Hausdorff and Chamfer distances, from {study.proximity.points:,} points on each mesh, besides",
-        )
+        points = f"distances of {study.proximity.points:,} points on each mesh"
+        yield "proximity", f"{points}; the time above leaves them out"
 
 
 def _task_lines(plan: Plan, sizes: Mapping[str, Sizes]) -> Iterator[tuple[str, str]]:
@@ -268,8 +267,9 @@ def _task_lines(plan: Plan, sizes: Mapping[str, Sizes]) -> Iterator[tuple[str, s
     total_bytes = format_bytes(plan.field_bytes * len(plan.rows))
     yield "storage", f"{format_bytes(plan.field_bytes)} per surface, {total_bytes} in all"
     families = f"{len(plan.study.object.families)} famil{'y' if len(plan.study.object.families) == 1 else 'ies'}"
+    reference = "with the reference" if plan.reference == REFERENCE_LABEL else f"reference {plan.reference}"
     yield "study", plan.study.object.title
-    yield "surfaces", f"{len(plan.rows)} in {families}, reference {plan.reference}"
+    yield "surfaces", f"{len(plan.rows)} in {families}, {reference}"
     tasks = sum(len(groups) for groups, *_ in sizes.values())
     yield "tasks", f"{tasks} for {len(sizes)} surfaces; chunks of the lattice: {len(plan.blocks)}"
     if plan.study.pairs == "all":
