@@ -255,7 +255,8 @@ class State:
 
     def advanced(self, seconds: float, **changes: object) -> State:
         """Return the state after a step of some predicted time."""
-        self.problem.notify(f"{self.problem.label}: {len(self.octaves)} octaves, step {self.steps}")
+        octaves = f"{len(self.octaves)} octave{'s' * (len(self.octaves) != 1)}"
+        self.problem.notify(f"{self.problem.label}: {octaves}, step {self.steps}")
         return replace(self, seconds=self.seconds + seconds, steps=self.steps + 1, **changes)  # type: ignore[arg-type]
 
 
