@@ -236,7 +236,9 @@ def format_verdict(store: AnyStore, style: Format = "text", orders: Sequence[flo
     for_programs = pd.DataFrame(rows, columns=[*names]).astype({"triangles": "Int64"})
     blank = {"mesh": "", "relative": math.nan, "triangles": pd.NA}
     full = [{**blank, "remark": row.get("absent", ""), **row, "absent": ""} for row in rows]
-    sections = [Section(sentences=[line for sentence in sentences for line in wrapped(sentence)])]
+    # As captions of tables and options write it.
+    plain = [sentence.replace("at order −", "at order -") for sentence in sentences]
+    sections = [Section(sentences=[line for sentence in plain for line in wrapped(sentence)])]
     sections += [
         Section(f"Verdict at order {order:g}", [(VERDICT_COLUMNS, [row for row in full if row["order"] == order])])
         for order in frame["order"].drop_duplicates()
