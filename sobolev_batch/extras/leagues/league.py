@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations
-from pathlib import Path
 from typing import Literal, overload
 
 import numpy as np
@@ -50,7 +49,7 @@ differ where the permutation test of pairs says so, at the level of 5 % for all 
 Pairs are compared at the sizes and over the objects that both have."""
 
 # The store of several objects, or stores of single objects by their names.
-AnyStores = str | Path | Location | Mapping[str, AnyStore]
+AnyStores = AnyStore | Mapping[str, AnyStore]
 # What methods are compared by unless another number is named.
 RELATIVE = "relative"
 # Columns of the ends of an interval.
@@ -250,8 +249,8 @@ def league(
     distance and its cost. docs/leagues.md explains the intervals and the test.
 
     Args:
-        store: Path or URL of the store of several objects; or stores of single objects by the name of the object. By
-            cost, also the store of one object.
+        store: Path or URL of the store of several objects, or what `open_store` made of it; or stores of single objects
+            by the name of the object. By cost, also the store of one object.
         order: One of the stores' orders, or several; default all.
         by: What methods are compared by, "size" or "cost".
         x: Size or cost of a mesh: "triangles" (the default by size), "vertices", "edge_length", "make_seconds" (the
