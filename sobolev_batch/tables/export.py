@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Literal
 
+import dask
 import xarray as xr
 
 from sobolev_batch.errors import from_extra, write_file
@@ -33,8 +34,10 @@ def export(store: AnyStore, path: Path, style: ExportFormat, order: Orders | Non
     else:
         with from_extra("export", "a NetCDF file needs"):
             import h5netcdf  # noqa: F401
-        # In memory: where a disk is full, its library ends the process.
-        data = _groups_of(store).to_netcdf(engine="h5netcdf")
+        # In memory: where a disk is full, its library ends the process. And without the lock of a cluster, which xarray
+        # keeps by the place of the data in memory, maybe that of a cluster that was.
+        with dask.config.set(scheduler="threads"):
+            data = _groups_of(store).to_netcdf(engine="h5netcdf")
     write_file(path, data, "the file")
 
 
