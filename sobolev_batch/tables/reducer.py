@@ -242,23 +242,24 @@ class Reducer:
         rows = list(rows)
         own = np.zeros((len(rows), self.lattice.shell_count))
         differences, products = (np.zeros_like(own) if self.reference is not None else own * np.nan for _ in range(2))
-        near_axes = [NearAxes(self.lattice, len(rows)) for _ in range(2)] if self.sampling is None else ()
+        # Of norms first, and of distances.
+        near_axes = NearAxes(self.lattice, 2 * len(rows)) if self.sampling is None else None
         for number, block in enumerate(self.blocks):
             reference = None if self.reference is None else self.read([self.reference], number)
             for batch in _slices(len(rows), self._read_at_once):
                 values = self.read(rows[batch], number)
                 own[batch] += shell_sums(values, None, self.lattice, block)
-                for near in near_axes[:1]:
-                    near.take(batch, block, values)
+                if near_axes is not None:
+                    near_axes.take(batch, block, values)
                 if reference is not None:
                     values -= reference
-                    for near in near_axes[1:]:
-                        near.take(batch, block, values)
+                    if near_axes is not None:
+                        near_axes.take(slice(batch.start + len(rows), batch.stop + len(rows)), block, values)
                     differences[batch] += shell_sums(values, None, self.lattice, block)
                     products[batch] += shell_sums(values, np.broadcast_to(reference, values.shape), self.lattice, block)
-        images = [near.images() for near in near_axes] or [np.zeros((len(rows), 0))] * 2
+        images = np.zeros((2 * len(rows), 0)) if near_axes is None else near_axes.images()
         if self.reference is None:
-            images[1] = images[1] * np.nan
+            images[len(rows) :] = np.nan
         samples = 0 if self.sampling is None else self.sampling.size
         reference_octaves = np.full(samples, np.nan, dtype=np.complex128)
         if self.reference is not None:
@@ -266,9 +267,9 @@ class Reducer:
         parts = []
         for batch in _slices(len(rows), max(1, int(_HELD_BYTES // (_SPECTRUM_BYTES * max(samples, 1))))):
             octaves = np.stack([self.read_octaves(row) for row in rows[batch]]).astype(np.complex128)
-            arrays = self.axis.spectra(own[batch], squared_moduli(octaves), images[0][batch]).named("norm")
+            arrays = self.axis.spectra(own[batch], squared_moduli(octaves), images[: len(rows)][batch]).named("norm")
             octaves -= reference_octaves
-            of_difference = self.axis.spectra(differences[batch], squared_moduli(octaves), images[1][batch])
+            of_difference = self.axis.spectra(differences[batch], squared_moduli(octaves), images[len(rows) :][batch])
             arrays |= of_difference.named("distance")
             inner = (octaves * reference_octaves.conj()).real
             arrays |= self.axis.spectra(products[batch], inner, is_square=False).named("product")
