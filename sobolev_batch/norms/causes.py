@@ -85,7 +85,7 @@ def spectrum(
     lattice = Lattice.from_field(first)
     edges = _edges(bands, lattice)
     count = len(edges) - 1
-    sums, _ = shells_of(first, second, lattice)
+    sums = shells_of(first, second, lattice)
     weighted = SobolevWeights(lattice, orders).per_shell * sums
     members = _bands_of_shells(edges, lattice)
     squared = np.stack([_sums_of_bands(row, members, count) for row in weighted])

@@ -28,7 +28,7 @@ from sobolev_batch.norms.budget import Support, sums_of_shells
 from sobolev_batch.norms.columns import VARIABLES, labelled, labelled_distances, lattice_attributes
 from sobolev_batch.norms.estimate import NormEstimate, ReferenceEstimate, estimate_norms
 from sobolev_batch.norms.fields import OperandLike, as_operand, field_of, pair_of, quality_of, shells_against, shells_of
-from sobolev_batch.norms.images import images_at
+from sobolev_batch.norms.images import NearAxes, images_at
 from sobolev_batch.norms.tail.remainder import remainder_of_flat
 from sobolev_batch.parameters import check_seed
 from sobolev_batch.shown import progress_line
@@ -93,7 +93,8 @@ def norm(
         return labelled(order, _closed_form(values, values**2).named("norm"), {})
     field = field_of(a, lattice, orders)
     weights = SobolevWeights(Lattice.from_field(field), orders)
-    sums, near_axes = shells_of(field, None, weights.lattice)
+    near_axes = NearAxes(weights.lattice, 1)
+    sums = shells_of(field, None, weights.lattice, near_axes)
     estimate = _estimate(weights, sums, [field], images=images_at(near_axes.images(), orders)[:, 0])
     return labelled(order, estimate.named("norm"), lattice_attributes(weights.lattice, field))
 
@@ -232,7 +233,7 @@ def _estimate(
 ) -> NormEstimate:
     """Return a norm or distance from shell sums, with the errors that follow from the fields' qualities.
 
-    What lies beyond the lattice in the squared norm, and what images add to it, (orders,) may be known.
+    Bounds on what lies beyond the lattice in the squared norm, and on what images add to it, (orders,) may be known.
     """
     qualities = [quality for quality in map(quality_of, fields) if quality is not None]
     areas = np.array(sum(quality.area for quality in qualities))

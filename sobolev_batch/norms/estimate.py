@@ -199,9 +199,9 @@ class ReferenceEstimate:
             # By Schwarz's inequality the product beyond the lattice is at most that of both norms there, and images
             # change it by about as much as theirs.
             errors = np.zeros_like(values)
-            for part in ("truncation", "aliasing"):
-                unseen = [(one.values + getattr(one, part)) ** 2 - one.values**2 for one in (distances, norms)]
-                errors = errors + np.sqrt(unseen[0] * unseen[1])
+            for own, other in ((distances.truncation, norms.truncation), (distances.aliasing, norms.aliasing)):
+                unseen = (distances.values + own) ** 2 - distances.values**2
+                errors = errors + np.sqrt(unseen * ((norms.values + other) ** 2 - norms.values**2))
         else:
             values = values + tail.totals
             errors = tail.octaves_error + tail.remainder_error

@@ -330,11 +330,12 @@ def shells_against(a: xr.DataArray, b: xr.DataArray, lattice: Lattice) -> tuple[
     return sums, near_axes
 
 
-def shells_of(a: xr.DataArray, b: xr.DataArray | None, lattice: Lattice) -> tuple[Reals, NearAxes]:
-    """Return the shell sums of |a|², or of |a - b|², and a or a - b near the axes."""
-    sums, near_axes = np.zeros(lattice.shell_count), NearAxes(lattice, 1)
+def shells_of(a: xr.DataArray, b: xr.DataArray | None, lattice: Lattice, near_axes: NearAxes | None = None) -> Reals:
+    """Return the shell sums of |a|², or of |a - b|²; where asked, a or a - b near the axes is gathered with them."""
+    sums = np.zeros(lattice.shell_count)
     for block, (values, *others) in read_blocks(lattice, *((a,) if b is None else (a, b))):
         difference = values - others[0] if others else values
         sums += shell_sums(difference, None, lattice, block)
-        near_axes.take(slice(1), block, difference[None])
-    return sums, near_axes
+        if near_axes is not None:
+            near_axes.take(slice(1), block, difference[None])
+    return sums

@@ -1,4 +1,4 @@
-"""What images of surfaces at the period of a given lattice add to a squared distance, by the field of the difference.
+"""What images of surfaces at the period of a given lattice add to a squared norm, by the field itself.
 
 A sum over a lattice has, besides the integral, the correlation of the measure with each of its images. The sum over the
 frequencies half a step further along one axis has the same, with the other sign for images of odd number along it. So
@@ -62,7 +62,7 @@ class NearAxes:
                 held[fields, *common.place_in(near)] = values[:, *common.place_in(block)]
 
     def images(self) -> Reals:
-        """Return what images add to squared norms of `IMAGE_ORDERS`, either way, (fields, orders)."""
+        """Return bounds on what images add to squared norms of `IMAGE_ORDERS`, either way, (fields, orders)."""
         sums, of_axes = self._sums(), 0.0
         # Images at odd multiples of the period, of twice the period, and so on.
         while len(sums) > 1:

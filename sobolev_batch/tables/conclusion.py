@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -45,7 +45,13 @@ _OBJECT_COLUMNS = (
 )
 
 
-def study_verdict(frame: pd.DataFrame, failed: Mapping[str, str]) -> tuple[tuple[str, ...], list[TableRow], str]:
+def _typeset(order: float) -> str:
+    return minus(f"{order:g}")
+
+
+def study_verdict(
+    frame: pd.DataFrame, failed: Mapping[str, str], order_text: Callable[[float], str] = _typeset
+) -> tuple[tuple[str, ...], list[TableRow], str]:
     """Return the verdict on a study at each order, from the rows of `table` and the reasons of meshes that are missing.
 
     It is a sentence for each order; rows of nearest meshes, smallest meshes below bounds, and meshes that are missing
@@ -59,7 +65,8 @@ def study_verdict(frame: pd.DataFrame, failed: Mapping[str, str]) -> tuple[tuple
     families, sentences, lines = sized[:_MOST_FAMILIES], [], list[TableRow]()
     for order, rows in frame.groupby("order", sort=False):
         at_sizes, at_shown = ([rows[rows["mesh"].isin(labels)] for labels in some] for some in (sizes, shown_sizes))
-        sentences.append(f"{_of_sizes(order, at_sizes)}{_sentence(order, rows, frame.attrs['reference'])}")
+        at_order = f"at order {order_text(order)}"
+        sentences.append(f"{_of_sizes(at_order, at_sizes)}{_sentence(at_order, rows, frame.attrs['reference'])}")
         of_order = (*_nearest_rows(rows, at_shown), *_smallest_rows(rows, families), *_doubtful_rows(rows, failed))
         lines += [{**line, "order": order} for line in of_order]
     shown = {"sizes": (len(shown_sizes), len(sizes)), "families": (len(families), len(sized))}
@@ -67,7 +74,7 @@ def study_verdict(frame: pd.DataFrame, failed: Mapping[str, str]) -> tuple[tuple
     return tuple(sentences), lines, " and ".join(omitted)
 
 
-def _of_sizes(order: float, at_sizes: Sequence[pd.DataFrame]) -> str:
+def _of_sizes(at_order: str, at_sizes: Sequence[pd.DataFrame]) -> str:
     """Return a sentence on which family is nearest where meshes of several families have about as many triangles."""
     wins, leads = Counter[str](), []
     for members in at_sizes:
@@ -80,7 +87,7 @@ def _of_sizes(order: float, at_sizes: Sequence[pd.DataFrame]) -> str:
                 leads.append(second / best["distance"] if best["resolved"] else math.inf)
     if not wins:
         return ""
-    total, at_order = len(at_sizes), minus(f"at order {order:g}")
+    total = len(at_sizes)
     is_sweep = len(wins) == 1 and wins.total() == total
     parts = []
     for family, number in wins.most_common(_MOST_FAMILIES):
@@ -92,8 +99,8 @@ def _of_sizes(order: float, at_sizes: Sequence[pd.DataFrame]) -> str:
     return f"{', '.join(parts)}, {at_order}. "
 
 
-def _sentence(order: float, rows: pd.DataFrame, reference: str) -> str:
-    name, at_order = "the reference" if reference == "reference" else reference, minus(f"at order {order:g}")
+def _sentence(at_order: str, rows: pd.DataFrame, reference: str) -> str:
+    name = "the reference" if reference == "reference" else reference
     closest, compared = _nearest(rows), int(rows["distance"].notna().sum())
     if compared == 0:
         return f"No mesh could be compared with {name}."
@@ -231,14 +238,13 @@ def format_verdict(store: AnyStore, style: Format = "text", orders: Sequence[flo
     require_one_object(tree)
     frame = table(tree, orders)
     reasons = frame[frame["status"] != "complete"].drop_duplicates("mesh").set_index("mesh")["reason"]
-    sentences, rows, omitted = study_verdict(frame, reasons.to_dict())
+    # Orders as captions of tables and options write them.
+    sentences, rows, omitted = study_verdict(frame, reasons.to_dict(), "{:g}".format)
     names = ("order", "verdict", "mesh", "relative", "relative_error", "triangles", "remark", "absent")
     for_programs = pd.DataFrame(rows, columns=[*names]).astype({"triangles": "Int64"})
     blank = {"mesh": "", "relative": math.nan, "triangles": pd.NA}
     full = [{**blank, "remark": row.get("absent", ""), **row, "absent": ""} for row in rows]
-    # As captions of tables and options write it.
-    plain = [sentence.replace("at order −", "at order -") for sentence in sentences]
-    sections = [Section(sentences=[line for sentence in plain for line in wrapped(sentence)])]
+    sections = [Section(sentences=[line for sentence in sentences for line in wrapped(sentence)])]
     sections += [
         Section(f"Verdict at order {order:g}", [(VERDICT_COLUMNS, [row for row in full if row["order"] == order])])
         for order in frame["order"].drop_duplicates()
