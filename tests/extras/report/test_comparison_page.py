@@ -82,5 +82,6 @@ def test_a_browser_and_one_sheet_of_paper_show_it(tmp_path: Path) -> None:
         assert reader.complaints() == []
         assert set(reader.requests()) == {page.as_uri()}
         reader.driver.execute_script("dispatchEvent(new Event('beforeprint'))")
-        printed = reader.command("Page.printToPDF", paperWidth=8.27, paperHeight=11.69, preferCSSPageSize=True)
-        assert len(re.findall(rb"/Type\s*/Page\b", base64.b64decode(printed["data"]))) == 1
+        for across, down in ((8.27, 11.69), (8.5, 11.0)):
+            printed = reader.command("Page.printToPDF", paperWidth=across, paperHeight=down, preferCSSPageSize=True)
+            assert len(re.findall(rb"/Type\s*/Page\b", base64.b64decode(printed["data"]))) == 1
