@@ -282,7 +282,7 @@ class Comparison:
             for direction, way in (("A to B", self.deviations.forward), ("B to A", self.deviations.backward)):
                 yield f"largest deviation, {direction}: {deviation_text(way, self.unit)}"
             yield from printed_table(self.rows, [f"in {self.unit}", "A to B", "B to A", "larger"], "text").split("\n")
-            yield from _proximity_lines(self.nearness, (self.first, self.second))
+            yield from _proximity_lines(self.nearness, (self.first, self.second), self.unit)
 
     @property
     def sentences(self) -> Iterator[str]:
@@ -392,14 +392,14 @@ def _remarks(options: CompareOptions, first: Mesh, second: Mesh, doubt: str | No
         )
 
 
-def _proximity_lines(found: Mapping[str, float], meshes: tuple[Mesh, Mesh]) -> Iterator[str]:
+def _proximity_lines(found: Mapping[str, float], meshes: tuple[Mesh, Mesh], unit: str) -> Iterator[str]:
     """Yield what is made of the usual distances in both directions, and the shapes of both meshes."""
     if not math.isnan(found["bias"]):
         signed = with_error(found["bias"], found["bias_error"])
-        yield f"mean distance of A, positive outside of B and negative inside: {signed} (s.e.)"
-    yield f"Chamfer, the sum of both means: {with_error(found['chamfer'], found['chamfer_error'])} (s.e.)"
+        yield f"mean distance of A, positive outside of B and negative inside: {signed} {unit} (s.e.)"
+    yield f"Chamfer, the sum of both means: {with_error(found['chamfer'], found['chamfer_error'])} {unit} (s.e.)"
     yield (
-        f"F-score at {found['threshold']:.4g}: {100 * found['fscore']:.4g} % "
+        f"F-score at {found['threshold']:.4g} {unit}: {100 * found['fscore']:.4g} % "
         f"({100 * found['precision']:.4g} % of A, {100 * found['recall']:.4g} % of B)"
     )
     for label, mesh in zip("AB", meshes, strict=True):

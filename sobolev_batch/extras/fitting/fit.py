@@ -1,5 +1,7 @@
 """Meshes that come nearer to a target: their vertices move, and their edges are split where that helps most."""
 
+from __future__ import annotations
+
 import itertools
 from collections.abc import Callable, Sequence
 from contextlib import suppress

@@ -3,6 +3,8 @@
 Libraries are known by the names of their classes, and none is imported.
 """
 
+from __future__ import annotations
+
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -1,5 +1,7 @@
 """Meshes into files, each replaced only once the new one is whole."""
 
+from __future__ import annotations
+
 from pathlib import Path
 
 from sobolev_batch.errors import InputError, MeshError, new_file_beside, write_file
