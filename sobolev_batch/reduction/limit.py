@@ -127,7 +127,7 @@ class Limit:
             own, other = (getattr(one, self.measure) for one in (mesh, reference))
             value, error = abs(own - other) / (abs(other) or math.nan), 0.0
         else:
-            numbers = sampled_numbers(Triangles(mesh), Triangles(reference))
+            numbers = sampled_numbers(Triangles(mesh), Triangles(reference), signed=self.measure == "bias")
             value = abs(numbers[self.measure])
             error = float(quantile(DEFAULT_POINTS - 1)) * numbers[f"{self.measure}_error"]
         if math.isnan(value):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -11,8 +13,10 @@ import tomli_w
 from distributed import Client
 
 import sobolev_batch as sb
+from sobolev_batch.geometry import closest, proximity
 from sobolev_batch.reduction import limit as limits
 from sobolev_batch.reduction import searched
+from sobolev_batch.reduction.limit import Limit
 from sobolev_batch.sources.mesh_cache import MeshCache
 from sobolev_batch.sources.registry import Member, load_mesh
 from sobolev_batch.store.location import Location
@@ -290,3 +294,14 @@ def test_objects_planned_at_once_have_the_new_version_of_a_program(
     # Tasks find what was planned.
     assert [row.member.fingerprint_digest() for row in rows] == [row.fingerprint for row in rows]
     assert sum(row.fingerprint != first[row.label] for row in rows) == 2
+
+
+def test_only_a_bias_asks_for_sides(monkeypatch: pytest.MonkeyPatch) -> None:
+    sides = Mock(side_effect=closest.signs)
+    monkeypatch.setattr(proximity, "signs", sides)
+    meshes = lumpy(1), lumpy(2)
+    rms = Limit(0.1, "rms").bounds(*meshes)
+    assert not sides.called
+    bias = Limit(0.1, "bias").bounds(*meshes)
+    assert sides.called
+    assert 0 < bias[2] < rms[2] < math.inf
