@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import tomllib
 from collections import Counter
@@ -123,3 +124,9 @@ def test_names_are_sorted_and_unknown_ones_refused() -> None:
     assert len(names) == len({name.split(".")[-1] for name in names})
     with pytest.raises(AttributeError, match="nothing"):
         sb.nothing  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_help_of_functions_begins_with_names_of_types() -> None:
+    # A type that is written out takes a screen, before the first word about the function.
+    functions = {name: value for name, value in public_names().items() if inspect.isfunction(value)}
+    assert {name for name, one in functions.items() if len(str(inspect.signature(one))) > 700} == set()

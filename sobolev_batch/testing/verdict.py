@@ -1,5 +1,7 @@
 """Verdicts on two surfaces: the same to a tolerance, different, or undecided; and an assertion for test suites."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import mkdtemp

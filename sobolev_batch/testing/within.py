@@ -1,5 +1,7 @@
 """Whether the largest deviation of two meshes is within a length: a verdict, and an assertion of test suites."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass, replace
 from typing import Literal

@@ -1,5 +1,7 @@
 """The rigid motion that brings a mesh nearest to another one: low frequencies from many starts, then higher ones."""
 
+from __future__ import annotations
+
 from itertools import product
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Squared distances as functions of the vertices of a mesh, also of tensors: value, derivative, error of that."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Literal, Self
