@@ -231,6 +231,7 @@ ATTACKS: dict[str, Attack] = {
             *_vertices(0), *[f"property char p{i}" for i in range(100_000)], "element face 0", encoding="ascii"
         ),
     ),
+    "ply ascii, rows of nothing": _file(".ply", _ply_header("element nothing 100000000", encoding="ascii") + b"1\n"),
     "ply, sparse": _sparse(".ply", _ply_header(*_vertices(10**9), "element face 0")),
     "ply ascii, float overflow": _file(".ply", ply(BOX_VERTICES * 1e300, BOX_TRIANGLES)),
     "ply ascii, index that overflows": _file(".ply", _changed(_PLY, b"3 4 6 7", b"3 4 6 99999999999")),

@@ -95,7 +95,9 @@ def parse_ply(data: bytes) -> Raw:
     for name, element in elements.items():
         values, sizes, place = _columns(element, _WANTED.get(name, ()), body, place)
         columns[name] = values, sizes
-        rows.append(np.broadcast_to(len(element.properties) + sum(sizes.values()), element.count))
+        # Rows of nothing take no room in a file, which may announce any number of them.
+        if element.properties:
+            rows.append(np.broadcast_to(len(element.properties) + sum(sizes.values()), element.count))
     if is_text:
         _require_aligned(np.frombuffer(lines, np.uintc), rows)
     if body[place : place + 3].tobytes() not in _LAST_LINE:
