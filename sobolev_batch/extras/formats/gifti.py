@@ -23,6 +23,10 @@ _GIFTI_TYPES = {
     for name in ("UINT8", "INT16", "UINT16", "INT32", "UINT32", "INT64", "UINT64", "FLOAT32", "FLOAT64")
 }
 _INDEXING: dict[str, Literal["C", "F"]] = {"RowMajorOrder": "C", "ColumnMajorOrder": "F"}
+# What older writers call encodings and orders of bytes.
+_CALLED = {"GIFTI_ENCODING_ASCII": "ASCII", "GIFTI_ENCODING_B64BIN": "Base64Binary"}
+_CALLED |= {"GIFTI_ENCODING_B64GZ": "GZipBase64Binary", "GIFTI_ENDIAN_BIG": "BigEndian"}
+_CALLED |= {"GIFTI_ENDIAN_LITTLE": "LittleEndian"}
 _POINTS, _FACES = "NIFTI_INTENT_POINTSET", "NIFTI_INTENT_TRIANGLE"
 
 
@@ -38,7 +42,7 @@ def parse_gifti(data: bytes) -> Raw:
             case "start", "GIFTI":
                 announced = values.get("NumberOfDataArrays")
             case "start", "DataArray":
-                attributes, found = values, found + 1
+                attributes, found = {key: _CALLED.get(value, value) for key, value in values.items()}, found + 1
             case "start", "MatrixData" if attributes.get("Intent") == _POINTS:
                 texts = []
             case "end", "MatrixData" if texts is not None:

@@ -43,6 +43,8 @@ _STL_HEADER_BYTES = 84
 _STL_START_BYTES = 1024
 # The space before a statement of a facet. Some programs write several on a line.
 _STL_STATEMENT = re.compile(rb"(?i)\s(?=(?:facet\s+normal|outer\s+loop|vertex|endloop|endfacet|endsolid)(?!\S))")
+# The blank that some programs write within the words that end something.
+_STL_BLANK = re.compile(rb"(?i)(?<=\send)[ \t]+(?=(?:loop|facet|solid)(?!\S))")
 _STL_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
@@ -200,7 +202,7 @@ def parse_stl(data: bytes) -> Raw:
         try:
             corners = _stl_text_corners(data)
         except MeshError:
-            corners = _stl_text_corners(_STL_STATEMENT.sub(b"\n", data))
+            corners = _stl_text_corners(_STL_STATEMENT.sub(b"\n", _STL_BLANK.sub(b"", data)))
     else:
         count = max(0, len(data) - _STL_HEADER_BYTES) / _STL_RECORD.itemsize
         raise MeshError(

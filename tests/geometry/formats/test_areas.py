@@ -85,6 +85,7 @@ CASES: dict[str, Case] = {
             ("a byte-order mark", BOM + STL_TEXT, BOX_AREA),
             ("solid in a binary header", STL_SOLID, BOX_AREA),
             ("solid in a binary header and a byte more", STL_SOLID + b"\0", BOX_AREA),
+            ("blanks in the words that end something", re.sub(rb"\bend\B", b"END ", STL_TEXT), BOX_AREA),
             ("a byte behind the triangles", STL_BINARY + b"\0", BOX_AREA),
             ("bytes behind the triangles", STL_BINARY + b"\n" * 49, BOX_AREA),
             ("as many bytes as a triangle has", STL_BINARY + bytes(50), "holds 13.00 triangles, .* announces 12"),
@@ -580,6 +581,14 @@ CASES |= {
         ),
         BOX_AREA,
     ),
+    **{
+        f"gifti, the words of older writers for {old.decode()}": (".gii", replaced(content, (old, new)), BOX_AREA)
+        for content, old, new in (
+            (GIFTI_BOX, b"GZipBase64Binary", b"GIFTI_ENCODING_B64GZ"),
+            (GIFTI_BOX, b"LittleEndian", b"GIFTI_ENDIAN_LITTLE"),
+            (_SPELLED[".gii"], b"ASCII", b"GIFTI_ENCODING_ASCII"),
+        )
+    },
     "gifti, an order that does not exist": (
         ".gii",
         replaced(GIFTI_BOX, (b"RowMajorOrder", b"RowmajorOrder")),
