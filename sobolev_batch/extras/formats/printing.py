@@ -58,8 +58,8 @@ class _Package:
 
     def __init__(self, data: bytes) -> None:
         self.archive = zipfile.ZipFile(io.BytesIO(data))
-        # Names of parts are the same in upper case.
-        self.names = {name.lower(): name for name in self.archive.namelist()}
+        # Names of parts are the same in upper case, and some programs for archives turn their slashes round.
+        self.names = {name.replace("\\", "/").lower(): name for name in self.archive.namelist()}
         self.most = self.left = unpacked_limit(len(data))
         self.parts: dict[str, dict[str, _Object]] = {}
         self.items: list[_Placing] = []

@@ -404,6 +404,11 @@ CASES |= {
         1.25 * BOX_AREA,
     ),
     "3mf, names of parts in other cases": (".3mf", package_3mf(model(BOX_3MF)).replace(b"main", b"MAIN"), BOX_AREA),
+    "3mf, names of parts with backslashes": (
+        ".3mf",
+        replaced(package_3mf(model(BOX_3MF)), (b"3D/main.model", rb"3D\main.model"), (b"_rels/.rels", rb"_rels\.rels")),
+        BOX_AREA,
+    ),
     "3mf, names with a prefix": (
         ".3mf",
         package_3mf(re.sub(rb"(</?)(?=\w)", rb"\1c:", model(BOX_3MF))),
