@@ -297,12 +297,11 @@ def _stl_text_corners(data: bytes) -> Reals:
                 raise MeshError(f"after facet {facet}: a facet ends within a line")
             case "solid" | "endsolid" as word:
                 in_solid = word == "solid"
-            case "facet":
-                facet, facet_corners = facet + 1, 0
-            case "endfacet":
-                if facet_corners != 3:
+            case "facet" | "endfacet" as word:
+                # Where lines are lost, a facet need not end.
+                if facet_corners not in (3, 3 * (word == "endfacet")):
                     raise MeshError(f"facet {facet} has {facet_corners} vertices, expected three")
-                facet_corners = 0
+                facet, facet_corners = facet + (word == "facet"), 0
             case "outer" | "endloop":
                 continue
             case other:

@@ -85,6 +85,11 @@ CASES: dict[str, Case] = {
             ("a byte-order mark", BOM + STL_TEXT, BOX_AREA),
             ("solid in a binary header", STL_SOLID, BOX_AREA),
             ("solid in a binary header and a byte more", STL_SOLID + b"\0", BOX_AREA),
+            (
+                "three facets without their ends",
+                re.sub(rb"vertex[^v]*endfacet\n", b"", STL_TEXT, count=3),
+                "facet 1 has 2 vertices, expected three",
+            ),
             ("blanks in the words that end something", re.sub(rb"\bend\B", b"END ", STL_TEXT), BOX_AREA),
             ("a byte behind the triangles", STL_BINARY + b"\0", BOX_AREA),
             ("bytes behind the triangles", STL_BINARY + b"\n" * 49, BOX_AREA),
