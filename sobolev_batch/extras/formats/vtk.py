@@ -29,9 +29,10 @@ from sobolev_batch.geometry.formats.parsing import (
 )
 from sobolev_batch.geometry.formats.polygons import cut_polygons
 
-# VTK's numbers for types of cells: vertices and lines, those with area, and those with flat faces around a volume.
+# VTK's numbers for types of cells: vertices and lines, those with area, of two corners at most, and those with flat
+# faces around a volume.
 _WITHOUT_AREA, _VTK_TRIANGLE, _STRIP, _POLYGON, _PIXEL, _QUAD = (0, 1, 2, 3, 4, 21), 5, 6, 7, 8, 9
-_WITH_VOLUME = (*range(10, 17), 41, 42)
+_OF_TWO, _WITH_VOLUME = (0, 1, 3), (*range(10, 17), 41, 42)
 _SURFACE = "python -c \"import pyvista; pyvista.read('scan{}').extract_surface().triangulate().save('scan.vtp')\""
 _PACKED_ANEW = "python -c \"import pyvista; pyvista.read('scan.vtp').save('new.vtp')\""
 _KINDS, _FACES = ("polydata", "unstructuredgrid", "unstructured_grid"), ("polys", "strips", "cells")
@@ -310,7 +311,9 @@ def _unpacked(block: bytes, most: int, packed: str) -> bytes:
 
 def _faces(kinds: Indices, corners: Indices, sizes: Indices, suffix: str) -> tuple[Indices, Indices, tuple[str, ...]]:
     """Return the corners of faces, and their numbers, from those of all cells."""
-    has_area, has_volume = ~np.isin(kinds, _WITHOUT_AREA), np.isin(kinds, _WITH_VOLUME)
+    # What has more corners than a line is none, whatever its type.
+    has_area = ~np.isin(kinds, _WITHOUT_AREA) | (np.isin(kinds, _OF_TWO) & (sizes > 2))
+    has_volume = np.isin(kinds, _WITH_VOLUME)
     # Without any face beside them, they are refused.
     has_area &= ~has_volume | ~(has_area & ~has_volume).any()
     is_strip, is_pixel = kinds == _STRIP, kinds == _PIXEL

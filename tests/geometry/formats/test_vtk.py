@@ -89,6 +89,10 @@ BAD: dict[str, tuple[Callable[[], Any], str]] = {
     "lines alone": (lambda: pyvista.PolyData(BOX_VERTICES, lines=[2, 0, 7]), "no faces"),
     "tetrahedra": (lambda: grid([[0, 1, 2, 4]], 10), r"type 10 with 4 corners.*read\('scan.vtk'\).extract_surface"),
     "triangles of four corners": (lambda: grid(BOX_QUADS, 5), "type 5 with 4 corners"),
+    "a line of three corners": (
+        lambda: pyvista.UnstructuredGrid(cells(BOX_TRIANGLES), [5] * 11 + [3], BOX_VERTICES),
+        "cell 12 is of VTK's type 3 with 3 corners",
+    ),
     "curved triangles": (lambda: grid([[0, 1, 2, 3, 4, 5]], 22), "type 22 with 6 corners.*extract_surface"),
     "ghosts": (with_ghosts, "ghost cells"),
     "an image": (lambda: pyvista.ImageData(dimensions=(3, 3, 3)), "STRUCTURED_POINTS.*extract_surface"),
