@@ -203,6 +203,11 @@ ATTACKS: dict[str, Attack] = {
     "obj, a face that goes around and around": _file(
         ".obj", _OBJ + b"v nan 0 0\nf 1 2 -1\nf" + b" 1 2 3" * 100_000 + b"\n"
     ),
+    "obj, a face that goes around and around, and back elsewhere": _file(
+        ".obj",
+        b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 2 0 0\nv 3 0 0\nv 2 1 0\nv nan 0 0\nf 1 2 7\n"
+        + b"f%s%s\n" % (b" 1 2 3" * 4000, b" 6 5 4" * 3999),
+    ),
     "obj, continued lines": _file(".obj", b"v 0 0 0\nf 1 \\\n" + b"1 \\\n" * 500_000),
     "obj, long index": _file(".obj", _OBJ + b"f 1 2 " + _DIGITS + b"\n"),
     "obj, huge index": _file(".obj", _OBJ + b"f 1 2 9223372036854775808\n"),

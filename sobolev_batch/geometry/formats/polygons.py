@@ -24,8 +24,9 @@ _AXES = (1.0, 0.618, 0.414)
 _FLAT, _EQUAL_AREAS, _NO_AREA = 1e-6, 1e-6, 1e-12
 # The largest turn to the wrong side of a convex polygon, in radians, and error of the sum of all, in whole turns.
 _WRONG_TURN, _WRONG_SUM = 1e-9, 1e-4
-# Corners of an outline up to which it is cut by ears although it goes around itself: these take their cube in time.
-_MOST_WINDING = 300
+# Corners of an outline up to which it is cut by ears whatever it lies around, and how often a longer one may lie around
+# a place: ears of others take the cube of its corners in time. Parts of its corners below levels that show it.
+_MOST_WINDING, _MOST_AROUND, _LEVELS = 300, 3, np.arange(1, 16) / 16
 # Of faces: heights above and below their planes, areas, those with another cut, and whether they cross themselves.
 _Measures = list[tuple[Reals, Reals, Reals, NDArray[np.bool_]]]
 
@@ -164,8 +165,10 @@ def _cut_others(axes: list[Reals], corners: Indices, sizes: Indices, found: _Mea
     is_convex = (np.minimum.reduceat(turns, starts) > -_WRONG_TURN) & (np.abs(whole_turns - 1) < _WRONG_SUM)
     # Where an outline turns back by half a turn, nothing tells the side to which it turns.
     winds = whole_turns - np.add.reduceat(turns > np.pi - _WRONG_TURN, starts) > 3 / 2
-    # Coordinates that are no numbers are refused later. Ears of what goes around many times take long.
-    is_convex |= ~np.isfinite(np.add.reduceat(np.abs(points).sum(axis=0), starts)) | (winds & (sizes > _MOST_WINDING))
+    # Coordinates that are no numbers are refused later.
+    is_convex |= ~np.isfinite(np.add.reduceat(np.abs(points).sum(axis=0), starts))
+    for one in np.flatnonzero(~is_convex & (sizes > _MOST_WINDING)):
+        is_convex[one] = _most_around(*plane[:, starts[one] : starts[one] + sizes[one]]) > _MOST_AROUND
     triangles, owners = _fans_and_ears(plane, sizes, is_convex, twice)
     lengths = np.sqrt(dot(normals, normals))
     offsets = dot(points, normals[:, polygon] / np.where(lengths > 0, lengths, 1.0)[polygon])
@@ -207,3 +210,16 @@ def _fans_and_ears(plane: Reals, sizes: Indices, is_convex: NDArray[np.bool_], t
         parts.append(ears if len(ears) else fans[owners == one])
         of_parts.append(np.full(len(parts[-1]), one))
     return np.concatenate(parts), np.concatenate(of_parts)
+
+
+def _most_around(x: Reals, y: Reals) -> int:
+    """Return how often an outline lies around a place, at most, where some levels cross it."""
+    most, steps, rises, heights = 0, np.roll(x, -1) - x, np.roll(y, -1) - y, np.unique(y)
+    for place in np.searchsorted(heights[:-1], np.quantile(y, _LEVELS), "right"):
+        # Between corners, where sides do not meet.
+        level = heights[place - 1 : place + 1].mean()
+        is_below = y < level
+        cut = np.flatnonzero(is_below != np.roll(is_below, -1))
+        order = np.argsort(x[cut] + (level - y[cut]) / rises[cut] * steps[cut])
+        most = max(most, np.abs(np.cumsum(np.where(is_below[cut[order]], 1, -1))).max(initial=0))
+    return int(most)
