@@ -38,17 +38,18 @@ _FIRST_PAUSE, _LONGEST_PAUSE = 0.005, 0.1
 _NAMES_OF_SIGNALS = {one.value: one.name for one in signal.Signals}
 # Variable of a program's environment with its folder. On Linux it shows which processes left the program's session.
 _MARK = "SOBOLEV_BATCH_FOLDER"
-# It is told the number of a process. When the writer ends, however it does, it kills the session of the process and
-# those that left it, and removes the folder.
+# It is told the number of a process, if one starts. When the writer ends, however it does, it kills the session of the
+# process and those that left it, and removes the folder.
 _GUARD = f"""
-read -r number || exit
 exec 2> /dev/null
-read -r _
-kill -s KILL -- "-$number"
-for place in $(grep -lFzx -e "{_MARK}=$1" /proc/[0-9]*/environ); do
-    place=${{place%/environ}}
-    kill -s KILL "${{place#/proc/}}"
-done
+if read -r number; then
+    read -r _
+    kill -s KILL -- "-$number"
+    for place in $(grep -lFzx -e "{_MARK}=$1" /proc/[0-9]*/environ); do
+        place=${{place%/environ}}
+        kill -s KILL "${{place#/proc/}}"
+    done
+fi
 rm -rf -- "$1"
 """
 

@@ -173,6 +173,18 @@ def test_a_program_ends_with_the_process_that_waits_for_it(tmp_path: Path) -> No
 
 
 @pytest.mark.process
+def test_a_process_that_is_killed_before_its_program_begins_leaves_no_folder(tmp_path: Path) -> None:
+    run = (
+        "import os; import sobolev_batch as sb; from sobolev_batch.sources import programs; "
+        "programs._write = lambda *_: os.kill(os.getpid(), 9); "
+        "programs.run_command(sb.shapes.icosphere(0), ['true'], ('.ply', '.ply'), 1000.0, 10**9)"
+    )
+    ended = subprocess.run([sys.executable, "-c", run], env=os.environ | {"TMPDIR": str(tmp_path)})
+    assert ended.returncode == -9
+    wait_until(lambda: not list(tmp_path.iterdir()))
+
+
+@pytest.mark.process
 def test_a_mesh_whose_files_changed_while_it_was_made_is_not_kept(tmp_path: Path) -> None:
     (tmp_path / "copy.sh").write_text("cp $1 $2; echo >> $0")
     table = {**COPY, "command": ["sh", "{folder}/copy.sh", "{input}", "{output}"]}
