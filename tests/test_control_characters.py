@@ -24,7 +24,7 @@ from distributed import Client
 
 import sobolev_batch as sb
 from sobolev_batch.cli import cli
-from sobolev_batch.cli.output import EchoHandler, echo, progress_bar, replace_line, show_usage_error
+from sobolev_batch.cli.output import EchoHandler, echo, lengthen, progress_bar, replace_line, show_usage_error
 from sobolev_batch.sources import files
 from sobolev_batch.tables import FORMATS
 from sobolev_batch.tables.rendering import machine_table, printed_table, prose
@@ -226,7 +226,7 @@ def test_choices_of_an_option_that_lacks_are_indented(capsys: pytest.CaptureFixt
     option = click.Option(["--to"], type=click.Choice(["csv", "nc"]), required=True)
     show_usage_error(click.MissingParameter(param=option))
     show_usage_error(click.UsageError("a\tb"))
-    assert capsys.readouterr().err.splitlines()[1:] == ["  csv,", "  nc", r"Error: a\tb"]
+    assert capsys.readouterr().err.splitlines()[1:] == ["  csv,", "  nc", r"error: a\tb"]
 
 
 def test_help_in_place_of_arguments_has_its_lines(capsys: pytest.CaptureFixture[str]) -> None:
@@ -264,6 +264,14 @@ def test_a_message_takes_the_place_of_a_bar(monkeypatch: pytest.MonkeyPatch) -> 
     assert first.endswith("\r\x1b[Ka message")
     assert second.endswith("\r\x1b[Ka warning")
     assert "3/3" in bar_of_all[0]
+
+
+def test_a_bar_that_is_full_goes_on_with_the_next_object() -> None:
+    with progress_bar(1, "fields") as bar:
+        bar.update(1)
+        lengthen(bar, 3)
+        bar.update(1)
+        assert bar.pct == 0.5
 
 
 def test_first_studies_of_hostile_folders(tmp_path: Path) -> None:

@@ -115,15 +115,21 @@ def progress_bar(length: int, label: str, *, show_count: bool = True) -> Any:
     return click.progressbar(length=length, label=visible(label), file=sys.stderr, show_pos=show_count)
 
 
+def lengthen(bar: Any, steps: int) -> None:
+    """Add steps to a bar: those of another object, which begins when all others may be done."""
+    bar.length, bar.finished = bar.length + steps, False
+
+
 def show_usage_error(error: click.ClickException) -> None:
-    """Print what is wrong with a command, as click words it."""
+    """Print what is wrong with a command, as click words it, in the letters of all other errors."""
     if isinstance(error, click.exceptions.NoArgsIsHelpError):
         # Its message is the help.
         echo_lines(error.message, err=True)
         return
     text = StringIO()
     error.show(text)
-    shown = text.getvalue().removesuffix("\n").replace(error.message, visible(error.message))
+    worded = text.getvalue().removesuffix("\n").replace("Error: ", "error: ", 1)
+    shown = worded.replace(error.message, visible(error.message))
     # Click sets lists of choices off by tabulators.
     echo_lines(shown.expandtabs(2), err=True)
 
@@ -156,8 +162,7 @@ def progress_reports() -> Iterator[Callable[[Progress], None]]:
                 bar.update(1)
             elif progress.part and bar is not None:
                 # Objects go on side by side: one bar has the steps of all that have begun.
-                bar.length += progress.total
-                bar.update(0)
+                lengthen(bar, progress.total)
             else:
                 bars.close()
                 label = "all objects" if progress.part else _STAGES[progress.stage]

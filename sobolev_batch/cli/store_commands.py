@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from sobolev_batch.cli.options import PATH, ChosenOrders, json_option, orders_option, store_argument
-from sobolev_batch.cli.output import echo, echo_result, progress_bar, replace_line
+from sobolev_batch.cli.output import echo, echo_result, lengthen, progress_bar, replace_line
 from sobolev_batch.cli.program import EXIT_OTHER, EXIT_SOME_FAILED, cli
 
 if TYPE_CHECKING:
@@ -64,8 +64,7 @@ def verify_command(context: click.Context, store: Location, style: str) -> None:
 
         def show(done: int, total: int) -> None:
             if done == 1:
-                # The next object adds its own.
-                bar.length = (bar.length or 0) + total
+                lengthen(bar, total)
             bar.update(1)
 
         result = verify(store, show)
