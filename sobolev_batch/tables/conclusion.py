@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 
 from sobolev_batch.tables import Format
-from sobolev_batch.tables.convergence import ALONE, remarks, table, tables_of
-from sobolev_batch.tables.open import AnyStore, as_tree, require_one_object
+from sobolev_batch.tables.convergence import ALONE, joined, remarks, tables_of
+from sobolev_batch.tables.open import AnyStore, as_tree, stores_of
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.smallest import smallest_of
 from sobolev_batch.tables.text import count, minus, percent, spread, wrapped
@@ -233,26 +233,27 @@ def _names(labels: Sequence[str]) -> str:
 
 
 def format_verdict(store: AnyStore, style: Format = "text", orders: Sequence[float] | None = None) -> str:
-    """Return the verdict on the study of one object as text, or its rows for programs."""
-    tree = as_tree(store)
-    require_one_object(tree)
-    frame = table(tree, orders)
-    reasons = frame[frame["status"] != "complete"].drop_duplicates("mesh").set_index("mesh")["reason"]
-    # Orders as captions of tables and options write them.
-    sentences, rows, omitted = study_verdict(frame, reasons.to_dict(), "{:g}".format)
-    names = ("order", "verdict", "mesh", "relative", "relative_error", "triangles", "remark", "absent")
-    for_programs = pd.DataFrame(rows, columns=[*names]).astype({"triangles": "Int64"})
-    blank = {"mesh": "", "relative": math.nan, "triangles": pd.NA}
-    full = [{**blank, "remark": row.get("absent", ""), **row, "absent": ""} for row in rows]
-    sections = [Section(sentences=[line for sentence in sentences for line in wrapped(sentence)])]
-    sections += [
-        Section(f"Verdict at order {order:g}", [(VERDICT_COLUMNS, [row for row in full if row["order"] == order])])
-        for order in frame["order"].drop_duplicates()
-    ]
-    notes, known = [f"Only {omitted} are shown."] if omitted else [], remarks(tree, frame)
-    notes += known[:_MOST_REMARKS]
-    notes += [f"and {len(known) - _MOST_REMARKS:,} more remarks"] if len(known) > _MOST_REMARKS else []
-    return rendered(style, for_programs, sections, notes)
+    """Return the verdict on each object of a study as text, or their rows for programs."""
+    stores, for_programs, sections = stores_of(store), {}, list[Section]()
+    for name, frame in tables_of(store, orders).items():
+        reasons = frame[frame["status"] != "complete"].drop_duplicates("mesh").set_index("mesh")["reason"]
+        # Orders as captions of tables and options write them.
+        sentences, rows, omitted = study_verdict(frame, reasons.to_dict(), "{:g}".format)
+        names = ("order", "verdict", "mesh", "relative", "relative_error", "triangles", "remark", "absent")
+        for_programs[name] = pd.DataFrame(rows, columns=[*names]).astype({"triangles": "Int64"})
+        blank = {"mesh": "", "relative": math.nan, "triangles": pd.NA}
+        full = [{**blank, "remark": row.get("absent", ""), **row, "absent": ""} for row in rows]
+        sections += [Section(f"Object {name}")] if name else []
+        sections.append(Section(sentences=[line for sentence in sentences for line in wrapped(sentence)]))
+        sections += [
+            Section(f"Verdict at order {order:g}", [(VERDICT_COLUMNS, [row for row in full if row["order"] == order])])
+            for order in frame["order"].drop_duplicates()
+        ]
+        notes, known = [f"Only {omitted} are shown."] if omitted else [], remarks(as_tree(stores[name]), frame)
+        notes += known[:_MOST_REMARKS]
+        notes += [f"and {len(known) - _MOST_REMARKS:,} more remarks"] if len(known) > _MOST_REMARKS else []
+        sections.append(Section(sentences=notes))
+    return rendered(style, joined(for_programs), sections, ())
 
 
 def format_objects(

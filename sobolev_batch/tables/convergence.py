@@ -170,7 +170,7 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
     >>> frame[["components", "euler_characteristic"]].value_counts().to_dict()
     {(1, 2): 4}
     """
-    return _joined(tables_of(store, order, x=x))
+    return joined(tables_of(store, order, x=x))
 
 
 def tables_of(
@@ -259,7 +259,7 @@ def _divided(rows: pd.DataFrame, x: str) -> dict[str, pd.DataFrame]:
     return frames
 
 
-def _joined(frames: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+def joined(frames: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
     """Return the rows of several objects after each other, named in the first column; those of an only one alone."""
     if "" in frames:
         return frames[""]
@@ -276,11 +276,11 @@ def format_table(
     """Return the convergence tables of a store, or of several objects by their names, as text."""
     frames = tables_of(store, orders, x=x)
     if style in ("csv", "json"):
-        return machine_table(_joined(frames), style)
+        return machine_table(joined(frames), style)
     stores = stores_of(store)
     trees = {name: as_tree(stores[name]) for name in frames}
     sections = (part for name, frame in frames.items() for part in _sections(name, trees[name], frame, x))
-    return rendered(style, _joined(frames), sections, _notes([*trees.values()], list(frames.values()), x))
+    return rendered(style, joined(frames), sections, _notes([*trees.values()], list(frames.values()), x))
 
 
 def _sections(name: str, tree: xr.DataTree, frame: pd.DataFrame, x: str) -> Iterator[Section]:

@@ -9,8 +9,8 @@ import pandas as pd
 from sobolev_batch.errors import InputError
 from sobolev_batch.parameters import fraction
 from sobolev_batch.tables import Format
-from sobolev_batch.tables.convergence import MESH, TRIANGLES, table
-from sobolev_batch.tables.open import AnyStore, as_tree, require_one_object
+from sobolev_batch.tables.convergence import MESH, TRIANGLES, joined, tables_of
+from sobolev_batch.tables.open import AnyStore
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.text import percent, wrapped
 from sobolev_batch.transform.lattice import Orders
@@ -35,7 +35,7 @@ def smallest_below(store: AnyStore, relative: float | str, order: Orders | None 
     """Return the mesh with the fewest triangles in each family whose relative distance is certainly below a bound.
 
     Args:
-        store: Path, URL or opened DataTree of the store.
+        store: Path, URL or opened DataTree of the store. Of several objects, each row begins with its object.
         relative: Bound on the relative distance with its error, such as 0.01 or "1%".
         order: One of the store's orders, or several; default all.
 
@@ -56,14 +56,16 @@ def smallest_below(store: AnyStore, relative: float | str, order: Orders | None 
     >>> frame[["family", "mesh", "triangles"]].values.tolist()
     [['icosphere', 'icosphere/2', 320]]
     """
+    return joined(_of_objects(store, relative, order))
+
+
+def _of_objects(store: AnyStore, relative: float | str, order: Orders | None) -> dict[str, pd.DataFrame]:
     most = fraction(relative)
-    tree = as_tree(store)
-    require_one_object(tree)
-    frame = table(tree, order)
-    if not (frame["triangles"] > 0).any():
+    frames = tables_of(store, order)
+    if not any((frame["triangles"] > 0).any() for frame in frames.values()):
         raise InputError("the smallest mesh has the fewest triangles, and no surface of the store is known to have any")
-    smallest = smallest_of(frame, most)
-    return smallest.assign(undecided=smallest["undecided"].map(", ".join))
+    found = {name: smallest_of(frame, most) for name, frame in frames.items()}
+    return {name: frame.assign(undecided=frame["undecided"].map(", ".join)) for name, frame in found.items()}
 
 
 def smallest_of(frame: pd.DataFrame, most: float) -> pd.DataFrame:
@@ -82,16 +84,16 @@ def format_smallest(
     store: AnyStore, style: Format = "text", orders: Sequence[float] | None = None, *, below: float | str
 ) -> str:
     """Return the smallest meshes below a bound as text; see `smallest_below`."""
-    frame = smallest_below(store, below, orders)
-    amount = f"{100 * frame.attrs['below']:g} %"
-    sections = []
-    for order, rows in frame.groupby("order", sort=False):
-        caption = f"Smallest mesh below {amount} of the norm of {frame.attrs['reference']}, order {order:g}"
-        cells = [
-            {**row, "mesh": row["mesh"] or "none", "remark": _remark(row)} for row in rows.to_dict(orient="records")
-        ]
-        sections.append(Section(caption, [(_COLUMNS, cells)]))
-    return rendered(style, frame, sections, wrapped(_NOTE))
+    frames, amount, sections = _of_objects(store, below, orders), f"{100 * fraction(below):g} %", list[Section]()
+    for name, frame in frames.items():
+        sections += [Section(f"Object {name}")] if name else []
+        for order, rows in frame.groupby("order", sort=False):
+            caption = f"Smallest mesh below {amount} of the norm of {frame.attrs['reference']}, order {order:g}"
+            cells = [
+                {**row, "mesh": row["mesh"] or "none", "remark": _remark(row)} for row in rows.to_dict(orient="records")
+            ]
+            sections.append(Section(caption, [(_COLUMNS, cells)]))
+    return rendered(style, joined(frames), sections, wrapped(_NOTE))
 
 
 def _smallest(members: pd.DataFrame, most: float) -> dict[str, Any]:

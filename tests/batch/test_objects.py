@@ -27,10 +27,11 @@ from sobolev_batch.store.lock import Lock, locked
 from sobolev_batch.store.objects import Objects
 from sobolev_batch.store.records import ObjectRecord, Records
 from sobolev_batch.study.plan import Plan, make_plan
-from sobolev_batch.tables.conclusion import format_objects
+from sobolev_batch.tables.conclusion import format_objects, format_verdict
 from sobolev_batch.tables.convergence import format_table
 from sobolev_batch.tables.export import export
 from sobolev_batch.tables.open import chosen_families
+from sobolev_batch.tables.smallest import format_smallest
 from tests.support.commands import call
 from tests.support.stores import flip
 from tests.support.studies import GONE, balls, methods_of, small_table
@@ -720,6 +721,22 @@ def test_a_run_without_any_tables_says_so_and_ends_with_status_3(tmp_path: Path)
     (tmp_path / "study.toml").write_text(tomli_w.dumps(study_of([GONE, {**GONE, "name": "lost"}]).table))
     done = call("run", tmp_path / "study.toml", "--store", tmp_path / "s.zarr", "--workers", "1")
     assert (done.returncode, done.stdout.startswith("no league: there are no tables yet")) == (3, True)
+
+
+def test_verdicts_and_smallest_meshes_are_those_of_each_object(store: Path) -> None:
+    smallest = sb.smallest_below(store, "50%", -3.0)
+    assert smallest["object"].unique().tolist() == ["a", "b"]
+    verdicts = pd.read_csv(StringIO(format_verdict(store, "csv")))
+    for name in "ab":
+        for all_rows, own in (
+            (smallest, sb.smallest_below(store / name, "50%", -3.0)),
+            (verdicts, pd.read_csv(StringIO(format_verdict(store / name, "csv")))),
+        ):
+            rows = all_rows[all_rows["object"] == name].drop(columns="object").reset_index(drop=True)
+            pd.testing.assert_frame_equal(rows, own, check_dtype=False)
+        assert format_verdict(store / name) in format_verdict(store)
+    text = format_smallest(store, below=0.5)
+    assert text.index("Object a") < text.index("Smallest mesh below 50 %") < text.index("Object b")
 
 
 def test_objects_are_listed_from_the_worst_one(store: Path) -> None:
