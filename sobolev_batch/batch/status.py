@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from sobolev_batch.errors import DamageError
 from sobolev_batch.shown import Shown
+from sobolev_batch.sources.names import quoted
 from sobolev_batch.store.latest_run import LOST_AFTER_SECONDS, RunRecord
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
@@ -44,6 +45,8 @@ class Status(Shown):
             that goes on computes them again.
         not_begun: Names of the objects that no run has come to; how many surfaces they have is not known.
         failures: Number of surfaces that could not be computed, those of whole objects too.
+        not_listed: Names of the objects that have tables, but no rows in those of all: a run that goes on adds them at
+            its end, and one of a part with other settings or orders took them out.
 
     >>> import sobolev_batch as sb
     >>> status = sb.status("storage/icosphere.zarr")
@@ -63,6 +66,7 @@ class Status(Shown):
     lost_records: tuple[str, ...] = ()
     not_begun: tuple[str, ...] = ()
     failures: int = 0
+    not_listed: tuple[str, ...] = ()
 
     @classmethod
     def from_store(cls, store: AnyStore) -> Status:
@@ -82,6 +86,7 @@ class Status(Shown):
             tallies = {"": contents.tally()}
             moments = [record.finished for record in contents.records if record is not None]
         refused = {name: one.reason for name, one in tallies.items() if one.reason}
+        listed = tallies if objects is None else {**objects.tabulated, **refused}
         return cls(
             str(location_of(store)),
             sum(one.complete for one in tallies.values()),
@@ -95,6 +100,7 @@ class Status(Shown):
             tuple(labelled({name: dict.fromkeys(one.lost_records) for name, one in tallies.items()})),
             () if objects is None else tuple(name for name in objects.names if name not in tallies),
             sum(one.failures for one in tallies.values()),
+            tuple(name for name, one in tallies.items() if one.reduced and name not in listed),
         )
 
     @property
@@ -133,7 +139,7 @@ class Status(Shown):
     @property
     def is_incomplete(self) -> bool:
         """True if no run goes on, and surfaces lack a record, or have another one than the tables were made from."""
-        return not self.going_on and bool(self.waiting or self.lost_records or self.not_begun)
+        return not self.going_on and bool(self.waiting or self.lost_records or self.not_begun or self.not_listed)
 
     @property
     def lost(self) -> bool:
@@ -151,6 +157,9 @@ class Status(Shown):
         lost = dict.fromkeys(self.lost_records, "its completion record is gone or another one; run the study again")
         for label, reason in (*self.failed.items(), *self.not_compared.items(), *lost.items()):
             yield f"{label}: {reason}"
+        if self.not_listed and not self.going_on:
+            few = f"{len(self.not_listed):,} objects, such as {quoted(self.not_listed[0])}"
+            yield f"{few}, have no rows in the tables of all: run the whole study"
         if self.run is not None:
             yield from self._run_lines(self.run)
         if not self.reduced:

@@ -648,11 +648,14 @@ def test_no_table_mixes_rows_of_other_settings(
     sb.run(other, changeable, threads, only=["b"])
     assert "1 objects that this run left out, such as 'a', have rows of other settings" in caplog.text
     require_rows(changeable, "b")
+    assert sb.status(changeable).not_listed == ("a",)
+    assert "1 objects, such as 'a', have no rows in the tables of all" in str(sb.status(changeable))
     # Nor do those of orders that are computed from the stores of objects.
     assert set(sb.table(changeable, -5.0)["object"]) == {"b"}
     caplog.clear()
     assert {label[0] for label in sb.run(other, changeable, threads).computed} == {"a"}
     require_rows(changeable, "a", "b")
+    assert sb.status(changeable).not_listed == ()
     # What is of the same settings stays.
     sb.run(other, changeable, threads, only=["a"])
     require_rows(changeable, "a", "b")
