@@ -158,8 +158,8 @@ class Status(Shown):
         for label, reason in (*self.failed.items(), *self.not_compared.items(), *lost.items()):
             yield f"{label}: {reason}"
         if self.not_listed and not self.going_on:
-            few = f"{len(self.not_listed):,} objects, such as {quoted(self.not_listed[0])}"
-            yield f"{few}, have no rows in the tables of all: run the whole study"
+            few = f"{len(self.not_listed):,}, such as {quoted(self.not_listed[0])}"
+            yield f"objects without rows in the tables of all: {few}; run the whole study"
         if self.run is not None:
             yield from self._run_lines(self.run)
         if not self.reduced:

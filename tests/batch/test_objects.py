@@ -649,7 +649,7 @@ def test_no_table_mixes_rows_of_other_settings(
     assert "1 objects that this run left out, such as 'a', have rows of other settings" in caplog.text
     require_rows(changeable, "b")
     assert sb.status(changeable).not_listed == ("a",)
-    assert "1 objects, such as 'a', have no rows in the tables of all" in str(sb.status(changeable))
+    assert "objects without rows in the tables of all: 1, such as 'a'; run" in str(sb.status(changeable))
     # Nor do those of orders that are computed from the stores of objects.
     assert set(sb.table(changeable, -5.0)["object"]) == {"b"}
     caplog.clear()
