@@ -10,7 +10,6 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from threading import Event
@@ -28,7 +27,7 @@ from sobolev_batch.extras.fitting import DEFAULT_SMOOTHING, DEFAULT_STEPS
 from sobolev_batch.norms import DEFAULT_ORDER
 
 if TYPE_CHECKING:
-    from sobolev_batch.extras.figures.style import PictureFormat, Size
+    from sobolev_batch.extras.figures.style import PictureFormat
     from sobolev_batch.extras.figures.views import Axis, Colors
     from sobolev_batch.extras.fitting.fit import FitProgress, FitQuality
     from sobolev_batch.geometry.mesh import Mesh
@@ -225,8 +224,19 @@ def _text(quality: FitQuality, scale: float) -> str:
     show_default=True,
     help="Give each mesh its own scale of colours, or all a common one.",
 )
-@click.pass_context
-def plot_command(context: click.Context, /, size: str | None, **options: Any) -> None:
+def plot_command(
+    store: Location,
+    output: Path,
+    formats: tuple[PictureFormat, ...],
+    size: str | None,
+    orders: ChosenOrders,
+    families: tuple[str, ...],
+    x: str | None,
+    meshes: tuple[str, ...],
+    folder: Path,
+    up: Axis | None,
+    colors: Colors,
+) -> int:
     """Draw the results of STORE as pictures.
 
     They show convergence, distances and spectra, and some of the meshes. Those of several objects show
@@ -235,77 +245,47 @@ def plot_command(context: click.Context, /, size: str | None, **options: Any) ->
     Meshes are coloured by their witness functions, which show where they differ from the reference. They are rebuilt
     from the study. Pictures need the extra "plot". By default a few are chosen by their distances.
     """
+    from sobolev_batch.extras.leagues.league import league
     from sobolev_batch.store.objects import Objects
+    from sobolev_batch.tables.convergence import EDGE_LENGTH
 
     with from_extra("plot", "a plot needs"):
-        from sobolev_batch.extras.figures.style import parse_size
-    chosen = _PlotOptions(panel=None if size is None else parse_size(size), **options)
-    _require_folder(chosen.output)
-    if Objects.read(chosen.store) is not None:
-        chosen.draw_league()
-    elif chosen.draw_store() and chosen.meshes:
-        context.exit(EXIT_SOME_FAILED)
-
-
-@dataclass(frozen=True)
-class _PlotOptions:
-    """The arguments and options of plot, by the names of its parameters; the size of a panel in inches."""
-
-    store: Location
-    output: Path
-    formats: tuple[PictureFormat, ...]
-    orders: ChosenOrders
-    families: tuple[str, ...]
-    x: str | None
-    meshes: tuple[str, ...]
-    folder: Path
-    up: Axis | None
-    colors: Colors
-    panel: Size | None
-
-    def draw_store(self) -> bool:
-        """Draw the results of one object and some of its meshes; return whether a mesh could not be drawn."""
-        from sobolev_batch.extras.figures.drawing import write_plots
+        from sobolev_batch.extras.figures.drawing import COST_LEAGUE, LEAGUE, write_plots
         from sobolev_batch.extras.figures.selection import Selection
+        from sobolev_batch.extras.figures.style import drawing, parse_size, write_figures
         from sobolev_batch.extras.figures.views import write_witness_plots
-        from sobolev_batch.tables.convergence import EDGE_LENGTH
 
-        selection = Selection.from_store(self.store, self.orders, self.families or None, self.x or EDGE_LENGTH)
+    panel, chosen = None if size is None else parse_size(size), families or None
+    _require_folder(output)
+    if Objects.read(store) is None:
+        selection = Selection.from_store(store, orders, chosen, x or EDGE_LENGTH)
         # First, since a label may be wrong.
-        witness_paths, missing = write_witness_plots(
-            selection, self.output, self.folder, self.meshes, self.up, self.colors, self.formats, self.panel
-        )
-        paths, omissions = write_plots(selection, self.output, self.formats, self.panel)
+        witness_paths, missing = write_witness_plots(selection, output, folder, meshes, up, colors, formats, panel)
+        paths, omissions = write_plots(selection, output, formats, panel)
         for path in (*paths, *witness_paths):
             echo(path)
         for name, notes in omissions.items():
             echo(f"{name}: {'; '.join(notes)}", err=True)
         for label, reason in missing.items():
             echo(f"{label}: not drawn with its witness function: {reason}", err=True)
-        return bool(missing)
-
-    def draw_league(self) -> None:
-        """Draw the leagues of several objects, by size and where costs are known by cost."""
-        from sobolev_batch.extras.figures.drawing import COST_LEAGUE, LEAGUE
-        from sobolev_batch.extras.figures.style import drawing, write_figures
-        from sobolev_batch.extras.leagues.league import league
-
-        if self.meshes:
-            raise click.UsageError("--mesh draws meshes of one object: name its store, such as STORE/OBJECT")
-        figures = {}
-        with drawing(self.panel):
-            with suppress(InputError):
-                by_cost = league(self.store, self.orders, by="cost", methods=self.families or None)
-                figures["league-by-cost"] = COST_LEAGUE.figure(by_cost, size=self.panel)
-            try:
-                by_size = league(self.store, self.orders, x=self.x, methods=self.families or None)
-                figures["league"] = LEAGUE.figure(by_size, size=self.panel)
-            except InputError as error:
-                if self.x or not figures:
-                    raise
-                echo(f"league: {error}", err=True)
-        for path in write_figures(figures, self.output, self.formats, self.panel):
-            echo(path)
+        return EXIT_SOME_FAILED if missing and meshes else 0
+    if meshes:
+        raise click.UsageError("--mesh draws meshes of one object: name its store, such as STORE/OBJECT")
+    figures = {}
+    with drawing(panel):
+        with suppress(InputError):
+            by_cost = league(store, orders, by="cost", methods=chosen)
+            figures["league-by-cost"] = COST_LEAGUE.figure(by_cost, size=panel)
+        try:
+            by_size = league(store, orders, x=x, methods=chosen)
+            figures["league"] = LEAGUE.figure(by_size, size=panel)
+        except InputError as error:
+            if x or not figures:
+                raise
+            echo(f"league: {error}", err=True)
+    for path in write_figures(figures, output, formats, panel):
+        echo(path)
+    return 0
 
 
 def _require_folder(path: Path) -> None:
@@ -329,9 +309,7 @@ def _require_folder(path: Path) -> None:
 @click.option("--distances", is_flag=True, help="Also write the distance of each vertex from the reference.")
 @_output_option("Write the files into this folder.", ".")
 @_folder_option
-@click.pass_context
 def witness_command(
-    context: click.Context,
     store: Location,
     meshes: tuple[str, ...],
     orders: ChosenOrders,
@@ -339,7 +317,7 @@ def witness_command(
     distances: bool,
     output: Path,
     folder: Path,
-) -> None:
+) -> int:
     """Write the meshes of STORE with their witness functions.
 
     The witness function shows where a mesh differs from the reference. Each mesh gets one file, in its own unit of
@@ -351,19 +329,18 @@ def witness_command(
     made, labels, chosen = exported(store, meshes, orders, folder)
     _require_folder(output)
     output.mkdir(parents=True, exist_ok=True)
-    reference, is_complete = made.reference if distances else None, True
+    reference, status = made.reference if distances else None, 0
     for label in labels:
         try:
             found = made.with_witness(label, chosen, reference)
         except SobolevBatchError as error:
             echo(f"{label}: {error}", err=True)
-            is_complete = False
+            status = EXIT_SOME_FAILED
             continue
         path = output / f"{made.stem(label)}.{style}"
         write_vertex_witness(path, found)
         echo(path)
-    if not is_complete:
-        context.exit(EXIT_SOME_FAILED)
+    return status
 
 
 @click.command("report", cls=Command)
