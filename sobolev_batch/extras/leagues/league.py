@@ -20,6 +20,7 @@ from sobolev_batch.extras.leagues.statistics import (
     Curve,
     adjusted,
     common_sizes,
+    errors_of_logarithms,
     filled,
     interval,
     numbers_of,
@@ -408,14 +409,12 @@ def _with_common_sizes(curves: Mapping[str, Curve]) -> dict[str, Curve]:
 def _curves(frame: pd.DataFrame, order: float, x: str, y: str, methods: Sequence[str]) -> dict[str, Curve]:
     """Return the curve at an order of each method that has numbers for an object."""
     sizes, (values, errors) = sizes_of(frame, x), numbers_of(frame, y)
-    families, is_known = frame["family"].to_numpy(), np.isfinite(sizes) & np.isfinite(values)
-    is_known &= frame["order"].to_numpy() == order
-    of_methods = {method: is_known & (families == method) for method in methods}
-    return {
-        method: Curve.from_numbers(sizes[own], values[own], errors[own])
-        for method, own in of_methods.items()
-        if own.any()
-    }
+    known = np.flatnonzero((frame["order"].to_numpy() == order) & np.isfinite(sizes) & np.isfinite(values))
+    by_size = known[np.argsort(sizes[known], kind="stable")]
+    families = frame["family"].to_numpy()[by_size]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        numbers = np.stack([np.log(sizes), np.log(values), errors_of_logarithms(values, errors)])[:, by_size]
+    return {method: Curve(*numbers[:, families == method]) for method in methods if method in families}
 
 
 def format_league(leagues: Sequence[League], style: Format = "text") -> str:

@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Self
 
 import numpy as np
 import pandas as pd
@@ -41,14 +40,6 @@ class Curve:
     sizes: Reals
     values: Reals
     errors: Reals
-
-    @classmethod
-    def from_numbers(cls, sizes: Reals, values: Reals, errors: Reals) -> Self:
-        """Return the curve of some meshes, by their finite sizes and distances in any order."""
-        order = np.argsort(sizes, kind="stable")
-        with np.errstate(divide="ignore"):
-            logarithms = np.log(sizes[order]), np.log(values[order])
-        return cls(*logarithms, errors_of_logarithms(values[order], errors[order]))
 
     @property
     def range(self) -> Range:
