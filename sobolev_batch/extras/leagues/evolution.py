@@ -79,12 +79,22 @@ def evolution(
             known = StoreAccessor(tree).distance(orders, row.mesh, row.true)
         numbers = {name: np.nan if known is None else known[name].values for name in _NUMBERS}
         frames.append(pd.DataFrame({"family": row.family, "time": row.time, "order": orders, **numbers}))
-    table = pd.concat(frames, ignore_index=True).set_index(["family", "time", "order"]).to_xarray()
+    table: xr.Dataset = pd.concat(frames, ignore_index=True).set_index(["family", "time", "order"]).to_xarray()
     found = table.reindex(family=meshes["family"].unique().tolist(), time=sorted(meshes["time"].unique()), order=orders)
     for name in (*_NUMBERS, "time", "order"):
         found[name].attrs = VARIABLES[name]
     found["family"].attrs = described("family of meshes")
-    return _with_growth(found, factor)
+    first = found.isel(time=found["distance"].notnull().argmax("time")).drop_vars("time")
+    # Nothing is known of the growth of a distance that may be zero.
+    growth = found["distance"] / first["distance"].where(first["distance"] > first["error"])
+    late = found["distance"] - found["error"] > factor * (first["distance"] + first["error"])
+    remesh_time = found["time"].where(late & growth.notnull()).min("time")
+    return found.assign(
+        growth=growth.assign_attrs(described("distance over that of the first time", NUMBER)),
+        remesh_time=remesh_time.transpose("family", "order").assign_attrs(
+            described("first time at which a new mesh pays", factor=f"{factor:g}")
+        ),
+    )
 
 
 def format_evolution(
@@ -101,12 +111,12 @@ def format_evolution(
     columns = [*_NUMBERS, "growth"]
     frame: pd.DataFrame = found[columns].to_dataframe().dropna(how="all").reset_index()
     names = found["family"].values.tolist()
-    table = (Column("time", "time"), *(Column(f"family {name}", name) for name in names))
+    table = (Column("time", "time", "{:.12g}".format), *(Column(f"family {name}", name) for name in names))
     sections = []
     for order in found["order"].values.tolist():
         families = {name: found.sel(order=order, family=name) for name in names}
         cells = [
-            {"time": _time(time), **{f"family {name}": _cell(rows.sel(time=time)) for name, rows in families.items()}}
+            {"time": time, **{f"family {name}": _cell(rows.sel(time=time)) for name, rows in families.items()}}
             for time in found["time"].values.tolist()
         ]
         caption = f"Sobolev distance of order {order:g} to {truth or reference_of(tree)} over time, in % of its norm"
@@ -141,21 +151,6 @@ def _moving_meshes(tree: xr.DataTree, truth: str | None) -> pd.DataFrame:
     return meshes
 
 
-def _with_growth(found: xr.Dataset, factor: float) -> xr.Dataset:
-    """Return distances over `family`, `time` and `order` with their growth, and when a new mesh pays."""
-    first = found.isel(time=found["distance"].notnull().argmax("time")).drop_vars("time")
-    # Nothing is known of the growth of a distance that may be zero.
-    growth = found["distance"] / first["distance"].where(first["distance"] > first["error"])
-    late = found["distance"] - found["error"] > factor * (first["distance"] + first["error"])
-    remesh_time = found["time"].where(late & growth.notnull()).min("time")
-    return found.assign(
-        growth=growth.assign_attrs(described("distance over that of the first time", NUMBER)),
-        remesh_time=remesh_time.transpose("family", "order").assign_attrs(
-            described("first time at which a new mesh pays", factor=f"{factor:g}")
-        ),
-    )
-
-
 def _cell(found: xr.Dataset) -> str:
     text = with_error(100 * found["relative"].item(), 100 * found["relative_error"].item())
     growth = found["growth"].item()
@@ -169,9 +164,5 @@ def _moment(found: xr.Dataset, factor: float) -> str:
         return "its first distance is not larger than its error, so nothing is known of its growth"
     moment = found["remesh_time"].item()
     if np.isfinite(moment):
-        return f"a new mesh first pays at time {_time(moment)}"
+        return f"a new mesh first pays at time {moment:.12g}"
     return f"the distance has at no time certainly grown to {factor:g} times the first"
-
-
-def _time(time: float) -> str:
-    return f"{time:.12g}"
