@@ -17,27 +17,15 @@ Loop = TypeVar("Loop", bound=Callable[..., Any])
 
 # Processor seconds on arrays from which on numba is worth its import.
 _WORTH_SECONDS = 1.0
-
-
-class _Spent:
-    """Processor seconds that work on arrays was predicted to take in this process."""
-
-    def __init__(self) -> None:
-        self.seconds, self._lock = 0.0, Lock()
-
-    def add(self, seconds: float) -> float:
-        with self._lock:
-            self.seconds += seconds
-            return self.seconds
-
-
-_spent: ContextVar[_Spent] = ContextVar("spent", default=_Spent())  # noqa: B039
+# One number: the processor seconds that work on arrays was predicted to take in this process.
+_spent: ContextVar[list[float]] = ContextVar("spent", default=[0.0])  # noqa: B039
+_adding = Lock()
 
 
 @contextmanager
 def by_itself() -> Iterator[None]:
     """Count only the work within, so that its digits do not depend on what the process did before, or does beside."""
-    token = _spent.set(_Spent())
+    token = _spent.set([0.0])
     try:
         yield
     finally:
@@ -49,12 +37,15 @@ def pays(seconds: float) -> bool:
 
     The seconds of all calls in a process add up, so that many small pieces of work turn to loops as one large one does.
     """
-    return _spent.get().add(seconds) > _WORTH_SECONDS
+    spent = _spent.get()
+    with _adding:
+        spent[0] += seconds
+        return spent[0] > _WORTH_SECONDS
 
 
 def use() -> None:
     """Let loops pay from now on, whatever the process has done before: what it stores then depends on nothing else."""
-    _spent.get().add(math.inf)
+    pays(math.inf)
 
 
 def loop(function: Loop) -> Loop:
