@@ -109,7 +109,18 @@ def make_report(
     """Return the report of a store, and what it leaves out; see `report`."""
     objects = Objects.read(Location.parse(location_of(store)))
     if objects is None:
-        return _study_page(store, folder, witnesses, up)
+        tree = as_tree(store)
+        content = study_content(tree, Status.from_store(store))
+        selection = Selection.from_store(tree)
+        spectra = selection.spectra if selection.has_spectra else None
+        omission = "" if spectra is None else spectra.attrs["omission"]
+        views, missing = make_views(tree, folder, witnesses, up=up)
+        charts = {**chart_data(tree, spectra, views), "costs": cost_data(content["costs"])}
+        # Who names meshes leaves out the others.
+        content["omissions"] += chart_omissions(tree, charts, omission, () if witnesses else views, missing)
+        page = filled("study", content, charts, omission=omission, views=views, missing=missing)
+        require_unchanged(tree)
+        return page
     if witnesses:
         raise InputError(
             f"{objects.location}: meshes are shown in the report of one object, such as "
@@ -119,21 +130,6 @@ def make_report(
     charts = league_data(content["leagues"], content["name"], content["orders"])
     families = content["costs"][0].methods if content["costs"] else charts["families"]
     return filled("league", content, {**charts, "families": list(families), "costs": cost_data(content["costs"])})
-
-
-def _study_page(store: AnyStore, folder: str | Path, witnesses: Sequence[str], up: Axis | None) -> Page:
-    tree = as_tree(store)
-    content = study_content(tree, Status.from_store(store))
-    selection = Selection.from_store(tree)
-    spectra = selection.spectra if selection.has_spectra else None
-    omission = "" if spectra is None else spectra.attrs["omission"]
-    views, missing = make_views(tree, folder, witnesses, up=up)
-    charts = {**chart_data(tree, spectra, views), "costs": cost_data(content["costs"])}
-    # Who names meshes leaves out the others.
-    content["omissions"] += chart_omissions(tree, charts, omission, () if witnesses else views, missing)
-    page = filled("study", content, charts, omission=omission, views=views, missing=missing)
-    require_unchanged(tree)
-    return page
 
 
 def filled(template: str, content: dict[str, Any], charts: Json, **values: Any) -> Page:
