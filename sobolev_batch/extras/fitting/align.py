@@ -135,10 +135,7 @@ def _nodes(mesh: Mesh, lattice: Lattice, most: int) -> WeightedPoints:
 
 def _of_axes(own: Mesh, target: Mesh) -> list[Reals]:
     """Return the four rotations that take the principal axes of a mesh to those of another."""
-    bases = []
-    for mesh in (own, target):
-        centers = np.sum(mesh.corners(), axis=0) / 3
-        bases.append(np.linalg.eigh((mesh.areas * centers.T) @ centers)[1])
-    signs = [np.diag(sign) for sign in product((1.0, -1.0), repeat=3)]
-    turns = [bases[1] @ sign @ bases[0].T for sign in signs]
+    pairs = [(mesh.areas, np.sum(mesh.corners(), axis=0) / 3) for mesh in (own, target)]
+    first, second = (np.linalg.eigh((areas * centers.T) @ centers)[1] for areas, centers in pairs)
+    turns = [second @ np.diag(signs) @ first.T for signs in product((1.0, -1.0), repeat=3)]
     return [turn for turn in turns if np.linalg.det(turn) > 0]

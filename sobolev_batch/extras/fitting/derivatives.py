@@ -173,8 +173,7 @@ def torch_function(squared: SquaredDistance) -> Callable[[Any], Any]:
             (gradient,) = context.saved_tensors
             return slope * gradient
 
-    function: Callable[[Any], Any] = _Function.apply
-    return function
+    return _Function.apply  # type: ignore[no-any-return]
 
 
 def jax_function(squared: SquaredDistance) -> Callable[[Any], Any]:
@@ -198,17 +197,15 @@ def jax_function(squared: SquaredDistance) -> Callable[[Any], Any]:
         import jax
 
     def value(vertices: Any) -> Any:
-        found = np.asarray(squared.value(np.asarray(vertices)))
-        return found.astype(vertices.dtype)
+        return np.asarray(squared.value(np.asarray(vertices)), dtype=vertices.dtype)
 
     def value_and_gradient(vertices: Any) -> tuple[Any, Any]:
         found, gradient = squared(np.asarray(vertices))
-        return np.asarray(found).astype(vertices.dtype), gradient.astype(vertices.dtype)
+        return np.asarray(found, dtype=vertices.dtype), gradient.astype(vertices.dtype)
 
-    def forward(vertices: Any) -> tuple[Any, Any]:
+    def forward(vertices: Any) -> Any:
         shapes = jax.ShapeDtypeStruct((), vertices.dtype), jax.ShapeDtypeStruct(vertices.shape, vertices.dtype)
-        found: tuple[Any, Any] = jax.pure_callback(value_and_gradient, shapes, vertices)
-        return found
+        return jax.pure_callback(value_and_gradient, shapes, vertices)
 
     def backward(gradient: Any, slope: Any) -> tuple[Any]:
         return (slope * gradient,)
@@ -218,8 +215,7 @@ def jax_function(squared: SquaredDistance) -> Callable[[Any], Any]:
         return jax.pure_callback(value, jax.ShapeDtypeStruct((), vertices.dtype), vertices)
 
     function.defvjp(forward, backward)
-    result: Callable[[Any], Any] = function
-    return result
+    return function  # type: ignore[no-any-return]
 
 
 def gradient(

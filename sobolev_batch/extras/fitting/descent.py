@@ -143,10 +143,9 @@ class Smoothing:
 
     def __init__(self, mesh: Mesh, free: Indices, amount: float) -> None:
         self.free, self.amount, self._count = free, amount, len(mesh.vertices)
-        one, other = Edges.from_mesh(mesh).ends.T
-        both = np.concatenate([one, other]), np.concatenate([other, one])
-        neighbours = coo_array((np.ones(len(both[0])), both), shape=(self._count, self._count)).tocsr()
-        graph: Any = laplacian(neighbours)
+        ends = Edges.from_mesh(mesh).ends
+        neighbours = coo_array((np.ones(len(ends)), ends.T), shape=(self._count, self._count)).tocsr()
+        graph: Any = laplacian(neighbours, symmetrized=True)
         self._factors = splu(csc_array(eye_array(len(free)) + amount * csc_array(graph)[free][:, free]))
 
     def movement(self, steps: Reals) -> Reals:

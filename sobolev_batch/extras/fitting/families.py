@@ -26,7 +26,6 @@ from sobolev_batch.sources.registry import (
     load_mesh,
     single_member,
 )
-from sobolev_batch.transform.fourier import Execution
 
 # Raise it whenever a fit of the same mesh gives another one.
 _VERSION = 3
@@ -128,9 +127,7 @@ class FittedMember(Member):
         start, target = load_mesh(self.start), self.target.load()
         similarity = Similarity.to_unit_ball(target)
         try:
-            # The result must not depend on the worker, so one thread it is.
-            pair = similarity.apply(start), similarity.apply(target)
-            fitted = fitted_mesh(*pair, self.settings, Execution(), self.triangles)
+            fitted = fitted_mesh(similarity.apply(start), similarity.apply(target), self.settings, self.triangles)
         except InputError as error:
             raise MeshError(f"{self.start.name} cannot be fitted to {self.target.name}: {error}") from error
         vertices = np.asarray(fitted.vertices) / similarity.scale + np.asarray(similarity.origin)

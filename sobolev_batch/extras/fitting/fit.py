@@ -184,13 +184,12 @@ def fit(
     return _measured(mesh, FitProblem.for_target(mesh, target, lattice, settings, execution), (), on_progress)
 
 
-def fitted_mesh(
-    mesh: Mesh, target: Operand, settings: FitSettings, execution: Execution, triangles: int | None = None
-) -> Mesh:
+def fitted_mesh(mesh: Mesh, target: Operand, settings: FitSettings, triangles: int | None = None) -> Mesh:
     """Return the mesh that `fit` finds, or `refine` for a number of triangles, without measures of its distance."""
     goals = () if triangles is None else _goals(len(mesh.triangles), triangles)
     start = mesh if triangles is None else welded(mesh)[0]
-    run = _finished(FitProblem.for_target(start, target, None, settings, execution), goals)
+    # The result must not depend on the worker, so one thread it is.
+    run = _finished(FitProblem.for_target(start, target, None, settings, Execution()), goals)
     if run.end is End.INTERRUPTED:
         # A mesh of a study is the whole fit.
         raise KeyboardInterrupt

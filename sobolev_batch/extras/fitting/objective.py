@@ -64,15 +64,14 @@ class FitSettings:
     keep_boundary: bool = False
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "order", single_order(self.order))
+        order = single_order(self.order)
         if not is_whole_number(self.steps) or self.steps < 1:
             raise InputError(f"steps must be a whole number from 1 on, found {self.steps!r}")
-        object.__setattr__(self, "steps", int(self.steps))
         if not is_finite_number(self.smoothing) or not 0 <= self.smoothing <= MOST_SMOOTHING:
             raise InputError(f"smoothing must be a number from 0 to {MOST_SMOOTHING:g}, found {self.smoothing!r}")
-        object.__setattr__(self, "smoothing", float(self.smoothing))
         if not isinstance(self.keep_boundary, bool):
             raise InputError(f"keep_boundary must be True or False, found {self.keep_boundary!r}")
+        vars(self).update(order=order, steps=int(self.steps), smoothing=float(self.smoothing))
 
     @property
     def coarse_order(self) -> float:
