@@ -13,7 +13,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure, SubFigure
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from sobolev_batch.arrays import Reals
@@ -134,9 +134,8 @@ def hide_frame(axes: Axes) -> None:
 
 def inches(axes: Axes) -> Size:
     """Return width and height of axes, before labels and legends take their part."""
-    figure = axes.figure.figure if isinstance(axes.figure, SubFigure) else axes.figure
-    place, box = axes.get_position(original=True), axes.figure.bbox
-    return float(place.width * box.width / figure.dpi), float(place.height * box.height / figure.dpi)
+    place, figure = axes.get_position(original=True), axes.figure
+    return float(place.width * figure.bbox.width / figure.dpi), float(place.height * figure.bbox.height / figure.dpi)
 
 
 def set_log_scale(axes: Axes, names: Literal["x", "y", "xy"]) -> None:
