@@ -142,16 +142,13 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
         for path in paths
         if {path, references[name]} <= extents.keys()
     }
-    lacks = (
-        "its name lacks that of the reference"
-        if "" in references
-        else "no other mesh belongs to it by name, nor it to one"
-    )
-    left_out |= {str(path): lacks for path in sizes if path not in used}
     if "" in references:
+        lacks = "its name lacks that of the reference"
         sections, summary = _one_object(references[""], families, sizes, below)
     else:
+        lacks = "no other mesh belongs to it by name, nor it to one"
         sections, summary = _several_objects(references, families, below)
+    left_out |= {str(path): lacks for path in sizes if path not in used}
     name = _json(_free_name(folder.resolve().name, fallback="study"))
     text = _filled("study", name=name, sections="".join(f"\n{section}" for section in sections))
     study = Study.from_table(tomllib.loads(text), folder=base)
