@@ -90,13 +90,11 @@ def compare_studies(
     joined = pd.concat(frames, ignore_index=True)
     if joined.empty:
         raise InputError("the studies have no mesh in common that both have computed at the same order")
-    rows = [
+    result = pd.DataFrame(
         {"y": name, "order": s, "method": method, **_change(meshes)}
         for (name, s, method), meshes in joined.groupby(["y", "order", "family"], sort=False)
-    ]
-    result = pd.DataFrame(rows)
-    for _, of_order in result.groupby(["y", "order"], sort=False):
-        result.loc[of_order.index, "p"] = adjusted(of_order["p"].to_numpy())
+    )
+    result["p"] = result.groupby(["y", "order"], sort=False)["p"].transform(lambda p: adjusted(p.to_numpy()))
     words = np.where(result["ratio"] < 1, "nearer", "farther")
     result.insert(9, "verdict", np.where(result["p"] < SIGNIFICANCE, words, "undecided"))
     result.attrs["lost"] = tuple(dict.fromkeys(lost))

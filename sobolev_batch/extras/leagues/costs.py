@@ -193,7 +193,7 @@ def _is_unbeaten(costs: pd.Series, own: pd.Series, others: pd.Series) -> NDArray
     # Among those of the same cost, the first is the nearest.
     alike = np.where(place > first, padded[first], np.where(first + 1 < end, padded[first + 1], np.inf))
     distance, result = own.to_numpy()[order], np.empty(len(order), dtype=bool)
-    result[order] = (np.minimum(cheaper, alike) >= distance) & (cheaper > distance)
+    result[order] = (alike >= distance) & (cheaper > distance)
     return result
 
 

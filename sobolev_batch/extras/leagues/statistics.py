@@ -140,10 +140,8 @@ def within_objects(values: Reals) -> Reals:
     methods = values.shape[1]
     if len(values) < 2:
         return np.full(methods, np.nan)
-    if methods == 1:
-        return np.asarray(np.std(values, axis=0, ddof=1))
-    centred = values - values.mean(axis=1, keepdims=True)
-    return np.asarray(np.std(centred, axis=0, ddof=1) * math.sqrt(methods / (methods - 1)))
+    centred = values - values.mean(axis=1, keepdims=True) if methods > 1 else values
+    return np.asarray(np.std(centred, axis=0, ddof=1) * math.sqrt(methods / max(1, methods - 1)))
 
 
 def sign_flip_test(differences: Reals, errors: Reals) -> float:
