@@ -124,8 +124,7 @@ class _Stage:
 
 def _nodes(mesh: Mesh, lattice: Lattice, most: int) -> WeightedPoints:
     """Return quadrature nodes of a mesh for a lattice; of more than some, random ones as a rough likeness."""
-    transform = MeshTransform.from_mesh(mesh, lattice, TransformSettings(_EPS, tolerance=1e-4))
-    nodes = transform.nodes(mesh.vertices)
+    nodes = MeshTransform.from_mesh(mesh, lattice, TransformSettings(_EPS, tolerance=1e-4)).nodes(mesh.vertices)
     if len(nodes.weights) <= most:
         return nodes
     total = nodes.weights.sum()

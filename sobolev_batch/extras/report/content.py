@@ -262,8 +262,7 @@ def _object_rows(tables: Mapping[str, pd.DataFrame], order: float, league: Leagu
     """Yield the objects with their best methods at one order."""
     places = {} if league is None else {name: place for place, name in enumerate(league.objects)}
     for name, frame in tables.items():
-        meshes = frame[frame["order"] == order]
-        row = {"order": order, "object": name, **totals_of(meshes)}
+        row = {"order": order, "object": name, **totals_of(frame[frame["order"] == order])}
         if league is None or name not in places:
             reason = league.left_out.get(name, "no distances") if league else "methods cannot be compared"
             yield {**row, "absent": f"left out: {reason}"}
