@@ -48,11 +48,7 @@ _FRACTIONS = (16, 8, 4, 2)
 _FEWEST_TRIANGLES = 4
 
 # The pieces of a study file by their names. Values are filled in as JSON spells them, which TOML shares.
-_PIECES = dict(
-    re.findall(
-        r"^##### (\w+)\n(.*?)(?=^#####|\Z)", Path(__file__).with_name("draft.toml").read_text("utf-8"), re.M | re.S
-    )
-)
+_PIECES = tomllib.loads(Path(__file__).with_name("draft.toml").read_text("utf-8"))
 # The files of each object and family; a study of one object calls that "".
 _Families = Mapping[tuple[str, str], Sequence[PurePosixPath]]
 
