@@ -55,8 +55,6 @@ with from_extra("report", "a report needs"):
 MOST_POINTS, MOST_NUMBERS = 50_000, 400_000
 
 Json = dict[str, Any]
-# A page as HTML, and what it leaves out, for people.
-Page = tuple[str, tuple[str, ...]]
 
 
 def report(
@@ -105,8 +103,8 @@ def write_page(path: Path, text: str) -> None:
 
 def make_report(
     store: AnyStore, *, folder: str | Path = ".", witnesses: Sequence[str] = (), up: Axis | None = None
-) -> Page:
-    """Return the report of a store, and what it leaves out; see `report`."""
+) -> tuple[str, tuple[str, ...]]:
+    """Return the report of a store, and what it leaves out, for people; see `report`."""
     objects = Objects.read(Location.parse(location_of(store)))
     if objects is None:
         tree = as_tree(store)
@@ -132,7 +130,7 @@ def make_report(
     return filled("league", content, {**charts, "families": list(families), "costs": cost_data(content["costs"])})
 
 
-def filled(template: str, content: dict[str, Any], charts: Json, **values: Any) -> Page:
+def filled(template: str, content: dict[str, Any], charts: Json, **values: Any) -> tuple[str, tuple[str, ...]]:
     """Return a page from its template, with all that it needs to be drawn, and what it leaves out."""
     # Two thirds of a page, if the browser were not to unpack it.
     library = plotly.offline.get_plotlyjs()
