@@ -239,8 +239,7 @@ def plot_command(
 ) -> int:
     """Draw the results of STORE as pictures.
 
-    They show convergence, distances and spectra, and some of the meshes. Those of several objects show
-    their league.
+    They show convergence, distances and spectra, and some of the meshes. Those of several objects show their league.
 
     Meshes are coloured by their witness functions, which show where they differ from the reference. They are rebuilt
     from the study. Pictures need the extra "plot". By default a few are chosen by their distances.

@@ -43,9 +43,8 @@ class Verdict(Shown):
         tolerance: Largest relative distance of surfaces that count as the same.
         order: Order s of the norm.
         area_change: Area of the surface over that of the reference, less one.
-        method: What the distance follows from: "identical" (meshes have the same triangles),
-            "lattice" (the areas bound what lies beyond it), or "octaves" (random frequencies measure what lies
-            beyond a lattice).
+        method: What the distance follows from: "identical" (meshes have the same triangles), "lattice" (the areas bound
+            what lies beyond it), or "octaves" (random frequencies measure what lies beyond a lattice).
         doubt: Question whether both are in the same unit of length and in the same place, where they do not look it.
 
     >>> import sobolev_batch as sb
