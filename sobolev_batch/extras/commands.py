@@ -126,9 +126,9 @@ def fit_command(
     from sobolev_batch.geometry.surface import Similarity
 
     require_writable(output)
+    own, goal = read_mesh(start), read_mesh(target)
     if output.exists() and output.samefile(target):
         raise InputError(f"{output}: this is the target, which would be lost; name another file")
-    own, goal = read_mesh(start), read_mesh(target)
     # Refused in the files' own unit.
     require_comparable(own, goal)
     similarity = Similarity() if no_scaling else Similarity.to_unit_ball(goal)
@@ -428,11 +428,14 @@ def league_command(
     from sobolev_batch.extras.leagues.league import format_league, league
 
     is_worse = False
+    if against is None and most is not None:
+        raise click.UsageError("--most is a ratio to an earlier study: name it with --against")
+    if against is not None and (x or by == "cost"):
+        raise click.UsageError("--against compares meshes of the same names: leave out --by and --x")
     if against is not None:
-        changes = compare_studies(store, against, orders, y=columns)
-        lost = changes.attrs["lost"]
-        changes = changes[changes["method"].isin(families or changes["method"])]
-        is_worse = bool(lost or (changes["verdict"] == "farther").any() or (most and (changes["ratio"] > most).any()))
+        changes = compare_studies(store, against, orders, y=columns, methods=families or None)
+        is_worse = bool(changes.attrs["lost"]) or (changes["verdict"] == "farther").any()
+        is_worse |= most is not None and (changes["ratio"] > most).any()
         text = format_changes(changes, style)
     elif by == "cost":
         by_cost = league(store, orders, by="cost", x=x, methods=families or None)

@@ -371,6 +371,10 @@ def test_a_league_needs_no_more_than_the_store(store: Path, monkeypatch: pytest.
     assert changes.loc["ico", ["low", "high"]].tolist() == [0.0, np.inf]
     more["convergence"] = xr.DataTree(convergence.where(convergence["mesh"] != "ico/1"))
     assert sb.compare_studies({"a": more}, one, -3).attrs["lost"] == ("a/ico/1",)
+    of_eggs = sb.compare_studies({"a": more}, one, -3, methods="egg")
+    assert (of_eggs["method"].tolist(), of_eggs.attrs["lost"]) == (["egg"], ())
+    with pytest.raises(sb.errors.InputError, match="no method is named 'icos'; known are ico, egg"):
+        sb.compare_studies(one, one, methods=["icos"])
     with pytest.raises(sb.errors.StoreError, match="it holds the store of one object"):
         sb.league(store / "a")
     with pytest.raises(sb.errors.StoreError, match="nowhere"):

@@ -172,12 +172,15 @@ REFUSED = [
     ("compare no.ply no.ply --report . --below 1%", ".: the report cannot be written there: Is a directory"),
     ("compare no.ply no.ply --report start.ply", "no.ply: cannot be read"),
     ("compare no.ply no.ply --report none", "no.ply: cannot be read"),
+    ("fit start.ply no.ply -o target.ply", "no.ply: cannot be read"),
     ("fit start.ply target.ply -o ./target.ply", "this is the target, which would be lost"),
     ("fit small.ply target.ply -o f.ply", "the start is 0.06 units wide and the target 63"),
     ("fit start.ply target.ply -o f.ply --refine-to 80", "80 triangles already"),
 ]
 MISUSED = [
     (f"table time {STORE} --factor 1", "1.0 is not in the range x>1.0"),
+    (f"table league {STORE} --against {STORE} --x edge_length", "leave out --by and --x"),
+    (f"table league {STORE} --most 2", "name it with --against"),
     (f"plot {STORE} --format gif", "'gif' is not one of 'png', 'svg', 'pdf'"),
 ]
 

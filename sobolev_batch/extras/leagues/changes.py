@@ -1,13 +1,22 @@
 """A study against an earlier one of the same objects, and as text: which methods came nearer."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from itertools import chain
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
 from sobolev_batch.errors import InputError
-from sobolev_batch.extras.leagues.league import ENDS, RELATIVE, AnyStores, interval_text, number_text, orders_of
+from sobolev_batch.extras.leagues.league import (
+    ENDS,
+    RELATIVE,
+    AnyStores,
+    chosen_methods,
+    interval_text,
+    number_text,
+    orders_of,
+)
 from sobolev_batch.extras.leagues.statistics import adjusted, errors_of_logarithms, interval, numbers_of, sign_flip_test
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.parameters import as_names
@@ -44,6 +53,7 @@ def compare_studies(
     order: Orders | None = None,
     *,
     y: str | Sequence[str] = RELATIVE,
+    methods: str | Sequence[str] | None = None,
 ) -> pd.DataFrame:
     """Compare the distances of two studies of the same objects, such as those of two releases of a remesher.
 
@@ -56,6 +66,7 @@ def compare_studies(
         order: One of the stores' orders, or several; default all that both have.
         y: What to compare, one or several columns of `table` of which less is better: "relative", "hausdorff",
             "make_seconds", "triangles" (of searched families) and so on.
+        methods: Names of the families to compare; default all.
 
     Returns:
         A row for each y, order and method (family): y, order, method; objects and meshes, their numbers; ratio, the
@@ -67,7 +78,8 @@ def compare_studies(
         lacks.
 
     Raises:
-        InputError: The studies have no mesh in common, or an object has another reference or unit of length.
+        InputError: The studies have no mesh in common, or no such method; or an object has another reference or unit of
+            length.
         StoreError: A location has no store.
 
     >>> import sobolev_batch as sb
@@ -84,9 +96,15 @@ def compare_studies(
         raise InputError(
             f"the studies have no object in common: the new one has {quoted([*news])}, the old one {quoted([*olds])}"
         )
-    columns = as_names(y)
     lost = [f"{name} (all of it)" for name in olds if name not in news]
-    frames = [frame for name in common for frame in _joined(name, news[name], olds[name], order, columns, lost)]
+    trees = {name: (as_tree(news[name]), as_tree(olds[name])) for name in common}
+    tables = {name: [table(tree, order) for tree in pair] for name, pair in trees.items()}
+    chosen = chosen_methods(chain(*tables.values()), methods)
+    frames = []
+    for name, pair in tables.items():
+        _require_same_reference(name, *trees[name])
+        new_rows, old_rows = (frame[frame["family"].isin(chosen)] for frame in pair)
+        frames += [_joined(name, new_rows, old_rows, column, lost) for column in as_names(y)]
     joined = pd.concat(frames, ignore_index=True)
     if joined.empty:
         raise InputError("the studies have no mesh in common that both have computed at the same order")
@@ -101,27 +119,25 @@ def compare_studies(
     return result
 
 
-def _joined(
-    name: str, new: AnyStore, old: AnyStore, order: Orders | None, columns: Sequence[str], lost: list[str]
-) -> Iterator[pd.DataFrame]:
-    """Yield for each column the meshes that two stores of an object have in common, with logarithms of ratios.
-
-    Labels of the others that the old one has are added to those that are lost.
-    """
-    trees = as_tree(new), as_tree(old)
-    if trees[0].attrs["similarity"] != trees[1].attrs["similarity"] or len({_identity(tree) for tree in trees}) > 1:
+def _require_same_reference(name: str, new: xr.DataTree, old: xr.DataTree) -> None:
+    if new.attrs["similarity"] != old.attrs["similarity"] or _identity(new) != _identity(old):
         raise InputError(
             f"{name or 'the studies'}: they have different references or units of length, so their distances cannot be "
             "compared; give both the same [reference] and [scaling]"
         )
-    tables = [table(tree, order) for tree in trees]
-    for y in columns:
-        first, second = (_numbers(frame[frame["order"].isin(orders_of([frame], y))], y) for frame in tables)
-        both = first.merge(second, on=_KEYS, suffixes=("", "_old"))
-        gone = second["mesh"][~second["mesh"].isin(first["mesh"])].unique()
-        lost += [f"{name}/{mesh}".lstrip("/") for mesh in gone]
-        ratios, errors = np.log(both["value"] / both["value_old"]), both["log_error"] + both["log_error_old"]
-        yield both.assign(y=y, object=name, log_ratio=ratios, log_error=errors)
+
+
+def _joined(name: str, new: pd.DataFrame, old: pd.DataFrame, y: str, lost: list[str]) -> pd.DataFrame:
+    """Return the meshes that two tables of an object have in common, with logarithms of ratios of a column.
+
+    Labels of the others that the old one has are added to those that are lost.
+    """
+    first, second = (_numbers(frame[frame["order"].isin(orders_of([frame], y))], y) for frame in (new, old))
+    both = first.merge(second, on=_KEYS, suffixes=("", "_old"))
+    gone = second["mesh"][~second["mesh"].isin(first["mesh"])].unique()
+    lost += [f"{name}/{mesh}".lstrip("/") for mesh in gone]
+    ratios, errors = np.log(both["value"] / both["value_old"]), both["log_error"] + both["log_error_old"]
+    return both.assign(y=y, object=name, log_ratio=ratios, log_error=errors)
 
 
 def _identity(tree: xr.DataTree) -> str:

@@ -298,7 +298,7 @@ def league(
         )
     tables = tables_of(stores, order)
     if by == "cost":
-        return cost_leagues_of(tables, objects, x or DEFAULT_COST, _chosen(tables, methods))
+        return cost_leagues_of(tables, objects, x or DEFAULT_COST, chosen_methods(tables.values(), methods))
     return leagues_of(tables, objects, x=x or "triangles", y=y, methods=methods)
 
 
@@ -321,7 +321,7 @@ def leagues_of(
     """Rank methods by the rows of `table` of each object that has some, among all objects; see `league`."""
     if x == y:
         raise InputError(f"all methods have the same {y} at equal {x}; choose another x, such as target_tolerance")
-    chosen = _chosen(tables, methods)
+    chosen = chosen_methods(tables.values(), methods)
     unfinished = dict.fromkeys((name for name in objects if name not in tables), "it has no tables yet")
     return tuple(_league(tables, s, x, y, chosen, unfinished) for s in orders_of(tables.values(), y))
 
@@ -333,9 +333,9 @@ def orders_of(frames: Iterable[pd.DataFrame], y: str) -> list[float]:
     return orders[:1] if y != RELATIVE and is_same else orders
 
 
-def _chosen(tables: Mapping[str, pd.DataFrame], methods: Sequence[str] | None) -> list[str]:
-    """Return the methods to compare, default all; InputError where one is unknown."""
-    families = list(dict.fromkeys(family for frame in tables.values() for family in frame["family"]))
+def chosen_methods(frames: Iterable[pd.DataFrame], methods: str | Sequence[str] | None) -> list[str]:
+    """Return the methods to compare, default all of some tables; InputError where one is unknown."""
+    families = list(dict.fromkeys(family for frame in frames for family in frame["family"]))
     chosen = families if methods is None else as_names(methods)
     for method in chosen:
         if method not in families:
