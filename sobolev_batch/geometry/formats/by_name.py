@@ -77,6 +77,7 @@ _TRIMESH = "import trimesh; trimesh.load('scan.dae').to_mesh().export('scan.ply'
 _PYVISTA = "import pyvista; pyvista.read('scan{0}').%sextract_surface().triangulate().save('scan.vtp')"
 _GMSH = "pip install gmsh; gmsh scan{0} -2 -o scan.stl"
 _RESAVED = "pip install gmsh; gmsh scan{0} -save -format msh41 -o surface.msh"
+_ASSIMP = "assimp export scan{0} scan.ply"
 _MESHIO = "pip install meshio h5py; meshio convert scan{0} scan.vtu"
 CONVERTED = {
     suffix: (name, command.format(suffix))
@@ -86,7 +87,8 @@ CONVERTED = {
         *(("OpenCTM", ".ctm", _MESHLAB), ("STEP", ".step .stp", _GMSH), ("IGES", ".iges .igs", _GMSH)),
         *(("BREP", ".brep", _GMSH), ("Abaqus", ".inp", _MESHIO), ("Nastran", ".bdf .nas", _MESHIO)),
         *(("XDMF", ".xdmf", _MESHIO), ("Medit in binary", ".meshb", _MESHIO), ("I-deas", ".unv", _RESAVED)),
-        *(("MED", ".med", _RESAVED), ("CGNS", ".cgns", _RESAVED), ("FBX", ".fbx", "assimp export scan.fbx scan.ply")),
+        *(("MED", ".med", _RESAVED), ("CGNS", ".cgns", _RESAVED), ("FBX", ".fbx", _ASSIMP)),
+        *(("LightWave", ".lwo", _ASSIMP), ("Draco", ".drc", "draco_decoder -i scan{0} -o scan.ply")),
         ("VTK collection", ".vtm .pvd", _PYTHON.format("pyvista", _PYVISTA % "combine().")),
         ("VTK data set", ".pvtu .pvtp .vti .vts .vtr .vtkhdf", _PYTHON.format("pyvista", _PYVISTA % "")),
         ("tar", ".tar .tgz", "tar -xf scan{0}"),

@@ -38,6 +38,7 @@ _MISTAKEN = {
     rb"\xff\xfe|\xfe\xff|([\t-~]\0|\0[\t-~]){4}": "a text in UTF-16; save it in UTF-8",
     rb"\x1f\x8b": "compressed by gzip; unpack it, or let its name end in .gz",
     rb"(?s:.{257})ustar": "an archive; unpack it by tar -xf",
+    rb"#!ascii": "FreeSurfer's text; convert it: mris_convert lh.asc lh.gii",
     rb"BZh\d1AY|\xfd7zXZ|\x28\xb5\x2f\xfd": "packed; unpack it",
 }
 # How files of some formats begin.

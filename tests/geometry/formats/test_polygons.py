@@ -57,6 +57,14 @@ def test_flat_polygons_have_their_area_from_every_corner_on_and_seen_from_both_s
             assert area_of(placed(turned, offset), corners) == pytest.approx(area, rel=1e-9 * (1 + offset), abs=1e-9)
 
 
+def test_a_long_outline_may_have_bridges_from_one_corner_to_all_of_its_holes() -> None:
+    # Each hole is a triangle of area 1/20.
+    hole = np.array([(9, 0), (10, 0.05), (10, -0.05), (9, 0), (0, 0)])
+    turns = [np.array([(np.cos(a), np.sin(a)), (-np.sin(a), np.cos(a))]) for a in np.linspace(1.56, 0.01, 80)]
+    outline = np.concatenate([[(0, 0)], *(hole @ turn for turn in turns), [(20, 0), (20, 20), (0, 20)]])
+    assert area_of(placed(outline), np.arange(len(outline))) == pytest.approx(396)
+
+
 @pytest.mark.parametrize("name", [name for name, (_, area) in FLAT.items() if area])
 def test_triangles_face_the_side_of_their_polygon(name: str) -> None:
     outline, _ = FLAT[name]

@@ -279,7 +279,7 @@ def test_empty_and_missing_files_and_folders_are_told_apart(tmp_path: Path, endi
 
 @pytest.mark.parametrize(
     "name",
-    ["scan.pts", "scan", "scan.gz", "ply", ".ply", "scan.ply.gz.gz", "scan.lwo", "scan.xyz.gz", "lh.aparc.annot"],
+    ["scan.pts", "scan", "scan.gz", "ply", ".ply", "scan.ply.gz.gz", "scan.blend", "scan.xyz.gz", "lh.aparc.annot"],
 )
 def test_names_without_a_known_format_are_refused_with_the_page_that_converts(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(PLY_BOX)
