@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.formats.by_name import Format
-from sobolev_batch.geometry.formats.parsing import Raw, beside_volume, reals, whole
+from sobolev_batch.geometry.formats.parsing import SURFACE, Raw, beside_volume, reals, whole
 from sobolev_batch.geometry.formats.polygons import cut_polygons
 
 # Medit's cells with volume, and words of sections that have no part in a surface.
@@ -56,7 +56,7 @@ def parse_medit(data: bytes) -> Raw:
         for name, width in (("Vertices", 4), ("Triangles", 4), ("Quadrilaterals", 5))
     )
     volumes = sum(int(_numbers(sections[name], name)[0]) for name in _MEDIT_VOLUMES if name in sections)
-    return _surface(vertices, [corners - 1 for corners in faces], volumes)
+    return _surface(vertices, [corners - 1 for corners in faces], volumes, ".mesh")
 
 
 def parse_gmsh(data: bytes) -> Raw:
@@ -82,7 +82,7 @@ def parse_gmsh(data: bytes) -> Raw:
     for corners, place in zip(faces, places, strict=True):
         if (place == len(known)).any() or (known[place] != corners).any():
             raise MeshError("it has a face with a node that is not there")
-    return _surface(numbered[:, 1:], [order_of_nodes[place] for place in places], volumes)
+    return _surface(numbered[:, 1:], [order_of_nodes[place] for place in places], volumes, ".msh")
 
 
 class _Numbers:
@@ -202,12 +202,13 @@ def _numbers(section: bytes, name: str) -> array[float]:
     return reals(section.decode("ascii", "replace").split(), f"its section {name}")
 
 
-def _surface(vertices: Reals, faces: Sequence[NDArray[Any]], volumes: int) -> Raw:
+def _surface(vertices: Reals, faces: Sequence[NDArray[Any]], volumes: int, suffix: str) -> Raw:
     """Return the surface of faces (m, k) of each number of corners, beside so many cells with volume."""
     corners = np.concatenate([np.zeros(0), *(some.ravel() for some in faces)])
     sizes = np.repeat([some.shape[1] for some in faces], [len(some) for some in faces])
     if not len(sizes) and volumes:
-        raise MeshError(f"it has {volumes:,} cells with volume and no faces; save its surface beside them")
+        command = f"pip install pyvista meshio; {SURFACE.format(suffix)}"
+        raise MeshError(f"it has {volumes:,} cells with volume and no faces; take its surface: {command}")
     if (corners != np.floor(corners)).any():
         raise MeshError("it has indices that are not integers")
     raw = cut_polygons(vertices, corners.astype(np.int64), sizes)

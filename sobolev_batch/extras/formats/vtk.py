@@ -19,6 +19,7 @@ from sobolev_batch.errors import MeshError
 from sobolev_batch.geometry.formats.by_name import Format
 from sobolev_batch.geometry.formats.parsing import (
     BYTE_ORDERS,
+    SURFACE,
     Raw,
     beside_volume,
     triangle_strips,
@@ -33,7 +34,6 @@ from sobolev_batch.geometry.formats.polygons import cut_polygons
 # faces around a volume.
 _WITHOUT_AREA, _VTK_TRIANGLE, _STRIP, _POLYGON, _PIXEL, _QUAD = (0, 1, 2, 3, 4, 21), 5, 6, 7, 8, 9
 _OF_TWO, _WITH_VOLUME = (0, 1, 3), (*range(10, 17), 41, 42)
-_SURFACE = "python -c \"import pyvista; pyvista.read('scan{}').extract_surface().triangulate().save('scan.vtp')\""
 _PACKED_ANEW = "python -c \"import pyvista; pyvista.read('scan.vtp').save('new.vtp')\""
 _KINDS, _FACES = ("polydata", "unstructuredgrid", "unstructured_grid"), ("polys", "strips", "cells")
 # The codes that NumPy has for the types of numbers in XML and in legacy files, and what these call cells.
@@ -67,7 +67,7 @@ def parse_vtk(data: bytes, suffix: str) -> Raw:
     """Return the vertices and triangles of a VTK file, legacy (.vtk) or XML (.vtp, .vtu)."""
     kind, pieces = _of_legacy(data) if suffix == ".vtk" else _of_xml(data)
     if kind.lower() not in _KINDS:
-        raise MeshError(f"the file holds {kind[:40]}, no polygons; take its surface: {_SURFACE.format(suffix)}")
+        raise MeshError(f"the file holds {kind[:40]}, no polygons; take its surface: {SURFACE.format(suffix)}")
     if any(piece.get("ghosts", _NONE).any() for piece in pieces):
         raise MeshError(
             "the file has ghost cells, which belong to other parts of a surface; remove them: in PyVista by "
@@ -322,7 +322,7 @@ def _faces(kinds: Indices, corners: Indices, sizes: Indices, suffix: str) -> tup
     if wrong.size:
         raise MeshError(
             f"cell {wrong[0] + 1} is of VTK's type {kinds[wrong[0]]} with {sizes[wrong[0]]} corners, no flat polygon; "
-            f"take the surface: {_SURFACE.format(suffix)}"
+            f"take the surface: {SURFACE.format(suffix)}"
         )
     # The corners of a pixel lie row by row, and not around it.
     last = (np.cumsum(sizes) - sizes)[is_pixel, None] + [2, 3]

@@ -60,6 +60,8 @@ _INTEGERS = re.compile("[-+0-9]*")
 # Fortran writes the exponents of doubles with a D, and Windows what is no number as -nan(ind) or 1.#QNAN.
 _FORTRAN = re.compile(r"(?<=[0-9.])[dD](?=[+-]?[0-9])")
 _NO_NUMBER = re.compile(r"[+-]?(nan\(\w*\)|1\.#\w+)", re.ASCII | re.IGNORECASE)
+# The command that takes the surface of cells with volume.
+SURFACE = "python -c \"import pyvista; pyvista.read('scan{}').extract_surface().triangulate().save('scan.vtp')\""
 # The index that ends a strip of triangles within a list.
 _BREAK = -1
 
