@@ -3,14 +3,12 @@
 Whoever drives the run computes nothing itself: it hands out tasks, and keeps what they have found.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from numbers import Real
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -67,7 +65,7 @@ class Ended:
     tables: bytes | None = None
 
     @classmethod
-    def of(cls, workspace: Workspace, computed: set[int], tables: Tables | None = None) -> Ended:
+    def of(cls, workspace: Workspace, computed: set[int], tables: Tables | None = None) -> Self:
         """Return how a run ended that has computed some rows, by what its workspace holds now, and new tables."""
         labels, complete = workspace.labels, workspace.complete
         one = workspace.plan.study.object

@@ -1,10 +1,9 @@
 """Spheres, ellipsoids and tori in closed form, and triangulations inscribed in them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from scipy.special import elliprg
@@ -71,9 +70,9 @@ class Sphere:
         """Centre and radius of the sphere."""
         return self.center, self.radius
 
-    def moved(self, scale: float, origin: Point) -> Sphere:
+    def moved(self, scale: float, origin: Point) -> Self:
         """Return the sphere after x -> scale * (x - origin)."""
-        return Sphere(scale * self.radius, moved_point(self.center, scale, origin))
+        return type(self)(scale * self.radius, moved_point(self.center, scale, origin))
 
 
 @dataclass(frozen=True)
@@ -128,10 +127,10 @@ class Ellipsoid(Smooth):
         along_u = np.stack([a * slopes * cosines, b * slopes * sines, np.full_like(u, c)])
         return along_u, np.stack([-a * radii * sines, b * radii * cosines, np.zeros_like(u)])
 
-    def moved(self, scale: float, origin: Point) -> Ellipsoid:
+    def moved(self, scale: float, origin: Point) -> Self:
         """Return the ellipsoid after x -> scale * (x - origin)."""
         a, b, c = self.axes
-        return Ellipsoid((scale * a, scale * b, scale * c), moved_point(self.center, scale, origin))
+        return type(self)((scale * a, scale * b, scale * c), moved_point(self.center, scale, origin))
 
     @cached_property
     def area(self) -> float:
@@ -211,9 +210,9 @@ class Torus(Smooth):
         slopes = -self.r * np.sin(v)
         return along_u, np.stack([slopes * cosines, slopes * sines, self.r * np.cos(v)])
 
-    def moved(self, scale: float, origin: Point) -> Torus:
+    def moved(self, scale: float, origin: Point) -> Self:
         """Return the torus after x -> scale * (x - origin)."""
-        return Torus(scale * self.R, scale * self.r, moved_point(self.center, scale, origin))
+        return type(self)(scale * self.R, scale * self.r, moved_point(self.center, scale, origin))
 
     @cached_property
     def area(self) -> float:

@@ -23,11 +23,10 @@ doi:10.1145/1531326.1531380; L. Sacht, A. Jacobson, "Cascading upper bounds for 
 distance" (2024). The cut along planes is ours.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
@@ -199,10 +198,10 @@ class _Pieces:
     close: Indices
     is_searched: bool = False
 
-    def batches(self) -> Iterator[_Pieces]:
+    def batches(self) -> Iterator[Self]:
         """Yield them in groups that memory holds."""
         for group in slices(self.corners.shape[2], _BATCH):
-            yield _Pieces(self.corners[..., group], self.close[:, group], self.is_searched)
+            yield replace(self, corners=self.corners[..., group], close=self.close[:, group])
 
 
 def directed_deviation(

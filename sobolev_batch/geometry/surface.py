@@ -1,7 +1,5 @@
 """The protocol of surfaces and their extents, the map to the unit of a study, and doubts about unit and place."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -60,7 +58,7 @@ class Extent:
     highest: tuple[float, ...]
 
     @classmethod
-    def union(cls, extents: Sequence[Extent]) -> Self:
+    def union(cls, extents: Sequence[Self]) -> Self:
         """Return the extent of several surfaces together."""
         lowest = np.min([extent.lowest for extent in extents], axis=0)
         highest = np.max([extent.highest for extent in extents], axis=0)
@@ -138,7 +136,7 @@ class Similarity:
         vars(self).update(scale=float(self.scale), origin=checked_point(self.origin, "a similarity's origin"))
 
     @classmethod
-    def to_unit_ball(cls, surface: Surface) -> Similarity:
+    def to_unit_ball(cls, surface: Surface) -> Self:
         """Return the similarity that takes the bounding sphere of a surface to the unit sphere at the origin.
 
         The bounding sphere lies around the centre of the bounding box and reaches the farthest point.

@@ -5,11 +5,10 @@ follow from the same sums as the number itself; discretisation comes from the fi
 docs/numerics.md says how well these estimates hold.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import Self
 
 import numpy as np
 from scipy.special import exprel, gammaln
@@ -59,7 +58,7 @@ class Sums:
     outer: Reals
 
     @classmethod
-    def zeros(cls, orders: int, *shape: int) -> Sums:
+    def zeros(cls, orders: int, *shape: int) -> Self:
         """Return sums of zero for fields of a shape."""
         return cls(np.zeros((orders, *shape)), np.zeros((orders, 4, *shape)), np.zeros((2, *shape)))
 

@@ -5,11 +5,10 @@ only the digits by which a pair is closer to each other than to the center. Pair
 reported; their differences must be summed directly.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,7 +57,7 @@ class Arrangement:
     by_window: Reals
 
     @classmethod
-    def for_block(cls, weights: SobolevWeights, block: Block) -> Arrangement:
+    def for_block(cls, weights: SobolevWeights, block: Block) -> Self:
         """Return the arrangement of a block of the weights' lattice."""
         lattice = weights.lattice
         shells = lattice.shells(block).ravel()

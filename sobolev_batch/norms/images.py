@@ -8,8 +8,6 @@ keeps the end of the lattice out of it. Images of faces parallel to them count m
 frequencies across an axis fade slowly: see `_ACROSS`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cached_property
 

@@ -6,8 +6,6 @@ exponentials, which a polynomial of a low degree interpolates to all digits (J.-
 doi:10.1137/S0036144502417715).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -75,9 +73,9 @@ class ComparedSpectra:
         """Return several of these as one, field by field."""
         return cls({name: np.concatenate([one.arrays[name] for one in several]) for name in several[0].arrays})
 
-    def __getitem__(self, chosen: Any) -> ComparedSpectra:
+    def __getitem__(self, chosen: Any) -> Self:
         """Return the spectra of some fields."""
-        return ComparedSpectra({name: values[chosen] for name, values in self.arrays.items()})
+        return replace(self, arrays={name: values[chosen] for name, values in self.arrays.items()})
 
     @property
     def norm(self) -> Spectra:

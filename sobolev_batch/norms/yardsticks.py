@@ -1,7 +1,5 @@
 """Yardsticks: changes of a mesh that bring it as far from itself as another one is."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
@@ -125,32 +123,6 @@ def yardsticks(
     return found.assign(labelled(order, columns, {}).data_vars)
 
 
-def _curves(
-    mesh: Mesh, frequencies: Frequencies, values: SurfaceValues, target: ErrorTarget, start: float, seed: int
-) -> dict[Change, _Curve]:
-    """Return the distance of a mesh from itself by the amount of each change; searches begin with a relative one."""
-
-    def apart(changed: Mesh) -> NormEstimate:
-        others = frequencies.values(changed, target, Execution(threads=available_cores()))
-        return frequencies.norms([others, values], [changed, mesh], [1, -1])
-
-    _, radius = mesh.bounding_sphere
-    bounds, count = (_LEAST, _MOST), len(mesh.triangles)
-    return {
-        "moved": _Curve(
-            lambda amount: frequencies.moved(values, mesh, amount * radius), start, bounds, 1.0, is_cheap=True
-        ),
-        "noise": _Curve(lambda amount: apart(with_noise(mesh, amount * radius, seed)), start, bounds, 1.0),
-        "decimated": _Curve(
-            lambda amount: apart(decimated(mesh, round(amount))),
-            max(count // 4, _FEWEST_TRIANGLES),
-            (_FEWEST_TRIANGLES, count - 1),
-            -1.0,
-            unit=1.0,
-        ),
-    }
-
-
 @dataclass(frozen=True, eq=False)
 class _Curve:
     """Distances (orders,) to the reference by the amount of a change, each computed once.
@@ -233,6 +205,32 @@ class _Curve:
             if power / self.slope > _LEAST_POWER:
                 return power
         return self.slope
+
+
+def _curves(
+    mesh: Mesh, frequencies: Frequencies, values: SurfaceValues, target: ErrorTarget, start: float, seed: int
+) -> dict[Change, _Curve]:
+    """Return the distance of a mesh from itself by the amount of each change; searches begin with a relative one."""
+
+    def apart(changed: Mesh) -> NormEstimate:
+        others = frequencies.values(changed, target, Execution(threads=available_cores()))
+        return frequencies.norms([others, values], [changed, mesh], [1, -1])
+
+    _, radius = mesh.bounding_sphere
+    bounds, count = (_LEAST, _MOST), len(mesh.triangles)
+    return {
+        "moved": _Curve(
+            lambda amount: frequencies.moved(values, mesh, amount * radius), start, bounds, 1.0, is_cheap=True
+        ),
+        "noise": _Curve(lambda amount: apart(with_noise(mesh, amount * radius, seed)), start, bounds, 1.0),
+        "decimated": _Curve(
+            lambda amount: apart(decimated(mesh, round(amount))),
+            max(count // 4, _FEWEST_TRIANGLES),
+            (_FEWEST_TRIANGLES, count - 1),
+            -1.0,
+            unit=1.0,
+        ),
+    }
 
 
 def _error_of_both(first: NormEstimate, second: NormEstimate) -> Reals:

@@ -1,7 +1,5 @@
 """What a store has of a study, and what is missing; and the workspace of a run, which fills it."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -40,11 +38,11 @@ class Contents:
     records: list[Record | None]
 
     @classmethod
-    def of_store(cls, store: Store) -> Contents:
+    def of_store(cls, store: Store) -> Self:
         """Return the contents of a store without a plan of its study."""
         labels, removed = store.labels(), store.removed
         rows = dict.fromkeys(i for i, label in enumerate(labels) if label not in removed)
-        return Contents(store, labels, rows, list(Records(store).read()))
+        return cls(store, labels, rows, list(Records(store).read()))
 
     @property
     def complete(self) -> dict[int, Record]:

@@ -1,7 +1,5 @@
 """The choice of a lattice and a dtype for a study's fields, and how it grows where distances miss an accuracy."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Mapping, Sequence
@@ -76,7 +74,7 @@ class LatticeChoice:
             None if octaves is None else TailSampling.from_dict(octaves),
         )
 
-    def grown(self, distances: NormEstimate, orders: Sequence[float], accuracy: Accuracy) -> LatticeChoice | None:
+    def grown(self, distances: NormEstimate, orders: Sequence[float], accuracy: Accuracy) -> Self | None:
         """Return a choice of more frequencies for distances (orders, meshes) that miss an accuracy; NaN do not count.
 
         That is a larger or finer lattice; with octaves, more samples, one more octave or a finer lattice. Return None

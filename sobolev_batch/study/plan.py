@@ -1,12 +1,10 @@
 """A plan: the surfaces of a study as rows of the store, with a digest of all that each field depends on."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -112,7 +110,7 @@ class Plan:
         sample, closest = (None, self.choice.closest) if row.label == self.reference else (self.sample, ())
         return DistanceTarget(self.study.orders, self.study.accuracy, sample, closest)
 
-    def with_choice(self, choice: LatticeChoice, also: Collection[str] = ()) -> Plan:
+    def with_choice(self, choice: LatticeChoice, also: Collection[str] = ()) -> Self:
         """Return the plan of the same study on another lattice, where a run computes some more labels."""
         rows = (
             replace(

@@ -1,9 +1,7 @@
 """The triangles of a mesh in arrays of a backend."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -43,18 +41,18 @@ class FaceArrays:
     def __len__(self) -> int:
         return len(self.areas)
 
-    def part(self, which: slice | Indices) -> FaceArrays:
+    def part(self, which: slice | Indices) -> Self:
         """Return some of the triangles, with all vertices, in contiguous rows."""
         if not isinstance(which, slice):
             which = self.backend.upload(which)
         corners = np.ascontiguousarray(self.corners[:, which], like=self.corners)
-        return FaceArrays(self.columns, corners, self.areas[which], self.radii[which], self.backend)
+        return replace(self, corners=corners, areas=self.areas[which], radii=self.radii[which])
 
     def at(self, corner: int) -> Array:
         """Return the coordinates (3, m) of one corner of each triangle."""
         return np.take(self.columns, self.corners[corner], axis=1)
 
-    def batches(self, size: int) -> Iterator[FaceArrays]:
+    def batches(self, size: int) -> Iterator[Self]:
         """Return the triangles in batches: of a size on the processor, where temporaries stay in its cache."""
         step = size if self.backend is CPU else _HELD
         return map(self.part, slices(len(self), step))

@@ -3,15 +3,13 @@
 The prediction of errors is good enough to choose settings by; the probe measures the error afterwards.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import get_args
+from typing import Self, get_args
 
 import numpy as np
 
@@ -141,9 +139,9 @@ class ErrorTarget:
     orders: tuple[float, ...]
     norms: tuple[float, ...]
 
-    def tightened(self, factor: float) -> ErrorTarget:
+    def tightened(self, factor: float) -> Self:
         """Return a target that is smaller by a factor."""
-        return ErrorTarget(self.orders, tuple(norm / factor for norm in self.norms))
+        return replace(self, norms=tuple(norm / factor for norm in self.norms))
 
 
 def cheapest_dtype(surfaces: Sequence[Surface], lattice: FrequencyLattice, target: ErrorTarget) -> ComplexDtype:

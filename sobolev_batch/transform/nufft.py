@@ -1,10 +1,8 @@
 """The primitive of all fields: weighted points transformed onto a block of the lattice; and its adjoint."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -27,16 +25,16 @@ class WeightedPoints:
     coordinates: Array
     weights: Array
 
-    def part(self, part: slice) -> WeightedPoints:
+    def part(self, part: slice) -> Self:
         """Return some of the points, which share their memory with these."""
-        return WeightedPoints(self.coordinates[:, part], self.weights[part])
+        return type(self)(self.coordinates[:, part], self.weights[part])
 
-    @staticmethod
-    def concatenated(batches: Sequence[WeightedPoints]) -> WeightedPoints:
+    @classmethod
+    def concatenated(cls, batches: Sequence[Self]) -> Self:
         """Return the points of several batches as one."""
         if len(batches) == 1:
             return batches[0]
-        return WeightedPoints(
+        return cls(
             np.concatenate([points.coordinates for points in batches], axis=1),
             np.concatenate([points.weights for points in batches]),
         )

@@ -6,11 +6,10 @@ shares neither the quadrature nor the NUFFT with the field. Those of a parametri
 the nodes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -215,9 +214,7 @@ class Sample:
     exact: Complexes
 
     @classmethod
-    def from_surface(
-        cls, surface: Surface, draws: Draws, execution: Execution = ON_CPU, *, fast: bool = False
-    ) -> Sample:
+    def from_surface(cls, surface: Surface, draws: Draws, execution: Execution = ON_CPU, *, fast: bool = False) -> Self:
         """Return the sample of a surface at given draws; a fast one may be off by some 1e-13 of the area."""
         kind = kind_of(surface)
         values = kind.sampled_values if fast else kind.exact_values

@@ -1,9 +1,8 @@
 """Triangle meshes as weighted points: the rule of each triangle, and its points."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,17 +47,17 @@ class RuleUse:
         """Number of points of a closed mesh, after shared ones are merged."""
         return len(self.members) * (self.rule.node_count << 2 * self.splits if self.splits else self.rule.cost)
 
-    def split(self, most: int) -> Iterator[RuleUse]:
+    def split(self, most: int) -> Iterator[Self]:
         """Yield parts whose expected points are at most a number, or of one triangle without splits."""
         points_each = self.expected_points / len(self.members)
         if points_each > most and self.splits:
             for quarter in range(4):
-                yield from RuleUse(self.rule, self.splits - 1, self.members, (*self.path, quarter)).split(most)
+                yield from replace(self, splits=self.splits - 1, path=(*self.path, quarter)).split(most)
             return
         count = int(most / points_each)
         step = max(1, count if self.rule.shares else min(_TRIANGLES, count))
         for part in slices(len(self.members), step):
-            yield RuleUse(self.rule, self.splits, self.members[part], self.path)
+            yield replace(self, members=self.members[part])
 
     def points(self, mesh: FaceArrays) -> WeightedPoints:
         """Return the points, on the backend of the faces of the whole mesh."""

@@ -3,14 +3,12 @@
 Each step is reported to those who watch.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, count
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Generic, Literal, Self, TypeVar
 from uuid import uuid4
 
 from distributed import CancelledError, Client, Future, as_completed
@@ -93,7 +91,7 @@ class Task:
     row: int = -1
     label: str = ""
     stage: str = ""
-    divided: tuple[Task, ...] = ()
+    divided: tuple[Self, ...] = ()
 
 
 def task_key(stage: str, study: str, part: str, label: str) -> tuple[str, str, str]:

@@ -5,8 +5,6 @@ hangs, keeps its connections open and says nothing. Dask gives up such a worker 
 ``distributed.scheduler.worker-ttl``. For such a scheduler, a run would wait for ever.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import threading
@@ -70,9 +68,9 @@ class Silence:
     since: str = field(default_factory=lambda: f"{datetime.now(UTC):%H:%M:%S} UTC")
     seconds: float = 0.0
 
-    def after(self, elapsed: float, heard: object = None) -> Silence:
+    def after(self, elapsed: float, heard: object = None) -> Self:
         """Return the silence after some more seconds; it begins anew if the process was heard of meanwhile."""
-        return replace(self, seconds=self.seconds + elapsed) if heard == self.heard else Silence(heard)
+        return replace(self, seconds=self.seconds + elapsed) if heard == self.heard else type(self)(heard)
 
 
 class Watch:

@@ -5,8 +5,6 @@ octaves farther out: a difference outside both errors counts as an error, unless
 the accuracy is met, octaves get more samples, or more points are drawn, or an octave is added, whichever is cheapest.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
@@ -246,14 +244,14 @@ class State:
         """Predict the time of the samples of an octave, without those that are known."""
         return sum(size.sampling_seconds(sampling, known) for size in self.sizes)
 
-    def redrawn(self, number: int, points: int | None = None) -> State:
+    def redrawn(self, number: int, points: int | None = None) -> Self:
         """Return the state after a step that estimates one remainder from new points."""
         problem, known = self.problem, list(self.remainders)
         cutoff, seconds, seed = known[number].cutoff, known[number].seconds(points or 0), self.seed + self.steps + 1
         known[number] = problem.beyond(cutoff, seed, points)
         return self.advanced(seconds, remainders=tuple(known))
 
-    def advanced(self, seconds: float, **changes: object) -> State:
+    def advanced(self, seconds: float, **changes: object) -> Self:
         """Return the state after a step of some predicted time."""
         octaves = f"{len(self.octaves)} octave{'s' * (len(self.octaves) != 1)}"
         self.problem.notify(f"{self.problem.label}: {octaves}, step {self.steps}")

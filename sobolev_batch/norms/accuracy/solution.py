@@ -1,7 +1,5 @@
 """Norms and distances that were computed to an accuracy, with the fields and settings that they come from."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
@@ -51,7 +49,7 @@ class Solution:
     values: tuple[SurfaceValues, ...] = ()
     shortfall: AccuracyError | None = None
     has_tail: bool = False
-    alone: tuple[Solution, ...] = ()
+    alone: tuple[Self, ...] = ()
 
     @classmethod
     def zero(cls, orders: Sequence[float], moved: Reals | float = 0.0) -> Self:
@@ -60,7 +58,7 @@ class Solution:
         return cls(NormEstimate(zeros, zeros, zeros, zeros + moved))
 
     @classmethod
-    def of_apart(cls, apart: Reals, alone: Sequence[Solution]) -> Self:
+    def of_apart(cls, apart: Reals, alone: Sequence[Self]) -> Self:
         """Return the distance of surfaces far apart from their norms: its square is the sum of both squares.
 
         The product of both surfaces does not exceed `apart` (orders,); what it may change is an error by images.

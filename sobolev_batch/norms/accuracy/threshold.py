@@ -1,7 +1,5 @@
 """Distances beside a threshold, computed as exactly as it takes to tell on which side of it they lie."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -73,13 +71,13 @@ class Interval:
         value, error = float(found.values[0]), caution * float(found.errors[0])
         return cls.around(value, error, error)
 
-    def times(self, factor: float) -> Interval:
+    def times(self, factor: float) -> Self:
         """Return the bounds on a multiple."""
-        return Interval(factor * self.lower, factor * self.upper)
+        return type(self)(factor * self.lower, factor * self.upper)
 
-    def over(self, divisor: Interval) -> Interval:
+    def over(self, divisor: Self) -> Self:
         """Return the bounds on a quotient."""
-        return Interval(self.lower / divisor.upper, self.upper / divisor.lower)
+        return type(self)(self.lower / divisor.upper, self.upper / divisor.lower)
 
 
 def relative_distance(

@@ -11,8 +11,6 @@ foot. With q sinh t for the distance along the edge, dθ is dt/cosh t. K and M f
 they are cut; twice the reach and twice the nodes tell what that changes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace

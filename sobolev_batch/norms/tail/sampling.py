@@ -7,12 +7,10 @@ the integral of f as its expectation, and no sample weighs more than the method 
 let it.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -229,7 +227,7 @@ class TailSampling:
             octaves.append(OctaveSampling(most.octave, lattices, most.draws, most.seed, normals, most.uniform_fraction))
         return cls(cutoff, tuple(octaves))
 
-    def refined(self, factor: float, more_octaves: int, largest: int, seed: int) -> TailSampling:
+    def refined(self, factor: float, more_octaves: int, largest: int, seed: int) -> Self:
         """Return a sampling with about ``factor`` times the samples, and further octaves; no M is above ``largest``."""
         rng, samplings = np.random.default_rng(seed), []
         for one in self.octaves:
@@ -240,7 +238,7 @@ class TailSampling:
         for index in range(len(samplings) + 1, len(samplings) + 1 + more_octaves):
             octave, last = Octave(self.cutoff, index), samplings[-1]
             samplings.append(OctaveSampling.random(octave, sizes, last.draws, normals, last.uniform_fraction, rng))
-        return TailSampling(self.cutoff, tuple(samplings))
+        return replace(self, octaves=tuple(samplings))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the sampling as a dictionary for JSON, from which `from_dict` makes it again."""
