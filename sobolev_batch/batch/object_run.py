@@ -213,8 +213,7 @@ def _compute(cluster: Cluster, workspace: Workspace) -> Stages[Ended]:
         computed.update(rows, repaired)
         if not rounds_left or tabulated is None or study.accuracy is None:
             break
-        choice = workspace.plan.choice.grown(tabulated.distances, study.orders, study.accuracy)
-        if choice is None:
+        if (choice := workspace.plan.choice.grown(tabulated.distances, study.orders, study.accuracy)) is None:
             break
         # Fields that a run of a part leaves out would be lost.
         stored = {workspace.labels[i] for i in workspace.complete}

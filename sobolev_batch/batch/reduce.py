@@ -85,8 +85,7 @@ class Reduction:
 
     def __str__(self) -> str:
         """Return the result in a line."""
-        best = self.bracket.best
-        if best is None:
+        if (best := self.bracket.best) is None:
             return f"{self.name}: {self.reason}"
         return f"{self.name}: {best.triangles:,} of {self.original_triangles:,} triangles, {len(self.trials)} trials"
 
@@ -284,8 +283,7 @@ def _is_small(search: RecordedSearch) -> bool:
 
 def _searched(search: RecordedSearch, cluster: Callable[[], Any], at_once: Callable[[], int]) -> Stages[Reduction]:
     """Search for the fewest triangles of a mesh, on a cluster or, where that is None, in this process."""
-    known = search.recorded()
-    if known is None:
+    if (known := search.recorded()) is None:
         search.make_room()
         read = Task(search.begun, (), search.projected_bytes(0), label=search.name, stage="read")
         known = yield from result_from(cluster(), read)

@@ -430,8 +430,7 @@ def _checked_vertices(vertices: ArrayLike) -> Reals:
         raise MeshError(f"vertices must have shape (n, 3), found {array.shape}")
     with np.errstate(over="ignore"):
         converted = _owned(array, np.float64)
-    bad = np.flatnonzero(~np.isfinite(converted).all(axis=1))
-    if bad.size:
+    if (bad := np.flatnonzero(~np.isfinite(converted).all(axis=1))).size:
         raise MeshError(f"{bad.size} of {len(array)} vertices have NaN or infinite coordinates: {_listed(bad, array)}")
     return _frozen(converted)
 

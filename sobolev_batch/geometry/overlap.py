@@ -328,8 +328,7 @@ def without_common_parts(surfaces: Sequence[Surface]) -> Mapping[int, Surface]:
 
 def without_shared_triangles(surfaces: Sequence[Surface]) -> Mapping[int, Surface]:
     """Return one surface, or two without the triangles that both have, by their signs in the difference."""
-    meshes = two_meshes(surfaces)
-    if not meshes:
+    if not (meshes := two_meshes(surfaces)):
         return dict(zip((1, -1), surfaces, strict=False))
     shared = shared_triangles(*(mesh.vertices[mesh.triangles] for mesh in meshes))
     if shared[0].any():

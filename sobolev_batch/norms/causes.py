@@ -254,7 +254,6 @@ def _coordinates(points: ArrayLike) -> Reals:
         raise InputError(f"points must be real numbers (n, 3): {error}") from error
     if array.ndim != 2 or array.shape[1] != 3:
         raise InputError(f"points must have the shape (n, 3), found {array.shape}")
-    bad = int(np.count_nonzero(~np.isfinite(array).all(axis=1)))
-    if bad:
+    if bad := int(np.count_nonzero(~np.isfinite(array).all(axis=1))):
         raise InputError(f"{bad} of {len(array)} points have NaN or infinite coordinates")
     return np.ascontiguousarray(array.T)

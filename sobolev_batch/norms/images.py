@@ -55,8 +55,7 @@ class NearAxes:
     def take(self, fields: slice, block: Block, values: Complexes) -> None:
         """Take what is needed of a block of some fields, (fields, *block.shape)."""
         for near, held in zip(self._blocks, self._values, strict=True):
-            common = near.intersection(block)
-            if common is not None:
+            if (common := near.intersection(block)) is not None:
                 held[fields, *common.place_in(near)] = values[:, *common.place_in(block)]
 
     def images(self) -> Reals:

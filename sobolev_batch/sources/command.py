@@ -125,8 +125,7 @@ class RemesherSource(NestedSource, KeepingSource):
             texts = list(map(_as_text, values))
             named = [f"{key}={text}" for key, text in zip(lists, texts, strict=True)]
             name = texts[0] if len(texts) == 1 else ",".join(named) or alone
-            problem = label_problem(name)
-            if problem is not None:
+            if (problem := label_problem(name)) is not None:
                 raise StudyError(f"the parameters {quoted(name)} are no label: {problem}")
             yield name, {**self.parameters, **dict(zip(lists, values, strict=True))}
 
@@ -242,8 +241,7 @@ class RemeshedMember(Member):
     def load(self) -> Mesh:
         """Return the mesh that is kept, or make it and keep it; MeshError where that failed, or is not permitted."""
         digest = self.fingerprint_digest()
-        mesh = self.cache.read(digest)
-        if mesh is not None:
+        if (mesh := self.cache.read(digest)) is not None:
             return mesh
         if not self.cache.may_run:
             raise MeshError(

@@ -106,8 +106,7 @@ def _refuse_mesh(*_: object, **__: object) -> NoReturn:
 
 def _own_problems(member: Member, twin: Member, first_of: dict[str, tuple[str, object]]) -> Iterator[str]:
     """Yield what is wrong with a member and its twin; name and identity of the first by fingerprint are kept."""
-    problem = label_problem(member.name)
-    if problem is not None:
+    if (problem := label_problem(member.name)) is not None:
         yield f"has a name that is no label: {problem}"
     digest, pickled = member.fingerprint_digest(), pickle.dumps(member)
     if twin.fingerprint_digest() != digest:

@@ -82,8 +82,7 @@ def read_mesh_list(path: Path) -> tuple[MeshTable, ...]:
         raise StudyError(f"meshes: the list {quoted(path.name)} cannot be read: {str(error).strip()}") from error
     header = cells.iloc[0].fillna("").str.strip()
     frame = cells.iloc[1:].fillna("").set_axis(header, axis=1)
-    repeated = header[header.duplicated()]
-    if len(repeated):
+    if len(repeated := header[header.duplicated()]):
         raise StudyError(f"meshes: the list {quoted(path.name)} has the column {quoted(repeated.iloc[0])} twice")
     if "path" not in frame or frame.empty:
         raise StudyError(
@@ -134,8 +133,7 @@ def _checked_table(table: Mapping[str, Any]) -> MeshTable:
             raise ValueError(f"{quoted(path)} has the time {quoted(time)}; a time is a number")
         checked["time"] = float(time)
     for key, value in known.items():
-        problem = node_problem(key)
-        if problem is not None:
+        if (problem := node_problem(key)) is not None:
             raise ValueError(f"{quoted(key)} cannot name metadata: {problem}")
         if isinstance(value, Real) and is_finite_number(value):
             checked[key] = float(value)
@@ -236,8 +234,7 @@ def _listed_members(meshes: str | tuple[MeshTable, ...], folder: Path) -> tuple[
     unnamed = list(dict.fromkeys(path for path, mesh in zip(paths, meshes, strict=True) if "name" not in mesh))
     stems = dict(zip(unnamed, names_of_files(unnamed), strict=True))
     names = [mesh.get("name") or stems[path] for path, mesh in zip(paths, meshes, strict=True)]
-    repeated = duplicate_names(names)
-    if repeated:
+    if repeated := duplicate_names(names):
         raise StudyError(f"meshes: several are named {quoted(repeated[0][0])}; give each a name of its own")
     return tuple(
         FileMember(
@@ -289,8 +286,7 @@ def matching_files(folder: Path, path: str) -> list[Path]:
         raise StudyError(f"paths: the glob {quoted(path, 300)} is none: {error}") from error
     if not any(part.startswith(".") for part in wild):
         found = [file for file in found if not any(part.startswith(".") for part in file.relative_to(base).parts)]
-    files = [file for file in dict.fromkeys(found) if file.is_file()]
-    if not files:
+    if not (files := [file for file in dict.fromkeys(found) if file.is_file()]):
         raise StudyError(
             f"paths: the glob {quoted(path, 300)} matches no file below {base}; correct it, or put files there"
         )
@@ -305,15 +301,13 @@ def _times(paths: list[Path], given: tuple[float, ...] | Literal["names"]) -> di
         times = dict(zip(sorted(paths, key=lambda path: natural_key(path.as_posix())), given, strict=True))
     else:
         raise StudyError(f"times: {len(given)} times are given for {len(paths)} files; give one for each")
-    repeated = [time for time, count in Counter(times.values()).items() if count > 1]
-    if repeated:
+    if repeated := [time for time, count in Counter(times.values()).items() if count > 1]:
         raise StudyError(f"times: several files have the time {repeated[0]:g}; each state needs a time of its own")
     return dict(sorted(times.items(), key=lambda item: item[1]))
 
 
 def _last_number(path: Path) -> float:
-    numbers = numbers_in(mesh_stem(path))
-    if not numbers:
+    if not (numbers := numbers_in(mesh_stem(path))):
         raise StudyError(f"times: the name of the file {quoted(path.name)} has no number; list the times instead")
     return numbers[-1]
 
@@ -325,11 +319,9 @@ def names_of_files(paths: list[Path]) -> list[str]:
         counts = Counter(map(caseless_key, names))
         names = [name if counts[caseless_key(name)] == 1 else other for name, other in zip(names, longer, strict=True)]
     for path, name in zip(paths, names, strict=True):
-        problem = label_problem(name)
-        if problem is not None:
+        if (problem := label_problem(name)) is not None:
             raise StudyError(f"paths: the name of the file {quoted(path.name)} is no label: {problem}; rename the file")
-    duplicates = duplicate_names(names)
-    if duplicates:
+    if duplicates := duplicate_names(names):
         raise StudyError(
             f"paths: the files {' and '.join(map(quoted, duplicates[0][:3]))} have names that differ only in case or "
             "in the encoding of accents; rename one"

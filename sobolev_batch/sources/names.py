@@ -48,11 +48,9 @@ def name_problem(text: str, longest: int, forbidden: str = "") -> str | None:
         return "it is empty"
     if len(text) > longest:
         return f"it has {len(text)} characters, {longest} are allowed"
-    invisible = next((c for c in text if not c.isprintable()), None)
-    if invisible is not None:
+    if (invisible := next((c for c in text if not c.isprintable()), None)) is not None:
         return f"it holds the invisible character U+{ord(invisible):04X} {unicodedata.name(invisible, '')}".rstrip()
-    barred = next((c for c in text if c in forbidden), None)
-    if barred is not None:
+    if (barred := next((c for c in text if c in forbidden), None)) is not None:
         return f"it holds {barred!r}"
     if text != text.strip():
         return "it begins or ends with a blank"

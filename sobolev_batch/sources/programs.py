@@ -209,8 +209,7 @@ def _tail(*files: IO[bytes]) -> str:
     """Return the end of the first file that says something, on one line."""
     for file in files:
         file.seek(max(0, _size(file) - 4 * _LONGEST_TAIL))
-        text = " ".join(file.read(4 * _LONGEST_TAIL).decode(errors="replace").split())
-        if text:
+        if text := " ".join(file.read(4 * _LONGEST_TAIL).decode(errors="replace").split()):
             return text if len(text) <= _LONGEST_TAIL else f"... {text[-_LONGEST_TAIL:]}"
     return ""
 

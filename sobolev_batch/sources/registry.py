@@ -332,12 +332,10 @@ def checked_times(value: object) -> tuple[float, ...]:
         raise ValueError("must be a list of numbers, such as [0.0, 0.5, 1.0]")
     if len(value) > _MOST_TIMES:
         raise ValueError(f"at most {_MOST_TIMES} entries are allowed, found {len(value)}")
-    wrong = [time for time in value if not is_finite_number(time)]
-    if wrong:
+    if wrong := [time for time in value if not is_finite_number(time)]:
         raise ValueError(f"each time must be a finite number, found {quoted(wrong[0])} among them")
     times = tuple(map(float, value))
-    repeated = sorted(time for time, count in Counter(times).items() if count > 1)
-    if repeated:
+    if repeated := sorted(time for time, count in Counter(times).items() if count > 1):
         raise ValueError(f"each time can be there once, found {repeated[0]:g} again")
     return times
 

@@ -45,11 +45,9 @@ class RunRecord:
     @classmethod
     def read(cls, store: Store) -> Self | None:
         """Return the record in a store, or None before the first run."""
-        document = store.stored_document(RECORDS)
-        if document is None:
+        if (document := store.stored_document(RECORDS)) is None:
             raise store.damage(f"{RECORDS}/{ROOT}", "it is not there")
-        table = document.get("attributes", {}).get(_RUN)
-        if table is None:
+        if (table := document.get("attributes", {}).get(_RUN)) is None:
             return None
         digest = table.pop(DIGEST, "") if isinstance(table, dict) else ""
         name = f"{store.path}: {RECORDS}/{ROOT}, the record of the latest run,"
@@ -87,8 +85,7 @@ def unlock(store: str | Path | Location, *, force: bool = False) -> Lock | None:
     sobolev_batch.errors.ForeignError: memory://new.zarr: it holds no store of a study
     """
     location = root_of(Location.parse(store))
-    lock = Lock.read(location)
-    if lock is None:
+    if (lock := Lock.read(location)) is None:
         if Objects.read(location) is None:
             Store.open(location)
         return None

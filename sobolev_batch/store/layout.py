@@ -134,8 +134,7 @@ class Store:
     def exists(self) -> bool:
         """Return whether a zarr hierarchy exists; DamageError where only its root is gone, which is written first."""
         if "" not in self.documents:
-            root = self.stored_document("")
-            if root is None:
+            if (root := self.stored_document("")) is None:
                 if self.stored_document(RECORDS) is not None:
                     raise self.damage("the store", f"{ROOT}, the metadata at the root, is gone")
                 return False
@@ -144,8 +143,7 @@ class Store:
                 document.pop("consolidated_metadata", None)
                 self.documents.setdefault(name, document)
             of_rows = self.documents.keys() & {LABELS, QUALITY, *_OF_ROWS}
-            counts = {tuple(self.documents[name]["shape"][:1]) for name in of_rows}
-            if len(counts) > 1:
+            if len({tuple(self.documents[name]["shape"][:1]) for name in of_rows}) > 1:
                 raise self.damage(ROOT, "its arrays have different numbers of rows")
             try:
                 self.documents[""] = {**root, "attributes": attributes_of(root)}
@@ -233,8 +231,7 @@ class Store:
     def stored_document(self, name: str) -> Document | None:
         """Return the metadata document of a node that readers may not find yet; None if there is none."""
         key = f"{name}/{ROOT}".lstrip("/")
-        text = self.location.read(key, MOST_BYTES)
-        if text is None:
+        if (text := self.location.read(key, MOST_BYTES)) is None:
             return None
         try:
             document = dict(json.loads(text))
@@ -471,8 +468,7 @@ def table_attributes(store: Store, group: str) -> dict[str, Any] | None:
 
 def hide_tables(store: Store) -> list[str]:
     """Hide the tables, which do not fit together while they are written, and return the names of their nodes."""
-    names = table_names(store)
-    if names:
+    if names := table_names(store):
         store.hide(names)
     return names
 

@@ -72,8 +72,7 @@ class Location:
         """Return the location that a path or URL names; StoreError, without secrets, where it cannot name a store."""
         if isinstance(store, Location):
             return store
-        url = _URL.match(str(store))
-        if url is None:
+        if (url := _URL.match(str(store))) is None:
             return cls(_folder_name(store))
         scheme, separator, rest = url.groups()
         if separator == "::" or "::" in rest:

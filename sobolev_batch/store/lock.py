@@ -85,8 +85,7 @@ class Lock:
     @classmethod
     def read(cls, location: Location) -> Lock | None:
         """Return the lock on a store, or None if it has none."""
-        text = location.read(LOCK_KEY)
-        if text is None:
+        if (text := location.read(LOCK_KEY)) is None:
             return None
         try:
             return _adapter.validate_json(text)

@@ -74,8 +74,7 @@ def mapping_in(text: str) -> dict[str, Any]:
 def problems_of(documents: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Yield the paths of nodes, empty for the root, whose metadata documents are not used, and why."""
     for name, document in documents.items():
-        problem = _problem(name, document)
-        if problem:
+        if problem := _problem(name, document):
             yield name, problem
         # zarr repeats in each group what the root has.
         elif document.get("consolidated_metadata"):
@@ -93,8 +92,7 @@ def _problem(name: str, document: Any) -> str:
     kind = document.get("node_type")
     if document.get("zarr_format") != 3 or kind != ("array" if "/" in name else "group"):
         return f"{node} is {_shown(kind)} of zarr format {_shown(document.get('zarr_format'))}"
-    unknown = set(document) - (_GROUP_KEYS if kind == "group" else _ARRAY_KEYS)
-    if unknown:
+    if unknown := set(document) - (_GROUP_KEYS if kind == "group" else _ARRAY_KEYS):
         return f"{node} has metadata {_shown(min(unknown))}"
     if not isinstance(document.get("attributes", {}), dict):
         return f"the attributes of {node} are no table"

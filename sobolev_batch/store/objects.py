@@ -187,8 +187,7 @@ def stores_below(location: Location) -> dict[str, Location]:
     are those without rows in the tables at the root, where there are any: they are of other settings, or not finished;
     and those whose stores a run has changed that was killed before these tables.
     """
-    objects = Objects.read(location)
-    if objects is None:
+    if (objects := Objects.read(location)) is None:
         return {"": location}
     refused = {name for name, one in objects.recorded().items() if one.reason or not (one.key or one.settings)}
     own = (name for name in objects.tabulated or objects.rows if name not in refused)

@@ -145,8 +145,7 @@ class Workspace(Contents):
                     "of the study, or name another store"
                 )
         workspace = cls.for_plan(prepare_store(location, plan), plan)
-        complete = workspace.complete
-        if complete:
+        if complete := workspace.complete:
             whole = Fields(workspace.store).complete_rows()
             workspace.withdraw((i for i in complete if i not in whole), "it is not there, or not all of it")
         return workspace
@@ -203,8 +202,7 @@ class Workspace(Contents):
         Fields that are outdated, and stay, are as good as missing: no table may mix them with others.
         """
         others = self.outdated
-        replaced = {*others, *(i for i in rows if self.records[i] is not None)}
-        if replaced:
+        if replaced := {*others, *(i for i in rows if self.records[i] is not None)}:
             hide_tables(self.store)
             qualities = ["" if i in replaced else quality for i, quality in enumerate(self.qualities)]
             self.store.write(QUALITY, [0], qualities)

@@ -53,8 +53,7 @@ def comparison_warnings(study: Study) -> Iterator[str]:
         # The run reports what cannot be listed, and such an object is none to compare at.
         with suppress(InputError):
             gaps[name] = _gap_in_sizes(one.members, alone=not name)
-    lacking = {name: gap for name, gap in gaps.items() if gap}
-    if lacking:
+    if lacking := {name: gap for name, gap in gaps.items() if gap}:
         first, gap = next(iter(lacking.items()))
         where = f" for {len(lacking)} of {len(study.objects)} objects, such as {first}" if first else ""
         yield f"{gap}; methods cannot be ranked at equal triangles{where}; add meshes of sizes that all have"

@@ -115,8 +115,7 @@ def choose_pilots(members: Members, similarity: Similarity, reference: Extent, l
                     break
                 if label in look.set_aside or member.expected_size().projected_bytes > _MOST_BYTES:
                     continue
-                surface = look.at(label, member, similarity, reference)
-                if surface is not None:
+                if (surface := look.at(label, member, similarity, reference)) is not None:
                     pilots[label] = surface
                     break
     return pilots
@@ -217,8 +216,7 @@ def _best_for_most(problems: _Problems, dtype: ComplexDtype | None) -> tuple[Lat
         if choice is not None and not shortfalls:
             return choice, short
         short += shortfalls
-        problems = {label: problem for label, problem in problems.items() if label not in shortfalls}
-        if not problems:
+        if not (problems := {label: problem for label, problem in problems.items() if label not in shortfalls}):
             break
     return None, short
 

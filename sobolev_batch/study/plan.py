@@ -170,8 +170,7 @@ def _lattice_choice(
         tail = TailSampling.usual(study.lattice.xi_max, study.octaves, [surface]) if study.octaves else None
         compared_with = fingerprint_of(reference, own) if tail or FaceNormals.from_surfaces([surface]) else ""
         return LatticeChoice(study.lattice, dtype, dtype, tail=tail, compared_with=compared_with), Look()
-    accuracy = study.accuracy
-    if accuracy is None:
+    if (accuracy := study.accuracy) is None:
         raise ValueError("a study has a lattice or an accuracy")
     # What the choice is made from, except families, which may gain meshes.
     basis = digest_of(

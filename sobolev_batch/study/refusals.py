@@ -148,7 +148,6 @@ def _named(key: _Key, values: Mapping[str, Any]) -> str:
     if section == "mesh" and rest:
         place, rest = f"[mesh.{readable_key(str(rest[0]))}]", rest[1:]
     name = ".".join(readable_key(part) for part in rest if isinstance(part, str))
-    numbers = ", ".join(str(part + 1) for part in rest if isinstance(part, int))
-    if numbers:
+    if numbers := ", ".join(str(part + 1) for part in rest if isinstance(part, int)):
         name = f"entry {numbers} of {name}" if name else f"entry {numbers}"
     return ": ".join(filter(None, (place, name)))

@@ -54,8 +54,7 @@ def _line_of_text(longest: int, forbidden: str = "") -> AfterValidator:
     without = f", without {' and '.join(forbidden)}" if forbidden else ""
 
     def check(text: str) -> str:
-        problem = name_problem(text, longest, forbidden)
-        if problem is not None:
+        if (problem := name_problem(text, longest, forbidden)) is not None:
             raise ValueError(
                 f"1 to {longest} visible characters are needed, blanks only between them{without}; {problem}"
             )

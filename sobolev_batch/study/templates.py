@@ -94,8 +94,7 @@ def _objects(
             f"[objects] lists {quoted(unnamed[0])}, and no [[object]] section has this name; list all objects, or give "
             "all of them sections"
         )
-    same = duplicate_names(names)
-    if same:
+    if same := duplicate_names(names):
         raise StudyError(f"object: names must differ by more than case, found {quoted(same[0][:3])}; rename one")
     return objects
 
@@ -112,8 +111,7 @@ def _names_in_reference(values: Mapping[str, Any], folder: Path) -> list[str]:
     names: set[str] = set()
     for template in templates:
         match = re.compile(_pattern(template)).fullmatch
-        found = {matched["object"] for matched in map(match, _matching(template, folder)) if matched}
-        if not found:
+        if not (found := {matched["object"] for matched in map(match, _matching(template, folder)) if matched}):
             raise StudyError(
                 f"no file gives {OBJECT} of {template!r} one name; it stands for a part of a path, without /"
             )

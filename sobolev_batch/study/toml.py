@@ -67,8 +67,7 @@ def _plain(value: Any, key: tuple[object, ...]) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(entry, (*key, number)) for number, entry in enumerate(value)]
     if isinstance(value, pd.DataFrame):
-        repeated = value.columns[value.columns.duplicated()]
-        if len(repeated):
+        if len(repeated := value.columns[value.columns.duplicated()]):
             raise StudyError(f"{_dotted(key)}: a DataFrame has the column {quoted(repeated[0])} twice; rename one")
         known = value.astype(object).where(value.notna(), None)
         return _plain(known.to_dict(orient="records"), key)

@@ -90,8 +90,7 @@ class SobolevAccessor:
 
     def _each(self, one: Callable[..., xr.Dataset], *others: xr.DataArray | None) -> xr.Dataset:
         """Apply a function to each field, and the same others, and join results along the dimension of the stack."""
-        stacked = self._stacked()
-        if stacked is None:
+        if (stacked := self._stacked()) is None:
             return one(self._field, *others)
         results = [one(self._field.isel({stacked: i}), *others) for i in range(self._field.sizes[stacked])]
         joined = xr.concat(results, dim=stacked, coords="minimal", compat="equals", join="exact", data_vars="all")
@@ -99,8 +98,7 @@ class SobolevAccessor:
 
     def _stacked(self) -> str | None:
         """Return the dimension of the stack, or None for a single field."""
-        others = [str(name) for name in self._field.dims if name not in AXES]
-        if len(others) > 1:
+        if len(others := [str(name) for name in self._field.dims if name not in AXES]) > 1:
             raise LatticeError(f"fields may be stacked along one dimension, found {', '.join(others)}")
         if others and not self._field.sizes[others[0]]:
             raise InputError(f"the stack has no fields along {others[0]}")

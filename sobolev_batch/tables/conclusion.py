@@ -137,8 +137,7 @@ def _nearest_rows(rows: pd.DataFrame, at_sizes: Sequence[pd.DataFrame]) -> Itera
 
 
 def _nearest_row(label: str, members: pd.DataFrame) -> TableRow:
-    closest = _nearest(members)
-    if closest is None:
+    if (closest := _nearest(members)) is None:
         is_known = members["distance"].notna().any()
         return _absent(label, "no distance is above its error" if is_known else "no distance is known")
     best, rivals = closest

@@ -190,8 +190,7 @@ def tables_of(
             if order is None or np.isin(order, stored).all():
                 return _divided(_rows(tree, order), x)
     trees = {name: as_tree(place) for name, place in stores_of(store).items()}
-    finished = {name: tree for name, tree in trees.items() if "convergence" in tree.children}
-    if not finished:
+    if not (finished := {name: tree for name, tree in trees.items() if "convergence" in tree.children}):
         raise InputError("there are no tables yet: run the study to its end")
     return {name: _table(tree, order, x) for name, tree in finished.items()}
 

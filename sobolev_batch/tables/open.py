@@ -107,8 +107,7 @@ def open_store(store: str | Path | Location | Sequence[str | Path | Location]) -
             raise DamageError(
                 f"{opened.path}: the store is damaged ({problem}); run the study again", problem
             ) from error
-    numerics = (table_attributes(opened, "convergence") or {}).get(NUMERICS, ())
-    if len(numerics) > 1:
+    if len(numerics := (table_attributes(opened, "convergence") or {}).get(NUMERICS, ())) > 1:
         _log.warning(
             "%s: its fields were computed by numerics of versions %s, as the column numerics of /meshes says; run the "
             "study again, which computes those of others anew", *(location, " and ".join(map(str, numerics))),
@@ -237,8 +236,7 @@ def location_of(store: AnyStore) -> str | Path | Location:
         return store
     if _PARTS in store.encoding:
         raise InputError(f"{source_of(store)}: this is done for one store at a time")
-    source = source_of(store)
-    if source is None:
+    if (source := source_of(store)) is None:
         raise InputError(
             "the DataTree does not say where it was opened; open it with sobolev_batch.open_store, "
             "or give the path or URL of the store"

@@ -147,8 +147,7 @@ def _at_orders(
     """Return a table of an open store at some orders, or all of its own; those that it lacks are computed."""
     own: list[float] = stored["order"].values.tolist()
     chosen = own if order is None else list(check_orders(order))
-    others = tuple(dict.fromkeys(s for s in chosen if s not in own))
-    if not others:
+    if not (others := tuple(dict.fromkeys(s for s in chosen if s not in own))):
         return stored.sel(order=chosen)
     computed, own = compute(others), [s for s in own if s in chosen]
     table = xr.concat(

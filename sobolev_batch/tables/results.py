@@ -128,8 +128,7 @@ def _strings(values: Sequence[str]) -> NDArray[np.generic]:
 
 def _criterion(study: Study, family: str, rows: Sequence[Row], counts: Sequence[int]) -> Criterion:
     """Return what orders a family, of whose complete meshes the numbers of triangles are given."""
-    chosen = next((one.order_by for one in study.object.families if one.name == family), None)
-    if chosen is not None:
+    if (chosen := next((one.order_by for one in study.object.families if one.name == family), None)) is not None:
         return chosen
     if any(row.member.time is not None for row in rows):
         return "time"
@@ -187,8 +186,7 @@ class Results:
         complete = {row for row in reducer.complete if row in places}
         of_reference = None if reducer.reference is None else read_spectra(reducer.store, [reducer.reference]).norm
         for chunk in chunks_of_spectra(reducer.store):
-            rows = [row for row in chunk if row in complete]
-            if rows:
+            if rows := [row for row in chunk if row in complete]:
                 found = reducer.norms_of(rows, read_spectra(reducer.store, rows), of_reference)
                 parts = [*found.reference.area_and_shape(found.distances).values()]
                 of_rows = [places[row] for row in rows]

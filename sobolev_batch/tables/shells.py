@@ -112,8 +112,7 @@ def lower_bounds(reducer: Reducer, row: int, others: Set[int]) -> dict[int, floa
 
     own, weights, bounds = shells([row]), reducer.weights.per_shell[0], dict[int, float]()
     for chunk in chunks_of_spectra(reducer.store):
-        rows = [one for one in chunk if one in others]
-        if rows:
+        if rows := [one for one in chunk if one in others]:
             squares = (shells(rows) - own) ** 2 @ weights
             bounds |= zip(rows, ((1 - _ROUNDING) * np.sqrt(squares)).tolist(), strict=True)
     return bounds

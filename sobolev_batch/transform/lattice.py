@@ -365,8 +365,7 @@ def check_orders(order: Orders) -> tuple[float, ...]:
         given = np.empty((0, 0))
     if given.dtype.kind not in "iuf" or given.ndim > 1:
         raise OrderError(f"an order is a number, such as -2.0, or a list of numbers; found {order!r}")
-    orders = tuple(dict.fromkeys(given.astype(float).tolist()))
-    if not orders:
+    if not (orders := tuple(dict.fromkeys(given.astype(float).tolist()))):
         raise OrderError("at least one order is needed")
     for s in orders:
         if not (np.isfinite(s) and s < -0.5):
@@ -378,8 +377,7 @@ def check_orders(order: Orders) -> tuple[float, ...]:
 
 def single_order(order: float) -> float:
     """Return one order as a float, as `check_orders` does; several are an InputError."""
-    orders = check_orders(order)
-    if len(orders) > 1:
+    if len(orders := check_orders(order)) > 1:
         raise InputError(f"one order is needed, found {len(orders)}")
     return orders[0]
 

@@ -129,8 +129,7 @@ def _first_mode(block: Block, lattice: FrequencyLattice) -> Reals:
 def _shifted_strengths(weights: Array, angles: Array, shift: Reals, dtype: ComplexDtype) -> Array:
     """Return strengths whose modes are shifted: a phase factor, at no cost in the FFT."""
     strengths = np.empty(len(weights), dtype=dtype, like=weights)
-    axes = np.flatnonzero(shift).tolist()
-    if not axes:
+    if not (axes := np.flatnonzero(shift).tolist()):
         strengths.real = weights
         strengths.imag = 0
         return strengths

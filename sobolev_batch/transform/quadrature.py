@@ -89,8 +89,7 @@ def assign_rules(
     That is eps, of the whole mesh relative to its area, or a tolerance of each triangle relative to its own. A GPU
     helps, also with faces that it has.
     """
-    fixed = fixed_rule(quadrature)
-    if fixed is not None:
+    if (fixed := fixed_rule(quadrature)) is not None:
         return (RuleUse(fixed, 0, np.arange(len(mesh.triangles), dtype=np.uint32)),)
     tolerance = tolerance_for(mesh, highest_frequency, eps, faces, backend) if tolerance is None else tolerance
     rules, ranges = rule_ranges(tolerance, shares_vertices(mesh))

@@ -211,8 +211,7 @@ def remote_client(address: str, trust_network: bool = False) -> Iterator[Client]
     except (OSError, ValueError) as error:
         raise _unreachable(address, seconds, error) from error
     with client:
-        workers = client.scheduler_info(n_workers=-1)["workers"]
-        if not workers:
+        if not (workers := client.scheduler_info(n_workers=-1)["workers"]):
             raise ClusterError(f"the scheduler at {address} has no workers; start some with: dask worker {address}")
         # An address on loopback may be one end of a tunnel.
         for worker in workers:
@@ -238,8 +237,7 @@ def require_private(name: str, who: str, trust_network: bool = False) -> None:
         infos = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError) as error:
         raise ClusterError(f"no Dask scheduler answers at {name!r}: there is no host {host!r}") from error
-    beyond = [str(place[0]) for *_, place in infos if not _is_loopback(str(place[0]))]
-    if beyond:
+    if beyond := [str(place[0]) for *_, place in infos if not _is_loopback(str(place[0]))]:
         raise InputError(
             f"{who} at {name} is neither encrypted nor on loopback ({beyond[0]}): everybody who reaches it "
             "could run programs on these machines and read the meshes. Use tls:// (docs/clusters.md), or "

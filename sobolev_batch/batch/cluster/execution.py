@@ -416,8 +416,7 @@ class _Loop(Generic[Result]):
 
     def _try_alone(self) -> bool:
         """Hand one of the tasks out whose workers died; False where there is none."""
-        suspects = [(run, task) for run in self._begun for task in run.suspects]
-        if not suspects:
+        if not (suspects := [(run, task) for run in self._begun for task in run.suspects]):
             return False
         run, self._alone = min(suspects, key=lambda suspect: suspect[1].row)
         run.suspects.remove(self._alone)

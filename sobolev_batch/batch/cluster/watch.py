@@ -136,8 +136,7 @@ class Watch:
             address: self._workers.get(address, Silence()).after(elapsed, worker["last_seen"])
             for address, worker in workers.items()
         }
-        silent = {name: one.since for name, one in self._workers.items() if one.seconds > _TELL_AFTER_SECONDS}
-        if silent:
+        if silent := {name: one.since for name, one in self._workers.items() if one.seconds > _TELL_AFTER_SECONDS}:
             return self._silent_workers(silent)
         if not workers:
             return "no worker is left; waiting for one to start"

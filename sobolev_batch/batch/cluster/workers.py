@@ -135,8 +135,7 @@ class Workers:
         """Return the workers that can serve a study with this backend."""
         if backend != "gpu":
             return self
-        members = tuple(member for member in self.members if member.backend == "gpu")
-        if not members:
+        if not (members := tuple(member for member in self.members if member.backend == "gpu")):
             reasons = "; ".join(f"{member.address}: {member.note}" for member in self.members[:_MOST_NAMED])
             raise ClusterError(
                 f"the study requests backend 'gpu', and none of the {len(self.members)} workers can compute on one. "
@@ -207,8 +206,7 @@ class VersionPlugin(WorkerPlugin):  # type: ignore[misc]  # distributed has no t
     async def setup(self, worker: Worker) -> None:
         """Compare the versions; where they differ, say so, take no task, and leave."""
         found = _packages(get_versions([*self.required[1:], *_OF_EXTRAS])) | _checkout()
-        differing = _differing(found, self.ours, self.required)
-        if not differing:
+        if not (differing := _differing(found, self.ours, self.required)):
             return
         listed = ", ".join(f"{name} {version or 'is missing'}" for name, version in differing.items())
         expected = ", ".join(f"{name} {self.ours[name]}" for name in differing)

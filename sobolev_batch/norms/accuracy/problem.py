@@ -232,8 +232,7 @@ class Problem:
             return
         parts, floor = self.accuracy.discretisation_parts(self.orders), self.rounding
         # A distance of no more than rounding is that of near-duplicates, and has no relative accuracy.
-        below = (parts * values < floor) & (values > floor)
-        if below.any():
+        if (below := (parts * values < floor) & (values > floor)).any():
             worst = int(np.argmax(below * floor / (parts * np.maximum(values, floor))))
             rtol = self.accuracy.rtol
             reachable = 2 * rtol * floor / float(parts[worst] * values[worst])

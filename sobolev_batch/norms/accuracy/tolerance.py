@@ -116,8 +116,7 @@ class Accuracy:
     def largest_intervals(self) -> int:
         """Largest M for which two fields and the transform of one fit into the memory; InputError where none does."""
         candidates = range(2, LARGEST_M + 1, 2)
-        fitting = bisect_right(candidates, self.allowed_bytes, key=_projected_bytes)
-        if not fitting:
+        if not (fitting := bisect_right(candidates, self.allowed_bytes, key=_projected_bytes)):
             raise InputError(
                 f"{self.allowed_bytes / 1e9:.3g} GB of memory are too little; the smallest lattice takes "
                 f"{_projected_bytes(2) / 1e9:.3g} GB"
