@@ -128,8 +128,7 @@ def object_key(one: StudyObject, members: Members, fingerprints: Mapping[str, st
         [label, family, member.time, member.metadata, fingerprints[label]]
         for label, (family, member) in members.items()
     ]
-    inputs = [*_VERSIONS, one.table, surfaces]
-    return digest_of(inputs)
+    return digest_of([*_VERSIONS, one.table, surfaces])
 
 
 def ended_already(workspace: Workspace) -> Ended | None:

@@ -260,8 +260,7 @@ def _outcomes(
 
         def is_fatal(error: Exception) -> bool:
             # Without a cluster, no other mesh fares better.
-            is_unstarted = isinstance(error, ClusterError) and not cluster.cache_info().currsize
-            return is_unstarted or _ends_all(error)
+            return _ends_all(error) or (isinstance(error, ClusterError) and not cluster.cache_info().currsize)
 
         runs = ((search.name, _searched(search, cluster, at_once)) for search in searches)
         for name, outcome in side_by_side(runs, is_fatal):

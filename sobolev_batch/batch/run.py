@@ -144,8 +144,7 @@ def run(
             """Start the cluster of all objects, which is not needed where nothing is missing."""
             own = nullcontext(client) if client is not None else _own_cluster(study, location, workers, memory)
             started = stack.enter_context(own)
-            watch = stack.enter_context(Watch(started, study.backend == "gpu").kept())
-            return started, watch
+            return started, stack.enter_context(Watch(started, study.backend == "gpu").kept())
 
         def equip() -> tuple[Cluster, Watch]:
             started, watch = start()

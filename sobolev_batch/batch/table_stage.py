@@ -115,8 +115,7 @@ def write_results(
     for name in set(replaced) - store.documents.keys():
         store.location.remove(name)
     store.consolidate()
-    tables = {"meshes": results.meshes, "convergence": convergence}
-    return Tabulated(results.to_reference, tables), store.metadata
+    return Tabulated(results.to_reference, {"meshes": results.meshes, "convergence": convergence}), store.metadata
 
 
 def _pairs(workspace: Workspace) -> Pairs | None:

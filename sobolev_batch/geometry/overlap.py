@@ -367,8 +367,7 @@ def _matched(hashes: NDArray[np.uint64], others: NDArray[np.uint64]) -> NDArray[
     from pandas import Series
 
     own = Series(hashes)
-    times = own.map(Series(others).value_counts()).fillna(0)
-    return np.asarray(own.groupby(own).cumcount() < times)
+    return np.asarray(own.groupby(own).cumcount() < own.map(Series(others).value_counts()).fillna(0))
 
 
 def _triangle_hashes(corners: Reals) -> NDArray[np.uint64]:

@@ -320,8 +320,7 @@ def doubled(counts: Counts) -> Counts:
 def _brought_back(interval: Interval, values: Reals) -> Reals:
     """Return parameters within their interval."""
     if interval.periodic:
-        turns = np.floor((values - interval.low) / interval.length)
-        return np.asarray(values - turns * interval.length)
+        return np.asarray(values - np.floor((values - interval.low) / interval.length) * interval.length)
     return np.asarray(np.clip(values, interval.low, interval.high))
 
 

@@ -97,8 +97,7 @@ class Edges:
         def triangles_after(number: int) -> int:
             return len(self.sides) + int(np.count_nonzero(self._completed(order[:number])[self.sides]))
 
-        most = bisect_right(range(1, len(order) + 1), triangles, key=triangles_after)
-        return self._completed(order[:most])
+        return self._completed(order[: bisect_right(range(1, len(order) + 1), triangles, key=triangles_after)])
 
     def split(self, marks: Marks) -> Mesh:
         """Return the mesh with new vertices, after its own, at the middles of marked edges; of two cuts the shorter."""
@@ -148,8 +147,8 @@ def _icosahedron() -> Mesh:
     triangles = []
     for a, b, c in combinations(range(len(corners)), 3):
         if linked[a, b] and linked[b, c] and linked[c, a]:
-            outwards = np.linalg.det(corners[[a, b, c]]) > 0
-            triangles.append((a, b, c) if outwards else (a, c, b))
+            # Facing outwards.
+            triangles.append((a, b, c) if np.linalg.det(corners[[a, b, c]]) > 0 else (a, c, b))
     return _projected(Mesh(corners, triangles))
 
 

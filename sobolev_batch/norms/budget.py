@@ -203,5 +203,4 @@ def image_weight(spacing: float, order: float, widths: Reals, images: Reals = _P
 def image_distances(spacing: float, widths: Reals, images: Reals = _PERIOD) -> Reals:
     """Return bounds on the least distances (n,) of surfaces to their images, from below; see `image_weight`."""
     # The least distance of S to S + v is at least v·u - width(u), for every direction u.
-    offsets = np.abs(images @ DIRECTIONS.T) / spacing
-    return np.asarray(np.maximum((offsets - widths).max(axis=1), 0.0))
+    return np.asarray(np.maximum((np.abs(images @ DIRECTIONS.T) / spacing - widths).max(axis=1), 0.0))

@@ -216,8 +216,7 @@ def compute_field(
     values, sample = transformed.values, sample if kind.lowest_degree <= USUAL_DEGREE else None
     draws = sample.draws if sample else draws_for([surface], lattice, orders, kind.lowest_degree, COMMON)
     probe = probe_block(surface, lattice, settings, lattice.half, values, draws, execution, sample)
-    quality = Quality.from_surface(surface, probe)
-    return Field(values, transformed.points, transformed.backend, quality, settings)
+    return Field(values, transformed.points, transformed.backend, Quality.from_surface(surface, probe), settings)
 
 
 def field_for(

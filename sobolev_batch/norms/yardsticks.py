@@ -118,8 +118,7 @@ def yardsticks(
         for i in resolved.tolist():
             for change in wanted:
                 (on_progress or str)(f"order {orders[i]:g}: {change} as far")
-                curve = curves[change]
-                columns[change][i], columns[f"{change}_error"][i] = curve.equivalent(i, estimate)
+                columns[change][i], columns[f"{change}_error"][i] = curves[change].equivalent(i, estimate)
     return found.assign(labelled(order, columns, {}).data_vars)
 
 
@@ -174,8 +173,7 @@ class _Curve:
 
     def _gap(self, amount: float, order: int, wanted: NormEstimate) -> float:
         """Return the logarithm of the distance of a known amount over the one wanted."""
-        distance = max(self.known[amount].values[order], np.finfo(np.float64).tiny)
-        return math.log(distance / wanted.values[order])
+        return math.log(max(self.known[amount].values[order], np.finfo(np.float64).tiny) / wanted.values[order])
 
     def _confirmed(
         self, order: int, wanted: tuple[float, float], found: float, uncertain: float

@@ -155,8 +155,7 @@ class CommandSource(RemesherSource):
     @property
     def commands(self) -> tuple[str, ...]:
         """The command and that of the version, as a shell would have them; and those of other sources."""
-        own = [self.command, *([self.version] if self.version else [])]
-        return (*map(shlex.join, own), *super().commands)
+        return (*map(shlex.join, filter(None, (self.command, self.version))), *super().commands)
 
     @model_validator(mode="after")
     def _check_command(self) -> Self:

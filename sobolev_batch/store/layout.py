@@ -462,8 +462,7 @@ def _is_of_tables(node: str) -> bool:
 
 def table_attributes(store: Store, group: str) -> dict[str, Any] | None:
     """Return the attributes of a group, or None if it is not listed."""
-    listed = store.exists() and group in store.documents
-    return store.documents[group].get("attributes", {}) if listed else None
+    return store.documents[group].get("attributes", {}) if store.exists() and group in store.documents else None
 
 
 def hide_tables(store: Store) -> list[str]:

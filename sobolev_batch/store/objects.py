@@ -78,8 +78,7 @@ class Objects:
         """Return the store of an object, None before its reference was made; DamageError if it is lost or another."""
         try:
             store = Store(self.location.below(name))
-            present = store.exists() and not store.is_unfinished
-            study = store.attributes()["study"]["name"] if present else None
+            study = store.attributes()["study"]["name"] if store.exists() and not store.is_unfinished else None
         except ForeignError as error:
             raise DamageError(f"{error} (the object {name!r} was there)", str(error)) from error
         if study is None:

@@ -279,8 +279,7 @@ class Records(Generic[RecordType]):
 
     def write(self, row: int, record: RecordType | None) -> None:
         """Write the completion record of a row, or withdraw it: one chunk, replaced as a whole."""
-        line = _WITHDRAWN if record is None else record.to_json(row)
-        self.store.write(RECORD, [row], [line])
+        self.store.write(RECORD, [row], [_WITHDRAWN if record is None else record.to_json(row)])
 
     def collect(self, records: Sequence[RecordType | None]) -> list[int]:
         """Collect the records of rows in pages, each of rows that all have one, and remove their own chunks.

@@ -198,8 +198,7 @@ class Results:
 
     def norms_table(self) -> xr.Dataset:
         """Return `norm` (mesh, order) with its error."""
-        columns = {**self.norms.named("norm"), "beyond": self.beyond[0]}
-        return table_of(columns, self.meshes, self.orders)
+        return table_of({**self.norms.named("norm"), "beyond": self.beyond[0]}, self.meshes, self.orders)
 
     def distances_table(self) -> xr.Dataset:
         """Return `distance` (mesh, other, order) with its error; the only other is the reference."""

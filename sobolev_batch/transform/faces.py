@@ -54,5 +54,4 @@ class FaceArrays:
 
     def batches(self, size: int) -> Iterator[Self]:
         """Return the triangles in batches: of a size on the processor, where temporaries stay in its cache."""
-        step = size if self.backend is CPU else _HELD
-        return map(self.part, slices(len(self), step))
+        return map(self.part, slices(len(self), size if self.backend is CPU else _HELD))

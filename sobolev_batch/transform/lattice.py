@@ -70,8 +70,7 @@ class Block:
     def intersection(self, block: Block) -> Block | None:
         """Return the block that this one and another have in common; None where that is none."""
         ends = zip(self.start, self.shape, block.start, block.shape, strict=True)
-        sides = [(max(a, b), min(a + m, b + n) - max(a, b)) for a, m, b, n in ends]
-        (i, di), (j, dj), (k, dk) = sides
+        (i, di), (j, dj), (k, dk) = ((max(a, b), min(a + m, b + n) - max(a, b)) for a, m, b, n in ends)
         return Block((i, j, k), (di, dj, dk)) if min(di, dj, dk) > 0 else None
 
     def split(self, largest_size: int) -> tuple[Block, ...]:
@@ -313,8 +312,7 @@ class OctaveLattice(FrequencyLattice):
 
         The weights of a frequency and of its negative add up to 2.
         """
-        layers = self.half.indices(2) + self.offset[2]
-        return np.asarray(1 + erf(layers / _FADING_LAYERS))
+        return np.asarray(1 + erf((self.half.indices(2) + self.offset[2]) / _FADING_LAYERS))
 
 
 @dataclass(frozen=True)

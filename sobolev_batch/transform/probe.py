@@ -87,8 +87,7 @@ def norms_of_draws(parts: Reals) -> Reals:
 
 def norms_of_checks(radii: Reals, squares: Reals, orders: Sequence[float]) -> Reals:
     """Return norms of an error (orders,) from checks at some |ξ| (P,), not weighted by an order yet, raised."""
-    weights = np.array([(1 + radii**2) ** order for order in orders])
-    return norms_of_draws(weights * squares)
+    return norms_of_draws(np.array([(1 + radii**2) ** order for order in orders]) * squares)
 
 
 def draw(lattice: Lattice, orders: Sequence[float], degree: int, count: int, seed: int) -> Draws:
@@ -112,8 +111,7 @@ def draw(lattice: Lattice, orders: Sequence[float], degree: int, count: int, see
 def measure(draws: Draws, computed: Complexes, exact: Complexes) -> Probe:
     """Return the probe from a field's values at the drawn frequencies (P,) and the exact ones."""
     sums = draws.scales * np.abs(computed - exact) ** 2
-    shells = np.sum(draws.indices**2, axis=1)
-    return Probe(tuple(shells.tolist()), tuple(sums.tolist()))
+    return Probe(tuple(np.sum(draws.indices**2, axis=1).tolist()), tuple(sums.tolist()))
 
 
 def with_own(draws: Draws, count: float, lattice: Lattice, block: Block, values: Complexes) -> Draws:

@@ -64,8 +64,7 @@ def sphere_inner_product(first: Sphere, second: Sphere, order: float) -> float:
         mean = integrand(0.0)
     else:
         # Integrate up to the kink of the Matérn function at zero from both sides.
-        kinks = sorted(t for t in (-near / separation, -far / separation) if -1 < t < 1)
-        edges = [-1.0, *kinks, 1.0]
+        edges = [-1.0, *sorted(t for t in (-near / separation, -far / separation) if -1 < t < 1), 1.0]
         mean = 0.5 * sum(_integral(integrand, low, high) for low, high in pairwise(edges))
     value = 8 * math.pi * radii[0] * radii[1] * mean
     if not math.isfinite(value):

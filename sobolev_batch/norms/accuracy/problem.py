@@ -281,8 +281,7 @@ def support_of(surfaces: Sequence[Surface]) -> Support:
 
 def are_equal(a: Surface, b: Surface) -> bool:
     """Return whether two meshes are equal as area measures, to rounding."""
-    have_equal_areas = abs(a.area - b.area) <= _ROUNDING * (a.area + b.area)
-    return have_equal_areas and not without_common_parts((a, b))
+    return abs(a.area - b.area) <= _ROUNDING * (a.area + b.area) and not without_common_parts((a, b))
 
 
 def _rounding(surfaces: Sequence[Surface]) -> float:

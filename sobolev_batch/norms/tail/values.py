@@ -136,8 +136,7 @@ def _compared(
         chosen.append(sample_set.samples.start + drawn)
         scales.append(weights[drawn] / (count * chances[drawn]))
     places = np.concatenate(chosen)
-    exact = kind.sampled_values(sampling.frequencies[places], ON_CPU.threads, backend)
-    differences = values[places] - exact
+    differences = values[places] - kind.sampled_values(sampling.frequencies[places], ON_CPU.threads, backend)
     return sampling.radii[places], np.concatenate(scales) * np.abs(differences) ** 2
 
 
