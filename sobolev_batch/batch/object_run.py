@@ -280,15 +280,9 @@ def _imprecise(workspace: Workspace) -> dict[str, float]:
     """Return the largest relative error of each mesh whose distances miss the accuracy, by its label."""
     if workspace.plan.study.accuracy is None or not workspace.has_tables:
         return {}
-    labels = workspace.store.read_strings("convergence/mesh")
-    distances, errors, relative, within = (
-        np.asarray(workspace.store.read(f"convergence/{name}", ...))
-        for name in ("distance", "error", "relative", "within")
-    )
+    store, names = workspace.store, ("distance", "error", "relative", "within")
+    distances, errors, relative, within = (np.asarray(store.read(f"convergence/{name}")) for name in names)
     # Of what is next to equal to the reference, no computation gives digits.
     short = ~within.astype(bool) & (relative > NEXT_TO_EQUAL)
-    return {
-        label: float(np.max(errors[i][short[i]] / distances[i][short[i]]))
-        for i, label in enumerate(labels)
-        if short[i].any()
-    }
+    largest = np.divide(errors, distances, out=np.zeros_like(errors), where=short).max(axis=1).tolist()
+    return {label: error for label, error in zip(store.read_strings("convergence/mesh"), largest, strict=True) if error}

@@ -62,15 +62,8 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> Stages[Tabulated 
         pairs.lay_out(coordinates_of(meshes, plan.study.orders))
         tiles = pairs.stale()
     advance = cluster.count_steps("reduction", len(chunks) + len(tiles))
-    of_spectra = (
-        Task(
-            fill_chunk,
-            (reducer.only(rows), number, {row: keys[row] for row in rows if row in keys}),
-            projected_bytes,
-            stage="spectra",
-        )
-        for number, rows in chunks.items()
-    )
+    parts = ((reducer.only(rows), n, {row: keys[row] for row in rows if row in keys}) for n, rows in chunks.items())
+    of_spectra = (Task(fill_chunk, part, projected_bytes, stage="spectra") for part in parts)
 
     def take(task: Task, outcome: Any) -> None:
         result_of(outcome)
@@ -79,11 +72,9 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> Stages[Tabulated 
     yield Wave(cluster, of_spectra, take, projected_bytes)
     if pairs is not None:
         # After all spectra, where their row of the reference comes from.
-        parts = ((pairs.only(tile), tile) for tile in tiles)
-        of_pairs = (
-            Task(fill_tile, (reducer.only(part.keys), part, tile), projected_bytes, stage="pairs")
-            for part, tile in parts
-        )
+        own_pairs = ((pairs.only(tile), tile) for tile in tiles)
+        of_tiles = ((reducer.only(own.keys), own, tile) for own, tile in own_pairs)
+        of_pairs = (Task(fill_tile, of_tile, projected_bytes, stage="pairs") for of_tile in of_tiles)
         yield Wave(cluster, of_pairs, take, projected_bytes)
     last = Task(write_results, (workspace, reducer, meshes, digest, replaced), projected_bytes, stage="tables")
     tabulated: Tabulated

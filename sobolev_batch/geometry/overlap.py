@@ -227,15 +227,13 @@ def _cut_together(
         for layers in (sheets[0].layers, sheets[1].layers)
     )
     # Without corners on straight sides there are fewer triangles.
-    rests = [
-        shapely.simplify(shapely.difference(*pair, grid_size=grid), rounding)
-        for pair in ((mine, others), (others, mine))
-    ]
+    remaining = (shapely.difference(*pair, grid_size=grid) for pair in ((mine, others), (others, mine)))
+    rests = [shapely.simplify(polygons, rounding) for polygons in remaining]
     covered, left = ([shapely.area(one).sum(axis=1) for one in both] for both in ((mine, others), rests))
     before, after = sheets[0].areas + sheets[1].areas, left[0] + left[1]
     off = np.abs(covered[0] - covered[1] - left[0] + left[1])
     old, new, corners, rows = np.zeros(count), np.zeros(count), [], []
-    for sheet, rest, whole, remaining in zip(sheets, rests, covered, left, strict=True):
+    for sheet, rest, whole, uncovered in zip(sheets, rests, covered, left, strict=True):
         triangles, number = shapely.get_parts(shapely.constrained_delaunay_triangles(rest.ravel()), return_index=True)
         row = number // depth
         lifted = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3] @ frames[row]
@@ -243,7 +241,7 @@ def _cut_together(
         _, areas, heights = _measured(lifted)
         is_thick = heights > _LEAST_HEIGHT * rounding
         kept = np.bincount(row, areas * is_thick, count)
-        off = np.maximum(off, np.maximum(np.abs(sheet.areas - whole), np.abs(kept - remaining)))
+        off = np.maximum(off, np.maximum(np.abs(sheet.areas - whole), np.abs(kept - uncovered)))
         old, new = old + np.bincount(sheet.plane, minlength=count), new + np.bincount(row, is_thick, count)
         corners.append(lifted[is_thick])
         rows.append(row[is_thick])

@@ -179,10 +179,8 @@ def order_axis(order: Orders) -> tuple[tuple[str, ...], Reals, dict[str, str]]:
 def labelled(order: Orders, values: Mapping[str, Reals], attributes: Mapping[str, Any]) -> xr.Dataset:
     """Return values (orders,) by name over the dimension `order`, or without dimensions for a single order."""
     axis = order_axis(order)
-    columns = {
-        name: np.reshape(value, (*axis[1].shape, *([len(PARTS)] if name == "error_part" else [])))
-        for name, value in values.items()
-    }
+    further = {"error_part": [len(PARTS)]}
+    columns = {name: np.reshape(value, (*axis[1].shape, *further.get(name, ()))) for name, value in values.items()}
     return dataset_of(columns, axis[0], {"order": axis}).assign_attrs({"kernel": KERNEL, **attributes})
 
 

@@ -95,7 +95,7 @@ def norm(
     weights = SobolevWeights(Lattice.from_field(field), orders)
     near_axes = NearAxes(weights.lattice, 1)
     sums = shells_of(field, None, weights.lattice, near_axes)
-    estimate = _estimate(weights, sums, [field], images=images_at(near_axes.images(), orders)[:, 0])
+    estimate = _estimate(weights, sums, [field], images_at(near_axes.images(), orders)[:, 0])
     return labelled(order, estimate.named("norm"), lattice_attributes(weights.lattice, field))
 
 
@@ -167,8 +167,8 @@ def distance(
         found := remainder_of_flat((cast(Surface, a), cast(Surface, b)), weights.lattice.xi_max, orders)
     ):
         beyond = found.bounds(orders)
-    distances = _estimate(weights, squares, [first, second], beyond, images)
-    of_second = _estimate(weights, own, [second], images=images_of_second)
+    distances = _estimate(weights, squares, [first, second], images, beyond)
+    of_second = _estimate(weights, own, [second], images_of_second)
     known = [quality.beyond_at(orders) for quality in map(quality_of, (first, second)) if quality is not None]
     if len(known) == len((first, second)) and squares.any():
         # A study knows how far its fields are from its reference, which may not be that of both.
@@ -225,11 +225,7 @@ def to_accuracy(
 
 
 def _estimate(
-    weights: SobolevWeights,
-    sums: Reals,
-    fields: Sequence[xr.DataArray],
-    beyond: Reals | float = np.nan,
-    images: Reals | float = np.nan,
+    weights: SobolevWeights, sums: Reals, fields: Sequence[xr.DataArray], images: Reals, beyond: Reals | float = np.nan
 ) -> NormEstimate:
     """Return a norm or distance from shell sums, with the errors that follow from the fields' qualities.
 

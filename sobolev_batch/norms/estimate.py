@@ -247,10 +247,8 @@ class ReferenceEstimate:
             # Rounding may make the projection longer than what it projects.
             area = np.minimum(np.abs(self.products) / self.norms.values, values)
             highest = np.minimum(highest, most)
-        shape, shortest, longest = (
-            np.sqrt(np.maximum(distance**2 - part**2, 0.0))
-            for distance, part in ((values, area), (least, highest), (most, lowest))
-        )
+        pairs = (values, area), (least, highest), (most, lowest)
+        shape, shortest, longest = (np.sqrt(np.maximum(distance**2 - part**2, 0.0)) for distance, part in pairs)
         errors = (np.maximum(area - lowest, highest - area), np.maximum(shape - shortest, longest - shape))
         return dict(zip(AREA_AND_SHAPE, (area, errors[0], shape, errors[1]), strict=True))
 

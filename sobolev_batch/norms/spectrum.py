@@ -141,11 +141,8 @@ class _Segment:
 
     def moved(self, terms: Reals) -> Reals:
         """Move terms (fields, n) to the radii of each group, (fields, groups · _NODES)."""
-        groups = [
-            terms[:, first:last] @ self._interpolation(slice(first, last))
-            for first, last in pairwise([*self.starts, self.count])
-        ]
-        return np.concatenate(groups, axis=1)
+        groups = (slice(*ends) for ends in pairwise([*self.starts, self.count]))
+        return np.concatenate([terms[:, group] @ self._interpolation(group) for group in groups], axis=1)
 
     def _interpolation(self, samples: slice) -> Reals:
         """Return the matrix (n, _NODES) that interpolates from the nodes to samples, in the logarithm of 1 + |ξ|²."""

@@ -108,14 +108,11 @@ class RemesherSource(NestedSource, KeepingSource):
         members = []
         for name, parameters in self._swept(original.name):
             make, settings, files = self._remesher(parameters, folder)
-            metadata = {
-                key: _as_text(value) if isinstance(value, bool | str) else float(value)
-                for key, value in parameters.items()
-            }
-            identity = {"remesher": {**settings, "parameters": parameters}, "version": version}
-            members.append(
-                RemeshedMember(name, -1, make, identity, original, files, self._cache, metadata=tuple(metadata.items()))
+            metadata = tuple(
+                (key, _as_text(x) if isinstance(x, bool | str) else float(x)) for key, x in parameters.items()
             )
+            identity = {"remesher": {**settings, "parameters": parameters}, "version": version}
+            members.append(RemeshedMember(name, -1, make, identity, original, files, self._cache, metadata=metadata))
         return tuple(members)
 
     def _swept(self, alone: str) -> Iterator[tuple[str, dict[str, Parameter]]]:

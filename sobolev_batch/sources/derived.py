@@ -40,13 +40,8 @@ def decimated(mesh: Mesh, triangles: int, keep_boundary: bool = False) -> Mesh:
     with from_extra("studies", "decimation needs", MeshError):
         import fast_simplification
 
-    vertices, faces = fast_simplification.simplify(
-        np.array(mesh.vertices),
-        np.array(mesh.triangles, dtype=np.int32),
-        target_count=triangles,
-        preserve_border=keep_boundary,
-    )
-    return Mesh(vertices, faces)
+    arrays = np.array(mesh.vertices), np.array(mesh.triangles, dtype=np.int32)
+    return Mesh(*fast_simplification.simplify(*arrays, target_count=triangles, preserve_border=keep_boundary))
 
 
 def remeshed(mesh: Mesh, triangles: int) -> Mesh:

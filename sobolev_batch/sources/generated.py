@@ -126,10 +126,8 @@ class IcosphereSource(Source):
 
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member per level, coarse to fine."""
-        return tuple(
-            _triangulation(level, icosphere, (level,), {"icosphere": level}, 20 << 2 * level)
-            for level in sorted(set(self.levels))
-        )
+        levels = sorted(set(self.levels))
+        return tuple(_triangulation(n, icosphere, (n,), {"icosphere": n}, 20 << 2 * n) for n in levels)
 
 
 def _triangulation(

@@ -262,10 +262,8 @@ def _spectra_keys(plan: Plan, mesh: NDArray[Any]) -> dict[str, bytes]:
 
 def record_keys(rows: int, dimension: str = "row") -> dict[str, bytes]:
     """Return the keys of the arrays of records: a chunk for each row, which tasks write, and pages of many rows."""
-    keys = {
-        **array_keys(RECORD, str, (rows,), (1,), (dimension,)),
-        **array_keys(PAGE, str, (rows,), (ROWS_PER_PAGE,), (dimension,)),
-    }
+    keys = array_keys(RECORD, str, (rows,), (1,), (dimension,))
+    keys |= array_keys(PAGE, str, (rows,), (ROWS_PER_PAGE,), (dimension,))
     return {key: text for key, text in keys.items() if key != f"{RECORDS}/{ROOT}"}
 
 

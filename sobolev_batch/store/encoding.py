@@ -29,12 +29,7 @@ _strings = VLenUTF8()
 
 
 def array_keys(
-    name: str,
-    dtype: Any,
-    shape: tuple[int, ...],
-    chunks: tuple[int, ...],
-    dimensions: tuple[str, ...],
-    **attributes: Any,
+    name: str, dtype: Any, shape: Sequence[int], chunks: Sequence[int], dimensions: Sequence[str], **attributes: Any
 ) -> dict[str, bytes]:
     """Return the keys of an array without chunks, and of its group. It reads as NaN, or as empty strings."""
     document = _array_document(np.dtype(dtype), shape, chunks, dimensions, _MISSING, attributes)

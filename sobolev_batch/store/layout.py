@@ -306,12 +306,8 @@ class Store:
         dtype = object if document["data_type"] == "string" else document["data_type"]
         chunks = chunks_of(np.asarray(values, dtype=dtype), chunk_shape(document))
         self._forget(f"{name}/c")
-        self.location.write(
-            {
-                chunk_key(name, [start + i for start, i in zip_longest(index, own, fillvalue=0)]): chunk
-                for own, chunk in chunks
-            }
-        )
+        placed = ((map(sum, zip_longest(index, own, fillvalue=0)), chunk) for own, chunk in chunks)
+        self.location.write({chunk_key(name, place): chunk for place, chunk in placed})
 
     def publish(self, keys: Mapping[str, bytes]) -> None:
         """Write keys of new nodes. Readers find the nodes after `consolidate`."""

@@ -112,14 +112,8 @@ class Plan:
 
     def with_choice(self, choice: LatticeChoice, also: Collection[str] = ()) -> Self:
         """Return the plan of the same study on another lattice, where a run computes some more labels."""
-        rows = (
-            replace(
-                row,
-                key=_key(self.study, self.similarity, choice, row.fingerprint),
-                is_chosen=row.is_chosen or row.label in also,
-            )
-            for row in self.rows
-        )
+        keyed = ((row, _key(self.study, self.similarity, choice, row.fingerprint)) for row in self.rows)
+        rows = (replace(row, key=key, is_chosen=row.is_chosen or row.label in also) for row, key in keyed)
         return replace(self, rows=tuple(rows), choice=choice)
 
 

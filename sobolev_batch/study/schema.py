@@ -162,15 +162,15 @@ class _ScalingSection(Section):
         return Similarity(1.0 if self.scale is None else self.scale, self.origin or (0.0, 0.0, 0.0))
 
 
+Metrics = Annotated[tuple[Metric, ...], Field(strict=False, min_length=1), at_most(len(METRICS))]
+
+
 class ProximitySection(Section):
     """The usual distances of meshes from the reference; docs/studies.md has the keys."""
 
     points: Annotated[int, Field(ge=2, le=MOST_POINTS)] = DEFAULT_POINTS
     threshold: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
-    metrics: Annotated[tuple[Metric, ...], Field(strict=False, min_length=1), at_most(len(METRICS))] = (
-        "hausdorff",
-        "chamfer",
-    )
+    metrics: Metrics = ("hausdorff", "chamfer")
 
 
 class FamilyReference(Section):

@@ -31,12 +31,8 @@ def tables_in(store: Store) -> dict[str, xr.Dataset]:
     """Return the tables of a store, of an object or of all, in memory; none before they were made."""
     keys: Any = store.checked_keys(RECORD, has_tables=True)
     names = [name for name in TABLES_OF_ALL if name in store.documents and "convergence" in store.documents]
-    return {
-        name: with_coordinates(
-            xr.open_dataset(keys, group=name, engine="zarr", consolidated=True, zarr_format=3).load()
-        )
-        for name in names
-    }
+    opened = (xr.open_dataset(keys, group=name, engine="zarr", consolidated=True, zarr_format=3) for name in names)
+    return {name: with_coordinates(table.load()) for name, table in zip(names, opened, strict=True)}
 
 
 def packed_tables(name: str, tables: Tables, unit_length: float) -> bytes:

@@ -58,17 +58,8 @@ CONNECTION_COLUMNS = (
 _COUNTS = ("triangles", "vertices", *(column.name for column in CONNECTION_COLUMNS))
 _ABOUT = ("family", "name", "level", "rank", "ordered_by", "status", "reason", *_COUNTS, "seconds")
 _NUMBERS = (
-    "edge_length",
-    "distance",
-    "error",
-    *PARTS,
-    "relative",
-    "relative_error",
-    *AREA_AND_SHAPE,
-    "rate",
-    "rate_error",
-    "resolved",
-    "within",
+    *("edge_length", "distance", "error", *PARTS, "relative", "relative_error", *AREA_AND_SHAPE),
+    *("rate", "rate_error", "resolved", "within"),
 )
 # Of meshes that a program or function made.
 _MADE = tuple(item.name for item in fields(Cost))

@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.geometry.surface import DIRECTIONS, Extent
@@ -333,13 +332,7 @@ class Reducer:
         return self._estimate(self._sums(spectra), tail, areas, errors, unseen, spectra.images_at(self.orders))
 
     def _estimate(
-        self,
-        sums: Sums,
-        tail: Tail | None,
-        areas: Reals,
-        errors: Reals,
-        unseen: Reals | float = np.nan,
-        images: Reals | float = np.nan,
+        self, sums: Sums, tail: Tail | None, areas: Reals, errors: Reals, unseen: Reals | float, images: Reals
     ) -> NormEstimate:
         """Return norms; areas and norms of the fields' own errors are those of both surfaces of a pair together.
 
@@ -391,15 +384,15 @@ class Reducer:
         expected = [self.checksums[row][number] for row in rows]
         return Fields(self.store).read(rows, self.lattice.place(self.blocks[number]), expected)
 
-    def read_octaves(self, row: int) -> NDArray[np.complexfloating]:
+    def read_octaves(self, row: int) -> Complexes:
         """Return the values of a row at all samples of octaves (n,), and check them against its record."""
         if self.sampling is None:
             return np.zeros(0, dtype=np.complex128)
         place = (slice(0, self.sampling.size),)
-        values: NDArray[np.complexfloating] = Fields(self.store).read([row], place, [self.checksums[row][-1]])[0]
+        values: Complexes = Fields(self.store).read([row], place, [self.checksums[row][-1]])[0]
         return values
 
-    def octave_sums(self, values: NDArray[np.complexfloating]) -> list[OctaveSums]:
+    def octave_sums(self, values: Complexes) -> list[OctaveSums]:
         """Return the integrals of |values|² over each octave, from those at all samples (n,)."""
         parts = () if self.sampling is None else self.sampling.split(squared_moduli(values))
         return [weights.sums(squares) for weights, squares in zip(self.octave_weights, parts, strict=True)]

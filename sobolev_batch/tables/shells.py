@@ -68,10 +68,8 @@ def fill_chunk(reducer: Reducer, number: int, keys: Mapping[int, str]) -> None:
         arrays[f"{SPECTRA_GROUP}/{name}"][_places(missing, rows)] = values
 
     def write_keys(of: set[int]) -> None:
-        texts = [
-            seal(keys[row], [values[place] for values in arrays.values()]) if row in of else ""
-            for place, row in enumerate(rows)
-        ]
+        values_of_rows = zip(rows, zip(*arrays.values(), strict=True), strict=True)
+        texts = [seal(keys[row], values) if row in of else "" for row, values in values_of_rows]
         store.write(SPECTRA_KEYS, [number], texts)
 
     # Should this be interrupted, no old key may stand for new values.

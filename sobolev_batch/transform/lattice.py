@@ -18,7 +18,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import erf, erfc
 
-from sobolev_batch.arrays import Indices, Reals
+from sobolev_batch.arrays import Complexes, Indices, Reals
 from sobolev_batch.errors import InputError, LatticeError, OrderError
 from sobolev_batch.parameters import is_whole_number
 
@@ -93,10 +93,8 @@ class Block:
         """Yield blocks of one shape that cover this one or more, each with its slices of an array of this one."""
         for offsets in product(*(range(0, count, step) for count, step in zip(self.shape, shape, strict=True))):
             i, j, k = (first + offset for first, offset in zip(self.start, offsets, strict=True))
-            x, y, z = (
-                slice(offset, min(offset + step, count))
-                for offset, step, count in zip(offsets, shape, self.shape, strict=True)
-            )
+            sides = zip(offsets, shape, self.shape, strict=True)
+            x, y, z = (slice(offset, min(offset + step, count)) for offset, step, count in sides)
             yield Block((i, j, k), shape), (x, y, z)
 
 
@@ -380,9 +378,7 @@ def single_order(order: float) -> float:
     return orders[0]
 
 
-def shell_sums(
-    values: NDArray[np.complexfloating], others: NDArray[np.complexfloating] | None, lattice: Lattice, block: Block
-) -> Reals:
+def shell_sums(values: Complexes, others: Complexes | None, lattice: Lattice, block: Block) -> Reals:
     """Sum Re(a conj b) by the trapezoidal rule over each shell of one block of the half lattice.
 
     The fields a and b, or a itself for None, are complex (..., *block.shape). The sums are float64 (...,

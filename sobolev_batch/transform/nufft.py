@@ -34,10 +34,8 @@ class WeightedPoints:
         """Return the points of several batches as one."""
         if len(batches) == 1:
             return batches[0]
-        return cls(
-            np.concatenate([points.coordinates for points in batches], axis=1),
-            np.concatenate([points.weights for points in batches]),
-        )
+        coordinates, weights = zip(*((points.coordinates, points.weights) for points in batches), strict=True)
+        return cls(np.concatenate(coordinates, axis=1), np.concatenate(weights))
 
 
 def transform_points(

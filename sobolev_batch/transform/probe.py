@@ -7,8 +7,9 @@ the nodes.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import lru_cache
+from itertools import chain
 from typing import Self
 
 import numpy as np
@@ -152,10 +153,7 @@ def uniform_probe(lattice: Lattice, error: float) -> Probe:
 
 def join(probes: Sequence[Probe]) -> Probe:
     """Join the probes of disjoint sets of draws."""
-    return Probe(
-        tuple(shell for probe in probes for shell in probe.shells),
-        tuple(value for probe in probes for value in probe.sums),
-    )
+    return Probe(*(tuple(chain(*parts)) for parts in zip(*map(astuple, probes), strict=True)))
 
 
 @lru_cache(maxsize=2)

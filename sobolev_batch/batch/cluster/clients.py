@@ -137,13 +137,9 @@ def thread_client(workers: int | None = None) -> Iterator[Client]:
     """Give a client of a new cluster of threads of this process, for a store that no other process can see."""
     # The protocol opens no port, but the web pages of scheduler and worker would be open to every interface,
     # and the link would name one of them.
+    link = "http://127.0.0.1:{port}/status"
     with (
-        dask.config.set(
-            {
-                "distributed.worker.profile.enabled": False,
-                "distributed.dashboard.link": "http://127.0.0.1:{port}/status",
-            }
-        ),
+        dask.config.set({"distributed.worker.profile.enabled": False, "distributed.dashboard.link": link}),
         LocalCluster(
             n_workers=1,
             threads_per_worker=workers or available_cores(),

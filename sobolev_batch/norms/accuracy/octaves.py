@@ -288,11 +288,10 @@ def solution_of(state: State) -> Solution:
     of_octaves = [values.error_norms(core.weights.orders) for octave in state.octaves for values in octave.values]
     errors = np.asarray(np.hypot.reduce([core.errors, *of_octaves]))
     found = estimate_norms(core.sums, core.weights, support, errors, state.tail)
-    values = tuple(
-        SurfaceValues(field, tuple(octave.values[number] for octave in state.octaves))
-        for number, field in enumerate(core.fields)
-    )
-    return Solution(found, core.weights.lattice, values, has_tail=True)
+    values = [
+        SurfaceValues(field, tuple(one.values[n] for one in state.octaves)) for n, field in enumerate(core.fields)
+    ]
+    return Solution(found, core.weights.lattice, tuple(values), has_tail=True)
 
 
 def farther_out(state: State) -> State | None:
@@ -343,11 +342,8 @@ def refined(state: State) -> State | None:
         finer, seconds = {}, 0.0
     if core is state.core and not finer:
         return _checked_again(state)
-    octaves = tuple(
-        _measured(state, finer[number], octave) if number in finer else octave
-        for number, octave in enumerate(state.octaves)
-    )
-    return state.advanced(seconds, core=core, octaves=octaves)
+    octaves = (_measured(state, finer[n], one) if n in finer else one for n, one in enumerate(state.octaves))
+    return state.advanced(seconds, core=core, octaves=tuple(octaves))
 
 
 def _checked_again(state: State) -> State | None:
@@ -426,10 +422,8 @@ def _finer_samplings(state: State) -> dict[int, OctaveSampling]:
     # Those that matter least together stay as they are.
     ascending = np.argsort(variances)
     decisive = ascending[np.cumsum(variances[ascending]) > _LEFT_FRACTION * permitted[order]]
-    finer = {
-        int(number): _finer_sampling(state, state.octaves[number], order, permitted[order] / len(state.octaves))
-        for number in decisive
-    }
+    of_each = permitted[order] / len(state.octaves)
+    finer = {n: _finer_sampling(state, state.octaves[n], order, of_each) for n in decisive.tolist()}
     return {number: sampling for number, sampling in finer.items() if sampling is not None}
 
 

@@ -164,12 +164,9 @@ class Sheets:
     @cached_property
     def centers(self) -> Reals:
         """Centroid of each triangle, piece or sphere (m, 3)."""
-        return np.concatenate(
-            [
-                centers_and_radii(part.vertices[part.triangles])[0] if isinstance(part, Mesh) else [part.center]
-                for part in self._parts
-            ]
-        )
+        corners = (part.vertices[part.triangles] for part in self._parts if isinstance(part, Mesh))
+        of_spheres = ([sphere.center] for sphere, _ in self.spheres)
+        return np.concatenate([*(centers_and_radii(one)[0] for one in corners), *of_spheres])
 
     def around(self, points: Reals, seen: Reals) -> Reals:
         """Return the most that points (n,) nearby saw, for each triangle, piece or sphere (m,)."""

@@ -7,10 +7,9 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from sobolev_batch.arrays import Reals
+from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.norms.tail.sampling import OctaveSampling
 
 # The true value lies within an error by chance with this probability, if sums over groups, or over points, are normal.
@@ -118,7 +117,7 @@ def _images_of(intervals: int) -> tuple[Reals, Reals]:
     return waves, counts[1:].astype(np.float64)
 
 
-def squared_moduli(values: NDArray[np.complexfloating]) -> Reals:
+def squared_moduli(values: Complexes) -> Reals:
     """Return |values|² in double precision."""
     return np.asarray(values.real.astype(np.float64, copy=False) ** 2 + values.imag.astype(np.float64, copy=False) ** 2)
 

@@ -114,10 +114,8 @@ class Kernels:
     def of_orders(cls, cutoff: float, orders: Sequence[float], fineness: int = 1) -> Self:
         """Return the kernels of some orders."""
         start, end = _grid(cutoff, fineness)
-        totals, drops, values = (
-            np.stack(rows, axis=-1)
-            for rows in zip(*(_tables(cutoff, order, fineness) for order in orders), strict=True)
-        )
+        tables = zip(*(_tables(cutoff, order, fineness) for order in orders), strict=True)
+        totals, drops, values = (np.stack(rows, axis=-1) for rows in tables)
         reach, step = fineness * max(map(reach_of, orders)) / cutoff, (end - start) / (len(drops) - 1)
         return cls(cutoff, tuple(orders), fineness, reach, start, step, totals, drops, values)
 

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sobolev_batch.arrays import Reals
+from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms.tail.sampling import OctaveSampling
@@ -55,7 +54,7 @@ class OctaveValues:
     """
 
     sampling: OctaveSampling
-    values: NDArray[np.complexfloating]
+    values: Complexes
     radii: Reals
     squares: Reals
 
@@ -80,7 +79,7 @@ def octave_values(
     many points, are exact. Known values, on the first lattices and maybe at the same drawn frequencies, are not
     computed again.
     """
-    values: list[NDArray[np.complexfloating]] = []
+    values: list[Complexes] = []
     finished = 0 if known is None else len(known.sampling.lattices)
     for number, sample_set in enumerate(sampling.sample_sets):
         if known is not None and number < finished:
@@ -116,7 +115,7 @@ def settings_on(
 def _compared(
     surface: Surface,
     sampling: OctaveSampling,
-    values: NDArray[np.complexfloating],
+    values: Complexes,
     orders: Sequence[float],
     backend: Backend,
 ) -> tuple[Reals, Reals]:
