@@ -16,6 +16,6 @@ ComplexDtype = Literal["complex128", "complex64"]
 Array = Any
 
 
-def slices(count: int, size: int) -> Iterator[slice]:
-    """Return the slices, of at most a size each, that make up a count of entries."""
-    return (slice(start, min(start + size, count)) for start in range(0, count, size))
+def slices(count: int, size: int, start: int = 0) -> Iterator[slice]:
+    """Return the slices, of at most a size each, that make up a count of entries, or those from one of them on."""
+    return (slice(first, min(first + size, count)) for first in range(start, count, size))

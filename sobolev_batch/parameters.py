@@ -33,12 +33,6 @@ def check_seed(seed: object) -> None:
         raise InputError(f"seed must be a whole number from 0 on, found {seed!r}")
 
 
-def check_workers(workers: object) -> None:
-    """Refuse anything but a whole number from 1 on, or None, by an InputError."""
-    if workers is not None and (not is_whole_number(workers) or workers < 1):
-        raise InputError(f"workers must be a whole number from 1 on, found {workers!r}")
-
-
 def path_of(path: object) -> Path:
     """Return a path that a text or a path names; InputError where it is neither."""
     try:

@@ -108,9 +108,8 @@ class RemesherSource(NestedSource, KeepingSource):
         members = []
         for name, parameters in self._swept(original.name):
             make, settings, files = self._remesher(parameters, folder)
-            metadata = tuple(
-                (key, _as_text(x) if isinstance(x, bool | str) else float(x)) for key, x in parameters.items()
-            )
+            known = parameters.items()
+            metadata = tuple((key, _as_text(x) if isinstance(x, bool | str) else float(x)) for key, x in known)
             identity = {"remesher": {**settings, "parameters": parameters}, "version": version}
             members.append(RemeshedMember(name, -1, make, identity, original, files, self._cache, metadata=metadata))
         return tuple(members)

@@ -58,9 +58,8 @@ def read_chunk(store: Store, keys: str, index: Index) -> tuple[list[str], dict[s
     # A single key is for the whole of a chunk, others are for its rows.
     is_for_rows = sealed.ndim == 1
     for number, text in enumerate(sealed.ravel().tolist()):
-        if text and text != seal(
-            key_in(text), [values[number] if is_for_rows else values for values in arrays.values()]
-        ):
+        own = [values[number] if is_for_rows else values for values in arrays.values()]
+        if text and text != seal(key_in(text), own):
             raise store.damage(f"chunk {index} of {keys.split('/')[0]}", CHANGED)
     return [key_in(text) for text in sealed.ravel().tolist()], arrays
 

@@ -18,8 +18,8 @@ from sobolev_batch.geometry.surface import Extent, Similarity, Surface
 from sobolev_batch.machine import available_cores
 from sobolev_batch.norms.accuracy.octaves import solve_in_octaves
 from sobolev_batch.norms.accuracy.problem import ESTIMATE_CAUTION, Problem, error_target
-from sobolev_batch.norms.accuracy.solve import coarser_than, permits_octaves, prefers_octaves, run_pilot
-from sobolev_batch.norms.accuracy.tolerance import Accuracy, core_lattice, lattice_of
+from sobolev_batch.norms.accuracy.solve import COARSER, prefers_octaves, run_pilot
+from sobolev_batch.norms.accuracy.tolerance import LEAST_OF_OCTAVES, Accuracy, core_lattice, lattice_of
 from sobolev_batch.norms.budget import Support
 from sobolev_batch.norms.tail.face_normals import FaceNormals
 from sobolev_batch.norms.tail.sampling import OctaveSampling, TailSampling
@@ -165,7 +165,7 @@ def choose_lattice(
     notes = [f"{label} will miss rtol {accuracy.rtol:g}" for label in short if choice is not None]
     if choice is None:
         # Fewer digits of all of them, from the easiest on.
-        for rtol in coarser_than(accuracy.rtol):
+        for rtol in (one for one in COARSER if one > accuracy.rtol):
             aimed, _ = _best_for_most(_with_accuracy(problems, rtol=rtol), study.dtype)
             if aimed is None:
                 break
@@ -197,7 +197,7 @@ def _best(problems: _Problems, dtype: ComplexDtype | None) -> _Outcome:
     # Near-duplicates have no relative accuracy.
     distances = {label: values for label, values in estimates.items() if np.all(values > problems[label].rounding)}
     ways = [partial(_on_one_lattice, problems, dtype)]
-    if distances and permits_octaves(first.accuracy):
+    if distances and first.accuracy.rtol >= LEAST_OF_OCTAVES:
         octaves_first = any(map(prefers_octaves, problems.values()))
         ways.insert(0 if octaves_first else 1, partial(_in_octaves, problems, dtype, distances))
     outcomes: list[_Outcome] = []

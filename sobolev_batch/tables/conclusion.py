@@ -45,12 +45,8 @@ _OBJECT_COLUMNS = (
 )
 
 
-def _typeset(order: float) -> str:
-    return minus(f"{order:g}")
-
-
 def study_verdict(
-    frame: pd.DataFrame, failed: Mapping[str, str], order_text: Callable[[float], str] = _typeset
+    frame: pd.DataFrame, failed: Mapping[str, str], order_text: Callable[[float], str] = lambda s: minus(f"{s:g}")
 ) -> tuple[tuple[str, ...], list[TableRow], str]:
     """Return the verdict on a study at each order, from the rows of `table` and the reasons of meshes that are missing.
 

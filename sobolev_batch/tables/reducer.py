@@ -1,14 +1,14 @@
 """Norms and distances from stored fields: batches and tiles of rows, each one task over the store."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
 
-from sobolev_batch.arrays import Complexes, Reals
+from sobolev_batch.arrays import Complexes, Reals, slices
 from sobolev_batch.geometry.surface import DIRECTIONS, Extent
 from sobolev_batch.norms.budget import Sums, Support, add_sums, image_weight, sums_of_shells
 from sobolev_batch.norms.estimate import NormEstimate, ReferenceEstimate, Tail, estimate_norms
@@ -245,7 +245,7 @@ class Reducer:
         near_axes = NearAxes(self.lattice, 2 * len(rows)) if self.sampling is None else None
         for number, block in enumerate(self.blocks):
             reference = None if self.reference is None else self.read([self.reference], number)
-            for batch in _slices(len(rows), self._read_at_once):
+            for batch in slices(len(rows), self._read_at_once):
                 values = self.read(rows[batch], number)
                 own[batch] += shell_sums(values, None, self.lattice, block)
                 if near_axes is not None:
@@ -264,7 +264,7 @@ class Reducer:
         if self.reference is not None:
             reference_octaves[:] = self.read_octaves(self.reference)
         parts = []
-        for batch in _slices(len(rows), max(1, int(_HELD_BYTES // (_SPECTRUM_BYTES * max(samples, 1))))):
+        for batch in slices(len(rows), max(1, int(_HELD_BYTES // (_SPECTRUM_BYTES * max(samples, 1))))):
             octaves = np.stack([self.read_octaves(row) for row in rows[batch]]).astype(np.complex128)
             arrays = self.axis.spectra(own[batch], squared_moduli(octaves), images[: len(rows)][batch]).named("norm")
             octaves -= reference_octaves
@@ -278,7 +278,7 @@ class Reducer:
     def pairs(self, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
         """Return distances over (orders, rows, others), in batches that fit a task; others are rows, or none."""
         distances, is_square = np.zeros((5, len(self.orders), len(rows), len(others))), tuple(rows) == tuple(others)
-        for batch in _slices(len(rows), max(1, self._capacity - self._group - self._read_at_once)):
+        for batch in slices(len(rows), max(1, self._capacity - self._group - self._read_at_once)):
             first = batch.start if is_square else 0
             found = self.tile(rows[batch], others[first:]).stacked
             distances[..., batch, first:] = found
@@ -355,7 +355,7 @@ class Reducer:
         reference = None if self.reference is None else self.read([self.reference], number)
 
         def read(fields: Sequence[int], buffer: Complexes) -> Complexes:
-            for batch in _slices(len(fields), self._read_at_once):
+            for batch in slices(len(fields), self._read_at_once):
                 values = self.read(fields[batch], number).astype(np.complex128, copy=False)
                 if reference is not None:
                     values -= reference
@@ -372,10 +372,10 @@ class Reducer:
             for array, found in zip(right.arrays, arrangement.squares(fields).arrays, strict=True):
                 array[..., group] = found
 
-        for group in _slices(shared, self._group):
+        for group in slices(shared, self._group):
             multiply(group, held[group], group.stop)
         buffer = np.empty((min(self._group, len(others) - shared), block.size), dtype=np.complex128)
-        for group in _slices(len(others), self._group, shared):
+        for group in slices(len(others), self._group, shared):
             multiply(group, read(others[group], buffer), len(rows))
         return products, left, right
 
@@ -400,7 +400,7 @@ class Reducer:
     def _tails_of_pairs(self, sampling: TailSampling, rows: Sequence[int], others: Sequence[int], shared: int) -> Tail:
         """Return the tails of squared distances (orders, rows, others); the first ``shared`` others are the rows."""
         parts = np.zeros((len(fields(Tail)), len(self.orders), len(rows), len(others)))
-        for batch in _slices(len(rows), max(1, _HELD_BYTES // (16 * sampling.size))):
+        for batch in slices(len(rows), max(1, _HELD_BYTES // (16 * sampling.size))):
             held = {i: self.read_octaves(rows[i]) for i in range(batch.start, batch.stop)}
             for j in range(min(batch.start, shared), len(others)):
                 values = held[j] if j < shared and j in held else self.read_octaves(others[j])
@@ -442,8 +442,3 @@ class Reducer:
             values = self.read(rows, number)
             sums += shell_sums(values[0] - values[1] if len(rows) > 1 else values[0], None, self.lattice, block)
         return sums
-
-
-def _slices(count: int, size: int, start: int = 0) -> Iterator[slice]:
-    for first in range(start, count, size):
-        yield slice(first, min(first + size, count))

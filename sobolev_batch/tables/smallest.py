@@ -114,10 +114,7 @@ def _smallest(members: pd.DataFrame, most: float) -> dict[str, Any]:
 
 def _remark(row: Mapping[Any, Any]) -> str:
     """Return the nearest mesh of a family without one below the bound, and the undecided ones."""
-    remarks = []
-    if not row["mesh"]:
-        amount = percent(row["nearest_relative"], row["nearest_relative_error"])
-        remarks.append(f"nearest: {row['nearest']}, {amount}" if row["nearest"] else "no distance is known")
-    if row["undecided"]:
-        remarks.append(f"undecided: {row['undecided']}")
-    return "; ".join(remarks)
+    amount = percent(row["nearest_relative"], row["nearest_relative_error"])
+    nearest = f"nearest: {row['nearest']}, {amount}" if row["nearest"] else "no distance is known"
+    undecided = f"undecided: {row['undecided']}" if row["undecided"] else ""
+    return "; ".join(filter(None, ("" if row["mesh"] else nearest, undecided)))

@@ -24,7 +24,7 @@ from distributed.comm.addressing import get_address_host_port, parse_address
 from sobolev_batch.batch.cluster import workers as workers_module
 from sobolev_batch.errors import ClusterError, InputError, one_line
 from sobolev_batch.machine import available_cores, machine_memory, require_machine_memory
-from sobolev_batch.parameters import byte_count, check_workers, format_bytes
+from sobolev_batch.parameters import byte_count, format_bytes, is_whole_number
 
 # In less, a worker with all its libraries has no memory left for any transform.
 _LEAST_BYTES = 700_000_000
@@ -155,7 +155,8 @@ def thread_client(workers: int | None = None) -> Iterator[Client]:
 
 def check_cluster(client: Client | None, workers: object, memory: object = None) -> None:
     """Refuse by an InputError a client that is of no use, processes to start beside it, and a wrong number of them."""
-    check_workers(workers)
+    if workers is not None and (not is_whole_number(workers) or workers < 1):
+        raise InputError(f"workers must be a whole number from 1 on, found {workers!r}")
     if client is not None:
         require_blocking(client)
         if workers is not None or memory is not None:

@@ -288,9 +288,8 @@ def solution_of(state: State) -> Solution:
     of_octaves = [values.error_norms(core.weights.orders) for octave in state.octaves for values in octave.values]
     errors = np.asarray(np.hypot.reduce([core.errors, *of_octaves]))
     found = estimate_norms(core.sums, core.weights, support, errors, state.tail)
-    values = [
-        SurfaceValues(field, tuple(one.values[n] for one in state.octaves)) for n, field in enumerate(core.fields)
-    ]
+    in_octaves = [octave.values for octave in state.octaves]
+    values = [SurfaceValues(field, tuple(one[n] for one in in_octaves)) for n, field in enumerate(core.fields)]
     return Solution(found, core.weights.lattice, tuple(values), has_tail=True)
 
 

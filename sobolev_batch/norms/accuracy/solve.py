@@ -38,8 +38,8 @@ from sobolev_batch.transform.probe import Sample, estimate
 _ROUNDS = 6
 # From this rtol on, octaves are cheaper than a larger lattice.
 _OCTAVES_FIRST = 1e-3
-# What a best effort aims at where more is out of reach.
-_COARSER = (1e-1, 1e-2, 1e-3, LEAST_OF_OCTAVES)
+# What a best effort aims at where more is out of reach, the easiest first.
+COARSER = (1e-1, 1e-2, 1e-3, LEAST_OF_OCTAVES)
 # Coordinates in double precision may be off by this, in radii, if the origin is some 10⁷ of these away. Of distances as
 # small, relative to the norms, the digits are not worth minutes of a best effort.
 _OF_COORDINATES = 1e-8
@@ -107,7 +107,7 @@ def solve(problem: Problem, seed: int = 0) -> Solution:
     if seem_equal and _differ_beyond(strict, first[0]):
         # No lattice would show it.
         attempts = [in_octaves]
-    elif permits_octaves(problem.accuracy):
+    elif problem.accuracy.rtol >= LEAST_OF_OCTAVES:
         if prefers_octaves(problem) and not seem_equal:
             attempts = [in_octaves, on_lattices]
         else:
@@ -147,7 +147,7 @@ def _largest_share(solution: Solution) -> float:
 def _in_coarser_octaves(problem: Problem, seed: int) -> list[Solution]:
     """Return what octaves reach that aim at less than required: aiming too high, they would stop far too early."""
     found = []
-    for rtol in coarser_than(problem.accuracy.rtol):
+    for rtol in (one for one in COARSER if one > problem.accuracy.rtol):
         try:
             solution = solve_in_octaves(problem.with_rtol(rtol), seed)
         except AccuracyError:
@@ -159,30 +159,15 @@ def _in_coarser_octaves(problem: Problem, seed: int) -> list[Solution]:
     return found
 
 
-def coarser_than(rtol: float) -> list[float]:
-    """Return what a best effort may aim at in place of an rtol, from the easiest on.
-
-    >>> coarser_than(5e-3)
-    [0.1, 0.01]
-    """
-    return [coarser for coarser in _COARSER if coarser > rtol]
-
-
 def prefers_octaves(problem: Problem) -> bool:
     """Tell whether octaves are likely to be cheaper than one lattice that reaches far enough, or are more reliable.
 
     The tail of flat faces follows no law that a lattice could extrapolate, since they may repeat.
     """
     is_regular = max(problem.orders) < _LOW_ORDER or not FaceNormals.from_surfaces(problem.surfaces)
-    least = _OCTAVES_FIRST if is_regular else LEAST_OF_OCTAVES
-    if problem.accuracy.rtol < least:
+    if problem.accuracy.rtol < (_OCTAVES_FIRST if is_regular else LEAST_OF_OCTAVES):
         return False
     return not is_regular or first_lattice(problem.support, problem.orders, problem.accuracy)[1]
-
-
-def permits_octaves(accuracy: Accuracy) -> bool:
-    """Tell whether octaves can give an accuracy with a sensible number of samples."""
-    return accuracy.rtol >= LEAST_OF_OCTAVES
 
 
 def _near_duplicates(problem: Problem, lattice: Lattice) -> NDArray[np.bool_]:
@@ -352,7 +337,7 @@ def run_pilot(problem: Problem) -> tuple[Reals, Lattice, ComplexDtype]:
     for rounds_left in reversed(range(_ROUNDS)):
         dtype = problem.dtype(lattice, target)
         solution, _ = _compute(problem, lattice, target, dtype)
-        solution, larger = _with_hidden_part(problem, solution, permits_octaves(problem.accuracy))
+        solution, larger = _with_hidden_part(problem, solution, problem.accuracy.rtol >= LEAST_OF_OCTAVES)
         allowed = problem.accuracy.rtol * problem.accuracy.scale(values)
         if np.all(solution.estimate.truncation <= allowed) or problem.accuracy.best_effort:
             break
