@@ -215,7 +215,6 @@ def finish_mesh(job: Job, parts: Sequence[list[StoredBlocks] | Record]) -> Recor
 
 
 def _store_octaves(job: Job, tail: TailSampling, surface: Surface, target: ErrorTarget | None) -> StoredBlocks:
-    """Compute and store a surface's values at all samples of octaves."""
     settings = target.tightened(_OCTAVES_TIGHTENING) if target else job.transform
     values = [octave_values(surface, octave, job.orders, settings, job.execution) for octave in tail.octaves]
     cutoff, difference = tail.highest_frequency, None
@@ -244,7 +243,6 @@ def _beyond_lattice(job: Job, surface: Surface) -> Remainder | None:
 
 
 def _store_whole(job: Job, surface: Surface, target: ErrorTarget | None) -> StoredBlocks:
-    """Compute and store a field of one block."""
     lattice, transform, execution = job.lattice, job.transform, job.execution
     if target:
         field = field_for(surface, lattice, target, transform, execution)

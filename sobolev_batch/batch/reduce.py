@@ -235,7 +235,6 @@ def _permitted(method: Method, search: Range | None) -> Remesher:
 def _outcomes(
     searches: Sequence[RecordedSearch], client: Client | None, workers: int | None
 ) -> Iterator[tuple[str, Reduction | Exception]]:
-    """Carry out searches and yield what came of each; see `reduce`."""
     processes = available_cores() if workers is None else workers
     if client is None and (processes == 1 or (workers is None and len(searches) == 1 and _is_small(searches[0]))):
         for search in searches:

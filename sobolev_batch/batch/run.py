@@ -289,7 +289,6 @@ def _tabulate(objects: Objects, ended: Mapping[str, Ended], is_current: Callable
 
 
 def _summary(location: Location, ended: Mapping[str, Ended]) -> Summary:
-    """Return the outcome of the objects of a study together."""
     records = {name: one.record for name, one in ended.items()}
     return Summary(
         str(location),

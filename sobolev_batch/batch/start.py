@@ -67,7 +67,6 @@ def warnings_of(study: Study, store: Location) -> tuple[str, ...]:
 
 
 def _require_members(study: Study, only: Sequence[str]) -> None:
-    """Refuse names of objects, families and members that a study does not have."""
     known: dict[str, None] = {}
     unknown = list(only)
     for one in study.objects.values() if only else ():

@@ -143,7 +143,6 @@ def are_tabulated(workspace: Workspace, digest: str = "") -> bool:
 
 
 def _digest(workspace: Workspace, placed: Sequence[Placed]) -> str:
-    """Return a digest of all that the tables depend on."""
     plan = workspace.plan
     shown = [(workspace.rows[i], workspace.records[i]) for i, _, _ in placed]
     rows = [

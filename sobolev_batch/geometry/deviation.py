@@ -199,7 +199,6 @@ class _Pieces:
     is_searched: bool = False
 
     def batches(self) -> Iterator[Self]:
-        """Yield them in groups that memory holds."""
         for group in slices(self.corners.shape[2], _BATCH):
             yield replace(self, corners=self.corners[..., group], close=self.close[:, group])
 

@@ -334,7 +334,6 @@ class Mesh:
         return _frozen(np.concatenate([measure(edges) for edges in self._edges()]))
 
     def _edges(self) -> Iterator[_Edges]:
-        """Yield the edges of each batch of triangles."""
         axes = np.ascontiguousarray(self.vertices.T)
         for batch in slices(len(self.triangles), _BATCH):
             a, b, c = (axes.take(corner, axis=1) for corner in self.triangles[batch].T)
@@ -394,7 +393,6 @@ def _aspect_ratios(edges: _Edges) -> Reals:
 
 
 def _used(triangles: Indices, vertex_count: int) -> Indices:
-    """Return the indices of the vertices that triangles use, in ascending order."""
     used = np.zeros(vertex_count, dtype=bool)
     used[triangles] = True
     return np.flatnonzero(used).astype(np.int64, copy=False)
@@ -499,7 +497,6 @@ def _edges_of(triangles: Indices, vertex_count: int) -> tuple[int, int, int, int
 
 
 def _count_duplicates(triangles: Indices) -> int:
-    """Return how many triangles repeat the three vertices of another one."""
     ordered = np.sort(triangles, axis=1)
     ordered = ordered[np.lexsort(ordered.T)]
     return int(np.count_nonzero((ordered[1:] == ordered[:-1]).all(axis=1)))

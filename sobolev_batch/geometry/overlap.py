@@ -84,7 +84,6 @@ class _Side:
 
     @classmethod
     def of(cls, mesh: Mesh, center: Reals, size: float) -> Self:
-        """Measure the triangles of a mesh, batch by batch."""
         count = len(mesh.triangles)
         side = cls(mesh, center, size, np.zeros((count, 4)), np.zeros(count), np.zeros(count))
         for part in slices(count, _BATCH):

@@ -318,7 +318,6 @@ def doubled(counts: Counts) -> Counts:
 
 
 def _brought_back(interval: Interval, values: Reals) -> Reals:
-    """Return parameters within their interval."""
     if interval.periodic:
         return np.asarray(values - np.floor((values - interval.low) / interval.length) * interval.length)
     return np.asarray(np.clip(values, interval.low, interval.high))

@@ -120,12 +120,10 @@ class _Segment:
 
     @property
     def count(self) -> int:
-        """Number of samples."""
         return int(self.samples.stop - self.samples.start)
 
     @property
     def place(self) -> slice:
-        """Place of these radii on the axis."""
         return slice(self.first, self.first + len(self.starts) * _NODES)
 
     @cached_property

@@ -115,7 +115,6 @@ class RemesherSource(NestedSource, KeepingSource):
         return tuple(members)
 
     def _swept(self, alone: str) -> Iterator[tuple[str, dict[str, Parameter]]]:
-        """Yield a name and the parameters of each mesh."""
         lists = {name: value for name, value in self.parameters.items() if isinstance(value, list | tuple)}
         for values in product(*lists.values()):
             texts = list(map(_as_text, values))

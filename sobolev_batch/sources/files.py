@@ -294,7 +294,6 @@ def matching_files(folder: Path, path: str) -> list[Path]:
 
 
 def _times(paths: list[Path], given: tuple[float, ...] | Literal["names"]) -> dict[Path, float]:
-    """Return the time of each file, in the order of times."""
     if given == "names":
         times = {path: _last_number(path) for path in paths}
     elif len(given) == len(paths):
@@ -344,7 +343,6 @@ def file_digest(path: Path) -> str:
 
 
 def _read_once(file: BufferedReader, length: int) -> bytes:
-    """Read an open file, and remember its digest."""
     state, data = _settled_state(Path(file.name), file), file.read(length)
     _remembered(state, hashlib.sha256(data).hexdigest())
     return data
@@ -359,7 +357,6 @@ def _settled_state(path: Path, file: BufferedReader) -> _State:
 
 
 def _remembered(state: _State, digest: str) -> str:
-    """Return a digest, and remember it for a state of its file."""
     if len(_digests) >= _MOST_DIGESTS:
         _digests.clear()
     if state:

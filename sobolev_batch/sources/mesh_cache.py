@@ -105,7 +105,6 @@ class MeshCache:
         return any(self.asked.get(key, known) != known for key, (_, known) in self.assumed.items())
 
     def _ask(self, key: str, words: Sequence[str]) -> str:
-        """Return what a command prints, and keep it."""
         self.asked[key] = printed(words)
         self.folder.write({key: self.asked[key].encode()})
         return self.asked[key]

@@ -215,7 +215,6 @@ def _tail(*files: IO[bytes]) -> str:
 
 
 def _write(mesh: Mesh, path: Path) -> None:
-    """Write a mesh in a format of this package or of meshio."""
     if path.suffix in WRITERS:
         write_mesh(mesh, path)
         return
@@ -224,7 +223,6 @@ def _write(mesh: Mesh, path: Path) -> None:
 
 
 def _read(path: Path) -> Mesh:
-    """Read a mesh in a format of this package or of meshio."""
     if is_mesh_name(path):
         return read_mesh(path)
     meshio = _meshio(path)

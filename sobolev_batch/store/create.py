@@ -281,7 +281,6 @@ def _weight_columns(plan: Plan) -> dict[str, tuple[str, Reals, dict[str, str]]]:
 
 
 def _sample_columns(tail: TailSampling) -> dict[str, tuple[str, NDArray[Any], dict[str, str]]]:
-    """Return the coordinates of the samples of octaves."""
     units = {"units": "cycles per unit length"}
     columns = {name: ("sample", column, units) for name, column in zip(AXES, tail.frequencies.T, strict=True)}
     columns["weight"] = ("sample", tail.weights, {"long_name": "weight in the integral over all frequencies"})
@@ -363,7 +362,6 @@ def labels_for(plan: Plan, stored: Sequence[str], records: Sequence[Record | Non
 
 
 def _attributes(plan: Plan, labels: Sequence[str]) -> dict[str, Any]:
-    """Return the attributes of the root of the store of a plan with some rows."""
     study, planned = plan.study, {row.label for row in plan.rows}
     return {
         "title": study.object.title,

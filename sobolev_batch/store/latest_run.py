@@ -108,7 +108,6 @@ def unlock(store: str | Path | Location, *, force: bool = False) -> Lock | None:
 
 
 def _silence_seconds(location: Location, lock: Lock) -> float:
-    """Return the time since the latest heartbeat of a lock's holder."""
     moments = [lock.since] if lock.run else []
     # If the store cannot be read, only the lock itself is known.
     with suppress(StoreError):

@@ -157,7 +157,6 @@ def acquire(location: Location, lock: Lock) -> None:
 
 
 def _take_over(location: Location, lock: Lock, current: Lock) -> None:
-    """Take the lock over from a process that is gone."""
     refusal = LockError(
         f"{location}: another run has this store to itself: {current.driver}, since {current.since}. "
         "Wait for it or stop it; if it is gone without having been able to say so, "

@@ -117,7 +117,6 @@ class _Line:
     """A record as one line of JSON, which begins with its row: records of rows may trade places."""
 
     def to_json(self, row: int) -> str:
-        """Return the record of a row as one line of JSON."""
         return json.dumps({_ROW: row, **asdict(cast(Any, self))})
 
     @classmethod

@@ -179,7 +179,6 @@ def choose_lattice(
 
 
 def _worst(shortfalls: Mapping[str, AccuracyError]) -> AccuracyError:
-    """Return why the pair that needs the largest rtol misses its accuracy."""
     return max(shortfalls.values(), key=lambda shortfall: shortfall.reachable)
 
 

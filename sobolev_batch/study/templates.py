@@ -61,7 +61,6 @@ def sections_of_objects(
 
 
 def _listed_meshes(given: str | Sequence[MeshTable], folder: Path) -> dict[str, _Listed]:
-    """Return the meshes of the section [objects], by object."""
     base = Path()
     if isinstance(given, str):
         base, given = Path(given).parent, read_mesh_list(folder / given)

@@ -124,7 +124,6 @@ def _sizes(rows: pd.DataFrame) -> list[list[str]]:
 
 
 def _nearest_rows(rows: pd.DataFrame, at_sizes: Sequence[pd.DataFrame]) -> Iterator[TableRow]:
-    """Yield the nearest mesh of all, and those of each size."""
     yield _nearest_row("nearest of all", rows)
     for members in at_sizes:
         low, high = int(members["triangles"].min()), int(members["triangles"].max())
@@ -175,7 +174,6 @@ def _lead(best: pd.Series, members: pd.DataFrame) -> str:
 
 
 def _smallest_rows(rows: pd.DataFrame, families: Sequence[str]) -> Iterator[TableRow]:
-    """Yield the smallest mesh of each family below each bound."""
     for bound in _BOUNDS:
         frame = smallest_of(rows, bound)
         for row in frame[frame["family"].isin(families)].to_dict(orient="records"):

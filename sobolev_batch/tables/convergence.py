@@ -187,7 +187,6 @@ def tables_of(
 
 
 def _table(tree: xr.DataTree, order: Orders | None, x: str) -> pd.DataFrame:
-    """Return the rows of one object, see `table`."""
     frame = _rows(tree, order)
     frame.attrs["reference"] = reference_of(tree)
     frame.attrs["unit_length"] = unit_of(tree)[1]
@@ -274,7 +273,6 @@ def format_table(
 
 
 def _sections(name: str, tree: xr.DataTree, frame: pd.DataFrame, x: str) -> Iterator[Section]:
-    """Yield the tables of an object, and what is to be known of its meshes."""
     if name:
         yield Section(f"Object {name}")
     marked = with_remarks(frame)
@@ -322,7 +320,6 @@ def with_remarks(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _notes(trees: Sequence[xr.DataTree], frames: Sequence[pd.DataFrame], x: str) -> list[str]:
-    """Return what the numbers of all tables mean."""
     notes = [*wrapped(_NOTE), *([] if x == EDGE_LENGTH else [f"Rates are those of distance ~ ({x})^-rate."])]
     notes += wrapped(" ".join(unit_notes(trees)))
     if any("proximity" in tree.children for tree in trees):

@@ -146,7 +146,6 @@ def _joined(trees: Sequence[xr.DataTree]) -> xr.DataTree:
 
 
 def _common(tree: xr.DataTree) -> dict[str, Any]:
-    """Return what stores have in common that open as one."""
     reference = finished_group(tree, "meshes", load=False)["key"].sel(mesh=reference_of(tree)).item()
     of_study = {name: root_attribute(tree, "study")[name] for name in ("lattice", "dtype", "octaves")}
     return {**of_study, "similarity": root_attribute(tree, "similarity"), "reference": reference}

@@ -103,7 +103,6 @@ def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
 
 
 def _pairs_at(tree: xr.DataTree, meshes: xr.Dataset, others: tuple[float, ...]) -> xr.Dataset:
-    """Return the distances of all pairs of meshes from their fields."""
     reducer, _ = stored_reducer(tree, others)
     rows: list[int] = meshes["row"].values.tolist()
     found = known_distances(reducer, rows, rows, set(reducer.complete)).named("distance")

@@ -255,8 +255,6 @@ class _Run(Generic[Result]):
 
 
 class _Loop(Generic[Result]):
-    """The loop over all tasks of all runs."""
-
     def __init__(self, waiting: Iterator[tuple[str, Stages[Result]]], is_fatal: Callable[[Exception], bool]) -> None:
         self._waiting, self._is_fatal = waiting, is_fatal
         self._begun: list[_Run[Result]] = []
@@ -270,7 +268,6 @@ class _Loop(Generic[Result]):
         self._ended = deque[tuple[str, Result | Exception]]()
 
     def outcomes(self) -> Iterator[tuple[str, Result | Exception]]:
-        """Yield the outcome of each run; see `side_by_side`."""
         try:
             while True:
                 self._hand_out()
@@ -340,7 +337,6 @@ class _Loop(Generic[Result]):
         self._completed.add(future)
 
     def _take_back(self) -> None:
-        """Wait for tasks that end, and give their outcomes to their runs."""
         # Others were given up.
         batch = [future for future in self._completed.next_batch() if future in self._running]
         runs: dict[_Run[Result], None] = {}
@@ -372,7 +368,6 @@ class _Loop(Generic[Result]):
             self._go_on(run)
 
     def _give(self, run: _Run[Result], task: Task, outcome: Any) -> None:
-        """Give the outcome of a task to its run."""
         try:
             if type(outcome) in (StoreError, SpaceError):
                 raise type(outcome)(f"{outcome}; then the same command goes on from what is stored") from outcome
@@ -394,7 +389,6 @@ class _Loop(Generic[Result]):
         self._advance(run, error)
 
     def _go_on(self, run: _Run[Result]) -> None:
-        """Let a run go on whose wave is done."""
         if run in self._begun and not (run in self._ready or run.in_flight or run.suspects):
             self._advance(run)
 

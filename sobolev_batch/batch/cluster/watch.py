@@ -166,7 +166,6 @@ class Watch:
         self._client.scheduler_comm.comm.abort()
 
     def _ask(self, operation: str, **arguments: Any) -> Any:
-        """Return what the scheduler answers within some seconds."""
         return self._client.sync(
             getattr(self._client.scheduler, operation), callback_timeout=_POLL_SECONDS, **arguments
         )

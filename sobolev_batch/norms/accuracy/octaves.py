@@ -453,6 +453,5 @@ def _lattice(state: State, octave: Octave, intervals: int, rng: np.random.Genera
 
 
 def _resolvable_frequency(problem: Problem) -> float:
-    """Return the frequency up to which all surfaces can be transformed."""
     areas = [surface.area for surface in problem.surfaces if isinstance(surface, Smooth)]
     return float((_MOST_SMOOTH_NODES / (4 * POINTS_PER_SQUARE * max(areas))) ** 0.5) if areas else np.inf

@@ -139,7 +139,6 @@ def _is_rounding(problem: Problem, solution: Solution) -> bool:
 
 
 def _largest_share(solution: Solution) -> float:
-    """Return the largest error of a solution, relative to its number."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return float(np.nan_to_num(solution.estimate.errors / solution.estimate.values, nan=np.inf).max())
 

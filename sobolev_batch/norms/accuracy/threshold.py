@@ -146,7 +146,6 @@ class _Search:
         return self._in_octaves(seed), "octaves"
 
     def on_first_lattice(self) -> tuple[float, Interval]:
-        """Return the part of the distance on the first lattice, and bounds on all of it."""
         most = min(_FIRST_M, self.problem.accuracy.largest_intervals)
         return self._on_lattice(self._lattice(_BEYOND, most), _FIRST_RTOL)
 
@@ -179,7 +178,6 @@ class _Search:
         return value, _with_beyond(problem, value, error, lattice, [field.values for field in fields])
 
     def _in_octaves(self, seed: int) -> Interval:
-        """Return bounds on the distance from what octaves measure."""
         rtol = _FIRST_RTOL
         for _ in range(_ROUNDS):
             accuracy = replace(self.problem.accuracy, rtol=rtol, floor=self.threshold.lower)

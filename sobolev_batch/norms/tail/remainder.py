@@ -226,7 +226,6 @@ def remainder_of_flat(
 def _estimate(
     seen_by: _Seen, count: int, rng: np.random.Generator, *, is_exact: bool = True, is_bound: bool = False
 ) -> Remainder:
-    """Return an estimate from some points."""
     little = seen_by.moved
     found = _from_pairs(seen_by, *little, count, rng) if little else _from_points(seen_by, count, rng)
     terms, covering, n, means = found.terms, seen_by.covering, len(found.terms), found.terms.mean(axis=0)
