@@ -266,10 +266,8 @@ def _store_blocks(job: Job, surface: Surface, blocks: Sequence[Block], target: E
         probes.append(probe_block(surface, lattice, transform, block, result.values, draws, execution))
         backends.append(result.backend)
         points = result.points
-    quality = Quality.from_surface(surface, join(probes))
-    return StoredBlocks(
-        Facts.of_surface(surface, points), quality=quality, checksums=tuple(checksums), backends=tuple(backends)
-    )
+    facts, quality = Facts.of_surface(surface, points), Quality.from_surface(surface, join(probes))
+    return StoredBlocks(facts, quality=quality, checksums=tuple(checksums), backends=tuple(backends))
 
 
 def _finished(job: Job, stored: Sequence[StoredBlocks]) -> Record:

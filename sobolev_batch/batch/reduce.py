@@ -301,9 +301,8 @@ def _searched(search: RecordedSearch, cluster: Callable[[], Any], at_once: Calla
     reason, folder = search.reason(record), search.folder
     path = str(folder.below(search.mesh_key)) if isinstance(folder, Location) and not reason else ""
     mesh = None if reason or path else search.mesh(record)
-    return Reduction(
-        search.name, search.limit, record.triangles, record.trials, search.bracket(record), reason, path, mesh
-    )
+    found = record.triangles, record.trials, search.bracket(record)
+    return Reduction(search.name, search.limit, *found, reason, path, mesh)
 
 
 def _originals(meshes: Any, folder: Location | None) -> dict[str, tuple[Member, str]]:

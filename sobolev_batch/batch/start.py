@@ -71,9 +71,8 @@ def _require_members(study: Study, only: Sequence[str]) -> None:
     unknown = list(only)
     for one in study.objects.values() if only else ():
         try:
-            known |= dict.fromkeys(
-                [*filter(None, [one.name]), *(family for family, _ in one.members.values()), *one.members]
-            )
+            families = (family for family, _ in one.members.values())
+            known |= dict.fromkeys([*filter(None, [one.name]), *families, *one.members])
         except InputError:
             return  # The run reports what cannot be listed, and may have any name.
         unknown = [name for name in unknown if not one.chosen([name])]

@@ -45,20 +45,18 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> Stages[Tabulated 
     digest = _digest(workspace, placed)
     if are_tabulated(workspace, digest):
         return None
-    plan, complete = workspace.plan, workspace.complete
+    store, plan, complete = workspace.store, workspace.plan, workspace.complete
     qualities = {row: record.quality for row, record in complete.items()}
     checksums = {row: record.checksums for row, record in complete.items()}
-    reducer = Reducer.for_fields(
-        workspace.store, plan.choice, plan.study.orders, qualities, checksums, workspace.reference
-    )
+    reducer = Reducer.for_fields(store, plan.choice, plan.study.orders, qualities, checksums, workspace.reference)
     # A larger task is tried all the same, with nothing beside it.
     projected_bytes = min(reducer.task_bytes, cluster.workers.largest_allowed_bytes)
     keys, meshes = _spectrum_keys(workspace), meshes_table(workspace, placed)
-    chunks = stale_chunks(workspace.store, keys)
+    chunks = stale_chunks(store, keys)
     pairs, tiles, replaced = _pairs(workspace), list[tuple[int, int]](), list[str]()
     if pairs is not None:
         # Readers find all tables of one state, or none.
-        replaced = hide_tables(workspace.store)
+        replaced = hide_tables(store)
         pairs.lay_out(coordinates_of(meshes, plan.study.orders))
         tiles = pairs.stale()
     advance = cluster.count_steps("reduction", len(chunks) + len(tiles))
@@ -78,7 +76,7 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> Stages[Tabulated 
         yield Wave(cluster, of_pairs, take, projected_bytes)
     last = Task(write_results, (workspace, reducer, meshes, digest, replaced), projected_bytes, stage="tables")
     tabulated: Tabulated
-    tabulated, workspace.store.metadata = yield from result_from(cluster, last)
+    tabulated, store.metadata = yield from result_from(cluster, last)
     return tabulated
 
 

@@ -140,10 +140,8 @@ def _shared_planes(sides: Sequence[_Side], tolerance: float) -> tuple[Reals, lis
     cluster, of = np.unique(cluster, return_inverse=True)[1], [np.full(len(side.areas), -1) for side in sides]
     if not len(kept):
         return np.zeros((0, 4)), of
-    halves = ~is_second[kept], is_second[kept]
-    members = [
-        which[kept[half] - start] for which, half, start in zip(chosen, halves, (0, len(chosen[0])), strict=True)
-    ]
+    halves, starts = (~is_second[kept], is_second[kept]), (0, len(chosen[0]))
+    members = [which[kept[half] - start] for which, half, start in zip(chosen, halves, starts, strict=True)]
     corners = [side.corners(which) for side, which in zip(sides, members, strict=True)]
     planes = _planes_through(np.concatenate(corners), np.concatenate([cluster[half] for half in halves]))
     step = max(1, _MOST_PAIRS // (8 * len(planes)))

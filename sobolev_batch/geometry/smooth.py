@@ -134,9 +134,8 @@ class Smooth(ABC):
         The counts of nodes along u and v are odd where periodic. The weights include the area elements. Where
         `tangents` is None, these are those of the interpolant through all nodes: see `Interval.derivative`.
         """
-        (u, along_u), (v, along_v) = (
-            interval.rule(count) for interval, count in zip(self.intervals, counts, strict=True)
-        )
+        rules = (interval.rule(count) for interval, count in zip(self.intervals, counts, strict=True))
+        (u, along_u), (v, along_v) = rules
         whole = self._on_grid(u, v) if self.tangents(u[:1], v[:1]) is None else None
         for batch in slices(counts[0], max(1, most // counts[1])):
             parts = self._on_grid(u[batch], v) if whole is None else tuple(values[:, batch] for values in whole)

@@ -102,9 +102,7 @@ def outer_windows(weights: SobolevWeights) -> Reals:
     """Return the weights (2, shell_count) that turn shell sums into the mean energies of `Sums.outer`."""
     lattice, ranges = weights.lattice, _WINDOWS if weights.cutoff is None else _OCTAVES
     radii = 2 / lattice.M * np.sqrt(np.arange(lattice.shell_count))
-    return np.stack(
-        [((radii >= low) & (radii < high)) / ((high - low) * lattice.xi_max) for low, high in ranges]
-    ).astype(np.float64)
+    return np.stack([((radii >= low) & (radii < high)) / ((high - low) * lattice.xi_max) for low, high in ranges])
 
 
 def truncated(

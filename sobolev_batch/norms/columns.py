@@ -151,9 +151,8 @@ def dataset_of(
     columns: Mapping[str, NDArray[Any]], dimensions: Sequence[str], coordinates: Mapping[Any, Any]
 ) -> xr.Dataset:
     """Return values by name over some dimensions, and `error_part` over `part` besides, as a described dataset."""
-    variables = {
-        name: ((*dimensions, *(("part",) if name == "error_part" else ())), values) for name, values in columns.items()
-    }
+    further = {"error_part": ("part",)}
+    variables = {name: ((*dimensions, *further.get(name, ())), values) for name, values in columns.items()}
     names = {"part": np.array(PARTS, dtype=object)} if "error_part" in columns else {}
     return describe(xr.Dataset(variables, coords={**coordinates, **names}))
 

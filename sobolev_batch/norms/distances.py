@@ -256,9 +256,8 @@ def _spheres(*operands: OperandLike, lattice: Lattice | None) -> tuple[Sphere, .
 
 def _distance_of_spheres(a: Sphere, b: Sphere, order: Orders) -> xr.Dataset:
     orders = check_orders(order)
-    own, other, product = (
-        np.array([sphere_inner_product(*pair, s) for s in orders]) for pair in ((a, a), (b, b), (a, b))
-    )
+    pairs = (a, a), (b, b), (a, b)
+    own, other, product = (np.array([sphere_inner_product(*pair, s) for s in orders]) for pair in pairs)
     distances = _closed_form(np.sqrt(np.maximum(own + other - 2 * product, 0.0)), own + other)
     errors = _CLOSED_FORM_ACCURACY * (own + other)
     reference = ReferenceEstimate(_closed_form(np.sqrt(other), other), product - other, errors)

@@ -306,9 +306,8 @@ def with_noise(mesh: Mesh, amplitude: float, seed: int) -> Mesh:
 def _vertex_normals(vertices: Reals, triangles: Indices) -> Reals:
     """Return the mean normal of the triangles at each vertex, weighted by area, (m, 3); zero where they cancel."""
     crosses = normals(vertices, triangles)
-    sums = np.stack(
-        [np.bincount(triangles.ravel(), np.repeat(crosses[:, axis], 3), len(vertices)) for axis in range(3)], axis=1
-    )
+    columns = [np.bincount(triangles.ravel(), np.repeat(column, 3), len(vertices)) for column in crosses.T]
+    sums = np.stack(columns, axis=1)
     lengths = np.linalg.norm(sums, axis=1, keepdims=True)
     return np.asarray(np.divide(sums, lengths, out=np.zeros_like(sums), where=lengths > 0))
 

@@ -30,9 +30,8 @@ def study_schema() -> dict[str, Any]:
     """
     sources: dict[str, type[BaseModel]] = {name: source_type_of(name) for name in sorted(sources_by_name())}
     models: set[type[BaseModel]] = {StudyDocument, Source, Family, FamilyReference, SearchedSource, *sources.values()}
-    references, whole = models_json_schema(
-        [(model, "validation") for model in sorted(models, key=attrgetter("__name__"))]
-    )
+    in_order = sorted(models, key=attrgetter("__name__"))
+    references, whole = models_json_schema([(model, "validation") for model in in_order])
     known = whole["$defs"]
     keys = {model: known[reference["$ref"].rsplit("/", 1)[1]] for (model, _), reference in references.items()}
     of_family = {key: keys[Family]["properties"][key] for key in KEYS_OF_FAMILY}

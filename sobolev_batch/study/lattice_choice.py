@@ -92,9 +92,8 @@ class LatticeChoice:
             more = _larger_lattice(self.lattice, truncation, aliasing, orders, accuracy)
             before = f"xi_max {self.lattice.xi_max:.4g}, M {self.lattice.M}"
         else:
-            more = _finer_octaves(
-                self.lattice, self.tail, truncation.max(), aliasing.max(), statistical.max(), accuracy
-            )
+            largest = truncation.max(), aliasing.max(), statistical.max()
+            more = _finer_octaves(self.lattice, self.tail, *largest, accuracy)
             before = f"{len(self.tail.octaves)} octaves with {self.tail.size:,} samples"
         if more is None:
             return None

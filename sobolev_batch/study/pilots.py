@@ -183,9 +183,7 @@ def _worst(shortfalls: Mapping[str, AccuracyError]) -> AccuracyError:
 
 
 def _with_accuracy(problems: _Problems, **changes: Any) -> _Problems:
-    return {
-        label: replace(problem, accuracy=replace(problem.accuracy, **changes)) for label, problem in problems.items()
-    }
+    return {label: replace(one, accuracy=replace(one.accuracy, **changes)) for label, one in problems.items()}
 
 
 def _best(problems: _Problems, dtype: ComplexDtype | None) -> _Outcome:
@@ -224,9 +222,8 @@ def _in_octaves(problems: _Problems, dtype: ComplexDtype | None, distances: Mapp
     """Choose a small lattice and the octaves beyond it, from the pairs with the smallest distances (orders,)."""
     first = next(iter(problems.values()))
     closest = ESTIMATE_CAUTION * np.min(list(distances.values()), axis=0)
-    demanding = dict.fromkeys(
-        min(distances, key=lambda label: distances[label][order]) for order in range(len(first.orders))
-    )
+    numbers = range(len(first.orders))
+    demanding = dict.fromkeys(min(distances, key=lambda label: distances[label][order]) for order in numbers)
     lattices: dict[str, Lattice] = {}
     samplings: list[list[OctaveSampling]] = []
     shortfalls: dict[str, AccuracyError] = {}
@@ -301,9 +298,8 @@ def _choice(
     computed = dtype or ("complex128" if "complex128" in needed else "complex64")
     target = error_target(closest, problem.orders, problem.accuracy, problem.area)
     stored = dtype or ("complex64" if problem.permits_single_storage(lattice, target) else computed)
-    distances = ", ".join(
-        f"{value:.2g} at order {order:g}" for value, order in zip(closest.tolist(), problem.orders, strict=True)
-    )
+    at_orders = zip(closest.tolist(), problem.orders, strict=True)
+    distances = ", ".join(f"{value:.2g} at order {order:g}" for value, order in at_orders)
     dtypes = computed if stored == computed else f"{computed}, stored as {stored},"
     reason = f"{dtypes} for the smallest distance of a pilot, about {distances}"
     return LatticeChoice(lattice, stored, computed, tuple(closest.tolist()), (*reasons, reason), tail=tail)

@@ -210,9 +210,8 @@ class Reducer:
         distances = self._estimate_by(spectra.distance, of_difference, areas, errors, unseen)
         products = spectra.product(reference)
         of_product = Tail.of_product(self.axis.octave_integrals(products, self.orders), tail, of_b, of_difference)
-        against = ReferenceEstimate.from_products(
-            self._sums(products), self.weights, self.widths, distances, norm_of_b, of_product
-        )
+        on_lattice = self._sums(products), self.weights, self.widths
+        against = ReferenceEstimate.from_products(*on_lattice, distances, norm_of_b, of_product)
         beyond_difference = zeros if of_difference is None else of_difference.remainder
         return Compared(norms, distances, against, (beyond, beyond_difference))
 
@@ -338,10 +337,8 @@ class Reducer:
 
         Bounds on the norms that the lattice leaves unseen, and on what images add to the squared norms, may be known.
         """
-        support, given = Support(areas, self.widths), self.is_given
-        return estimate_norms(
-            sums, self.weights, support, errors, tail, is_given=given, beyond=unseen**2, images=images
-        )
+        support, beyond, given = Support(areas, self.widths), unseen**2, self.is_given
+        return estimate_norms(sums, self.weights, support, errors, tail, is_given=given, beyond=beyond, images=images)
 
     def _block_sums(
         self, rows: Sequence[int], others: Sequence[int], number: int, shared: int

@@ -254,6 +254,5 @@ def coordinates_of(meshes: xr.Dataset, orders: Sequence[float]) -> xr.Dataset:
     """Return the coordinates that every table has, from the table of meshes."""
     names = [*_COORDINATES, *sorted(_SOME_COORDINATES & meshes.coords.keys()), *meshes.attrs.get("metadata", ())]
     coordinates = meshes.reset_coords()[names].rename(edge_length_mean="edge_length")
-    return describe(
-        xr.Dataset(coords={**coordinates.variables, "order": ("order", np.array(orders, dtype=np.float64))})
-    )
+    axis = "order", np.array(orders, dtype=np.float64)
+    return describe(xr.Dataset(coords={**coordinates.variables, "order": axis}))

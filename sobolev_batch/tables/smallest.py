@@ -89,9 +89,8 @@ def format_smallest(
         sections += [Section(f"Object {name}")] if name else []
         for order, rows in frame.groupby("order", sort=False):
             caption = f"Smallest mesh below {amount} of the norm of {frame.attrs['reference']}, order {order:g}"
-            cells = [
-                {**row, "mesh": row["mesh"] or "none", "remark": _remark(row)} for row in rows.to_dict(orient="records")
-            ]
+            records = rows.to_dict(orient="records")
+            cells = [{**row, "mesh": row["mesh"] or "none", "remark": _remark(row)} for row in records]
             sections.append(Section(caption, [(_COLUMNS, cells)]))
     return rendered(style, joined(frames), sections, wrapped(_NOTE))
 

@@ -83,10 +83,8 @@ class VertexWitness:
             for order, row in zip(self.orders, self.values, strict=True)
         }
         first = next(iter(rows))
-        quality = {"quality": rows[first].astype(np.float32)}
-        return write_ply(
-            self.mesh, {**quality, **rows, **(self.distances or {})}, [*self.notes, f"quality repeats {first}"]
-        )
+        columns = {"quality": rows[first].astype(np.float32), **rows, **(self.distances or {})}
+        return write_ply(self.mesh, columns, [*self.notes, f"quality repeats {first}"])
 
 
 def order_text(order: float) -> str:

@@ -204,9 +204,8 @@ def _contributions(
     phases = _phases(points[0][:, close], near, plain)
     real[close], imaginary[close] = _near(doubled[close], phases, ab[close], ac[close], _SERIES_GAP)
     at_corners = (cosine_and_sine(_phases(corner[:, apart], far, plain)) for corner in points[1:])
-    quotients = doubled[apart] * _quotient(
-        [cosines + 1j * sines for cosines, sines in at_corners], ab[apart], ac[apart]
-    )
+    exponentials = [cosines + 1j * sines for cosines, sines in at_corners]
+    quotients = doubled[apart] * _quotient(exponentials, ab[apart], ac[apart])
     real[apart], imaginary[apart] = quotients.real, quotients.imag
     return real, imaginary
 

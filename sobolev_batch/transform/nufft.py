@@ -67,9 +67,8 @@ def transform_points(
         # setpts keeps references, not copies: the angles live until execute has returned.
         plan.setpts(*(np.ascontiguousarray(row, dtype=spec.real_dtype, like=row) for row in folded))
         for sub_block, (x, y, z) in block.tiles(spec.shape):
-            values = plan.execute(
-                _shifted_strengths(points.weights, angles, _first_mode(sub_block, lattice), spec.dtype)
-            )
+            first = _first_mode(sub_block, lattice)
+            values = plan.execute(_shifted_strengths(points.weights, angles, first, spec.dtype))
             if total is None:
                 is_whole = spec.shape == block.shape
                 total = values if is_whole else np.zeros(block.shape, dtype=spec.dtype, like=values)

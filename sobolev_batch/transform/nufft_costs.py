@@ -214,9 +214,8 @@ def fastest_spec(whole: NufftSpec, workload: Workload, costs: Costs, allowed_byt
     while batches[-1] // 2 >= _SMALLEST_BATCH:
         batches.append(batches[-1] // 2)
     for batch, sigma in product(batches, costs.oversamplings(whole)):
-        smaller = [
-            replace(whole, shape=shape, oversampling=sigma, batch=batch) for shape in sub_shapes(whole.shape, sigma)
-        ]
+        shapes = sub_shapes(whole.shape, sigma)
+        smaller = [replace(whole, shape=shape, oversampling=sigma, batch=batch) for shape in shapes]
         # Ever smaller sub-blocks take ever less memory: the first that fits is the largest.
         first = bisect_left(smaller, True, key=fits)
         if first < len(smaller):

@@ -35,9 +35,8 @@ class Measure:
         """Return the sum of some surfaces, each with its sign."""
         signed = list(zip(surfaces, signs, strict=True))
         lattice = sum(sign * one.field.values for one, sign in signed)
-        octaves = (
-            sum(sign * one.octaves[number].values for one, sign in signed) for number in range(len(surfaces[0].octaves))
-        )
+        numbers = range(len(surfaces[0].octaves))
+        octaves = (sum(sign * one.octaves[number].values for one, sign in signed) for number in numbers)
         return cls(np.asarray(lattice), tuple(map(np.asarray, octaves)))
 
 

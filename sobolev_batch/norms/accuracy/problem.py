@@ -187,9 +187,8 @@ class Problem:
         """Return samples of all surfaces at the same frequencies; those of a lattice are computed once."""
         if lattice not in self._samples:
             draws = draws_for(self.surfaces, lattice, self.orders, USUAL_DEGREE)
-            self._samples[lattice] = tuple(
-                Sample.from_surface(surface, draws, self.execution) for surface in self.surfaces
-            )
+            samples = (Sample.from_surface(surface, draws, self.execution) for surface in self.surfaces)
+            self._samples[lattice] = tuple(samples)
         return self._samples[lattice]
 
     def dtype(self, lattice: Lattice, target: ErrorTarget) -> ComplexDtype:

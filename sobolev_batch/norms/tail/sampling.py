@@ -211,10 +211,8 @@ class TailSampling:
         """Return a sampling of some octaves by one lattice each, and by draws where surfaces have flat faces."""
         rng, normals = np.random.default_rng(seed), FaceNormals.from_surfaces(surfaces)
         octaves = (Octave(cutoff, index) for index in range(1, count + 1))
-        draws = _USUAL_DRAWS if normals else 0
-        return cls(
-            cutoff, tuple(OctaveSampling.random(one, [USUAL_M], draws, normals, _USUAL_UNIFORM, rng) for one in octaves)
-        )
+        usual = [USUAL_M], _USUAL_DRAWS if normals else 0, normals, _USUAL_UNIFORM, rng
+        return cls(cutoff, tuple(OctaveSampling.random(one, *usual) for one in octaves))
 
     @classmethod
     def joined(cls, cutoff: float, several: Sequence[Sequence[OctaveSampling]], normals: FaceNormals) -> Self:
