@@ -141,15 +141,11 @@ def are_tabulated(workspace: Workspace, digest: str = "") -> bool:
 
 
 def _digest(workspace: Workspace, placed: Sequence[Placed]) -> str:
-    plan = workspace.plan
-    shown = [(workspace.rows[i], workspace.records[i]) for i, _, _ in placed]
-    rows = [
-        [
-            *(row.label, row.family, row.member.time, row.member.metadata),
-            *((record.key, record.status, record.reason) if record else ("", "", "")),
-        ]
-        for row, record in shown
-    ]
+    plan, rows = workspace.plan, []
+    for i, _, _ in placed:
+        row, record = workspace.rows[i], workspace.records[i]
+        state = (record.key, record.status, record.reason) if record else ("", "", "")
+        rows.append([row.label, row.family, row.member.time, row.member.metadata, *state])
     inputs = {
         "version": TABLES_VERSION,
         "rows": rows,

@@ -91,16 +91,12 @@ class SearchedSource(KeepingSource):
         original = reference if self.mesh is None else single_member(self.mesh, folder)
         parameter, ends = searched_parameter(self.search)
         remesher = Remesher(self.template, parameter, ends, folder.absolute())
-        return tuple(
-            SearchedMember(
-                name,
-                -1,
-                metadata=(("target_tolerance", limit.value), ("target_measure", limit.measure)),
-                search=RecordedSearch(original, reference, limit, remesher, self._cache.folder),
-                may_run=self._cache.may_run,
-            )
-            for name, limit in self.limits().items()
-        )
+        members = []
+        for name, limit in self.limits().items():
+            search = RecordedSearch(original, reference, limit, remesher, self._cache.folder)
+            metadata = ("target_tolerance", limit.value), ("target_measure", limit.measure)
+            members.append(SearchedMember(name, -1, search, self._cache.may_run, metadata=metadata))
+        return tuple(members)
 
 
 @dataclass(frozen=True)

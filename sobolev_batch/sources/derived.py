@@ -84,19 +84,14 @@ class _ReducingSource(NestedSource):
 
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member per triangle count, coarse to fine."""
-        original = single_member(self.mesh, folder)
-        reduce = partial(type(self).reduce, **self.options)
+        originals, libraries = {self.kind: single_member(self.mesh, folder)}, (self.library,)
+        made = partial(MadeMember, originals=originals, libraries=libraries, triangle_bytes=_REDUCING_BYTES)
+        reduce, about = partial(type(self).reduce, **self.options), dict(self.options)
+        if self.radius is not None:
+            about["radius"] = self.radius
         return tuple(
-            MadeMember(
-                str(count),
-                rank,
-                _reduced,
-                {"triangles": count, **self.options} | ({} if self.radius is None else {"radius": self.radius}),
-                (reduce, count, self.radius),
-                originals={self.kind: original},
-                libraries=(self.library,),
-                triangles=count,
-                triangle_bytes=_REDUCING_BYTES,
+            made(
+                str(count), rank, _reduced, {"triangles": count, **about}, (reduce, count, self.radius), triangles=count
             )
             for rank, count in enumerate(sorted(set(self.triangles)))
         )
@@ -163,18 +158,10 @@ class SphericalLevelsSource(NestedSource):
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member per level, coarse to fine."""
         surface, sphere = single_member(self.mesh, folder), single_member(self.sphere, folder)
+        # The hull takes memory like a reduction of the surface.
+        made = partial(MadeMember, originals={"surface": surface, "sphere": sphere}, triangle_bytes=_REDUCING_BYTES)
         return tuple(
-            MadeMember(
-                str(level),
-                level,
-                _first_vertices,
-                {"spherical level": level},
-                (level,),
-                originals={"surface": surface, "sphere": sphere},
-                triangles=20 * 4**level,
-                # The hull takes memory like a reduction of the surface.
-                triangle_bytes=_REDUCING_BYTES,
-            )
+            made(str(level), level, _first_vertices, {"spherical level": level}, (level,), triangles=20 * 4**level)
             for level in sorted(set(self.levels))
         )
 
@@ -248,18 +235,11 @@ class FlowSource(NestedSource):
 
     def members(self, folder: Path) -> tuple[Member, ...]:
         """Return one member for each time, in their order."""
-        start = single_member(self.mesh, folder)
+        made = partial(MadeMember, originals={"flow": single_member(self.mesh, folder)}, triangle_bytes=_CARRYING_BYTES)
+        settings = [self.period, self.strength]
+        about = {"settings": settings, "version": _VERSION}
         return tuple(
-            MadeMember(
-                repr(time),
-                -1,
-                carried,
-                {"time": time, "settings": [self.period, self.strength], "version": _VERSION},
-                (time, self.period, self.strength),
-                originals={"flow": start},
-                triangle_bytes=_CARRYING_BYTES,
-                time=time,
-            )
+            made(repr(time), -1, carried, {"time": time, **about}, (time, *settings), time=time)
             for time in sorted(self.times)
         )
 
@@ -268,16 +248,10 @@ def _displaced(
     kind: str, original: Member, amounts: tuple[float, ...], displace: Callable[..., Mesh], **settings: Any
 ) -> tuple[Member, ...]:
     """Return a member for each fraction of the radius by which a mesh is displaced, the smallest first."""
+    made = partial(MadeMember, originals={kind: original}, triangle_bytes=_DISPLACING_BYTES)
+    about = {"version": _VERSION, **settings}
     return tuple(
-        MadeMember(
-            f"{amount:g}",
-            -1,
-            displace,
-            {"amount": amount, "version": _VERSION, **settings},
-            (amount, *settings.values()),
-            originals={kind: original},
-            triangle_bytes=_DISPLACING_BYTES,
-        )
+        made(f"{amount:g}", -1, displace, {"amount": amount, **about}, (amount, *settings.values()))
         for amount in sorted(set(amounts))
     )
 

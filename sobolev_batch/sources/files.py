@@ -236,16 +236,11 @@ def _listed_members(meshes: str | tuple[MeshTable, ...], folder: Path) -> tuple[
     names = [mesh.get("name") or stems[path] for path, mesh in zip(paths, meshes, strict=True)]
     if repeated := duplicate_names(names):
         raise StudyError(f"meshes: several are named {quoted(repeated[0][0])}; give each a name of its own")
-    return tuple(
-        FileMember(
-            name,
-            -1,
-            path.absolute(),
-            time=mesh.get("time"),
-            metadata=tuple((key, value) for key, value in mesh.items() if key not in ("path", "name", "time")),
-        )
-        for name, path, mesh in zip(names, paths, meshes, strict=True)
-    )
+    members = []
+    for name, path, mesh in zip(names, paths, meshes, strict=True):
+        metadata = tuple((key, value) for key, value in mesh.items() if key not in ("path", "name", "time"))
+        members.append(FileMember(name, -1, path.absolute(), time=mesh.get("time"), metadata=metadata))
+    return tuple(members)
 
 
 def _recorded_file(name: str, path: str) -> Path:

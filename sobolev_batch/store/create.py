@@ -203,32 +203,17 @@ def _lay_out(store: Store, plan: Plan, labels: Sequence[str], qualities: Sequenc
     quality: Any = "mesh", padded, {}, {"chunks": (min(rows, _MOST_SPECTRA),)}
     units = {"units": "cycles per unit length"}
     axes = {name: (name, axis, units) for name, axis in zip(AXES, plan.lattice.axes, strict=True)}
-    keys = {
-        **array_keys(
-            FIELD,
-            plan.choice.dtype,
-            (rows, *plan.lattice.shape),
-            (1, *plan.blocks[0].shape),
-            ("mesh", *AXES),
-            long_name="Fourier transform of the area measure, xi_z >= 0 half",
-            # xarray makes coordinates of what `coordinates` names, which then stay with a selected field.
-            coordinates="quality",
-        ),
-        **dataset_keys(
-            "fourier", xr.Dataset({"quality": quality}, coords={**axes, "mesh": mesh, **_weight_columns(plan)})
-        ),
-        **record_keys(rows),
-    }
+    dtype, shape, chunks = plan.choice.dtype, (rows, *plan.lattice.shape), (1, *plan.blocks[0].shape)
+    meaning = "Fourier transform of the area measure, xi_z >= 0 half"
+    # xarray makes coordinates of what `coordinates` names, which then stay with a selected field.
+    keys = array_keys(FIELD, dtype, shape, chunks, ("mesh", *AXES), long_name=meaning, coordinates="quality")
+    coordinates = {**axes, "mesh": mesh, **_weight_columns(plan)}
+    keys |= dataset_keys("fourier", xr.Dataset({"quality": quality}, coords=coordinates)) | record_keys(rows)
     if plan.tail is not None:
-        keys |= array_keys(
-            OCTAVES,
-            plan.choice.dtype,
-            (rows, plan.tail.size),
-            (1, plan.tail.size),
-            ("mesh", "sample"),
-            long_name="Fourier transform of the area measure, beyond the lattice",
-            description="the sum of weight (1 + |xi|²)^s |octaves|² is the tail of a squared norm to the last octave",
-        )
+        meaning = "Fourier transform of the area measure, beyond the lattice"
+        sums = "the sum of weight (1 + |xi|²)^s |octaves|² is the tail of a squared norm to the last octave"
+        attributes, size = {"long_name": meaning, "description": sums}, plan.tail.size
+        keys |= array_keys(OCTAVES, dtype, (rows, size), (1, size), ("mesh", "sample"), **attributes)
         keys |= dataset_keys(OCTAVES_GROUP, xr.Dataset(coords={**_sample_columns(plan.tail), "mesh": mesh}))
     list_records(store)
     spectra, before = _spectra_keys(plan, mesh), store.documents.get(SPECTRA_KEYS)

@@ -64,15 +64,10 @@ class LatticeChoice:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any], octaves: Mapping[str, Any] | None) -> Self:
         """Return the choice that a dictionary holds, with its `octaves`."""
-        return cls(
-            Lattice(values["xi_max"], values["M"]),
-            values["dtype"],
-            values["transform_dtype"],
-            tuple(values["closest"]),
-            tuple(values["reasons"]),
-            values["basis"],
-            None if octaves is None else TailSampling.from_dict(octaves),
-        )
+        known: dict[str, Any] = {name: values[name] for name in ("dtype", "transform_dtype", "basis")}
+        known |= {name: tuple(values[name]) for name in ("closest", "reasons")}
+        tail = None if octaves is None else TailSampling.from_dict(octaves)
+        return cls(Lattice(values["xi_max"], values["M"]), **known, tail=tail)
 
     def grown(self, distances: NormEstimate, orders: Sequence[float], accuracy: Accuracy) -> Self | None:
         """Return a choice of more frequencies for distances (orders, meshes) that miss an accuracy; NaN do not count.

@@ -145,17 +145,10 @@ def choose_lattice(
         )
     extent = Extent.union([reference.extent, *look.extents.values()])
     widths, reach = _REACH_MARGIN * extent.widths, _REACH_MARGIN * extent.reach
-    problems = {
-        label: Problem(
-            (surface, reference),
-            study.orders,
-            replace(accuracy, best_effort=False),
-            Support(np.array(surface.area + reference.area), widths, reach),
-            label,
-            available_cores(),
-        )
-        for label, surface in pilots.items()
-    }
+    strict, problems = replace(accuracy, best_effort=False), dict[str, Problem]()
+    for label, surface in pilots.items():
+        support = Support(np.array(surface.area + reference.area), widths, reach)
+        problems[label] = Problem((surface, reference), study.orders, strict, support, label, available_cores())
     if not accuracy.best_effort:
         choice, shortfalls = _best(problems, study.dtype)
         if choice is None or shortfalls:
