@@ -86,14 +86,11 @@ class _ReducingSource(NestedSource):
         """Return one member per triangle count, coarse to fine."""
         originals, libraries = {self.kind: single_member(self.mesh, folder)}, (self.library,)
         made = partial(MadeMember, originals=originals, libraries=libraries, triangle_bytes=_REDUCING_BYTES)
-        reduce, about = partial(type(self).reduce, **self.options), dict(self.options)
-        if self.radius is not None:
-            about["radius"] = self.radius
+        reduce = partial(type(self).reduce, **self.options)
+        about = {**self.options, **({} if self.radius is None else {"radius": self.radius})}
         return tuple(
-            made(
-                str(count), rank, _reduced, {"triangles": count, **about}, (reduce, count, self.radius), triangles=count
-            )
-            for rank, count in enumerate(sorted(set(self.triangles)))
+            made(str(n), rank, _reduced, {"triangles": n, **about}, (reduce, n, self.radius), triangles=n)
+            for rank, n in enumerate(sorted(set(self.triangles)))
         )
 
 
