@@ -6,7 +6,7 @@ table is made from the records.
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -66,9 +66,7 @@ def measure_proximities(cluster: Cluster, workspace: Workspace) -> Stages[None]:
         workspace.store.consolidate()
 
 
-def _measure(
-    cluster: Cluster, workspace: Workspace, requested: ProximitySection, keys: Mapping[int, str]
-) -> Stages[None]:
+def _measure(cluster: Cluster, workspace: Workspace, requested: ProximitySection, keys: dict[int, str]) -> Stages[None]:
     similarity, complete, reference = workspace.plan.similarity, workspace.complete, workspace.reference
     tasks = []
     for i, key in keys.items():

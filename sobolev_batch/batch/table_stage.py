@@ -83,10 +83,7 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> Stages[Tabulated 
 def write_results(
     workspace: Workspace, reducer: Reducer, meshes: xr.Dataset, digest: str, replaced: Sequence[str]
 ) -> tuple[Tabulated, Metadata]:
-    """Write the tables that follow from stored spectra, on a worker, and return also the metadata of the store then.
-
-    Done again, the task writes the same.
-    """
+    """Write the tables that follow from stored spectra, the same each time, and return also the metadata then."""
     store, results = workspace.store, Results.from_spectra(reducer, meshes, workspace.plan.reference)
     numerics = sorted({record.numerics for record in workspace.complete.values()})
     convergence = results.convergence_table(workspace.plan.study.accuracy)

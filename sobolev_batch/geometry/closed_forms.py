@@ -134,10 +134,7 @@ class Ellipsoid(Smooth):
 
     @cached_property
     def area(self) -> float:
-        """Area 4π R_G(a²b², a²c², b²c²), in squared units of length.
-
-        B. C. Carlson, "Elliptic integrals", https://dlmf.nist.gov/19.33.E1.
-        """
+        """Area 4π R_G(a²b², a²c², b²c²) (B. C. Carlson, https://dlmf.nist.gov/19.33.E1), in squared units of length."""
         largest = max(self.axes)
         a, b, c = (axis / largest for axis in self.axes)
         return float(4 * math.pi * largest**2 * elliprg((a * b) ** 2, (a * c) ** 2, (b * c) ** 2))

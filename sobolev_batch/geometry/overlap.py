@@ -208,9 +208,7 @@ def _cut(sides: Sequence[_Side], of: Sequence[Indices], planes: Reals, rounding:
     return cuts
 
 
-def _cut_together(
-    sides: Sequence[_Side], of: Sequence[Indices], planes: Reals, numbers: Indices, rounding: float
-) -> _Cut:
+def _cut_together(sides: Sequence[_Side], of: list[Indices], planes: Reals, numbers: Indices, rounding: float) -> _Cut:
     count, grid = len(planes), 2.0 ** np.floor(np.log2(_GRID * rounding))
     normals = planes[:, :3]
     # Along an axis where the plane is across one: then no coordinate is rounded.
@@ -281,10 +279,8 @@ class _Sheet:
         np.maximum.at(gaps, plane, _heights_above(corners, planes[plane]))
         unions = shapely.union_all(shapely.multipolygons(polygons, indices=plane)[:, None], axis=1)
         of_planes = np.split(polygons, np.cumsum(np.bincount(plane, minlength=count))[:-1])
-        stacks = {
-            row: _stack(of_planes[row], float(_BALANCE * areas[row]), grid)
-            for row in np.flatnonzero(np.abs(shapely.area(unions) - areas) > _BALANCE * areas).tolist()
-        }
+        covered_often = np.flatnonzero(np.abs(shapely.area(unions) - areas) > _BALANCE * areas).tolist()
+        stacks = {row: _stack(of_planes[row], float(_BALANCE * areas[row]), grid) for row in covered_often}
         layers = np.full((count, max([1, *map(len, stacks.values())])), shapely.Polygon(), dtype=object)
         layers[:, 0] = unions
         for row, stack in stacks.items():

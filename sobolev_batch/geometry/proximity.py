@@ -29,11 +29,8 @@ LENGTHS = (
     *(f"{name}{way}" for name in _SYMMETRIC for way in ("", *_WAYS)),
     *("mean_error", "rms_error", "bias", "bias_error", "chamfer", "chamfer_error", "threshold"),
 )
-NUMBERS = (
-    *LENGTHS,
-    *("fscore", "precision", "recall"),
-    *(f"{name}{way}" for name in ("normal_mean", "normal_max") for way in ("", *_WAYS)),
-)
+_NORMALS = tuple(f"{name}{way}" for name in ("normal_mean", "normal_max") for way in ("", *_WAYS))
+NUMBERS = (*LENGTHS, "fscore", "precision", "recall", *_NORMALS)
 # What a study may show in its tables, with the numbers of `proximity` that belong to it.
 METRICS = {
     "hausdorff": ("hausdorff", "hausdorff_upper"),
@@ -199,24 +196,20 @@ def _mean(values: Reals) -> tuple[float, float]:
     return float(values.mean()), float(values.std(ddof=1)) / np.sqrt(len(values))
 
 
-def share_beyond(
-    a: MeshLike, b: MeshLike, length: float, points: int = DEFAULT_POINTS, *, one_way: bool = False
-) -> tuple[float, float]:
+def share_beyond(a: MeshLike, b: MeshLike, length: float, *, one_way: bool = False) -> tuple[float, float]:
     """Return the share of the area that is farther from the other mesh than a length, by random points, and its error.
 
     It is the larger of both directions, or that of the first mesh. The standard error is that of a share which is one
     point larger.
     """
     meshes = as_mesh(a), as_mesh(b)
-    rng, ways = np.random.default_rng(0), (meshes, meshes[::-1])[: 1 if one_way else 2]
+    rng, ways, points = np.random.default_rng(0), (meshes, meshes[::-1])[: 1 if one_way else 2], DEFAULT_POINTS
     count = max(np.count_nonzero(sampled_distances(mesh, other, rng, points) > length) for mesh, other in ways)
     likely = (count + 1) / (points + 2)
     return count / points, float(np.sqrt(likely * (1 - likely) / points))
 
 
-def sampled_distances(
-    mesh: Mesh, other: Mesh, rng: np.random.Generator, points: int = DEFAULT_POINTS, *, signed: bool = False
-) -> Reals:
+def sampled_distances(mesh: Mesh, other: Mesh, rng: np.random.Generator, points: int, *, signed: bool = False) -> Reals:
     """Return the distances (n,) of random points, spread evenly by area, from another mesh; see `vertex_distances`."""
     return point_distances(_drawn(mesh, points, rng)[0], other, signed=signed)
 

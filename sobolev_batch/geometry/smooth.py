@@ -217,10 +217,8 @@ class Smooth(ABC):
         greatest: Reals = values.max(axis=1)
         steps = np.linspace(-1, 1, _ZOOM_GRID)
         for _ in range(_ZOOMS):
-            lines = [
-                _brought_back(interval, center[:, None] + width * steps)
-                for interval, center, width in zip(self.intervals, centers, widths, strict=True)
-            ]
+            around = zip(self.intervals, centers, widths, strict=True)
+            lines = [_brought_back(interval, center[:, None] + width * steps) for interval, center, width in around]
             u, v = np.broadcast_arrays(lines[0][:, :, None], lines[1][:, None, :])
             values = heights(self.positions(u, v)).reshape(count, -1)
             np.maximum(greatest, values.max(axis=1), out=greatest)

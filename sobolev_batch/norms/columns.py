@@ -11,6 +11,9 @@ from sobolev_batch.arrays import Reals
 from sobolev_batch.norms.estimate import PARTS, NormEstimate, ReferenceEstimate
 from sobolev_batch.transform.lattice import AXES, Lattice, Orders, check_orders
 
+# Values of variables, by name.
+Columns = Mapping[str, NDArray[Any]]
+
 KERNEL = "weight (1 + |xi|^2)^s, xi in cycles per unit length"
 LENGTH, AREA, VOLUME = "unit length", "unit length squared", "unit length cubed"
 FREQUENCY, NUMBER, ANGLE = "cycles per unit length", "1", "degree"
@@ -147,9 +150,7 @@ VARIABLES: Mapping[str, Mapping[str, Any]] = {
 TAKEN_NAMES = VARIABLES.keys() | set(PARTS)
 
 
-def dataset_of(
-    columns: Mapping[str, NDArray[Any]], dimensions: Sequence[str], coordinates: Mapping[Any, Any]
-) -> xr.Dataset:
+def dataset_of(columns: Columns, dimensions: Sequence[str], coordinates: Mapping[Any, Any]) -> xr.Dataset:
     """Return values by name over some dimensions, and `error_part` over `part` besides, as a described dataset."""
     further = {"error_part": ("part",)}
     variables = {name: ((*dimensions, *further.get(name, ())), values) for name, values in columns.items()}

@@ -1,7 +1,7 @@
 """Yardsticks: changes of a mesh that bring it as far from itself as another one is."""
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, cast, get_args
 
@@ -175,9 +175,7 @@ class _Curve:
         """Return the logarithm of the distance of a known amount over the one wanted."""
         return math.log(max(self.known[amount].values[order], np.finfo(np.float64).tiny) / wanted.values[order])
 
-    def _confirmed(
-        self, order: int, wanted: tuple[float, float], found: float, uncertain: float
-    ) -> tuple[float, float]:
+    def _confirmed(self, order: int, wanted: Sequence[float], found: float, uncertain: float) -> tuple[float, float]:
         """Return an amount, and how far off it may be: so much that the distance surely passes the one wanted.
 
         Both are NaN where it does not up to the largest amount: far moves are all as far.

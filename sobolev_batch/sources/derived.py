@@ -1,7 +1,4 @@
-"""Families that are made of one other mesh: coarser, displaced, or carried along by a flow.
-
-docs/studies.md has the keys of each source.
-"""
+"""Families of one other mesh: coarser, displaced, or carried along by a flow; docs/studies.md has their keys."""
 
 import warnings
 from collections.abc import Callable

@@ -1,7 +1,4 @@
-"""Families that are generated from formulas: closed forms and their triangulations.
-
-docs/studies.md has the keys of each source.
-"""
+"""Families from formulas: closed forms and their triangulations; docs/studies.md has their keys."""
 
 from collections.abc import Callable
 from dataclasses import astuple, fields
@@ -31,10 +28,7 @@ Levels = Several[Annotated[int, Field(ge=0, le=FINEST_LEVEL)]]
 
 
 class ClosedFormSource(Source):
-    """A source of one surface in closed form, or of its triangulations where a subclass has levels.
-
-    A subclass has the fields of the closed form.
-    """
+    """A source of a closed form, whose fields a subclass has, or of its triangulations where that has levels."""
 
     label: ClassVar[str]
     form: ClassVar[type[ClosedForm]]

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from zarr.buffer.cpu import NDBuffer
 
+from sobolev_batch.arrays import slices
 from sobolev_batch.errors import DamageError
 from sobolev_batch.store.checked import checksum_of
 from sobolev_batch.store.layout import FIELD, OCTAVES, Store
@@ -31,10 +32,7 @@ class Fields:
     def places(self) -> tuple[Place, ...]:
         """Return the places of a field's values: its blocks, in the order of a plan's blocks, and then its octaves."""
         array = self.store.array(FIELD)
-        axes = [
-            [slice(start, min(start + step, total)) for start in range(0, total, step)]
-            for total, step in zip(array.shape[1:], array.chunks[1:], strict=True)
-        ]
+        axes = map(slices, array.shape[1:], array.chunks[1:])
         has_octaves = OCTAVES in self.store.documents
         octaves = [(slice(0, self.store.document(OCTAVES)["shape"][1]),)] if has_octaves else []
         return (*product(*axes), *octaves)

@@ -168,10 +168,7 @@ class Location:
             sync(store.delete(prefix) if isinstance(store, FolderStore) else store.delete_dir(prefix))
 
     def remove_partial_files(self, besides: Collection[str] = ()) -> None:
-        """Remove what writers left behind that were killed in the middle of a key. No other run may be writing.
-
-        Folders of some names are left out.
-        """
+        """Remove what killed writers left of keys, but not in folders of some names. No other run may be writing."""
         with self.access("read"):
             files = () if self.scheme else _files_below(self.name, {os.path.join(self.name, name) for name in besides})
             partial = [file.path for file in files if PARTIAL_FILE.search(file.name)]

@@ -265,10 +265,7 @@ class Records(Generic[RecordType]):
         return tuple(records)
 
     def read_one(self, row: int, *, of_this_run: bool = False) -> RecordType | None:
-        """Return the completion record of one row, or None if it has none that can be read.
-
-        Those of the run that is going on are in no page yet.
-        """
+        """Return the completion record of a row, or None if none can be read; those of this run are in no page yet."""
         with suppress(DamageError):
             line = str(self.store.read(RECORD, row))
             if not line and not of_this_run:

@@ -82,7 +82,5 @@ def withdraw_chunk(store: Store, keys: str, index: Index) -> None:
 def _region(store: Store, name: str, index: Index) -> tuple[slice, ...]:
     """Return the place of an array's chunk along the axes of its keys."""
     document = store.document(name)
-    return tuple(
-        slice(step * number, min(step * (number + 1), length))
-        for number, step, length in zip(index, chunk_shape(document), document["shape"], strict=False)
-    )
+    axes = zip(index, chunk_shape(document), document["shape"], strict=False)
+    return tuple(slice(step * number, min(step * (number + 1), length)) for number, step, length in axes)

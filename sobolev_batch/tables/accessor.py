@@ -66,20 +66,14 @@ class SobolevAccessor:
         bands: int | Sequence[float] | None = None,
         similarity: Similarity | None = None,
     ) -> xr.Dataset:
-        """Return the squared distance, or the squared norm if other is None, by wavelength.
-
-        See `sobolev_batch.spectrum`.
-        """
+        """Return the squared distance, or squared norm if other is None, by wavelength (`sobolev_batch.spectrum`)."""
         common = None if other is None else self._transformed(other, order)
         return self._each(partial(spectrum, order=order, bands=bands, similarity=similarity), common)
 
     def witness(
         self, other: OperandLike, order: Orders, points: ArrayLike, *, eps: float | None = None
     ) -> xr.DataArray:
-        """Return the witness function at points (n, 3), positive where this surface has more area.
-
-        See `sobolev_batch.witness`.
-        """
+        """Return the witness function (`sobolev_batch.witness`) at points (n, 3), positive where this has more area."""
         return witness(self._field, other, order, points, eps=eps)
 
     def _transformed(self, other: OperandLike, order: Orders) -> xr.DataArray:

@@ -17,8 +17,9 @@ from sobolev_batch.tables import Format
 from sobolev_batch.tables.text import POWER, SHORTEST_TEXT, line_length, middle_cut
 from sobolev_batch.visible import visible
 
-# Rows of a table: a frame, or its records.
+# Rows of a table: a frame, or its records; and its cells.
 Rows: TypeAlias = pd.DataFrame | Sequence[Mapping[Any, Any]]
+Cells: TypeAlias = Sequence[Sequence[str]]
 
 _PLAIN = {ord(raised): plain for plain, raised in zip("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹", strict=True)}
 # What follows a number in a text, by the mark of its row.
@@ -115,9 +116,7 @@ def json_text(value: Any) -> str:
     return json.dumps(json.loads(text, parse_constant=lambda _: None), indent=2)
 
 
-def printed_table(
-    rows: Sequence[Sequence[str]], headers: Sequence[str], style: Format, texts: Sequence[int] = ()
-) -> str:
+def printed_table(rows: Cells, headers: Sequence[str], style: Format, texts: Sequence[int] = ()) -> str:
     """Return cells as a table whose columns are aligned to the right, but for the first and for those of texts.
 
     In a text, spaces beside headers, texts and labels of the first column give way where lines would be too long: texts
@@ -156,9 +155,7 @@ def printed_table(
     return "\n\n".join(printed_table(*part) for part in parts if part[0])
 
 
-def _lines(
-    rows: Sequence[Sequence[str]], headers: Sequence[str], lefts: Container[int], widths: Sequence[int]
-) -> Iterator[str]:
+def _lines(rows: Cells, headers: Sequence[str], lefts: Container[int], widths: Sequence[int]) -> Iterator[str]:
     lines = (line for row in rows for line in zip_longest(*(cell.split("\n") for cell in row), fillvalue=""))
     for line in (headers, ["-" * width for width in widths], *lines):
         cells = [
@@ -168,7 +165,7 @@ def _lines(
         yield (" " * _GAP).join(cells).rstrip()
 
 
-def _widths(rows: Sequence[Sequence[str]], headers: Sequence[str], padding: int = 0) -> list[int]:
+def _widths(rows: Cells, headers: Sequence[str], padding: int = 0) -> list[int]:
     return [
         max(len(header) + padding, *(len(line) for cell in column for line in cell.split("\n")))
         for header, *column in zip(headers, *rows, strict=True)
@@ -179,9 +176,7 @@ def _lacking(widths: Sequence[int]) -> int:
     return sum(widths) + _GAP * (len(widths) - 1) - line_length()
 
 
-def _with_short_texts(
-    rows: Sequence[Sequence[str]], headers: Sequence[str], texts: Sequence[int]
-) -> Sequence[Sequence[str]]:
+def _with_short_texts(rows: Cells, headers: Sequence[str], texts: Sequence[int]) -> Cells:
     """Return rows whose labels and texts are shortened so that lines fit, unless two labels would then be the same."""
     for column in texts:
         if (lacking := _lacking(_widths(rows, headers))) > 0:

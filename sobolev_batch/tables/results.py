@@ -4,7 +4,7 @@ In the order of tables, families are as in the study, and the meshes of each fro
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Literal, Self
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
-from sobolev_batch.norms.columns import VARIABLES, dataset_of, describe
+from sobolev_batch.norms.columns import VARIABLES, Columns, dataset_of, describe
 from sobolev_batch.norms.estimate import AREA_AND_SHAPE, NormEstimate
 from sobolev_batch.norms.rates import observed_rates
 from sobolev_batch.sources.names import natural_key
@@ -241,9 +241,7 @@ def rates_in_families(
     return rates
 
 
-def table_of(
-    columns: Mapping[str, NDArray[Any]], meshes: xr.Dataset, orders: Sequence[float], *dimensions: str
-) -> xr.Dataset:
+def table_of(columns: Columns, meshes: xr.Dataset, orders: Sequence[float], *dimensions: str) -> xr.Dataset:
     """Return values (orders, ...) by name over dimensions (default "mesh") and the order, as a table of meshes."""
     dimensions = dimensions or ("mesh",)
     moved = {name: np.moveaxis(values, 0, len(dimensions)) for name, values in columns.items()}

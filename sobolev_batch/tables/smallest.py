@@ -70,19 +70,14 @@ def _of_objects(store: AnyStore, relative: float | str, order: Orders | None) ->
 
 def smallest_of(frame: pd.DataFrame, most: float) -> pd.DataFrame:
     """Return the smallest mesh of each family of triangles below a bound, of rows of `table`; see `smallest_below`."""
-    with_triangles = frame[frame["triangles"] > 0]
-    rows = [
-        {"order": s, "family": family, **_smallest(members, most)}
-        for (s, family), members in with_triangles.groupby(["order", "family"], sort=False)
-    ]
+    families = frame[frame["triangles"] > 0].groupby(["order", "family"], sort=False)
+    rows = [{"order": s, "family": family, **_smallest(members, most)} for (s, family), members in families]
     smallest = pd.DataFrame(rows, columns=["order", "family", *_NAMES]).astype({"triangles": "Int64"})
     smallest.attrs = {"reference": frame.attrs["reference"], "below": most}
     return smallest
 
 
-def format_smallest(
-    store: AnyStore, style: Format = "text", orders: Sequence[float] | None = None, *, below: float | str
-) -> str:
+def format_smallest(store: AnyStore, style: Format, orders: Sequence[float] | None, *, below: float | str) -> str:
     """Return the smallest meshes below a bound as text; see `smallest_below`."""
     frames, amount, sections = _of_objects(store, below, orders), f"{100 * fraction(below):g} %", list[Section]()
     for name, frame in frames.items():

@@ -1,7 +1,4 @@
-"""The kinds of surfaces, and what transforms need of each: quadrature points and exact values.
-
-A further kind of surface is one more class here.
-"""
+"""The kinds of surfaces, each a class, and what transforms need of them: quadrature points and exact values."""
 
 import math
 from abc import ABC, abstractmethod

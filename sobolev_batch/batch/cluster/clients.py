@@ -243,10 +243,7 @@ def require_private(name: str, who: str, trust_network: bool = False) -> None:
 
 
 def check_connection(address: str, seconds: float) -> None:
-    """Shake hands with the scheduler at an address once.
-
-    Dask's client waits for ever where something listens that is no scheduler.
-    """
+    """Shake hands with the scheduler at an address: Dask's client waits for ever for what listens and is none."""
     try:
         arguments = Security().get_connection_args("client")
         # In a thread: a notebook has a loop of its own running in this one.

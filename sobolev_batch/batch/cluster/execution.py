@@ -1,7 +1,4 @@
-"""Tasks of many runs on a cluster: handed out in turn, in the free memory, and their outcomes taken back.
-
-Each step is reported to those who watch.
-"""
+"""Tasks of many runs on a cluster: handed out in turn, in the free memory, taken back, and reported step by step."""
 
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence

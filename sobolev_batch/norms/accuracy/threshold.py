@@ -1,7 +1,6 @@
 """Distances beside a threshold, computed as exactly as it takes to tell on which side of it they lie."""
 
 import math
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -262,9 +261,7 @@ def _exact_norm(reference: _Reference) -> Interval:
     return Interval.of(solve(reference.problem.with_rtol(_EXACT_NORM_RTOL)).estimate)
 
 
-def _with_beyond(
-    problem: Problem, value: float, error: float, lattice: Lattice, fields: Sequence[Complexes]
-) -> Interval:
+def _with_beyond(problem: Problem, value: float, error: float, lattice: Lattice, fields: list[Complexes]) -> Interval:
     """Return bounds on a norm by its part on a lattice, all that may lie beyond it, and the fields of its surfaces."""
     (order,) = problem.orders
     windows = outer_windows(SobolevWeights(lattice, problem.orders))
