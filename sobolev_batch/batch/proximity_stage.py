@@ -16,15 +16,8 @@ import xarray as xr
 from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, describe_failure
 from sobolev_batch.batch.field_costs import MESH_BYTES
 from sobolev_batch.errors import InputError, MeshError, StoreError, one_line
+from sobolev_batch.geometry import proximity
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.geometry.proximity import (
-    LENGTHS,
-    NUMBERS,
-    POINT_BYTES,
-    TRIANGLE_BYTES,
-    WORKING_BYTES,
-    proximity_and_deviations,
-)
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms.columns import describe
 from sobolev_batch.sources.registry import digest_of
@@ -70,10 +63,10 @@ def _measure(cluster: Cluster, workspace: Workspace, requested: ProximitySection
     similarity, complete, reference = workspace.plan.similarity, workspace.complete, workspace.reference
     tasks = []
     for i, key in keys.items():
-        projected_bytes = 2 * POINT_BYTES * requested.points + WORKING_BYTES
+        projected_bytes = 2 * proximity.POINT_BYTES * requested.points + proximity.WORKING_BYTES
         for row in (i, reference):
             triangles, size = complete[row].facts.triangles, workspace.rows[row].member.expected_size()
-            projected_bytes += TRIANGLE_BYTES * triangles + max(size.projected_bytes, MESH_BYTES * triangles)
+            projected_bytes += proximity.TRIANGLE_BYTES * triangles + max(size.projected_bytes, MESH_BYTES * triangles)
         pair = tuple((workspace.rows[row], complete[row].facts.digest) for row in (i, reference))
         arguments = workspace.store, i, complete[i], key, pair, similarity, requested
         label = workspace.labels[i]
@@ -117,8 +110,8 @@ def measure_proximity(
         # The bounds of a mesh that was searched are to prove what the search has proved.
         tolerance = dict(pair[0][0].member.metadata).get("target_tolerance")
         within = _BELOW * tolerance * similarity.scale if isinstance(tolerance, float) else None
-        found, _ = proximity_and_deviations(*meshes, points=requested.points, threshold=limit, within=within)
-        lengths = {name: found[name] / similarity.scale for name in LENGTHS}
+        found, _ = proximity.proximity_and_deviations(*meshes, points=requested.points, threshold=limit, within=within)
+        lengths = {name: found[name] / similarity.scale for name in proximity.LENGTHS}
         measured = ProximityRecord(key, "", {**found, **lengths})
     except StoreError:
         raise
@@ -175,7 +168,8 @@ def _dataset(workspace: Workspace, requested: ProximitySection) -> xr.Dataset:
     """Return the numbers of `proximity` (mesh), and `reason` where they are NaN, in the order of tables."""
     labels, records = zip(*_current(workspace), strict=True)
     columns: dict[str, Any] = {
-        name: [record.numbers.get(name, np.nan) if record else np.nan for record in records] for name in NUMBERS
+        name: [record.numbers.get(name, np.nan) if record else np.nan for record in records]
+        for name in proximity.NUMBERS
     }
     columns["reason"] = np.array([record.reason if record else "" for record in records], dtype=object)
     attributes = {

@@ -10,16 +10,7 @@ from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, r
 from sobolev_batch.errors import DamageError
 from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.sources.registry import digest_of
-from sobolev_batch.store.layout import (
-    DISTANCES,
-    NUMERICS,
-    PAIRS_KEYS,
-    QUALITY,
-    Metadata,
-    hide_tables,
-    table_attributes,
-    write_table,
-)
+from sobolev_batch.store import layout
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.tables.all_objects import Tables
 from sobolev_batch.tables.pairs import Pairs, fill_tile
@@ -56,7 +47,7 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> Stages[Tabulated 
     pairs, tiles, replaced = _pairs(workspace), list[tuple[int, int]](), list[str]()
     if pairs is not None:
         # Readers find all tables of one state, or none.
-        replaced = hide_tables(store)
+        replaced = layout.hide_tables(store)
         pairs.lay_out(coordinates_of(meshes, plan.study.orders))
         tiles = pairs.stale()
     advance = cluster.count_steps("reduction", len(chunks) + len(tiles))
@@ -82,22 +73,22 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> Stages[Tabulated 
 
 def write_results(
     workspace: Workspace, reducer: Reducer, meshes: xr.Dataset, digest: str, replaced: Sequence[str]
-) -> tuple[Tabulated, Metadata]:
+) -> tuple[Tabulated, layout.Metadata]:
     """Write the tables that follow from stored spectra, the same each time, and return also the metadata then."""
     store, results = workspace.store, Results.from_spectra(reducer, meshes, workspace.plan.reference)
     numerics = sorted({record.numerics for record in workspace.complete.values()})
     convergence = results.convergence_table(workspace.plan.study.accuracy)
-    convergence.attrs |= {"digest": digest, NUMERICS: numerics}
-    replaced = [*replaced, *(hide_tables(store) if _pairs(workspace) is None else ())]
-    store.write(QUALITY, [0], workspace.qualities)
-    write_table(store, "meshes", results.meshes)
-    write_table(store, "norms", results.norms_table())
-    if PAIRS_KEYS not in store.documents:
-        if store.stored_document(PAIRS_KEYS) is not None:
-            store.location.remove(DISTANCES)
-        write_table(store, DISTANCES, results.distances_table())
+    convergence.attrs |= {"digest": digest, layout.NUMERICS: numerics}
+    replaced = [*replaced, *(layout.hide_tables(store) if _pairs(workspace) is None else ())]
+    store.write(layout.QUALITY, [0], workspace.qualities)
+    layout.write_table(store, "meshes", results.meshes)
+    layout.write_table(store, "norms", results.norms_table())
+    if layout.PAIRS_KEYS not in store.documents:
+        if store.stored_document(layout.PAIRS_KEYS) is not None:
+            store.location.remove(layout.DISTANCES)
+        layout.write_table(store, layout.DISTANCES, results.distances_table())
     # Written last: its digest says that all tables belong to the fields that are stored.
-    write_table(store, "convergence", convergence)
+    layout.write_table(store, "convergence", convergence)
     for name in set(replaced) - store.documents.keys():
         store.location.remove(name)
     store.consolidate()
@@ -123,16 +114,16 @@ def _spectrum_keys(workspace: Workspace) -> dict[int, str]:
 
 def are_tabulated(workspace: Workspace, digest: str = "") -> bool:
     """Return True where the tables of a store belong to its fields and to the plan, by their digest if it is known."""
-    attributes = table_attributes(workspace.store, "convergence")
+    attributes = layout.table_attributes(workspace.store, "convergence")
     if attributes is None or attributes.get("digest") != (digest or _digest(workspace, table_order(workspace))):
         return False
     if stale_chunks(workspace.store, _spectrum_keys(workspace)):
         return False
     pairs = _pairs(workspace)
-    if pairs is not None and (PAIRS_KEYS not in workspace.store.documents or pairs.stale()):
+    if pairs is not None and (layout.PAIRS_KEYS not in workspace.store.documents or pairs.stale()):
         return False
     try:
-        return list(workspace.store.read_strings(QUALITY)) == workspace.qualities
+        return list(workspace.store.read_strings(layout.QUALITY)) == workspace.qualities
     except DamageError:
         return False
 

@@ -18,24 +18,9 @@ from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import DamageError, ForeignError, StoreError
 from sobolev_batch.norms.spectrum import RadialAxis
 from sobolev_batch.norms.tail.sampling import TailSampling
+from sobolev_batch.store import layout
 from sobolev_batch.store.encoding import ROOT, array_keys, dataset_keys, documents_in, group_document
-from sobolev_batch.store.layout import (
-    DESCRIPTION,
-    FIELD,
-    NUMERICS,
-    OCTAVES,
-    OCTAVES_GROUP,
-    PAGE,
-    QUALITY,
-    RECORD,
-    RECORDS,
-    REMOVED,
-    SPECTRA_GROUP,
-    SPECTRA_KEYS,
-    UNFINISHED,
-    Store,
-    hide_tables,
-)
+from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import LOCK_KEYS
 from sobolev_batch.store.metadata import SCHEMA_VERSION, chunk_shape
@@ -79,19 +64,19 @@ def reserve(location: Location, title: str) -> None:
 def give_up(location: Location) -> None:
     """Remove what was begun of a store, where its study turned out to be impossible."""
     with suppress(DamageError):
-        if Store(location).is_unfinished and location.names() <= {ROOT, RECORDS, *LOCK_KEYS}:
-            location.remove(RECORDS)
+        if Store(location).is_unfinished and location.names() <= {ROOT, layout.RECORDS, *LOCK_KEYS}:
+            location.remove(layout.RECORDS)
             location.discard(ROOT)
 
 
 def list_records(store: Store) -> None:
     """List the group of records, whose own document has the record of a run that may be going on."""
-    store.documents[RECORDS] = group_document({})
+    store.documents[layout.RECORDS] = group_document({})
     document = None
     with suppress(StoreError):  # It is damaged.
-        document = store.stored_document(RECORDS)
+        document = store.stored_document(layout.RECORDS)
     if document is None:
-        store.location.write({f"{RECORDS}/{ROOT}": json.dumps(store.documents[RECORDS]).encode()})
+        store.location.write({f"{layout.RECORDS}/{ROOT}": json.dumps(store.documents[layout.RECORDS]).encode()})
 
 
 def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
@@ -129,12 +114,12 @@ def prepare_store(location: str | Path | Location, plan: Plan) -> Store:
     is_kept = set(stored) <= {row.label for row in plan.rows}
     labels = labels_for(plan, stored, [None] * len(stored) if is_kept else Records(store).read(), is_trusted=True)
     if labels != list(stored):
-        _lay_out(store, plan, labels, store.read_strings(QUALITY))
-    similarity = {"scale": plan.similarity.scale, "origin": list(plan.similarity.origin)}
-    if attributes.get("similarity") != similarity:
+        _lay_out(store, plan, labels, store.read_strings(layout.QUALITY))
+    current = _attributes(plan, labels)
+    if attributes.get("similarity") != current["similarity"]:
         # Tables are in another unit of length, and the run may end before there are others.
-        hide_tables(store)
-    store.documents[""]["attributes"].update(_attributes(plan, labels))
+        layout.hide_tables(store)
+    store.documents[""]["attributes"].update(current)
     if plan.study.object.name:
         # The run has its record at the root of all objects, and writes this one nowhere else.
         list_records(store)
@@ -151,7 +136,7 @@ def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:
     stored: tuple[str, ...] = ()
     with suppress(StoreError, ValueError, TypeError, KeyError):
         stored = store.labels()
-    last, last_page = (max(store.stored_chunks(name), default=-1) for name in (RECORD, PAGE))
+    last, last_page = (max(store.stored_chunks(name), default=-1) for name in (layout.RECORD, layout.PAGE))
     count = max(1 + last, ROWS_PER_PAGE * (1 + last_page))
     fresh = Store(store.location)
     fresh.documents = documents_in(record_keys(count))
@@ -169,7 +154,8 @@ def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:
     _log.warning("%s: tables or metadata are not what was written, and are made again", store.path)
     store.location.remove_partial_files()
     if plan.tail is not None:
-        fresh.documents |= documents_in(dataset_keys(OCTAVES_GROUP, xr.Dataset(coords=_sample_columns(plan.tail))))
+        samples = xr.Dataset(coords=_sample_columns(plan.tail))
+        fresh.documents |= documents_in(dataset_keys(layout.OCTAVES_GROUP, samples))
     _require_same_samples(fresh, plan)
     labels = labels_for(plan, (stored + ("",) * count)[:count], records, is_trusted=False)
     _lay_out(fresh, plan, labels, ())
@@ -187,8 +173,8 @@ def _create(store: Store, plan: Plan) -> None:
     store.location.write({ROOT: json.dumps(_unfinished(plan.study.object.title)).encode()})
     store.location.remove_partial_files()
     present = store.location.names()
-    others = present - {*LOCK_KEYS, ROOT, RECORDS}
-    for name in (*sorted(others), *((RECORD, PAGE) if RECORDS in present else ())):
+    others = present - {*LOCK_KEYS, ROOT, layout.RECORDS}
+    for name in (*sorted(others), *((layout.RECORD, layout.PAGE) if layout.RECORDS in present else ())):
         store.location.remove(name)
     store.documents = {}
     _lay_out(store, plan, [row.label for row in plan.rows], ())
@@ -206,20 +192,20 @@ def _lay_out(store: Store, plan: Plan, labels: Sequence[str], qualities: Sequenc
     dtype, shape, chunks = plan.choice.dtype, (rows, *plan.lattice.shape), (1, *plan.blocks[0].shape)
     meaning = "Fourier transform of the area measure, xi_z >= 0 half"
     # xarray makes coordinates of what `coordinates` names, which then stay with a selected field.
-    keys = array_keys(FIELD, dtype, shape, chunks, ("mesh", *AXES), long_name=meaning, coordinates="quality")
+    keys = array_keys(layout.FIELD, dtype, shape, chunks, ("mesh", *AXES), long_name=meaning, coordinates="quality")
     coordinates = {**axes, "mesh": mesh, **_weight_columns(plan)}
     keys |= dataset_keys("fourier", xr.Dataset({"quality": quality}, coords=coordinates)) | record_keys(rows)
     if plan.tail is not None:
         meaning = "Fourier transform of the area measure, beyond the lattice"
         sums = "the sum of weight (1 + |xi|²)^s |octaves|² is the tail of a squared norm to the last octave"
         attributes, size = {"long_name": meaning, "description": sums}, plan.tail.size
-        keys |= array_keys(OCTAVES, dtype, (rows, size), (1, size), ("mesh", "sample"), **attributes)
-        keys |= dataset_keys(OCTAVES_GROUP, xr.Dataset(coords={**_sample_columns(plan.tail), "mesh": mesh}))
+        keys |= array_keys(layout.OCTAVES, dtype, (rows, size), (1, size), ("mesh", "sample"), **attributes)
+        keys |= dataset_keys(layout.OCTAVES_GROUP, xr.Dataset(coords={**_sample_columns(plan.tail), "mesh": mesh}))
     list_records(store)
-    spectra, before = _spectra_keys(plan, mesh), store.documents.get(SPECTRA_KEYS)
-    if before is not None and chunk_shape(before) != chunk_shape(documents_in(spectra)[SPECTRA_KEYS]):
+    spectra, before = _spectra_keys(plan, mesh), store.documents.get(layout.SPECTRA_KEYS)
+    if before is not None and chunk_shape(before) != chunk_shape(documents_in(spectra)[layout.SPECTRA_KEYS]):
         # They are summed up from the fields again.
-        store.location.remove(SPECTRA_GROUP)
+        store.location.remove(layout.SPECTRA_GROUP)
     store.publish(keys | spectra)
     store.documents[""] = group_document(_attributes(plan, labels))
 
@@ -234,22 +220,20 @@ def _spectra_keys(plan: Plan, mesh: NDArray[Any]) -> dict[str, bytes]:
         "octave": ("shell", axis.labels()["octave"], {"long_name": "number of the octave, 0 for the lattice"}),
         "lattice": ("shell", axis.labels()["lattice"], {"long_name": "lattice in the octave, -1 for drawn samples"}),
     }
-    keys = {
-        **dataset_keys(SPECTRA_GROUP, xr.Dataset(coords={**columns, "mesh": mesh})),
-        **array_keys(SPECTRA_KEYS, str, (rows,), (step,), ("mesh",)),
-    }
+    keys = dataset_keys(layout.SPECTRA_GROUP, xr.Dataset(coords={**columns, "mesh": mesh}))
+    keys |= array_keys(layout.SPECTRA_KEYS, str, (rows,), (step,), ("mesh",))
     for name, (width, dimension, meaning) in axis.arrays().items():
         attributes = {"long_name": meaning, "coordinates": " ".join(["key", *columns])}
-        path, dimensions = f"{SPECTRA_GROUP}/{name}", ("mesh", dimension)
+        path, dimensions = f"{layout.SPECTRA_GROUP}/{name}", ("mesh", dimension)
         keys |= array_keys(path, "float64", (rows, width), (step, width), dimensions, **attributes)
     return keys
 
 
 def record_keys(rows: int, dimension: str = "row") -> dict[str, bytes]:
     """Return the keys of the arrays of records: a chunk for each row, which tasks write, and pages of many rows."""
-    keys = array_keys(RECORD, str, (rows,), (1,), (dimension,))
-    keys |= array_keys(PAGE, str, (rows,), (ROWS_PER_PAGE,), (dimension,))
-    return {key: text for key, text in keys.items() if key != f"{RECORDS}/{ROOT}"}
+    keys = array_keys(layout.RECORD, str, (rows,), (1,), (dimension,))
+    keys |= array_keys(layout.PAGE, str, (rows,), (ROWS_PER_PAGE,), (dimension,))
+    return {key: text for key, text in keys.items() if key != f"{layout.RECORDS}/{ROOT}"}
 
 
 def _weight_columns(plan: Plan) -> dict[str, tuple[str, Reals, dict[str, str]]]:
@@ -279,7 +263,7 @@ def _sample_columns(tail: TailSampling) -> dict[str, tuple[str, NDArray[Any], di
 
 
 def _unfinished(title: str) -> dict[str, Any]:
-    return group_document({"title": title, "schema_version": SCHEMA_VERSION, UNFINISHED: True})
+    return group_document({"title": title, "schema_version": SCHEMA_VERSION, layout.UNFINISHED: True})
 
 
 def _require_same_samples(store: Store, plan: Plan) -> None:
@@ -287,7 +271,7 @@ def _require_same_samples(store: Store, plan: Plan) -> None:
     agree = []
     for name, expected in zip(AXES, () if plan.tail is None else plan.tail.frequencies.T, strict=False):
         with suppress(StoreError, ValueError, TypeError, KeyError):
-            stored = np.asarray(store.read(f"{OCTAVES_GROUP}/{name}"))
+            stored = np.asarray(store.read(f"{layout.OCTAVES_GROUP}/{name}"))
             agree.append(stored.shape == expected.shape and np.allclose(stored, expected, rtol=1e-9, atol=1e-12))
     if agree and not any(agree):
         raise StoreError(
@@ -350,7 +334,7 @@ def _attributes(plan: Plan, labels: Sequence[str]) -> dict[str, Any]:
     study, planned = plan.study, {row.label for row in plan.rows}
     return {
         "title": study.object.title,
-        "description": DESCRIPTION,
+        "description": layout.DESCRIPTION,
         "schema_version": SCHEMA_VERSION,
         "study": {
             "name": plan.name,
@@ -362,9 +346,9 @@ def _attributes(plan: Plan, labels: Sequence[str]) -> dict[str, Any]:
             "table": dict(study.object.table),
             "mesh_cache": str(study.cache.folder) if study.cache else None,
         },
-        REMOVED: [label for label in labels if label not in planned],
+        layout.REMOVED: [label for label in labels if label not in planned],
         "similarity": {"scale": plan.similarity.scale, "origin": list(plan.similarity.origin)},
-        "versions": {**{name: _version(name) for name in _RECORDED_VERSIONS}, NUMERICS: NUMERICS_VERSION},
+        "versions": {**{name: _version(name) for name in _RECORDED_VERSIONS}, layout.NUMERICS: NUMERICS_VERSION},
     }
 
 

@@ -13,17 +13,9 @@ from pydantic_core import ErrorDetails
 from sobolev_batch.errors import StudyError
 from sobolev_batch.sources.names import known_names, quoted, readable_key, shown_value
 from sobolev_batch.sources.registry import source_type_of
-from sobolev_batch.study.schema import (
-    KEYS_OF_FAMILY,
-    KEYS_OF_SEARCH,
-    FamilyReference,
-    StudyDocument,
-    SurfaceSections,
-    models_in,
-    with_named_meshes,
-)
+from sobolev_batch.study import schema
 
-Sections = TypeVar("Sections", bound=SurfaceSections)
+Sections = TypeVar("Sections", bound=schema.SurfaceSections)
 
 # Most refusals of one study.
 _MOST_OFFENDERS = 10
@@ -119,15 +111,19 @@ def _value_at(values: Any, key: _Key) -> Any:
 def _known_keys(values: Mapping[str, Any], key: _Key) -> Iterable[str]:
     """Return the keys that the table at a key may have."""
     if not key:
-        return StudyDocument.model_fields
+        return schema.StudyDocument.model_fields
     table = _value_at(values, key)
     with suppress(ValueError):  # as where a key is that of another section
-        table = with_named_meshes(table, values.get("mesh", {}))
+        table = schema.with_named_meshes(table, values.get("mesh", {}))
     if "source" not in table:
-        return next(models_in(StudyDocument.model_fields[str(key[0])].annotation)).model_fields
+        return next(schema.models_in(schema.StudyDocument.model_fields[str(key[0])].annotation)).model_fields
     if key == ("reference",) and table["source"] == "family":
-        return (*FamilyReference.model_fields, "source")
-    own = (*KEYS_OF_FAMILY, *KEYS_OF_SEARCH) if key[0] == "family" and len(key) == len(("family", 0)) else ()
+        return (*schema.FamilyReference.model_fields, "source")
+    own = (
+        (*schema.KEYS_OF_FAMILY, *schema.KEYS_OF_SEARCH)
+        if key[0] == "family" and len(key) == len(("family", 0))
+        else ()
+    )
     return (*source_type_of(table["source"]).model_fields, "source", *own)
 
 

@@ -17,20 +17,9 @@ from sobolev_batch.geometry.surface import Similarity, placement_doubt
 from sobolev_batch.norms.fields import Quality
 from sobolev_batch.parameters import as_names
 from sobolev_batch.sources.names import fits, quoted
+from sobolev_batch.store import layout
 from sobolev_batch.store.encoding import with_coordinates
-from sobolev_batch.store.layout import (
-    DIGEST,
-    FIELD,
-    NUMERICS,
-    OBJECTS,
-    OCTAVES_GROUP,
-    RECORD,
-    RECORDS,
-    SPECTRA_GROUP,
-    JoinedStore,
-    Store,
-    table_attributes,
-)
+from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.metadata import mapping_in
 from sobolev_batch.store.objects import stores_below
@@ -50,7 +39,7 @@ _SOURCE, _STATE = "source", "state"
 # Another: the trees of several stores that are open as one, each with the labels of its meshes by their own labels.
 _PARTS = "parts"
 # Groups that may be larger than the memory: xarray computes with them chunk by chunk.
-_LARGE = {"fourier", OCTAVES_GROUP, SPECTRA_GROUP}
+_LARGE = {"fourier", layout.OCTAVES_GROUP, layout.SPECTRA_GROUP}
 # What zarr and xarray raise for metadata that nobody has written.
 _MEANINGLESS = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError)
 
@@ -88,10 +77,10 @@ def open_store(store: str | Path | Location | Sequence[str | Path | Location]) -
     # Else values that are read once the process has gone to another folder would be missing ones.
     location = Location.parse(store).absolute()
     opened = Store(location)
-    has_objects = OBJECTS in opened.attributes(of_objects=None)["study"]
+    has_objects = layout.OBJECTS in opened.attributes(of_objects=None)["study"]
     # Left to itself, xarray looks for older formats, which nobody has checked, and lists keys again.
-    has_tables = table_attributes(opened, "convergence") is not None
-    keys: Any = opened.checked_keys(RECORD if has_objects else FIELD, has_tables=has_tables)
+    has_tables = layout.table_attributes(opened, "convergence") is not None
+    keys: Any = opened.checked_keys(layout.RECORD if has_objects else layout.FIELD, has_tables=has_tables)
     with opened.location.access("read"):
         try:
             tree = xr.open_datatree(keys, engine="zarr", consolidated=True, zarr_format=3)
@@ -107,12 +96,12 @@ def open_store(store: str | Path | Location | Sequence[str | Path | Location]) -
             raise DamageError(
                 f"{opened.path}: the store is damaged ({problem}); run the study again", problem
             ) from error
-    if len(numerics := (table_attributes(opened, "convergence") or {}).get(NUMERICS, ())) > 1:
+    if len(numerics := (layout.table_attributes(opened, "convergence") or {}).get(layout.NUMERICS, ())) > 1:
         _log.warning(
             "%s: its fields were computed by numerics of versions %s, as the column numerics of /meshes says; run the "
             "study again, which computes those of others anew", *(location, " and ".join(map(str, numerics))),
         )  # fmt: skip
-    tree.encoding = {**tree.encoding, _SOURCE: str(location), _STATE: tree.attrs.pop(DIGEST, None)}
+    tree.encoding = {**tree.encoding, _SOURCE: str(location), _STATE: tree.attrs.pop(layout.DIGEST, None)}
     return tree
 
 
@@ -135,7 +124,7 @@ def _joined(trees: Sequence[xr.DataTree]) -> xr.DataTree:
             [_part(tree, group, own, first, orders) for tree, own, first in zip(trees, names, firsts, strict=False)]
         )
         for group in trees[0].children
-        if group != RECORDS and all(group in tree.children for tree in trees)
+        if group != layout.RECORDS and all(group in tree.children for tree in trees)
     }
     groups["convergence"].attrs["reference"] = reference_of(trees[0])
     title = " + ".join(str(tree.attrs["title"]) for tree in trees)
@@ -191,7 +180,7 @@ def store_of(tree: xr.DataTree) -> Store:
     stores = [Store.open(location_of(part)) for part, _ in tree.encoding[_PARTS]]
     names = [own for _, own in tree.encoding[_PARTS]]
     labels = [own.get(label, "") for store, own in zip(stores, names, strict=True) for label in store.labels()]
-    return JoinedStore(stores, labels)
+    return layout.JoinedStore(stores, labels)
 
 
 def as_tree(store: AnyStore) -> xr.DataTree:
@@ -221,8 +210,8 @@ def require_unchanged(tree: xr.DataTree) -> None:
     for part, _ in tree.encoding.get(_PARTS, [(tree, {})]):
         source = source_of(part)
         # One that xarray itself has opened says so among its attributes.
-        state = part.encoding.get(_STATE, part.attrs.get(DIGEST))
-        if source is not None and Store.open(source).attributes().get(DIGEST) != state:
+        state = part.encoding.get(_STATE, part.attrs.get(layout.DIGEST))
+        if source is not None and Store.open(source).attributes().get(layout.DIGEST) != state:
             raise StoreError(
                 f"{source}: a run has changed the store while it was read; once that run has ended, open the store "
                 "again, or give the same command again"
@@ -254,13 +243,13 @@ def finished_group(tree: xr.DataTree, name: str, *, load: bool = True) -> xr.Dat
 
 def has_objects(tree: xr.DataTree) -> bool:
     """Return True for the root of several objects."""
-    return OBJECTS in root_attribute(tree, "study")
+    return layout.OBJECTS in root_attribute(tree, "study")
 
 
 def require_one_object(tree: xr.DataTree) -> None:
     """Refuse the root of several objects, by an InputError that names the store of one."""
     if has_objects(tree):
-        one = f"{source_of(tree)}/{next(iter(root_attribute(tree, 'study')[OBJECTS]), 'NAME')}"
+        one = f"{source_of(tree)}/{next(iter(root_attribute(tree, 'study')[layout.OBJECTS]), 'NAME')}"
         raise InputError(f"{source_of(tree)}: the store of several objects; name that of one, such as {one}")
 
 

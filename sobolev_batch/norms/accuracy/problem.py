@@ -9,15 +9,8 @@ import numpy as np
 
 from sobolev_batch.arrays import ComplexDtype, Complexes, Reals
 from sobolev_batch.errors import AccuracyError
+from sobolev_batch.geometry import overlap
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.geometry.overlap import (
-    rests_of,
-    signed,
-    two_meshes,
-    without_common_faces,
-    without_common_parts,
-    without_shared_triangles,
-)
 from sobolev_batch.geometry.refinement import refinement_of
 from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Similarity, Surface, centering
 from sobolev_batch.norms.accuracy.tolerance import Accuracy, first_lattice, unreachable
@@ -94,17 +87,17 @@ class Problem:
         Those that are far apart stay where they are, since a common move would cost digits. Flat faces stay as they are
         where two meshes have more triangles than are to be clipped, beside those that are the same in both.
         """
-        different, pair = without_shared_triangles(surfaces), tuple(surfaces) if len(surfaces) == 2 else ()
+        different, pair = overlap.without_shared_triangles(surfaces), tuple(surfaces) if len(surfaces) == 2 else ()
         settings = orders, accuracy, label, threads
-        if sum(len(mesh.triangles) for mesh in two_meshes(different.values())) > most_clipped:
+        if sum(len(mesh.triangles) for mesh in overlap.two_meshes(different.values())) > most_clipped:
             return replace(cls._between(different, pair, *settings), is_clipped=False)
-        different = without_common_faces(different)
+        different = overlap.without_common_faces(different)
         problem = cls._between(different, pair, *settings)
-        meshes, rounding = two_meshes(different.values()), _rounding(pair)
+        meshes, rounding = overlap.two_meshes(different.values()), _rounding(pair)
         if not meshes or not rounding:
             return problem
-        rests = rests_of(meshes[0], meshes[1], rounding / max(mesh.extent.reach for mesh in meshes))
-        closer = cls._between(signed(rests.meshes), pair, *settings)
+        rests = overlap.rests_of(meshes[0], meshes[1], rounding / max(mesh.extent.reach for mesh in meshes))
+        closer = cls._between(overlap.signed(rests.meshes), pair, *settings)
         moved = norm_of_moves(rests.areas, rests.distances, orders)
         if closer.surfaces and np.all(moved <= _MOVED_FRACTION * accuracy.rtol * closer.rough_values):
             return replace(closer, moved=moved)
@@ -115,7 +108,7 @@ class Problem:
 
         It stays as it is where that may be more than a small part of the norm. The surfaces are those it was made from.
         """
-        rounding, meshes = _rounding(surfaces), two_meshes(surfaces)
+        rounding, meshes = _rounding(surfaces), overlap.two_meshes(surfaces)
         if not meshes or not rounding or not self.surfaces:
             return self
         coarse, fine = sorted(meshes, key=lambda mesh: len(mesh.triangles))
@@ -280,7 +273,7 @@ def support_of(surfaces: Sequence[Surface]) -> Support:
 
 def are_equal(a: Surface, b: Surface) -> bool:
     """Return whether two meshes are equal as area measures, to rounding."""
-    return abs(a.area - b.area) <= _ROUNDING * (a.area + b.area) and not without_common_parts((a, b))
+    return abs(a.area - b.area) <= _ROUNDING * (a.area + b.area) and not overlap.without_common_parts((a, b))
 
 
 def _rounding(surfaces: Sequence[Surface]) -> float:
