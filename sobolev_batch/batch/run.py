@@ -9,18 +9,12 @@ from importlib.util import find_spec
 
 from distributed import Client
 
+from sobolev_batch.batch import object_run
 from sobolev_batch.batch.cluster.clients import check_cluster, local_client, memory_limit, thread_client
 from sobolev_batch.batch.cluster.execution import Cluster, Notify, Progress, Stages, side_by_side
 from sobolev_batch.batch.cluster.watch import Heartbeat, Watch
 from sobolev_batch.batch.cluster.workers import prepare_workers, require_store_access
-from sobolev_batch.batch.object_run import (
-    Ended,
-    ended_already,
-    ended_before,
-    has_rows_of_now,
-    run_object,
-    workspace_at_hand,
-)
+from sobolev_batch.batch.object_run import Ended
 from sobolev_batch.batch.start import StoreLike, ready_to_run
 from sobolev_batch.errors import InputError, SobolevBatchError
 from sobolev_batch.machine import available_cores, require_machine_memory
@@ -180,7 +174,7 @@ def carry_out(
     place = lock.of_run(location)
     numbers, equip = {name: n for n, name in enumerate(study.objects, 1)}, cache(equip)
     objects = None if "" in study.objects else Objects.prepared(place, study)
-    at_hand = workspace_at_hand(study, place) if objects is None else None
+    at_hand = object_run.workspace_at_hand(study, place) if objects is None else None
     if objects is None and at_hand is None:
         reserve(place, study.title)
     with Heartbeat(location, lock).kept() as heartbeat:
@@ -212,7 +206,7 @@ def carry_out(
                         continue
                 record = recorded.get(name)
                 known = record if name in whole else None
-                before = ended_before(one, known) if at_hand is None else ended_already(at_hand)
+                before = object_run.ended_before(one, known) if at_hand is None else object_run.ended_already(at_hand)
                 if before is not None:
                     ended[name] = before
                 else:
@@ -221,7 +215,7 @@ def carry_out(
                     if objects is not None and record is not None and record.key:
                         # Its store may become another one, and this run be killed, and the study be as before again.
                         objects.records.write(objects.rows[name], replace(record, key=""))
-                    yield name, run_object(one, place, cluster, at_hand)
+                    yield name, object_run.run_object(one, place, cluster, at_hand)
 
         def is_fatal(error: Exception) -> bool:
             return objects is None or ends_all(error) or not isinstance(error, SobolevBatchError)
@@ -240,7 +234,7 @@ def carry_out(
                 record = replace(outcome.record, key="", settings={}) if has_old_rows else outcome.record
                 objects.records.write(objects.rows[name], record)
         if objects is not None:
-            _tabulate(objects, ended, lambda name: has_rows_of_now(study.objects[name], recorded.get(name)))
+            _tabulate(objects, ended, lambda name: object_run.has_rows_of_now(study.objects[name], recorded.get(name)))
             _complete_records(objects, recorded, ended)
             objects.root.remember()
     return _summary(location, {name: ended[name] for name in study.objects if name in ended})

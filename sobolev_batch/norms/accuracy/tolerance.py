@@ -17,15 +17,8 @@ from scipy.special import betainc
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import AccuracyError, InputError
-from sobolev_batch.norms.budget import (
-    TRUNCATION_CAUTION,
-    Sums,
-    Support,
-    aliased,
-    image_distances,
-    image_weight,
-    truncated,
-)
+from sobolev_batch.norms import budget
+from sobolev_batch.norms.budget import Sums, Support
 from sobolev_batch.norms.estimate import NormEstimate
 from sobolev_batch.transform.fourier import TransformSettings, projected_bytes
 from sobolev_batch.transform.lattice import LARGEST_M, Lattice, SobolevWeights
@@ -153,7 +146,7 @@ def first_lattice(support: Support, orders: Sequence[float], accuracy: Accuracy)
     period = _first_period(support, orders, accuracy)
     radii = np.geomspace(0.5, _HIGHEST_FREQUENCY, 400)
     highest = radii[0]
-    parts = accuracy.truncation_parts(orders) / (TRUNCATION_CAUTION * _TAIL_MARGIN / 2)
+    parts = accuracy.truncation_parts(orders) / (budget.TRUNCATION_CAUTION * _TAIL_MARGIN / 2)
     for order, allowed in zip(orders, parts, strict=True):
         # ∫_x^∞ r² (1+r²)^s dr over the same from zero; it diverges from order -3/2 on.
         tails = betainc(max(-order - 1.5, 1e-9), 1.5, 1 / (1 + radii**2))
@@ -172,7 +165,7 @@ def core_lattice(support: Support, orders: Sequence[float], accuracy: Accuracy) 
     first, largest = _first_period(support, orders, accuracy), accuracy.largest_intervals
     lattice = lattice_of(_HIGHEST_FREQUENCY, first, min(_PILOT_M, largest))
     reach = _STEP_WAVES / lattice.xi_max
-    period = next(it for it in _growing(first) if image_distances(1 / it, support.widths).min() >= reach)
+    period = next(it for it in _growing(first) if budget.image_distances(1 / it, support.widths).min() >= reach)
     if period == first:
         return lattice
     intervals = min(good_intervals(2 * lattice.xi_max * period), largest)
@@ -199,7 +192,7 @@ def refined(sums: Sums, weights: SobolevWeights, support: Support, accuracy: Acc
 
     def tail(highest: float) -> Reals:
         with np.errstate(divide="ignore", invalid="ignore"):
-            tails = np.nan_to_num(truncated(sums, weights, support, highest) / (2 * sums.totals), posinf=0.0)
+            tails = np.nan_to_num(budget.truncated(sums, weights, support, highest) / (2 * sums.totals), posinf=0.0)
         return np.asarray(tails.reshape(len(orders), -1).max(axis=1))
 
     most, allowed = accuracy.largest_intervals, accuracy.truncation_parts(orders)
@@ -234,14 +227,14 @@ def good_intervals(least: float) -> int:
 def _refined_period(sums: Sums, weights: SobolevWeights, widths: Reals, accuracy: Accuracy) -> float:
     """Return the period 1/h at which the images that the sums show are small enough."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        images = np.nan_to_num(aliased(sums, weights, widths) / (2 * sums.totals), posinf=0.0)
+        images = np.nan_to_num(budget.aliased(sums, weights, widths) / (2 * sums.totals), posinf=0.0)
     images = images.reshape(len(weights.orders), -1).max(axis=1)
     first = 1 / weights.lattice.spacing
-    before = [image_weight(1 / first, order, widths) for order in weights.orders]
+    before = [budget.image_weight(1 / first, order, widths) for order in weights.orders]
 
     def suffices(period: float) -> bool:
         return period >= first + 8 or not any(
-            image * image_weight(1 / period, order, widths) / weight > accuracy.aliasing_part
+            image * budget.image_weight(1 / period, order, widths) / weight > accuracy.aliasing_part
             for image, order, weight in zip(images, weights.orders, before, strict=True)
         )
 
@@ -255,7 +248,7 @@ def _first_period(support: Support, orders: Sequence[float], accuracy: Accuracy)
 
     def suffices(period: float) -> bool:
         farthest = period > widest + _VANISHED
-        return farthest or all(image_weight(1 / period, order, widths) <= allowed for order in orders)
+        return farthest or all(budget.image_weight(1 / period, order, widths) <= allowed for order in orders)
 
     return max(next(filter(suffices, _growing(max(widest, _LEAST_WIDTH)))), LEAST_CLEARANCE * 2 * support.reach)
 
