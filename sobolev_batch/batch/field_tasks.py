@@ -58,8 +58,7 @@ class Job:
         lattice, transform, orders, similarity, backend, tail: What all rows share; see `Plan`.
         distance_target: Accuracy that the field is computed for, if the study has one.
         allowed_bytes: Memory that one transform may take besides its mesh and its block.
-        reference: Row of the reference, where the surface is compared with it beyond the lattice; None if it is too
-            large.
+        reference: Row of the reference, where surfaces are compared beyond the lattice; None if it is too large.
         numerics: Version of the numerics that the key of the row has.
     """
 
@@ -169,8 +168,7 @@ class StoredBlocks:
 def compute_mesh(job: Job, blocks: Sequence[Block]) -> Record:
     """Compute and store the whole field of a mesh, then its completion record, unless that exists.
 
-    The reason of a failure goes into the record, so that one bad mesh stops nothing else. A StoreError is not its
-    fault.
+    The reason of a failure goes into the record, so that one bad mesh stops nothing else; but for a StoreError.
     """
     stored = compute_parts(job, blocks, octaves=job.tail is not None)
     return stored if isinstance(stored, Record) else _finished(job, stored)

@@ -159,8 +159,7 @@ def reduce(
     """Find the fewest triangles with which each mesh is still within a tolerance of itself.
 
     Bounds decide, and a sample only of measures that have no others. A mesh that is not certainly within the tolerance
-    counts as one that is not. What was tried is recorded in the output, so that the same call goes on where it was
-    ended.
+    counts as one that is not. What was tried is recorded in the output, so that the same call goes on where it ended.
 
     Args:
         meshes: A mesh, the path of a file or a glob, a list of these paths, or meshes by name. Files are in one unit.

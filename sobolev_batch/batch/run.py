@@ -106,8 +106,7 @@ def run(
     Raises:
         StudyError, MeshError, LatticeError: The study cannot be carried out, or runs commands and may not.
         AccuracyError: The accuracy that the study requests is out of reach; nothing was computed.
-        StoreError: The store cannot be reached or written, belongs to another study, or is being written by another run
-            (LockError).
+        StoreError: The store cannot be reached or written, is another study's, or another run writes it (LockError).
         ClusterError: No worker has the GPU or the memory that the study requests; or the scheduler was lost.
         InputError: The memory is no size, or not there; or the client is none of Dask's, or asynchronous, or given
             beside workers or memory.

@@ -143,8 +143,7 @@ def drive(study: Study, store: str, run: str) -> None:
             _log.warning("%s: this worker leaves before the end of the study it drove", store)
             return
         _log.error("%s: the study could not be carried out: %s", store, error)
-        # The run's own heartbeat has written most errors by now, but not that a file of the study is missing
-        # on this machine.
+        # The run's own heartbeat has written most errors by now, but not that a file of the study is missing here.
         with suppress(StoreError):  # it may be what failed
             Heartbeat(location, lock).write("failed", f"{error} (on the worker that drove the study)")
     release(location, lock)

@@ -190,8 +190,7 @@ class _Bounds:
 class _Pieces:
     """Parts of triangles: corners (3 corners, 3 coordinates, n), and triangles (k, n) that may be close to each.
 
-    Covers of these parts, or of what they were cut from, may have been searched: where there was none, there hardly is
-    one now.
+    Covers of these parts, or of what they were cut from, may have been searched: where none was, there hardly is one.
     """
 
     corners: Reals

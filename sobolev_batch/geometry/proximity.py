@@ -199,8 +199,7 @@ def _mean(values: Reals) -> tuple[float, float]:
 def share_beyond(a: MeshLike, b: MeshLike, length: float, *, one_way: bool = False) -> tuple[float, float]:
     """Return the share of the area that is farther from the other mesh than a length, by random points, and its error.
 
-    It is the larger of both directions, or that of the first mesh. The standard error is that of a share which is one
-    point larger.
+    It is the larger of both directions, or that of the first mesh. The standard error is that for one point more.
     """
     meshes = as_mesh(a), as_mesh(b)
     rng, ways, points = np.random.default_rng(0), (meshes, meshes[::-1])[: 1 if one_way else 2], DEFAULT_POINTS
@@ -227,8 +226,7 @@ def vertex_distances(mesh: MeshLike, other: MeshLike, *, signed: bool = False) -
         Distances (n,) of float64, exact to rounding, in the unit of the meshes; NaN for a vertex that no triangle uses.
 
     Raises:
-        InputError: Signs are requested, but triangles of the other mesh are not oriented consistently; or see
-            `as_mesh`.
+        InputError: Signs are requested, but the other mesh is not oriented consistently; or see `as_mesh`.
 
     >>> import sobolev_batch as sb
     >>> ball = sb.shapes.icosphere(3)

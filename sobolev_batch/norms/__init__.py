@@ -1,9 +1,7 @@
 """Norms: from fields to norms and distances of every order, each with its error.
 
-In: surfaces, a lattice or a tolerance. Out: labelled datasets in which numbers have their errors. Knows neither dask
-nor zarr.
+In: surfaces, a lattice or a tolerance. Out: labelled datasets, numbers with errors. Knows neither dask nor zarr.
 """
 
-# Of every function, command and study that names none. Here, as the command line shows it without importing what
-# computes.
+# Of all functions, commands and studies that name none; here, where the command line need not import what computes.
 DEFAULT_ORDER = -2.0

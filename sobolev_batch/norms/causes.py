@@ -58,8 +58,7 @@ def spectrum(
         `own_longest_wavelength` and `own_shortest_wavelength`), and
 
         - `squared` (order, band): contribution of the band to the squared distance
-          ∫ (1 + |ξ|²)^s |a^ - b^|² dξ, in units of length. Bands that cover all frequencies add up to the
-          whole;
+          ∫ (1 + |ξ|²)^s |a^ - b^|² dξ, in units of length. Bands that cover all frequencies add up to the whole;
         - `share` (order, band): that over the whole; NaN where the whole is zero;
         - `total` (order): the whole, on the lattice;
         - `mean_square` (band): mean of |a^ - b^|² over the band, in unit length to the fourth; NaN
@@ -200,8 +199,7 @@ def witness(
     Raises:
         OrderError: An order is not below -1/2.
         LatticeError: The fields lie on different lattices, or points lie beyond the half period 1/(2h).
-        InputError: Points are not finite or not (n, 3); a surface comes without a lattice; settings are out
-            of range.
+        InputError: Points are not finite or not (n, 3); a surface lacks a lattice; settings are out of range.
 
     Source: A. Gretton et al., "A kernel two-sample test" (2012), JMLR 13, section 2.3.
 

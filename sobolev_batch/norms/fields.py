@@ -73,8 +73,7 @@ class Quality:
         area: Area of the surface, in squared units of length.
         probe: Measured error of the field itself; empty for a closed form.
         tail: Quality of the values in octaves; None without octaves.
-        beyond: What lies beyond a lattice without octaves in the distance from the study's reference; None where that
-            is extrapolated.
+        beyond: What lies beyond a lattice without octaves in the distance from the reference; None if extrapolated.
     """
 
     area: float

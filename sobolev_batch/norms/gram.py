@@ -19,8 +19,7 @@ from sobolev_batch.transform.lattice import Block, SobolevWeights
 
 Run = tuple[slice, int, int | None]
 
-# A squared distance this much smaller than the squared distances to the center has lost six of its
-# sixteen digits.
+# A squared distance this much below the squared distances to the center has lost six of its sixteen digits.
 _CANCELLATION = 1e-6
 # Columns of one product: this many samples of a few dozen fields, weighted for a few orders, stay in cache.
 _COLUMNS = 1 << 12
@@ -44,8 +43,7 @@ class Arrangement:
         trapezoid: Weight of each sample in the sum over the lattice (block.size,).
         by_order: Weights of the shells for each order, and for narrower ones (rows, lattice.shell_count).
         places: Rows of these that `Sums.totals` and `Sums.by_residue` take.
-        by_window: Weights of the shells for the outer ranges (2, lattice.shell_count), raised to make up for
-            the samples left out.
+        by_window: Weights of the shells for the outer ranges (2, lattice.shell_count), raised for samples left out.
     """
 
     order: NDArray[np.intp]
@@ -91,8 +89,7 @@ class Arrangement:
         """Return the contributions of this block to the inner products Re <a_i, b_j>_s of fields.
 
         The fields are complex128 (m, block.size) and (n, block.size), arranged, each row contiguous; preferably the
-        second ones are fewer. The arrays end in (m, n). The contributions of all blocks of the half lattice add up to
-        the whole.
+        second ones are fewer. The arrays end in (m, n). Contributions of all blocks of the half lattice add up.
         """
         m, n = len(first), len(second)
         left, right = first.view(np.float64), second.view(np.float64)
@@ -140,8 +137,7 @@ def differences(products: Sums, first: Sums, second: Sums) -> tuple[Sums, NDArra
     """Return squared differences of pairs from their inner products, and a mask of those that cancelled.
 
     The products are those of the differences to the center, in arrays that end in (m, n). The others are squares of
-    these differences, and end in (m,) and (n,). The mask (m, n) is True for pairs that lost more than about six digits
-    at any order.
+    these differences, and end in (m,) and (n,). The mask (m, n) is True for pairs that lost some six digits at any order.
     """
     scales = [a[..., :, None] + b[..., None, :] for a, b in zip(first.arrays, second.arrays, strict=True)]
     squares = Sums(*(scale - 2 * both for scale, both in zip(scales, products.arrays, strict=True)))

@@ -25,8 +25,7 @@ _NODES = 40
 # Chebyshev points and their barycentric weights.
 _ANGLES = np.pi * (np.arange(_NODES) + 0.5) / _NODES
 _POINTS, _POINT_WEIGHTS = -np.cos(_ANGLES), np.where(np.arange(_NODES) % 2, -1.0, 1.0) * np.sin(_ANGLES)
-# Orders at which peaks are known. Between them the logarithm of the largest sample is convex in the order, and below
-# the chord.
+# Orders at which peaks are known. Between them the largest sample's logarithm is convex in the order, below the chord.
 _PEAK_ORDERS = np.array([-0.5, -1, -1.5, -2, -2.5, -3, -3.5, -4, -5, -6, -8, -10, -14, -20, -100])
 
 

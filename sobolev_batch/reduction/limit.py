@@ -45,8 +45,7 @@ class Limit:
     """Largest distance of a mesh from the one that it was made of, by one measure.
 
     Attributes:
-        value: Largest value of the measure, whatever its sign: a length in the unit of the meshes, an angle in degrees,
-            or a fraction.
+        value: Largest value of the measure, of either sign: a length in the unit of the meshes, degrees or a fraction.
         measure: Column of tables: "hausdorff", the largest deviation, of each point of either mesh from the closest one
             of the other; "relative", the Sobolev distance over the norm of the original, in the unit in which its
             bounding sphere has the radius 1; "area" or "volume", its change over that of the original; or another one

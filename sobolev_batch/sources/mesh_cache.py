@@ -85,8 +85,7 @@ class MeshCache:
     def version(self, command: Sequence[str], words: Sequence[str]) -> str | None:
         """Return what a command, filled with words, printed last as the version of a program.
 
-        It runs where that is not known. None where it is not known, and the command may not run; StudyError where it
-        fails.
+        It runs where that is not known. None where it may not run then; StudyError where it fails.
         """
         key = f"version-{hashlib.sha256(shlex.join(command).encode()).hexdigest()}.txt"
         if key in self.asked:

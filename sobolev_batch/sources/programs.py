@@ -166,8 +166,7 @@ def _awaited(
     """Wait for a program, and return why it was ended before its time, its processor time and its largest memory."""
     problem, pause, deadline, peak_bytes = "", _FIRST_PAUSE, time.monotonic() + timeout, float("nan")
     while True:
-        # Nothing in subprocess tells the time of a single process. Its peak of memory would count this process, from
-        # which it was forked.
+        # Nothing in subprocess tells the time of a single process. Its peak of memory would count that of this one.
         found, status, usage = os.wait4(process.pid, 0 if problem else os.WNOHANG)
         if found:
             process.returncode = os.waitstatus_to_exitcode(status)

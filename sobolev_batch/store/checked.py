@@ -1,7 +1,6 @@
 """Chunks that are checked before zarr decodes them.
 
-zarr raises exceptions of many kinds for broken chunks, and takes any amount of memory for a chunk of texts whose count
-is damaged.
+zarr raises exceptions of many kinds for broken chunks, and takes any memory for texts whose count is damaged.
 """
 
 import json

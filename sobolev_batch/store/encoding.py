@@ -1,7 +1,6 @@
 """Arrays and datasets as the keys of a zarr store: metadata documents, and chunks with checksums.
 
-They are those that zarr and xarray write. These take a millisecond and more for each array, and thousands of objects
-have a hundred each.
+They are those of zarr and xarray, which take a millisecond for each array, and thousands of objects have a hundred.
 """
 
 import json

@@ -204,8 +204,7 @@ def _process_mark(number: int) -> str:
         fields = Path(f"/proc/{number}/stat").read_text(encoding="utf-8", errors="replace")
     except OSError:
         return ""
-    # The name in brackets may hold anything. The start is counted from the boot, so setting the clock does not
-    # move it.
+    # The name in brackets may hold anything. The start is counted from the boot, which no setting of the clock moves.
     state, started = (fields.rpartition(")")[2].split()[index] for index in (0, 19))
     if state in _ENDED:
         return ""

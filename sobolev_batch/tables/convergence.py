@@ -169,8 +169,7 @@ def tables_of(
 ) -> dict[str, pd.DataFrame]:
     """Return the rows of `table` of each object that has any, by its name, "" for an only one; InputError if none has.
 
-    The root of a store has the rows of all its objects at the orders of the study; others are computed from the stores
-    of the objects.
+    The root of a store has the rows of all objects at the orders of the study; others come from the stores of objects.
     """
     if not isinstance(store, Mapping) or isinstance(store, xr.DataTree):
         tree = as_tree(store)

@@ -61,8 +61,7 @@ def open_store(store: str | Path | Location | Sequence[str | Path | Location]) -
         store: Path or URL of the store, or several.
 
     Raises:
-        StoreError: The location has no store of a study, cannot be reached, or holds something else; or several stores
-            do not fit together.
+        StoreError: The location has no store of a study, or cannot be reached; or several stores do not fit together.
         DamageError: What is read at once is damaged. All else that is missing or damaged raises when it is read.
 
     >>> import sobolev_batch as sb

@@ -70,8 +70,7 @@ class Reducer:
         errors: Norms of the fields' own errors (orders, rows), likewise.
         beyond: Bounds on the distances from the study's reference beyond a lattice (orders, rows), NaN where these are
             extrapolated.
-        images: Roots of what images add to the squared distances from the reference (orders, rows), NaN where that is
-            not known.
+        images: Roots of what images add to the squared distances from the reference (orders, rows), NaN if unknown.
         widths: Widths of all surfaces together (13,), see `Extent`.
         checksums: Checksums of the blocks of each field, by its row, and of its values in octaves.
         sampling: Samples of the octaves; None where the fields are all there is.

@@ -47,8 +47,7 @@ def smallest_below(store: AnyStore, relative: float | str, order: Orders | None 
         the reference's label and the bound.
 
     Raises:
-        InputError: The store has no tables yet, lacks an order, or has no meshes of triangles, or the bound is not
-            positive.
+        InputError: The store has no tables yet, no such order or no triangles, or the bound is not positive.
         StoreError: The location has no store of a study.
 
     >>> import sobolev_batch as sb

@@ -35,8 +35,7 @@ class VertexWitness:
 
     Attributes:
         mesh: The mesh, in its own unit of length.
-        values: Witness function (orders, vertices) in 1 / unit length of the context; NaN where no triangle uses a
-            vertex.
+        values: Witness function (orders, vertices) in 1 / unit length of the context; NaN at vertices of no triangle.
         orders: Orders s of these.
         title: What was compared with what.
         unit: Unit of length of the context, in that of the mesh.

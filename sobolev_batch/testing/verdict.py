@@ -36,8 +36,7 @@ class Verdict(Shown):
     """Answer to whether two surfaces are the same, to a tolerance. It is true if they are the same.
 
     Attributes:
-        outcome: "same" if the upper bound is at most the tolerance, "different" if the lower one is above it, else
-            "undecided".
+        outcome: "same" if the upper bound is at most the tolerance, "different" if the lower is above, or "undecided".
         lower: Lower bound on the Sobolev distance of the surfaces over the Sobolev norm of the reference.
         upper: Upper bound on it. The bounds are only as narrow as the outcome needs.
         tolerance: Largest relative distance of surfaces that count as the same.

@@ -95,8 +95,7 @@ def assert_within(
         one_way: True if points of b may be farther from a: what a scan has not seen of a part, for example.
 
     Returns:
-        Bounds of the largest deviation each way and both, in the unit of the meshes; they are only as close as the
-        answer needs.
+        Bounds of the largest deviation each way and both, in the unit of the meshes, as close as the answer needs.
 
     Raises:
         AssertionError: A point is farther away, or rounding leaves that open. The message is one line, with the bounds

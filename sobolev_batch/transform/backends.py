@@ -348,8 +348,7 @@ def compute_on(backend: Backend, compute: Callable[[Backend], Result], *, alone:
 def gpu_backend() -> Gpu:
     """Return the GPU, once it has passed a trial; BackendError, with what to do, where none is usable.
 
-    Nothing of CUDA is loaded before this is called. To use several GPUs, start one process for each, with its own
-    CUDA_VISIBLE_DEVICES.
+    Nothing of CUDA is loaded before this. For several GPUs, start a process each, with its own CUDA_VISIBLE_DEVICES.
     """
     backend = Gpu.load()
     try_out(backend)

@@ -233,8 +233,7 @@ def _phases(points: Array, frequency: Array, plain: bool) -> Array:
 def _series(ab: Array, ac: Array, widest: float) -> tuple[Array, Array]:
     """Return real and imaginary part of Σ_n i^n h_n / (n+2)!, h_n the complete homogeneous symmetric polynomials.
 
-    As the nodes' mean is zero, h_n is the sum of C(j+k, k) p^j q^k over 2j + 3k = n, for p = Σ node²/2 and q their
-    product.
+    As the nodes have mean zero, h_n is the sum of C(j+k, k) p^j q^k over 2j + 3k = n, p = Σ node²/2, q their product.
     """
     lowest = (ab + ac) / -3
     p = (ab * (ab - ac) + ac * ac) / 3

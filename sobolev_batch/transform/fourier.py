@@ -67,8 +67,7 @@ class TransformSettings:
     """Accuracy, dtype and quadrature of fields; InputError where one is unknown or out of reach for the dtype.
 
     Attributes:
-        eps: Accuracy of a field relative to the surface's area; by default 1e-9 in complex128 and 1e-6 in
-            complex64.
+        eps: Accuracy of a field relative to the surface's area; default 1e-9 in complex128, 1e-6 in complex64.
         dtype: "complex128" or "complex64".
         quadrature: Rules for triangles: see `fixed_rule`.
         tolerance: Largest error of the rule on any one triangle, relative to its area, or of the nodes of a

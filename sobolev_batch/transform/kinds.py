@@ -46,8 +46,7 @@ class SurfaceKind(ABC):
     Attributes:
         surface: Surface in units of length.
         highest_frequency: Largest |ξ| at which the points stand for the surface, in cycles per unit length.
-        eps: Largest quadrature error at any such frequency, relative to the area. Only "auto" and parametrised
-            surfaces observe it.
+        eps: Largest quadrature error there, relative to the area. Only "auto" and parametrised surfaces observe it.
         quadrature: As in `TransformSettings`, like the tolerance.
     """
 
@@ -175,8 +174,7 @@ class _Triangles(SurfaceKind):
         total = float(ends[-1])
         margin = 0 if fits else max(expected)
         count = math.ceil(total / (capacity - margin))
-        # A batch of triangles goes where its first point goes, so that each batch of points exceeds its equal number by
-        # at most one of these.
+        # Batches of triangles go where their first point goes: those of points exceed their equal number by one at most.
         numbers = (np.concatenate([[0], ends[:-1]]) * count // total).astype(int).tolist()
         faces = self.faces(backend)
         for _, group in groupby(zip(numbers, triangles, strict=True), key=itemgetter(0)):

@@ -46,8 +46,7 @@ def transform_points(
     The values are a complex array (block.shape) of the backend; the number of points comes with them. The sum runs over
     all batches, whose points are in units of length and in arrays of the backend. Points with a |coordinate| of
     ``lattice.half_period`` or more are folded back without an error. The shape of the NUFFT is the block's or that of
-    sub-blocks. Its eps is relative to Σ|w_j|; the error is a small multiple of it. The values depend on its threads by
-    rounding.
+    sub-blocks. Its eps is relative to Σ|w_j|, its error a small multiple of that; threads change values by rounding.
 
     Source: A. Barnett, J. Magland, L. af Klinteberg, "A parallel non-uniform fast Fourier transform library based
     on an exponential of semicircle kernel" (2019), doi:10.1137/18M120885X.

@@ -18,8 +18,7 @@ Shape = tuple[int, int, int]
 # The limits of FINUFFT: below them 2.5 warns, and 2.6 refuses.
 FINEST_EPS: dict[ComplexDtype, float] = {"complex128": 1e-14, "complex64": 2e-7}
 
-# Points of one NUFFT: two million take 0.3 GB with their strengths and sorting, and make the FFT a small part of
-# the time.
+# Points of one NUFFT: two million take 0.3 GB with strengths and sorting, and make the FFT a small part of the time.
 DEFAULT_BATCH = 1 << 21
 # The smallest batch holds eight node sets of the largest triangle rule.
 _SMALLEST_BATCH = 1 << 12

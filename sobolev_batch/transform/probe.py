@@ -2,8 +2,7 @@
 
 The mean of weight · |computed - exact|² / p over frequencies drawn with probability p estimates the squared norm of a
 field's error without bias (importance sampling). The exact values of a mesh are the closed form of its triangles, which
-shares neither the quadrature nor the NUFFT with the field. Those of a parametrised surface are a direct sum over twice
-the nodes.
+shares neither quadrature nor NUFFT with the field; those of a parametrised surface are a sum over twice the nodes.
 """
 
 from collections.abc import Sequence

@@ -200,9 +200,8 @@ def candidate_rules() -> tuple[TriangleRule, ...]:
 def tabulated() -> dict[str, Reals]:
     """Return the symmetric rules and what was measured of each candidate, float64.
 
-    The "nodes" (n, 3) and "weights" (n,) of all degrees follow each other; "sizes" (50,) has the number of each. To
-    measure the errors "largest" (55, 160), "even" and "odd" (55, 64), as `python -m benchmarks.rule_errors` does, takes
-    a second.
+    The "nodes" (n, 3) and "weights" (n,) of all degrees follow each other; "sizes" (50,) has the number of each. The
+    errors "largest" (55, 160), "even" and "odd" (55, 64) take `python -m benchmarks.rule_errors` a second to measure.
     """
     with np.load(TABULATED, allow_pickle=False) as stored:  # noqa: TID251
         return {name: stored[name] for name in stored.files}

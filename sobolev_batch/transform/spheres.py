@@ -47,9 +47,8 @@ def sphere_inner_product(first: Sphere, second: Sphere, order: float) -> float:
     """Return the inner product of two spheres' area measures in the Sobolev norm of an order s < -1/2.
 
     It is 4πR₁R₂ times the mean over |t| <= 1 of 2 C(2π(R₁-R₂+dt)) - 2 C(2π(R₁+R₂+dt)), where d is the distance of the
-    centres and C(b) = ∫_0^∞ cos(bρ) (1+ρ²)^s dρ is a Matérn function: a closed form for concentric spheres, a
-    one-dimensional integral otherwise. The relative error is about 1e-13. OrderError where the Bessel functions
-    overflow.
+    centres and C(b) = ∫_0^∞ cos(bρ) (1+ρ²)^s dρ is a Matérn function: a closed form for concentric spheres, else an
+    integral in one dimension. The relative error is about 1e-13. OrderError where the Bessel functions overflow.
     """
     nu = -order - 0.5
     separation = math.dist(first.center, second.center)

@@ -42,8 +42,7 @@ _log = logging.getLogger(__name__)
 MEMORY = "sobolev-batch-memory"
 GPU = "sobolev-batch-gpu"
 
-# Dask pauses a worker near its memory limit and ends it at the limit; an idle process with its libraries takes
-# the constant.
+# Dask pauses a worker near its memory limit and ends it there; an idle process with its libraries takes the constant.
 _ALLOWED_FRACTION, _IDLE_BYTES = 0.85, 300e6
 _MOST_NAMED = 4
 _NAME = "sobolev-batch"
@@ -52,8 +51,7 @@ _KEPT_OUT = "sobolev-batch-kept-out"
 _SETUP_SECONDS = 0.05
 
 _VISIBLE = "CUDA_VISIBLE_DEVICES"
-# The device of this process and its lock. It has one at most, since CUDA settles on the devices that it sees at its
-# start.
+# The device of this process and its lock. There is one at most, as CUDA settles on those that it sees at its start.
 _own: dict[str, socket.socket] = {}
 _locking = ThreadLock()
 

@@ -25,8 +25,7 @@ from sobolev_batch.transform.probe import Sample, draws_for, estimate, needs_pro
 
 # A distance is first estimated from a few frequencies; it is seldom less than this fraction of the estimate.
 ESTIMATE_CAUTION = 0.7
-# No field is exact to less than this fraction of its area. Near-duplicates are that close, and have no
-# relative accuracy.
+# No field is exact to less than this fraction of its area. Near-duplicates, that close, have no relative accuracy.
 _ROUNDING = 1e-13
 # What rounding to single precision changes a value by, relative to it, and the fraction of an error that it may take.
 _STORED_ROUNDING, _STORED_FRACTION = 6e-8, 0.1

@@ -3,8 +3,7 @@
 An innermost ball and the octaves around it are a smooth partition of frequency space. All samples of an octave are
 pooled by the balance heuristic (E. Veach, L. J. Guibas 1995, doi:10.1145/218380.218498): a sample counts for the
 inverse of the density with which all lattices and draws together put samples there. The sum of weight · f then has
-the integral of f as its expectation, and no sample weighs more than the method that serves its frequency best would
-let it.
+the integral of f as its expectation, and no sample weighs more than under the best method for its frequency.
 """
 
 import hashlib

@@ -49,8 +49,7 @@ class OctaveValues:
     Attributes:
         values: Values at all samples, complex (n,).
         radii: |ξ| of each comparison, float64 (P,).
-        squares: Contribution of each comparison to the squared norm of the error, without the weight of an order,
-            float64 (P,).
+        squares: Contribution of each comparison to the squared norm of the error, without an order's weight (P,).
     """
 
     sampling: OctaveSampling
@@ -76,8 +75,7 @@ def octave_values(
 
     Values on lattices come from nonuniform FFTs, by these settings or by the cheapest ones for a target, and their
     errors are measured for some orders. Those at drawn frequencies, and on lattices where large triangles would take
-    many points, are exact. Known values, on the first lattices and maybe at the same drawn frequencies, are not
-    computed again.
+    many points, are exact. Known values, on the first lattices and maybe at the same draws, are not computed again.
     """
     values: list[Complexes] = []
     finished = 0 if known is None else len(known.sampling.lattices)
