@@ -110,8 +110,7 @@ class ClusterError(SobolevBatchError):
 def one_line(error: BaseException) -> str:
     """Return the message of an error on one line, or the name of its type if it has none.
 
-    Line breaks of our own messages are those of names, and stay visible. Only the beginning of a long message of
-    another library is kept.
+    Line breaks of our own messages are those of names, and stay visible. Long ones of other libraries lose their end.
     """
     message = ""
     with suppress(Exception):  # a user's own may have no text

@@ -1,7 +1,6 @@
 """Text as it is shown: characters that a terminal or page would obey, or hide, are replaced by escapes.
 
-Names of files and messages of other programs may hold any characters. Data keep them as they are; whatever is shown
-to people passes through here.
+Names of files and messages of other programs may hold any characters. Data keep them; what is shown passes here.
 """
 
 import logging

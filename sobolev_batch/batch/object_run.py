@@ -39,8 +39,7 @@ _log = logging.getLogger(__name__)
 _MOST_ROUNDS = 3
 # Fields that turn out damaged are computed again; where that goes on, something destroys them.
 _MOST_REPAIRS = 3
-# The worker that plans an object does all its work where that is predicted to take less: a task costs the scheduler and
-# the driver some milliseconds.
+# The worker that plans an object does all its work where that is predicted to take less: a task costs milliseconds.
 _SMALL_SECONDS = 2.0
 # Sections of a study on which all numbers of an object depend; it may gain others, families and named meshes.
 _SETTINGS = ("accuracy", "lattice", "transform", "scaling", "reference")

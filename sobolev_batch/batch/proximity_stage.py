@@ -1,7 +1,6 @@
 """Hausdorff and other usual distances of meshes from the reference, where a study requests them.
 
-One task measures those of a mesh, from both meshes and no field, and adds them to the mesh's completion record. A
-table is made from the records.
+A task measures those of a mesh, without fields, and adds them to the mesh's record. A table is made from the records.
 """
 
 import logging

@@ -62,8 +62,7 @@ class Reduction:
         original_triangles: Number of triangles of the mesh; 0 if it cannot be read.
         trials: What was tried, in this order.
         bracket: The ``best`` mesh, of the fewest triangles within the tolerance, and the next coarser one that
-            ``failed``. ``is_monotone`` is false where a finer mesh was farther away than a coarser one: then a smaller
-            one than ``best`` may hold.
+            ``failed``. ``is_monotone`` is false where a finer mesh was farther away: then a smaller one may hold.
         reason: Why there is no mesh; empty where there is one.
         path: Where the mesh was written; empty without an output.
         mesh: The mesh, where there is no output.

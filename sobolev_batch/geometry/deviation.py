@@ -57,8 +57,7 @@ _LEAST_CUT, _LEAST_SHORTER_CUT, _LARGEST_CUT = 0.05, 0.003, 0.97
 _STEEP = 4.0
 # Largest square of a change across a thin triangle over that of its width: its short side may be oblique.
 _ACROSS = 4.0
-# For so many pieces, those with the farthest centers, the closest triangle to the worst corner is worth a search. So
-# many are worth a search of covers.
+# For so many pieces, with the farthest centers, the closest triangle to the worst corner, and covers, are searched.
 _FEW = 300
 
 

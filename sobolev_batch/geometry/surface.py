@@ -139,8 +139,7 @@ class Similarity:
     def to_unit_ball(cls, surface: Surface) -> Self:
         """Return the similarity that takes the bounding sphere of a surface to the unit sphere at the origin.
 
-        The bounding sphere lies around the centre of the bounding box and reaches the farthest point.
-        Flat meshes have one too.
+        The sphere lies around the centre of the bounding box and reaches the farthest point; flat meshes have one too.
 
         Raises:
             InputError: It is a single point, or no surface, such as the path of a mesh that is still to be read.

@@ -182,8 +182,7 @@ def witness(
         a: Field from `fourier_transform` or a store, or a surface.
         b: Field on the same lattice, or a surface.
         order: One order s < -1/2, or several.
-        points: Points x, real (n, 3), in the fields' unit of length. For example ``mesh.vertices`` of a mesh
-            after the similarity of its study.
+        points: Points x, real (n, 3), in the fields' unit of length, as ``mesh.vertices`` after a study's similarity.
         lattice: Lattice to transform surfaces on. A field brings its own.
         eps: Accuracy of the NUFFT, relative to the sum of the moduli of all terms. The error is a small
             multiple of it. Default 1e-9, or 1e-6 in single precision.

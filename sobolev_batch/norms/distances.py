@@ -60,8 +60,7 @@ def norm(
         rtol: Largest relative error, in place of a lattice; see `distance`.
         memory: Memory that a transform may take with rtol, in bytes or as a text such as "4GB"; default 2e9.
         best_effort: Return the nearest that can be reached where the rtol is out of reach, instead of raising.
-        seed: Seed of the random frequencies that measure the tail with rtol. The same seed gives the same result.
-            A whole number from 0 on.
+        seed: Seed of the random frequencies with rtol, a whole number from 0 on; the same seed gives the same result.
         on_progress: Called with a line about each step with rtol; by default notebooks show the last one.
 
     Returns:
@@ -123,8 +122,7 @@ def distance(
             attributes of the dataset hold the last choice.
         memory: Memory that a transform may take with rtol, in bytes or as a text such as "4GB"; default 2e9.
         best_effort: Return the nearest that can be reached where the rtol is out of reach, instead of raising.
-        seed: Seed of the random frequencies that measure the tail with rtol. The same seed gives the same result.
-            A whole number from 0 on.
+        seed: Seed of the random frequencies with rtol, a whole number from 0 on; the same seed gives the same result.
         on_progress: Called with a line about each step with rtol; by default notebooks show the last one.
 
     Returns:

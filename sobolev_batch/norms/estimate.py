@@ -10,8 +10,7 @@ Without octaves the lattice ends sharply, and the remainder is only bounded (`tr
 lattice holds, and truncation can only add to it. The values m^ themselves are off by the discretisation, whose norm is
 known. By the triangle inequality the norm is off by no more. Of a difference it is the root of both surfaces' squares
 added: the phases between both errors are those between the surfaces, and where these coincide, errors of rules cancel.
-The other three are errors of the square, and change the root by what `change_of_root` says. The four are added: nothing
-is known of their signs.
+The other three are errors of the square, and change the root by `change_of_root`. All are added: signs are unknown.
 
 All that computes a norm or distance calls `estimate_norms`: pairs of surfaces, studies, tables of all pairs, accessors.
 What a distance is relative to, and its parts, follow from the product of the difference with the reference, which is a
@@ -107,8 +106,7 @@ class Tail:
     ) -> Tail | None:
         """Return the tail of <a - b, b> by its integral over the octaves, and the tails of ||a||², ||b||², ||a - b||².
 
-        Beyond the octaves no product is measured, but ||a||² - ||b||² - ||a - b||² is twice the product. None where the
-        lattice is all that is known.
+        Beyond octaves no product is measured, but ||a||² - ||b||² - ||a - b||² is twice it. None for a lattice alone.
         """
         if a is None or b is None or difference is None:
             return None

@@ -137,7 +137,7 @@ def differences(products: Sums, first: Sums, second: Sums) -> tuple[Sums, NDArra
     """Return squared differences of pairs from their inner products, and a mask of those that cancelled.
 
     The products are those of the differences to the center, in arrays that end in (m, n). The others are squares of
-    these differences, and end in (m,) and (n,). The mask (m, n) is True for pairs that lost some six digits at any order.
+    these, and end in (m,) and (n,). The mask (m, n) is True for pairs that lost more than some six digits at any order.
     """
     scales = [a[..., :, None] + b[..., None, :] for a, b in zip(first.arrays, second.arrays, strict=True)]
     squares = Sums(*(scale - 2 * both for scale, both in zip(scales, products.arrays, strict=True)))

@@ -35,8 +35,7 @@ class Spectra:
 
     Attributes:
         sums: Integrals of |field|² over the frequencies of each radius, float64 (fields, radii).
-        moments: Sums of the squared terms of drawn samples, moved to radii likewise, float64 (fields, moments); their
-            weights are the squared ones.
+        moments: Sums of drawn samples' squared terms, moved likewise, for squared weights, float64 (fields, moments).
         peaks: Deviation of each part of an octave that the scatter of its groups does not show, at some orders, float64
             (fields, peaks): the largest term, and images that all groups have.
         images: What images at the period add, float64 (fields, `IMAGE_ORDERS`); no columns where there are octaves.

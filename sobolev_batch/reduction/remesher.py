@@ -32,8 +32,7 @@ _DECIMATION = {"radius": 100.0, "keep_boundary": True}
 # Stands for the mesh of a source until that is given.
 _ANY_MESH = {"source": "icosphere", "levels": [0]}
 
-# The name of a source, a command, a function of a mesh, or the table of a family without its mesh; and the parameter
-# that is searched with its ends.
+# A source's name, a command, a function or a family's table without its mesh; and the searched parameter with its ends.
 Method = str | Callable[..., Any] | Mapping[str, Any]
 Range = Mapping[str, tuple[float, float]]
 

@@ -168,13 +168,9 @@ class CommandSource(RemesherSource):
         return self
 
     def _remesher(self, parameters: dict[str, Parameter], folder: Path) -> Remesher:
-        make = partial(
-            run_command,
-            words=[self._filled(word, parameters, folder) for word in self.command],
-            suffixes=(self.input, self.output),
-            timeout=self.timeout,
-            largest_output=self.largest_output,
-        )
+        words = [self._filled(word, parameters, folder) for word in self.command]
+        suffixes, most = (self.input, self.output), self.largest_output
+        make = partial(run_command, words=words, suffixes=suffixes, timeout=self.timeout, largest_output=most)
         found = {word: re.search(r"\{folder\}/.+", word) for word in self.command}
         files = {word: Path(self._filled(match[0], {}, folder)) for word, match in found.items() if match}
         return make, {"command": list(self.command), "input": self.input, "output": self.output}, files

@@ -1,9 +1,8 @@
 """Sources of surfaces, their members, and the registry that finds sources by name.
 
-A source is a validated description: the parameters of a family in a study file. It lists its members
-without computing anything. A member is a small value that travels to a worker, which makes the surface.
-Other packages add sources through the entry point group ``sobolev_batch.sources``; each entry point
-names a subclass of `Source`.
+A source is a validated description: the parameters of a family in a study file. It lists its members without computing
+anything. A member is a small value that travels to a worker, which makes the surface. Other packages add sources
+through the entry point group ``sobolev_batch.sources``; each entry point names a subclass of `Source`.
 """
 
 from __future__ import annotations
@@ -268,8 +267,7 @@ class MadeMember(Member):
 
     Attributes:
         make: Function of a module; it takes the meshes of the originals, then the arguments.
-        identity: What the fingerprint holds besides the originals and the libraries: the name of the formula, its
-            parameters and its version.
+        identity: Rest of the fingerprint, beside originals and libraries: name of the formula, parameters, version.
         originals: Members whose meshes the function takes, by their keys in the fingerprint.
         libraries: Distributions whose versions are part of the fingerprint.
         triangles: Number of triangles of the mesh; None for as many as the first original has.

@@ -60,8 +60,7 @@ class Location:
 
     Attributes:
         name: Path, or URL such as s3://bucket/name.zarr, without credentials.
-        fence: Function that raises a `StoreError` unless the location may be written; called before every write. It
-            holds for all that lies below.
+        fence: Function called before every write, here and below; it raises a `StoreError` unless that is permitted.
     """
 
     name: str
@@ -148,8 +147,7 @@ class Location:
     def create(self, key: str, document: bytes) -> bool:
         """Write a small document that nobody else writes unless its key exists, and return whether it was written.
 
-        Of several processes that try, one succeeds. Storage without conditional writes lets the last one win:
-        read the key again later.
+        Of several processes one succeeds; without conditional writes it is the last one: read the key again later.
         """
         with self.access("written"):
             sync(self.zarr_store().set_if_not_exists(key, CpuBuffer.from_bytes(document)))

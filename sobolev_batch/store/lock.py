@@ -1,9 +1,8 @@
 """Locks: the key by which one run at a time has a store to itself.
 
-Tasks of one run never write the same chunk, but those of two runs would. The lock lies in the store, where
-drivers on different machines see it, and is created by an operation that succeeds for one of them only. It is
-removed when its run ends. The lock of a killed driver is taken over if its process is certainly gone, and is
-otherwise unlocked by hand.
+Tasks of one run never write the same chunk, but those of two runs would. The lock lies in the store, where drivers on
+different machines see it, and is created by an operation that succeeds for one of them only. It is removed when its run
+ends. That of a killed driver is taken over if its process is certainly gone, and is otherwise unlocked by hand.
 
 A task may outlive its driver: a worker that was stopped goes on when it is continued, perhaps after another run has
 stored something newer. Before each write it looks whether the lock is still that of its run.

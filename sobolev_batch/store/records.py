@@ -1,7 +1,6 @@
 """Records in a store: of the computation of each surface, and of the objects of a study.
 
-A record is one chunk, which its task writes. Once a run has ended, records lie together in pages, since on object
-storage each chunk is a request.
+A record is a chunk, which its task writes. After a run they lie in pages: on object storage each chunk is a request.
 """
 
 from __future__ import annotations
@@ -145,8 +144,7 @@ class Record(_Line):
         status: "complete" or "failed".
         reason: Reason of the failure; empty otherwise.
         quality: Data of the field from which errors of norms are computed, see `Quality.to_json`.
-        checksums: Checksums of the field's blocks, see `Fields.write`. A field with others is damaged, or was
-            written by another task.
+        checksums: Checksums of the field's blocks, see `Fields.write`; others mean damage, or another task's field.
         worker: Address of the worker that finished it.
         finished: Time at which it was finished, in UTC.
         proximity: Hausdorff and Chamfer distances from the reference, where the study requests them.

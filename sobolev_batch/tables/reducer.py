@@ -76,8 +76,7 @@ class Reducer:
         sampling: Samples of the octaves; None where the fields are all there is.
         qualities: Quality of each row's values in octaves.
         known_reference: Row of the study's reference, which the qualities know; None if it has no field.
-        tile_bytes: Bytes of fields that a task holds at a time, in all: the rows of a tile, a group of the others,
-            and fields as they are read.
+        tile_bytes: Bytes of fields that a task holds at a time: rows of a tile, a group of others, and fields as read.
         is_given: True if the lattice was given, and not chosen for an accuracy.
     """
 

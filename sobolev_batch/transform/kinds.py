@@ -174,7 +174,8 @@ class _Triangles(SurfaceKind):
         total = float(ends[-1])
         margin = 0 if fits else max(expected)
         count = math.ceil(total / (capacity - margin))
-        # Batches of triangles go where their first point goes: those of points exceed their equal number by one at most.
+        # A batch of triangles goes where its first point goes, so that each batch of points exceeds its equal number by
+        # at most one of these.
         numbers = (np.concatenate([[0], ends[:-1]]) * count // total).astype(int).tolist()
         faces = self.faces(backend)
         for _, group in groupby(zip(numbers, triangles, strict=True), key=itemgetter(0)):

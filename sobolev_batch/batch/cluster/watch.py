@@ -165,9 +165,8 @@ class Watch:
         self._client.scheduler_comm.comm.abort()
 
     def _ask(self, operation: str, **arguments: Any) -> Any:
-        return self._client.sync(
-            getattr(self._client.scheduler, operation), callback_timeout=_POLL_SECONDS, **arguments
-        )
+        ask = getattr(self._client.scheduler, operation)
+        return self._client.sync(ask, callback_timeout=_POLL_SECONDS, **arguments)
 
 
 class Heartbeat:

@@ -330,8 +330,7 @@ def lock_gpu(devices: Sequence[str]) -> str | None:
 
     The device belongs to this process until it ends or releases it. The lock is a socket bound to a name that Linux
     keeps in memory: it is exclusive, needs no permissions, leaves no file, and ends with the process however that ends.
-    Containers share it if they share the network of the host. A file would not serve others better, since they have
-    temporary folders of their own.
+    Containers share it if they share the host's network; a file is no better, since their temporary folders are theirs.
 
     Return None where all are locked or this process has one already.
     """

@@ -29,8 +29,7 @@ Method = Literal["identical", "lattice", "octaves"]
 
 # Fraction of the threshold that may lie beyond the first lattice, and the relative error of its fields there.
 _BEYOND, _FIRST_RTOL = 0.7, 0.2
-# M of the first lattice at most, which is enough for surfaces that differ clearly. Where a larger one than the last is
-# needed, octaves are cheaper.
+# M of the first lattice at most, enough for surfaces that differ clearly, and M beyond which octaves are cheaper.
 _FIRST_M, _LARGEST_M = 96, 320
 # Shortest wavelengths of a lattice in the radius of the smallest surface, at least.
 _WAVES = 4.0

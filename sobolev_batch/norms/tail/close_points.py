@@ -62,8 +62,7 @@ class Moved:
     def in_proportion(self, densities: Reals, count: int, rng: np.random.Generator) -> tuple[Draw, Reals, Indices]:
         """Draw pairs in proportion to densities (m,), most of them, and evenly by area for the others.
 
-        Return also the square of how far each point is from the plane of the other's triangle (2, n), and which
-        triangles these are (n,).
+        Return also the squared distance of each point from the plane of the other's triangle (2, n), and these (n,).
         """
         shares = _shares(self.areas, densities)
         chosen, barycentric = _places(np.cumsum(shares), count, rng)
