@@ -1,7 +1,6 @@
 """The tasks of a field: they run on a worker, and turn a mesh's source into stored values and a completion record.
 
-Each task is a pure function of its arguments that writes whole chunks, so running it again, or
-twice at once, leaves the same store.
+A task is a pure function that writes whole chunks, so running it again, or twice at once, leaves the same store.
 """
 
 import logging
@@ -44,8 +43,7 @@ _log = logging.getLogger(__name__)
 
 # Fraction of a field's error that each octave may have, inverted: the squares of some octaves' errors add up.
 _OCTAVES_TIGHTENING = 5.0
-# The reference of the last task, by its fingerprint and scale: that of the next one, most likely. With more triangles
-# it would take much of a worker's memory.
+# The last task's reference, by fingerprint and scale, most likely the next one's; kept up to so many triangles.
 _KEPT_TRIANGLES = 1 << 20
 _reference: dict[tuple[str, Similarity], Surface] = {}
 

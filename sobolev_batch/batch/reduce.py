@@ -178,9 +178,8 @@ def reduce(
         precision: Width of the last bracket, from the mesh that holds to the next coarser one that failed, as a
             fraction of the parameter.
         output: Folder or URL for the reduced meshes, under their own names, and for records; default none.
-        client: Client of the cluster to compute on. By default, processes on this machine are started where there
-            are several meshes, or a large one; a script must then guard its main part by
-            ``if __name__ == "__main__"``.
+        client: Client of the cluster to compute on. By default, processes on this machine are started where there are
+            several meshes, or a large one; a script must then guard its main part by ``if __name__ == "__main__"``.
         workers: Number of these processes; default one for each core. With one, this process computes.
         on_progress: Called with the result of each mesh.
 

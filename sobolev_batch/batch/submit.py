@@ -56,9 +56,8 @@ def submit(
 ) -> Submission:
     """Hand a study over to a cluster and return; it goes on without this process.
 
-    One of the workers drives it, in a thread besides those for tasks; should that worker be lost,
-    another one takes over from what is stored. ``sobolev-batch status`` shows the progress. An object that
-    cannot be carried out stops no other.
+    One of the workers drives it, in a thread besides those for tasks; should that worker be lost, another takes over
+    from what is stored. ``sobolev-batch status`` shows the progress. An object that cannot be carried out stops none.
 
     Args:
         study: Study, or the path of its file.

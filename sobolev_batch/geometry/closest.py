@@ -18,8 +18,7 @@ import igl  # it reads the variable once
 
 # Processor seconds of a pair of a point and a triangle in arrays; a compiled loop takes a tenth.
 _PAIR_SECONDS = 4e-7
-# Height of a triangle over its longest side below which libigl may see points of it far too far away: it loses the
-# digits of the square of this number.
+# Height of a triangle over its longest side below which libigl may be far off: it loses the digits of its square.
 _THIN = 0.01
 # Cosine of the angle to a pseudonormal below which rounding may have chosen the side of a point, and aspect ratio of a
 # triangle beyond which rounding may have turned it.
@@ -29,8 +28,7 @@ _UNCLEAR, _SLIVER = 1e-6, 1e4
 class Triangles:
     """The triangles of a mesh, with what the distance of a point from each of them takes.
 
-    Lengths are in units of a power of two near the largest coordinate: that loses no digit, and keeps squares of
-    lengths within the range of doubles.
+    Lengths are in units of a power of two near the largest coordinate: no digit is lost, and no square overflows.
 
     Attributes:
         mesh: The mesh.

@@ -24,8 +24,7 @@ _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 def cover_distances(corners: Reals, other: Triangles, starts: Indices, most: float) -> Reals:
     """Return how far points of pieces (3 corners, 3, n) are at most from triangles that cover them, in units of scale.
 
-    Each cover is searched from a triangle that is close to the center of its piece. It is infinite (n,) where there is
-    none, or where that distance may exceed `most`.
+    Covers are searched from triangles close to the centers. It is infinite (n,) without one, or maybe above `most`.
     """
     if len(starts) > _PIECES:
         groups = slices(len(starts), _PIECES)

@@ -11,8 +11,7 @@ at right angles to the best t, through the side beyond which the worst corner li
 its closest points in t, and its bound is the distance itself. Where points of a piece are equally far from two
 triangles, along a line, both bound it together: each of them the part that is closer to it.
 
-Where the question is only whether the distance exceeds a length, many triangles of B may answer it together for all of
-a triangle that they cover (see `cover`).
+Where the question is only whether it exceeds a length, triangles of B may answer for one that they cover (`cover`).
 
 Where both meshes cut one plane into long thin triangles, pieces are as many as these cross each other. What takes many
 is begun again without the parts of planes that both meshes cover (see `overlap`).

@@ -28,8 +28,7 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 _ALL = slice(None)
 # Triangles that are measured or sorted at a time: their edges and temporaries stay in cache.
 _BATCH = 1 << 14
-# Twice the rounding error of a cross product, relative to the squared longest edge: a smaller area is not
-# distinguishable from zero in double precision.
+# Twice the rounding error of a cross product, relative to the squared longest edge: a smaller area is as good as zero.
 _AREA_RESOLUTION = 8 * np.finfo(np.float64).eps
 # Rounding to single precision along all axes, relative to the largest coordinate, with some margin.
 _SINGLE_ROUNDING = 2.0**-22

@@ -1,7 +1,6 @@
 """Smooth surfaces given by a parametrisation x(u, v) over two intervals, whose rules integrate over them.
 
-At a pole, one end of a parameter is a single point of the surface. The area element |x_u × x_v|
-vanishes there, which does no harm.
+At a pole, one end of a parameter is a single point. The area element |x_u × x_v| vanishes there, which does no harm.
 """
 
 import math

@@ -61,8 +61,7 @@ def spectrum(
           ∫ (1 + |ξ|²)^s |a^ - b^|² dξ, in units of length. Bands that cover all frequencies add up to the whole;
         - `share` (order, band): that over the whole; NaN where the whole is zero;
         - `total` (order): the whole, on the lattice;
-        - `mean_square` (band): mean of |a^ - b^|² over the band, in unit length to the fourth; NaN
-          where no lattice frequency lies in the band;
+        - `mean_square` (band): mean of |a^ - b^|² over it, in unit length to the fourth; NaN without frequencies;
         - `energy` (band): ∫_{|ξ|=r} |a^ - b^|² dS, its mean over the radii r of the band, from
           `mean_square`, in squared units of length. For one surface it tends to twice the area.
 

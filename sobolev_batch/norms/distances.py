@@ -117,9 +117,8 @@ def distance(
         b: Field on the same lattice, or a surface.
         order: One order s < -1/2, or several.
         lattice: Lattice to transform surfaces on. A field brings its own.
-        rtol: Largest error of the distance relative to it, in place of a lattice. Lattice, triangle rules,
-            eps and dtype are then chosen, and chosen again where the error of the result is too large. The
-            attributes of the dataset hold the last choice.
+        rtol: Largest relative error, in place of a lattice. Lattice, triangle rules, eps and dtype are then chosen, and
+            again where the error of the result is too large. The attributes of the dataset hold the last choice.
         memory: Memory that a transform may take with rtol, in bytes or as a text such as "4GB"; default 2e9.
         best_effort: Return the nearest that can be reached where the rtol is out of reach, instead of raising.
         seed: Seed of the random frequencies with rtol, a whole number from 0 on; the same seed gives the same result.

@@ -144,8 +144,7 @@ def fourier_transform(
     """Return the Fourier transform of a surface's area measure, ∫ exp(-2πi ξ·x) dμ(x), on a lattice.
 
     Args:
-        surface: `Mesh`, `Sphere`, `Ellipsoid`, `Torus` or `ParametrisedSurface`, in units of length; or what `as_mesh`
-            makes a mesh of, such as the path of a file.
+        surface: `Mesh`, `Sphere`, `Ellipsoid`, `Torus` or `ParametrisedSurface`, in units of length; or see `as_mesh`.
         lattice: Frequencies ξ, in cycles per unit length.
         eps: Accuracy relative to the surface's area; the error is a small multiple of it. Default 1e-9, or 1e-6 in
             single precision.

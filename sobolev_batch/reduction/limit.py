@@ -33,8 +33,7 @@ _ANY_ACCURACY = Accuracy(1e-2)
 _THREADS, _SEED = 1, 0
 # A limit that is met up to this fraction is met.
 _EQUAL = 1e-9
-# The measures that are taken where none is named, those whose change counts, and all: what is zero for the reference
-# itself, and has bounds or an error.
+# The measures where none is named, those whose change counts, and all: zero for the reference, with bounds or an error.
 HAUSDORFF, RELATIVE, _OF_ONE_MESH = "hausdorff", "relative", ("area", "volume")
 _OTHERS = re.compile("upper|error|threshold|fscore|precision|recall|normal_max")
 _MEASURES = (RELATIVE, *(name for name in NUMBERS if not _OTHERS.search(name)), *_OF_ONE_MESH)

@@ -21,8 +21,7 @@ _FIRST_SLOPE, _LEAST_SLOPE, _LARGEST_SLOPE = 1.0, 0.3, 3.0
 # Least logarithm of a distance over the limit, also in place of a zero; and the largest one that counts at the end of a
 # bracket: beyond it, distances say little about where the limit is met.
 _LEAST_EXCESS, _NEAR = -7.0, 0.5
-# How far beside the predicted size to try, as a fraction of the last bracket's width: on the side where the bracket is
-# wider, so that the trial likely ends the search.
+# How far beside the predicted size to try, as a part of the last bracket's width: on its wider side, to end the search.
 _BESIDE = 0.4
 # A step is so short, or cuts off so much of the bracket, that halves can end the search within as many trials. One spot
 # that decimation spoils early may keep the largest deviation the same for many sizes, which then follows no power.
@@ -30,8 +29,7 @@ _BESIDE = 0.4
 _FEW_TRIALS, _CLOSED = 8, 0.85
 # Widths that differ by this fraction are equal.
 _EQUAL = 1e-9
-# Several trials at a time lie a bracket's last width apart, or this fraction of the way to the predicted size. The
-# first ones lie apart by this logarithm.
+# Trials at once lie the last bracket's width apart, or this part of the way to the prediction; first, this logarithm.
 _APART, _SPREAD, _FIRST_APART = 0.9, 0.4, 0.7
 
 

@@ -23,9 +23,8 @@ _SMALL_TRIANGLES, _FACTOR = 10_000, 10
 def check_source(source: Source, folder: str | Path = ".") -> None:
     """Check that a source and its members keep the promises that studies rely on.
 
-    Run it in the tests of a package that adds a source, on a few small members; some must differ in a
-    single parameter. It lists the members twice. It makes every surface twice, once from a pickled member in
-    another working directory, and compares the two.
+    Run it in the tests of a package that adds a source, on a few small members, some of which differ in one parameter.
+    It lists members twice, and compares surfaces made twice, once from a pickled member in another working directory.
 
     Args:
         source: Source to check.

@@ -43,8 +43,7 @@ class MeshCache:
     that prints the version of a program has what it printed last.
 
     Attributes:
-        assumed: Commands whose versions were taken as they were printed last, and these, by the keys of their files.
-            Others may replace the files at any time.
+        assumed: Commands whose versions were taken as printed last, and these, by the keys of files, which may change.
         asked: Versions that commands have printed since this object was made, by the same keys.
     """
 

@@ -57,10 +57,9 @@ Metadata = tuple[tuple[str, float | str], ...]
 class Source(BaseModel, ABC):
     """The parameters of a family of surfaces. Subclass it to add a source of your own.
 
-    A subclass adds pydantic fields, one for each key of the family's table in a study file, and
-    `members`. Values are frozen, their types are strict and unknown keys are refused. The entry point
-    group ``sobolev_batch.sources`` makes the subclass known; `check_source` tests it. docs/surfaces.md
-    has a whole package.
+    A subclass adds pydantic fields, one for each key of the family's table in a study file, and `members`. Values are
+    frozen, their types are strict and unknown keys are refused. The entry point group ``sobolev_batch.sources`` makes
+    the subclass known; `check_source` tests it. docs/surfaces.md has a whole package.
 
     >>> from pathlib import Path
     >>> import sobolev_batch as sb
@@ -206,9 +205,8 @@ class Member(ABC):
     def fingerprint(self) -> Fingerprint:
         """Return JSON-able values that determine the surface: contents of files rather than their names.
 
-        A run takes a stored field over where the fingerprint is the same. So equal fingerprints promise
-        equal surfaces; include the versions of libraries and a number that you raise with each change of a
-        formula.
+        A run takes a stored field over where the fingerprint is the same. So equal fingerprints promise equal surfaces;
+        include the versions of libraries and a number that you raise with each change of a formula.
 
         Raises:
             MeshError: A file that the surface depends on cannot be read.
@@ -271,8 +269,7 @@ class MadeMember(Member):
         originals: Members whose meshes the function takes, by their keys in the fingerprint.
         libraries: Distributions whose versions are part of the fingerprint.
         triangles: Number of triangles of the mesh; None for as many as the first original has.
-        triangle_bytes: Measured peak of the memory that making takes, for each triangle of the first original, or of
-            the mesh itself where there is none.
+        triangle_bytes: Measured peak of the memory of making, for each triangle of the first original, or of the mesh.
     """
 
     make: Callable[..., Mesh]

@@ -62,8 +62,7 @@ SPECTRA_KEYS, PAIRS_KEYS = f"{SPECTRA_GROUP}/key", f"{DISTANCES}/key"
 # Among its versions, and those of the tables, is that of the numerics by which fields were computed.
 NUMERICS = "numerics"
 DIGEST, UNFINISHED, OBJECTS, REMOVED = "digest", "unfinished", "objects", "removed"
-# This key at the root of a store in object storage holds, of keys below the digest, their SHA-256 and what the storage
-# says of their content when it lists them.
+# This key at the root in object storage has the SHA-256 of keys below the digest, and what listings say of these.
 TAGS = "tags.json"
 # What a reader finds first.
 DESCRIPTION = (

@@ -1,7 +1,6 @@
 """Locations of stores: a local folder, or a URL of object storage, through the stores of zarr.
 
-A location holds no credentials, so it can be stored, logged and sent to a worker. The drivers of object storage take
-them from the environment of each process.
+A location holds no credentials, so it can be stored, logged and sent: drivers take them from the environment.
 
 A store may come from somebody else. A link in it may lead to a device that never ends, or make a run write outside of
 the store. So no link below its folder is followed: checksums would reveal a wrong chunk only after it was read.

@@ -38,8 +38,7 @@ class LatticeChoice:
         reasons: Reasons of the choice, one line each.
         basis: Digest of the data that the choice was made from; empty if the lattice was given.
         tail: Sampling of the octaves beyond the lattice; None without octaves.
-        compared_with: Digest of the reference that surfaces are compared with beyond a given lattice, where it has flat
-            faces or octaves follow; else empty.
+        compared_with: Digest of the reference beyond a given lattice, where it has flat faces or octaves; else empty.
     """
 
     lattice: Lattice

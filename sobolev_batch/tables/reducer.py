@@ -36,8 +36,7 @@ _FEWEST_ROWS = 4
 _LEAST_LIMIT, _SWING, _RISE, _STEEPEST_GROWTH = 0.7, 1.25, 0.9, 2.5
 # Rows of a tile whose values in octaves are held at a time take this many bytes.
 _HELD_BYTES = 128 << 20
-# A sample of octaves takes this many bytes: its frequency, weight and place, values of three fields with their squares,
-# and what moves them to the radii of spectra.
+# Bytes of a sample of octaves: frequency, weight, place, values of three fields with squares, and its move to radii.
 _SAMPLE_BYTES = 400.0
 # What tasks make anew: it is cheaper than sending it.
 _MADE_ANEW = {"weights", "octave_weights", "axis"}

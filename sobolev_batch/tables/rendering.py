@@ -29,8 +29,7 @@ _TABULATE_FORMATS = {"markdown": "github", "latex": "latex_booktabs"}
 _GAP, _PADDING = 2, 2
 # Spreadsheets take texts that begin so for formulas, and run them; those of East Asia also take the wide ones.
 _FORMULA_SIGNS = tuple("=+-@＝＋－＠")
-# What divides cells of Markdown, or begins code, links, HTML, entities, formulas and headings; and emphasis, which
-# underscores within words do not begin.
+# What divides cells of Markdown, or begins code, links, HTML, entities, formulas, headings or, not in words, emphasis.
 _MARKDOWN_MARKS = re.compile(r"[\\|`\[\]<>&~$#*]|(?<![^\W_])_|_(?![^\W_])")
 # After the end of a row, LaTeX takes these for options of that end.
 _LATEX_OPTIONS = re.compile(r"^( *)(?=[\[*])", re.MULTILINE)

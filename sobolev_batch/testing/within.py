@@ -83,8 +83,7 @@ def assert_within(
 ) -> Deviations:
     """Raise an AssertionError unless no point of either mesh is farther from the other mesh than a length.
 
-    Bounds decide, and no sample: a spike or a hole that was closed is found, however small. Which vertices and
-    triangles the meshes have does not matter.
+    Bounds decide, and no sample: a spike or a closed hole is found, however small, whatever the vertices and triangles.
 
     Args:
         a: Mesh, the path of a mesh file, or a tuple of vertices (n, 3) and triangles (m, 3).

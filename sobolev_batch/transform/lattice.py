@@ -102,8 +102,7 @@ class FrequencyLattice:
     """Equally spaced frequencies along three orthogonal axes.
 
     Attributes:
-        tolerates_images: True if the images of surfaces at the period 1/h cancel on average over many lattices; else
-            surfaces must lie within the period.
+        tolerates_images: True if images at the period 1/h cancel on average over lattices; else surfaces lie within it.
         spacing: Distance h between neighbouring frequencies, in cycles per unit length.
         half: Block of all samples.
         highest_frequency: Largest |ξ| at which samples count, in cycles per unit length.

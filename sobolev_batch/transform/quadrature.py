@@ -86,8 +86,7 @@ def assign_rules(
 ) -> tuple[RuleUse, ...]:
     """Return the rules of all triangles up to a frequency: the prescribed one, or those that keep an error.
 
-    That is eps, of the whole mesh relative to its area, or a tolerance of each triangle relative to its own. A GPU
-    helps, also with faces that it has.
+    That is eps, of the mesh relative to its area, or a tolerance of each triangle to its own. A GPU and its faces help.
     """
     if (fixed := fixed_rule(quadrature)) is not None:
         return (RuleUse(fixed, 0, np.arange(len(mesh.triangles), dtype=np.uint32)),)

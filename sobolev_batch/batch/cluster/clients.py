@@ -135,8 +135,7 @@ def _shielded_from_interrupts() -> Iterator[Callable[[], object]]:
 @contextmanager
 def thread_client(workers: int | None = None) -> Iterator[Client]:
     """Give a client of a new cluster of threads of this process, for a store that no other process can see."""
-    # The protocol opens no port, but the web pages of scheduler and worker would be open to every interface,
-    # and the link would name one of them.
+    # The protocol opens no port, but web pages of scheduler and worker would be open to all interfaces, and linked.
     link = "http://127.0.0.1:{port}/status"
     with (
         dask.config.set({"distributed.worker.profile.enabled": False, "distributed.dashboard.link": link}),
