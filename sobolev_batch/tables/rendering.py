@@ -156,11 +156,9 @@ def printed_table(rows: Cells, headers: Sequence[str], style: Format, texts: Seq
 
 def _lines(rows: Cells, headers: Sequence[str], lefts: Container[int], widths: Sequence[int]) -> Iterator[str]:
     lines = (line for row in rows for line in zip_longest(*(cell.split("\n") for cell in row), fillvalue=""))
+    aligned = [str.ljust if column in lefts else str.rjust for column in range(len(headers))]
     for line in (headers, ["-" * width for width in widths], *lines):
-        cells = [
-            cell.ljust(width) if column in lefts else cell.rjust(width)
-            for column, (cell, width) in enumerate(zip(line, widths, strict=True))
-        ]
+        cells = (align(cell, width) for align, cell, width in zip(aligned, line, widths, strict=True))
         yield (" " * _GAP).join(cells).rstrip()
 
 
