@@ -101,21 +101,20 @@ def _array_document(
     codec: dict[str, Any] = {"name": "vlen-utf8", "configuration": {}} if is_text else {"name": "bytes"}
     if not is_text and dtype.itemsize > 1:
         codec["configuration"] = {"endian": "little"}
-    return _json(
-        {
-            "shape": shape,
-            "data_type": "string" if is_text else dtype.name,
-            "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": chunks}},
-            "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
-            "fill_value": fill_values[dtype.kind],
-            "codecs": [codec, {"name": "crc32c"}],
-            "attributes": attributes,
-            "dimension_names": dimensions,
-            "zarr_format": 3,
-            "node_type": "array",
-            "storage_transformers": [],
-        }
-    )
+    document = {
+        "shape": shape,
+        "data_type": "string" if is_text else dtype.name,
+        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": chunks}},
+        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+        "fill_value": fill_values[dtype.kind],
+        "codecs": [codec, {"name": "crc32c"}],
+        "attributes": attributes,
+        "dimension_names": dimensions,
+        "zarr_format": 3,
+        "node_type": "array",
+        "storage_transformers": [],
+    }
+    return _json(document)
 
 
 def group_document(attributes: dict[Any, Any]) -> dict[str, Any]:

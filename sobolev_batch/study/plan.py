@@ -167,15 +167,14 @@ def _lattice_choice(
     if (accuracy := study.accuracy) is None:
         raise ValueError("a study has a lattice or an accuracy")
     # What the choice is made from, except families, which may gain meshes.
-    basis = digest_of(
-        {
-            "accuracy": [accuracy.rtol, float(accuracy.allowed_bytes), accuracy.best_effort],
-            "orders": study.orders,
-            "dtype": study.dtype,
-            "similarity": [similarity.scale, *similarity.origin],
-            "reference": dict(members[reference][1].fingerprint()),
-        }
-    )
+    made_from = {
+        "accuracy": [accuracy.rtol, float(accuracy.allowed_bytes), accuracy.best_effort],
+        "orders": study.orders,
+        "dtype": study.dtype,
+        "similarity": [similarity.scale, *similarity.origin],
+        "reference": dict(members[reference][1].fingerprint()),
+    }
+    basis = digest_of(made_from)
     if earlier is not None and earlier.basis == basis:
         return earlier, Look()
     others = {label: member for label, member in members.items() if label != reference}

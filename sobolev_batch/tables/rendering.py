@@ -142,16 +142,13 @@ def printed_table(rows: Cells, headers: Sequence[str], style: Format, texts: Seq
     if len(groups) == 1:
         return "\n".join(_lines(short, headers, {0, *texts}, widths))
     # Each by itself, in which longer labels and texts may have room.
-    parts = [
-        (
-            [[row[i] for i in group] for row in rows if group is groups[0] or any(row[i] for i in group[labels:])],
-            [headers[i] for i in group],
-            style,
-            [group.index(i) for i in texts if i in group],
-        )
-        for group in groups
-    ]
-    return "\n\n".join(printed_table(*part) for part in parts if part[0])
+    tables = []
+    for group in groups:
+        kept = [row for row in rows if group is groups[0] or any(row[i] for i in group[labels:])]
+        if cells := [[row[i] for i in group] for row in kept]:
+            own = [group.index(i) for i in texts if i in group]
+            tables.append(printed_table(cells, [headers[i] for i in group], style, own))
+    return "\n\n".join(tables)
 
 
 def _lines(rows: Cells, headers: Sequence[str], lefts: Container[int], widths: Sequence[int]) -> Iterator[str]:

@@ -136,17 +136,11 @@ def _shielded_from_interrupts() -> Iterator[Callable[[], object]]:
 def thread_client(workers: int | None = None) -> Iterator[Client]:
     """Give a client of a new cluster of threads of this process, for a store that no other process can see."""
     # The protocol opens no port, but web pages of scheduler and worker would be open to all interfaces, and linked.
-    link = "http://127.0.0.1:{port}/status"
+    link, count = "http://127.0.0.1:{port}/status", workers or available_cores()
+    pages = dict.fromkeys(("dashboard_address", "worker_dashboard_address"), "127.0.0.1:0")
     with (
         dask.config.set({"distributed.worker.profile.enabled": False, "distributed.dashboard.link": link}),
-        LocalCluster(
-            n_workers=1,
-            threads_per_worker=workers or available_cores(),
-            processes=False,
-            protocol="inproc://",
-            dashboard_address="127.0.0.1:0",
-            worker_dashboard_address="127.0.0.1:0",
-        ) as cluster,
+        LocalCluster(n_workers=1, threads_per_worker=count, processes=False, protocol="inproc://", **pages) as cluster,
         Client(cluster) as client,
     ):
         yield client

@@ -135,12 +135,8 @@ class Cluster:
         resources = {MEMORY: task.projected_bytes} if claims_memory and task.projected_bytes else {}
         if task.needs_gpu:
             resources[GPU] = 1.0
-        return self.client.submit(
-            task.function,
-            *map(submitted, task.arguments),
-            key=task_key(task.stage or task.function.__name__, self.study, self.part, task.label),
-            resources=resources or None,
-        )
+        key = task_key(task.stage or task.function.__name__, self.study, self.part, task.label)
+        return self.client.submit(task.function, *map(submitted, task.arguments), key=key, resources=resources or None)
 
 
 @dataclass(frozen=True, eq=False)
