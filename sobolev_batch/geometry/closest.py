@@ -31,7 +31,6 @@ class Triangles:
     Lengths are in units of a power of two near the largest coordinate: no digit is lost, and no square overflows.
 
     Attributes:
-        mesh: The mesh.
         scale: The unit.
         corners: Corner of each triangle, three arrays (3, m) of the coordinates.
         outward: For each side, from a corner to the next, the direction (3, m) in the plane that leads out of the

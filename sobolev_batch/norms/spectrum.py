@@ -192,9 +192,6 @@ class RadialAxis:
     """The radii over which spectra of fields on a lattice, and in the octaves beyond it, are given.
 
     The shells |k|² = 0, 1, ... of the lattice come first, then the radii of each group of samples of each octave.
-
-    Attributes:
-        sampling: Samples of the octaves; None without any.
     """
 
     lattice: Lattice

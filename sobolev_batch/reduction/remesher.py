@@ -64,7 +64,6 @@ class Remesher:
 
     Attributes:
         source: Source of such meshes, of any other mesh and for any values of the parameter.
-        parameter: Name of the parameter.
         ends: Smallest and largest value to try, whole numbers for a parameter that takes those alone; None for numbers
             of triangles, up to that of the mesh itself, which is then not remeshed.
         folder: Folder in which relative paths start.

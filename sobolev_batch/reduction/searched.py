@@ -47,7 +47,6 @@ class SearchedSource(KeepingSource):
         search: Name of the parameter, and between which two values to search; None for triangles.
         template: Source that makes them, from its table without its mesh and the parameter that is searched.
         mesh: Mesh to start from; None for the reference.
-        reference: Reference of the study.
         unit: Unit of the files, where it is known.
         default_order: Order of fractions for which none is given.
     """

@@ -30,7 +30,6 @@ class RunRecord:
     Attributes:
         state: "submitted" until a worker starts it, then "running", "done" or "failed".
         driver: Description of the driver: its process and host, and its cluster.
-        started: Time of the start, in UTC.
         seen: Time of the driver's latest heartbeat, in UTC.
         error: Reason of the failure, or obstacle to the run; empty otherwise.
     """

@@ -49,7 +49,6 @@ class Pairs:
     Attributes:
         rows: Row of each mesh in the order of the matrix, that in which the meshes were added.
         keys: What each row with a field was computed from, by the row; see `Record`.
-        reference: Row of the reference.
     """
 
     store: Store

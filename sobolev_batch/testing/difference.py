@@ -36,7 +36,6 @@ class VertexWitness:
     Attributes:
         mesh: The mesh, in its own unit of length.
         values: Witness function (orders, vertices) in 1 / unit length of the context; NaN at vertices of no triangle.
-        orders: Orders s of these.
         title: What was compared with what.
         unit: Unit of length of the context, in that of the mesh.
         distances: Distances (vertices,) of vertices from the reference by their names in files, in the unit of the

@@ -108,7 +108,6 @@ class Cluster:
     Attributes:
         client: Client of the cluster; None where one task does all the work itself, see `in_place`.
         workers: Workers that the cluster had when the study began.
-        notify: Callback for each step of progress.
         study, part: Name of the study, and of its object where it names any, for the names of tasks.
     """
 
@@ -144,7 +143,6 @@ class Wave:
     """Tasks of a run that may go on beside each other. What comes after them waits for all of them, and for no others.
 
     Attributes:
-        cluster: Cluster that does them, prepared for the run.
         tasks: Read as they are handed out.
         take: Called with each task and its result, or the exception that ended it: a `ClusterError` where no worker has
             the memory, or where every worker died of it. What it raises ends the wave, and is raised where the wave was

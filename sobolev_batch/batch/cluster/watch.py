@@ -76,7 +76,6 @@ class Watch:
     """A watch over a cluster: it finds what keeps a run from going on, and ends a run whose scheduler stays silent.
 
     Attributes:
-        address: Address of the scheduler.
         obstacle: What keeps the run from going on, for people; empty if nothing does.
     """
 
@@ -170,12 +169,7 @@ class Watch:
 
 
 class Heartbeat:
-    """The record in a store that says where a run goes on, and how it ended.
-
-    Attributes:
-        stage: What the run does, for people.
-        watch: The watch over its cluster, once there is one.
-    """
+    """The record in a store that says where a run goes on, at which stage, and how it ended."""
 
     def __init__(self, location: Location, lock: Lock, watch: Watch | None = None) -> None:
         self.stage, self.watch = "", watch

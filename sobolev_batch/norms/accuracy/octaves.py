@@ -116,8 +116,7 @@ class State:
     """A norm or a distance in the course of its computation.
 
     Attributes:
-        seed: Seed of the random frequencies and points.
-        octaves: Octaves around them, from the inside out.
+        octaves: Octaves around the core, from the inside out.
         remainders: What lies beyond the core, and beyond each octave.
         for_others: True if other pairs are to be compared at the same frequencies.
         seconds: Processor time that was predicted for the octaves and remainders.

@@ -50,11 +50,9 @@ class Problem:
         support: Area of the surfaces together, and sizes of all surfaces that share the lattice.
         label: Name of the norm or distance in messages.
         pair: Surfaces that a distance is between, with what they share; empty for a norm.
-        signs: Signs of the surfaces in the difference.
         apart: What the product of two surfaces that are far apart does not exceed (orders,); None for others.
         is_clipped: False where what both cover of flat faces is not left out yet.
         moved: Norm (orders,) that faces which were taken out do not exceed, as they are apart by a rounding of files.
-        notify: Called with a line about each step.
     """
 
     surfaces: Sequence[Surface]

@@ -91,7 +91,6 @@ class Kernels:
 
     Attributes:
         cutoff: |ξ| at which the step ends, in cycles per unit length.
-        orders: Orders s.
         fineness: 1, or how many times as far the kernels reach, and as many nodes serve.
         reach: Distance beyond which all kernels are zero.
         start: Where the tables begin, and the step between their entries.

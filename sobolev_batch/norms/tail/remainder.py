@@ -87,7 +87,6 @@ class Remainder:
         orders: Orders s in descending order.
         energies: Mean of the energy beyond the cutoff, weighted by (1 - step(r)) (1 + r²)^s, for each order.
         errors: How far off these may be at 99 %.
-        points: Number of points.
         pairs: Number of pairs of a point and a triangle.
         covering: Number of points from which no part of a surface is hidden.
         hidden: Largest share of the squared errors that allows for what too few points may have missed.

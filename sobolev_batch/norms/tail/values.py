@@ -142,7 +142,6 @@ class SurfaceSize:
     """Size of a surface, on which the processor time of its transforms depends.
 
     Attributes:
-        triangles: Number of triangles.
         extent: Area in squared units of length; of triangles, if they were equilateral with the same distance from
             centroid to farthest corner, since long ones take points like those.
         is_closed_form: True if transforms take no points.
