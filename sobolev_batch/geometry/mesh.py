@@ -48,9 +48,8 @@ class _Sizes(NamedTuple):
 class Mesh:
     """A triangle mesh in three-dimensional space, as a sum of flat area measures.
 
-    Both arrays are copied, converted to float64 and int64 and made read-only. Read-only arrays of these
-    types that own their memory are shared instead. Zero-area triangles, duplicates, open boundaries and
-    non-manifold edges are kept; `counts` reports them.
+    Both arrays are copied as float64 and int64 and made read-only; read-only ones of these types that own their memory
+    are shared. Zero-area triangles, duplicates, open boundaries and non-manifold edges stay; `counts` reports them.
 
     Args:
         vertices: Coordinates, real (n, 3), finite, in the user's unit of length.

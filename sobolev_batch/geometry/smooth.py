@@ -93,10 +93,9 @@ class Interval:
     def derivative(self, values: Reals, axis: int) -> Reals:
         """Return the derivative, at the nodes of the `rule`, of the interpolant through values at them.
 
-        The interpolant is a trigonometric polynomial where periodic, which needs an odd number of nodes,
-        and a polynomial otherwise (H. Wang, S. Xiang 2012, doi:10.1090/S0025-5718-2011-02549-4). For
-        functions that the nodes resolve, the error is about n or n² roundings of the largest value. The values may
-        have any shape, in which one axis runs over the nodes.
+        The interpolant is a trigonometric polynomial where periodic, which needs an odd number of nodes, and a
+        polynomial otherwise (H. Wang, S. Xiang 2012, doi:10.1090/S0025-5718-2011-02549-4). For functions that the nodes
+        resolve, the error is about n or n² roundings of the largest value. One axis of the values runs over the nodes.
         """
         count = values.shape[axis]
         if self.periodic:

@@ -1,8 +1,7 @@
 """What a lattice leaves out of a norm or distance: truncation and aliasing.
 
-Truncation (frequencies beyond the cube) and aliasing (images of the surfaces at the lattice's period)
-follow from the same sums as the number itself; discretisation comes from the fields (`transform/probe`).
-docs/numerics.md says how well these estimates hold.
+Truncation (frequencies beyond the cube) and aliasing (images at the lattice's period) follow from the same sums as the
+number; discretisation comes from the fields (`transform/probe`). docs/numerics.md says how well these estimates hold.
 """
 
 from collections.abc import Sequence
@@ -110,10 +109,9 @@ def truncated(
 ) -> Reals:
     """Bound the squared norm beyond xi_max, or beyond a higher frequency (orders, ...), of a lattice chosen or given.
 
-    The energy on |ξ| = r grows like r^p until it reaches 2 area(μ) + 2 area(ν), its mean for unrelated
-    surfaces. Between two surfaces closer than the wavelength, p is 2, whatever the two ranges show, and more where
-    detail begins. The energy oscillates with the inverse width of the surfaces; if ξ_max covers few of these periods,
-    the outer ranges may lie in a trough.
+    The energy on |ξ| = r grows like r^p until it reaches 2 area(μ) + 2 area(ν), its mean for unrelated surfaces.
+    Between two closer than the wavelength, p is 2, whatever the two ranges show, and more where detail begins. The
+    energy oscillates with the surfaces' inverse width; if ξ_max covers few periods, the outer ranges may be a trough.
     """
     lattice, (least, most) = weights.lattice, _POWERS_IF_GIVEN if is_given else _POWERS
     inner, outer = sums.outer

@@ -133,9 +133,8 @@ def estimate_norms(
 ) -> NormEstimate:
     """Return norms (orders, ...) from sums over the lattice, and the tail beyond it where octaves measured that.
 
-    The discretisation is the norm of the values' own errors (orders, ...), of a difference that of both together. The
-    lattice is chosen for an accuracy, or given. Bounds on the squared norms beyond it, and on what images add to these,
-    (orders, ...) may be known, else NaN.
+    The discretisation is the norm of the values' own errors (orders, ...), of a difference that of both. Bounds
+    (orders, ...) on the squares beyond the lattice, chosen or given, and on what images add may be known, else NaN.
     """
     squares: Reals = np.maximum(sums.totals, 0.0)
     # Sublattices do not show images of ends that are farther apart at fractions of the period than at all of it.

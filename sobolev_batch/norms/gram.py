@@ -1,8 +1,7 @@
 """Squared distances between many fields at once, as weighted matrix products.
 
-Fields enter as differences to one common center, so that the product |a|² + |b|² - 2<a, b> loses
-only the digits by which a pair is closer to each other than to the center. Pairs that lose too many are
-reported; their differences must be summed directly.
+Fields enter as differences to one center, so that |a|² + |b|² - 2<a, b> loses only the digits by which a pair is closer
+to each other than to the center. Pairs that lose too many are reported; their differences must be summed directly.
 """
 
 from collections.abc import Iterator

@@ -141,9 +141,8 @@ class RemeshSource(_ReducingSource):
 class SphericalLevelsSource(NestedSource):
     """Coarse versions of a surface whose vertices follow an icosahedral refinement.
 
-    The vertices of such a surface (FreeSurfer's fsaverage is one) come in the order of their levels:
-    the first 10*4^N + 2 form level N. Its map to the sphere has the same vertices in the same order,
-    and the convex hull of the first ones gives the triangles of the level.
+    Its vertices (as of FreeSurfer's fsaverage) are in order of levels: the first 10*4^N + 2 form level N. Its map to
+    the sphere has the same vertices in this order, and the convex hull of the first ones has the triangles of a level.
     """
 
     sphere: OtherSource

@@ -141,9 +141,8 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
         - where the study requests [proximity]: the numbers of its metrics, by their names in `proximity`, and volume,
           smallest_angle and aspect_ratio; their lengths are in the unit of the files.
 
-        Numbers of a mesh that failed are NaN. The frame's ``attrs`` have the
-        reference's label, and where there are any, the study's rtol, as ``metadata`` the names of the metadata, and as
-        ``computed`` the orders that were computed from the fields.
+        Numbers of a mesh that failed are NaN. The frame's ``attrs`` have the reference's label and, where there are
+        any, the study's rtol, the names of ``metadata``, and as ``computed`` the orders computed from the fields.
 
     Raises:
         InputError: The store has no tables yet, or its meshes have no such size.
