@@ -250,5 +250,4 @@ class Torus(Smooth):
         corner = np.arange(around * across).reshape(around, across)
         ahead, above = np.roll(corner, -1, axis=0), np.roll(corner, -1, axis=1)
         opposite = np.roll(ahead, -1, axis=1)
-        cells = np.stack([corner, ahead, opposite, corner, opposite, above], axis=-1)
-        return Mesh(vertices, cells.reshape(-1, 3))
+        return Mesh(vertices, np.stack([corner, ahead, opposite, corner, opposite, above], axis=-1).reshape(-1, 3))

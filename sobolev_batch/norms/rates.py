@@ -112,6 +112,5 @@ def observed_rates(distances: Reals, errors: Reals, sizes: Reals) -> tuple[Reals
             span = np.log(sizes[coarse] / sizes[fine])
             rates[fine] = np.log(distances[coarse] / distances[fine]) / span
             # The widest that both distances allow.
-            widest = sum(-np.log1p(-errors[i] / distances[i]) for i in (coarse, fine))
-            uncertainties[fine] = widest / span
+            uncertainties[fine] = sum(-np.log1p(-errors[i] / distances[i]) for i in (coarse, fine)) / span
     return rates, uncertainties

@@ -157,8 +157,7 @@ def _mended(store: Store, plan: Plan, damage: DamageError | None) -> Store:
         samples = xr.Dataset(coords=_sample_columns(plan.tail))
         fresh.documents |= documents_in(dataset_keys(layout.OCTAVES_GROUP, samples))
     _require_same_samples(fresh, plan)
-    labels = labels_for(plan, (stored + ("",) * count)[:count], records, is_trusted=False)
-    _lay_out(fresh, plan, labels, ())
+    _lay_out(fresh, plan, labels_for(plan, (stored + ("",) * count)[:count], records, is_trusted=False), ())
     # Nothing else replaces the record of a row that has lost its label.
     for row in damaged:
         if row < count:

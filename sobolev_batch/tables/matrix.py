@@ -84,8 +84,7 @@ def matrix(
 def matrix_frame(distances: xr.Dataset, order: float) -> pd.DataFrame:
     """Return the distances of one order in long form, with their errors: one row for each pair of meshes."""
     chosen = parts_as_variables(distances.sel(order=order))[[*_COLUMNS]].load()
-    frame = chosen.to_dataframe(dim_order=["mesh", "other"]).reset_index()
-    return frame[["order", "mesh", "other", *_COLUMNS]]
+    return chosen.to_dataframe(dim_order=["mesh", "other"]).reset_index()[["order", "mesh", "other", *_COLUMNS]]
 
 
 def format_matrix(store: AnyStore, style: Format = "text", orders: Sequence[float] | None = None) -> str:

@@ -337,9 +337,7 @@ class Reducer:
         support, beyond, given = Support(areas, self.widths), unseen**2, self.is_given
         return estimate_norms(sums, self.weights, support, errors, tail, is_given=given, beyond=beyond, images=images)
 
-    def _block_sums(
-        self, rows: Sequence[int], others: Sequence[int], number: int, shared: int
-    ) -> tuple[Sums, Sums, Sums]:
+    def _block_sums(self, rows: Sequence[int], others: Sequence[int], number: int, shared: int) -> Sequence[Sums]:
         """Return one block's products of rows and others, and the squares of either.
 
         The first ``shared`` others are the rows: of these, only the products on and above the diagonal.

@@ -16,10 +16,10 @@ import xarray as xr
 from distributed import Client
 
 import sobolev_batch as sb
-from sobolev_batch.batch import proximity_stage as module
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.proximity_stage import measure_proximity
+from sobolev_batch.geometry import proximity
 from sobolev_batch.store.field_arrays import Fields
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.records import Records
@@ -154,7 +154,7 @@ def test_too_little_memory_is_foreseen_and_a_later_run_makes_up_for_it(
 ) -> None:
     study = study_of(proximity={"points": 100})
     with monkeypatch.context() as patched:
-        patched.setattr(module, "POINT_BYTES", 1e13)
+        patched.setattr(proximity, "POINT_BYTES", 1e13)
         summary = sb.run(study, store, threads)
     assert sorted(summary.not_compared) == [*MESHES]
     assert summary.not_compared["ico/0"].startswith("no proximity: it takes about")

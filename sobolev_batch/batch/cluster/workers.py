@@ -286,8 +286,7 @@ def require_same_versions(client: Client, libraries: Iterable[str] = ()) -> tupl
     # One checkout may follow another without a new version.
     checkouts = client.run(_checkout, on_error="return")
     ours = _packages(answers["client"]) | _checkout()
-    of_scheduler = _differing(_packages(answers["scheduler"]), ours, _OF_DASK)
-    processes = {f"scheduler {client.scheduler.address}": of_scheduler}
+    processes = {f"scheduler {client.scheduler.address}": _differing(_packages(answers["scheduler"]), ours, _OF_DASK)}
     for address, answer in answers["workers"].items():
         if answer:  # a worker that is just leaving answers nothing
             checkout = checkouts.get(address)

@@ -83,8 +83,7 @@ class Core:
     @classmethod
     def on_lattice(cls, problem: Problem, lattice: Lattice, cutoff: float) -> Self:
         """Compute the fields of a problem on a lattice."""
-        estimates = estimate_from(problem.samples(lattice), problem.orders)
-        values = problem.accuracy.scale(ESTIMATE_CAUTION * estimates)
+        values = problem.accuracy.scale(ESTIMATE_CAUTION * estimate_from(problem.samples(lattice), problem.orders))
         problem.require_above_rounding(values)
         # The octaves' values have errors of their own.
         target = error_target(values, problem.orders, problem.accuracy, problem.area)

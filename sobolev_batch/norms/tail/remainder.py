@@ -394,8 +394,7 @@ class _Seen:
         for mesh, _ in self.sheets.meshes:
             # A few triangles stand for all of them.
             step = max(1, len(mesh.triangles) // 2000)
-            corners = mesh.vertices[mesh.triangles[::step]]
-            centers, radii = centers_and_radii(corners)
+            centers, radii = centers_and_radii(mesh.vertices[mesh.triangles[::step]])
             offsets = np.linalg.norm(places[:, None] - centers, axis=2)
             pairs += step * int(np.count_nonzero(offsets < self.kernels.reach + radii))
         most = _MOST_POINTS if self.sheets.cancel or self.kernels.cutoff > 1 else _MOST_POINTS_ALONE
