@@ -23,15 +23,7 @@ from sobolev_batch.transform.backends import CPU, Backend, Gpu
 from sobolev_batch.transform.kinds import SurfaceKind, kind_of
 from sobolev_batch.transform.lattice import LARGEST_M, Block, FrequencyLattice, Lattice
 from sobolev_batch.transform.nufft import transform_points
-from sobolev_batch.transform.nufft_costs import (
-    CPU_COSTS,
-    DEFAULT_BATCH,
-    FINEST_EPS,
-    Costs,
-    NufftSpec,
-    Workload,
-    fastest_spec,
-)
+from sobolev_batch.transform.nufft_costs import DEFAULT_BATCH, FINEST_EPS, Costs, NufftSpec, Workload, fastest_spec
 from sobolev_batch.transform.rule_errors import weight_masses
 from sobolev_batch.transform.rules import fixed_rule
 
@@ -291,7 +283,7 @@ def field_seconds(triangles: int, area: float, lattice: Lattice, settings: Trans
     """Return the predicted processor time of the field of a mesh; of a closed form with zero triangles."""
     spec = NufftSpec(lattice.half.shape, settings.eps, settings.dtype)
     workload = Workload(points=expected_points(triangles, area, lattice, settings), triangles=triangles)
-    return _NANO * CPU_COSTS.projected_nanoseconds(spec, spec.shape, workload)
+    return _NANO * CPU.costs.projected_nanoseconds(spec, spec.shape, workload)
 
 
 @lru_cache(maxsize=4)
