@@ -326,11 +326,8 @@ def _parts(
     heights[np.abs(heights) <= bounds.rounding * lengths[side, pieces]] = 0.0
     turned, shares = _crossings(heights)
     a, b, c = (corners[corner, :, pieces].T for corner in turned)
-    fair = (
-        (shares.max(axis=0) > _LEAST_CUT)
-        & (shares.min(axis=0) > _LEAST_SHORTER_CUT)
-        & (shares.min(axis=0) < _LARGEST_CUT)
-    )
+    shorter, longer = shares.min(axis=0), shares.max(axis=0)
+    fair = (longer > _LEAST_CUT) & (shorter > _LEAST_SHORTER_CUT) & (shorter < _LARGEST_CUT)
     # Near the plane of the best triangle, the part that is cut away from slivers needs no further look.
     thin = np.max([other.squared_heights(corner, best) for corner in corners], axis=0) <= bounds.enough**2
     thin &= heights.min(axis=0) < 0

@@ -9,6 +9,7 @@ than it divides the area, as between combs.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -298,15 +299,11 @@ def _stack(polygons: _Objects, slack: float, grid: float) -> list[Any]:
     if not first or not second or len(first) + len(second) > _MOST_LAYERS:
         return []
     stack: list[Any] = []
+    shared = partial(shapely.intersection, grid_size=grid)
     for depth in range(1, len(first) + len(second) + 1):
         # What both together cover so often: the one at least i times, and the other the times that are missing.
         pairs = [(i, depth - i) for i in range(max(0, depth - len(second)), min(depth, len(first)) + 1)]
-        parts = [
-            shapely.intersection(first[i - 1], second[j - 1], grid_size=grid)
-            if i and j
-            else [*second[:j], *first[:i]][-1]
-            for i, j in pairs
-        ]
+        parts = [shared(first[i - 1], second[j - 1]) if i and j else [*second[:j], *first[:i]][-1] for i, j in pairs]
         polygons = shapely.get_parts(parts)
         stack.append(shapely.union_all(polygons[shapely.get_dimensions(polygons) == _FLAT], grid_size=grid))
     return [polygon for polygon in stack if polygon.area > slack]

@@ -319,11 +319,8 @@ def shells_against(a: xr.DataArray, b: xr.DataArray, lattice: Lattice) -> tuple[
     for block, (values, others) in read_blocks(lattice, a, b):
         difference = values - others
         near_axes.take(slice(2), block, np.stack([difference, others]))
-        sums += [
-            shell_sums(difference, None, lattice, block),
-            shell_sums(difference, others, lattice, block),
-            shell_sums(others, None, lattice, block),
-        ]
+        factors = (difference, None), (difference, others), (others, None)
+        sums += [shell_sums(one, other, lattice, block) for one, other in factors]
     return sums, near_axes
 
 

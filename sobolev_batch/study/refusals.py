@@ -119,11 +119,8 @@ def _known_keys(values: Mapping[str, Any], key: _Key) -> Iterable[str]:
         return next(schema.models_in(schema.StudyDocument.model_fields[str(key[0])].annotation)).model_fields
     if key == ("reference",) and table["source"] == "family":
         return (*schema.FamilyReference.model_fields, "source")
-    own = (
-        (*schema.KEYS_OF_FAMILY, *schema.KEYS_OF_SEARCH)
-        if key[0] == "family" and len(key) == len(("family", 0))
-        else ()
-    )
+    is_family = key[0] == "family" and len(key) == len(("family", 0))
+    own = (*schema.KEYS_OF_FAMILY, *schema.KEYS_OF_SEARCH) if is_family else ()
     return (*source_type_of(table["source"]).model_fields, "source", *own)
 
 

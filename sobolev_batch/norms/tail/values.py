@@ -111,11 +111,7 @@ def settings_on(
 
 
 def _compared(
-    surface: Surface,
-    sampling: OctaveSampling,
-    values: Complexes,
-    orders: Sequence[float],
-    backend: Backend,
+    surface: Surface, sampling: OctaveSampling, values: Complexes, orders: Sequence[float], backend: Backend
 ) -> tuple[Reals, Reals]:
     """Compare values on lattices with exact ones at a few samples, drawn by weight; fewer where each costs more."""
     kind = kind_of(surface)
