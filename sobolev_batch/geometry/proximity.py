@@ -67,7 +67,7 @@ def proximity(
 
     Returns:
         Numbers by name. Lengths are in the unit of the meshes, and angles in degrees. Names with ``_forward`` are
-        those of points of a from b, names with ``_backward`` those of points of b from a; alone it is the larger.
+        those of points of a from b, names with ``_backward`` those of points of b from a; the name alone is the larger.
 
         - hausdorff and hausdorff_upper: the largest distance of all points, not only of random ones, is between them;
           they are the bounds of `largest_deviation`, 1 % apart;

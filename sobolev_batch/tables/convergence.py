@@ -116,7 +116,7 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
     """Return the convergence table of a store in long form: one row for each mesh and order.
 
     Args:
-        store: Path, URL or opened DataTree of the store. Rows of several objects follow each other, by a column object.
+        store: Path, URL or opened DataTree of the store. Rows of several objects begin with a column object.
         order: One order s < -1/2, or several; default all of the store. Others than those are computed from the stored
             fields, which takes about as long as reading them.
         x: Size of a mesh, a column of the table, in which rates are observed: "edge_length", "triangles", "vertices"

@@ -31,7 +31,7 @@ _log = logging.getLogger(__name__)
 
 # A few beats may be lost, or take long, before others take the run for lost.
 HEARTBEAT_SECONDS = LOST_AFTER_SECONDS / 6
-# A silence is told after this time. Workers tell of themselves twice a second, among thousands twice a minute.
+# A silence is told after this time. Workers tell of themselves twice a second, of thousands twice a minute.
 _TELL_AFTER_SECONDS = 30.0
 _POLL_SECONDS = 5.0
 _MOST_NAMED = 4
