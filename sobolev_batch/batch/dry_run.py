@@ -365,10 +365,12 @@ def _forecast(
         text = "no field is missing, and tables follow from them" if lacks_tables else "nothing is missing"
         return 0.0, 0.0, (text,)
     work = share * sum(one.processor_seconds for one in objects)
-    processes, start = (1 + len(workers.members), _CLUSTER_SECONDS) if starts_processes else (0, 0.0)
+    processes = start = 0.0
+    if starts_processes:
+        processes, start = _PROCESS_SECONDS * slowness() * (1 + len(workers.members)), _CLUSTER_SECONDS
     alone = sum(one.planning_seconds for one in objects) if len(objects) == share == 1 else 0.0
     seconds = start + max(alone + (work - alone) / workers.threads, *(one.shortest_seconds for one in objects))
-    all_work = _PROCESS_SECONDS * processes + work
+    all_work = processes + work
     fields = f"{missing:,} missing field{'s' * (missing != 1)}"
     tasks = f"{workers.threads} task{'s' * (workers.threads != 1)} at once"
     lines: tuple[str, ...] = (

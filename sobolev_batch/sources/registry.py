@@ -270,6 +270,7 @@ class MadeMember(Member):
         libraries: Distributions whose versions are part of the fingerprint.
         triangles: Number of triangles of the mesh; None for as many as the first original has.
         triangle_bytes: Measured peak of the memory of making, for each triangle of the first original, or of the mesh.
+        triangle_seconds: Measured time of making, for each triangle of the mesh.
     """
 
     make: Callable[..., Mesh]
@@ -279,6 +280,7 @@ class MadeMember(Member):
     libraries: tuple[str, ...] = ()
     triangles: int | None = None
     triangle_bytes: int = 0
+    triangle_seconds: float = 0.0
 
     def load(self) -> Mesh:
         """Make the mesh."""
@@ -293,11 +295,13 @@ class MadeMember(Member):
         }
 
     def expected_size(self) -> ExpectedSize:
-        """Return the number of triangles and the memory that it takes to make them, the first original included."""
+        """Return the number of triangles, and what it takes to make them, the first original included."""
         first = next(iter(self.originals.values()), None)
         size = ExpectedSize(self.triangles or 0) if first is None else first.expected_size()
         size = replace(size, projected_bytes=max(size.projected_bytes, float(self.triangle_bytes * size.triangles)))
-        return size if self.triangles is None else replace(size, triangles=self.triangles, factor=1.0)
+        if self.triangles is not None:
+            size = replace(size, triangles=self.triangles, factor=1.0)
+        return replace(size, seconds=size.seconds + self.triangle_seconds * size.triangles)
 
 
 def digest_of(values: Any) -> str:

@@ -18,6 +18,7 @@ from distributed import Client
 import sobolev_batch as sb
 from sobolev_batch.batch.cluster.workers import Workers
 from sobolev_batch.batch.dry_run import seconds_of_missing
+from sobolev_batch.batch.field_costs import row_seconds
 from sobolev_batch.batch.start import warnings_of
 from sobolev_batch.geometry.formats.writing import write_mesh
 from sobolev_batch.store.layout import Store, hide_tables
@@ -115,6 +116,16 @@ def test_meshes_that_take_long_to_make_count(plan: Plan) -> None:
     fitted, *_ = make_plan(sb.Study.from_table(small_table(family=[fit]))).rows
     fast, *_ = plan.rows
     assert fitted.member.expected_size().seconds > 1 > fast.member.expected_size().seconds
+
+
+def test_remeshing_and_comparing_beyond_octaves_count(plan: Plan) -> None:
+    family = {"name": "even", "source": "remesh", "mesh": {"source": "icosphere", "levels": [5]}, "triangles": [4000]}
+    even, *_ = make_plan(sb.Study.from_table(small_table(family=[family]))).rows
+    assert row_seconds(plan, even) > 1 > row_seconds(plan, replace(even, member=plan.rows[0].member))
+    with_octaves = make_plan(sb.Study.from_table(small_table(lattice={"xi_max": 2.0, "M": 16, "octaves": 1})))
+    mesh = with_octaves.rows[0]
+    as_reference = row_seconds(replace(with_octaves, reference=mesh.label), mesh)
+    assert row_seconds(with_octaves, mesh) - as_reference > 0.1
 
 
 def test_workers_of_a_cluster_are_tried(client: Client, plan: Plan) -> None:
