@@ -389,7 +389,9 @@ def _league(
             reason = "no object connects it with the methods that are compared"
             others = {f"method {method}": reason for method in methods if method not in connected}
             return _league(tables, order, x, y, connected, {**unfinished, **others})
-    reasons = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:3])
+    # Those with tables tell more.
+    tell_most = sorted(left_out.items(), key=lambda item: item[0] in unfinished)
+    reasons = "; ".join(f"{name}: {reason}" for name, reason in tell_most[:3])
     raise InputError(
         f"no objects can serve to compare the methods {', '.join(methods)} ({reasons}); compare fewer methods, "
         'or compare them by cost (table league --by cost, in Python by="cost")'
