@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from html import escape
 from typing import TYPE_CHECKING, Any
@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 # More rows of one kind, or at either end of a text in a notebook, would hide the others.
 _MOST_ALIKE = 20
+# Labels in one line.
+_MOST_NAMED = 3
 # Notebooks align the cells of tables to the right and keep them short.
 _CELL_STYLE = 'style="text-align: left; vertical-align: top; white-space: pre-wrap"'
 
@@ -60,6 +62,20 @@ def reasons(name: str, by_label: Mapping[str, str]) -> Iterable[tuple[str, str]]
         yield name, f"{label}: {reason}"
     if len(by_label) > _MOST_ALIKE:
         yield name, f"and {len(by_label) - _MOST_ALIKE:,} more"
+
+
+def few_of(labels: Sequence[str]) -> str:
+    """Return a few labels, and how many more there are."""
+    more = len(labels) - _MOST_NAMED
+    return ", ".join(labels[:_MOST_NAMED]) + (f" and {more:,} more" if more > 0 else "")
+
+
+def together(by_label: Mapping[str, str]) -> dict[str, str]:
+    """Return each reason once, by a few of the labels that have it."""
+    labels: dict[str, list[str]] = {}
+    for label, reason in by_label.items():
+        labels.setdefault(reason, []).append(label)
+    return {few_of(own): reason for reason, own in labels.items()}
 
 
 def _below(caption: str, content: str) -> str:

@@ -12,6 +12,7 @@ import pytest
 
 import sobolev_batch as sb
 from sobolev_batch.extras.leagues.league import leagues_of
+from sobolev_batch.shown import together
 from tests.support.studies import method_rows, small_table
 
 HOSTILE = "<script>alert('&')</script>"
@@ -58,6 +59,10 @@ def test_texts_are_shown_and_never_run(value: Any, texts: list[str]) -> None:
     if isinstance(value, sb.testing.Verdict):
         return
     assert HOSTILE in text
+
+
+def test_a_reason_of_many_meshes_is_told_once() -> None:
+    assert together({**dict.fromkeys("abcde", "x"), "f": "y"}) == {"a, b, c and 2 more": "x", "f": "y"}
 
 
 def test_a_plan_shows_its_lines() -> None:

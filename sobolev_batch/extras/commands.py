@@ -25,6 +25,7 @@ from sobolev_batch.cli.table_commands import table_options
 from sobolev_batch.errors import InputError, MeshError, SobolevBatchError, StoreError, from_extra, require_writable
 from sobolev_batch.extras.fitting import DEFAULT_SMOOTHING, DEFAULT_STEPS
 from sobolev_batch.norms import DEFAULT_ORDER
+from sobolev_batch.shown import reasons, together
 
 if TYPE_CHECKING:
     from sobolev_batch.extras.figures.style import PictureFormat
@@ -265,8 +266,8 @@ def plot_command(
             echo(path)
         for name, notes in omissions.items():
             echo(f"{name}: {'; '.join(notes)}", err=True)
-        for label, reason in missing.items():
-            echo(f"{label}: not drawn with its witness function: {reason}", err=True)
+        for labels, reason in together(missing).items():
+            echo(f"{labels}: not drawn with its witness function: {reason}", err=True)
         return EXIT_SOME_FAILED if missing and meshes else 0
     if meshes:
         raise click.UsageError("--mesh draws meshes of one object: name its store, such as STORE/OBJECT")
@@ -328,18 +329,19 @@ def witness_command(
     made, labels, chosen = exported(store, meshes, orders, folder)
     _require_folder(output)
     output.mkdir(parents=True, exist_ok=True)
-    reference, status = made.reference if distances else None, 0
+    reference, missing = made.reference if distances else None, dict[str, str]()
     for label in labels:
         try:
             found = made.with_witness(label, chosen, reference)
         except SobolevBatchError as error:
-            echo(f"{label}: {error}", err=True)
-            status = EXIT_SOME_FAILED
+            missing[label] = str(error)
             continue
         path = output / f"{made.stem(label)}.{style}"
         write_vertex_witness(path, found)
         echo(path)
-    return status
+    for _, line in reasons("", together(missing)):
+        echo(line, err=True)
+    return EXIT_SOME_FAILED if missing else 0
 
 
 @click.command("report", cls=Command)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from sobolev_batch.shown import few_of
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.convergence import ALONE, joined, remarks, tables_of
 from sobolev_batch.tables.open import AnyStore, as_tree, stores_of
@@ -25,7 +26,7 @@ _SAME_SIZE = 1.2
 # More rows are no verdict any more.
 _MOST_SIZES = 8
 _MOST_FAMILIES = 6
-MOST_NAMED, _MOST_REMARKS = 3, 10
+_MOST_REMARKS = 10
 
 VERDICT_COLUMNS = (
     Column("verdict", "verdict", kind="label"),
@@ -105,7 +106,7 @@ def _sentence(at_order: str, rows: pd.DataFrame, reference: str) -> str:
     best, rivals = closest
     # On one line, in a sentence.
     amount = percent(best["relative"], best["relative_error"]).replace(" ", "\N{NO-BREAK SPACE}")
-    who = rivals[0] if len(rivals) == 1 else f"one of {_names(rivals)}"
+    who = rivals[0] if len(rivals) == 1 else f"one of {few_of(rivals)}"
     doubt = f", and the errors leave open whether {who} is nearer" if rivals else ""
     if compared == 1:
         return f"{best['mesh']} differs from {name} by {amount} {at_order}."
@@ -136,7 +137,7 @@ def _nearest_row(label: str, members: pd.DataFrame) -> TableRow:
         is_known = members["distance"].notna().any()
         return _absent(label, "no distance is above its error" if is_known else "no distance is known")
     best, rivals = closest
-    return _row(label, best, f"errors leave open {_names(rivals)}" if rivals else _lead(best, members))
+    return _row(label, best, f"errors leave open {few_of(rivals)}" if rivals else _lead(best, members))
 
 
 def _nearest(frame: pd.DataFrame) -> tuple[pd.Series, tuple[str, ...]] | None:
@@ -178,7 +179,7 @@ def _smallest_rows(rows: pd.DataFrame, families: Sequence[str]) -> Iterator[Tabl
         frame = smallest_of(rows, bound)
         for row in frame[frame["family"].isin(families)].to_dict(orient="records"):
             label = f"below {100 * bound:g} %: {row['family']}"
-            open_ones = f"errors leave open {_names(row['undecided'])}" if row["undecided"] else ""
+            open_ones = f"errors leave open {few_of(row['undecided'])}" if row["undecided"] else ""
             if row["mesh"]:
                 yield _row(label, row, open_ones)
             else:
@@ -190,9 +191,9 @@ def _smallest_rows(rows: pd.DataFrame, families: Sequence[str]) -> Iterator[Tabl
 def _doubtful_rows(rows: pd.DataFrame, failed: Mapping[str, str]) -> Iterator[TableRow]:
     """Yield the meshes whose distances have larger errors than the study requests, and those that failed."""
     if (is_short := _is_above_rtol(rows)).any():
-        yield _absent("above rtol", _names(rows["mesh"][is_short].tolist()))
+        yield _absent("above rtol", few_of(rows["mesh"][is_short].tolist()))
     if failed:
-        yield {**_absent("missing", _names(list(failed))), "reasons": "failed"}
+        yield {**_absent("missing", few_of(list(failed))), "reasons": "failed"}
 
 
 def totals_of(rows: pd.DataFrame) -> dict[str, int]:
@@ -217,12 +218,6 @@ def _row(label: str, mesh: Mapping[str, Any] | pd.Series, remark: str) -> TableR
 
 def _absent(label: str, text: str) -> TableRow:
     return {"verdict": label, "absent": text}
-
-
-def _names(labels: Sequence[str]) -> str:
-    """Return a few labels, and how many more there are."""
-    more = len(labels) - MOST_NAMED
-    return ", ".join(labels[:MOST_NAMED]) + (f" and {more:,} more" if more > 0 else "")
 
 
 def format_verdict(store: AnyStore, style: Format = "text", orders: Sequence[float] | None = None) -> str:

@@ -19,6 +19,7 @@ from sobolev_batch.extras.leagues.costs import CostLeague
 from sobolev_batch.extras.leagues.evolution import evolution
 from sobolev_batch.extras.leagues.league import League, percent_text
 from sobolev_batch.parameters import path_of
+from sobolev_batch.shown import together
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import utc_now
 from sobolev_batch.store.objects import Objects
@@ -260,8 +261,8 @@ def chart_omissions(
         yield f"spectra: only those of {omission} are shown"
     if 0 < len(views) < compared:
         yield f"witness functions: only {len(views)} of {compared:,} meshes are drawn; --mesh chooses them"
-    for label, reason in missing.items():
-        yield f"the witness function of {label}: {reason}"
+    for labels, reason in together(missing).items():
+        yield f"the witness function of {labels}: {reason}"
 
 
 def _convergence(tree: xr.DataTree, orders: list[float], most: int) -> list[list[Json]]:
