@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from sobolev_batch import compiled
 from sobolev_batch.batch.cluster.execution import Cluster, Stages, Task, Wave, describe_failure
 from sobolev_batch.batch.field_costs import MESH_BYTES
 from sobolev_batch.errors import InputError, MeshError, StoreError, one_line
@@ -105,11 +106,14 @@ def measure_proximity(
     started = time.perf_counter()
     try:
         limit = None if requested.threshold is None else requested.threshold * similarity.scale
-        meshes = (_load(*mesh, similarity) for mesh in pair)
         # The bounds of a mesh that was searched are to prove what the search has proved.
         tolerance = dict(pair[0][0].member.metadata).get("target_tolerance")
         within = _BELOW * tolerance * similarity.scale if isinstance(tolerance, float) else None
-        found, _ = proximity.proximity_and_deviations(*meshes, points=requested.points, threshold=limit, within=within)
+        # Digits, and bounds with them, do not depend on what else the process computes.
+        with compiled.by_itself():
+            compiled.use()
+            meshes, points = (_load(*mesh, similarity) for mesh in pair), requested.points
+            found, _ = proximity.proximity_and_deviations(*meshes, points=points, threshold=limit, within=within)
         lengths = {name: found[name] / similarity.scale for name in proximity.LENGTHS}
         measured = ProximityRecord(key, "", {**found, **lengths})
     except StoreError:

@@ -10,6 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Self
 
+from sobolev_batch import compiled
 from sobolev_batch.errors import InputError, MeshError, one_line
 from sobolev_batch.geometry.closest import Triangles
 from sobolev_batch.geometry.deviation import largest_deviation
@@ -141,15 +142,18 @@ def tried(reference_member: Member, member: Member, limit: Limit, size: float) -
     that failed; what is wrong with the reference is raised as a MeshError.
     """
     reference, started = load_mesh(reference_member), time.perf_counter()
-    if limit.measure in _OF_ONE_MESH:
-        # What is not known of the reference is known of no mesh.
-        limit.bounds(reference, reference)
     mesh, reason, bounds = None, "", (math.inf,) * 3
-    try:
-        mesh = load_mesh(member)
-        bounds = limit.bounds(mesh, reference)
-    except InputError as error:
-        reason = one_line(error)
+    # A search that was ended goes on in another process, by the same bounds.
+    with compiled.by_itself():
+        compiled.use()
+        if limit.measure in _OF_ONE_MESH:
+            # What is not known of the reference is known of no mesh.
+            limit.bounds(reference, reference)
+        try:
+            mesh = load_mesh(member)
+            bounds = limit.bounds(mesh, reference)
+        except InputError as error:
+            reason = one_line(error)
     is_within, triangles = bounds[2] <= limit.value * (1 + _EQUAL), 0 if mesh is None else len(mesh.triangles)
     trial = Trial(float(size), triangles, *bounds, is_within, time.perf_counter() - started, reason)
     return trial, mesh if is_within else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import signal
@@ -16,6 +17,7 @@ import xarray as xr
 from distributed import Client
 
 import sobolev_batch as sb
+from sobolev_batch import compiled
 from sobolev_batch.batch.cluster.clients import local_client
 from sobolev_batch.batch.cluster.execution import Progress
 from sobolev_batch.batch.proximity_stage import measure_proximity
@@ -165,6 +167,21 @@ def test_too_little_memory_is_foreseen_and_a_later_run_makes_up_for_it(
     assert measured(study, store, threads) == [*MESHES]
     assert sb.status(store).not_compared == {}
     assert_right(store, study)
+
+
+def test_distances_do_not_depend_on_what_the_process_did_before(store: Path) -> None:
+    here, plan, found = Store.open(store), make_plan(study_of()), []
+    record, reference = Records(here).read()[1], Records(here).read()[-1]
+    assert record is not None
+    assert reference is not None
+    pair = (plan.rows[1], record.facts.digest), (plan.rows[-1], reference.facts.digest)
+    for key, seconds in (("after little", 0.0), ("after much", math.inf)):
+        with compiled.by_itself():
+            compiled.pays(seconds)
+            measured = measure_proximity(here, 1, record, key, pair, plan.similarity, ProximitySection(points=100))
+        assert measured.proximity is not None
+        found.append(measured.proximity.numbers)
+    assert found[0] == found[1]
 
 
 def test_a_mesh_that_has_changed_is_not_measured(store: Path, tmp_path: Path) -> None:

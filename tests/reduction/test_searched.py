@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -13,6 +14,7 @@ import tomli_w
 from distributed import Client
 
 import sobolev_batch as sb
+from sobolev_batch import compiled
 from sobolev_batch.geometry import closest, proximity
 from sobolev_batch.reduction import limit as limits
 from sobolev_batch.reduction import searched
@@ -100,6 +102,17 @@ def test_meshes_of_two_objects_hold_and_are_those_of_reduce(client: Client, fold
     again = sb.run(sb.Study.from_table(described, folder=folder), store, client=client)
     assert again.computed == ()
     assert {path.name: path.stat().st_mtime_ns for path in (folder / "made-meshes").iterdir()} == before
+
+
+@pytest.mark.parametrize("within", ["0.5 mm", "5 %"])
+def test_a_trial_does_not_depend_on_what_the_process_did_before(within: str, folder: Path) -> None:
+    search, found = member(folder, DECIMATED | {"within": within}).search, []  # type: ignore[attr-defined]
+    for seconds in (0.0, math.inf):
+        with compiled.by_itself():
+            compiled.pays(seconds)
+            trial, _ = limits.tried(*search.trial(search.begun(), 200.0))
+        found.append(replace(trial, seconds=0.0))
+    assert found[0] == found[1]
 
 
 def test_a_search_goes_on_where_it_was_ended(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
