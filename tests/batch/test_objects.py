@@ -742,7 +742,7 @@ def test_verdicts_and_smallest_meshes_are_those_of_each_object(store: Path) -> N
             rows = all_rows[all_rows["object"] == name].drop(columns="object").reset_index(drop=True)
             pd.testing.assert_frame_equal(rows, own, check_dtype=False)
         assert format_verdict(store / name) in format_verdict(store)
-    text = format_smallest(store, below=0.5)
+    text = format_smallest(store, "text", None, below=0.5)
     assert text.index("Object a") < text.index("Smallest mesh below 50 %") < text.index("Object b")
 
 
