@@ -1,5 +1,7 @@
 """Meshes reduced as far as a tolerance permits, many at a time: each trial is a task, and its outcome is recorded."""
 
+from __future__ import annotations
+
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress

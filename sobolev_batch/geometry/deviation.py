@@ -22,6 +22,8 @@ doi:10.1145/1531326.1531380; L. Sacht, A. Jacobson, "Cascading upper bounds for 
 distance" (2024). The cut along planes is ours.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace

@@ -1,5 +1,7 @@
 """Distances of two meshes from point to closest point: Hausdorff, mean, RMS, percentiles, Chamfer, F-score, normals."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,5 +1,7 @@
 """Causes of a distance: wavelengths, and places where the surfaces differ."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

@@ -5,6 +5,8 @@ reduced to one number per shell first, whatever the orders; a norm of any order 
 weighted sum of those. Fields are read block by block, so they need not fit into memory.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import cast

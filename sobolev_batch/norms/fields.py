@@ -1,5 +1,7 @@
 """Fourier fields of surfaces on the half lattice, each with an estimate of its error; fields as operands of metrics."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace

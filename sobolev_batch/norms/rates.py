@@ -1,5 +1,7 @@
 """Observed orders of convergence: how fast a sequence of meshes comes nearer to a surface."""
 
+from __future__ import annotations
+
 import os
 from collections.abc import Callable, Mapping, Sequence
 

@@ -1,5 +1,7 @@
 """Yardsticks: changes of a mesh that bring it as far from itself as another one is."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
