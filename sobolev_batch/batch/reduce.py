@@ -132,7 +132,7 @@ def format_reductions(found: Mapping[str, Reduction], style: Format = "text", un
         Column("failed_triangles", "next that failed", count),
         Column("trials", "trials"),
         Column("seconds", "time", duration),
-        *([Column("note", "note", kind="text")] if any(one.to_row()["note"] for one in found.values()) else []),
+        Column("note", "note", kind="text"),
     ]
     frame = pd.DataFrame([one.to_row() for one in found.values()])
     frame = frame.astype({"triangles": "Int64", "failed_triangles": "Int64"})

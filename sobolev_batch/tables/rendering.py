@@ -85,7 +85,10 @@ def rendered(style: Format, frame: pd.DataFrame, sections: Iterable[Section], no
 
 
 def column_table(columns: Sequence[Column], rows: Rows, style: Format) -> str:
-    """Return rows of a frame as a table for people, with marks, and where numbers are absent; see `printed_table`."""
+    """Return rows of a frame as a table for people, with marks, and where numbers are absent; see `printed_table`.
+
+    Columns of texts that no row has are left out.
+    """
     cells = [
         [
             "missing"
@@ -95,8 +98,9 @@ def column_table(columns: Sequence[Column], rows: Rows, style: Format) -> str:
         ]
         for row in (rows.to_dict(orient="records") if isinstance(rows, pd.DataFrame) else rows)
     ]
-    texts = [number for number, column in enumerate(columns) if column.kind == "text"]
-    return printed_table(cells, [column.header for column in columns], style, texts)
+    shown = [n for n, column in enumerate(columns) if column.kind != "text" or any(row[n] for row in cells)]
+    texts = [k for k, n in enumerate(shown) if columns[n].kind == "text"]
+    return printed_table([[row[n] for n in shown] for row in cells], [columns[n].header for n in shown], style, texts)
 
 
 def machine_table(frame: pd.DataFrame, style: Format) -> str:

@@ -23,7 +23,7 @@ from sobolev_batch.store.records import Records
 from sobolev_batch.tables.conclusion import format_objects, format_verdict
 from sobolev_batch.tables.convergence import format_table
 from sobolev_batch.tables.matrix import format_matrix
-from sobolev_batch.tables.rendering import printed_table
+from sobolev_batch.tables.rendering import Column, column_table, printed_table
 from sobolev_batch.tables.smallest import format_smallest
 from tests.support.made_tree import root_attributes
 from tests.support.studies import small_table
@@ -91,6 +91,15 @@ def test_columns_that_follow_keep_what_tells_rows_apart(monkeypatch: pytest.Monk
     monkeypatch.setenv("COLUMNS", "40")
     rows = [[method, by, "1" * 12, "2" * 12] for by in ("relative", "triangles") for method in ("a", "b")]
     assert printed_table(rows, ["method", "by", "new", "old"], "text").count("triangles") == 2 * 2
+
+
+def test_a_column_of_texts_that_no_row_has_is_left_out() -> None:
+    columns = Column("mesh", "mesh", kind="label"), Column("remark", "remark", kind="text"), Column("n", "count")
+    rows = [{"mesh": name, "remark": "", "n": None} for name in "ab"]
+    # Numbers that are all unknown stay.
+    assert column_table(columns, rows, "text").split("\n")[0].split() == ["mesh", "count"]
+    rows[1]["remark"] = "thin"
+    assert column_table(columns, rows, "text").split("\n")[0].split() == ["mesh", "remark", "count"]
 
 
 def test_meshes_that_are_not_computed_are_counted_on_one_line(tree: xr.DataTree) -> None:
