@@ -52,8 +52,12 @@ _MOST_FLAT = 200_000
 # The most on a surface alone in large units, below a cutoff of 1: edges are narrow there, and few points meet them.
 _MOST_POINTS_ALONE = 16_384
 _USUAL_PAIRS, _MOST_PAIRS = 150_000, 500_000
-# Share of the squared errors that is most of them, and a relative error that may be smaller for some more points.
-MOSTLY, _ROUGH = 0.5, 0.15
+# Share of the squared errors that is most of them, and a relative error that may be smaller for some more points; it
+# may be much smaller for surfaces that are large beside the unit, below a cutoff of 1.
+MOSTLY, _ROUGH, _ROUGH_OF_LARGE = 0.5, 0.15, 0.01
+# The distance over which a kernel falls that begins at a low cutoff: its weight has the unit of length. Without this
+# limit, 12 of 63 pairs of sheets of 10 to 1,000 units lay outside of their errors, whose edges no point had met.
+_LONGEST_REACH = 1.0
 # Points for each square of the reach, so that none is farther than it from the next; and those of them that are
 # computed again with twice the reach and twice the nodes.
 _PER_REACH, _CONTROLS = 2.0, 24
@@ -186,7 +190,8 @@ def remainder(
         return _estimate(seen_by, points or _FEW_POINTS, rng, is_exact=not is_scale)
     affordable = seen_by.affordable(rng)
     found = _estimate(seen_by, min(affordable, _FEW_POINTS) if is_bound else affordable, rng, is_bound=is_bound)
-    if found.hidden > MOSTLY and np.any(np.array(found.errors) > _ROUGH * np.abs(found.energies)):
+    rough = _ROUGH if cutoff > 1 else _ROUGH_OF_LARGE
+    if found.hidden > MOSTLY and np.any(np.array(found.errors) > rough * np.abs(found.energies)):
         # Nothing is hidden from more of them.
         count = min(found.covering, _MOST_PAIRS * found.points // max(found.pairs, 1))
         found = _estimate(seen_by, count, rng) if count > found.points else found
@@ -338,7 +343,7 @@ class _Seen:
     @property
     def squared_reach(self) -> float:
         """Squared reach of the kernel that reaches least."""
-        return float((reach_of(self.kernels.orders[0]) / self.kernels.cutoff) ** 2)
+        return float(min(reach_of(self.kernels.orders[0]) / self.kernels.cutoff, _LONGEST_REACH) ** 2)
 
     @property
     def covering(self) -> int:

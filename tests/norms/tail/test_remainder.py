@@ -159,3 +159,20 @@ def test_a_far_move_among_small_ones_is_seen_by_few_points() -> None:
         few = remainder(surfaces, [1, -1], 60.0, (-1.0, -2.0), points=40, seed=seed)
         assert np.all(np.abs(np.subtract(few.energies, many.energies)) < few.errors)
         assert np.all(np.less(few.errors, many.energies))
+
+
+@pytest.mark.parametrize("cells", [1, 20])
+def test_edges_of_sheets_that_are_large_beside_the_unit_are_not_missed(cells: int) -> None:
+    size, gap, radii = 400.0, 0.1, np.linspace(0, 6, 60_001)
+
+    def pairs(height: float) -> float:
+        """∬ K over pairs of points of squares at a height, by how many are at a distance within the plane."""
+        areas = 2 * np.pi * size**2 * radii - 8 * size * radii**2 + 2 * radii**3
+        return float(np.trapezoid(np.pi**2 * np.exp(-2 * np.pi * np.hypot(radii, height)) * areas, radii))
+
+    x, y = np.mgrid[: cells + 1, : cells + 1].reshape(2, -1) * size / cells
+    corners = np.array([[0, 1, cells + 2], [0, cells + 2, cells + 1]])
+    triangles = (np.flatnonzero((x < size) & (y < size))[:, None, None] + corners).reshape(-1, 3)
+    high, low = (Mesh(np.stack([x, y, np.full_like(x, height)], axis=1), triangles) for height in (gap, 0.0))
+    found = sb.distance(high, low, -2.0, rtol=1e-2)
+    assert abs(found["distance"] - np.sqrt(2 * (pairs(0.0) - pairs(gap)))) < found["error"] < 1e-2 * found["distance"]
