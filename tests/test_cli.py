@@ -156,7 +156,7 @@ def test_tables_in_every_format_at_lists_of_orders(folder: Path) -> None:
     assert rf"{number} \% ±" in frames["latex"]
     matrix = output("table", "matrix", STORE, "--format", "csv", folder=folder)
     assert len(matrix.splitlines()) == 1 + 2 * 3 * 3
-    options = ("--format", "json", "--below", "500%", "--order", "-3")
+    options = ("--format", "json", "--below", "99%", "--order", "-3")
     (row,) = json.loads(output("table", "smallest", STORE, *options, folder=folder))
     assert row["mesh"] == "ico/0"
 
@@ -443,6 +443,7 @@ REFUSED = [
     ("status taken", "taken: it holds no store of a study"),
     ("status 1.off", "1.off: it holds no store of a study"),
     (f"table smallest {STORE} --below much", "found 'much'"),
+    (f"table smallest {STORE} --below 5", "below 1, such as '1%', found 5"),
     (f"table {STORE} --order -0.4", "below -1/2, found -0.4"),
     ("compare a.ply b.ply", "a.ply: cannot be read"),
     ("compare 1.off 3.off --order -4 --M 0", "M must be an even integer"),

@@ -404,7 +404,12 @@ def time_command(store: Location, style: Format, orders: ChosenOrders, truth: st
     help="Compare this column of the table, of which less is better; may be repeated.",
 )
 @click.option("--family", "families", multiple=True, help="Compare this method; may be repeated. [default: all]")
-@click.option("--against", type=location, metavar="STORE", help="Compare with this earlier study instead.")
+@click.option(
+    "--against",
+    type=location,
+    metavar="STORE",
+    help="Compare with this earlier study instead; families within tolerances need --y triangles.",
+)
 @click.option(
     "--most", type=click.FloatRange(min=1.0), metavar="RATIO", help="A mean ratio to the earlier study above it fails."
 )
@@ -437,7 +442,10 @@ def league_command(
     if against is not None:
         changes = compare_studies(store, against, orders, y=columns, methods=families or None)
         is_worse = bool(changes.attrs["lost"]) or (changes["verdict"] == "farther").any()
-        is_worse |= most is not None and (changes["ratio"] > most).any()
+        larger = changes[changes["ratio"] > (math.inf if most is None else most)]
+        for row in larger.to_dict("records"):
+            echo(f"{row['method']}: {row['y']} grew {row['ratio']:.3g} times in the mean, above {most:g}", err=True)
+        is_worse |= len(larger) > 0
         text = format_changes(changes, style)
     elif by == "cost":
         by_cost = league(store, orders, by="cost", x=x, methods=families or None)

@@ -78,7 +78,7 @@ def proximity(
         - bias and bias_error: mean distance of points of a, positive outside of b and negative inside, and its
           standard error; NaN if triangles of b are not oriented consistently. An open mesh has its outside where its
           triangles face;
-        - p50, p95 and p99: the distance below which 50, 95 and 99 % of the area are;
+        - p50, p95 and p99: the distance below which 50, 95 and 99 % of the area is;
         - chamfer: the sum of both means, not squared; chamfer_error is its standard error;
         - fscore: harmonic mean of precision, the fraction of the area of a within the threshold of b, and recall, that
           of b within the threshold of a; and threshold;

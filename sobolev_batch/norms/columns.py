@@ -123,7 +123,7 @@ VARIABLES: Mapping[str, Mapping[str, Any]] = {
             ("hausdorff_upper", "upper bound of the Hausdorff distance"),
             ("mean", "mean distance"),
             ("rms", "root mean square of distances"),
-            *((f"p{percent}", f"distance within which {percent} % of the area are") for percent in (50, 95, 99)),
+            *((f"p{percent}", f"distance within which {percent} % of the area is") for percent in (50, 95, 99)),
             ("normal_mean", "mean angle between normals"),
             ("normal_max", "largest angle between normals that was found"),
         )

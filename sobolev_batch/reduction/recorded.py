@@ -135,8 +135,9 @@ class RecordedSearch:
         """Return why nothing was found; empty where something was."""
         if self.bracket(record).best is not None:
             return ""
-        nearest = min(self._counted(record), key=lambda one: one.upper)
-        found = f"{nearest.triangles:,} triangles, at most {nearest.upper:.4g} away ({self.limit.measure})"
+        # Where a mesh was clearly too far away, its upper bound was left where it was.
+        nearest = min(self._counted(record), key=lambda one: (one.lower, one.upper))
+        found = f"{nearest.triangles:,} triangles, at least {nearest.lower:.4g} away ({self.limit.measure})"
         return nearest.reason or f"nothing is within the tolerance of {self.limit.value:.4g}; nearest are {found}"
 
     def mesh(self, record: SearchRecord) -> Mesh:

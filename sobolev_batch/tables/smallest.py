@@ -47,7 +47,8 @@ def smallest_below(store: AnyStore, relative: float | str, order: Orders | None 
         the reference's label and the bound.
 
     Raises:
-        InputError: The store has no tables yet, no such order or no triangles, or the bound is not positive.
+        InputError: The store has no tables yet, no such order or no triangles, or the bound is not
+            between 0 and 1.
         StoreError: The location has no store of a study.
 
     >>> import sobolev_batch as sb
@@ -59,7 +60,8 @@ def smallest_below(store: AnyStore, relative: float | str, order: Orders | None 
 
 
 def _of_objects(store: AnyStore, relative: float | str, order: Orders | None) -> dict[str, pd.DataFrame]:
-    most = fraction(relative)
+    if (most := fraction(relative)) >= 1:
+        raise InputError(f"a bound is a fraction of the norm below 1, such as '1%', found {relative!r}")
     frames = tables_of(store, order)
     if not any((frame["triangles"] > 0).any() for frame in frames.values()):
         raise InputError("the smallest mesh has the fewest triangles, and no surface of the store is known to have any")

@@ -352,7 +352,8 @@ def test_a_league_needs_no_more_than_the_store(store: Path, monkeypatch: pytest.
     with monkeypatch.context() as patched:
         patched.setattr("sobolev_batch.extras.leagues.changes.compare_studies", lambda *_, **__: frame)
         for words, status in (([], 0), (["--most", "2.1"], 0), (["--most", "1.05"], 1)):
-            assert call("table", "league", store, "--against", store, *words).returncode == status
+            done = call("table", "league", store, "--against", store, *words)
+            assert (done.returncode, "egg: triangles grew 2 times in the mean" in done.stderr) == (status, bool(status))
         frame.attrs["lost"] = ("a/ico/1",)
         done = call("table", "league", store, "--against", store)
         assert (done.returncode, "a/ico/1 is in the old study, and missing in the new one." in done.stdout) == (1, True)

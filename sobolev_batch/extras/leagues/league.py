@@ -53,6 +53,8 @@ Pairs are compared at the sizes and over the objects that both have."""
 AnyStores = AnyStore | Mapping[str, AnyStore]
 # What methods are compared by unless another number is named.
 RELATIVE = "relative"
+# Objects that serve no league are told with their reasons, so many of them.
+_MOST_REASONS = 3
 # Columns of the ends of an interval.
 ENDS = ("low", "high")
 
@@ -391,7 +393,9 @@ def _league(
             return _league(tables, order, x, y, connected, {**unfinished, **others})
     # Those with tables tell more.
     tell_most = sorted(left_out.items(), key=lambda item: item[0] in unfinished)
-    reasons = "; ".join(f"{name}: {reason}" for name, reason in tell_most[:3])
+    reasons = "; ".join(f"{name}: {reason}" for name, reason in tell_most[:_MOST_REASONS])
+    if (more := len(tell_most) - _MOST_REASONS) > 0:
+        reasons += f"; {more:,} more"
     raise InputError(
         f"no objects can serve to compare the methods {', '.join(methods)} ({reasons}); compare fewer methods, "
         'or compare them by cost (table league --by cost, in Python by="cost")'
