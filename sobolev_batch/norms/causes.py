@@ -12,7 +12,16 @@ from sobolev_batch.arrays import ComplexDtype, Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms import DEFAULT_ORDER
-from sobolev_batch.norms.columns import AREA, FREQUENCY, KERNEL, LENGTH, described, lattice_attributes, order_axis
+from sobolev_batch.norms.columns import (
+    AREA,
+    FREQUENCY,
+    KERNEL,
+    LENGTH,
+    NUMBER,
+    described,
+    lattice_attributes,
+    order_axis,
+)
 from sobolev_batch.norms.fields import OperandLike, field_of, pair_of, read_blocks, shells_of
 from sobolev_batch.parameters import is_whole_number
 from sobolev_batch.transform.fourier import TransformSettings, require_points_inside, thread_count
@@ -91,7 +100,7 @@ def spectrum(
     return xr.Dataset(
         {
             "squared": ((*dims, "band"), squared.reshape(*values.shape, -1), described("squared value", LENGTH)),
-            "share": ((*dims, "band"), share.reshape(*values.shape, -1), described("share of the total", "1")),
+            "share": ((*dims, "band"), share.reshape(*values.shape, -1), described("share of the total", NUMBER)),
             "total": (dims, total.reshape(values.shape), described("squared value of all bands", LENGTH)),
             "mean_square": ("band", mean, described("mean square of the field", "unit length to the fourth")),
             "energy": ("band", mean * surfaces, described("energy on a sphere of frequencies", AREA)),
