@@ -26,6 +26,7 @@ from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import Lock, locked, utc_now
 from sobolev_batch.store.objects import Objects, ends_all, labelled
 from sobolev_batch.store.records import ObjectRecord
+from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.study import Study, StudyLike
 from sobolev_batch.tables.all_objects import write_all
 from sobolev_batch.visible import visible
@@ -170,11 +171,10 @@ def carry_out(
 
     What ends the run of an only object without a name is raised, and what ends those of all objects.
     """
-    place = lock.of_run(location)
-    numbers, equip = {name: n for n, name in enumerate(study.objects, 1)}, cache(equip)
+    place, numbers = lock.of_run(location), {name: n for n, name in enumerate(study.objects, 1)}
+    equip, at_hand = cache(equip), None
     objects = None if "" in study.objects else Objects.prepared(place, study)
-    at_hand = object_run.workspace_at_hand(study, place) if objects is None else None
-    if objects is None and at_hand is None:
+    if objects is None and (at_hand := object_run.workspace_at_hand(study, place)) is None:
         reserve(place, study.title)
     with Heartbeat(location, lock).kept() as heartbeat:
 
@@ -184,59 +184,107 @@ def carry_out(
             heartbeat.advance(f"{begin}{progress.stage}, {progress.done} of {progress.total}")
             notify(replace(progress, part=part))
 
-        def equipped(name: str) -> Cluster:
+        def cluster_of(name: str) -> Cluster:
             cluster, heartbeat.watch = equip()
             # Asked before anything is computed: a GPU that nobody has would be waited for.
             cluster.workers.with_backend(study.backend).require_accuracy(study.accuracy)
             return replace(cluster, notify=partial(beat, name), part=name)
 
-        recorded = {} if objects is None else objects.recorded()
-        whole = frozenset[str]()
+        if objects is None:
+            return _summary(location, {"": _only(study, place, cluster_of, at_hand)})
+        runs = _Runs(study, place, objects, cluster_of)
+        for name, outcome in side_by_side(runs.begun(), runs.is_fatal):
+            runs.end(name, outcome)
+        runs.tabulate()
+    return _summary(location, {name: runs.ended[name] for name in study.objects if name in runs.ended})
+
+
+def _only(study: Study, place: Location, cluster_of: Callable[[str], Cluster], at_hand: Workspace | None) -> Ended:
+    """Run a study of an only object without a name, in its workspace where that is at hand."""
+    if at_hand is not None and (before := object_run.ended_already(at_hand)) is not None:
+        return before
+    runs = [("", object_run.run_object(study, place, cluster_of(""), at_hand))]
+    return next(ended for _, ended in side_by_side(runs, is_fatal=lambda error: True) if isinstance(ended, Ended))
+
+
+class _Runs:
+    """The runs of objects that have names: which have to begin, how each ended, and what the root keeps of it."""
+
+    def __init__(self, study: Study, place: Location, objects: Objects, cluster_of: Callable[[str], Cluster]) -> None:
+        self.study, self.place, self.objects, self.cluster_of = study, place, objects, cluster_of
+        self.recorded, self.ended = objects.recorded(), dict[str, Ended]()
+
+    def begun(self) -> Iterator[tuple[str, Stages[Ended]]]:
+        """Yield the runs of objects of which anything may be missing."""
+        objects, whole = self.objects, frozenset[str]()
         # A run of a part may have left the others no more than its own orders.
-        if objects is not None and objects.tabulated_orders == study.orders:
-            whole = place.names().intersection(objects.tabulated)
-        ended: dict[str, Ended] = {}
+        if objects.tabulated_orders == self.study.orders:
+            whole = self.place.names().intersection(objects.tabulated)
+        for name in self.study.objects:
+            one, record = self.study.of_object(name), self.recorded.get(name)
+            with suppress(InputError):  # Its run says what cannot be listed.
+                if self.study.only and not one.object.chosen(self.study.only):
+                    continue
+            if (before := object_run.ended_before(one, record if name in whole else None)) is not None:
+                self.ended[name] = before
+                continue
+            # What is wrong with the cluster is no fault of an object, and is raised.
+            cluster = self.cluster_of(name)
+            if record is not None and record.key:
+                # Its store may become another one, and this run be killed, and the study be as before again.
+                objects.records.write(objects.rows[name], replace(record, key=""))
+            yield name, object_run.run_object(one, self.place, cluster)
 
-        def runs() -> Iterator[tuple[str, Stages[Ended]]]:
-            for name in study.objects:
-                one = study.of_object(name)
-                with suppress(InputError):  # Its run says what cannot be listed.
-                    if name and study.only and not one.object.chosen(study.only):
-                        continue
-                record = recorded.get(name)
-                known = record if name in whole else None
-                before = object_run.ended_before(one, known) if at_hand is None else object_run.ended_already(at_hand)
-                if before is not None:
-                    ended[name] = before
-                else:
-                    # What is wrong with the cluster is no fault of an object, and is raised.
-                    cluster = equipped(name)
-                    if objects is not None and record is not None and record.key:
-                        # Its store may become another one, and this run be killed, and the study be as before again.
-                        objects.records.write(objects.rows[name], replace(record, key=""))
-                    yield name, object_run.run_object(one, place, cluster, at_hand)
+    def is_fatal(self, error: Exception) -> bool:
+        """Tell whether what ended the run of an object ends those of all."""
+        return ends_all(error) or not isinstance(error, SobolevBatchError)
 
-        def is_fatal(error: Exception) -> bool:
-            return objects is None or ends_all(error) or not isinstance(error, SobolevBatchError)
+    def end(self, name: str, outcome: Ended | Exception) -> None:
+        """Keep how the run of an object ended."""
+        if isinstance(outcome, Exception):
+            _log.error("%s: %s", name, outcome)
+            total = 1
+            with suppress(InputError):
+                total = len(self.study.objects[name].members)
+            outcome = Ended(ObjectRecord(reason=str(outcome), total=total, finished=utc_now()))
+        self.ended[name] = outcome
+        # With its key, the next run would trust the old rows at the root, should this one be killed.
+        has_old_rows = outcome.tables is not None and name in self.objects.tabulated
+        record = replace(outcome.record, key="", settings={}) if has_old_rows else outcome.record
+        self.objects.records.write(self.objects.rows[name], record)
 
-        for name, outcome in side_by_side(runs(), is_fatal):
-            if isinstance(outcome, Exception):
-                _log.error("%s: %s", name, outcome)
-                total = 1
-                with suppress(InputError):
-                    total = len(study.objects[name].members)
-                outcome = Ended(ObjectRecord(reason=str(outcome), total=total, finished=utc_now()))
-            ended[name] = outcome
-            if objects is not None:
-                # With its key, the next run would trust the old rows at the root, should this one be killed.
-                has_old_rows = outcome.tables is not None and name in objects.tabulated
-                record = replace(outcome.record, key="", settings={}) if has_old_rows else outcome.record
-                objects.records.write(objects.rows[name], record)
-        if objects is not None:
-            _tabulate(objects, ended, lambda name: object_run.has_rows_of_now(study.objects[name], recorded.get(name)))
-            _complete_records(objects, recorded, ended)
-            objects.root.remember()
-    return _summary(location, {name: ended[name] for name in study.objects if name in ended})
+    def tabulate(self) -> None:
+        """Write the tables of all objects at the root, if rows of any changed, came, went or have another place.
+
+        Objects that the run left out keep theirs if these are of the study's settings now.
+        """
+        objects, ended = self.objects, self.ended
+        changed = {name: one.tables for name, one in ended.items() if one.tables is not None}
+        # Those that it found to be impossible lose them.
+        lost = {name for name, one in ended.items() if one.record.reason} | changed.keys()
+        left_out = (name for name in objects.tabulated if name in objects.rows and name not in ended)
+        if others := [name for name in left_out if not self._has_rows_of_now(name)]:
+            _log.warning(
+                "%s: %d objects that this run left out, such as %s, have rows of other settings, and none in the "
+                "tables of all until a run of them", *(objects.location, len(others), quoted(others[0])),
+            )  # fmt: skip
+            lost.update(others)
+        kept = [name for name in objects.names if name in objects.tabulated and name not in lost]
+        if changed or kept != [*objects.tabulated]:
+            write_all(objects.root, objects.names, changed.values(), kept)
+        self._collect_records()
+        objects.root.remember()
+
+    def _has_rows_of_now(self, name: str) -> bool:
+        return object_run.has_rows_of_now(self.study.objects[name], self.recorded.get(name))
+
+    def _collect_records(self) -> None:
+        """Collect the records of objects in pages, with the keys of those whose new rows are at the root now."""
+        objects, known = self.objects, {**self.recorded, **{name: one.record for name, one in self.ended.items()}}
+        alone = {*objects.records.collect([known.get(name) for name in objects.names])}
+        for name in objects.tabulated:
+            if name in self.ended and self.ended[name].tables is not None and objects.rows[name] in alone:
+                objects.records.write(objects.rows[name], known[name])
 
 
 def _own_cluster(
@@ -250,35 +298,6 @@ def _own_cluster(
         memory_limit(memory, workers or available_cores())
     # In threads, where no other process would see the store.
     return thread_client(workers) if location.is_in_memory else local_client(workers, memory)
-
-
-def _complete_records(objects: Objects, recorded: Mapping[str, ObjectRecord], ended: Mapping[str, Ended]) -> None:
-    """Collect the records of objects in pages, with the keys of those whose new rows are at the root now."""
-    known = {**recorded, **{name: one.record for name, one in ended.items()}}
-    alone = {*objects.records.collect([known.get(name) for name in objects.names])}
-    for name in objects.tabulated:
-        if name in ended and ended[name].tables is not None and objects.rows[name] in alone:
-            objects.records.write(objects.rows[name], known[name])
-
-
-def _tabulate(objects: Objects, ended: Mapping[str, Ended], is_current: Callable[[str], bool]) -> None:
-    """Write the tables of all objects at the root, where rows of any have changed, came, went or have another place.
-
-    Objects that the run left out keep theirs if these are of the study's settings now.
-    """
-    changed = {name: one.tables for name, one in ended.items() if one.tables is not None}
-    # Those that it found to be impossible lose them.
-    lost = {name for name, one in ended.items() if one.record.reason} | changed.keys()
-    left_out = (name for name in objects.tabulated if name in objects.rows and name not in ended)
-    if others := [name for name in left_out if not is_current(name)]:
-        _log.warning(
-            "%s: %d objects that this run left out, such as %s, have rows of other settings, and none in the tables of "
-            "all until a run of them", *(objects.location, len(others), quoted(others[0])),
-        )  # fmt: skip
-        lost.update(others)
-    kept = [name for name in objects.names if name in objects.tabulated and name not in lost]
-    if changed or kept != [*objects.tabulated]:
-        write_all(objects.root, objects.names, changed.values(), kept)
 
 
 def _summary(location: Location, ended: Mapping[str, Ended]) -> Summary:
