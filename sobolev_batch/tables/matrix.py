@@ -35,7 +35,8 @@ def pairs_of(
     if stored.sizes["other"] != stored.sizes["mesh"]:
         return None
     reference, complete = reference_of(tree), complete_meshes(tree)
-    others = [label for label in complete if label != reference and (among is None or label in among)]
+    wanted = {*complete} if among is None else {*among}
+    others = [label for label in complete if label != reference and label in wanted]
     kept = others[: None if most is None else max(0, most - 1)] + [reference] * (reference in complete)
     return distances_at(tree, order)[["distance", "error"]].sel(order=order, mesh=kept, other=kept).load()
 

@@ -279,7 +279,7 @@ def has_pairs(selection: Selection) -> bool:
 def draw_matrix(selection: Selection, order: float, axes: Axes) -> None:
     """Draw the distances of all pairs as a heat map, with similar meshes beside each other."""
     tree, reference = selection.tree, reference_of(selection.tree)
-    chosen = [label for label, family in families_of(tree).items() if family in selection.families]
+    chosen = {label for label, family in families_of(tree).items() if family in selection.families}
     complete = [label for label in complete_meshes(tree) if label in chosen or label == reference]
     pairs = pairs_of(tree, order, MOST_MESHES, complete)
     if pairs is None:
