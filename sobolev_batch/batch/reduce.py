@@ -68,6 +68,7 @@ class Reduction:
         reason: Why there is no mesh; empty where there is one.
         path: Where the mesh was written; empty without an output.
         mesh: The mesh, where there is no output.
+        remarks: What one should know of the result, a sentence each.
 
     >>> import sobolev_batch as sb
     >>> found = sb.reduce(sb.shapes.icosphere(3), within=0.05)["mesh"]
@@ -83,22 +84,18 @@ class Reduction:
     reason: str = ""
     path: str = ""
     mesh: Mesh | None = field(default=None, repr=False, compare=False)
+    remarks: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         """Return the result in a line."""
         if (best := self.bracket.best) is None:
             return f"{self.name}: {self.reason}"
-        return f"{self.name}: {best.triangles:,} of {self.original_triangles:,} triangles, {len(self.trials)} trials"
+        counts = f"{best.triangles:,} of {self.original_triangles:,} triangles, {len(self.trials)} trials"
+        return "; ".join((f"{self.name}: {counts}", *self.remarks))
 
     def to_row(self) -> dict[str, Any]:
         """Return the row of a table; bounds are lengths in the unit of the meshes, degrees or fractions."""
         best, failed = self.bracket.best, self.bracket.failed
-        crash = f"size {failed.size:g} failed: {failed.reason}" if failed and failed.reason else ""
-        notes = {
-            crash: crash,
-            "not monotone: a finer mesh was farther away": not self.bracket.is_monotone,
-            "no smaller one holds; another method may make one": best and best.triangles >= self.original_triangles,
-        }
         return {
             "object": self.name,
             "measure": self.limit.measure,
@@ -108,7 +105,7 @@ class Reduction:
             "trials": len(self.trials),
             "seconds": sum(one.seconds for one in self.trials),
             "is_monotone": self.bracket.is_monotone,
-            "note": self.reason or "; ".join(text for text, holds in notes.items() if holds),
+            "note": self.reason or "; ".join(self.remarks),
             "path": self.path,
         }
 
@@ -301,7 +298,7 @@ def _searched(search: RecordedSearch, cluster: Callable[[], Any], at_once: Calla
     path = str(folder.below(search.mesh_key)) if isinstance(folder, Location) and not reason else ""
     mesh = None if reason or path else search.mesh(record)
     found = record.triangles, record.trials, search.bracket(record)
-    return Reduction(search.name, search.limit, *found, reason, path, mesh)
+    return Reduction(search.name, search.limit, *found, reason, path, mesh, search.remarks(record))
 
 
 def _originals(meshes: Any, folder: Location | None) -> dict[str, tuple[Member, str]]:

@@ -91,7 +91,7 @@ VARIABLES: Mapping[str, Mapping[str, Any]] = {
     "ordered_by": described("what orders the family: level, triangles, names or time"),
     "row": described("number of the mesh in /fourier", NUMBER),
     "status": described("complete, failed or missing"),
-    "reason": described("reason of a failure"),
+    "reason": described("reason of a failure, or remark on how the mesh was made"),
     "vertices": _count("vertices"),
     "triangles": _count("triangles"),
     "boundary_edges": _count("edges of one triangle"),

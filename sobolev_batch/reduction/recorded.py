@@ -21,6 +21,8 @@ from sobolev_batch.sources.registry import Member, digest_of, load_mesh
 _VERSION = 5
 # Measured peak of a trial: for each triangle of the original, and of the libraries.
 _TRIAL_BYTES, _LEAST_BYTES = 1400, 3e8
+# Sizes more times apart tell whether a remesher uses them: its triangles then follow at least this power of them.
+_APART, _LEAST_POWER = 1.5, 0.1
 
 
 @dataclass(frozen=True)
@@ -138,7 +140,35 @@ class RecordedSearch:
         # Where a mesh was clearly too far away, its upper bound was left where it was.
         nearest = min(self._counted(record), key=lambda one: (one.lower, one.upper))
         found = f"{nearest.triangles:,} triangles, at least {nearest.lower:.4g} away ({self.limit.measure})"
-        return nearest.reason or f"nothing is within the tolerance of {self.limit.value:.4g}; nearest are {found}"
+        text = nearest.reason or f"nothing is within the tolerance of {self.limit.value:.4g}; nearest are {found}"
+        return "; ".join(filter(None, (text, self._unfollowed(record))))
+
+    def remarks(self, record: SearchRecord) -> tuple[str, ...]:
+        """Return what one should know of what was found, a sentence each; nothing where nothing was."""
+        bracket = self.bracket(record)
+        if (best := bracket.best) is None:
+            return ()
+        failed = bracket.failed
+        texts = (
+            f"size {failed.size:g} failed: {failed.reason}" if failed and failed.reason else "",
+            "" if bracket.is_monotone else "not monotone: a finer mesh was farther away",
+            "no smaller one holds; another method may make one" if best.triangles >= record.triangles else "",
+            self._unfollowed(record),
+        )
+        return tuple(filter(None, texts))
+
+    def _unfollowed(self, record: SearchRecord) -> str:
+        """Return a sentence where the remesher makes about as many triangles whatever the size; else nothing."""
+        made = [one for one in record.trials if one.triangles and not self.remesher.keeps(one.size, record.triangles)]
+        pairs = zip(*((one.size, one.triangles) for one in made), strict=True)
+        (low, high), (fewest, most) = [(min(values), max(values)) for values in pairs] or [(1, 1)] * 2
+        if high <= _APART * low or most > fewest * (high / low) ** _LEAST_POWER:
+            return ""
+        name, counts = self.remesher.parameter, " to ".join(f"{one:,}" for one in dict.fromkeys((fewest, most)))
+        return (
+            f"sizes do not follow {name}: asked for {low:g} to {high:g}, the method made {counts} triangles; "
+            f"see whether it uses {name}"
+        )
 
     def mesh(self, record: SearchRecord) -> Mesh:
         """Return the best mesh, which is kept as a PLY file."""

@@ -12,7 +12,7 @@ from sobolev_batch.errors import InputError, MeshError, StudyError, refused_by_p
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.reduction.limit import Limit, tried
-from sobolev_batch.reduction.recorded import RecordedSearch
+from sobolev_batch.reduction.recorded import RecordedSearch, SearchRecord
 from sobolev_batch.reduction.remesher import Remesher, searched_parameter
 from sobolev_batch.sources.files import number_as_text
 from sobolev_batch.sources.names import quoted
@@ -119,10 +119,16 @@ class SearchedMember(Member):
 
     def cost(self) -> Cost | None:
         """Return what all trials took, as far as that is known."""
-        record = None
+        return None if (record := self._recorded()) is None else Cost(sum(one.seconds for one in record.trials))
+
+    def remark(self) -> str:
+        """Return what one should know of what was found, as far as that is known."""
+        return "" if (record := self._recorded()) is None else "; ".join(self.search.remarks(record))
+
+    def _recorded(self) -> SearchRecord | None:
         with suppress(MeshError):
-            record = self.search.recorded()
-        return None if record is None else Cost(sum(one.seconds for one in record.trials))
+            return self.search.recorded()
+        return None
 
     def fingerprint(self) -> Fingerprint:
         """Return the digest of the search."""

@@ -232,6 +232,10 @@ class Member(ABC):
         """Return what making the surface took, where that is recorded."""
         return None
 
+    def remark(self) -> str:
+        """Return what one should know of how the surface was made; empty where that is nothing."""
+        return ""
+
 
 @dataclass(frozen=True)
 class SurfaceMember(Member):

@@ -142,7 +142,7 @@ class Record(_Line):
     Attributes:
         key: Key of the row when the surface was computed: a digest of all that its field depends on.
         status: "complete" or "failed".
-        reason: Reason of the failure; empty otherwise.
+        reason: Reason of the failure, or what one should know of how the surface was made; empty otherwise.
         quality: Data of the field from which errors of norms are computed, see `Quality.to_json`.
         checksums: Checksums of the field's blocks, see `Fields.write`; others mean damage, or another task's field.
         worker: Address of the worker that finished it.

@@ -18,10 +18,10 @@ from sobolev_batch.tables import Format
 from sobolev_batch.tables.open import (
     AnyStore,
     as_tree,
+    doubts_of,
     finished_group,
     has_objects,
     metadata_of,
-    placement_doubts,
     reference_of,
     stores_of,
     study_unit,
@@ -342,7 +342,7 @@ def remarks(tree: xr.DataTree, frame: pd.DataFrame) -> list[str]:
     if "proximity" in tree.children:
         reasons = finished_group(tree, "proximity")["reason"].to_series()
         failures += [f"{mesh} has no proximity: {reason}" for mesh, reason in reasons.items() if reason]
-    return [*failures, *(f"{mesh}: {doubt}" for mesh, doubt in placement_doubts(tree).items())]
+    return [*failures, *(f"{mesh}: {doubt}" for mesh, doubt in doubts_of(tree).items())]
 
 
 def _with_rates(frame: pd.DataFrame, x: str) -> pd.DataFrame:

@@ -311,15 +311,17 @@ def complete_meshes(tree: xr.DataTree) -> list[str]:
     return labels
 
 
-def placement_doubts(tree: xr.DataTree) -> dict[str, str]:
-    """Return why one doubts that a mesh can be compared with the reference, by the label of the mesh."""
+def doubts_of(tree: xr.DataTree) -> dict[str, str]:
+    """Return what one should know of how a mesh was made, or why it may not be comparable, by the label of the mesh."""
     complete, reference = complete_meshes(tree), reference_of(tree)
-    if reference not in complete:
-        return {}
-    texts = tree["fourier"].to_dataset()["quality"].sel(mesh=complete).values.tolist()
-    extents = {label: Quality.from_json(text).extent for label, text in zip(complete, texts, strict=True)}
-    doubts = {label: placement_doubt(extent, extents[reference]) for label, extent in extents.items()}
-    return {label: doubt for label, doubt in doubts.items() if doubt is not None}
+    doubts: dict[str, str | None] = {}
+    if reference in complete:
+        texts = tree["fourier"].to_dataset()["quality"].sel(mesh=complete).values.tolist()
+        extents = {label: Quality.from_json(text).extent for label, text in zip(complete, texts, strict=True)}
+        doubts = {label: placement_doubt(extent, extents[reference]) for label, extent in extents.items()}
+    remarks = finished_group(tree, "meshes", load=False)["reason"].sel(mesh=complete).to_series()
+    both = {str(label): "; ".join(filter(None, (remark, doubts.get(label)))) for label, remark in remarks.items()}
+    return {label: text for label, text in both.items() if text}
 
 
 def unit_of(tree: xr.DataTree) -> tuple[str, float]:

@@ -17,7 +17,8 @@ import sobolev_batch as sb
 from sobolev_batch.batch import reduce as module
 from sobolev_batch.batch.reduce import Reduction, format_reductions
 from sobolev_batch.reduction import limit as limits
-from sobolev_batch.sources.registry import SurfaceMember
+from sobolev_batch.reduction.remesher import Remesher
+from sobolev_batch.sources.registry import SurfaceMember, load_mesh
 from sobolev_batch.store.location import Location
 from tests.geometry.test_deviation import distance_from_triangles, grid
 from tests.support.commands import call, started
@@ -361,6 +362,26 @@ def test_results_that_are_not_monotone_are_told() -> None:
     assert best is not None
     assert best.upper <= 0.1
     assert "not monotone" in format_reductions({"disc": found})
+
+
+@pytest.mark.parametrize(
+    ("within", "ends", "spread"), [(0.3, None, 0), (0.03, None, 0), (0.03, (10, 500), 0), (0.3, None, 20)]
+)
+def test_a_remesher_that_makes_the_same_of_each_size_is_told(
+    within: float, ends: tuple[int, int] | None, spread: int
+) -> None:
+    original, rng = lumpy(3), np.random.default_rng(0)
+    half = load_mesh(Remesher.parse("decimate").member(SurfaceMember("", -1, original, {}), 600))
+
+    def same(mesh: sb.Mesh, triangles: int) -> sb.Mesh:
+        return sb.Mesh(half.vertices, half.triangles[rng.integers(spread + 1) :])
+
+    search = None if ends is None else {"triangles": ends}
+    told = found_by(original, within=within, method=same, search=search)
+    assert "sizes do not follow triangles" in told.to_row()["note"]
+    assert f"{max(one.triangles for one in told.trials if one.size < 1280)} triangles" in told.to_row()["note"]
+    assert "sizes do not follow" in str(told)
+    assert "sizes do not follow" not in str(found_by(original, within=within))
 
 
 def test_a_mesh_that_cannot_be_reduced_is_told() -> None:

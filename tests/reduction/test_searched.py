@@ -24,6 +24,7 @@ from sobolev_batch.sources.registry import Member, load_mesh
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.plan import Plan
+from sobolev_batch.tables.convergence import format_table
 from tests.batch.test_reduce import EndedError, disc, farthest, found_by, lumpy
 from tests.support.commands import call
 
@@ -163,6 +164,20 @@ def test_another_mesh_is_judged_against_the_reference(folder: Path) -> None:
     start["distances"] = [0.2]
     with pytest.raises(sb.errors.MeshError, match=r"tolerance of 0\.1; nearest are \d+ triangles, at least 0\.[12]"):
         member(folder, {**DECIMATED, "mesh": start}, **sections).load()
+
+
+def test_a_remesher_that_makes_the_same_of_each_size_is_told(threads: Client, folder: Path) -> None:
+    def same(mesh: sb.Mesh, triangles: int) -> sb.Mesh:
+        return lumpy(1)
+
+    family = {"name": "same", "source": same, "version": "1"}
+    described = table({**family, "within": 0.5}, {**family, "name": "close", "within": 0.001}, DECIMATED, name="a")
+    described["family"][1]["search"] = {"triangles": [20, 300]}
+    store = folder / "scans.zarr"
+    summary = sb.run(sb.Study.from_table(described, folder=folder), store, client=threads)
+    told = [line for line in format_table(store).split("\n") if "sizes do not follow triangles" in line]
+    assert sorted(line.split()[0] for line in told) == ["close/0.001", "same/0.5:"]
+    assert "sizes do not follow triangles" in summary.failed["close/0.001"]
 
 
 def test_searches_differ_by_their_measure(folder: Path) -> None:

@@ -42,7 +42,7 @@ from sobolev_batch.tables.convergence import (
     unit_notes,
     with_remarks,
 )
-from sobolev_batch.tables.open import finished_group, open_store, placement_doubts, root_attribute, similarity_of
+from sobolev_batch.tables.open import doubts_of, finished_group, open_store, root_attribute, similarity_of
 from sobolev_batch.tables.rendering import Column
 from sobolev_batch.tables.text import minus, percent
 from sobolev_batch.transform.lattice import Lattice
@@ -174,7 +174,7 @@ def study_content(tree: xr.DataTree, status: Status) -> dict[str, Any]:
         "convergence": convergence_table(tree, frame, families, MOST_CONVERGENCE_ROWS // convergence.sizes["order"]),
         "meshes": _meshes_table(meshes, families),
         "omissions": [f"verdict: only {omitted} are shown"] if omitted else [],
-        "doubtful": reasons_table("doubtful", placement_doubts(tree)),
+        "doubtful": reasons_table("doubtful", doubts_of(tree)),
         "rtol": convergence.attrs.get("rtol"),
         "has_proximity": "proximity" in tree.children,
         "units": " ".join(unit_notes([tree])),
