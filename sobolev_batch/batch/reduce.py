@@ -184,7 +184,8 @@ def reduce(
 
     Returns:
         What was found for each mesh, by the name of its file, or "mesh". One that cannot be read, or of which nothing
-        is within the tolerance, has a reason, and does not raise.
+        is within the tolerance, has a reason, and does not raise. Where no smaller mesh held, the original itself is
+        found, and a remark says so.
 
     Raises:
         InputError: A parameter is wrong, or the output would replace a mesh.

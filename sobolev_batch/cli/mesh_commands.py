@@ -277,7 +277,8 @@ def reduce_command(
     tolerance is known. Bounds decide, or samples with their errors. The same command goes on where it was ended. A
     command in METHOD runs in a folder of its own, here or on the workers; {folder} in it is the current one.
 
-    The exit status is 3 if nothing within the tolerance was found for some.
+    The exit status is 3 if nothing within the tolerance was found for some. The original itself is something: where no
+    smaller mesh held, it is what is written, and a note says so.
     """
     from sobolev_batch.batch.reduce import format_reductions, reduce
 

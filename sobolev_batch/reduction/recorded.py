@@ -149,10 +149,12 @@ class RecordedSearch:
         if (best := bracket.best) is None:
             return ()
         failed = bracket.failed
+        is_original = self.remesher.keeps(best.size, record.triangles)
+        itself = ": the smallest of those tried that does is the original itself" if is_original else ""
         texts = (
             f"size {failed.size:g} failed: {failed.reason}" if failed and failed.reason else "",
             "" if bracket.is_monotone else "not monotone: a finer mesh was farther away",
-            "no smaller one holds; another method may make one" if best.triangles >= record.triangles else "",
+            f"no smaller mesh held{itself}; another method may make one" if best.triangles >= record.triangles else "",
             self._unfollowed(record),
         )
         return tuple(filter(None, texts))

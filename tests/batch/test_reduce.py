@@ -319,7 +319,13 @@ def test_a_tolerance_that_nothing_meets_and_one_that_four_triangles_meet() -> No
     itself = found_by(lumpy(2), within=1e-9)
     assert itself.mesh is not None
     assert itself.mesh.digest == lumpy(2).digest
+    assert any("the original itself" in remark for remark in itself.remarks)
+    assert "the original itself" in str(itself)
+    # Another mesh of as many triangles is not the original.
+    alike = found_by(lumpy(2), 1e-9, method=lambda mesh, edge: mesh, search={"edge": (0.5, 1.0)})
+    assert ("another method" in str(alike), "the original itself" in str(alike)) == (True, False)
     least = found_by(lumpy(2), within=5.0)
+    assert least.remarks == ()
     assert least.bracket.best is not None
     assert (least.bracket.best.size, least.bracket.failed, len(least.trials)) == (4, None, 1)
     # The library stops at eight.
@@ -382,6 +388,15 @@ def test_a_remesher_that_makes_the_same_of_each_size_is_told(
     assert f"{max(one.triangles for one in told.trials if one.size < 1280)} triangles" in told.to_row()["note"]
     assert "sizes do not follow" in str(told)
     assert "sizes do not follow" not in str(found_by(original, within=within))
+
+
+def test_the_command_ends_well_only_where_it_wrote_a_mesh_that_holds(tmp_path: Path) -> None:
+    sb.write_mesh(lumpy(2), tmp_path / "scan.ply")
+    words = "reduce", tmp_path / "scan.ply", "--workers", "1", "--output", tmp_path / "reduced", "--within"
+    for within, status in (("0.1", 0), ("1e-9", 0), ("1e-30", 3)):
+        done = call(*words, within)
+        assert (done.returncode, (tmp_path / "reduced" / "scan.ply").exists()) == (status, status == 0)
+        assert ("the original itself" in " ".join(done.stdout.split())) == (within == "1e-9")
 
 
 def test_a_mesh_that_cannot_be_reduced_is_told() -> None:
