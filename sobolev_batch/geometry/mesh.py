@@ -226,6 +226,10 @@ class Mesh:
         >>> sb.Mesh(sphere.vertices, sphere.triangles[:, ::-1]).defects
         ('all triangles face inwards',)
         """
+        return tuple(self._defects.values())
+
+    @property
+    def _defects(self) -> dict[str, str]:
         words = {
             "boundary_edges": ("open edge", ""),
             "nonmanifold_edges": ("edge", " of more than two triangles"),
@@ -235,8 +239,26 @@ class Mesh:
         }
         counts = (self.merged or self).counts
         found = {key: counts[key] for key in words if counts[key]}
-        texts = [f"{n:,} {words[key][0]}{'s' * (n != 1)}{words[key][1]}" for key, n in found.items()]
-        return (*texts, *(["all triangles face inwards"] if self.volume < 0 else []))
+        texts = {key: f"{n:,} {words[key][0]}{'s' * (n != 1)}{words[key][1]}" for key, n in found.items()}
+        return texts | ({"volume": "all triangles face inwards"} if self.volume < 0 else {})
+
+    def damage_beside(self, original: Mesh) -> tuple[str, ...]:
+        """Return in words what a mesh that was made of another one has lost: defects of kinds that this one has not.
+
+        Another number of components, or another Euler characteristic, of parts, handles and holes, counts too.
+
+        >>> import sobolev_batch as sb
+        >>> sphere = sb.shapes.icosphere(1)
+        >>> sb.Mesh(sphere.vertices, sphere.triangles[1:]).damage_beside(sphere)
+        ('3 open edges', 'Euler characteristic 1 (was 2)')
+        """
+        new = [text for kind, text in self._defects.items() if kind not in original._defects]
+        counts, were = ((one.merged or one).counts for one in (self, original))
+        named = {"components": "components", "euler_characteristic": "Euler characteristic"}
+        changes = [
+            f"{name} {counts[key]:,} (was {were[key]:,})" for key, name in named.items() if counts[key] != were[key]
+        ]
+        return (*new, *changes)
 
     @cached_property
     def volume(self) -> float:

@@ -155,5 +155,6 @@ def tried(reference_member: Member, member: Member, limit: Limit, size: float) -
         except InputError as error:
             reason = one_line(error)
     is_within, triangles = bounds[2] <= limit.value * (1 + _EQUAL), 0 if mesh is None else len(mesh.triangles)
-    trial = Trial(float(size), triangles, *bounds, is_within, time.perf_counter() - started, reason)
+    broken = ", ".join(mesh.damage_beside(reference)) if is_within and mesh is not None else ""
+    trial = Trial(float(size), triangles, *bounds, is_within, time.perf_counter() - started, reason, broken)
     return trial, mesh if is_within else None

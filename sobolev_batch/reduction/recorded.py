@@ -150,11 +150,13 @@ class RecordedSearch:
             return ()
         failed = bracket.failed
         is_original = self.remesher.keeps(best.size, record.triangles)
+        of = "original" if self.original is self.reference else "reference"
         itself = ": the smallest of those tried that does is the original itself" if is_original else ""
         texts = (
             f"size {failed.size:g} failed: {failed.reason}" if failed and failed.reason else "",
             "" if bracket.is_monotone else "not monotone: a finer mesh was farther away",
             f"no smaller mesh held{itself}; another method may make one" if best.triangles >= record.triangles else "",
+            best.broken and f"it is broken, unlike the {of}: {best.broken}",
             self._unfollowed(record),
         )
         return tuple(filter(None, texts))

@@ -45,6 +45,7 @@ class Trial:
         is_within: True where the distance is certainly within the limit. An open question counts as not within.
         seconds: Time of making and judging it.
         reason: Why there is no mesh, or no distance.
+        broken: How a mesh within the limit is broken, unlike its reference; see `Mesh.damage_beside`.
     """
 
     size: float
@@ -55,6 +56,7 @@ class Trial:
     is_within: bool = False
     seconds: float = 0.0
     reason: str = ""
+    broken: str = ""
 
 
 @dataclass(frozen=True)

@@ -390,6 +390,27 @@ def test_a_remesher_that_makes_the_same_of_each_size_is_told(
     assert "sizes do not follow" not in str(found_by(original, within=within))
 
 
+@pytest.mark.parametrize("was_open", [False, True])
+def test_what_a_remesher_broke_is_told(was_open: bool, tmp_path: Path) -> None:
+    whole = lumpy(3)
+    sb.write_mesh(sb.Mesh(whole.vertices, whole.triangles[was_open:]), tmp_path / "part.ply")
+
+    def torn(mesh: sb.Mesh, triangles: int) -> sb.Mesh:
+        made = load_mesh(Remesher.parse("decimate").member(SurfaceMember("", -1, mesh, {}), triangles))
+        return sb.Mesh(made.vertices, [*made.triangles[1:-1], made.triangles[-2]])
+
+    for _ in range(2):
+        # Also where it goes on from its record.
+        found = found_by(tmp_path / "part.ply", within=0.3, method=torn, output=tmp_path / "reduced")
+        assert rows(found)[0] < 640
+        for told in (str(found), found.to_row()["note"]):
+            assert "unlike the original: " in told
+            assert "1 duplicate triangle" in told
+            # What was so before is no fault of the remesher.
+            assert ("open edges" in told) == (not was_open)
+    assert found_by(tmp_path / "part.ply", within=0.3).remarks == ()
+
+
 def test_the_command_ends_well_only_where_it_wrote_a_mesh_that_holds(tmp_path: Path) -> None:
     sb.write_mesh(lumpy(2), tmp_path / "scan.ply")
     words = "reduce", tmp_path / "scan.ply", "--workers", "1", "--output", tmp_path / "reduced", "--within"

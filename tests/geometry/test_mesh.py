@@ -6,6 +6,7 @@ import copy
 import pickle
 import re
 import tracemalloc
+from collections.abc import Callable
 from dataclasses import FrozenInstanceError
 from typing import Any
 
@@ -265,3 +266,32 @@ def test_triangles_are_shared_in_any_orientation_and_as_often_as_in_both() -> No
     mine, others = corners[[0, 1, 1, 2]], np.concatenate([corners[[1, 0]][:, [2, 1, 0]], -corners[3:]])
     in_mine, in_others = shared_triangles(mine, others)
     assert (in_mine.tolist(), in_others.tolist()) == ([True, True, False, False], [True, True, False])
+
+
+@pytest.mark.parametrize(
+    ("spoiled", "told"),
+    [
+        (lambda v, t: (v, t[1:]), ("3 open edges", "Euler characteristic 1 (was 2)")),
+        (lambda v, t: (v, [t[0][::-1], *t[1:]]), ("3 edges at which normals flip",)),
+        (lambda v, t: (v, t[:, ::-1]), ("all triangles face inwards",)),
+        (
+            lambda v, t: (v, [*t, t[0]]),
+            (
+                "3 edges of more than two triangles",
+                "1 duplicate triangle, counted twice",
+                "Euler characteristic 3 (was 2)",
+            ),
+        ),
+        (
+            lambda v, t: (np.vstack([v, 2 * v]), np.vstack([t, t + len(v)])),
+            ("components 2 (was 1)", "Euler characteristic 4 (was 2)"),
+        ),
+    ],
+)
+def test_damage_is_what_an_original_has_not(spoiled: Callable[..., Any], told: tuple[str, ...]) -> None:
+    sound, fine = icosphere(1), icosphere(2)
+    broken = Mesh(*spoiled(sound.vertices, sound.triangles))
+    assert broken.damage_beside(fine) == told
+    # It does not depend on counts, nor on seams that double vertices.
+    assert broken.damage_beside(Mesh(*spoiled(fine.vertices, fine.triangles))) == ()
+    assert Mesh(sound.vertices[sound.triangles].reshape(-1, 3), np.arange(240).reshape(-1, 3)).damage_beside(fine) == ()
