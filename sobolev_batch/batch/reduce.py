@@ -39,7 +39,7 @@ from sobolev_batch.reduction.search import PRECISION, Bracket, Trial
 from sobolev_batch.sources.files import FileMember, matching_files, names_of_files
 from sobolev_batch.sources.mesh_cache import InMemory, MeshCache
 from sobolev_batch.sources.names import duplicate_names, label_problem, quoted
-from sobolev_batch.sources.registry import Member, SurfaceMember
+from sobolev_batch.sources.registry import MadeMember, Member, SurfaceMember
 from sobolev_batch.store.location import Location
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.rendering import Column, Section, rendered
@@ -188,7 +188,7 @@ def reduce(
         found, and a remark says so.
 
     Raises:
-        InputError: A parameter is wrong, or the output would replace a mesh.
+        InputError: A parameter is wrong, a mesh is of no known kind, or the output would replace a mesh.
         StoreError: The output cannot be written.
         ClusterError: No cluster could start, or its scheduler was lost.
 
@@ -302,6 +302,21 @@ def _searched(search: RecordedSearch, cluster: Callable[[], Any], at_once: Calla
     return Reduction(search.name, search.limit, *found, reason, path, mesh, search.remarks(record))
 
 
+def _given(name: str, mesh: MeshLike) -> Member:
+    """Return a mesh as a member, which cannot be loaded where the mesh is broken; InputError where it is none."""
+    try:
+        made = as_mesh(mesh)
+    except MeshError as error:
+        return MadeMember(name, -1, _refused, {"refused": (problem := one_line(error))}, (problem,))
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from error
+    return SurfaceMember(name, -1, made, {"mesh": made.digest})
+
+
+def _refused(problem: str) -> Mesh:
+    raise MeshError(problem)
+
+
 def _originals(meshes: Any, folder: Location | None) -> dict[str, tuple[Member, str]]:
     """Return the meshes to reduce by their names, each with the suffix of the file to write into a folder."""
     if isinstance(meshes, str | os.PathLike):
@@ -311,8 +326,7 @@ def _originals(meshes: Any, folder: Location | None) -> dict[str, tuple[Member, 
         names = [*map(str, by_name)]
         if problem := next(filter(None, map(label_problem, names)), None if names else "there is none"):
             raise InputError(f"meshes to reduce need names of their own, found {quoted(names)}: {problem}")
-        made = {str(name): as_mesh(mesh) for name, mesh in by_name.items()}
-        return {name: (SurfaceMember(name, -1, mesh, {"mesh": mesh.digest}), ".ply") for name, mesh in made.items()}
+        return {str(name): (_given(str(name), mesh), ".ply") for name, mesh in by_name.items()}
     paths = list(dict.fromkeys(path for one in meshes for path in matching_files(Path(), os.fspath(one))))
     # Names of files that lie in different folders are whole paths.
     names = ["_".join(part for part in PurePath(name).parts if part != "/") for name in names_of_files(paths)]

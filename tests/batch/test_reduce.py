@@ -509,6 +509,25 @@ def test_meshes_by_name_need_names(names: list[str], message: str) -> None:
         sb.reduce(dict.fromkeys(names, lumpy(1)), 1.0)
 
 
+@pytest.mark.parametrize("on_cluster", [False, True])
+def test_a_broken_mesh_stops_no_other(on_cluster: bool, threads: Client, tmp_path: Path) -> None:
+    options: dict[str, Any] = {"client": threads} if on_cluster else {"workers": 1}
+    broken = [[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0], [0.0, 1.0, 0.0]], [[0, 1, 2]]
+    meshes = {"broken": broken, "sound": lumpy(2), "absent": str(tmp_path / "absent.ply")}
+    found = sb.reduce({**meshes, "broken": lumpy(2)}, 0.1, output=tmp_path / "reduced", **options)
+    assert not found["broken"].reason
+    found = sb.reduce(meshes, 0.1, output=tmp_path / "reduced", **options)
+    assert list(found) == [*meshes]
+    assert rows(found["sound"])[0] < 160
+    assert "NaN" in found["broken"].reason
+    assert "absent.ply" in found["absent"].reason
+    # What was found before, of another mesh of this name, is no result of this one.
+    assert {path.name for path in (tmp_path / "reduced").glob("*.ply")} == {"sound.ply"}
+    assert "NaN" in found_by(broken, within=0.1).reason
+    with pytest.raises(sb.errors.InputError, match=r"^none: .*found int"):
+        sb.reduce({**meshes, "none": 3}, 0.1, **options)
+
+
 def test_no_original_is_replaced(scan: Path) -> None:
     before = scan.read_bytes()
     with pytest.raises(sb.errors.InputError, match="would replace it"):
