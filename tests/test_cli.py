@@ -281,11 +281,15 @@ def test_a_hole_that_was_closed_is_seen(folder: Path) -> None:
         done = call("compare", "full.off", "hole.off", "--within", length, *unit, folder=folder)
         assert (done.returncode, done.stdout.count("\n")) == (status, 1), done.stderr
         assert done.stdout.startswith(f"full.off: {answer}")
+        assert (" of full.off" in done.stdout) == ("largest" in answer)
     (folder / "other").mkdir()
     sb.write_mesh(plate(True), folder / "other/full.off")
     for length in ("2", "1e-4 %"):  # Folders tell files of one name apart.
         done = call("compare", "other/full.off", "full.off", "--within", length, folder=folder)
         assert done.stdout.startswith("other/full.off: "), done.stderr
+    # It names the mesh that has the point, and the area, whichever comes first.
+    turned = output("compare", "hole.off", "full.off", "--within", "2", folder=folder, status=1)
+    assert [" of full.off" in part for part in turned.split(";")] == [True, True]
     one_way = output("compare", "hole.off", "full.off", "--within", "2", "--one-way", folder=folder)
     assert one_way.startswith("hole.off: within 2: largest deviation ")
     for more in ((), ("--within", "2%")):

@@ -146,7 +146,7 @@ class CompareOptions:
             (order,), scaling = self.chosen_orders, not self.no_scaling
             same = same_surface(a, b, tolerance=tolerance, order=order, scaling=scaling, memory=self.memory)
             return f"{self.names[0]}: {same}", vars(same) | numbers | {"distance": same.distance, "error": same.error}
-        near = judge_deviation(a, b, str(self.within), self.unit, one_way=self.one_way)
+        near = judge_deviation(a, b, str(self.within), self.unit, one_way=self.one_way, names=self.names)
         numbers |= {"outcome": near.outcome, "length": near.length, "unit": near.unit, "beyond": near.beyond}
         return f"{self.names[0]}: {near}", numbers | asdict(near.largest) | asdict(near.deviations)
 

@@ -128,6 +128,8 @@ def compare_command(context: click.Context, /, **options: Any) -> None:
         echo_result(chosen.style, visible(line), numbers)
         if write_page is not None:
             write_page(chosen.report, Comparison.of_files(chosen), line)
+            if chosen.style == "text":
+                echo(str(chosen.report))
         context.exit(_STATUSES[numbers["outcome"]])
     found = Comparison.of_files(chosen)
     echo_result(chosen.style, "\n".join(map(visible, found.lines)), found.document)

@@ -197,16 +197,18 @@ def _mean(values: Reals) -> tuple[float, float]:
     return float(values.mean()), float(values.std(ddof=1)) / np.sqrt(len(values))
 
 
-def share_beyond(a: MeshLike, b: MeshLike, length: float, *, one_way: bool = False) -> tuple[float, float]:
+def share_beyond(a: MeshLike, b: MeshLike, length: float, *, one_way: bool = False) -> tuple[float, float, int]:
     """Return the share of the area that is farther from the other mesh than a length, by random points, and its error.
 
-    It is the larger of both directions, or that of the first mesh. The standard error is that for one point more.
+    It is the larger of both directions, or that of the first mesh, and the last number is 1 where it is that of the
+    second one. The standard error is that for one point more.
     """
     meshes = as_mesh(a), as_mesh(b)
     rng, ways, points = np.random.default_rng(0), (meshes, meshes[::-1])[: 1 if one_way else 2], DEFAULT_POINTS
-    count = max(np.count_nonzero(sampled_distances(mesh, other, rng, points) > length) for mesh, other in ways)
+    counts = [np.count_nonzero(sampled_distances(mesh, other, rng, points) > length) for mesh, other in ways]
+    count = max(counts)
     likely = (count + 1) / (points + 2)
-    return count / points, float(np.sqrt(likely * (1 - likely) / points))
+    return count / points, float(np.sqrt(likely * (1 - likely) / points)), counts.index(count)
 
 
 def sampled_distances(mesh: Mesh, other: Mesh, rng: np.random.Generator, points: int, *, signed: bool = False) -> Reals:

@@ -29,6 +29,8 @@ class DeviationVerdict:
         beyond: Share of the area that is farther away, the larger of both directions, and its standard error; zero
             unless some is certainly.
         one_way: True where only the points of the first mesh count.
+        names: Names of the meshes.
+        beyond_of: Number of the mesh that has this share of its area farther away, 0 or 1.
     """
 
     length: float
@@ -36,11 +38,18 @@ class DeviationVerdict:
     deviations: Deviations
     beyond: tuple[float, float] = (0.0, 0.0)
     one_way: bool = False
+    names: tuple[str, str] = ("a", "b")
+    beyond_of: int = 0
 
     @property
     def largest(self) -> Deviation:
         """Bounds of the deviation that counts."""
         return self.deviations.forward if self.one_way else self.deviations.both
+
+    @property
+    def farther(self) -> int:
+        """Number of the mesh of whose points one is farthest away, 0 or 1."""
+        return int(not self.one_way and self.deviations.backward.lower > self.deviations.forward.lower)
 
     @property
     def outcome(self) -> Literal["within", "not within", "undecided"]:
@@ -49,14 +58,15 @@ class DeviationVerdict:
         return "undecided" if is_within is None else "within" if is_within else "not within"
 
     def __str__(self) -> str:
-        """Return the answer with the bounds and the place, and the share of the area beyond the length."""
+        """Return the answer with the bounds and the place on a mesh, and the share of its area beyond the length."""
         length = f"{self.length:.{max(_LENGTH_DIGITS, self._digits)}g}{f' {self.unit}' if self.unit else ''}"
         answer = f"undecided whether within {length}" if self.outcome == "undecided" else f"{self.outcome} {length}"
-        beyond = f"; {percent(*self.beyond)} of the area is farther away" if self.outcome == "not within" else ""
-        largest = self.largest
-        if self.outcome == "not within" and largest.upper > _CLOSE * largest.lower:
-            largest = replace(largest, upper=math.nan)
-        return f"{answer}: largest deviation {deviation_text(largest, self.unit, self._digits)}{beyond}"
+        largest, beyond = self.largest, ""
+        if self.outcome == "not within":
+            beyond = f"; {percent(*self.beyond)} of the area of {self.names[self.beyond_of]} is farther away"
+            largest = replace(largest, upper=math.nan) if largest.upper > _CLOSE * largest.lower else largest
+        deviation = f"{deviation_text(largest, self.unit, self._digits)} of {self.names[self.farther]}"
+        return f"{answer}: largest deviation {deviation}{beyond}"
 
     @property
     def _digits(self) -> int:
@@ -68,14 +78,21 @@ class DeviationVerdict:
 
 
 def judge_deviation(
-    a: MeshLike, b: MeshLike, length: float | str, unit: str | None = None, *, one_way: bool = False
+    a: MeshLike,
+    b: MeshLike,
+    length: float | str,
+    unit: str | None = None,
+    *,
+    one_way: bool = False,
+    names: tuple[str, str] = ("a", "b"),
 ) -> DeviationVerdict:
-    """Return whether the largest deviation of two meshes is within a length; see `assert_within`."""
+    """Return whether the largest deviation of two meshes, with names, is within a length; see `assert_within`."""
     limit = length_in(length, unit)
-    verdict = DeviationVerdict(limit, unit, largest_deviation(a, b, within=limit), one_way=one_way)
+    verdict = DeviationVerdict(limit, unit, largest_deviation(a, b, within=limit), one_way=one_way, names=names)
     if verdict.outcome != "not within":
         return verdict
-    return replace(verdict, beyond=share_beyond(a, b, limit, one_way=one_way))
+    share, error, of = share_beyond(a, b, limit, one_way=one_way)
+    return replace(verdict, beyond=(share, error), beyond_of=of if share else verdict.farther)
 
 
 def assert_within(
@@ -108,7 +125,7 @@ def assert_within(
     >>> sb.testing.assert_within(coarse, fine, 0.001)
     Traceback (most recent call last):
         ...
-    AssertionError: not within 0.001: largest deviation ≥ 0.00..., at (...); 9... % of the area is farther away
+    AssertionError: not within 0.001: largest deviation ≥ 0.00..., at (...) of b; 9... % of the area of b is ...
     """
     __tracebackhide__ = True
     verdict = judge_deviation(a, b, length, unit, one_way=one_way)

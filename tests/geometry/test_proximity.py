@@ -230,10 +230,12 @@ def test_the_bias_is_the_mean_distance_with_its_sign() -> None:
 
 def test_the_share_of_the_area_beyond_a_length() -> None:
     # A square of side 4 around one of side 2: all but what is within the threshold of the smaller one.
-    share, error = share_beyond(square(2.0), square(4.0), 0.5)
+    share, error, of = share_beyond(square(2.0), square(4.0), 0.5)
+    assert of == 1
+    assert share_beyond(square(4.0), square(2.0), 0.5)[2] == 0
     assert 0 < error < 0.01
     assert abs(share - (1 - (4 + 4 * 2 * 0.5 + np.pi * 0.5**2) / 16)) < 4 * error
-    share, error = share_beyond(square(4.0), square(4.0, 0.25), 0.26)
+    share, error, _ = share_beyond(square(4.0), square(4.0, 0.25), 0.26)
     assert (share, error) == pytest.approx((0.0, 1e-4), rel=0.01)
 
 

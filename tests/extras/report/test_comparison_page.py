@@ -27,6 +27,8 @@ def made_page(folder: Path, *options: str, status: int = 0) -> Path:
     sb.write_mesh(sb.Mesh(10 * ball.vertices + 1000, ball.triangles), folder / "in.off")
     done = call("compare", NAME, "in.off", "--unit", "mm", "--report", "page.html", *options, folder=folder)
     assert done.returncode == status, done.stderr
+    # Its path is the last line, also after a verdict.
+    assert done.stdout.splitlines()[-1] == "page.html"
     return folder / "page.html"
 
 
@@ -52,6 +54,14 @@ def test_its_charts_hold_what_was_measured(tmp_path: Path) -> None:
     assert shares[0][x < -0.1].sum() == shares[1][x > 0.1].sum() == 0
     assert sum(data["bands"]["shares"]) == pytest.approx(1.0, abs=1e-2)
     assert data["bands"]["texts"][0].startswith("> ")
+
+
+@pytest.mark.slow
+def test_a_verdict_has_a_page(tmp_path: Path) -> None:
+    assert "not within 1 mm" in made_page(tmp_path, "--within", "1mm", status=1).read_text()
+    done = call("compare", "in.off", NAME, "--below", "1%", "--report", "other.html", folder=tmp_path)
+    assert (done.returncode, done.stdout.splitlines()[-1]) == (1, "other.html")
+    assert (tmp_path / "other.html").exists()
 
 
 @pytest.mark.slow
