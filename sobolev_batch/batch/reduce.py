@@ -95,7 +95,10 @@ class Reduction:
 
     def to_row(self) -> dict[str, Any]:
         """Return the row of a table; bounds are lengths in the unit of the meshes, degrees or fractions."""
-        best, failed = self.bracket.best, self.bracket.failed
+        best, failed = (
+            replace(one, lower=1 - one.upper, upper=1 - one.lower) if one and self.limit.is_score else one
+            for one in (self.bracket.best, self.bracket.failed)
+        )
         return {
             "object": self.name,
             "measure": self.limit.measure,
@@ -135,7 +138,8 @@ def format_reductions(found: Mapping[str, Reduction], style: Format = "text", un
     frame = frame.astype({"triangles": "Int64", "failed_triangles": "Int64"})
     title = VARIABLES[limit.measure]["long_name"].removeprefix("lower bound of the ")
     of = {HAUSDORFF: "", RELATIVE: f" at order {limit.order or 0:g}"}.get(limit.measure, f": {title}")
-    caption = f"fewest triangles within {factor * limit.value:.6g}{sign}{of}"
+    within = "of at least" if limit.is_score else "within"
+    caption = f"fewest triangles {within} {factor * limit.value:.6g}{sign}{of}"
     return rendered(style, frame, [Section(caption, [(columns, frame)])], [])
 
 
@@ -167,7 +171,8 @@ def reduce(
         measure: What is to be within the tolerance, by its column in tables: "hausdorff", the largest deviation;
             "relative", this distance; "area" or "volume", of which the change counts; or another number of `proximity`,
             such as "rms", "mean_forward", "p95", "bias" or "normal_mean" (in degrees), with its error at 99 %: those of
-            10,000 points, which may miss a spot.
+            10,000 points, which may miss a spot. Of "fscore", "precision" and "recall", with points matched within 1 %
+            of the radius, the tolerance is the least that is permitted, such as "95%".
         unit: Name of the unit of the files, which a length with a unit needs.
         method: Name of a source that makes meshes of a number of triangles ("decimate", "remesh"); a command with
             {input}, {output} and a parameter, which thereby is permitted to run; a function of a mesh and a parameter;

@@ -242,7 +242,9 @@ def _range(context: click.Context, param: click.Parameter, value: str | None) ->
     help="Keep the largest deviation within a length, such as 0.1mm, or the distance within 1% of the norm.",
 )
 @click.option("--order", type=float, help=f"Measure this fraction at an order below -1/2. [default: {DEFAULT_ORDER:g}]")
-@click.option("--measure", metavar="COLUMN", help="Keep rms, mean, p95, area or another column within the tolerance.")
+@click.option(
+    "--measure", metavar="COLUMN", help="Keep rms, mean, area or another column within TOLERANCE, or fscore above."
+)
 @click.option("--unit", metavar="NAME", help="Name the unit of length of the files, such as mm.")
 @click.option(
     *("--with", "method"),

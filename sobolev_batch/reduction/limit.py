@@ -6,6 +6,7 @@ A question that is clear is answered early: bounds are only as close as it needs
 import math
 import re
 import time
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Self
@@ -15,7 +16,7 @@ from sobolev_batch.errors import InputError, MeshError, one_line
 from sobolev_batch.geometry.closest import Triangles
 from sobolev_batch.geometry.deviation import largest_deviation
 from sobolev_batch.geometry.mesh import Mesh
-from sobolev_batch.geometry.proximity import DEFAULT_POINTS, NUMBERS, sampled_numbers
+from sobolev_batch.geometry.proximity import DEFAULT_POINTS, METRICS, NUMBERS, sampled_numbers
 from sobolev_batch.geometry.surface import Similarity
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.accuracy.threshold import relative_distance
@@ -34,9 +35,10 @@ _ANY_ACCURACY = Accuracy(1e-2)
 _THREADS, _SEED = 1, 0
 # A limit that is met up to this fraction is met.
 _EQUAL = 1e-9
-# The measures where none is named, those whose change counts, and all: zero for the reference, with bounds or an error.
-HAUSDORFF, RELATIVE, _OF_ONE_MESH = "hausdorff", "relative", ("area", "volume")
-_OTHERS = re.compile("upper|error|threshold|fscore|precision|recall|normal_max")
+# The measures where none is named, those whose change counts, and those of which more is better; and all, with bounds
+# or an error, which are zero for the reference, or one.
+HAUSDORFF, RELATIVE, _OF_ONE_MESH, _SCORES = "hausdorff", "relative", ("area", "volume"), (*METRICS["fscore"],)
+_OTHERS = re.compile("upper|error|threshold|normal_max")
 _MEASURES = (RELATIVE, *(name for name in NUMBERS if not _OTHERS.search(name)), *_OF_ONE_MESH)
 
 
@@ -45,7 +47,8 @@ class Limit:
     """Largest distance of a mesh from the one that it was made of, by one measure.
 
     Attributes:
-        value: Largest value of the measure, of either sign: a length in the unit of the meshes, degrees or a fraction.
+        value: Largest value of the measure, of either sign: a length in the unit of the meshes, degrees or a fraction;
+            of "fscore", "precision" and "recall", the smallest.
         measure: Column of tables: "hausdorff", the largest deviation, of each point of either mesh from the closest one
             of the other; "relative", the Sobolev distance over the norm of the original, in the unit in which its
             bounding sphere has the radius 1; "area" or "volume", its change over that of the original; or another one
@@ -73,6 +76,11 @@ class Limit:
         """
         is_relative = order is not None or str(within).rstrip().endswith("%")
         column = (RELATIVE if is_relative else HAUSDORFF) if measure is None else str(measure)
+        if column not in _MEASURES and column in VARIABLES:
+            raise InputError(
+                f"{column} cannot be a limit: it is no distance, change or score of a mesh beside its original with "
+                f"bounds or an error; {known_names('', _MEASURES)}"
+            )
         if column not in _MEASURES:
             raise InputError(f"no measure is named {quoted(column)}; {known_names(column, _MEASURES)}")
         if order is not None and column != RELATIVE:
@@ -102,8 +110,25 @@ class Limit:
         """Units of the column: `FILE_LENGTH`, `ANGLE`, or others, in which the value is a fraction."""
         return str(VARIABLES[self.measure]["units"])
 
+    @property
+    def is_score(self) -> bool:
+        """True for a measure of which more is better."""
+        return self.measure in _SCORES
+
+    @property
+    def largest(self) -> float:
+        """Largest distance: the value, or what is left from it to the best score."""
+        return 1 - self.value if self.is_score else self.value
+
     def bounds(self, mesh: Mesh, reference: Mesh) -> tuple[float, float, float]:
-        """Return an estimate of the distance of a mesh from a reference, a lower and an upper bound."""
+        """Return an estimate of the distance of a mesh from a reference, a lower and an upper bound.
+
+        That of a score is what it lacks to one.
+        """
+        if self.is_score:
+            numbers = sampled_numbers(Triangles(mesh), Triangles(reference), signed=False)
+            lower, upper = (max(0.0, 1 - score) for score in _score_ends(numbers, self.measure))
+            return upper, lower, upper
         if self.order is None and not self.measure.startswith(HAUSDORFF):
             value, error = self._value(mesh, reference)
             # What decides.
@@ -135,6 +160,21 @@ class Limit:
         return value, error
 
 
+def _score_ends(numbers: Mapping[str, float], measure: str) -> Iterator[float]:
+    """Yield the largest and the smallest score that random points permit at 99 %.
+
+    Source: E. B. Wilson, "Probable inference, the law of succession, and statistical inference" (1927),
+    doi:10.1080/01621459.1927.10502953, whose interval has a width also where all points are matched.
+    """
+    count, square = DEFAULT_POINTS, float(quantile(DEFAULT_POINTS - 1)) ** 2
+    shares = numbers["precision"], numbers["recall"]
+    widths = [math.sqrt(square * (count * share * (1 - share) + square / 4)) for share in shares]
+    for sign in (1, -1):
+        pairs = zip(shares, widths, strict=True)
+        ends = [(count * share + square / 2 + sign * width) / (count + square) for share, width in pairs]
+        yield dict(zip(_SCORES, (2 * math.prod(ends) / (sum(ends) or 1.0), *ends), strict=True))[measure]
+
+
 def tried(reference_member: Member, member: Member, limit: Limit, size: float) -> tuple[Trial, Mesh | None]:
     """Make a mesh and judge it against a reference.
 
@@ -154,7 +194,7 @@ def tried(reference_member: Member, member: Member, limit: Limit, size: float) -
             bounds = limit.bounds(mesh, reference)
         except InputError as error:
             reason = one_line(error)
-    is_within, triangles = bounds[2] <= limit.value * (1 + _EQUAL), 0 if mesh is None else len(mesh.triangles)
+    is_within, triangles = bounds[2] <= limit.largest * (1 + _EQUAL), 0 if mesh is None else len(mesh.triangles)
     broken = ", ".join(mesh.damage_beside(reference)) if is_within and mesh is not None else ""
     trial = Trial(float(size), triangles, *bounds, is_within, time.perf_counter() - started, reason, broken)
     return trial, mesh if is_within else None

@@ -139,8 +139,9 @@ class RecordedSearch:
             return ""
         # Where a mesh was clearly too far away, its upper bound was left where it was.
         nearest = min(self._counted(record), key=lambda one: (one.lower, one.upper))
-        found = f"{nearest.triangles:,} triangles, at least {nearest.lower:.4g} away ({self.limit.measure})"
-        text = nearest.reason or f"nothing is within the tolerance of {self.limit.value:.4g}; nearest are {found}"
+        measure = f"{'1 - ' * self.limit.is_score}{self.limit.measure}"
+        found = f"{nearest.triangles:,} triangles, at least {nearest.lower:.4g} away ({measure})"
+        text = nearest.reason or f"nothing is within the tolerance of {self.limit.largest:.4g}; nearest are {found}"
         return "; ".join(filter(None, (text, self._unfollowed(record))))
 
     def remarks(self, record: SearchRecord) -> tuple[str, ...]:

@@ -107,10 +107,10 @@ class Remesher:
         """Return the search for a mesh of some triangles and radius that is to be within a limit of itself."""
         low, high = self.ends or (min(_FEWEST, triangles), triangles)
         if self.parameter != _TRIANGLES:
-            return Search(limit.value, low, high, self.is_whole, precision=precision)
-        fraction = limit.value / {FILE_LENGTH: radius, ANGLE: 90.0}.get(limit.units, 1.0)
+            return Search(limit.largest, low, high, self.is_whole, precision=precision)
+        fraction = limit.largest / {FILE_LENGTH: radius, ANGLE: 90.0}.get(limit.units, 1.0)
         first = max(low, min(_FIRST / fraction, high / 2))
-        return Search(limit.value, low, high, self.is_whole, False, first, precision)
+        return Search(limit.largest, low, high, self.is_whole, False, first, precision)
 
     def keeps(self, size: float, triangles: float) -> bool:
         """Tell whether the mesh of one size is the original itself, which has no more triangles."""

@@ -159,6 +159,30 @@ def test_a_number_of_random_points_is_within_the_tolerance_with_its_error(measur
     assert f"within {limit:g}{'°' if measure == 'normal_mean' else ' mm'}: " in text
 
 
+@pytest.mark.parametrize("measure", ["fscore", "precision", "recall"])
+def test_a_score_is_at_least_the_tolerance_with_its_error(measure: str) -> None:
+    original, found = lumpy(3), found_by(lumpy(3), "90%", measure=measure)
+    best, row = found.bracket.best, found.to_row()
+    assert best is not None
+    assert found.mesh is not None
+    assert best.triangles < 640
+    # With the default threshold of `proximity`, of more and other points, and nearer to the tolerance than 5 %.
+    more = sb.proximity(found.mesh, original, points=50_000, seed=1)[measure]
+    assert 0.9 <= row["lower"] < more < row["upper"] < 0.95
+    assert row["failed_lower"] < 0.9
+    assert (row["upper"] - row["lower"]) / 2 == pytest.approx(2.5763 * np.sqrt(more * (1 - more) / 10_000), rel=0.5)
+    shown = format_reductions({"lumpy": found})
+    assert "of at least 90 %: " in shown
+    assert f"{measure} " in shown
+    stricter = found_by(lumpy(3), "99%", measure=measure).bracket.best
+    assert stricter is not None
+    assert stricter.triangles > best.triangles
+    nothing = found_by(lumpy(3), 0.9, measure=measure, search={"triangles": (4, 20)})
+    assert f"(1 - {measure})" in nothing.reason
+    # No sample proves that all of the area is matched.
+    assert found_by(original, 1 - 1e-6, measure=measure).reason
+
+
 def test_degrees_are_read_as_they_are_written() -> None:
     assert limits.Limit.parse("8 °", measure="normal_mean") == limits.Limit(8.0, "normal_mean")
 
@@ -470,10 +494,9 @@ def test_several_meshes_on_a_cluster(client: Client, scan: Path, tmp_path: Path)
         ({"within": "110%"}, "below 1"),
         ({"within": 0.0}, "a positive number"),
         ({"within": 1.0, "measure": "rsm"}, "no measure is named 'rsm'; did you mean rms?"),
-        (
-            {"within": 1.0, "measure": "fscore"},
-            "no measure is named 'fscore'; known are relative, hausdorff, .*, volume",
-        ),
+        ({"within": 1.0, "measure": "normal_max"}, "normal_max cannot be a limit: .*; known are relative, .*, volume"),
+        ({"within": 1.0, "measure": "smallest_angle"}, "smallest_angle cannot be a limit"),
+        ({"within": 1.0, "measure": "fscore"}, "a fraction of the fscore below 1"),
         ({"within": 1.0, "measure": 3}, "no measure is named '3'; known are"),
         ({"within": "1%", "measure": "rms"}, "rms is a length"),
         ({"within": "1%", "measure": "area", "order": -2.0}, "area has no order"),
