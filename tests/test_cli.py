@@ -303,6 +303,9 @@ def test_a_hole_that_was_closed_is_seen(folder: Path) -> None:
     # What is 2 from the rim of the hole is a millionth of the plate.
     share, error = found["beyond"]
     assert 0 <= share < 4 * error < 1e-3
+    assert found["beyond_of"] == "a"
+    assert document("compare", "hole.off", "full.off", "--within", "2", folder=folder, status=1)["beyond_of"] == "b"
+    assert document("compare", "hole.off", "full.off", "--within", "4", folder=folder)["beyond_of"] is None
 
 
 def document(*arguments: str, folder: Path, status: int = 0) -> dict[str, Any]:
