@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 from sobolev_batch.arrays import Indices, Reals
-from sobolev_batch.compiled import loop
+from sobolev_batch.compiled import loop, part
 
 
 @loop
@@ -49,11 +49,10 @@ def add_potentials(
             for node in range(ends[rule], ends[rule + 1]):
                 p, q, r = nodes[node, 0], nodes[node, 1], nodes[node, 2]
                 dx, dy, dz = p * ax + q * bx + r * cx, p * ay + q * by + r * cy, p * az + q * bz + r * cz
-                entry, fraction = _place(dx * dx + dy * dy + dz * dz, tables)
+                place = _place(dx * dx + dy * dy + dz * dz, tables)
                 weight = sign * doubled / 2 * nodes[node, 3]
                 for order in range(out.shape[1]):
-                    low = values[entry, order]
-                    out[row, order] += weight * (low + fraction * (values[entry + 1, order] - low))
+                    out[row, order] += weight * _looked_up(values, place, order)
             continue
         nx, ny, nz = nx / doubled, ny / doubled, nz / doubled
         height = nx * ax + ny * ay + nz * az
@@ -66,16 +65,23 @@ def add_potentials(
 
 @loop
 def _place(square: float, tables: Any) -> Any:
-    """Return the entry of a table before d², and how far behind it that lies."""
+    """Return the entry of a table nearest to d², and the weights of those before and behind it."""
     cutoff, reach, start, step, values = tables[0], tables[1], tables[2], tables[3], tables[6]
     relative = math.sqrt(min(max(square, (tables[7] / cutoff) ** 2), reach * reach)) * cutoff / tables[8]
     place = ((math.log(relative) if relative < 1 else relative - 1) - start) / step
-    place = min(place, len(values) - 1.0001)
-    if place < 0:
-        place = 0.0
+    place = max(min(place, len(values) - 1.5001), 0.0)
     # NaN has no entry, and stays what it is.
-    entry = int(place) if place == place else 0
-    return entry, place - entry
+    entry = int(place + 0.5) if place > 1 else 1
+    low, high = 0.5 - (place - entry), 0.5 + (place - entry)
+    return entry, low * low / 2, high * high / 2
+
+
+@part
+def _looked_up(table: Reals, place: Any, order: int) -> Any:
+    """Return the value of a table at a place: see `Kernels.looked_up`."""
+    entry, low, high = place
+    middle = table[entry, order]
+    return middle + low * (table[entry - 1, order] - middle) + high * (table[entry + 1, order] - middle)
 
 
 @loop
@@ -111,15 +117,13 @@ def _add_span(
     q, square = max(abs(offset), tables[7] * reach), height * height
     farthest = math.sqrt(max(reach * reach - square - q * q, 0.0))
     begin, end = min(near, farthest), min(far, farthest)
-    level, level_fraction = _place(square, tables)
+    level = _place(square, tables)
     outside = math.atan2(far, q) - math.atan2(end, q) if far > end else 0.0
     if near > begin:
         outside -= math.atan2(near, q) - math.atan2(begin, q)
     low, last = min(math.asinh(begin / q), last_t), min(math.asinh(end / q), last_t)
     for order in range(out.shape[1]):
-        base = drops[level, order]
-        base += level_fraction * (drops[level + 1, order] - base)
-        out[row, order] += sign * outside * (totals[order] - base)
+        out[row, order] += sign * outside * (totals[order] - _looked_up(drops, level, order))
     angle, half = 0.0, nodes.shape[1] // 2
     while low < last:
         widest = math.exp(low)
@@ -131,12 +135,10 @@ def _add_span(
             for growth in (middle * factor, middle / factor):
                 widening = (growth + 1 / growth) / 2
                 weight = sign * nodes[1, half + node] / 2 * (high - low) / widening
-                entry, fraction = _place(square + (q * widening) ** 2, tables)
+                place = _place(square + (q * widening) ** 2, tables)
                 angle += weight
                 for order in range(out.shape[1]):
-                    found = drops[entry, order]
-                    out[row, order] += weight * (found + fraction * (drops[entry + 1, order] - found))
+                    out[row, order] += weight * _looked_up(drops, place, order)
         low = high
     for order in range(out.shape[1]):
-        base = drops[level, order]
-        out[row, order] -= angle * (base + level_fraction * (drops[level + 1, order] - base))
+        out[row, order] -= angle * _looked_up(drops, level, order)

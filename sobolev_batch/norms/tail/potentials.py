@@ -34,8 +34,8 @@ from sobolev_batch.transform.rules import symmetric_rule
 # with a share of the time that loops take to load.
 _ON_ARRAYS, _COMPILED, _START = (1e-6, 4e-7), (5e-7, 5e-8), 0.15
 # Distances in wavelengths 1/X between which kernels are tabulated. The smaller one is rounding. Beyond the larger one,
-# which depends on the order, they are below 1 % of what they are at zero, and from this fraction of it on they fade.
-_LEAST, _FADE = 1e-12, 0.75
+# which depends on the order, they are below 1 % of what they are at zero, and between these fractions of it they fade.
+_LEAST, _FADE = 1e-12, (0.75, 0.999)
 _REACHES = (-4.0, -3.0, -2.0, -1.0), (12.0, 10.0, 8.0, 6.0)
 # Entries of a table up to the reach, how many times as many are interpolated, and where equal steps begin.
 _ENTRIES, _DENSER, _LINEAR_FROM = 1500, 8, 0.3
@@ -119,12 +119,27 @@ class Kernels:
         return cls(cutoff, tuple(orders), fineness, reach, start, step, totals, drops, values)
 
     def looked_up(self, table: Array, squares: Array) -> Array:
-        """Return a table's values at each d², (..., orders)."""
+        """Return a table's values at each d², (..., orders), by quadratic splines.
+
+        A face has one height above a parallel one. Straight lines would lose second differences, which a distance is
+        made of, of moves by less than a step of the table.
+        """
         squares = np.minimum(np.maximum(squares, (_LEAST / self.cutoff) ** 2), self.reach**2)
-        places = np.minimum((_scale(np.sqrt(squares), self.cutoff) - self.start) / self.step, len(table) - 1.0001)
-        entries = np.where(places > 0, places, 0.0).astype(np.int64)  # NaN stays what it is
-        low = table[entries]
-        return low + (places - entries)[..., None] * (table[entries + 1] - low)
+        places = np.minimum((_scale(np.sqrt(squares), self.cutoff) - self.start) / self.step, len(table) - 1.5001)
+        entries = np.where(places > 1, places + 0.5, 1.0).astype(np.int64)  # NaN stays what it is
+        offsets, middle = np.maximum(places, 0.0) - entries, table[entries]
+        low, high = (
+            ((0.5 - offsets) * (0.5 - offsets) / 2)[..., None],
+            ((0.5 + offsets) * (0.5 + offsets) / 2)[..., None],
+        )
+        return middle + low * (table[entries - 1] - middle) + high * (table[entries + 1] - middle)
+
+
+def _splines(values: Reals) -> Reals:
+    """Return the coefficients of the quadratic spline, whose knots are midway between entries, near values (n,)."""
+    coefficients = values.copy()
+    coefficients[1:-1] -= np.diff(values, 2) / 8
+    return coefficients
 
 
 def _scale(distances: Array, cutoff: float) -> Array:
@@ -171,11 +186,12 @@ def _tables(cutoff: float, order: float, fineness: int) -> tuple[float, Reals, R
     fine = np.linspace(start, end, len(dense))
     distances = _distances(fine, cutoff)
     # What is left at the reach is cut without a jump, and distances of rounding are none.
-    faded = np.clip((distances / reach - _FADE) / (1 - _FADE), 0.0, 1.0)
+    faded = np.clip((distances / reach - _FADE[0]) / (_FADE[1] - _FADE[0]), 0.0, 1.0)
     dense = total + (dense - total) * np.cos(np.pi / 2 * faded) ** 2
-    dense[0] = 0.0
     values = np.gradient(dense, fine) / np.minimum(distances, _LINEAR_FROM / cutoff) / distances
     values[-2:] = 0.0
+    dense, values = _splines(dense), _splines(values)
+    dense[:3] = 0.0
     return total, dense, values
 
 

@@ -144,3 +144,22 @@ def test_a_look_at_each_pair_finds_what_trees_find(cutoff: float, monkeypatch: p
         found.append((potentials.add_of_triangles(sums, points, triangles, kernels), sums))
     assert found[0][0] == found[1][0] > 1000
     np.testing.assert_allclose(found[0][1], found[1][1], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_second_differences_hold_for_moves_far_below_the_steps_of_the_tables(compiled: bool) -> None:
+    kernels, height, count = Kernels.of_orders(CUTOFF, (-1.0, -1.5, -3.0)), 0.008, 20
+    points = np.array([0.003, 0.004, 0.0]) + 1e-3 * np.random.default_rng(0).random((count, 3)) * [1, 1, 0]
+    corners = np.tile(np.array([[0.0, 0.0, height], [0.011, 0.0, height], [0.0, 0.013, height]]), (count, 1, 1))
+
+    def seen(move: float) -> Reals:
+        moved, rows = corners + np.array([0.0, 0.0, move]), np.arange(count)
+        if not compiled:
+            return np.asarray(of_triangles(points, moved, kernels))
+        found = np.zeros((count, 3))
+        add_compiled(found, points, SignedTriangles(moved, np.ones(count)), (rows, rows), kernels, 1)
+        return found
+
+    # From far larger moves, which differ by their fourth powers.
+    small, large = ((seen(move) + seen(-move) - 2 * seen(0.0)) / move**2 for move in (4e-6, 2e-4))
+    assert small.mean(axis=0) == pytest.approx(large.mean(axis=0), rel=0.1)
