@@ -11,8 +11,18 @@ from uuid import uuid4
 from sobolev_batch.visible import visible
 
 __all__ = [
-    *("AccuracyError", "BackendError", "ClusterError", "DamageError", "InputError", "LatticeError", "LockError"),
-    *("MemoryLimitError", "MeshError", "OrderError", "SobolevBatchError", "SpaceError", "StoreError", "StudyError"),
+    *("AccuracyError", "BackendError", "ClusterError", "DamageError", "ForeignError", "InputError"),
+    *(
+        "LatticeError",
+        "LockError",
+        "MemoryLimitError",
+        "MeshError",
+        "OrderError",
+        "SobolevBatchError",
+        "SpaceError",
+        "StoreError",
+        "StudyError",
+    ),
 ]
 
 # Characters of another library's message that are worth keeping.
@@ -139,16 +149,18 @@ def written(place: object, what: str, kind: type[InputError] = StoreError) -> It
     """Turn a failure to write a file into an error that says what cannot be written, where, and why."""
     try:
         yield
-    except OSError as error:
+    except (OSError, ValueError) as error:  # the latter for a null character in the name
         kind = SpaceError if is_for_want_of_space(error) else kind
-        raise kind(f"{place}: {what} cannot be written there: {error.strerror or error}") from error
+        reason = getattr(error, "strerror", None) or error
+        raise kind(f"{place}: {what} cannot be written there: {reason}") from error
 
 
 @contextmanager
 def new_file_beside(path: Path, what: str, kind: type[InputError] = StoreError) -> Iterator[IO[bytes]]:
     """Open a file that may replace another one, and is gone at the end unless it has; see `written`."""
-    # A link stays, and may lead to another disk.
-    place = Path(os.path.realpath(path)).with_name(f".{uuid4().hex}{path.suffix}")
+    with written(path, what, kind):
+        # A link stays, and may lead to another disk.
+        place = Path(os.path.realpath(path)).with_name(f".{uuid4().hex}{path.suffix}")
     try:
         with written(path, what, kind), place.open("xb") as file:
             yield file
@@ -191,9 +203,10 @@ def from_extra(extra: str, purpose: str, kind: type[InputError] = InputError) ->
 
 
 @contextmanager
-def naming(what: str) -> Iterator[None]:
-    """Name in a StudyError what it is about, unless that is empty."""
+def naming(what: str, kind: type[InputError] = StudyError) -> Iterator[None]:
+    """Name in an error of a kind what it is about, unless that is empty."""
     try:
         yield
-    except StudyError as error:
-        raise StudyError(f"{what}: {error}" if what else str(error)) from error
+    except kind as error:
+        error.args = (f"{what}: {error}" if what else str(error), *error.args[1:])
+        raise

@@ -1,12 +1,13 @@
-"""Parameters of the public interface: numbers, names, lengths, paths and sizes of memory, checked where they enter."""
+"""Parameters of the public interface: numbers, names, lengths, paths, functions and more, checked where they enter."""
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Collection, Iterable
 from numbers import Integral
 from pathlib import Path
-from typing import TypeGuard
+from typing import Any, TypeGuard
 
+import numpy as np
 from pydantic import ByteSize, TypeAdapter, ValidationError
 
 from sobolev_batch.errors import InputError
@@ -41,13 +42,36 @@ def path_of(path: object) -> Path:
         raise InputError(f"a path is a text or a pathlib.Path, found {type(path).__name__}") from error
 
 
+def check_choice(name: str, value: object, choices: Collection[str]) -> None:
+    """Refuse what is none of some texts, by an InputError."""
+    if not isinstance(value, str) or value not in choices:
+        raise InputError(f"{name} must be one of {', '.join(choices)}, found {value!r}")
+
+
+def check_flags(**flags: object) -> None:
+    """Refuse truth values, by their names, that are neither True nor False, by an InputError: any text is true."""
+    for name, value in flags.items():
+        if not isinstance(value, bool | np.bool_):
+            raise InputError(f"{name} must be True or False, found {value!r}")
+
+
+def callback(on_progress: Callable[..., object] | None) -> Callable[..., Any]:
+    """Return a function that tells of progress, by default one that tells nobody; InputError where it is none."""
+    if on_progress is not None and not callable(on_progress):
+        raise InputError(f"on_progress must be a function, found {on_progress!r}")
+    return on_progress or (lambda *_: None)
+
+
 def as_names(given: str | Iterable[str]) -> list[str]:
-    """Return names, or the one that a text is: a text is a sequence of its letters otherwise.
+    """Return names, or the one that a text is, of whose letters it is a sequence otherwise; InputError for others.
 
     >>> as_names("decimated"), as_names(("decimated", "remeshed"))
     (['decimated'], ['decimated', 'remeshed'])
     """
-    return [given] if isinstance(given, str) else [*given]
+    names = [given] if isinstance(given, str) or not isinstance(given, Iterable) else [*given]
+    if not all(isinstance(name, str) for name in names):
+        raise InputError(f"expected a name or a list of names, which are texts; found {given!r}")
+    return names
 
 
 def byte_count(memory: float | str) -> int:
@@ -61,7 +85,7 @@ def byte_count(memory: float | str) -> int:
         count = int(_BYTE_SIZE.validate_python(int(memory) if isinstance(memory, float) else memory))
     except (ValidationError, ValueError, OverflowError):
         count = 0
-    if count <= 0 or isinstance(memory, bool):
+    if not 0 < count < 2**63 or isinstance(memory, bool):
         raise InputError(
             f"memory must be a positive number of bytes, or a size such as '4GB' or '800MiB', found {memory!r}"
         )

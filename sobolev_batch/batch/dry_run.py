@@ -16,7 +16,7 @@ from sobolev_batch.batch.start import StoreLike, require_permission, settled, wa
 from sobolev_batch.geometry.surface import Similarity, placement_doubt
 from sobolev_batch.machine import available_cores
 from sobolev_batch.norms.fields import Quality
-from sobolev_batch.parameters import format_bytes
+from sobolev_batch.parameters import callback, format_bytes
 from sobolev_batch.shown import Shown, reasons
 from sobolev_batch.store.layout import stored_choice
 from sobolev_batch.store.location import Location
@@ -283,7 +283,7 @@ def plan(
     client: Client | None = None,
     *,
     allow_commands: bool = False,
-    on_progress: Callable[[str], object] = str,
+    on_progress: Callable[[str], object] | None = None,
 ) -> StudyPlan:
     """Return what running a study would do, without computing its fields.
 
@@ -317,6 +317,7 @@ def plan(
     surfaces:      5 in 1 family, with the reference
     ...
     """
+    notify = callback(on_progress)
     study, location = settled(study, store, may_run=allow_commands)
     if client is not None:
         require_blocking(client)
@@ -329,7 +330,7 @@ def plan(
     part = replace(study, objects={name: study.objects[name] for name in names})
 
     def planned(one: Study, place: Location) -> ObjectPlan:
-        on_progress(one.object.name or one.name)
+        notify(one.object.name or one.name)
         return _plan(one, place, workers, client, bases)
 
     plans, refused = for_each_object(part, location, planned)

@@ -32,6 +32,7 @@ from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.machine import available_cores
 from sobolev_batch.norms.columns import ANGLE, FILE_LENGTH, VARIABLES
+from sobolev_batch.parameters import callback
 from sobolev_batch.reduction.limit import HAUSDORFF, RELATIVE, Limit, tried
 from sobolev_batch.reduction.recorded import RecordedSearch
 from sobolev_batch.reduction.remesher import Method, Range, Remesher
@@ -205,6 +206,7 @@ def reduce(
     True
     """
     check_cluster(client, workers)
+    notify = callback(on_progress)
     limit, remesher = Limit.parse(within, order, unit, measure), _permitted(method, search)
     # It refuses a wrong precision.
     remesher.search(limit, 1, 1.0, precision)
@@ -219,8 +221,7 @@ def reduce(
         if isinstance(outcome, Exception):
             by_name[name].forget()
         found[name] = outcome if isinstance(outcome, Reduction) else Reduction(name, limit, reason=one_line(outcome))
-        if on_progress is not None:
-            on_progress(found[name])
+        notify(found[name])
     return {name: found[name] for name in by_name}
 
 

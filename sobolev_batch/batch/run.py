@@ -18,6 +18,7 @@ from sobolev_batch.batch.object_run import Ended
 from sobolev_batch.batch.start import StoreLike, ready_to_run
 from sobolev_batch.errors import InputError, SobolevBatchError
 from sobolev_batch.machine import available_cores, require_machine_memory
+from sobolev_batch.parameters import callback
 from sobolev_batch.reduction.searched import SearchedSource
 from sobolev_batch.shown import Shown, reasons
 from sobolev_batch.sources.names import quoted
@@ -129,7 +130,7 @@ def run(
     check_cluster(client, workers, memory)
     study, location = ready_to_run(study, store, allow_commands=allow_commands, only=only)
     location = location if client is None else location.absolute()
-    notify, lock = on_progress or (lambda progress: None), Lock.of_this_process()
+    notify, lock = callback(on_progress), Lock.of_this_process()
     require_usable(location, of_objects="" not in study.objects)
     with ExitStack() as stack:
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sobolev_batch.errors import InputError, StudyError
-from sobolev_batch.parameters import as_names, format_bytes
+from sobolev_batch.parameters import as_names, check_flags, format_bytes
 from sobolev_batch.sources.mesh_cache import MeshCache
 from sobolev_batch.sources.names import known_names, quoted
 from sobolev_batch.store.location import Location
@@ -31,6 +31,7 @@ def settled(study: StudyLike, store: StoreLike, *, may_run: bool) -> tuple[Study
 
     Stores there share the meshes. The place is storage/NAME.zarr where none is named.
     """
+    check_flags(allow_commands=may_run)
     study = as_study(study)
     location = Location.parse(_DEFAULT_FOLDER / f"{study.name}.zarr" if store is None else store)
     return study.with_cache(MeshCache(location.absolute().beside(MADE_MESHES), may_run)), location
@@ -40,6 +41,7 @@ def ready_to_run(
     study: StudyLike, store: StoreLike, *, allow_commands: bool, only: Sequence[str] = ()
 ) -> tuple[Study, Location]:
     """Return a study that may run, or a part of it, and its place; log what would make the run useless."""
+    check_flags(allow_commands=allow_commands)
     study, location = settled(replace(as_study(study), only=tuple(as_names(only))), store, may_run=True)
     require_permission(study, allow_commands)
     _require_members(study, study.only)

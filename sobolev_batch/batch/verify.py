@@ -10,6 +10,7 @@ from pathlib import Path
 
 from sobolev_batch.errors import DamageError, ForeignError, LockError, StoreError
 from sobolev_batch.machine import available_cores
+from sobolev_batch.parameters import callback
 from sobolev_batch.shown import Shown
 from sobolev_batch.store.encoding import ROOT
 from sobolev_batch.store.field_arrays import Fields
@@ -111,7 +112,7 @@ def verify(store: str | Path | Location, on_progress: Callable[[int, int], None]
     >>> found.is_sound, found.complete, found.total
     (True, 5, 5)
     """
-    location = Location.parse(store)
+    location, notify = Location.parse(store), callback(on_progress)
     root, lock = root_of(location), Lock.of_this_process()
     objects = Objects.read(location, is_thorough=True)
     if objects is None:
@@ -123,12 +124,12 @@ def verify(store: str | Path | Location, on_progress: Callable[[int, int], None]
         raise
     except StoreError as error:
         _log.info("%s: read without the right to write (%s)", location, error)
-        return _verify_all(location, objects, on_progress, may_write=False)
+        return _verify_all(location, objects, notify, may_write=False)
     try:
         # It is opened again: the last run may have ended since. Whoever unlocks it may change it.
         own = replace(location, fence=lock.of_holder(root).fence)
         objects = objects and Objects.read(own, is_thorough=True)
-        found = _verify_all(own, objects, on_progress, may_write=True)
+        found = _verify_all(own, objects, notify, may_write=True)
         if root != location and not found.is_sound and (above := Objects.read(replace(own, name=root.name))):
             # Runs pass over objects whose records there say that nothing is missing.
             above.records.write(above.rows[location.name.rpartition("/")[2]], None)
@@ -138,17 +139,17 @@ def verify(store: str | Path | Location, on_progress: Callable[[int, int], None]
 
 
 def _verify_all(
-    location: Location, objects: Objects | None, on_progress: Callable[[int, int], None] | None, *, may_write: bool
+    location: Location, objects: Objects | None, notify: Callable[[int, int], None], *, may_write: bool
 ) -> Verification:
     """Verify the only object of a store, or all of them."""
     if objects is None:
-        return _verify(Store.open(location), on_progress, may_write=may_write)
+        return _verify(Store.open(location), notify, may_write=may_write)
     verified: dict[str, Verification] = {}
     for name in objects.names:
         verified[name] = Verification(f"{objects.location}/{name}", 0, 0, {}, {}, withdrawn=False)
         try:
             if place := objects.existing_store(name):
-                verified[name] = _verify(Store.open(place), on_progress, may_write=may_write)
+                verified[name] = _verify(Store.open(place), notify, may_write=may_write)
         except (DamageError, ForeignError) as error:
             what = error.what if isinstance(error, DamageError) else str(error)
             verified[name] = replace(verified[name], tables={ROOT: what}, withdrawn=may_write)
@@ -166,7 +167,7 @@ def _verify_all(
     )
 
 
-def _verify(store: Store, on_progress: Callable[[int, int], None] | None, *, may_write: bool) -> Verification:
+def _verify(store: Store, notify: Callable[[int, int], None], *, may_write: bool) -> Verification:
     records, unread = Records(store).examine()
     damaged = {row: f"its completion record is damaged ({what})" for row, what in unread.items()}
     tables, chunks = _damaged_tables(store), dict[tuple[str, Index], str]()
@@ -188,7 +189,7 @@ def _verify(store: Store, on_progress: Callable[[int, int], None] | None, *, may
     for row, record in contents.complete.items():
         if planned is not None and record.numerics != planned and labels[row] not in removed:
             damaged[row] = f"it was computed by numerics of version {record.numerics}, and the study by {planned}"
-    damaged |= _damaged_fields(store, contents.complete, on_progress)
+    damaged |= _damaged_fields(store, contents.complete, notify)
     if may_write:
         for row in damaged:
             Records(store).write(row, None)
@@ -221,9 +222,7 @@ def _damaged_chunks(store: Store, *, are_tables_sound: bool) -> dict[tuple[str, 
     return dict.fromkeys(stale, "it is not that of the stored fields") | chunks
 
 
-def _damaged_fields(
-    store: Store, complete: Mapping[int, Record], on_progress: Callable[[int, int], None] | None
-) -> dict[int, str]:
+def _damaged_fields(store: Store, complete: Mapping[int, Record], notify: Callable[[int, int], None]) -> dict[int, str]:
     """Return the damage of each field, by its row."""
     whole = Fields(store).complete_rows() if complete else set()
 
@@ -235,8 +234,7 @@ def _damaged_fields(
         for done, (row, damage) in enumerate(zip(complete, pool.map(damage_of, complete), strict=True), 1):
             if damage:
                 damaged[row] = damage
-            if on_progress is not None:
-                on_progress(done, len(complete))
+            notify(done, len(complete))
     return damaged
 
 

@@ -118,7 +118,7 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
     (-2.0,)
     """
     folder, output = path_of(folder), path_of(output)
-    if os.path.lexists(output):
+    if output.exists() or output.is_symlink():
         # Before files are looked at, which may take a while.
         raise StudyError(f"{output} exists already; name another file, or move it away")
     if not folder.is_dir():

@@ -148,6 +148,8 @@ def league(league: League | CostLeague, ax: Axes | None = None) -> Axes:
     >>> sb.plot.league(at_order).get_xlabel()
     'number of triangles'
     """
+    if not isinstance(league, League | CostLeague):
+        raise InputError(f"league must be one of those that sobolev_batch.league returns, found {league!r}")
     return (LEAGUE if isinstance(league, League) else COST_LEAGUE).on(ax, [league], league)
 
 

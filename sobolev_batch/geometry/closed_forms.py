@@ -97,15 +97,14 @@ class Ellipsoid(Smooth):
 
     def __post_init__(self) -> None:
         shortest = 1 / LARGEST_LENGTH
-        if len(self.axes) != 3 or not all(
-            is_finite_number(a) and shortest <= float(a) <= LARGEST_LENGTH for a in self.axes
-        ):
+        axes = checked_point(self.axes, "an ellipsoid's semi-axes")
+        if not all(shortest <= a <= LARGEST_LENGTH for a in axes):
             raise InputError(
                 f"an ellipsoid's semi-axes must be three numbers between {shortest:g} and {LARGEST_LENGTH:g}, "
                 f"found {self.axes}"
             )
         center = checked_point(self.center, "an ellipsoid's center")
-        vars(self).update(axes=tuple(map(float, self.axes)), center=center)
+        vars(self).update(axes=axes, center=center)
 
     @property
     def intervals(self) -> tuple[Interval, Interval]:

@@ -35,7 +35,7 @@ from sobolev_batch.arrays import Indices, Reals, slices
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.closest import Triangles
 from sobolev_batch.geometry.cover import cover_distances
-from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
+from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh, each
 from sobolev_batch.geometry.mesh import Mesh, cross, dot
 from sobolev_batch.geometry.overlap import ROUNDING, rests_of
 from sobolev_batch.geometry.surface import is_finite_number
@@ -141,10 +141,10 @@ def largest_deviation(a: MeshLike, b: MeshLike, *, gap: float = DEFAULT_GAP, wit
     >>> found.both.upper <= 1.01 * found.both.lower, found.both.is_within(0.1)
     (True, True)
     """
-    for name, value in (("gap", gap), ("within", within)):
-        if value is not None and not (is_finite_number(value) and value > 0):
+    for name, value in (("gap", gap), ("within", gap if within is None else within)):
+        if not (is_finite_number(value) and value > 0):
             raise InputError(f"{name} must be a positive number, found {value!r}")
-    meshes = as_mesh(a), as_mesh(b)
+    meshes = each(as_mesh, {"a": a, "b": b})
     ways = (meshes, meshes[::-1])
     return Deviations(*(directed_deviation(mesh, Triangles(other), gap, within) for mesh, other in ways))
 

@@ -17,6 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from sobolev_batch.arrays import Array, Indices, Reals, slices
 from sobolev_batch.errors import MeshError, from_extra
 from sobolev_batch.geometry.surface import LARGEST_LENGTH, Extent, Point
+from sobolev_batch.parameters import as_names
 
 Corners = tuple[Reals, Reals, Reals]
 # Vectors (3, ...), one row an axis.
@@ -71,8 +72,8 @@ class Mesh:
     notes: tuple[str, ...] = ()
 
     def __init__(self, vertices: ArrayLike, triangles: ArrayLike, notes: tuple[str, ...] = ()) -> None:
-        checked = _checked_vertices(vertices)
-        vars(self).update(vertices=checked, triangles=_checked_triangles(triangles, len(checked)), notes=tuple(notes))
+        checked, notes = _checked_vertices(vertices), tuple(as_names(notes))
+        vars(self).update(vertices=checked, triangles=_checked_triangles(triangles, len(checked)), notes=notes)
         self._require_sizes()
 
     def _require_sizes(self) -> None:

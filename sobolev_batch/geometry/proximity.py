@@ -11,10 +11,10 @@ from sobolev_batch.arrays import Indices, Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.closest import Triangles, signs
 from sobolev_batch.geometry.deviation import Deviations, directed_deviation
-from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
+from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh, each
 from sobolev_batch.geometry.mesh import Mesh, Vectors, cross, cross_lengths, dot
 from sobolev_batch.geometry.surface import is_finite_number
-from sobolev_batch.parameters import check_seed, is_whole_number
+from sobolev_batch.parameters import check_flags, check_seed, is_whole_number
 
 DEFAULT_POINTS = 10_000
 MOST_POINTS = 10_000_000
@@ -123,7 +123,7 @@ def proximity_and_deviations(
     if threshold is not None and not (is_finite_number(threshold) and threshold > 0):
         raise InputError(f"threshold must be a positive number, found {threshold!r}")
     check_seed(seed)
-    meshes = as_mesh(a), as_mesh(b)
+    meshes = each(as_mesh, {"a": a, "b": b})
     searches = Triangles(meshes[0]), Triangles(meshes[1])
     numbers, deviations = sampled_numbers(*searches, points, threshold, seed), []
     for own, search in zip(meshes, searches[::-1], strict=True):
@@ -203,7 +203,7 @@ def share_beyond(a: MeshLike, b: MeshLike, length: float, *, one_way: bool = Fal
     It is the larger of both directions, or that of the first mesh, and the last number is 1 where it is that of the
     second one. The standard error is that for one point more.
     """
-    meshes = as_mesh(a), as_mesh(b)
+    meshes = each(as_mesh, {"a": a, "b": b})
     rng, ways, points = np.random.default_rng(0), (meshes, meshes[::-1])[: 1 if one_way else 2], DEFAULT_POINTS
     counts = [np.count_nonzero(sampled_distances(mesh, other, rng, points) > length) for mesh, other in ways]
     count = max(counts)
@@ -237,7 +237,8 @@ def vertex_distances(mesh: MeshLike, other: MeshLike, *, signed: bool = False) -
     >>> distances.shape, distances.round(12).min().item(), distances.round(12).max().item()
     ((642,), 1.0, 1.0)
     """
-    mesh, other = as_mesh(mesh), as_mesh(other)
+    check_flags(signed=signed)
+    mesh, other = each(as_mesh, {"mesh": mesh, "other": other})
     distances, used = np.full(len(mesh.vertices), np.nan), mesh.used_vertices
     distances[used] = point_distances(mesh.vertices[used], other, signed=signed)
     return distances

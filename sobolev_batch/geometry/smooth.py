@@ -265,6 +265,8 @@ class ParametrisedSurface(Smooth):
     origin: Point = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
+        if not callable(self.position):
+            raise InputError(f"position must be a function, found {self.position!r}")
         for name, interval in (("u", self.u), ("v", self.v)):
             if not isinstance(interval, Interval):
                 raise InputError(f"{name} must run over an Interval, found {interval!r}")

@@ -1,7 +1,7 @@
 """The protocol of surfaces and their extents, the map to the unit of a study, and doubts about unit and place."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass
 from itertools import product
 from numbers import Real
@@ -211,9 +211,10 @@ def is_finite_number(value: object) -> bool:
 
 def checked_point(point: Sequence[float], label: str) -> Point:
     """Return a point as three floats; InputError, which begins with the label, where it is not three finite numbers."""
-    if len(point) != 3 or not all(map(is_finite_number, point)):
+    given = [*point] if isinstance(point, Iterable) and not isinstance(point, Set) else []
+    if len(given) != 3 or not all(map(is_finite_number, given)):
         raise InputError(f"{label} must be three finite numbers, found {point!r}")
-    x, y, z = map(float, point)
+    x, y, z = map(float, given)
     return x, y, z
 
 

@@ -81,6 +81,8 @@ def spectrum(
     [0.26, 0.41, 0.32]
     """
     orders = check_orders(order)
+    if not isinstance(similarity, Similarity | None):
+        raise InputError(f"similarity must be a Similarity, found {similarity!r}")
     first, second = (field_of(a, lattice, orders), None) if b is None else pair_of(a, b, lattice, orders)
     lattice = Lattice.from_field(first)
     edges = _edges(bands, lattice)

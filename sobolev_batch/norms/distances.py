@@ -17,7 +17,7 @@ import xarray as xr
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.closed_forms import Sphere
-from sobolev_batch.geometry.formats.conversion import as_surface
+from sobolev_batch.geometry.formats.conversion import as_surface, each
 from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Surface
 from sobolev_batch.machine import available, available_cores
 from sobolev_batch.norms import DEFAULT_ORDER
@@ -29,10 +29,19 @@ from sobolev_batch.norms.accuracy.tolerance import Accuracy
 from sobolev_batch.norms.budget import Support, sums_of_shells
 from sobolev_batch.norms.columns import VARIABLES, labelled, labelled_distances, lattice_attributes
 from sobolev_batch.norms.estimate import NormEstimate, ReferenceEstimate, estimate_norms
-from sobolev_batch.norms.fields import OperandLike, as_operand, field_of, pair_of, quality_of, shells_against, shells_of
+from sobolev_batch.norms.fields import (
+    OperandLike,
+    as_operand,
+    common_lattice,
+    field_of,
+    pair_of,
+    quality_of,
+    shells_against,
+    shells_of,
+)
 from sobolev_batch.norms.images import NearAxes, images_at
 from sobolev_batch.norms.tail.remainder import remainder_of_flat
-from sobolev_batch.parameters import check_seed
+from sobolev_batch.parameters import callback, check_flags, check_seed
 from sobolev_batch.shown import progress_line
 from sobolev_batch.transform.lattice import Lattice, Orders, SobolevWeights, check_orders
 from sobolev_batch.transform.spheres import sphere_inner_product, sphere_norm
@@ -87,7 +96,7 @@ def norm(
     [4.39, 3.258]
     """
     orders = check_orders(order)
-    if (accuracy := accuracy_of(rtol, memory, best_effort=best_effort)) is not None:
+    if (accuracy := accuracy_of(rtol, memory, best_effort, seed, on_progress)) is not None:
         return to_accuracy("norm", (a,), order, lattice, accuracy, seed, on_progress)[0]
     if spheres := _spheres(a, lattice=lattice):
         values = np.array([sphere_norm(spheres[0], s) for s in orders])
@@ -148,13 +157,13 @@ def distance(
     ('2.8%', '8%', True)
     """
     orders = check_orders(order)
-    a, b = as_operand(a), as_operand(b)
-    if (accuracy := accuracy_of(rtol, memory, best_effort=best_effort)) is not None:
+    a, b = each(as_operand, {"a": a, "b": b})
+    if (accuracy := accuracy_of(rtol, memory, best_effort, seed, on_progress)) is not None:
         return to_accuracy("distance", (a, b), order, lattice, accuracy, seed, on_progress)[0]
     if spheres := _spheres(a, b, lattice=lattice):
         return _distance_of_spheres(spheres[0], spheres[1], order)
     has_fields = isinstance(a, xr.DataArray) or isinstance(b, xr.DataArray)
-    if lattice is not None and not has_fields and are_equal(a, b):
+    if (lattice := common_lattice((), lattice)) is not None and not has_fields and are_equal(a, b):
         nothing, reference = Solution.zero(orders).estimate, ReferenceEstimate.of_equal(len(orders))
         return labelled_distances(order, nothing, reference, {"xi_max": lattice.xi_max, "M": lattice.M})
     first, second = pair_of(a, b, lattice, orders)
@@ -179,8 +188,17 @@ def distance(
     return labelled_distances(order, distances, reference, lattice_attributes(weights.lattice, first, second))
 
 
-def accuracy_of(rtol: float | None, memory: float | str | None, *, best_effort: bool = False) -> Accuracy | None:
-    """Return the accuracy that parameters of the public functions ask for; None without an rtol."""
+def accuracy_of(
+    rtol: float | None,
+    memory: float | str | None,
+    best_effort: bool,
+    seed: int,
+    on_progress: Callable[[str], object] | None,
+) -> Accuracy | None:
+    """Return the accuracy that parameters of the public functions ask for, of which all are checked; None for none."""
+    check_flags(best_effort=best_effort)
+    check_seed(seed)
+    callback(on_progress)
     if rtol is not None:
         accuracy = Accuracy(rtol, best_effort=best_effort)
         return accuracy if memory is None else replace(accuracy, allowed_bytes=available(memory))
@@ -205,7 +223,6 @@ def to_accuracy(
     surfaces = [as_surface(operand) for operand in operands if not isinstance(operand, xr.DataArray)]
     if lattice is not None or len(surfaces) < len(operands):
         raise InputError("an rtol chooses the lattice: pass surfaces and no lattice, or a lattice and no rtol")
-    check_seed(seed)
     problem = Problem.from_surfaces(surfaces, orders, accuracy, f"the {name}", available_cores())
     problem = problem.up_to_rounding(surfaces)
     with progress_line(on_progress) as notify:

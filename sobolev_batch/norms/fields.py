@@ -13,7 +13,7 @@ from pydantic import TypeAdapter
 
 from sobolev_batch.arrays import ComplexDtype, Complexes, Reals
 from sobolev_batch.errors import DamageError, InputError, LatticeError
-from sobolev_batch.geometry.formats.conversion import SurfaceLike, as_surface
+from sobolev_batch.geometry.formats.conversion import SurfaceLike, as_surface, each
 from sobolev_batch.geometry.surface import DIRECTIONS, Extent, Surface
 from sobolev_batch.norms.images import NearAxes
 from sobolev_batch.norms.tail.remainder import Remainder
@@ -179,7 +179,7 @@ def fourier_transform(
     >>> round(field.sel(xi_x=0, xi_y=0, xi_z=0).item().real, 4)  # the area of the sphere, 4π
     12.5664
     """
-    settings = TransformSettings(eps, dtype, quadrature)
+    settings, lattice = TransformSettings(eps, dtype, quadrature), check_lattice(lattice)
     execution = Execution(backend_named(backend), thread_count(threads))
     field = compute_field(as_surface(surface), lattice, settings, check_orders(order), execution)
     attributes = {
@@ -247,13 +247,14 @@ def field_for(
 
 def as_operand(a: OperandLike) -> Operand:
     """Return a field as it is, and anything else as a surface; see `as_surface`."""
-    return a if isinstance(a, xr.DataArray) else as_surface(a)
+    return a if isinstance(a, xr.DataArray) else as_surface(a, or_field=True)
 
 
 def field_of(
     a: OperandLike, lattice: Lattice | None, orders: Sequence[float], eps: float | None = None
 ) -> xr.DataArray:
     """Return a field as it is, or transform a surface on a lattice; LatticeError or InputError where it is neither."""
+    a = as_operand(a)
     if isinstance(a, xr.DataArray):
         if a.dtype.kind != "c":
             raise InputError(f"a Fourier field has complex values, found {a.dtype}")
@@ -262,13 +263,19 @@ def field_of(
                 f"a field must have the dimensions {', '.join(AXES)} and no others, found {a.dims}: select one mesh"
             )
         return a
-    surface = as_surface(a)
-    if not isinstance(lattice, Lattice):
+    if lattice is None:
         raise InputError(
-            f"a surface such as this {type(surface).__name__} needs a lattice or an accuracy: "
+            f"a surface such as this {type(a).__name__} needs a lattice or an accuracy: "
             "pass lattice=Lattice(xi_max=..., M=...), or rtol=... to a norm or distance"
         )
-    return fourier_transform(surface, lattice, eps, order=orders)
+    return fourier_transform(a, lattice, eps, order=orders)
+
+
+def check_lattice(lattice: object) -> Lattice:
+    """Return a lattice as it is; InputError where it is none."""
+    if not isinstance(lattice, Lattice):
+        raise InputError(f"a lattice is a Lattice(xi_max=..., M=...), found {type(lattice).__name__}")
+    return lattice
 
 
 def field_values(field: xr.DataArray) -> Complexes:
@@ -283,6 +290,7 @@ def pair_of(
     a: OperandLike, b: OperandLike, lattice: Lattice | None, orders: Sequence[float]
 ) -> tuple[xr.DataArray, xr.DataArray]:
     """Return both as fields on one lattice, that of a field if there is one; see `field_of` and `common_lattice`."""
+    a, b = each(as_operand, {"a": a, "b": b})
     common = common_lattice((a, b), lattice)
     return field_of(a, common, orders), field_of(b, common, orders)
 
@@ -291,9 +299,7 @@ def common_lattice(operands: Sequence[OperandLike], lattice: Lattice | None) -> 
     """Return the lattice of the fields among operands, else the given one or None; LatticeError where they differ."""
     lattices = [Lattice.from_field(x) for x in operands if isinstance(x, xr.DataArray)]
     if lattice is not None:
-        if not isinstance(lattice, Lattice):
-            raise InputError(f"a lattice is a Lattice(xi_max=..., M=...), found {type(lattice).__name__}")
-        lattices.append(lattice)
+        lattices.append(check_lattice(lattice))
     for other in lattices[1:]:
         if other.M != lattices[0].M or not np.isclose(other.xi_max, lattices[0].xi_max, rtol=1e-12, atol=0):
             raise LatticeError(f"fields on different lattices cannot be compared: {lattices[0]} and {other}")

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 
 import numpy as np
 import xarray as xr
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError
-from sobolev_batch.geometry.formats.conversion import MeshLike, SurfaceLike, as_mesh
-from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.geometry.formats.conversion import MeshLike, SurfaceLike, as_mesh, each
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.columns import describe
 from sobolev_batch.norms.distances import distance
+from sobolev_batch.norms.fields import as_operand
+from sobolev_batch.parameters import callback
 from sobolev_batch.transform.lattice import Lattice, Orders
 
 # A rate is formed between meshes whose sizes differ by this factor at least: between nearly equal ones chance decides.
@@ -30,7 +30,7 @@ def convergence(
     lattice: Lattice | None = None,
     best_effort: bool = False,
     seed: int = 0,
-    on_progress: Callable[[int, int], object] = lambda done, total: None,
+    on_progress: Callable[[int, int], object] | None = None,
 ) -> xr.Dataset:
     """Return the distances of some meshes to a surface, and the observed orders of convergence between them.
 
@@ -63,12 +63,14 @@ def convergence(
     >>> found["triangles"].sel(mesh="level 3").item()
     1280
     """
-    if isinstance(meshes, str | os.PathLike | Mesh):
-        raise InputError(f"meshes are a list, or meshes by name, found one {type(meshes).__name__}; put it into a list")
+    if isinstance(meshes, str | bytes | Set) or not isinstance(meshes, Iterable):
+        raise InputError(f"meshes are a list, or meshes by name, found {type(meshes).__name__}; put it into a list")
     named = meshes if isinstance(meshes, Mapping) else {str(number): mesh for number, mesh in enumerate(meshes)}
     if not named:
         raise InputError("there are no meshes; pass one or more")
-    converted, found = {label: as_mesh(mesh) for label, mesh in named.items()}, []
+    notify, found = callback(on_progress), []
+    converted = dict(zip(named, each(as_mesh, {f"mesh {label!r}": mesh for label, mesh in named.items()}), strict=True))
+    (reference,) = each(as_operand, {"reference": reference})
     for done, (label, mesh) in enumerate(converted.items(), start=1):
         try:
             one = distance(mesh, reference, order, rtol=rtol, lattice=lattice, best_effort=best_effort, seed=seed)
@@ -76,7 +78,7 @@ def convergence(
             error.add_note(f"This is mesh {label!r}, number {done} of {len(named)}.")
             raise
         found.append(one)
-        on_progress(done, len(named))
+        notify(done, len(named))
     table = xr.concat(found, "mesh", combine_attrs="drop_conflicts").assign_coords(
         mesh=("mesh", np.array(list(converted), dtype=object)),
         edge_length=("mesh", [mesh.edge_length_range[0] for mesh in converted.values()]),

@@ -12,7 +12,7 @@ import xarray as xr
 
 from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError, LatticeError, MeshError
-from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
+from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh, each
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.machine import available_cores
 from sobolev_batch.norms import DEFAULT_ORDER
@@ -22,7 +22,7 @@ from sobolev_batch.norms.accuracy.solution import SurfaceValues
 from sobolev_batch.norms.columns import labelled
 from sobolev_batch.norms.distances import accuracy_of, distance, to_accuracy
 from sobolev_batch.norms.estimate import NormEstimate
-from sobolev_batch.parameters import as_names, check_seed
+from sobolev_batch.parameters import as_names, callback
 from sobolev_batch.sources.derived import decimated, with_noise
 from sobolev_batch.transform.fourier import ErrorTarget, Execution
 from sobolev_batch.transform.lattice import Lattice, Orders, check_orders
@@ -95,12 +95,11 @@ def yardsticks(
     >>> bool(0.05 < found["moved"] < 0.2), bool(30 < found["decimated"] < 60)
     (True, True)
     """
-    a, b = as_mesh(a), as_mesh(b)
-    check_seed(seed)
+    a, b = each(as_mesh, {"a": a, "b": b})
     if unknown := {*as_names(changes)} - {*CHANGES}:
         raise InputError(f"changes must be among {', '.join(CHANGES)}, found {', '.join(map(repr, sorted(unknown)))}")
     orders, solved, wanted = check_orders(order), None, [one for one in CHANGES if one in as_names(changes)]
-    if (accuracy := accuracy_of(rtol, memory, best_effort=best_effort)) is None:
+    if (accuracy := accuracy_of(rtol, memory, best_effort, seed, on_progress)) is None:
         found = distance(a, b, order, lattice=lattice)
     else:
         found, solved = to_accuracy("distance", (a, b), order, lattice, accuracy, seed, on_progress)
@@ -119,7 +118,7 @@ def yardsticks(
         curves = _curves(b, frequencies, values, target, float(relative[resolved].min()), seed)
         for i in resolved.tolist():
             for change in wanted:
-                (on_progress or str)(f"order {orders[i]:g}: {change} as far")
+                callback(on_progress)(f"order {orders[i]:g}: {change} as far")
                 columns[change][i], columns[f"{change}_error"][i] = curves[change].equivalent(i, estimate)
     return found.assign(labelled(order, columns, {}).data_vars)
 

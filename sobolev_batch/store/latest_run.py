@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal, Self
 
 from sobolev_batch.errors import LockError, StoreError
+from sobolev_batch.parameters import check_flags
 from sobolev_batch.store.checked import CHANGED
 from sobolev_batch.store.encoding import ROOT, group_document
 from sobolev_batch.store.layout import DIGEST, RECORDS, Store, document_digest
@@ -83,6 +84,7 @@ def unlock(store: str | Path | Location, *, force: bool = False) -> Lock | None:
         ...
     sobolev_batch.errors.ForeignError: memory://new.zarr: it holds no store of a study
     """
+    check_flags(force=force)
     location = root_of(Location.parse(store))
     if (lock := Lock.read(location)) is None:
         if Objects.read(location) is None:

@@ -248,8 +248,10 @@ class Location:
 
 
 def _folder_name(store: str | Path) -> str:
-    if not str(store):
-        raise StoreError("the path of the store is empty; name a folder or a URL")
+    if not str(store) or "\0" in str(store):
+        raise StoreError(
+            f"the path of the store is empty or has a null character, found {store!r}; name a folder or a URL"
+        )
     first = next(iter(path_of(store).parts), "")
     if first.endswith(":") and first[:-1] in available_protocols():
         # The rest may hold a password.

@@ -245,7 +245,7 @@ class Study:
         Raises:
             StudyError: See `from_toml`.
         """
-        values, folder = plain_tables(table), Path(folder)
+        values, folder = plain_tables(table), path_of(folder)
         document, sections = sections_of_objects(values, folder)
         objects: dict[str, StudyObject] = {}
         for name, (of_object, as_written) in sections.items():

@@ -12,6 +12,7 @@ from sobolev_batch.errors import InputError
 from sobolev_batch.geometry.proximity import METRICS, OF_ONE_MESH
 from sobolev_batch.norms.columns import parts_as_variables
 from sobolev_batch.norms.estimate import AREA_AND_SHAPE, PARTS
+from sobolev_batch.parameters import as_names
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.sources.programs import Cost
 from sobolev_batch.tables import Format
@@ -169,6 +170,7 @@ def tables_of(
 
     The root of a store has the rows of all objects at the orders of the study; others come from the stores of objects.
     """
+    (x,) = as_names([x])
     if not isinstance(store, Mapping) or isinstance(store, xr.DataTree):
         tree = as_tree(store)
         if not has_objects(tree):
@@ -362,9 +364,9 @@ def label_of(x: str, unit: str = "each object's unit") -> str:
 
 def sizes_of(frame: pd.DataFrame, x: str) -> Reals:
     """Return a column of `table`, NaN where sizes are not known; InputError where it has no such numbers."""
-    if x not in frame or not pd.api.types.is_numeric_dtype(frame[x]):
-        numbers = [name for name in _LABELS if name in frame]
-        given = [name for name in frame.attrs.get("metadata", ()) if pd.api.types.is_numeric_dtype(frame[name])]
+    numbers = [name for name in _LABELS if name in frame]
+    given = [name for name in frame.attrs.get("metadata", ()) if pd.api.types.is_numeric_dtype(frame[name])]
+    if not isinstance(x, str) or x not in (*numbers, *given):
         only = " (the store has no families of commands, functions or searches, which have it)"
         hint = only if str(x).startswith("make_") else ""
         raise InputError(f"no size of meshes is named {quoted(x)}{hint}; known are {', '.join([*numbers, *given])}")

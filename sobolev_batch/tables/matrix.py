@@ -10,6 +10,7 @@ from sobolev_batch.arrays import Reals
 from sobolev_batch.errors import InputError
 from sobolev_batch.norms.columns import parts_as_variables
 from sobolev_batch.norms.estimate import PARTS, quotients
+from sobolev_batch.parameters import check_choice
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.open import AnyStore, as_tree, complete_meshes, finished_group, reference_of
 from sobolev_batch.tables.other_orders import distances_at, norms_at, order_note
@@ -75,8 +76,7 @@ def matrix(
     tree = as_tree(store)
     order = single_order(order)
     distances = distances_at(tree, order)
-    if values not in _COLUMNS:
-        raise InputError(f"values must be one of {', '.join(_COLUMNS)}, found {values!r}")
+    check_choice("values", values, _COLUMNS)
     frame: pd.DataFrame = parts_as_variables(distances)[values].sel(order=order).transpose("mesh", "other").to_pandas()
     frame.attrs = {"order": order, "reference": reference_of(tree), "values": values}
     return frame

@@ -8,13 +8,13 @@ from tempfile import mkdtemp
 from typing import Literal
 
 from sobolev_batch.errors import InputError, SobolevBatchError, one_line
-from sobolev_batch.geometry.formats.conversion import SurfaceLike, as_surface
+from sobolev_batch.geometry.formats.conversion import SurfaceLike, as_surface, each
 from sobolev_batch.geometry.surface import Similarity, is_finite_number, placement_doubt
 from sobolev_batch.machine import available, available_cores
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.accuracy.threshold import Method, relative_distance
 from sobolev_batch.norms.accuracy.tolerance import Accuracy
-from sobolev_batch.parameters import check_seed
+from sobolev_batch.parameters import check_flags, check_seed
 from sobolev_batch.shown import Shown
 from sobolev_batch.tables.text import percent, rounded_outwards
 from sobolev_batch.testing.difference import write_difference
@@ -142,11 +142,12 @@ def same_surface(
     'different'
     """
     check_seed(seed)
+    check_flags(scaling=scaling)
     if not (is_finite_number(tolerance) and 0 < tolerance < 1):
         raise InputError(f"tolerance must be a number between 0 and 1, found {tolerance!r}")
     accuracy = Accuracy(_ANY_RTOL) if memory is None else Accuracy(_ANY_RTOL, available(memory))
     checked_order = single_order(order)
-    surface, reference = (as_surface(one) for one in (a, b))
+    surface, reference = each(as_surface, {"a": a, "b": b})
     area_change = surface.area / reference.area - 1
     similarity = Similarity.to_unit_ball(reference) if scaling else Similarity()
     pair = similarity.apply(surface), similarity.apply(reference)
@@ -196,7 +197,7 @@ def assert_same_surface(
     a has less area near (...); witness: ...-a.ply ...-b.ply
     """
     __tracebackhide__ = True
-    surface, reference = as_surface(a), as_surface(b)
+    surface, reference = each(as_surface, {"a": a, "b": b})
     verdict = same_surface(
         surface, reference, tolerance=tolerance, order=order, scaling=scaling, memory=memory, seed=seed
     )

@@ -9,7 +9,7 @@ from typing import Literal
 from sobolev_batch.geometry.deviation import Deviation, Deviations, largest_deviation
 from sobolev_batch.geometry.formats.conversion import MeshLike
 from sobolev_batch.geometry.proximity import share_beyond
-from sobolev_batch.parameters import length_in
+from sobolev_batch.parameters import check_flags, length_in
 from sobolev_batch.tables.text import between, percent, place_text
 
 # Digits of bounds and of the length, at least.
@@ -88,6 +88,7 @@ def judge_deviation(
 ) -> DeviationVerdict:
     """Return whether the largest deviation of two meshes, with names, is within a length; see `assert_within`."""
     limit = length_in(length, unit)
+    check_flags(one_way=one_way)
     verdict = DeviationVerdict(limit, unit, largest_deviation(a, b, within=limit), one_way=one_way, names=names)
     if verdict.outcome != "not within":
         return verdict

@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sobolev_batch.arrays import Array, Reals
-from sobolev_batch.errors import BackendError, InputError, one_line
+from sobolev_batch.errors import BackendError, one_line
+from sobolev_batch.parameters import check_choice
 from sobolev_batch.transform.nufft_costs import CPU_COSTS, FINEST_EPS, GPU_COSTS, Costs, NufftSpec
 
 Result = TypeVar("Result")
@@ -357,6 +358,7 @@ def gpu_backend() -> Gpu:
 
 def backend_named(name: str) -> Backend:
     """Return the backend for "cpu", "gpu" (or BackendError), or "auto": a usable GPU, else the processor."""
+    check_choice("backend", name, ("cpu", "gpu", "auto"))
     if name == "gpu":
         return gpu_backend()
     if name == "auto":
@@ -364,8 +366,6 @@ def backend_named(name: str) -> Backend:
             return gpu_backend()
         except BackendError as error:
             _log.info("computing on the processor: %s", error)
-    elif name != "cpu":
-        raise InputError(f"backend must be 'cpu', 'gpu' or 'auto', found {name!r}")
     return CPU
 
 

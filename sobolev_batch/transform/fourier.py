@@ -16,9 +16,9 @@ import numpy as np
 from sobolev_batch.arrays import Array, ComplexDtype, Complexes, Reals
 from sobolev_batch.errors import InputError, LatticeError, one_line
 from sobolev_batch.geometry.subdivision import icosphere
-from sobolev_batch.geometry.surface import Similarity, Surface
+from sobolev_batch.geometry.surface import Similarity, Surface, is_finite_number
 from sobolev_batch.machine import available_cores
-from sobolev_batch.parameters import is_whole_number
+from sobolev_batch.parameters import check_choice, is_whole_number
 from sobolev_batch.transform.backends import CPU, Backend, Gpu
 from sobolev_batch.transform.kinds import SurfaceKind, kind_of
 from sobolev_batch.transform.lattice import LARGEST_M, Block, FrequencyLattice, Lattice
@@ -81,13 +81,15 @@ class TransformSettings:
         tolerance: float | None = None,
         stored: ComplexDtype | None = None,
     ) -> None:
-        if dtype not in get_args(ComplexDtype):
-            raise InputError(f"dtype must be 'complex128' or 'complex64', found {dtype!r}")
-        eps = DEFAULT_EPS[dtype] if eps is None else float(eps)
-        if not FINEST_EPS[dtype] <= eps <= COARSEST_EPS:
-            raise InputError(f"eps must lie between {FINEST_EPS[dtype]:g} and {COARSEST_EPS:g} in {dtype}, found {eps}")
+        check_choice("dtype", dtype, get_args(ComplexDtype))
+        eps = DEFAULT_EPS[dtype] if eps is None else eps
+        if not is_finite_number(eps) or not FINEST_EPS[dtype] <= eps <= COARSEST_EPS:
+            ends = f"{FINEST_EPS[dtype]:g} and {COARSEST_EPS:g}"
+            raise InputError(f"eps must lie between {ends} in {dtype}, found {eps!r}")
         fixed_rule(quadrature)
-        vars(self).update(eps=eps, dtype=dtype, quadrature=quadrature, tolerance=tolerance, stored=stored or dtype)
+        vars(self).update(
+            eps=float(eps), dtype=dtype, quadrature=quadrature, tolerance=tolerance, stored=stored or dtype
+        )
 
     def kind_for(self, surface: Surface, lattice: FrequencyLattice) -> SurfaceKind:
         """Return a surface with quadrature points for a lattice."""

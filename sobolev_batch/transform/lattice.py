@@ -20,6 +20,7 @@ from scipy.special import erf, erfc
 
 from sobolev_batch.arrays import Complexes, Indices, Reals
 from sobolev_batch.errors import InputError, LatticeError, OrderError
+from sobolev_batch.geometry.surface import is_finite_number
 from sobolev_batch.parameters import is_whole_number
 
 # Beyond this a field takes more than 34 GB even in single precision.
@@ -174,8 +175,8 @@ class Lattice(FrequencyLattice):
     M: int
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.xi_max) and self.xi_max > 0):
-            raise LatticeError(f"xi_max must be positive and finite, found {self.xi_max}")
+        if not (is_finite_number(self.xi_max) and self.xi_max > 0):
+            raise LatticeError(f"xi_max must be a positive and finite number, found {self.xi_max!r}")
         if not _LOWEST_XI_MAX <= self.xi_max <= 1 / _LOWEST_XI_MAX:
             raise LatticeError(
                 f"xi_max must lie between {_LOWEST_XI_MAX:g} and {1 / _LOWEST_XI_MAX:g}, found {self.xi_max:g}; "

@@ -138,10 +138,8 @@ def fixed_rule(quadrature: str | int) -> TriangleRule | None:
     with interior nodes for all triangles. "gauss8" is the 64-point product rule of K. Koga's paper. Any other method is
     an InputError. Parametrised surfaces ignore the method.
     """
-    if quadrature == "auto":
-        return None
-    if quadrature == "gauss8":
-        return gauss_rule(8)
+    if isinstance(quadrature, str) and quadrature in ("auto", "gauss8"):
+        return None if quadrature == "auto" else gauss_rule(8)
     if isinstance(quadrature, int) and not isinstance(quadrature, bool) and 1 <= quadrature <= HIGHEST_DEGREE:
         return symmetric_rule(quadrature)
     raise InputError(

@@ -125,7 +125,7 @@ NO_POINTS: list[tuple[float, ...]] = [(0.0, 0.0), (0.0,) * 4, (), (math.nan, 0.0
     ("kind", "arguments", "message"),
     [
         *(
-            (Ellipsoid, (axes,), "three numbers between 1e-150 and 1e\\+150")
+            (Ellipsoid, (axes,), "three (finite numbers|numbers between 1e-150 and 1e\\+150)")
             for axes in ((1.0, 1.0), (1.0, 1.0, 0.0), (1.0, math.nan, 1.0), (1.0, math.inf, 1.0), (1.0, True, 1.0))
         ),
         (Ellipsoid, ((1.0, 1.0, 1e200),), "three numbers between"),

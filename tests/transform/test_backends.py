@@ -300,7 +300,7 @@ def test_auto_means_the_processor_where_there_is_no_gpu(
     assert "computing on the processor: no GPU: none" in caplog.text
     with pytest.raises(BackendError, match="no GPU: none"):
         fourier_transform(icosphere(0), LATTICE, backend="gpu")
-    with pytest.raises(InputError, match="backend must be 'cpu', 'gpu' or 'auto', found 'tpu'"):
+    with pytest.raises(InputError, match="backend must be one of cpu, gpu, auto, found 'tpu'"):
         backend_named("tpu")
 
 

@@ -15,7 +15,7 @@ from sobolev_batch.batch.start import MADE_MESHES
 from sobolev_batch.errors import InputError, SobolevBatchError, StoreError, from_extra, write_file
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Similarity
-from sobolev_batch.parameters import as_names, path_of
+from sobolev_batch.parameters import as_names, check_flags, path_of
 from sobolev_batch.sources.mesh_cache import MeshCache
 from sobolev_batch.sources.names import file_stem, fits
 from sobolev_batch.sources.registry import Member
@@ -209,6 +209,7 @@ def write_witness(
     (162, 3)
     """
     path = path_of(path)
+    check_flags(distances=distances)
     if path.suffix not in (".ply", ".vtp"):
         raise InputError(f"{path}: a witness is written as .ply or .vtp, found {path.suffix!r}")
     made, labels, orders = exported(store, [mesh], order, folder)

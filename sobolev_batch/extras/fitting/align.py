@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.extras.fitting.adjoint import MeshTransform
 from sobolev_batch.extras.fitting.derivatives import factors_of
-from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
+from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh, each
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.transform.fourier import TransformSettings
 from sobolev_batch.transform.lattice import Lattice, SobolevWeights, single_order
@@ -54,7 +54,7 @@ def align(a: MeshLike, b: MeshLike, *, order: float = -2.0) -> Reals:
     >>> np.abs(matrix[:3, 3] + [0.2, 0.1, 0.0]).max() < 1e-5
     np.True_
     """
-    order, meshes = single_order(order), (as_mesh(a), as_mesh(b))
+    order, meshes = single_order(order), each(as_mesh, {"a": a, "b": b})
     radius = meshes[1].bounding_sphere[1]
     centers = [mesh.areas @ np.sum(mesh.corners(), axis=0) / (3 * mesh.area) for mesh in meshes]
     # Around their centers of area, in radii of the second.

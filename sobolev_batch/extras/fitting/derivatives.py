@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from sobolev_batch.arrays import Complexes, Reals
 from sobolev_batch.errors import InputError, from_extra
 from sobolev_batch.extras.fitting.adjoint import MeshTransform
-from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
+from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh, each
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.surface import Extent
 from sobolev_batch.norms import DEFAULT_ORDER
@@ -267,7 +267,7 @@ def gradient(
     >>> bool(found["error"] < 0.2 * abs(found["gradient"]).sum())
     True
     """
-    mesh, target = as_mesh(mesh), as_operand(target)
+    (mesh,), (target,) = each(as_mesh, {"mesh": mesh}), each(as_operand, {"target": target})
     orders = check_orders(order)
     settings = TransformSettings(eps)
     finer = TransformSettings(max(settings.eps / _REFINEMENT, FINEST_EPS["complex128"]))

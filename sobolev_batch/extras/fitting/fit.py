@@ -16,14 +16,14 @@ from sobolev_batch.errors import AccuracyError, InputError
 from sobolev_batch.extras.fitting import DEFAULT_SMOOTHING, DEFAULT_STEPS
 from sobolev_batch.extras.fitting.descent import Descent, End, Smoothing
 from sobolev_batch.extras.fitting.objective import FitProblem, FitSettings, OrderWeights, welded
-from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh
+from sobolev_batch.geometry.formats.conversion import MeshLike, as_mesh, each
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.proximity import proximity
 from sobolev_batch.geometry.subdivision import Edges
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.norms.distances import distance
 from sobolev_batch.norms.fields import Operand, OperandLike, as_operand
-from sobolev_batch.parameters import is_whole_number
+from sobolev_batch.parameters import callback, is_whole_number
 from sobolev_batch.shown import progress_line
 from sobolev_batch.transform.fourier import Execution, thread_count
 from sobolev_batch.transform.lattice import Lattice
@@ -178,7 +178,7 @@ def fit(
     >>> fitted.after.distance < fitted.before.distance / 4
     True
     """
-    mesh, target = as_mesh(mesh), as_operand(target)
+    (mesh,), (target,) = each(as_mesh, {"mesh": mesh}), each(as_operand, {"target": target})
     settings = FitSettings(order, steps, smoothing, keep_boundary)
     execution = Execution(threads=thread_count(threads))
     return _measured(mesh, FitProblem.for_target(mesh, target, lattice, settings, execution), (), on_progress)
@@ -279,6 +279,7 @@ def measure_quality(problem: FitProblem, mesh: Mesh) -> FitQuality:
 
 def _measured(given: Mesh, problem: FitProblem, goals: Sequence[int], on_progress: Notify | None) -> Fit:
     """Return the mesh of a fit with its distances, or the given one if that is nearer."""
+    callback(on_progress)
     before = measure_quality(problem, problem.start)
     if before.error >= before.distance > 0 and isinstance(problem.target, xr.DataArray):
         raise InputError(
@@ -356,7 +357,7 @@ def refine(
     >>> len(refined.mesh.triangles) <= 40, refined.after.distance < refined.before.distance / 4
     (True, True)
     """
-    mesh, target = as_mesh(mesh), as_operand(target)
+    (mesh,), (target,) = each(as_mesh, {"mesh": mesh}), each(as_operand, {"target": target})
     settings = FitSettings(order, steps, smoothing, keep_boundary)
     execution, goals = Execution(threads=thread_count(threads)), _goals(len(mesh.triangles), triangles)
     problem = FitProblem.for_target(welded(mesh)[0], target, lattice, settings, execution)

@@ -28,7 +28,7 @@ from sobolev_batch.norms.fields import (
     field_values,
     quality_of,
 )
-from sobolev_batch.parameters import is_whole_number
+from sobolev_batch.parameters import check_flags, is_whole_number
 from sobolev_batch.transform.fourier import ErrorTarget, Execution, TransformSettings, choose_settings
 from sobolev_batch.transform.lattice import Lattice, SobolevWeights, single_order
 from sobolev_batch.transform.probe import Sample, draws_for, estimate
@@ -69,8 +69,7 @@ class FitSettings:
             raise InputError(f"steps must be a whole number from 1 on, found {self.steps!r}")
         if not is_finite_number(self.smoothing) or not 0 <= self.smoothing <= MOST_SMOOTHING:
             raise InputError(f"smoothing must be a number from 0 to {MOST_SMOOTHING:g}, found {self.smoothing!r}")
-        if not isinstance(self.keep_boundary, bool):
-            raise InputError(f"keep_boundary must be True or False, found {self.keep_boundary!r}")
+        check_flags(keep_boundary=self.keep_boundary)
         vars(self).update(order=order, steps=int(self.steps), smoothing=float(self.smoothing))
 
     @property

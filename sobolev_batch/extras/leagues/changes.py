@@ -87,6 +87,8 @@ def compare_studies(
     >>> same[["method", "meshes", "ratio", "verdict"]].to_dict("records")
     [{'method': 'icosphere', 'meshes': 4, 'ratio': 1.0, 'verdict': 'undecided'}]
     """
+    if not (columns := as_names(y)):
+        raise InputError("y names no column to compare; leave it out, or name one")
     news, olds = stores_of(new), stores_of(old)
     common = [name for name in news if name in olds]
     if not common:
@@ -104,7 +106,7 @@ def compare_studies(
     for name, pair in tables.items():
         _require_same_reference(name, *trees[name])
         new_rows, old_rows = (frame[frame["family"].isin(chosen)] for frame in pair)
-        frames += [_joined(name, new_rows, old_rows, column, lost) for column in as_names(y)]
+        frames += [_joined(name, new_rows, old_rows, column, lost) for column in columns]
     joined = pd.concat(frames, ignore_index=True)
     if joined.empty:
         raise InputError("the studies have no mesh in common that both have computed at the same order")

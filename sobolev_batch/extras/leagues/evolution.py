@@ -7,6 +7,7 @@ import pandas as pd
 import xarray as xr
 
 from sobolev_batch.errors import InputError
+from sobolev_batch.geometry.surface import is_finite_number
 from sobolev_batch.norms.columns import NUMBER, VARIABLES, described
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.tables import Format
@@ -63,8 +64,8 @@ def evolution(
     >>> bool((found["growth"].sel(family="carried").diff("time") > 0).all())
     True
     """
-    if not factor > 1:
-        raise InputError(f"the factor must be larger than 1, found {factor!r}")
+    if not is_finite_number(factor) or factor <= 1:
+        raise InputError(f"factor must be a number larger than 1, found {factor!r}")
     tree = as_tree(store)
     # Distances to a surface that moves are computed for each time.
     convergence = convergence_at(tree, order) if truth is None else finished_group(tree, "convergence")

@@ -28,7 +28,7 @@ from sobolev_batch.extras.leagues.statistics import (
     within_objects,
 )
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
-from sobolev_batch.parameters import as_names
+from sobolev_batch.parameters import as_names, check_choice
 from sobolev_batch.shown import shown_tables
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.store.layout import OBJECTS
@@ -281,8 +281,7 @@ def league(
     >>> by_cost.means[["member", "triangles", "front"]].round(1).to_dict("list")
     {'member': ['0', '1', '2', '3'], 'triangles': [20.0, 80.0, 320.0, 1280.0], 'front': [True, True, True, True]}
     """
-    if by not in ("size", "cost"):
-        raise InputError(f'methods are compared by "size" or "cost", found {by!r}')
+    check_choice("by", by, ("size", "cost"))
     stores: AnyStores = store
     if isinstance(store, Mapping) and not isinstance(store, xr.DataTree):
         objects = tuple(store)
@@ -300,8 +299,10 @@ def league(
         )
     tables = tables_of(stores, order)
     if by == "cost":
-        return cost_leagues_of(tables, objects, x or DEFAULT_COST, chosen_methods(tables.values(), methods))
-    return leagues_of(tables, objects, x=x or "triangles", y=y, methods=methods)
+        return cost_leagues_of(
+            tables, objects, DEFAULT_COST if x is None else x, chosen_methods(tables.values(), methods)
+        )
+    return leagues_of(tables, objects, x="triangles" if x is None else x, y=y, methods=methods)
 
 
 def _objects_of(store: AnyStore) -> tuple[str, ...]:
@@ -321,6 +322,7 @@ def leagues_of(
     methods: Sequence[str] | None = None,
 ) -> tuple[League, ...]:
     """Rank methods by the rows of `table` of each object that has some, among all objects; see `league`."""
+    x, y = as_names((x, y))
     if x == y:
         raise InputError(f"all methods have the same {y} at equal {x}; choose another x, such as target_tolerance")
     chosen = chosen_methods(tables.values(), methods)
@@ -339,6 +341,8 @@ def chosen_methods(frames: Iterable[pd.DataFrame], methods: str | Sequence[str] 
     """Return the methods to compare, default all of some tables; InputError where one is unknown."""
     families = list(dict.fromkeys(family for frame in frames for family in frame["family"]))
     chosen = families if methods is None else as_names(methods)
+    if not chosen:
+        raise InputError(f"there are no methods to compare; known are {', '.join(families)}")
     for method in chosen:
         if method not in families:
             raise InputError(f"no method is named {quoted(method)}; known are {', '.join(families)}")

@@ -21,6 +21,8 @@ _SMALLEST_RANGE = 1.1
 CONFIDENCE = 0.95
 # Numbers of `table` that no method should have little of.
 _MORE_IS_BETTER = ("fscore", "precision", "recall", "smallest_angle")
+# Numbers of which neither is.
+_NEITHER = ("order", "level", "rank", "rate", "rate_error")
 # All changes of sign are tried for as many objects, and as many random ones for more.
 _MOST_ENUMERATED, _DRAWS, _SEED = 14, 20_000, 0
 # Signs that are in memory at a time.
@@ -82,8 +84,8 @@ def numbers_of(frame: pd.DataFrame, y: str) -> tuple[Reals, Reals]:
 
     Of a bias, the modulus is meant. What is not known is NaN, and so is zero, but for distances.
     """
-    if y in _MORE_IS_BETTER or y not in frame or not pd.api.types.is_numeric_dtype(frame[y]):
-        known = [name for name in frame.select_dtypes("number") if name not in _MORE_IS_BETTER]
+    known = [name for name in frame.select_dtypes("number") if name not in (*_MORE_IS_BETTER, *_NEITHER)]
+    if y not in known:
         raise InputError(f"no number of which less is better is named {quoted(y)}; known are {', '.join(known)}")
     values = np.abs(frame[y].to_numpy(dtype=np.float64, na_value=np.nan))
     values = np.where((values > 0) | (y == "relative"), values, np.nan)

@@ -6,14 +6,14 @@ Libraries are known by the names of their classes, and none is imported.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sobolev_batch.errors import InputError, MeshError
+from sobolev_batch.errors import InputError, MeshError, naming
 from sobolev_batch.geometry.closed_forms import Sphere
 from sobolev_batch.geometry.formats.polygons import cut_polygons
 from sobolev_batch.geometry.formats.readers import read_mesh
@@ -24,6 +24,7 @@ from sobolev_batch.geometry.surface import Surface
 # What `as_mesh` makes a mesh of: "Any" stands for the meshes of other libraries, whose types may not be installed.
 MeshLike = Mesh | str | os.PathLike[str] | tuple[ArrayLike, ArrayLike] | Any
 SurfaceLike = Surface | MeshLike
+T = TypeVar("T")
 # A further kind has a class in `transform/kinds` too.
 SURFACE_KINDS = (Mesh, Sphere, Smooth)
 
@@ -31,7 +32,7 @@ _EXPECTED = (
     "a Mesh, the path of a mesh file, a pair (vertices, triangles) of arrays, or a mesh of trimesh, PyVista, meshio or "
     "Open3D"
 )
-_SURFACES = "a Sphere, a parametrised surface (Ellipsoid, Torus, ParametrisedSurface)"
+_SMOOTH = "a parametrised surface (Ellipsoid, Torus, ParametrisedSurface)"
 # Cells of meshio with flat faces, and those without area.
 _FACES, _WITHOUT_AREA = ("triangle", "quad", "polygon"), ("vertex", "line", "line3")
 
@@ -71,11 +72,22 @@ def as_mesh(mesh: MeshLike) -> Mesh:
     return _converted(mesh, _EXPECTED)
 
 
-def as_surface(surface: SurfaceLike) -> Surface:
+def as_surface(surface: SurfaceLike, *, or_field: bool = False) -> Surface:
     """Return a surface in closed form as it is, and anything else as a mesh, or InputError; see `as_mesh`."""
     if isinstance(surface, SURFACE_KINDS):
         return surface
-    return _converted(surface, f"{_EXPECTED}, {_SURFACES} or a Fourier field")
+    return _converted(
+        surface, f"{_EXPECTED}, a Sphere{f', {_SMOOTH} or a Fourier field' if or_field else f' or {_SMOOTH}'}"
+    )
+
+
+def each(convert: Callable[[Any], T], given: Mapping[str, Any]) -> list[T]:
+    """Return what `as_mesh` or its like makes of parameters or meshes, whose names begin its errors."""
+    found = []
+    for name, one in given.items():
+        with naming(name, InputError):
+            found.append(convert(one))
+    return found
 
 
 def _converted(found: Any, expected: str) -> Mesh:

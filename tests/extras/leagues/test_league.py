@@ -418,13 +418,13 @@ def test_names_that_hold_the_object_are_members_of_all_objects() -> None:
     ("x", "message"),
     [
         ("edge_length", "edge_length falls where meshes get finer, so it is no cost; take triangles"),
-        ("colour", "no size of meshes is named 'colour'; known are edge_length, triangles"),
-        ("none", "no mesh has both a distance and none; name another cost, such as triangles"),
+        ("colour", "no size of meshes is named 'colour'; known are edge_length, triangles, make_seconds"),
+        ("make_seconds", "no mesh has both a distance and make_seconds; name another cost, such as triangles"),
     ],
 )
 def test_a_cost_that_nothing_has_is_refused(x: str, message: str) -> None:
     with pytest.raises(sb.errors.InputError, match=message):
-        by_cost({"cow": POWERS.assign(none=np.nan)}, x)
+        by_cost({"cow": POWERS.assign(make_seconds=np.nan)}, x)
 
 
 def test_the_plot_by_cost_has_all_members_and_their_front() -> None:
