@@ -10,7 +10,7 @@ import pandas as pd
 
 from sobolev_batch.shown import few_of
 from sobolev_batch.tables import Format
-from sobolev_batch.tables.convergence import ALONE, joined, remarks, tables_of
+from sobolev_batch.tables.convergence import ALONE, joined, notes_of_left_out, remarks, tables_of
 from sobolev_batch.tables.open import AnyStore, as_tree, stores_of
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.smallest import smallest_of
@@ -223,7 +223,7 @@ def _absent(label: str, text: str) -> TableRow:
 def format_verdict(store: AnyStore, style: Format = "text", orders: Sequence[float] | None = None) -> str:
     """Return the verdict on each object of a study as text, or their rows for programs."""
     stores, for_programs, sections = stores_of(store), {}, list[Section]()
-    for name, frame in tables_of(store, orders).items():
+    for name, frame in (frames := tables_of(store, orders)).items():
         reasons = frame[frame["status"] != "complete"].drop_duplicates("mesh").set_index("mesh")["reason"]
         # Orders as captions of tables and options write them.
         sentences, rows, omitted = study_verdict(frame, reasons.to_dict(), "{:g}".format)
@@ -241,7 +241,7 @@ def format_verdict(store: AnyStore, style: Format = "text", orders: Sequence[flo
         notes += known[:_MOST_REMARKS]
         notes += [f"and {len(known) - _MOST_REMARKS:,} more remarks"] if len(known) > _MOST_REMARKS else []
         sections.append(Section(sentences=notes))
-    return rendered(style, joined(for_programs), sections, ())
+    return rendered(style, joined(for_programs), sections, notes_of_left_out(store, frames))
 
 
 def format_objects(
@@ -251,7 +251,8 @@ def format_objects(
 
     Those are first that lack most meshes, and then those whose nearest mesh is farthest from its reference.
     """
-    rows = pd.concat({name: frame[_OF_OBJECTS] for name, frame in tables_of(store, orders).items()}, names=["object"])
+    frames = tables_of(store, orders)
+    rows = pd.concat({name: frame[_OF_OBJECTS] for name, frame in frames.items()}, names=["object"])
     rows = rows.reset_index("object").reset_index(drop=True)
     keys = ["order", "object"]
     totals = rows[keys].join(_counted(rows)).groupby(keys, sort=False).sum()
@@ -260,11 +261,11 @@ def format_objects(
     frame = totals.join(nearest[["mesh", "relative", "relative_error"]]).fillna({"mesh": ""}).reset_index()
     frame = frame[[*keys, "mesh", "relative", "relative_error", *_TOTALS]]
     frame = frame.sort_values(["missing", "relative"], ascending=False, kind="stable")
-    sections, notes = [] if len(frame) else [Section(sentences=[ALONE])], []
+    sections, more = [] if len(frame) else [Section(sentences=[ALONE])], list[str]()
     for order, of_order in frame.groupby("order", sort=False):
         shown = of_order.to_dict(orient="records")[:most]
         columns = [one for one in _OBJECT_COLUMNS if one.format is not count or any(row[one.name] for row in shown)]
         sections.append(Section(f"Objects at order {order:g}, the worst first", [(columns, shown)]))
         if len(shown) < len(of_order):
-            notes = [f"{len(of_order) - len(shown):,} more: sobolev-batch table objects STORE"]
-    return rendered(style, frame, sections, notes)
+            more = [f"{len(of_order) - len(shown):,} more: sobolev-batch table objects STORE"]
+    return rendered(style, frame, sections, [*more, *notes_of_left_out(store, frames)])

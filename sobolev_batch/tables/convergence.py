@@ -13,6 +13,7 @@ from sobolev_batch.geometry.proximity import METRICS, OF_ONE_MESH
 from sobolev_batch.norms.columns import parts_as_variables
 from sobolev_batch.norms.estimate import AREA_AND_SHAPE, PARTS
 from sobolev_batch.parameters import as_names
+from sobolev_batch.shown import few_of
 from sobolev_batch.sources.names import quoted
 from sobolev_batch.sources.programs import Cost
 from sobolev_batch.tables import Format
@@ -23,6 +24,7 @@ from sobolev_batch.tables.open import (
     finished_group,
     has_objects,
     metadata_of,
+    objects_of,
     reference_of,
     stores_of,
     study_unit,
@@ -143,7 +145,8 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
           smallest_angle and aspect_ratio; their lengths are in the unit of the files.
 
         Numbers of a mesh that failed are NaN. The frame's ``attrs`` have the reference's label and, where there are
-        any, the study's rtol, the names of ``metadata``, and as ``computed`` the orders computed from the fields.
+        any, the study's rtol, the names of ``metadata``, and as ``computed`` the orders computed from the fields. Those
+        of several objects have what these share, and as ``left_out`` the names of objects without tables.
 
     Raises:
         InputError: The store has no tables yet, or its meshes have no such size.
@@ -160,7 +163,8 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
     >>> frame[["components", "euler_characteristic"]].value_counts().to_dict()
     {(1, 2): 4}
     """
-    return joined(tables_of(store, order, x=x))
+    frames = tables_of(store, order, x=x)
+    return joined(frames, left_out(store, frames))
 
 
 def tables_of(
@@ -247,11 +251,30 @@ def _divided(rows: pd.DataFrame, x: str) -> dict[str, pd.DataFrame]:
     return frames
 
 
-def joined(frames: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-    """Return the rows of several objects after each other, named in the first column; those of an only one alone."""
+def joined(frames: Mapping[str, pd.DataFrame], left_out: Sequence[str] = ()) -> pd.DataFrame:
+    """Return the rows of several objects after each other, named in the first column; those of an only one alone.
+
+    The frame's attributes are those that all objects share, and the names of objects that are left out.
+    """
     if "" in frames:
         return frames[""]
-    return pd.concat(frames, names=["object", "row"]).reset_index(level="object").reset_index(drop=True)
+    frame = pd.concat(frames, names=["object", "row"]).reset_index(level="object").reset_index(drop=True)
+    first, *others = (one.attrs for one in frames.values())
+    frame.attrs = {key: value for key, value in first.items() if all(one.get(key) == value for one in others)}
+    frame.attrs |= {"left_out": [*left_out]} if left_out else {}
+    return frame
+
+
+def left_out(store: AnyStore | Mapping[str, AnyStore], frames: Mapping[str, pd.DataFrame]) -> list[str]:
+    """Return the names of the objects of a store that have no rows."""
+    return [name for name in objects_of(store) if name not in frames]
+
+
+def notes_of_left_out(store: AnyStore | Mapping[str, AnyStore], frames: Mapping[str, pd.DataFrame]) -> list[str]:
+    """Return a sentence on the objects of a store that have no rows, by lines; nothing where all have some."""
+    names, total = left_out(store, frames), len(objects_of(store))
+    left = f"{len(names):,} of {total:,} objects {'is' if len(names) == 1 else 'are'} left out, without tables"
+    return wrapped(f"{left}: {few_of(names)}. The command status tells why.") if names else []
 
 
 def format_table(
@@ -268,7 +291,8 @@ def format_table(
     stores = stores_of(store)
     trees = {name: as_tree(stores[name]) for name in frames}
     sections = (part for name, frame in frames.items() for part in _sections(name, trees[name], frame, x))
-    return rendered(style, joined(frames), sections, _notes([*trees.values()], list(frames.values()), x))
+    notes = notes_of_left_out(store, frames) + _notes([*trees.values()], list(frames.values()), x)
+    return rendered(style, joined(frames), sections, notes)
 
 
 def _sections(name: str, tree: xr.DataTree, frame: pd.DataFrame, x: str) -> Iterator[Section]:

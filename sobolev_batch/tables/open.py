@@ -22,7 +22,7 @@ from sobolev_batch.store.encoding import with_coordinates
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.metadata import mapping_in
-from sobolev_batch.store.objects import stores_below
+from sobolev_batch.store.objects import Objects, stores_below
 from sobolev_batch.tables.all_objects import concatenated
 from sobolev_batch.visible import FILE_UNITS
 
@@ -194,6 +194,16 @@ def stores_of(store: AnyStore | Mapping[str, AnyStore]) -> Mapping[str, AnyStore
     if isinstance(store, xr.DataTree) and not has_objects(store):
         return {"": store}
     return {**stores_below(Location.parse(location_of(store)))}
+
+
+def objects_of(store: AnyStore | Mapping[str, AnyStore]) -> tuple[str, ...]:
+    """Return the names of a store's objects, or of stores by name; none where it is that of an only one."""
+    if isinstance(store, xr.DataTree):
+        return tuple(root_attribute(store, "study").get(layout.OBJECTS, ()))
+    if isinstance(store, Mapping):
+        return tuple(store)
+    found = Objects.read(Location.parse(store))
+    return () if found is None else found.names
 
 
 def source_of(tree: xr.DataTree) -> str | None:

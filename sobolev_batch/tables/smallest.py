@@ -9,7 +9,7 @@ import pandas as pd
 from sobolev_batch.errors import InputError
 from sobolev_batch.parameters import fraction
 from sobolev_batch.tables import Format
-from sobolev_batch.tables.convergence import MESH, TRIANGLES, joined, tables_of
+from sobolev_batch.tables.convergence import MESH, TRIANGLES, joined, left_out, notes_of_left_out, tables_of
 from sobolev_batch.tables.open import AnyStore
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.text import percent, wrapped
@@ -44,7 +44,7 @@ def smallest_below(store: AnyStore, relative: float | str, order: Orders | None 
         bound), its triangles, relative and relative_error (missing likewise); nearest (the mesh of the family with the
         smallest distance), nearest_relative and nearest_relative_error; undecided (meshes with fewer triangles of
         which the errors leave open whether they are below the bound, separated by commas). The frame's ``attrs`` have
-        the reference's label and the bound.
+        the reference's label and the bound, and of several objects as ``left_out`` the names of those without tables.
 
     Raises:
         InputError: The store has no tables yet, no such order or no triangles, or the bound is not
@@ -56,7 +56,8 @@ def smallest_below(store: AnyStore, relative: float | str, order: Orders | None 
     >>> frame[["family", "mesh", "triangles"]].values.tolist()
     [['icosphere', 'icosphere/2', 320]]
     """
-    return joined(_of_objects(store, relative, order))
+    frames = _of_objects(store, relative, order)
+    return joined(frames, left_out(store, frames))
 
 
 def _of_objects(store: AnyStore, relative: float | str, order: Orders | None) -> dict[str, pd.DataFrame]:
@@ -88,7 +89,7 @@ def format_smallest(store: AnyStore, style: Format, orders: Sequence[float] | No
             records = rows.to_dict(orient="records")
             cells = [{**row, "mesh": row["mesh"] or "none", "remark": _remark(row)} for row in records]
             sections.append(Section(caption, [(_COLUMNS, cells)]))
-    return rendered(style, joined(frames), sections, wrapped(_NOTE))
+    return rendered(style, joined(frames), sections, notes_of_left_out(store, frames) + wrapped(_NOTE))
 
 
 def _smallest(members: pd.DataFrame, most: float) -> dict[str, Any]:

@@ -71,6 +71,25 @@ def test_each_object_has_a_store_of_its_own(store: Path, threads: Client, tmp_pa
     assert json.loads(tree.attrs["study"])["objects"] == ["a", "gone", "b"]
 
 
+def test_objects_without_tables_are_named_beside_those_of_others(store: Path) -> None:
+    frame, smallest = sb.table(store), sb.smallest_below(store, "5%")
+    # What all objects share, without the units in which each was computed.
+    assert frame.attrs == {"reference": "reference", "left_out": ["gone"]} | {
+        key: frame.attrs[key] for key in ("unit_length",) if key in frame.attrs
+    }
+    assert smallest.attrs == {"reference": "reference", "below": 0.05, "left_out": ["gone"]}
+    texts = (
+        format_table(store),
+        format_verdict(store),
+        format_objects(store),
+        format_smallest(store, "text", None, below=0.05),
+    )
+    for text in texts:
+        assert text.count("1 of 3 objects is left out, without tables: gone.") == 1
+    assert "left_out" not in sb.table(store / "a").attrs
+    assert "left out" not in format_smallest(store / "a", "text", None, below=0.05)
+
+
 def test_what_is_damaged_is_named_with_its_object(changeable: Path) -> None:
     sound = sb.verify(changeable)
     assert (sound.is_sound, sound.complete, sound.total) == (True, 10, 10)

@@ -31,13 +31,10 @@ from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
 from sobolev_batch.parameters import as_names, check_choice
 from sobolev_batch.shown import shown_tables
 from sobolev_batch.sources.names import quoted
-from sobolev_batch.store.layout import OBJECTS
-from sobolev_batch.store.location import Location
-from sobolev_batch.store.objects import Objects
 from sobolev_batch.study.comparable import SIGNIFICANCE, gap_of, least_objects
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.convergence import EDGE_LENGTH, sizes_of, tables_of
-from sobolev_batch.tables.open import AnyStore, as_tree, root_attribute, source_of
+from sobolev_batch.tables.open import AnyStore, as_tree, objects_of, root_attribute, source_of
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.text import wrapped
 from sobolev_batch.transform.lattice import Orders
@@ -283,9 +280,7 @@ def league(
     """
     check_choice("by", by, ("size", "cost"))
     stores: AnyStores = store
-    if isinstance(store, Mapping) and not isinstance(store, xr.DataTree):
-        objects = tuple(store)
-    elif found := _objects_of(store):
+    if found := objects_of(store):
         objects = found
     elif by == "cost":
         tree = as_tree(store)
@@ -303,14 +298,6 @@ def league(
             tables, objects, DEFAULT_COST if x is None else x, chosen_methods(tables.values(), methods)
         )
     return leagues_of(tables, objects, x="triangles" if x is None else x, y=y, methods=methods)
-
-
-def _objects_of(store: AnyStore) -> tuple[str, ...]:
-    """Return the names of a store's objects; none where it is that of an only one."""
-    if isinstance(store, xr.DataTree):
-        return tuple(root_attribute(store, "study").get(OBJECTS, ()))
-    found = Objects.read(Location.parse(store))
-    return () if found is None else found.names
 
 
 def leagues_of(
