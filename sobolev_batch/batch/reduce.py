@@ -65,7 +65,7 @@ class Reduction:
         original_triangles: Number of triangles of the mesh; 0 if it cannot be read.
         trials: What was tried, in this order.
         bracket: The ``best`` mesh, of the fewest triangles within the tolerance, and the next coarser one that
-            ``failed``. ``is_monotone`` is false where a finer mesh was farther away: then a smaller one may hold.
+            ``failed``. ``is_monotone`` is false where a finer mesh was worse: then a smaller one may hold.
         reason: Why there is no mesh; empty where there is one.
         path: Where the mesh was written; empty without an output.
         mesh: The mesh, where there is no output.
@@ -178,8 +178,9 @@ def reduce(
         method: Name of a source that makes meshes of a number of triangles ("decimate", "remesh"); a command with
             {input}, {output} and a parameter, which thereby is permitted to run; a function of a mesh and a parameter;
             or the table of a family without its mesh.
-        search: Name of the parameter, and between which two values to search; whole numbers for one that takes no
-            others. Which end is coarse shows by itself. Default: triangles, from 4 to those of the mesh.
+        search: Name of the parameter, and between which two values to search, such as ``{"hausd": (0.001, 1.0)}``;
+            whole numbers for one that takes no others. Which end is coarse shows by itself. Default: triangles, from 4
+            to those of the mesh.
         precision: Width of the last bracket, from the mesh that holds to the next coarser one that failed, as a
             fraction of the parameter.
         output: Folder or URL for the reduced meshes, under their own names, and for records; default none.

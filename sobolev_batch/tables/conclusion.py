@@ -14,7 +14,7 @@ from sobolev_batch.tables.convergence import ALONE, joined, notes_of_left_out, r
 from sobolev_batch.tables.open import AnyStore, as_tree, stores_of
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.smallest import smallest_of
-from sobolev_batch.tables.text import count, minus, percent, spread, wrapped
+from sobolev_batch.tables.text import count, minus, percent, spread, times, wrapped
 
 # A row of a table: a record of a frame. It may also have its "order"; a "mark", a short remark about its marked number;
 # the number of its "color"; and the text "absent" in place of all numbers, with the section "reasons" that explains it.
@@ -73,15 +73,16 @@ def study_verdict(
 
 def _of_sizes(at_order: str, at_sizes: Sequence[pd.DataFrame]) -> str:
     """Return a sentence on which family is nearest where meshes of several families have about as many triangles."""
-    wins, leads = Counter[str](), []
+    wins, leads, finer = Counter[str](), [], 0
     for members in at_sizes:
         if (closest := _nearest(members)) is not None:
             best, rivals = closest
             families = members["family"]
             if not any(members["mesh"].isin(rivals) & (families != best["family"])):
                 wins[best["family"]] += 1
-                second = members["distance"][families != best["family"]].min()
-                leads.append(second / best["distance"] if best["resolved"] else math.inf)
+                second = members[families != best["family"]].sort_values("distance").iloc[0]
+                leads.append(second["distance"] / best["distance"] if best["resolved"] else math.inf)
+                finer += int(best["triangles"] > second["triangles"])
     if not wins:
         return ""
     total = len(at_sizes)
@@ -91,8 +92,10 @@ def _of_sizes(at_order: str, at_sizes: Sequence[pd.DataFrame]) -> str:
         where = "the same size" if total == 1 else f"{'each' if is_sweep else number} of {total:,} sizes"
         parts.append(f"{family} is nearest at {where}")
     if is_sweep and np.isfinite(leads).all():
-        low, high = (f"{lead:.2g}" for lead in (min(leads), max(leads)))
+        low, high = (times(lead, 2) for lead in (min(leads), max(leads)))
         parts.append(f"{low if low == high else f'{low} to {high}'} times nearer than the next")
+    if finer:
+        parts.append(f"with more triangles than the next{f' at {finer:,} of them' if total > 1 else ''}")
     return f"{', '.join(parts)}, {at_order}. "
 
 
@@ -157,7 +160,7 @@ def _nearest(frame: pd.DataFrame) -> tuple[pd.Series, tuple[str, ...]] | None:
 def _lead(best: pd.Series, members: pd.DataFrame) -> str:
     """Return by how much the nearest mesh is nearer than the next one of another family, of its size if there is one.
 
-    Where there is none, the remark has the number of triangles of the other one.
+    Where that has another number of triangles, the remark has it.
     """
     others = members[(members["family"] != best["family"]) & members["distance"].notna()]
     counts = np.maximum(others["triangles"].astype(float), 1.0) / max(best["triangles"], 1)
@@ -166,12 +169,14 @@ def _lead(best: pd.Series, members: pd.DataFrame) -> str:
         return ""
     rivals = of_size if len(of_size) else others
     second = rivals.loc[rivals["distance"].idxmin()]
-    size = "" if len(of_size) or not second["triangles"] else f" of {second['triangles']:,} triangles"
+    size = "" if second["triangles"] in (0, best["triangles"]) else f" of {second['triangles']:,} triangles"
     nearer = f"nearer than {second['mesh']}{size}"
     if not best["resolved"]:
         return f"below its error, {nearer}"
     ratio = second["distance"] / best["distance"]
-    return f"{ratio:.3g} times {nearer}" if ratio < 100 else f"far {nearer}"
+    if ratio == 1:
+        return nearer.replace("nearer than", "as near as")
+    return f"{times(ratio)} times {nearer}" if ratio < 100 else f"far {nearer}"
 
 
 def _smallest_rows(rows: pd.DataFrame, families: Sequence[str]) -> Iterator[TableRow]:

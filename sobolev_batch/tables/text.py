@@ -19,6 +19,8 @@ _DIGITS_WITHOUT_ERROR = 4
 _ROUNDED = 1.5
 # Beyond these, powers of ten are easier to read.
 _SMALLEST_PLAIN, _LARGEST_PLAIN, _LAST_PLAIN = 1e-3, 1e5, -6
+# Numbers from it on are shown as whole ones.
+_LARGE = 100.0
 POWER = " × 10"
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -69,6 +71,27 @@ def percent(fraction: float, error: float = math.nan) -> str:
 def count(number: int) -> str:
     """Return a number of things; nothing for none."""
     return f"{number:,}" if number else ""
+
+
+def number_text(value: float, unit: str = "") -> str:
+    """Return a number with three digits, or a large one as a whole, with ? for one that nothing bounds.
+
+    >>> number_text(2.5041), number_text(2851.3), number_text(math.inf)
+    ('2.5', '2,851', '?')
+    """
+    if not math.isfinite(value):
+        return "" if math.isnan(value) else "?"
+    return f"{value:,.0f}{unit}" if abs(value) >= _LARGE else f"{value:.3g}{unit}"
+
+
+def times(factor: float, digits: int = 3) -> str:
+    """Return a factor with some digits, or with as many as tell it from 1.
+
+    >>> times(2.5041), times(1.00042), times(1234.5)
+    ('2.5', '1.0004', '1,234')
+    """
+    needed = 1 - math.floor(math.log10(abs(factor - 1))) if factor != 1 else digits
+    return number_text(factor) if factor >= _LARGE else f"{factor:.{max(digits, needed)}g}"
 
 
 def bound(fraction: float) -> str:

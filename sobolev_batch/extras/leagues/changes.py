@@ -14,7 +14,6 @@ from sobolev_batch.extras.leagues.league import (
     AnyStores,
     chosen_methods,
     interval_text,
-    number_text,
     orders_of,
 )
 from sobolev_batch.extras.leagues.statistics import adjusted, errors_of_logarithms, interval, numbers_of, sign_flip_test
@@ -26,7 +25,7 @@ from sobolev_batch.tables import Format
 from sobolev_batch.tables.convergence import table
 from sobolev_batch.tables.open import AnyStore, as_tree, finished_group, reference_of, root_attribute, stores_of
 from sobolev_batch.tables.rendering import Column, Section, rendered
-from sobolev_batch.tables.text import wrapped
+from sobolev_batch.tables.text import number_text, wrapped
 from sobolev_batch.transform.lattice import Orders
 
 _NOTE = """\

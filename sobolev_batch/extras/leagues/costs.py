@@ -15,13 +15,11 @@ from sobolev_batch.shown import shown_tables
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.convergence import EDGE_LENGTH, sizes_of
 from sobolev_batch.tables.rendering import Column, Section, rendered
-from sobolev_batch.tables.text import percent, wrapped
+from sobolev_batch.tables.text import number_text, percent, wrapped
 
 DEFAULT_COST = "make_seconds"
 # Members that a row of a table names, and objects whose fronts a text has.
 _MOST_MEMBERS, _MOST_OBJECTS = 4, 10
-# Costs from it on, such as bytes, are shown as integers.
-_LARGE = 100.0
 COST_NOTE = """\
 A mesh is on the front of its object unless another one, at no more cost, is nearer to the
 reference or as near at less cost. It is undecided where the errors of the distances leave that
@@ -212,7 +210,7 @@ def front_columns(x: str) -> tuple[Column, ...]:
     """Return the columns of `CostLeague.front`, with a cost of this name."""
     return (
         Column("member", "front of the means", kind="label"),
-        Column(x, x, lambda cost: f"{cost:,.0f}" if cost >= _LARGE else f"{cost:.3g}"),
+        Column(x, x, number_text),
         Column("relative", "relative", percent, "relative_error"),
         Column("fronts", "on the front", "{} of {}".format, "objects"),
     )

@@ -1,6 +1,5 @@
 """A league: the methods of a study, ranked over all objects, and as text."""
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -28,6 +27,7 @@ from sobolev_batch.extras.leagues.statistics import (
     within_objects,
 )
 from sobolev_batch.norms.accuracy.tolerance import NEXT_TO_EQUAL
+from sobolev_batch.norms.columns import NUMBER, VARIABLES
 from sobolev_batch.parameters import as_names, check_choice
 from sobolev_batch.shown import shown_tables
 from sobolev_batch.sources.names import quoted
@@ -36,7 +36,7 @@ from sobolev_batch.tables import Format
 from sobolev_batch.tables.convergence import EDGE_LENGTH, sizes_of, tables_of
 from sobolev_batch.tables.open import AnyStore, as_tree, objects_of, root_attribute, source_of
 from sobolev_batch.tables.rendering import Column, Section, rendered
-from sobolev_batch.tables.text import wrapped
+from sobolev_batch.tables.text import number_text, times, wrapped
 from sobolev_batch.transform.lattice import Orders
 
 LEAGUE_NOTE = """\
@@ -56,13 +56,8 @@ _MOST_REASONS = 3
 ENDS = ("low", "high")
 
 
-def number_text(value: float, unit: str = "") -> str:
-    """Return a number with three digits, with ? for one that nothing bounds."""
-    return "" if math.isnan(value) else "?" if math.isinf(value) else f"{value:.3g}{unit}"
-
-
 def percent_text(value: float) -> str:
-    """Return the same of a fraction in per cent."""
+    """Return a fraction in per cent, as `number_text` does."""
     return number_text(100 * value, " %")
 
 
@@ -418,9 +413,15 @@ def format_league(leagues: Sequence[League], style: Format = "text") -> str:
     """Return leagues as text; see `league`."""
     frame = pd.concat([one.table.assign(order=one.order) for one in leagues], ignore_index=True)
     sections = [Section(one.caption, [(league_columns(one.y), one.table)], pair_lines(one)) for one in leagues]
-    notes = wrapped(LEAGUE_NOTE.format(x=leagues[0].x, y=", ".join(dict.fromkeys(one.y for one in leagues))))
+    notes = wrapped(LEAGUE_NOTE.format(x=leagues[0].x, y=", ".join(dict.fromkeys(_in_units(one.y) for one in leagues))))
     notes += [f"{name} is left out{where}: {reason}." for name, where, reason in left_out(leagues)]
     return rendered(style, frame[["order", *frame.columns.drop("order")]], sections, notes)
+
+
+def _in_units(y: str) -> str:
+    """Return the name of a column with the units of its numbers, if they have any that tables do not show."""
+    units = VARIABLES.get(y, {}).get("units", NUMBER)
+    return y if units == NUMBER else f"{y} in {units}"
 
 
 def left_out(leagues: Sequence[League]) -> Iterator[tuple[str, str, str]]:
@@ -441,7 +442,7 @@ def pair_lines(league: League) -> list[str]:
         if row.nearer:
             farther, ratio = (row.other, 1 / row.ratio) if row.nearer == row.method else (row.method, row.ratio)
             less = "is {} times nearer than" if league.y == RELATIVE else f"has {{}} times less {league.y} than"
-            lines.append(f"{row.nearer} {less.format(f'{ratio:.3g}')} {farther} (p = {row.p:.2g}).")
+            lines.append(f"{row.nearer} {less.format(times(ratio))} {farther} (p = {row.p:.2g}).")
     count, methods = len(league.objects), len(league.table)
     if not lines and methods > 1:
         least = least_objects(len(league.pairs))

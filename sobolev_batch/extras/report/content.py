@@ -28,7 +28,6 @@ from sobolev_batch.extras.leagues.league import (
     league_columns,
     leagues_of,
     left_out,
-    number_text,
     pair_lines,
 )
 from sobolev_batch.store.objects import Objects
@@ -44,7 +43,7 @@ from sobolev_batch.tables.convergence import (
 )
 from sobolev_batch.tables.open import doubts_of, finished_group, open_store, root_attribute, similarity_of
 from sobolev_batch.tables.rendering import Column
-from sobolev_batch.tables.text import minus, percent
+from sobolev_batch.tables.text import minus, number_text, percent
 from sobolev_batch.transform.lattice import Lattice
 
 # Rows of all convergence tables together, of the table of meshes, and of reasons; browsers become slow beyond.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from itertools import product
 from typing import Any
@@ -197,8 +198,9 @@ def test_methods_are_compared_by_any_number() -> None:
         text = format_league([made])
         assert f"League by {y}, over 6 objects" in text
         assert f"b has 3 times less {y} than a" in text
+        assert f"Numbers ({y} in unit length of the files) are" in " ".join(text.split())
         assert sb.plot.league(made).get_ylabel() != sb.plot.league(ranked(tables, y="hausdorff_upper")).get_ylabel()
-    for y in ("fscore", "colour", "mesh"):
+    for y in ("fscore", "colour", "mesh", "order"):
         with pytest.raises(sb.errors.InputError, match=f"less is better is named '{y}'; known are .*hausdorff, "):
             ranked(tables, y=y)
 
@@ -246,6 +248,14 @@ def test_meshes_of_nearly_one_size_are_compared_and_have_no_rate() -> None:
     assert made.table["rate"].isna().all()
     steep = method_rows({"a": {1000: 1.0, 1001: 0.5}, "b": {1000: 1.0, 1001: 0.5}})
     np.testing.assert_allclose(ranked({"x": POWERS, "steep": steep}).table["rate"], 2.0)
+
+
+def test_large_numbers_are_whole_ones_and_factors_are_told_from_1() -> None:
+    rows = POWERS.assign(tool=np.where(POWERS["family"] == "a", 1e6, 1.0004e6) / POWERS["triangles"])
+    text = format_league([ranked({f"{i}": rows.assign(tool=2.0**i * rows["tool"]) for i in range(6)}, y="tool")])
+    assert "a has 1.0004 times less tool than b" in text
+    assert not re.search(r"\de\+\d", text)
+    assert re.search(r"^a +1 +\d{2},\d{3} ", text, re.M)
 
 
 def test_objects_are_named_with_the_orders_that_leave_them_out() -> None:

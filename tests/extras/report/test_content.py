@@ -65,10 +65,16 @@ def test_the_nearest_mesh_of_each_size_and_the_smallest_below_bounds() -> None:
     meshes = [("a", 100, 0.2), ("b", 110, 0.1), ("a", 400, 0.02), ("b", 390, 0.04), ("b", 4000, 0.005)]
     sentence, rows, omitted = verdict_on(frame(meshes))
     assert sentence == (
-        "b is nearest at 1 of 2 sizes, a is nearest at 1 of 2 sizes, at order −2. "
+        "b is nearest at 1 of 2 sizes, a is nearest at 1 of 2 sizes, with more triangles than the next at 2 of them, "
+        "at order −2. "
         "Of 5 meshes, b/4000 is nearest to the reference at order −2: it differs by 0.5000\xa0%\xa0±\xa00.0005\xa0%."
     )
-    assert rows["100 to 110 triangles"] == ["b/110", "10.00 % ± 0.01 %", "110", "2 times nearer than a/100"]
+    assert rows["100 to 110 triangles"] == [
+        "b/110",
+        "10.00 % ± 0.01 %",
+        "110",
+        "2 times nearer than a/100 of 100 triangles",
+    ]
     assert rows["390 to 400 triangles"][0] == "a/400"
     assert not any("4,000" in label for label in rows)
     assert rows["below 5 %: a"][:3] == ["a/400", "2.000 % ± 0.002 %", "400"]
@@ -124,6 +130,15 @@ def test_the_first_sentence_compares_meshes_of_one_size() -> None:
     meshes = [("a", 100, 0.2), ("b", 100, 0.5), ("a", 400, 0.02), ("b", 400, 0.06), ("b", 4000, 0.005)]
     sentence, _, _ = verdict_on(frame(meshes))
     assert sentence.startswith("a is nearest at each of 2 sizes, 2.5 to 3 times nearer than the next, at order −2. ")
+    # What is nearer need not be better if it is finer.
+    finer = [("a", 118, 0.2), *meshes[1:]]
+    assert (
+        "3 times nearer than the next, with more triangles than the next at 1 of them, " in verdict_on(frame(finer))[0]
+    )
+    only = [("a", 266, 0.2), ("b", 230, 0.201)]
+    assert verdict_on(frame(only, error=1e-6))[0].startswith(
+        "a is nearest at the same size, 1.005 times nearer than the next, with more triangles than the next, "
+    )
     # The errors of the small ones leave open which is nearer.
     made = frame(meshes)
     made.loc[[0, 1], "error"] = 4.0
@@ -138,7 +153,7 @@ def test_the_nearest_of_all_is_compared_with_its_like() -> None:
     _, rows, _ = verdict_on(frame(meshes))
     assert rows["nearest of all"][-1] == "3 times nearer than b/5120 of 5,120 triangles"
     _, rows, _ = verdict_on(frame([*meshes, ("b", 10000, 0.05)]))
-    assert rows["nearest of all"][-1] == "5 times nearer than b/10000"
+    assert rows["nearest of all"][-1] == "5 times nearer than b/10000 of 10,000 triangles"
     _, rows, _ = verdict_on(frame([*meshes, ("c", 0, 0.02)]))
     assert rows["nearest of all"][-1] == "2 times nearer than c/0"
 
