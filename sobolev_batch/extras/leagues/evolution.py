@@ -65,7 +65,7 @@ def evolution(
     True
     """
     if not is_finite_number(factor) or factor <= 1:
-        raise InputError(f"factor must be a number larger than 1, found {factor!r}")
+        raise InputError(f"the factor must be larger than 1, found {factor!r}")
     tree = as_tree(store)
     # Distances to a surface that moves are computed for each time.
     convergence = convergence_at(tree, order) if truth is None else finished_group(tree, "convergence")

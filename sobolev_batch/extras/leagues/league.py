@@ -275,7 +275,9 @@ def league(
     """
     check_choice("by", by, ("size", "cost"))
     stores: AnyStores = store
-    if found := objects_of(store):
+    if isinstance(store, Mapping) and not isinstance(store, xr.DataTree):
+        objects = tuple(store)
+    elif found := objects_of(store):
         objects = found
     elif by == "cost":
         tree = as_tree(store)
