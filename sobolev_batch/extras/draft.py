@@ -19,7 +19,7 @@ from sobolev_batch.geometry.formats.by_name import is_mesh_name, mesh_stem
 from sobolev_batch.geometry.formats.readers import expected_size, read_mesh
 from sobolev_batch.geometry.surface import Extent, placement_doubt
 from sobolev_batch.parameters import path_of
-from sobolev_batch.shown import Shown, reasons
+from sobolev_batch.shown import Shown, few_of, reasons
 from sobolev_batch.sources.files import MOST_MESHES
 from sobolev_batch.sources.names import caseless_key, label_problem, name_problem, natural_key, quoted
 from sobolev_batch.study.schema import REFERENCE_LABEL, RESERVED
@@ -92,8 +92,8 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
     The reference is the mesh that is called original, reference, target or ground truth, or else the one with the most
     triangles. Each folder is a family; the meshes of a single folder are families by their names without the number at
     the end. Where several files are called references and others belong to them by name, the study has several
-    objects, and so it has where the names of files begin as those of finer ones, in any folder. Files are looked
-    at, and only small ones are read.
+    objects, and so it has where the names of files begin as those of finer ones, in any folder. References alone are
+    compared with decimated versions of themselves. Files are looked at, and only small ones are read.
 
     Args:
         folder: Folder with meshes, in it or in folders below.
@@ -143,7 +143,8 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
         sections, summary = _one_object(references[""], families, sizes, below)
     else:
         lacks = "no other mesh belongs to it by name, nor it to one"
-        sections, summary = _several_objects(references, families, below)
+        alone = () if families else _originals(references, sizes, below)
+        sections, summary = alone or _several_objects(references, families, below)
     left_out |= {str(path): lacks for path in sizes if path not in used}
     name = _json(_free_name(folder.resolve().name, fallback="study"))
     text = _filled("study", name=name, sections="".join(f"\n{section}" for section in sections))
@@ -233,14 +234,24 @@ def _free_name(wanted: str, taken: Iterable[str] = (), fallback: str = "meshes")
 def _references(sizes: Mapping[PurePosixPath, int]) -> dict[str, PurePosixPath]:
     """Return the references by their objects; none where all files are of one object.
 
-    There are several objects if several files are called references, and each has files of its name.
+    There are several objects if several files are called references, of which some have files of their names, or where
+    there are no other files at all.
     """
     called = [path for path in sizes if _is_called_reference(path)]
     references = {_object_of(path): path for path in called} or _finest_of_names(sizes)
     owners = {name for name, *_ in _owned(sizes, references)}
     are_different = 2 <= len({*map(caseless_key, references)}) == len(called or references)
     is_refused = any(name_problem(name, _LONGEST_NAME, RESERVED) or name.startswith((".", "__")) for name in references)
-    return references if are_different and not is_refused and references.keys() <= owners else {}
+    if not are_different or is_refused:
+        return {}
+    # Names that others continue, as cow and cow_500, are those of one object.
+    known = {*map(caseless_key, references)}
+    is_alone = len(called) == len(sizes) and not any(
+        known.intersection(caseless_key(name) for name, _ in _names_in(path) if own.startswith(name))
+        - {caseless_key(own)}
+        for own, path in references.items()
+    )
+    return references if is_alone else {name: path for name, path in references.items() if name in owners}
 
 
 def _finest_of_names(sizes: Mapping[PurePosixPath, int]) -> dict[str, PurePosixPath]:
@@ -377,6 +388,23 @@ def _one_object(
     return sections, tuple(summary)
 
 
+def _originals(
+    references: Mapping[str, PurePosixPath], sizes: Mapping[PurePosixPath, int], folder: PurePosixPath
+) -> tuple[list[str], tuple[str, ...]]:
+    """Return the sections of a study of originals alone, which decimates them, and what they hold."""
+    templates = {str(folder / path).replace(name, OBJECT) for name, path in references.items()}
+    fewest = min(sizes[path] for path in references.values())
+    counts = [count for part in _FRACTIONS if (count := fewest // part) >= _FEWEST_TRIANGLES]
+    if len(templates) > 1 or not counts:
+        raise StudyError(
+            f"there are originals alone ({few_of([*map(str, references.values())])}), with nothing to compare; add "
+            f"meshes with their names, such as METHOD/{next(iter(references))}_500.ply"
+        )
+    (path,) = templates
+    summary = f"{_objects_text(references)}, each compared with decimated versions of itself"
+    return [_filled("originals", path=_json(path), counts=counts)], (summary,)
+
+
 def _several_objects(
     references: Mapping[str, PurePosixPath], families: _Families, folder: PurePosixPath
 ) -> tuple[list[str], tuple[str, ...]]:
@@ -387,12 +415,17 @@ def _several_objects(
         _filled("mesh", name=_json(name), method=_json(method), path=_json(str(folder / path)))
         for name, method, path in listed
     )
-    names, counts = list(references), Counter(method for _, method, _ in listed[len(references) :])
-    more = f" and {len(names) - _MOST_OBJECTS} more" if len(names) > _MOST_OBJECTS else ""
+    counts = Counter(method for _, method, _ in listed[len(references) :])
     return [_filled("objects", meshes=meshes)], (
-        f"{len(names)} objects: {', '.join(names[:_MOST_OBJECTS])}{more}",
+        _objects_text(references),
         *(f"method {method}: {_count(count)}" for method, count in counts.items()),
     )
+
+
+def _objects_text(names: Iterable[str]) -> str:
+    shown = [*names]
+    more = f" and {len(shown) - _MOST_OBJECTS} more" if len(shown) > _MOST_OBJECTS else ""
+    return f"{len(shown)} object{'s' * (len(shown) != 1)}: {', '.join(shown[:_MOST_OBJECTS])}{more}"
 
 
 def _filled(piece: str, **values: object) -> str:

@@ -166,6 +166,40 @@ def test_objects_need_no_other_mesh_if_most_have_one(
     assert draft.left_out == (dict.fromkeys([f"in/part_5{end}.ply"], reason) if found > 1 else {})
 
 
+@pytest.mark.parametrize("lacking", [1, 2])
+@pytest.mark.parametrize("template", ["originals/{}.ply", "{}_original.ply", "{}/original.ply"])
+def test_originals_without_other_meshes_are_named(tmp_path: Path, template: str, lacking: int) -> None:
+    names = ("bell", "cow", "egg")
+    for number, name in enumerate(names):
+        write(tmp_path / template.format(name), 2)
+        if number >= lacking:
+            write(tmp_path / f"mmg/{name}_80.ply", 1)
+    found = sb.init_study(tmp_path, tmp_path / "study.toml")
+    assert [*as_study(found.path).objects] == [*names[lacking:]]
+    reason = "no other mesh belongs to it by name, nor it to one"
+    assert found.left_out == {template.format(name): reason for name in names[:lacking]}
+
+
+@pytest.mark.parametrize("template", ["originals/{}.ply", "{}_original.ply", "{}/original.ply"])
+def test_originals_alone_are_compared_with_their_decimations(tmp_path: Path, template: str) -> None:
+    for level, name in enumerate(("big cow", "cow"), start=2):
+        write(tmp_path / "meshes" / template.format(name), level)
+    found = sb.init_study(tmp_path / "meshes", tmp_path / "study.toml")
+    assert found.summary == ("2 objects: big cow, cow, each compared with decimated versions of itself",)
+    assert found.left_out == {}
+    for name, one in as_study(found.path).objects.items():
+        (reference,) = one.reference.members(tmp_path)  # type: ignore[union-attr]
+        assert reference.name == Path(template.format(name)).stem
+        assert [*one.members] == [*(f"quadric decimation/{count}" for count in (20, 40, 80, 160)), "reference"]
+
+
+def test_originals_alone_whose_names_follow_no_pattern_need_other_meshes(tmp_path: Path) -> None:
+    for path in ("originals/cow.ply", "originals/egg.obj"):
+        write(tmp_path / path, 2)
+    with pytest.raises(sb.errors.StudyError, match=r"originals alone .*; add meshes .* such as METHOD/cow_500\.ply"):
+        sb.init_study(tmp_path, tmp_path / "study.toml")
+
+
 def test_meshes_far_larger_than_their_reference_are_named(tmp_path: Path) -> None:
     for number in range(2):
         write(tmp_path / f"in/part_{number}.ply", 2)
