@@ -335,6 +335,9 @@ def plan(
 
     plans, refused = for_each_object(part, location, planned)
     seconds, processor_seconds, time = _forecast(plans.values(), share, workers, client is None, bases)
+    if refused:
+        few = f"{len(refused):,} of {len(plans) + len(refused):,} objects cannot be planned, for the reasons below"
+        time = (*(time if plans else ()), few)
     warnings, count = warnings_of(study, location), len(study.objects)
     return StudyPlan(
         study.name, str(location), count, share, plans, refused, seconds, processor_seconds, time, warnings

@@ -41,6 +41,16 @@ def records(plan: Plan, *labels: str, seconds: float) -> dict[str, Record]:
     return {label: Record(keys[label], "complete", seconds=seconds) for label in labels}
 
 
+def test_objects_that_cannot_be_planned_lack_something() -> None:
+    command = {"source": "command", "command": ["remesh", "{input}", "{output}", "{triangles}"], "triangles": [20]}
+    family = {"name": "ours", "mesh": {"source": "icosphere", "levels": [1]}, **command}
+    table = small_table(lattice=None, accuracy={"rtol": 0.05}, object=[*balls(a=1.0), *balls(b=1.1)], family=[family])
+    found = sb.plan(sb.Study.from_table(table), "memory://not-permitted.zarr")
+    assert [*found.refused] == ["a", "b"]
+    assert "2 of 2 objects cannot be planned" in str(found)
+    assert "nothing is missing" not in str(found)
+
+
 @pytest.mark.parametrize(
     "mesh", [sb.shapes.icosphere(1), sb.shapes.icosphere(4), sb.shapes.Torus(1.0, 0.4).mesh(96, 48)]
 )
