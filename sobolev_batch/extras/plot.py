@@ -14,6 +14,8 @@ import xarray as xr
 from sobolev_batch.errors import InputError, from_extra
 from sobolev_batch.extras.leagues.costs import CostLeague
 from sobolev_batch.extras.leagues.league import League
+from sobolev_batch.geometry.surface import is_finite_number
+from sobolev_batch.parameters import check_choice
 from sobolev_batch.tables.convergence import EDGE_LENGTH
 from sobolev_batch.tables.open import AnyStore, Families, as_tree, finished_group
 
@@ -63,7 +65,7 @@ def convergence(
     'relative Sobolev distance'
     """
     if isinstance(store, xr.Dataset):
-        return RATES.on(ax, store, order)
+        return RATES.on(_checked(ax), store, order)
     return _plot("convergence", Selection.from_store(store, order, family, x), ax)
 
 
@@ -150,7 +152,7 @@ def league(league: League | CostLeague, ax: Axes | None = None) -> Axes:
     """
     if not isinstance(league, League | CostLeague):
         raise InputError(f"league must be one of those that sobolev_batch.league returns, found {league!r}")
-    return (LEAGUE if isinstance(league, League) else COST_LEAGUE).on(ax, [league], league)
+    return (LEAGUE if isinstance(league, League) else COST_LEAGUE).on(_checked(ax), [league], league)
 
 
 def witness(
@@ -185,14 +187,24 @@ def witness(
     >>> ax = sb.plot.witness("storage/icosphere.zarr", "icosphere/1", order=-4)  # doctest: +SKIP
     """
     tree = as_tree(store)
+    if up is not None:
+        check_choice("up", up, ("x", "y", "z"))
+    if limit is not None and not (is_finite_number(limit) and limit > 0):
+        raise InputError(f"limit must be a positive number, found {limit!r}")
     orders = finished_group(tree, "convergence")["order"].values[:1].tolist() if order is None else [order]
     views, missing = make_views(tree, folder, [mesh], PICTURE_LIMITS, up, orders)
     if len(views) + len(missing) > 1:
         raise InputError(f"{mesh!r} stands for several meshes, and one is plotted; give its label")
     for label, reason in missing.items():
         raise InputError(f"{label}: {reason}")
-    return draw_witness(views[0], ax, limit)
+    return draw_witness(views[0], _checked(ax), limit)
 
 
 def _plot(kind: str, selection: Selection, axes: Axes | None) -> Axes:
-    return PLOTS[kind].on(axes, selection, selection.orders[0])
+    return PLOTS[kind].on(_checked(axes), selection, selection.orders[0])
+
+
+def _checked(axes: Axes | None) -> Axes | None:
+    if not isinstance(axes, Axes | None):
+        raise InputError(f"ax must be axes of Matplotlib, found {axes!r}")
+    return axes

@@ -96,17 +96,10 @@ class Plot:
         """Draw one item on axes with a legend within them, or on axes of a new figure, and return the axes."""
         if axes is None:
             return self.figure(subject, [item]).axes[0]
-        require_axes(axes)
         self.draw(subject, item, axes)
         if axes.get_legend() is None and axes.get_legend_handles_labels()[1]:
             axes.legend(fontsize="small")
         return axes
-
-
-def require_axes(axes: object) -> None:
-    """Refuse what are no axes of Matplotlib, by an InputError."""
-    if not isinstance(axes, Axes):
-        raise InputError(f"ax must be axes of Matplotlib, found {axes!r}")
 
 
 def _add_legend(figure: Figure) -> None:

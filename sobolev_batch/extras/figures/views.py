@@ -31,7 +31,6 @@ from sobolev_batch.extras.figures.style import (
     Size,
     drawing,
     escaped,
-    require_axes,
     set_title,
     shortened,
     write_figures,
@@ -39,9 +38,8 @@ from sobolev_batch.extras.figures.style import (
 from sobolev_batch.geometry.mesh import Mesh
 from sobolev_batch.geometry.proximity import point_distances
 from sobolev_batch.geometry.subdivision import subdivided
-from sobolev_batch.geometry.surface import is_finite_number, normals
+from sobolev_batch.geometry.surface import normals
 from sobolev_batch.norms.causes import witness
-from sobolev_batch.parameters import check_choice
 from sobolev_batch.sources.names import file_stem
 from sobolev_batch.tables.convergence import table
 from sobolev_batch.tables.open import Families, chosen_families, finished_group
@@ -210,8 +208,8 @@ def _turned(views: Sequence[MeshView], up: Axis | None = None) -> list[MeshView]
 
 def upwards(points: Reals, up: Axis | None = None) -> int:
     """Return by how many axes points (n, 3) are rolled until one axis, by default their `up_axis`, is the third."""
-    if up is not None:
-        check_choice("up", up, _AXES)
+    if up not in (None, *_AXES):
+        raise InputError(f"up must be one of {', '.join(_AXES)}, found {up!r}")
     return _AXES.index("z") - _AXES.index(up or up_axis(points))
 
 
@@ -339,11 +337,8 @@ def _mapping(view: MeshView, limit: float) -> ScalarMappable:
 
 def draw_witness(view: MeshView, axes: Axes | None = None, limit: float | None = None) -> Axes:
     """Draw a mesh at its first order on axes, or on those of a new figure, with its label above and a colour bar."""
-    axes = Figure(figsize=(WIDTH_INCHES, _HEIGHT_INCHES), layout="constrained").subplots() if axes is None else axes
+    axes = axes or Figure(figsize=(WIDTH_INCHES, _HEIGHT_INCHES), layout="constrained").subplots()
     limit = view.color_limits[0] if limit is None else limit
-    require_axes(axes)
-    if not is_finite_number(limit) or limit <= 0:
-        raise InputError(f"limit must be a positive number, found {limit!r}")
     draw_mesh(axes, view, limit=limit)
     set_title(axes, escaped(view.label), _seen(view))
     _add_colorbar(axes.figure, axes, [view], limit, 0)  # type: ignore[arg-type]

@@ -18,7 +18,7 @@ from sobolev_batch.errors import InputError, from_extra, write_file
 from sobolev_batch.extras.leagues.costs import CostLeague
 from sobolev_batch.extras.leagues.evolution import evolution
 from sobolev_batch.extras.leagues.league import League, percent_text
-from sobolev_batch.parameters import path_of
+from sobolev_batch.parameters import check_choice, path_of
 from sobolev_batch.shown import together
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.lock import utc_now
@@ -106,6 +106,8 @@ def make_report(
     store: AnyStore, *, folder: str | Path = ".", witnesses: Sequence[str] = (), up: Axis | None = None
 ) -> tuple[str, tuple[str, ...]]:
     """Return the report of a store, and what it leaves out, for people; see `report`."""
+    if up is not None:
+        check_choice("up", up, ("x", "y", "z"))
     objects = Objects.read(Location.parse(location_of(store)))
     if objects is None:
         tree = as_tree(store)
