@@ -11,18 +11,9 @@ from uuid import uuid4
 from sobolev_batch.visible import visible
 
 __all__ = [
-    *("AccuracyError", "BackendError", "ClusterError", "DamageError", "ForeignError", "InputError"),
-    *(
-        "LatticeError",
-        "LockError",
-        "MemoryLimitError",
-        "MeshError",
-        "OrderError",
-        "SobolevBatchError",
-        "SpaceError",
-        "StoreError",
-        "StudyError",
-    ),
+    *("AccuracyError", "BackendError", "ClusterError", "DamageError", "ForeignError", "InputError", "LatticeError"),
+    *("LockError", "MemoryLimitError", "MeshError", "OrderError", "SobolevBatchError", "SpaceError", "StoreError"),
+    "StudyError",
 ]
 
 # Characters of another library's message that are worth keeping.
