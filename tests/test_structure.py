@@ -126,7 +126,17 @@ def test_names_are_sorted_and_unknown_ones_refused() -> None:
         sb.nothing  # type: ignore[attr-defined]  # noqa: B018
 
 
-def test_help_of_functions_begins_with_names_of_types() -> None:
+def test_all_errors_are_listed() -> None:
+    kinds = {
+        name
+        for name, value in vars(sb.errors).items()
+        if isinstance(value, type) and value.__module__ == sb.errors.__name__
+    }
+    assert set(sb.errors.__all__) == kinds
+
+
+@pytest.mark.extras
+def test_names_are_sorted_and_unknown_ones_refused_begins_with_names_of_types() -> None:
     # A type that is written out takes a screen, before the first word about the function.
     functions = {name: value for name, value in public_names().items() if inspect.isfunction(value)}
     assert {name for name, one in functions.items() if len(str(inspect.signature(one))) > 700} == set()

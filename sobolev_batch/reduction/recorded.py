@@ -155,7 +155,7 @@ class RecordedSearch:
         itself = ": the smallest of those tried that does is the original itself" if is_original else ""
         texts = (
             f"size {failed.size:g} failed: {failed.reason}" if failed and failed.reason else "",
-            "" if bracket.is_monotone else "not monotone: a finer mesh was farther away",
+            "" if bracket.is_monotone else "not monotone: a finer mesh was worse",
             f"no smaller mesh held{itself}; another method may make one" if best.triangles >= record.triangles else "",
             best.broken and f"it is broken, unlike the {of}: {best.broken}",
             self._unfollowed(record),
