@@ -45,7 +45,7 @@ _CYCLES, _NODES = 32.0, leggauss(48)
 _RULES = (12, 0.6, 1.1), (4, 0.5, 0.5), (2, 0.2, 0.1)
 # Panels along an edge are at most as long as this, in t and in wavelengths 1/X, with nodes in each; t ends where all
 # that follows is rounding.
-_PANEL, _PANEL_WAVES, _PANEL_NODES, _LAST = 1.2, 1.5, leggauss(4), 22.0
+_PANEL, _PANEL_WAVES, _PANEL_NODES, _LAST = 2.0, 2.8, leggauss(8), 22.0
 # Pairs that are computed at a time on arrays.
 _BATCH = 20_000
 # Where more than this share of all pairs is close, by a sample of so many points and triangles, a look at each takes a
@@ -54,7 +54,7 @@ _OFTEN_CLOSE, _SAMPLE, _PAIRS_AT_ONCE = 0.05, 256, 1 << 22
 # With fewer close pairs a GPU takes longer. Pairs that it looks at, and computes, at a time; and nodes of rules, and
 # pairs that take integrals over edges, at a time: some 300 MB each.
 _FEWEST_FOR_GPU, _PAIRS_ON_DEVICE, _BATCH_ON_DEVICE = 1 << 15, 1 << 23, 1 << 19
-_NODES_AT_ONCE, _NEAR_AT_ONCE = 1 << 20, 1 << 17
+_NODES_AT_ONCE, _NEAR_AT_ONCE = 1 << 20, 1 << 16
 
 
 def tail_nodes(cutoff: float, order: float) -> Iterator[tuple[float, Reals, Reals]]:

@@ -8,6 +8,7 @@ import pytest
 from sobolev_batch import Mesh
 from sobolev_batch.arrays import Reals
 from sobolev_batch.norms.tail import potentials
+from sobolev_batch.norms.tail.close_points import Sheets
 from sobolev_batch.norms.tail.potentials import Kernels, SignedTriangles, add_compiled, of_triangles
 from sobolev_batch.norms.tail.remainder import remainder
 from sobolev_batch.shapes import icosphere
@@ -126,6 +127,7 @@ def test_nodes_that_are_too_few_along_edges_are_noticed(monkeypatch: pytest.Monk
     rods = [Rectangles.box((-0.5, y, 0.0), (0.5, y + 1e-3, 1e-3)).mesh() for y in (0.0, 2e-3)]
     truth, of_truth = remainder(rods, [1, -1], 12.0, [-2.0], points=4000).at([-2.0])
     monkeypatch.setattr(potentials, "_PANEL", 2.4)
+    monkeypatch.setattr(potentials, "_PANEL_NODES", np.polynomial.legendre.leggauss(4))
     monkeypatch.setattr(potentials, "_PANEL_WAVES", 3.0)
     value, error = remainder(rods, [1, -1], 12.0, [-2.0], points=4000).at([-2.0])
     assert abs(value - truth) < error + of_truth < truth
@@ -163,3 +165,20 @@ def test_second_differences_hold_for_moves_far_below_the_steps_of_the_tables(com
     # From far larger moves, which differ by their fourth powers.
     small, large = ((seen(move) + seen(-move) - 2 * seen(0.0)) / move**2 for move in (4e-6, 2e-4))
     assert small.mean(axis=0) == pytest.approx(large.mean(axis=0), rel=0.1)
+
+
+def test_thin_plates_that_move_a_little_along_their_normal_see_what_finer_nodes_see() -> None:
+    plates = [Rectangles.box((0, 0, move), (1, 0.7, 1e-3 + move)).mesh() for move in (0.0, 2.8e-5)]
+    sheets = Sheets.from_surfaces(plates, (1, -1), CUTOFF)
+    assert sheets.moved is not None
+    draw = sheets.moved.in_proportion(np.ones(len(plates[0].triangles)), 300, np.random.default_rng(0))[0]
+
+    def seen(fineness: int) -> float:
+        found = np.zeros((600, 1))
+        for triangles in sheets.triangles():
+            potentials.add_of_triangles(
+                found, draw.points.reshape(-1, 3), triangles, Kernels.of_orders(CUTOFF, (-2.0,), fineness)
+            )
+        return float(draw.weights.ravel() @ found[:, 0])
+
+    assert seen(1) == pytest.approx(seen(2), rel=5e-3)
