@@ -127,7 +127,7 @@ def _add_span(
     angle, half = 0.0, nodes.shape[1] // 2
     while low < last:
         widest = math.exp(low)
-        high = min(last, low + min(longest_t, 2 * longest / (q * (widest + 1 / widest))))
+        high = min(last, low + min(longest_t, math.log1p(2 * longest / (q * (widest + 1 / widest)))))
         middle = math.exp((low + high) / 2)
         for node in range(half):
             # The nodes of a panel lie in pairs about its middle.

@@ -45,7 +45,7 @@ _CYCLES, _NODES = 32.0, leggauss(48)
 _RULES = (12, 0.6, 1.1), (4, 0.5, 0.5), (2, 0.2, 0.1)
 # Panels along an edge are at most as long as this, in t and in wavelengths 1/X, with nodes in each; t ends where all
 # that follows is rounding.
-_PANEL, _PANEL_WAVES, _PANEL_NODES, _LAST = 2.0, 2.8, leggauss(8), 22.0
+_PANEL, _PANEL_WAVES, _PANEL_NODES, _LAST = 2.4, 3.8, leggauss(8), 22.0
 # Pairs that are computed at a time on arrays.
 _BATCH = 20_000
 # Where more than this share of all pairs is close, by a sample of so many points and triangles, a look at each takes a
@@ -393,7 +393,9 @@ def _of_span(offsets: Array, heights: Array, near: Array, far: Array, *, kernels
     active = np.flatnonzero(last > begun)
     while len(active):
         low, here = begun[active], q[active]
-        high = np.minimum(last[active], low + np.minimum(_PANEL / kernels.fineness, longest / (here * np.cosh(low))))
+        # Far along an edge the distance grows like exp t.
+        steps = np.log(1 + longest / (here * np.cosh(low)))
+        high = np.minimum(last[active], low + np.minimum(_PANEL / kernels.fineness, steps))
         # Nodes, pairs.
         nodes, weights = (np.asarray(row, like=q)[:, None] for row in _PANEL_NODES)
         widening = np.cosh((low + high) / 2 + (high - low) / 2 * nodes)
