@@ -54,7 +54,16 @@ def add_potentials(
                 for order in range(out.shape[1]):
                     out[row, order] += weight * _looked_up(values, place, order)
             continue
+        # See `_square_on_longest`.
+        wx, wy, wz = vx - ux, vy - uy, vz - uz
+        uu, vv, ww = ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz, wx * wx + wy * wy + wz * wz
+        if vv > uu:
+            ux, uy, uz, uu = vx, vy, vz, vv
+        if ww > uu:
+            ux, uy, uz, uu = wx, wy, wz, ww
         nx, ny, nz = nx / doubled, ny / doubled, nz / doubled
+        part_along = (nx * ux + ny * uy + nz * uz) / uu
+        nx, ny, nz = nx - part_along * ux, ny - part_along * uy, nz - part_along * uz
         height = nx * ax + ny * ay + nz * az
         if abs(height) >= tables[1]:
             continue

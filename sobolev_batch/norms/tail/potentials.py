@@ -364,6 +364,7 @@ def _over_edges(corners: Array, normals: Array, kernels: Kernels) -> Array:
     # Axes, edges, pairs.
     ends = np.roll(corners, -1, axis=1)
     along = ends - corners
+    normals = _square_on_longest(normals, along)
     along /= np.sqrt(dot(along, along))
     first, last = dot(corners, along), dot(ends, along)
     offsets = dot(normals[:, None], cross(corners, along))
@@ -376,6 +377,19 @@ def _over_edges(corners: Array, normals: Array, kernels: Kernels) -> Array:
     offsets, heights = np.concatenate([offsets, offsets]), np.concatenate([heights, heights])
     spans = (rows.ravel() for rows in (offsets, heights, begins, far))
     return _of_span(*spans, kernels=kernels).reshape(6, corners.shape[2], -1).sum(axis=0)
+
+
+def _square_on_longest(normals: Array, edges: Array) -> Array:
+    """Return unit normals (3, n) at right angles to the longest of three edges (3, 3, n).
+
+    Those of slivers are not, by rounding, so that their far points would seem to lie above their plane.
+    """
+    squares = dot(edges, edges)
+    best, square = edges[:, 0], squares[0]
+    for number in (1, 2):
+        is_longer = squares[number] > square
+        best, square = np.where(is_longer, edges[:, number], best), np.where(is_longer, squares[number], square)
+    return normals - dot(normals, best) / square * best
 
 
 def _of_span(offsets: Array, heights: Array, near: Array, far: Array, *, kernels: Kernels) -> Array:

@@ -190,3 +190,20 @@ def test_thin_parts_that_move_a_little_see_what_finer_nodes_see(
         return float(draw.weights.ravel() @ found[:, 0])
 
     assert seen(1) == pytest.approx(seen(4), rel=2e-3)
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_turned_slivers_have_no_height_over_themselves(compiled: bool) -> None:
+    rng, kernels = np.random.default_rng(1), Kernels.of_orders(CUTOFF, (-0.6,))
+    sliver, places = np.array([[0.6, 0.0, 0.0], [0.6 + 1e-8, 0.5, 0.0], [0.6, 0.5, 0.0]]), rng.dirichlet([1, 1, 1], 50)
+    # In its plane without any rounding, and turned.
+    seen = []
+    for turn in (np.eye(3), np.linalg.qr(rng.normal(size=(3, 3)))[0]):
+        corners, found = np.tile(sliver @ turn.T, (50, 1, 1)), np.zeros((50, 1))
+        points, rows = places @ corners[0], np.arange(50)
+        if compiled:
+            add_compiled(found, points, SignedTriangles(corners, np.ones(50)), (rows, rows), kernels, 1)
+        else:
+            found += of_triangles(points, corners, kernels)
+        seen.append(found.mean())
+    assert seen[1] == pytest.approx(seen[0], rel=1e-3)
