@@ -272,7 +272,7 @@ def _finished(job: Job, stored: Sequence[StoredBlocks]) -> Record:
         key=job.key,
         numerics=NUMERICS_VERSION,
         status="complete",
-        reason=job.row.member.remark(),
+        remark=job.row.member.remark(),
         seconds=sum(blocks.seconds for blocks in stored),
         worker=worker.address if worker else "local",
         backend=", ".join(backends),

@@ -94,13 +94,13 @@ class Status(Shown):
             refused | labelled({name: one.failed for name, one in tallies.items()}),
             labelled({name: one.not_compared for name, one in tallies.items()}),
             run,
-            {one.reduced for one in tallies.values() if not one.reason} == {True},
+            {one.has_tables for one in tallies.values() if not one.reason} == {True},
             age_seconds(run.seen) if run is not None and run.state in _PATIENCE_SECONDS else 0.0,
             math.nan if run is None else _rate(moments, run),
             tuple(labelled({name: dict.fromkeys(one.lost_records) for name, one in tallies.items()})),
             () if objects is None else tuple(name for name in objects.names if name not in tallies),
             sum(one.failures for one in tallies.values()),
-            tuple(name for name, one in tallies.items() if one.reduced and name not in listed),
+            tuple(name for name, one in tallies.items() if one.has_tables and name not in listed),
         )
 
     @property
@@ -200,7 +200,7 @@ def _tallies(objects: Objects) -> Iterator[tuple[str, ObjectRecord]]:
         record = recorded.get(name)
         if record is None and name not in present:
             continue
-        if record is None or (record.reduced and name not in present):
+        if record is None or (record.has_tables and name not in present):
             try:
                 if (place := objects.existing_store(name)) is None:
                     continue

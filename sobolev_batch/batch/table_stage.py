@@ -132,7 +132,7 @@ def _digest(workspace: Workspace, placed: Sequence[Placed]) -> str:
     plan, rows = workspace.plan, []
     for i, _, _ in placed:
         row, record = workspace.rows[i], workspace.records[i]
-        state = (record.key, record.status, record.reason) if record else ("", "", "")
+        state = (record.key, record.status, record.reason, record.remark) if record else ()
         rows.append([row.label, row.family, row.member.time, row.member.metadata, *state])
     inputs = {
         "version": TABLES_VERSION,

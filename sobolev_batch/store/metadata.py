@@ -14,7 +14,7 @@ from typing import Any, TypeGuard
 from sobolev_batch.sources.names import node_problem
 
 # The layout that docs/store.md describes has this version.
-SCHEMA_VERSION = 16
+SCHEMA_VERSION = 17
 
 Document = dict[str, Any]
 

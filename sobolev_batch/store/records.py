@@ -142,7 +142,8 @@ class Record(_Line):
     Attributes:
         key: Key of the row when the surface was computed: a digest of all that its field depends on.
         status: "complete" or "failed".
-        reason: Reason of the failure, or what one should know of how the surface was made; empty otherwise.
+        reason: Reason of the failure; empty otherwise.
+        remark: What one should know of how the surface was made; empty where that is nothing.
         quality: Data of the field from which errors of norms are computed, see `Quality.to_json`.
         checksums: Checksums of the field's blocks, see `Fields.write`; others mean damage, or another task's field.
         worker: Address of the worker that finished it.
@@ -157,6 +158,7 @@ class Record(_Line):
     key: str
     status: Status
     reason: str = ""
+    remark: str = ""
     facts: Facts = Facts()
     quality: str = ""
     checksums: tuple[int, ...] = ()
@@ -185,7 +187,7 @@ class ObjectRecord(_Line):
         not_compared: Reason for each surface without the Hausdorff and Chamfer distances that the study requests.
         imprecise: Largest relative error of the distances of each mesh that miss the accuracy requested.
         lost_records: Labels of surfaces that the tables list, and whose completion records are gone, or others.
-        reduced: True if it has tables.
+        has_tables: True if readers find its tables.
         settings: Settings of the study by which its rows in the tables of all were made.
         finished: Time at which its run ended, in UTC.
     """
@@ -200,7 +202,7 @@ class ObjectRecord(_Line):
     not_compared: Mapping[str, str] = field(default_factory=dict)
     imprecise: Mapping[str, float] = field(default_factory=dict)
     lost_records: tuple[str, ...] = ()
-    reduced: bool = False
+    has_tables: bool = False
     settings: Mapping[str, Any] = field(default_factory=dict)
     finished: Time | Literal[""] = ""
 

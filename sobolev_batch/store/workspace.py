@@ -80,7 +80,7 @@ class Contents:
             not_compared=self.not_compared,
             imprecise=imprecise or {},
             lost_records=tuple(self.labels[row] for row in self.unlike_tables) if imprecise is None else (),
-            reduced=self.has_tables,
+            has_tables=self.has_tables,
             finished=utc_now(),
         )
 

@@ -59,7 +59,7 @@ CONNECTION_COLUMNS = (
 )
 # Integers, or missing where a mesh failed.
 _COUNTS = ("triangles", "vertices", *(column.name for column in CONNECTION_COLUMNS))
-_ABOUT = ("family", "name", "level", "rank", "ordered_by", "status", "reason", *_COUNTS, "seconds")
+_ABOUT = ("family", "name", "level", "rank", "ordered_by", "status", "reason", "remark", *_COUNTS, "seconds")
 _NUMBERS = (
     *("edge_length", "distance", "error", *PARTS, "relative", "relative_error", *AREA_AND_SHAPE),
     *("rate", "rate_error", "resolved", "within"),
@@ -130,10 +130,10 @@ def table(store: AnyStore, order: Orders | None = None, *, x: str = EDGE_LENGTH)
 
         - order, mesh, family, name, level; rank, the place in the family from coarse to fine, and ordered_by, what
           decides on it (level, triangles, names or time);
-        - status, reason, triangles, vertices, seconds (of computing), edge_length (mean), and the metadata that the
-          study gives its meshes; what a remesher may break, by the names of `Mesh.counts`: components,
-          euler_characteristic, boundary_edges, nonmanifold_edges, inconsistent_edges and zero_area_triangles;
-          make_seconds, make_cpu_seconds, make_peak_bytes and exit_status of what made them, where the study does;
+        - status, reason (of a failure), remark (on its making), triangles, vertices, seconds (of computing), and
+          edge_length (mean); the metadata that the study gives its meshes; what a remesher may break, by the names of
+          `Mesh.counts`: components, euler_characteristic, boundary_edges, nonmanifold_edges, inconsistent_edges and
+          zero_area_triangles; make_seconds, make_cpu_seconds, make_peak_bytes and exit_status, where programs made it;
         - distance (to the reference), error and its parts truncation, aliasing, discretisation and statistical;
           relative and relative_error (over the norm of the reference);
         - area_part and shape_part: what a change of total area alone explains of the distance, and the rest. Their

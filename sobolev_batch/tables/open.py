@@ -329,7 +329,7 @@ def doubts_of(tree: xr.DataTree) -> dict[str, str]:
         texts = tree["fourier"].to_dataset()["quality"].sel(mesh=complete).values.tolist()
         extents = {label: Quality.from_json(text).extent for label, text in zip(complete, texts, strict=True)}
         doubts = {label: placement_doubt(extent, extents[reference]) for label, extent in extents.items()}
-    remarks = finished_group(tree, "meshes", load=False)["reason"].sel(mesh=complete).to_series()
+    remarks = finished_group(tree, "meshes", load=False)["remark"].sel(mesh=complete).to_series()
     both = {str(label): "; ".join(filter(None, (remark, doubts.get(label)))) for label, remark in remarks.items()}
     return {label: text for label, text in both.items() if text}
 

@@ -63,7 +63,7 @@ def table_order(workspace: Workspace) -> list[Placed]:
 
 
 def meshes_table(workspace: Workspace, placed: Sequence[Placed]) -> xr.Dataset:
-    """Return for each mesh family, level, rank, status, reason, counts, sizes, digests, seconds, worker, backend."""
+    """Return the group /meshes: what is known of each mesh from the study, its place in the order, and its record."""
     numbers, ranks, criteria = zip(*placed, strict=True)
     rows, records = [workspace.rows[i] for i in numbers], [workspace.records[i] for i in numbers]
     filled = [record or Record(key="", status="failed", reason="not computed") for record in records]
@@ -76,7 +76,6 @@ def meshes_table(workspace: Workspace, placed: Sequence[Placed]) -> xr.Dataset:
         "ordered_by": _strings(criteria),
         "row": np.array(numbers, dtype=np.int64),
         "status": _strings(["missing" if record is None else record.status for record in records]),
-        "reason": _strings([record.reason for record in filled]),
     }
     is_complete = np.array([record.status == "complete" for record in filled])
     for item in fields(Facts):
@@ -93,7 +92,7 @@ def meshes_table(workspace: Workspace, placed: Sequence[Placed]) -> xr.Dataset:
     times_of_end = [record.finished.removesuffix("Z") or "NaT" for record in filled]
     columns["finished"] = np.array(times_of_end, dtype="datetime64[s]")
     columns[NUMERICS] = np.array([record.numerics for record in filled], dtype=np.int64)
-    for name in ("worker", "backend", "key"):
+    for name in ("reason", "remark", "worker", "backend", "key"):
         columns[name] = _strings([getattr(record, name) for record in filled])
     columns["mesh"], metadata = _strings([row.label for row in rows]), _metadata(rows)
     times = [row.member.time for row in rows]

@@ -178,6 +178,8 @@ def test_a_remesher_that_makes_the_same_of_each_size_is_told(threads: Client, fo
     told = [line for line in format_table(store).split("\n") if "sizes do not follow triangles" in line]
     assert sorted(line.split()[0] for line in told) == ["close/0.001", "same/0.5:"]
     assert "sizes do not follow triangles" in summary.failed["close/0.001"]
+    rows = sb.table(store).set_index("mesh")[["reason", "remark"]]
+    assert (rows != "").loc[["close/0.001", "same/0.5"]].values.tolist() == [[True, False], [False, True]]
 
 
 def test_searches_differ_by_their_measure(folder: Path) -> None:

@@ -53,6 +53,7 @@ def tree() -> xr.DataTree:
         "row": [0, 1, 2, 3],
         "status": ["complete", "complete", "failed", "complete"],
         "reason": ["", "", "no 50% of it | is <there>", ""],
+        "remark": [""] * 4,
         "triangles": [20, 1280, 0, 0],
         "vertices": [12, 642, 0, 0],
         "seconds": [0.25, 2.0, 0.5, 0.125],
