@@ -391,37 +391,37 @@ def _plan(study: Study, location: Location, workers: Workers, client: Client | N
     if study.accuracy is not None and earlier_choice is None and not (study.cache and study.cache.may_run):
         # A few meshes decide on the lattice.
         require_permission(study, allow_commands=False)
-    study_plan = make_plan(study, earlier_choice)
-    planning_seconds = 0.0 if study_plan.choice is earlier_choice else process_time() - started
-    sizes, refused = size_rows(study_plan, study_plan.rows, workers.with_backend(study.backend))
-    workspace = Workspace.found(location, study_plan)
+    plan = make_plan(study, earlier_choice)
+    planning_seconds = 0.0 if plan.choice is earlier_choice else process_time() - started
+    sizes, refused = size_rows(plan, plan.rows, workers.with_backend(study.backend))
+    workspace = Workspace.found(location, plan)
     stored = {} if workspace is None else {workspace.labels[i]: record for i, record in workspace.stored.items()}
-    seconds, basis = seconds_of_missing(study_plan, stored, workers, client)
+    seconds, basis = seconds_of_missing(plan, stored, workers, client)
     bases.update(filter(None, [basis]))
-    doubtful, gpus = _doubts_of(study_plan, stored), sum(one.backend == "gpu" for one in workers.members)
+    doubtful, gpus = _doubts_of(plan, stored), sum(one.backend == "gpu" for one in workers.members)
     return ObjectPlan(
         store=str(location),
-        labels=tuple(row.label for row in study_plan.rows),
-        reference=study_plan.reference,
+        labels=tuple(row.label for row in plan.rows),
+        reference=plan.reference,
         stored=tuple(stored),
         refused=refused,
         doubtful=doubtful,
-        lattice=study_plan.lattice,
-        octaves=0 if study_plan.tail is None else len(study_plan.tail.octaves),
-        dtype=study_plan.choice.dtype,
-        similarity=study_plan.similarity,
-        field_bytes=study_plan.field_bytes,
+        lattice=plan.lattice,
+        octaves=0 if plan.tail is None else len(plan.tail.octaves),
+        dtype=plan.choice.dtype,
+        similarity=plan.similarity,
+        field_bytes=plan.field_bytes,
         memory_bytes={label: task_bytes for label, (*_, task_bytes) in sizes.items()},
         task_seconds=seconds,
-        unknown=tuple(row.label for row in study_plan.rows if row.label in seconds and not is_predictable(row)),
+        unknown=tuple(row.label for row in plan.rows if row.label in seconds and not is_predictable(row)),
         planning_seconds=planning_seconds,
         lacks_tables=not seconds and (workspace is None or not lacks_nothing(workspace)),
         lines=(
-            *_task_lines(study_plan, sizes),
-            ("store", f"{location}, {len(stored)} of {len(study_plan.rows)} already stored"),
+            *_task_lines(plan, sizes),
+            ("store", f"{location}, {len(stored)} of {len(plan.rows)} already stored"),
             *reasons("refused", refused),
             *reasons("doubtful", doubtful),
-            *_study_lines(study_plan),
+            *_study_lines(plan),
             (
                 "workers",
                 f"{len(workers.members)}, with {workers.threads} threads and {gpus} GPUs together; for tasks, "
@@ -431,14 +431,14 @@ def _plan(study: Study, location: Location, workers: Workers, client: Client | N
     )
 
 
-def _doubts_of(study_plan: Plan, stored: Mapping[str, Record]) -> dict[str, str]:
+def _doubts_of(plan: Plan, stored: Mapping[str, Record]) -> dict[str, str]:
     """Return why surfaces cannot be read, or what makes one doubt them, by label; none is read twice."""
-    others = {row.label: row for row in study_plan.rows if row.label != study_plan.reference}
+    others = {row.label: row for row in plan.rows if row.label != plan.reference}
     # What is stored need not be read again.
     known = {label: Quality.from_json(stored[label].quality).extent for label in others if label in stored}
-    seen = study_plan.look
+    seen = plan.look
     look = Look({**seen.extents, **known}, dict(seen.set_aside), dict(seen.notes))
     members = {label: (row.family, row.member) for label, row in others.items()}
-    look.at_all(members, study_plan.similarity, study_plan.reference_extent)
-    doubts = {label: placement_doubt(extent, study_plan.reference_extent) for label, extent in look.extents.items()}
+    look.at_all(members, plan.similarity, plan.reference_extent)
+    doubts = {label: placement_doubt(extent, plan.reference_extent) for label, extent in look.extents.items()}
     return look.notes | look.set_aside | {label: doubt for label, doubt in doubts.items() if doubt is not None}

@@ -14,13 +14,13 @@ from sobolev_batch.study.plan import Plan, Row
 from sobolev_batch.transform.fourier import TransformSettings, field_seconds, projected_bytes
 from sobolev_batch.transform.lattice import Block
 
-# Measured peak of describing a mesh and moving it to the study's unit, for each triangle.
+# Bytes of a triangle while its mesh is described and moved to the study's unit, at the measured peak.
 MESH_BYTES = 100.0
 # With less, the batches of points of a transform become so small that it is slow.
-LEAST_TRANSFORM_BYTES = 256e6
-# For the choice of quadrature rules, for each triangle.
+_LEAST_TRANSFORM_BYTES = 256e6
+# Bytes of a triangle while quadrature rules are chosen.
 _CHOICE_BYTES = 100.0
-# Of a sample of octaves: its frequency, weight, place and value, and what makes them.
+# Bytes of a sample of octaves: its frequency, weight, place and value, and what makes them.
 _SAMPLE_BYTES = 150.0
 # Time to describe and record a surface, and that of each of its triangles.
 _ROW_SECONDS, _TRIANGLE_SECONDS = 0.015, 5e-6
@@ -30,7 +30,7 @@ _COMPARING_SECONDS = 0.3
 BlockGroups = tuple[tuple[Block, ...], ...]
 # The groups of a row, the memory that one transform may take besides mesh and block, and that of a task.
 Sizes = tuple[BlockGroups, float, float]
-# Tasks that compare their surface with the reference load it too, but for a larger one.
+# Tasks that compare their surface with the reference load it too, unless it has more triangles.
 _LARGEST_REFERENCE = 3 << 20
 
 
@@ -95,7 +95,7 @@ def size_tasks(
     mesh_bytes = MESH_BYTES * size.triangles
     # The mesh, the block, and a block that it is added to or compared with.
     held_bytes = mesh_bytes + 2 * block_bytes + beyond_bytes
-    least_bytes = LEAST_TRANSFORM_BYTES + _CHOICE_BYTES * size.triangles
+    least_bytes = _LEAST_TRANSFORM_BYTES + _CHOICE_BYTES * size.triangles
     loading_bytes = max(size.projected_bytes, mesh_bytes)
     workers.require_memory(max(loading_bytes, held_bytes + least_bytes))
     allowed_bytes = max(least_bytes, workers.allowed_bytes_per_task - held_bytes)

@@ -187,7 +187,7 @@ def carry_out(
 
         def cluster_of(name: str) -> Cluster:
             cluster, heartbeat.watch = equip()
-            # Asked before anything is computed: a GPU that nobody has would be waited for.
+            # This is asked before anything is computed: tasks would wait for a GPU that nobody has.
             cluster.workers.with_backend(study.backend).require_accuracy(study.accuracy)
             return replace(cluster, notify=partial(beat, name), part=name)
 
@@ -232,7 +232,7 @@ class _Runs:
             # What is wrong with the cluster is no fault of an object, and is raised.
             cluster = self.cluster_of(name)
             if record is not None and record.key:
-                # Its store may become another one, and this run be killed, and the study be as before again.
+                # This run may change its store and be killed, and the study may then be as before: no key may say so.
                 objects.records.write(objects.rows[name], replace(record, key=""))
             yield name, object_run.run_object(one, self.place, cluster)
 
@@ -261,7 +261,7 @@ class _Runs:
         """
         objects, ended = self.objects, self.ended
         changed = {name: one.tables for name, one in ended.items() if one.tables is not None}
-        # Those that it found to be impossible lose them.
+        # Objects that could not be carried out lose their rows.
         lost = {name for name, one in ended.items() if one.record.reason} | changed.keys()
         left_out = (name for name in objects.tabulated if name in objects.rows and name not in ended)
         if others := [name for name in left_out if not self._has_rows_of_now(name)]:
@@ -297,19 +297,19 @@ def _own_cluster(
     if memory is not None:
         # Threads have no limit, and a wrong one is refused all the same.
         memory_limit(memory, workers or available_cores())
-    # In threads, where no other process would see the store.
+    # No other process sees a store in memory, so threads compute it.
     return thread_client(workers) if location.is_in_memory else local_client(workers, memory)
 
 
 def _summary(location: Location, ended: Mapping[str, Ended]) -> Summary:
     records = {name: one.record for name, one in ended.items()}
+    refused = {name: record.reason for name, record in records.items() if record.reason}
     return Summary(
-        str(location),
-        tuple(labelled({name: dict.fromkeys(one.computed) for name, one in ended.items()})),
-        tuple(labelled({name: dict.fromkeys(one.reused) for name, one in ended.items()})),
-        {name: record.reason for name, record in records.items() if record.reason}
-        | labelled({name: record.failed for name, record in records.items()}),
-        labelled({name: record.not_compared for name, record in records.items()}),
-        labelled({name: record.imprecise for name, record in records.items()}),
-        sum(record.failures for record in records.values()),
+        store=str(location),
+        computed=tuple(labelled({name: dict.fromkeys(one.computed) for name, one in ended.items()})),
+        reused=tuple(labelled({name: dict.fromkeys(one.reused) for name, one in ended.items()})),
+        failed=refused | labelled({name: record.failed for name, record in records.items()}),
+        not_compared=labelled({name: record.not_compared for name, record in records.items()}),
+        imprecise=labelled({name: record.imprecise for name, record in records.items()}),
+        failures=sum(record.failures for record in records.values()),
     )

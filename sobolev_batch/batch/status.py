@@ -88,19 +88,19 @@ class Status(Shown):
         refused = {name: one.reason for name, one in tallies.items() if one.reason}
         listed = tallies if objects is None else {**objects.tabulated, **refused}
         return cls(
-            str(location_of(store)),
-            sum(one.complete for one in tallies.values()),
-            sum(one.total for one in tallies.values()),
-            refused | labelled({name: one.failed for name, one in tallies.items()}),
-            labelled({name: one.not_compared for name, one in tallies.items()}),
-            run,
-            {one.has_tables for one in tallies.values() if not one.reason} == {True},
-            age_seconds(run.seen) if run is not None and run.state in _PATIENCE_SECONDS else 0.0,
-            math.nan if run is None else _rate(moments, run),
-            tuple(labelled({name: dict.fromkeys(one.lost_records) for name, one in tallies.items()})),
-            () if objects is None else tuple(name for name in objects.names if name not in tallies),
-            sum(one.failures for one in tallies.values()),
-            tuple(name for name, one in tallies.items() if one.has_tables and name not in listed),
+            store=str(location_of(store)),
+            complete=sum(one.complete for one in tallies.values()),
+            total=sum(one.total for one in tallies.values()),
+            failed=refused | labelled({name: one.failed for name, one in tallies.items()}),
+            not_compared=labelled({name: one.not_compared for name, one in tallies.items()}),
+            run=run,
+            reduced={one.has_tables for one in tallies.values() if not one.reason} == {True},
+            silence_seconds=age_seconds(run.seen) if run is not None and run.state in _PATIENCE_SECONDS else 0.0,
+            rate=math.nan if run is None else _rate(moments, run),
+            lost_records=tuple(labelled({name: dict.fromkeys(one.lost_records) for name, one in tallies.items()})),
+            not_begun=() if objects is None else tuple(name for name in objects.names if name not in tallies),
+            failures=sum(one.failures for one in tallies.values()),
+            not_listed=tuple(name for name, one in tallies.items() if one.has_tables and name not in listed),
         )
 
     @property

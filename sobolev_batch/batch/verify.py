@@ -157,13 +157,13 @@ def _verify_all(
             objects.records.write(objects.rows[name], None)
     damaged = [one for one in verified.values() if not one.is_sound]
     return Verification(
-        str(objects.location),
-        sum(one.complete for one in verified.values()),
-        sum(one.total for one in verified.values()),
-        labelled({name: one.fields for name, one in verified.items()}),
-        labelled({name: one.tables for name, one in verified.items()}),
-        bool(damaged) and all(one.withdrawn for one in damaged),
-        verified,
+        store=str(objects.location),
+        complete=sum(one.complete for one in verified.values()),
+        total=sum(one.total for one in verified.values()),
+        fields=labelled({name: one.fields for name, one in verified.items()}),
+        tables=labelled({name: one.tables for name, one in verified.items()}),
+        withdrawn=bool(damaged) and all(one.withdrawn for one in damaged),
+        objects=verified,
     )
 
 
@@ -201,12 +201,12 @@ def _verify(store: Store, notify: Callable[[int, int], None], *, may_write: bool
     for (keys, index), what in chunks.items():
         tables[f"chunk {'/'.join(map(str, index))} of {keys.split('/')[0]}"] = what
     return Verification(
-        store.path,
-        len(contents.complete),
-        len(rows),
-        {labels[row]: damaged[row] for row in sorted(damaged)},
-        tables,
-        may_write and bool(damaged or tables),
+        store=store.path,
+        complete=len(contents.complete),
+        total=len(rows),
+        fields={labels[row]: damaged[row] for row in sorted(damaged)},
+        tables=tables,
+        withdrawn=may_write and bool(damaged or tables),
     )
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields
 from typing import Any, Literal, Self
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
@@ -31,7 +32,7 @@ Criterion = Literal["level", "triangles", "names", "time"]
 # A row, its place in its family, and what orders that.
 Placed = tuple[int, int, Criterion]
 
-# Between numbers of triangles of a family that goes from coarse to fine: then edges differ by a tenth.
+# Least factor between numbers of triangles in a family that goes from coarse to fine: edges then differ by a tenth.
 _SMALLEST_STEP = 1.2
 # Meshes of about one size in such a family, on average.
 _MOST_OF_ONE_SIZE = 10
@@ -41,7 +42,7 @@ _COORDINATES = (
     *("family", "name", "is_reference", "level", "status"),
     *("vertices", "triangles", "edge_length_mean", "seconds"),
 )
-# Those that only some studies have.
+# Coordinates that only some studies have.
 _SOME_COORDINATES = {"time", *(item.name for item in fields(Cost))}
 # What orders families that go from coarse to fine.
 FROM_COARSE_TO_FINE = ("level", "triangles")
@@ -109,15 +110,13 @@ def meshes_table(workspace: Workspace, placed: Sequence[Placed]) -> xr.Dataset:
 
 def _metadata(rows: Sequence[Row]) -> dict[str, NDArray[np.generic]]:
     """Return the metadata of meshes by name: numbers with NaN, or texts with empty ones, where a mesh has none."""
-    given = [dict(row.member.metadata) for row in rows]
-    columns: dict[str, NDArray[np.generic]] = {}
-    for name in dict.fromkeys(name for metadata in given for name in metadata):
-        values = [metadata.get(name) for metadata in given]
-        if any(isinstance(value, str) for value in values):
-            columns[name] = _strings(["" if value is None else str(value) for value in values])
-        else:
-            columns[name] = np.array([np.nan if value is None else value for value in values], dtype=np.float64)
-    return columns
+    given = pd.DataFrame([dict(row.member.metadata) for row in rows], dtype=object)
+    are_texts = given.map(lambda value: isinstance(value, str)).any()
+    texts = given.where(given.notna(), "").map(str)
+    return {
+        name: _strings(texts[name].tolist()) if are_texts[name] else given[name].to_numpy(dtype=np.float64)
+        for name in given
+    }
 
 
 def _strings(values: Sequence[str]) -> NDArray[np.generic]:
