@@ -92,7 +92,7 @@ def _grouped(tasks: Sequence[Task]) -> Task:
     return replace(
         first,
         function=outcomes_here,
-        # A list of tasks would be done before, each by itself.
+        # Dask would do the tasks of a list first, each by itself.
         arguments=(tuple(tasks),),
         projected_bytes=max(task.projected_bytes for task in tasks),
         label=f"{first.label} and {len(others)} more",

@@ -134,7 +134,7 @@ def ended_already(workspace: Workspace) -> Ended | None:
     """Return how an object ended in whose workspace nothing is missing; None where anything is."""
     if not lacks_nothing(workspace):
         return None
-    # The last run may have been killed before it did.
+    # The last run may have been killed before it did so.
     workspace.put_in_order()
     return Ended.of(workspace, set())
 
@@ -178,7 +178,7 @@ def begin(study: Study, location: Location, workers: Workers | None) -> Begun | 
     any, nothing is computed.
     """
     with compiled.by_itself():
-        # Workers plan many.
+        # A worker plans many objects, for which compiling pays.
         compiled.use()
         workspace = Workspace.of_study(study, location)
     if (before := ended_already(workspace)) is not None:
@@ -213,7 +213,7 @@ def _compute(cluster: Cluster, workspace: Workspace) -> Stages[Ended]:
             break
         if (choice := workspace.plan.choice.grown(tabulated.distances, study.orders, study.accuracy)) is None:
             break
-        # Fields that a run of a part leaves out would be lost.
+        # A run of a part would lose the fields that it leaves out.
         stored = {workspace.labels[i] for i in workspace.complete}
         arguments = workspace.store.location, workspace.plan.with_choice(choice, stored)
         workspace = yield from result_from(cluster, Task(Workspace.prepared, arguments, stage="layout"))

@@ -18,7 +18,7 @@ from sobolev_batch.tables.pairs import PAIR_BYTES
 
 _log = logging.getLogger(__name__)
 
-# A store as functions take it that have a default.
+# A store as functions take it, None for the default place.
 StoreLike = str | Path | Location | None
 
 _DEFAULT_FOLDER = Path("storage")

@@ -93,7 +93,7 @@ def submit(
         # The worker was started in another folder.
         objects = {name: replace(one, folder=one.folder.absolute()) for name, one in study.objects.items()}
         study, key = replace(study, objects=objects), task_key("drive", study.name, "", "")
-        # Before all tasks of other studies, from which it takes no thread: it leaves its own at once.
+        # It goes before the tasks of other studies, and takes no thread from them, since it leaves its own at once.
         try:
             future = client.submit(drive, study, location.name, lock.run, key=key, pure=False, priority=1)
             fire_and_forget(future)

@@ -60,7 +60,7 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> Stages[Tabulated 
 
     yield Wave(cluster, of_spectra, take, projected_bytes)
     if pairs is not None:
-        # After all spectra, where their row of the reference comes from.
+        # Pairs wait for all spectra, from which their row of the reference comes.
         own_pairs = ((pairs.only(tile), tile) for tile in tiles)
         of_tiles = ((reducer.only(own.keys), own, tile) for own, tile in own_pairs)
         of_pairs = (Task(fill_tile, of_tile, projected_bytes, stage="pairs") for of_tile in of_tiles)
@@ -87,7 +87,7 @@ def write_results(
         if store.stored_document(layout.PAIRS_KEYS) is not None:
             store.location.remove(layout.DISTANCES)
         layout.write_table(store, layout.DISTANCES, results.distances_table())
-    # Written last: its digest says that all tables belong to the fields that are stored.
+    # This is written last: its digest says that all tables belong to the fields that are stored.
     layout.write_table(store, "convergence", convergence)
     for name in set(replaced) - store.documents.keys():
         store.location.remove(name)

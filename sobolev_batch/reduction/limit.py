@@ -35,9 +35,9 @@ _ANY_ACCURACY = Accuracy(1e-2)
 _THREADS, _SEED = 1, 0
 # A limit that is met up to this fraction is met.
 _EQUAL = 1e-9
-# The measures where none is named, those whose change counts, and those of which more is better; and all, with bounds
-# or an error, which are zero for the reference, or one.
+# Default measures of a length and of a fraction; those whose change counts; and scores, of which more is better.
 HAUSDORFF, RELATIVE, _OF_ONE_MESH, _SCORES = "hausdorff", "relative", ("area", "volume"), (*METRICS["fscore"],)
+# All measures have bounds or an error, and are 0, or a score of 1, where a mesh is the reference.
 _OTHERS = re.compile("upper|error|threshold|normal_max")
 _MEASURES = (RELATIVE, *(name for name in NUMBERS if not _OTHERS.search(name)), *_OF_ONE_MESH)
 
@@ -131,12 +131,12 @@ class Limit:
             return upper, lower, upper
         if self.order is None and not self.measure.startswith(HAUSDORFF):
             value, error = self._value(mesh, reference)
-            # What decides.
+            # The upper bound decides, so it guides the search too.
             return value + error, max(0.0, value - error), value + error
         if self.order is None:
             ways = largest_deviation(mesh, reference, within=self.value)
             deviation = getattr(ways, self.measure.removeprefix(HAUSDORFF).removeprefix("_") or "both")
-            # The lower bound is the largest distance of a vertex at least; the upper one is hardly below the limit.
+            # The lower bound is at least the distance of any vertex; the upper one falls hardly below the limit.
             return deviation.lower, deviation.lower, deviation.upper
         to_unit = Similarity.to_unit_ball(reference)
         pair = to_unit.apply(mesh), to_unit.apply(reference)

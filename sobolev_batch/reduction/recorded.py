@@ -21,7 +21,7 @@ from sobolev_batch.sources.registry import Member, digest_of, load_mesh
 _VERSION = 6
 # Measured peak of a trial: for each triangle of the original, and of the libraries.
 _TRIAL_BYTES, _LEAST_BYTES = 1400, 3e8
-# Sizes more times apart tell whether a remesher uses them: its triangles then follow at least this power of them.
+# Over sizes more than this factor apart, the triangles of a remesher that uses them follow at least this power of them.
 _APART, _LEAST_POWER = 1.5, 0.1
 
 
@@ -115,7 +115,7 @@ class RecordedSearch:
             key = self._key_of_mesh(record)
             replaced, written[key] = self._read_mesh(record), WRITERS[PurePath(key).suffix](mesh)
             record = replace(record, mesh_digest=_digest(written[key]), replaced_digest=_digest(replaced))
-        # The record first: no mesh lies there that none tells of, and one that is missing is made again.
+        # The record is written first: each mesh then has a record, and a mesh that is missing is made again.
         self.folder.write({f"{self.name or record.digest}.json": _RECORDS.dump_json(record, exclude_defaults=True)})
         self.folder.write(written)
         return record

@@ -21,15 +21,15 @@ from sobolev_batch.sources.registry import Member, Source, parse_source, single_
 
 # What a remesher is asked for by default, and the fewest triangles of a closed mesh.
 _TRIANGLES, _FEWEST = "triangles", 4
-# The first of them to try, times the limit over the radius of the mesh or over its norm: decimations of five meshes
-# within 0.2 to 5 % of the radius, and within 1 % of the norm at order -2, took 2 to 20 in the end, and 10 in the mean.
+# A search first tries this number of triangles over the limit, as a fraction of the radius of the mesh or of its norm:
+# decimations of five within 0.2 to 5 % of the radius, and 1 % of the norm at order -2, took 2 to 20, 10 in the mean.
 _FIRST = 10.0
 # Decimation works best at this size: five meshes of this radius kept 1.5 to 5 times fewer triangles than those of 1 or
 # less within the same fraction of their radius, and those of 3,000 did not come below some number of triangles. And
 # open borders move early if they may: half of the triangles of an open cow were off by 2.3 % of the radius, and by
 # 0.09 % with its border kept.
 _DECIMATION = {"radius": 100.0, "keep_boundary": True}
-# Stands for the mesh of a source until that is given.
+# It stands for the mesh of a source until that is given.
 _ANY_MESH = {"source": "icosphere", "levels": [0]}
 
 # A source's name, a command, a function or a family's table without its mesh; and the searched parameter with its ends.

@@ -23,9 +23,9 @@ _FIRST_SLOPE, _LEAST_SLOPE, _LARGEST_SLOPE = 1.0, 0.3, 3.0
 _LEAST_EXCESS, _NEAR = -7.0, 0.5
 # How far beside the predicted size to try, as a part of the last bracket's width: on its wider side, to end the search.
 _BESIDE = 0.4
-# A step is so short, or cuts off so much of the bracket, that halves can end the search within as many trials. One spot
-# that decimation spoils early may keep the largest deviation the same for many sizes, which then follows no power.
-# The last bracket is then this fraction of its width, since whole numbers are rounded.
+# Steps are kept so short, or cut off so much of the bracket, that halving it can end the search within so many trials:
+# where decimation spoils one spot early, the largest deviation is the same for many sizes, and follows no power.
+# Whole sizes are rounded, so that halving aims at this fraction of the last bracket's width.
 _FEW_TRIALS, _CLOSED = 8, 0.85
 # Widths that differ by this fraction are equal.
 _EQUAL = 1e-9

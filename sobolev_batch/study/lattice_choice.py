@@ -123,6 +123,6 @@ def _finer_octaves(
     is_too_much = intervals > accuracy.largest_intervals or len(tail.octaves) + more_octaves > MOST_OCTAVES
     if is_too_much or (factor, more_octaves, intervals) == (1.0, 0, lattice.M):
         return None
-    # Another seed than that of the samples before.
+    # The seed differs from that of the samples before.
     refined = tail.refined(factor, more_octaves, accuracy.largest_intervals, seed=tail.size)
     return (Lattice(lattice.xi_max, intervals), refined) if refined.size <= _MOST_SAMPLES else None

@@ -41,7 +41,7 @@ _MOST_BYTES = 1e9
 _REACH_MARGIN = 1.03
 # Surfaces that are no pilots may need a little more than those that are: the fraction of the accuracy for pilots.
 _PILOT_FRACTION = 0.7
-# So often a best effort leaves out the pairs that cannot have the accuracy, and looks again.
+# A best effort leaves out the pairs that cannot have the accuracy and chooses again, at most this often.
 _MOST_RETRIES = 2
 
 # The pair of each pilot with the reference, by label. All have the same orders, accuracy and sizes.
@@ -157,14 +157,14 @@ def choose_lattice(
     choice, short = _best_for_most(problems, study.dtype)
     notes = [f"{label} will miss rtol {accuracy.rtol:g}" for label in short if choice is not None]
     if choice is None:
-        # Fewer digits of all of them, from the easiest on.
+        # Fewer digits are sought for all of them, from the easiest accuracy on.
         for rtol in (one for one in COARSER if one > accuracy.rtol):
             aimed, _ = _best_for_most(_with_accuracy(problems, rtol=rtol), study.dtype)
             if aimed is None:
                 break
             choice, notes = aimed, [f"all miss rtol {accuracy.rtol:g}; this is for {rtol:g}"]
     if choice is None:
-        # The largest lattice that a pair may need and the memory permits.
+        # Take the largest lattice that a pair may need and the memory permits.
         choice, shortfalls = _on_one_lattice(_with_accuracy(problems, best_effort=True), study.dtype)
     if choice is None:
         raise _worst(shortfalls)

@@ -20,7 +20,7 @@ from sobolev_batch.study.schema import REFERENCE_LABEL, ObjectSection, StudyDocu
 OBJECT, METHOD = "{object}", "{method}"
 
 _PART = re.compile(r"(\*\*/|\*\*|\*|\?|\[[^\]]*\]|\{object\}|\{method\})")
-# With the stars beside them, since two in a row would stand for whole folders.
+# They take the stars beside them along, since two stars in a row stand for whole folders.
 _PLACEHOLDERS = re.compile(r"(?:\*?\{(?:object|method)\}\*?)+")
 _PATTERNS = {"**/": "(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
 

@@ -107,7 +107,7 @@ def _sentence(at_order: str, rows: pd.DataFrame, reference: str) -> str:
     if closest is None:
         return f"No distance to {name} is above its error {at_order}: the meshes may be equal to it."
     best, rivals = closest
-    # On one line, in a sentence.
+    # The number stays on one line of the sentence.
     amount = percent(best["relative"], best["relative_error"]).replace(" ", "\N{NO-BREAK SPACE}")
     who = rivals[0] if len(rivals) == 1 else f"one of {few_of(rivals)}"
     doubt = f", and the errors leave open whether {who} is nearer" if rivals else ""
@@ -230,7 +230,7 @@ def format_verdict(store: AnyStore, style: Format = "text", orders: Sequence[flo
     stores, for_programs, sections = stores_of(store), {}, list[Section]()
     for name, frame in (frames := tables_of(store, orders)).items():
         reasons = frame[frame["status"] != "complete"].drop_duplicates("mesh").set_index("mesh")["reason"]
-        # Orders as captions of tables and options write them.
+        # Orders are written as in captions of tables and in options.
         sentences, rows, omitted = study_verdict(frame, reasons.to_dict(), "{:g}".format)
         names = ("order", "verdict", "mesh", "relative", "relative_error", "triangles", "remark", "absent")
         for_programs[name] = pd.DataFrame(rows, columns=[*names]).astype({"triangles": "Int64"})

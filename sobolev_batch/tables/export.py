@@ -34,8 +34,8 @@ def export(store: AnyStore, path: Path, style: ExportFormat, order: Orders | Non
     else:
         with from_extra("export", "a NetCDF file needs"):
             import h5netcdf  # noqa: F401
-        # In memory: where a disk is full, its library ends the process. And without the lock of a cluster, which xarray
-        # keeps by the place of the data in memory, maybe that of a cluster that was.
+        # It is made in memory, since its library ends the process where a disk is full. Threads need no lock of a
+        # cluster: xarray keeps such locks by the place of data in memory, and might take that of one that is gone.
         with dask.config.set(scheduler="threads"):
             data = _groups_of(store).to_netcdf(engine="h5netcdf")
     write_file(path, data, "the file")

@@ -36,7 +36,7 @@ AnyStore = str | Path | Location | xr.DataTree
 
 # Entries of the encoding of a tree: where it was opened, and the digest of its tables then.
 _SOURCE, _STATE = "source", "state"
-# Another: the trees of several stores that are open as one, each with the labels of its meshes by their own labels.
+# Another entry: the trees of several stores that are open as one, each with the new labels of its meshes by their own.
 _PARTS = "parts"
 # Groups that may be larger than the memory: xarray computes with them chunk by chunk.
 _LARGE = {"fourier", layout.OCTAVES_GROUP, layout.SPECTRA_GROUP}
@@ -73,7 +73,7 @@ def open_store(store: str | Path | Location | Sequence[str | Path | Location]) -
     """
     if isinstance(store, Iterable) and not isinstance(store, str):
         return _joined([open_store(place) for place in store])
-    # Else values that are read once the process has gone to another folder would be missing ones.
+    # The process may go to another folder before it reads values; zarr would take those of a relative path for missing.
     location = Location.parse(store).absolute()
     opened = Store(location)
     has_objects = layout.OBJECTS in opened.attributes(of_objects=None)["study"]
@@ -267,7 +267,7 @@ def root_attribute(tree: xr.DataTree, name: str) -> dict[str, Any]:
     return _mapping_in(tree.attrs[name]) if name in tree.attrs else {}
 
 
-# That of many objects is long.
+# The attribute of many objects is long, and is read often.
 _mapping_in = lru_cache(mapping_in)
 
 

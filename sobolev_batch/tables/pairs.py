@@ -101,7 +101,7 @@ class Pairs:
     def key_of_tile(self, tile: tuple[int, int]) -> str:
         """Return the key of what a tile depends on."""
         sides = [[self.keys.get(row, "") for row in self.tile_rows(number)] for number in tile]
-        # Products lose no digits but those of the difference to the reference, which is their center.
+        # A tile depends on the reference too: its products are of differences from it.
         ends = self.keys.get(self.reference, ""), *map(repr, self.orders), str(_TILES_VERSION)
         return key_of([*sides[0], "|", *sides[1], "|", *ends])
 

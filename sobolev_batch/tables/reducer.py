@@ -237,7 +237,7 @@ class Reducer:
         rows = list(rows)
         own = np.zeros((len(rows), self.lattice.shell_count))
         differences, products = (np.zeros_like(own) if self.reference is not None else own * np.nan for _ in range(2))
-        # Of norms first, and of distances.
+        # The rows of norms come first, then those of distances.
         near_axes = NearAxes(self.lattice, 2 * len(rows)) if self.sampling is None else None
         for number, block in enumerate(self.blocks):
             reference = None if self.reference is None else self.read([self.reference], number)

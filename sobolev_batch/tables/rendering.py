@@ -145,7 +145,7 @@ def printed_table(rows: Cells, headers: Sequence[str], style: Format, texts: Seq
         groups[-1].append(column)
     if len(groups) == 1:
         return "\n".join(_lines(short, headers, {0, *texts}, widths))
-    # Each by itself, in which longer labels and texts may have room.
+    # Each group is a table of its own, in which longer labels and texts may have room.
     tables = []
     for group in groups:
         kept = [row for row in rows if group is groups[0] or any(row[i] for i in group[labels:])]

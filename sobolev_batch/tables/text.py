@@ -199,7 +199,7 @@ def _magnitude(value: float) -> int:
 
 def _rounded_up(value: float, digits: int) -> float:
     unit = 10.0 ** (_magnitude(value) - digits + 1)
-    # Less a little, so that no rounding error of the division counts.
+    # A little is taken off, so that no rounding error of the division counts.
     return float(f"{math.ceil(value / unit - 1e-9 * abs(value / unit)) * unit:.{digits}g}")
 
 
