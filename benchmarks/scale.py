@@ -66,7 +66,7 @@ def tiny_meshes(effort: Effort) -> Iterator[Row]:
     yield row("fields", fields)
     yield row("of it tasks, by each worker", tasks / _WORKERS)
     yield row("of it scheduler, records, driver", fields - tasks / _WORKERS)
-    yield row("reduction and tables", ended - marks["reduction begins"])
+    yield row("tables", ended - marks["tables begins"])
     yield row("status", status)
     yield row("a run that finds everything there", again)
     yield row(f"{_ADDED} more", added)

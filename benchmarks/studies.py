@@ -40,19 +40,19 @@ class Split:
     Attributes:
         planning: seconds until the first task was about to be submitted.
         fields: seconds while meshes were transformed.
-        reduction: seconds from the first tile of the reduction to the last table.
+        tables: seconds from the first part of the tables to the last table.
         tasks: seconds spent within the tasks of the fields, of all workers together.
     """
 
     planning: float
     fields: float
-    reduction: float
+    tables: float
     tasks: float
 
     @property
     def total(self) -> float:
         """Seconds of the whole run."""
-        return self.planning + self.fields + self.reduction
+        return self.planning + self.fields + self.tables
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def study_overhead(effort: Effort) -> Iterator[Row]:
     yield row("of the fields within tasks", median(split.tasks for split in splits))
     yield row("of the tasks reading", count * median(part.reading for part in parts))
     yield row("of the tasks describing", count * median(part.describing for part in parts))
-    yield row("of it reduction and tables", _WORKERS * median(split.reduction for split in splits))
+    yield row("of it tables", _WORKERS * median(split.tables for split in splits))
 
 
 def all_pairs(effort: Effort) -> Iterator[Row]:
@@ -144,8 +144,8 @@ def _split_run(study: sb.Study, store: Path, client: Client) -> Split:
     started = time.perf_counter()
     sb.run(study, store, client, on_progress=listen)
     ended = time.perf_counter()
-    fields, reduction = first["fields"], first["reduction"]
-    return Split(fields - started, reduction - fields, ended - reduction, sum(tasks))
+    fields, tables = first["fields"], first["tables"]
+    return Split(fields - started, tables - fields, ended - tables, sum(tasks))
 
 
 def _parts(client: Client, paths: Sequence[Path], study: sb.Study) -> Parts:
@@ -197,7 +197,7 @@ def _study_of_files(intervals: int) -> dict[str, Any]:
 
 
 def _study_of_spheres(count: int, intervals: int, orders: Sequence[float], pairs: str) -> sb.Study:
-    """Spheres in closed form, since a reduction takes as long whatever the fields hold."""
+    """Spheres in closed form, since tables take as long whatever the fields hold."""
     rng = np.random.default_rng(0)
     families = [
         {

@@ -1,4 +1,4 @@
-"""Tables from stored fields: the reduction as tasks of the cluster, and its results in the store."""
+"""Tables from stored fields: computed by tasks of the cluster, and written to the store."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,10 +13,10 @@ from sobolev_batch.sources.registry import digest_of
 from sobolev_batch.store import layout
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.tables.all_objects import Tables
+from sobolev_batch.tables.evaluator import Evaluator
 from sobolev_batch.tables.pairs import Pairs, fill_tile
-from sobolev_batch.tables.reducer import Reducer
 from sobolev_batch.tables.results import Placed, Results, coordinates_of, meshes_table, table_order
-from sobolev_batch.tables.shells import fill_chunk, spectrum_keys, stale_chunks
+from sobolev_batch.tables.stored_spectra import fill_chunk, spectrum_keys, stale_chunks
 
 # Raise it whenever tables hold something that those of older versions lack: they are then made again.
 TABLES_VERSION = 22
@@ -39,9 +39,9 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> Stages[Tabulated 
     store, plan, complete = workspace.store, workspace.plan, workspace.complete
     qualities = {row: record.quality for row, record in complete.items()}
     checksums = {row: record.checksums for row, record in complete.items()}
-    reducer = Reducer.for_fields(store, plan.choice, plan.study.orders, qualities, checksums, workspace.reference)
+    evaluator = Evaluator.for_fields(store, plan.choice, plan.study.orders, qualities, checksums, workspace.reference)
     # A larger task is tried all the same, with nothing beside it.
-    projected_bytes = min(reducer.task_bytes, cluster.workers.largest_allowed_bytes)
+    projected_bytes = min(evaluator.task_bytes, cluster.workers.largest_allowed_bytes)
     keys, meshes = _spectrum_keys(workspace), meshes_table(workspace, placed)
     chunks = stale_chunks(store, keys)
     pairs, tiles, replaced = _pairs(workspace), list[tuple[int, int]](), list[str]()
@@ -50,8 +50,8 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> Stages[Tabulated 
         replaced = layout.hide_tables(store)
         pairs.lay_out(coordinates_of(meshes, plan.study.orders))
         tiles = pairs.stale()
-    advance = cluster.count_steps("reduction", len(chunks) + len(tiles))
-    parts = ((reducer.only(rows), n, {row: keys[row] for row in rows if row in keys}) for n, rows in chunks.items())
+    advance = cluster.count_steps("tables", len(chunks) + len(tiles))
+    parts = ((evaluator.only(rows), n, {row: keys[row] for row in rows if row in keys}) for n, rows in chunks.items())
     of_spectra = (Task(fill_chunk, part, projected_bytes, stage="spectra") for part in parts)
 
     def take(task: Task, outcome: Any) -> None:
@@ -62,20 +62,20 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> Stages[Tabulated 
     if pairs is not None:
         # Pairs wait for all spectra, from which their row of the reference comes.
         own_pairs = ((pairs.only(tile), tile) for tile in tiles)
-        of_tiles = ((reducer.only(own.keys), own, tile) for own, tile in own_pairs)
+        of_tiles = ((evaluator.only(own.keys), own, tile) for own, tile in own_pairs)
         of_pairs = (Task(fill_tile, of_tile, projected_bytes, stage="pairs") for of_tile in of_tiles)
         yield Wave(cluster, of_pairs, take, projected_bytes)
-    last = Task(write_results, (workspace, reducer, meshes, digest, replaced), projected_bytes, stage="tables")
+    last = Task(write_results, (workspace, evaluator, meshes, digest, replaced), projected_bytes, stage="tables")
     tabulated: Tabulated
     tabulated, store.metadata = yield from result_from(cluster, last)
     return tabulated
 
 
 def write_results(
-    workspace: Workspace, reducer: Reducer, meshes: xr.Dataset, digest: str, replaced: Sequence[str]
+    workspace: Workspace, evaluator: Evaluator, meshes: xr.Dataset, digest: str, replaced: Sequence[str]
 ) -> tuple[Tabulated, layout.Metadata]:
     """Write the tables that follow from stored spectra, the same each time, and return also the metadata then."""
-    store, results = workspace.store, Results.from_spectra(reducer, meshes, workspace.plan.reference)
+    store, results = workspace.store, Results.from_spectra(evaluator, meshes, workspace.plan.reference)
     numerics = sorted({record.numerics for record in workspace.complete.values()})
     convergence = results.convergence_table(workspace.plan.study.accuracy)
     convergence.attrs |= {"digest": digest, layout.NUMERICS: numerics}

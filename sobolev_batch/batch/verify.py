@@ -34,7 +34,7 @@ from sobolev_batch.store.records import Record, Records
 from sobolev_batch.store.sealed_chunks import Index, damaged_chunks, withdraw_chunk
 from sobolev_batch.store.workspace import Contents
 from sobolev_batch.tables.pairs import Pairs
-from sobolev_batch.tables.shells import spectrum_keys, stale_chunks
+from sobolev_batch.tables.stored_spectra import spectrum_keys, stale_chunks
 from sobolev_batch.visible import visible
 
 _log = logging.getLogger(__name__)

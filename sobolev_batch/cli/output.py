@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from sobolev_batch.batch.cluster.execution import Progress
 
 # Labels of bars, of one length.
-_STAGES = {"lattice": "lattice   ", "fields": "transforms", "reduction": "tables    ", "proximity": "proximity "}
+_STAGES = {"lattice": "lattice   ", "fields": "transforms", "tables": "tables    ", "proximity": "proximity "}
 CLEAR_LINE = "\r\x1b[K"
 # Time after which a silent command says that it goes on, and that between such lines without a terminal.
 _PATIENCE_SECONDS, _SECONDS_BETWEEN_LINES = 2.0, 30.0

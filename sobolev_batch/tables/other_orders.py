@@ -13,19 +13,19 @@ from sobolev_batch.sources.names import quoted
 from sobolev_batch.store.layout import QUALITY
 from sobolev_batch.store.records import Record, Records
 from sobolev_batch.store.workspace import complete_records, rows_unlike_tables
+from sobolev_batch.tables.evaluator import Evaluator
 from sobolev_batch.tables.open import finished_group, reference_of, require_unchanged, source_of, store_of
 from sobolev_batch.tables.pairs import known_distances
-from sobolev_batch.tables.reducer import Reducer
 from sobolev_batch.tables.results import Results, table_of
-from sobolev_batch.tables.shells import spectrum_keys, stale_chunks
+from sobolev_batch.tables.stored_spectra import spectrum_keys, stale_chunks
 from sobolev_batch.transform.lattice import Orders, check_orders
 
 # Labels of meshes: one, several, or all.
 Meshes = str | Sequence[str] | None
 
 
-def stored_reducer(tree: xr.DataTree, order: Orders, *meshes: str) -> tuple[Reducer, list[int]]:
-    """Return the reducer of an open store for any orders, and the rows of some meshes.
+def stored_evaluator(tree: xr.DataTree, order: Orders, *meshes: str) -> tuple[Evaluator, list[int]]:
+    """Return the evaluator of an open store for any orders, and the rows of some meshes.
 
     No record of other meshes is read, and distances are to the last one. Without labels, all records are read, and
     distances are to the reference. InputError where no mesh with a field has a label, DamageError where the record of a
@@ -52,7 +52,7 @@ def stored_reducer(tree: xr.DataTree, order: Orders, *meshes: str) -> tuple[Redu
     qualities = {row: record.quality for row, record in complete.items()}
     checksums = {row: record.checksums for row, record in complete.items()}
     compared_with = rows[-1] if rows else None
-    return Reducer.for_fields(store, store.choice(), orders, qualities, checksums, reference, compared_with), rows
+    return Evaluator.for_fields(store, store.choice(), orders, qualities, checksums, reference, compared_with), rows
 
 
 def _computed(tree: xr.DataTree, orders: tuple[float, ...], meshes: Meshes = None) -> Results:
@@ -75,8 +75,8 @@ def _computed(tree: xr.DataTree, orders: tuple[float, ...], meshes: Meshes = Non
             raise DamageError(f"{part.path}: radial spectra are damaged ({problem}); run the study again", problem)
         texts = np.asarray(part.read(QUALITY, [row - first for row in rows])).tolist() if rows else []
         qualities |= zip(rows, texts, strict=True)
-    reducer = Reducer.for_fields(store, store.choice(), orders, qualities, {}, row_of_reference)
-    return Results.from_spectra(reducer, table, reference)
+    evaluator = Evaluator.for_fields(store, store.choice(), orders, qualities, {}, row_of_reference)
+    return Results.from_spectra(evaluator, table, reference)
 
 
 def convergence_at(tree: xr.DataTree, order: Orders | None, meshes: Meshes = None) -> xr.Dataset:
@@ -103,9 +103,9 @@ def distances_at(tree: xr.DataTree, order: Orders | None) -> xr.Dataset:
 
 
 def _pairs_at(tree: xr.DataTree, meshes: xr.Dataset, others: tuple[float, ...]) -> xr.Dataset:
-    reducer, _ = stored_reducer(tree, others)
+    evaluator, _ = stored_evaluator(tree, others)
     rows: list[int] = meshes["row"].values.tolist()
-    found = known_distances(reducer, rows, rows, set(reducer.complete)).named("distance")
+    found = known_distances(evaluator, rows, rows, set(evaluator.complete)).named("distance")
     return describe(table_of(found, meshes, others, "mesh", "other").assign_coords(other=meshes["mesh"].values))
 
 

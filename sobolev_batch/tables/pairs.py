@@ -19,8 +19,8 @@ from sobolev_batch.store.encoding import array_keys, dataset_keys
 from sobolev_batch.store.layout import DISTANCES, PAIRS_KEYS, Store
 from sobolev_batch.store.metadata import chunk_shape
 from sobolev_batch.store.sealed_chunks import key_in, key_of, missing_chunks, seal
-from sobolev_batch.tables.reducer import Reducer
-from sobolev_batch.tables.shells import read_spectra
+from sobolev_batch.tables.evaluator import Evaluator
+from sobolev_batch.tables.stored_spectra import read_spectra
 
 # Raise it whenever the same fields lead to other distances: tiles of older versions are then made again.
 _TILES_VERSION = 5
@@ -126,10 +126,10 @@ class Pairs:
         return replace(self, keys={row: self.keys[row] for row in sorted(needed & self.keys.keys())})
 
 
-def fill_tile(reducer: Reducer, pairs: Pairs, tile: tuple[int, int]) -> None:
+def fill_tile(evaluator: Evaluator, pairs: Pairs, tile: tuple[int, int]) -> None:
     """Compute a tile of distances, and write it with its mirror image; DamageError where a field was changed."""
     sides = [pairs.tile_rows(number) for number in tile]
-    estimate = known_distances(reducer, sides[0], sides[1], pairs.keys.keys())
+    estimate = known_distances(evaluator, sides[0], sides[1], pairs.keys.keys())
     arrays = {name: np.moveaxis(values, 0, 2) for name, values in sorted(estimate.named("distance").items())}
     mirrored = {name: np.swapaxes(values, 0, 1) for name, values in arrays.items()}
     both = {tile: arrays, tile[::-1]: mirrored} if tile[0] != tile[1] else {tile: arrays}
@@ -143,30 +143,32 @@ def fill_tile(reducer: Reducer, pairs: Pairs, tile: tuple[int, int]) -> None:
         pairs.store.write(PAIRS_KEYS, place, [[seal(pairs.key_of_tile(tile), values_by_name.values())]])
 
 
-def known_distances(reducer: Reducer, rows: Sequence[int], others: Sequence[int], complete: Set[int]) -> NormEstimate:
+def known_distances(
+    evaluator: Evaluator, rows: Sequence[int], others: Sequence[int], complete: Set[int]
+) -> NormEstimate:
     """Return distances over (orders, rows, others), of complete rows as `pair_distances`, else NaN."""
     known = [[row for row in side if row in complete] for side in (rows, others)]
     first, second = np.ix_(*([place for place, row in enumerate(side) if row in complete] for side in (rows, others)))
-    values = np.full((1 + len(PARTS), len(reducer.orders), len(rows), len(others)), np.nan)
+    values = np.full((1 + len(PARTS), len(evaluator.orders), len(rows), len(others)), np.nan)
     if all(known):
-        values[..., first, second] = pair_distances(reducer, *known).stacked
+        values[..., first, second] = pair_distances(evaluator, *known).stacked
     return NormEstimate(*values)
 
 
-def pair_distances(reducer: Reducer, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
+def pair_distances(evaluator: Evaluator, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
     """Return distances over (orders, rows, others), the same or no rows; those to the reference come from spectra."""
-    reference, sides = reducer.reference, {*rows, *others}
-    if reference is None or not (reducer.sampling is None or reference in sides):
-        return reducer.pairs(rows, others)
+    reference, sides = evaluator.reference, {*rows, *others}
+    if reference is None or not (evaluator.sampling is None or reference in sides):
+        return evaluator.pairs(rows, others)
     read = sorted(sides | {reference})
-    spectra, places, images = read_spectra(reducer.store, read), {row: k for k, row in enumerate(read)}, reducer.images
-    if reducer.sampling is None:
-        images = images.copy()
-        images[:, read] = np.sqrt(spectra.distance.images_at(reducer.orders))
-    distances = replace(reducer, images=images).pairs(rows, others).stacked
+    spectra, places = read_spectra(evaluator.store, read), {row: k for k, row in enumerate(read)}
+    images = evaluator.images.copy()
+    if evaluator.sampling is None:
+        images[:, read] = np.sqrt(spectra.distance.images_at(evaluator.orders))
+    distances = replace(evaluator, images=images).pairs(rows, others).stacked
     of_reference = spectra[[places[reference]]].norm
     for side, opposite, axis in ((rows, others, 2), (others, rows, 3)):
         if reference in side:
-            found = reducer.norms_of(opposite, spectra[[places[row] for row in opposite]], of_reference).distances
+            found = evaluator.norms_of(opposite, spectra[[places[row] for row in opposite]], of_reference).distances
             distances.swapaxes(2, axis)[:, :, side.index(reference)] = found.stacked
     return NormEstimate(*distances)

@@ -1,4 +1,4 @@
-"""The tables of a reduction as datasets: of the meshes, and of their norms, distances and observed rates.
+"""The tables of a study as datasets: of the meshes, and of their norms, distances and observed rates.
 
 In the order of tables, families are as in the study, and the meshes of each from coarse to fine.
 """
@@ -25,8 +25,8 @@ from sobolev_batch.store.records import Facts, Record
 from sobolev_batch.store.workspace import Workspace
 from sobolev_batch.study.plan import Row
 from sobolev_batch.study.study import Study
-from sobolev_batch.tables.reducer import Reducer
-from sobolev_batch.tables.shells import chunks_of_spectra, read_spectra
+from sobolev_batch.tables.evaluator import Evaluator
+from sobolev_batch.tables.stored_spectra import chunks_of_spectra, read_spectra
 
 Criterion = Literal["level", "triangles", "names", "time"]
 # A row, its place in its family, and what orders that.
@@ -159,7 +159,7 @@ def _key(criterion: Criterion, row: Row, triangles: int | None) -> tuple[Any, ..
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """The results of a reduction in the order of tables, NaN where there are none.
+    """The results of a study in the order of tables, NaN where there are none.
 
     Attributes:
         norms, to_reference: Norms, and distances to the reference, each (orders, meshes).
@@ -176,23 +176,24 @@ class Results:
     beyond: Reals
 
     @classmethod
-    def from_spectra(cls, reducer: Reducer, meshes: xr.Dataset, reference: str) -> Self:
-        """Return norms, and distances to the reference, from the spectra that the reducer's store holds."""
-        count, orders = meshes.sizes["mesh"], len(reducer.orders)
+    def from_spectra(cls, evaluator: Evaluator, meshes: xr.Dataset, reference: str) -> Self:
+        """Return norms, and distances to the reference, from the spectra that the evaluator's store holds."""
+        count, orders = meshes.sizes["mesh"], len(evaluator.orders)
         arrays = [np.full((parts, orders, count), np.nan) for parts in (5, 5, 4, 2)]
         places = {row: place for place, row in enumerate(meshes["row"].values.tolist())}
-        complete = {row for row in reducer.complete if row in places}
-        of_reference = None if reducer.reference is None else read_spectra(reducer.store, [reducer.reference]).norm
-        for chunk in chunks_of_spectra(reducer.store):
+        complete = {row for row in evaluator.complete if row in places}
+        b = evaluator.reference
+        of_reference = None if b is None else read_spectra(evaluator.store, [b]).norm
+        for chunk in chunks_of_spectra(evaluator.store):
             if rows := [row for row in chunk if row in complete]:
-                found = reducer.norms_of(rows, read_spectra(reducer.store, rows), of_reference)
+                found = evaluator.norms_of(rows, read_spectra(evaluator.store, rows), of_reference)
                 parts = [*found.reference.area_and_shape(found.distances).values()]
                 of_rows = [places[row] for row in rows]
                 numbers = found.norms.stacked, found.distances.stacked, np.stack(parts), np.stack(found.beyond)
                 for array, values in zip(arrays, numbers, strict=True):
                     array[..., of_rows] = values
         norms, to_reference, *others = arrays
-        return cls(meshes, reference, reducer.orders, NormEstimate(*norms), NormEstimate(*to_reference), *others)
+        return cls(meshes, reference, evaluator.orders, NormEstimate(*norms), NormEstimate(*to_reference), *others)
 
     def norms_table(self) -> xr.Dataset:
         """Return `norm` (mesh, order) with its error."""

@@ -10,12 +10,12 @@ from sobolev_batch.norms.causes import band_coordinates
 from sobolev_batch.norms.columns import AREA, KERNEL, LENGTH, NUMBER, described, order_axis
 from sobolev_batch.norms.estimate import AREA_AND_SHAPE, NormEstimate
 from sobolev_batch.parameters import as_names
+from sobolev_batch.tables.evaluator import Evaluator
 from sobolev_batch.tables.open import complete_meshes, finished_group, reference_of, similarity_of
-from sobolev_batch.tables.other_orders import Meshes, convergence_at, norms_at, require_fields, stored_reducer
+from sobolev_batch.tables.other_orders import Meshes, convergence_at, norms_at, require_fields, stored_evaluator
 from sobolev_batch.tables.pairs import pair_distances
-from sobolev_batch.tables.reducer import Reducer
 from sobolev_batch.tables.results import table_of
-from sobolev_batch.tables.shells import lower_bounds
+from sobolev_batch.tables.stored_spectra import lower_bounds
 from sobolev_batch.transform.lattice import Orders, check_orders, single_order, smooth_step
 
 # The upper end of a band, its squares (orders,), its energy, and the standard error of that.
@@ -100,11 +100,11 @@ class StoreAccessor:
             return self._chosen(table[[name for name in _OF_DISTANCES if name in table]], order, mesh)
         meshes = finished_group(self._tree, "meshes")
         labels = complete_meshes(self._tree) if mesh is None else as_names(mesh)
-        reducer, rows = stored_reducer(self._tree, order, *labels, other)
-        found = reducer.norms(rows[:-1])
+        evaluator, rows = stored_evaluator(self._tree, order, *labels, other)
+        found = evaluator.norms(rows[:-1])
         columns = {**found.distances.named("distance"), **found.reference.area_and_shape(found.distances)}
         columns["relative"], columns["relative_error"] = found.distances.relative_to(found.reference.norms)
-        table = table_of(columns, meshes.sel(mesh=labels), reducer.orders)
+        table = table_of(columns, meshes.sel(mesh=labels), evaluator.orders)
         return self._chosen(table, order, mesh if isinstance(mesh, str) else labels)
 
     def nearest(self, mesh: str, count: int = 10, order: float = DEFAULT_ORDER) -> xr.Dataset:
@@ -132,11 +132,11 @@ class StoreAccessor:
         if count < 1:
             raise InputError(f"the number of nearest meshes must be positive, found {count!r}")
         orders, meshes = (single_order(order),), finished_group(self._tree, "meshes")
-        reducer, _ = stored_reducer(self._tree, orders)
+        evaluator, _ = stored_evaluator(self._tree, orders)
         labels = dict(zip(meshes["row"].values.tolist(), meshes["mesh"].values.tolist(), strict=True))
         require_fields(self._tree, meshes, [mesh])
         row = int(meshes["row"].sel(mesh=mesh).item())
-        bounds = lower_bounds(reducer, row, {one for one in reducer.complete if one in labels and one != row})
+        bounds = lower_bounds(evaluator, row, {one for one in evaluator.complete if one in labels and one != row})
         candidates = sorted(bounds, key=bounds.__getitem__)
         # Values and the parts of their errors, and their rows, nearest first.
         found, rows = np.empty((5, 0)), np.empty(0, dtype=np.int64)
@@ -144,7 +144,7 @@ class StoreAccessor:
             if len(rows) >= count and found[0, -1] <= bounds[candidates[start]]:
                 break
             group = candidates[start : start + _CANDIDATES]
-            found = np.hstack([found, pair_distances(reducer, [row], group).stacked[:, 0, 0]])
+            found = np.hstack([found, pair_distances(evaluator, [row], group).stacked[:, 0, 0]])
             rows = np.append(rows, group)
             nearest = np.lexsort((rows, found[0]))[:count]
             found, rows = found[:, nearest], rows[nearest]
@@ -186,13 +186,13 @@ class StoreAccessor:
         >>> round(bands["share"].sum().item(), 6)
         1.0
         """
-        reducer, indices = stored_reducer(self._tree, order, *([mesh] if other is None else [mesh, other]))
-        bands = [*_inner_bands(reducer, indices), *_octaves(reducer, indices)]
+        evaluator, indices = stored_evaluator(self._tree, order, *([mesh] if other is None else [mesh, other]))
+        bands = [*_inner_bands(evaluator, indices), *_octaves(evaluator, indices)]
         upper, squares, energies, deviations = (np.array(column) for column in zip(*bands, strict=True))
         lower = np.array([0.0, *upper[:-1]])
         dims, values, _ = axis = order_axis(order)
         squared = squares.T.reshape(*values.shape, -1)
-        areas = reducer.areas[indices].sum()
+        areas = evaluator.areas[indices].sum()
         with np.errstate(invalid="ignore"):
             share = squared / squared.sum(axis=-1)[..., None]
         return xr.Dataset(
@@ -207,27 +207,27 @@ class StoreAccessor:
         )
 
 
-def _inner_bands(reducer: Reducer, rows: list[int]) -> list[Band]:
-    lattice = reducer.lattice
+def _inner_bands(evaluator: Evaluator, rows: list[int]) -> list[Band]:
+    lattice = evaluator.lattice
     count = max(1, (lattice.M // (2 * _FEWEST_SPACINGS)).bit_length())
     cutoffs = lattice.xi_max / 2.0 ** np.arange(count)[::-1]
     radii = lattice.spacing * np.sqrt(np.arange(lattice.shell_count))
     windows = np.diff([smooth_step(radii, cutoff) for cutoff in cutoffs], axis=0, prepend=0.0)
-    sums, upper = reducer.sums_over_shells(rows), _HALF_WEIGHT * cutoffs
+    sums, upper = evaluator.sums_over_shells(rows), _HALF_WEIGHT * cutoffs
     energies = windows @ sums / np.diff(upper, prepend=0.0)
-    if reducer.sampling is None:
+    if evaluator.sampling is None:
         # No octave takes over from the last band.
         windows[-1], upper[-1] = 1 - windows[:-1].sum(axis=0), lattice.xi_max
-    squares = windows * sums @ (1 + radii[:, None] ** 2) ** reducer.orders
+    squares = windows * sums @ (1 + radii[:, None] ** 2) ** evaluator.orders
     return [(*ends, 0.0) for ends in zip(upper.tolist(), squares, energies.tolist(), strict=True)]
 
 
-def _octaves(reducer: Reducer, rows: list[int]) -> list[Band]:
-    if reducer.sampling is None:
+def _octaves(evaluator: Evaluator, rows: list[int]) -> list[Band]:
+    if evaluator.sampling is None:
         return []
-    values = [reducer.read_octaves(row) for row in rows]
-    sums = reducer.octave_sums(values[0] - values[1] if len(rows) > 1 else values[0])
+    values = [evaluator.read_octaves(row) for row in rows]
+    sums = evaluator.octave_sums(values[0] - values[1] if len(rows) > 1 else values[0])
     return [
         (_HALF_WEIGHT * sampling.octave.highest, one.squares, one.energy, one.energy_deviation)
-        for sampling, one in zip(reducer.sampling.octaves, sums, strict=True)
+        for sampling, one in zip(evaluator.sampling.octaves, sums, strict=True)
     ]

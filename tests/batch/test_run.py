@@ -94,10 +94,10 @@ def test_a_run_counts_its_steps_and_a_second_one_has_none(client: Client, study:
     steps: list[Progress] = []
     first = sb.run(study, store_path, client, on_progress=steps.append)
     assert (len(first.computed), first.reused, steps[0].stage) == (5, (), "cluster")
-    fields, reduction = ([step for step in steps if step.stage == stage] for stage in ("fields", "reduction"))
+    fields, tables = ([step for step in steps if step.stage == stage] for stage in ("fields", "tables"))
     assert [step.done for step in fields] == list(range(6))
     assert {step.label for step in fields[1:]} == set(first.computed)
-    assert reduction[-1].done == reduction[-1].total > 0
+    assert tables[-1].done == tables[-1].total > 0
     before = stamps()
     steps.clear()
     second = sb.run(study, store_path, client, on_progress=steps.append)
@@ -134,10 +134,10 @@ def test_tables_of_an_older_version_are_made_anew(
     with monkeypatch.context() as patch:
         patch.setattr(table_stage, "TABLES_VERSION", table_stage.TABLES_VERSION - 1)
         sb.run(study, store_path, client)
-    for reduced in (True, False):
+    for tabulated in (True, False):
         steps: list[Progress] = []
         assert sb.run(study, store_path, client, on_progress=steps.append).computed == ()
-        assert bool(steps) == ("reduction" in {step.stage for step in steps}) == reduced
+        assert bool(steps) == ("tables" in {step.stage for step in steps}) == tabulated
 
 
 def test_what_another_version_computed_is_never_taken_for_ours_and_is_named(

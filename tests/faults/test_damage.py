@@ -179,7 +179,7 @@ def test_damaged_tables_are_never_read(store: Path) -> None:
     ("damage", "pairs", "row"),
     [(truncate, "all", 1), (empty, "reference", 4), (flip, "all", 4), (delete, "reference", 1), (swap, "all", 1)],
 )
-def test_a_reduction_names_the_mesh_and_computes_it_again(
+def test_a_tabulation_names_the_mesh_and_computes_it_again(
     damage: Damage, pairs: str, row: int, store: Path, threads: Client, caplog: pytest.LogCaptureFixture
 ) -> None:
     damage(store / FIELD.format(row=row))
@@ -192,7 +192,7 @@ def test_a_reduction_names_the_mesh_and_computes_it_again(
 
 def test_what_is_damaged_again_and_again_ends_the_run(store: Path, threads: Client) -> None:
     def ruin(progress: Progress) -> None:
-        if progress.stage == "reduction" and not progress.done:
+        if progress.stage == "tables" and not progress.done:
             flip(store / FIELD.format(row=1))
 
     study = Study.from_table(small_table(norm={"orders": [-4.0]}))

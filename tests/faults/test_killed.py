@@ -78,7 +78,7 @@ def test_a_mesh_that_kills_every_worker_is_blamed_and_no_other(
 
 
 @pytest.mark.parametrize(
-    "line", ["[2/5]", *(pytest.param(line, marks=pytest.mark.all) for line in ("dashboard:", "tables reduced"))]
+    "line", ["[2/5]", *(pytest.param(line, marks=pytest.mark.all) for line in ("dashboard:", "parts of tables"))]
 )
 def test_the_next_run_computes_what_has_no_record(
     line: str, store_path: Path, finished_store: Path, tmp_path: Path
@@ -92,7 +92,7 @@ def test_the_next_run_computes_what_has_no_record(
         assert driver.stdout is not None
         driver.stdout.read()
     complete = [record is not None for record in Records(Store.open(store_path)).read()].count(True)
-    assert complete >= {"dashboard:": 0, "[2/5]": 2, "tables reduced": 5}[line]
+    assert complete >= {"dashboard:": 0, "[2/5]": 2, "parts of tables": 5}[line]
     # The process is known to be gone, so that its claim keeps nobody out.
     again = call("run", study, "--store", store_path, "--workers", "1")
     assert again.returncode == 0, again.stderr
@@ -130,7 +130,7 @@ def several(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     "line",
     [
         "lattices chosen",
-        *(pytest.param(line, marks=pytest.mark.all) for line in ("b, 2 of 2: [1/3]", "tables reduced", "measured")),
+        *(pytest.param(line, marks=pytest.mark.all) for line in ("b, 2 of 2: [1/3]", "parts of tables", "measured")),
     ],
 )
 def test_objects_go_on_wherever_their_driver_was_killed(
@@ -177,7 +177,7 @@ with Client(processes=False, n_workers=1, threads_per_worker=1, dashboard_addres
 
 
 @pytest.mark.all
-@pytest.mark.parametrize("moment", ["[1/5]", "[3/5]", "tables reduced"])
+@pytest.mark.parametrize("moment", ["[1/5]", "[3/5]", "parts of tables"])
 def test_a_larger_lattice_goes_on_where_its_driver_was_killed(moment: str, tmp_path: Path) -> None:
     undisturbed, store_path = tmp_path / "undisturbed.zarr", tmp_path / "store.zarr"
     done = finished(sys.executable, "-c", GROWING.replace("sys.argv[1]", repr(str(undisturbed))))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 import sobolev_batch as sb
 from sobolev_batch.norms.estimate import AREA_AND_SHAPE, PARTS, NormEstimate
-from sobolev_batch.tables.other_orders import distances_at, stored_reducer
+from sobolev_batch.tables.other_orders import distances_at, stored_evaluator
 from tests.support.rectangles import Rectangles
 from tests.support.studies import small_table, variable
 
@@ -91,15 +91,15 @@ def test_flat_faces_that_repeat_beyond_a_given_lattice_are_in_every_error(store_
 def test_with_octaves_stored_spectra_fields_and_tiles_of_pairs_agree(store_path: Path, threads: Client) -> None:
     sb.run(study_of(2), store_path, threads)
     tree = sb.open_store(store_path)
-    reducer, (row, reference) = stored_reducer(tree, OTHERS, MESH, "reference")
+    evaluator, (row, reference) = stored_evaluator(tree, OTHERS, MESH, "reference")
     of_spectra = tree.sobolev.distance(OTHERS, MESH)
-    of_fields = reducer.norms([row])
+    of_fields = evaluator.norms([row])
     expected = parts_of(of_spectra)
     assert (expected > 0).all()
     assert np.moveaxis(of_fields.distances.stacked, 0, -1)[:, 0] == pytest.approx(expected, rel=1e-9)
     for name, values in of_fields.reference.area_and_shape(of_fields.distances).items():
         assert of_spectra[name].values == pytest.approx(values[:, 0], rel=1e-9)
-    pair: NormEstimate = reducer.pairs([row], [reference])
+    pair: NormEstimate = evaluator.pairs([row], [reference])
     found = pair.stacked[..., 0, 0].T
     assert found[:, :4] == pytest.approx(expected[:, :4], rel=1e-7)
     # Of stored spectra the largest sample is known at some orders, and bounded between them.

@@ -18,7 +18,7 @@ from sobolev_batch.errors import DamageError
 from sobolev_batch.geometry.formats.writing import write_mesh
 from sobolev_batch.store.layout import Store
 from sobolev_batch.tables import pairs
-from sobolev_batch.tables.reducer import Reducer
+from sobolev_batch.tables.evaluator import Evaluator
 from tests.support.rectangles import Rectangles
 from tests.support.studies import small_table
 
@@ -40,13 +40,13 @@ def _two_meshes_a_side(monkeypatch: pytest.MonkeyPatch) -> None:
 def tiles(monkeypatch: pytest.MonkeyPatch) -> list[Tile]:
     """Return the rows and others of each tile that is computed from now on."""
     computed: list[Tile] = []
-    measured = Reducer.pairs
+    measured = Evaluator.pairs
 
-    def recording(reducer: Reducer, rows: list[int], others: list[int]) -> Any:
+    def recording(evaluator: Evaluator, rows: list[int], others: list[int]) -> Any:
         computed.append((tuple(rows), tuple(others)))
-        return measured(reducer, rows, others)
+        return measured(evaluator, rows, others)
 
-    monkeypatch.setattr(Reducer, "pairs", recording)
+    monkeypatch.setattr(Evaluator, "pairs", recording)
     return computed
 
 

@@ -29,7 +29,7 @@ from sobolev_batch.parameters import byte_count, format_bytes, is_whole_number
 # In less, a worker with all its libraries has no memory left for any transform.
 _LEAST_BYTES = 700_000_000
 # Dask has workers hand freed memory back at once, and the arrays of a task come and go: taking fresh memory
-# for each took a third of a reduction's time. What glibc may keep is bounded.
+# for each took a third of the time of tables. What glibc may keep is bounded.
 _KEPT_BYTES = 64 << 20
 _LARGEST_KEPT_BYTES = 32 << 20
 # After a worker has died, Dask looks once whether it is back, and gives it up for ever if it is just then

@@ -17,7 +17,7 @@ from sobolev_batch.errors import ClusterError, SpaceError, StoreError, one_line
 from sobolev_batch.store.records import Record
 
 Result = TypeVar("Result")
-Stage = Literal["cluster", "search", "lattice", "fields", "reduction", "proximity"]
+Stage = Literal["cluster", "search", "lattice", "fields", "tables", "proximity"]
 # Runs that have begun and not ended: at least so many, and so many for each thread of the workers, whose first task may
 # be their only one. Each has its plan and its records in memory.
 _FEWEST_RUNS, _RUNS_PER_THREAD = 64, 4
@@ -27,7 +27,7 @@ _FEWEST_IN_FLIGHT, _IN_FLIGHT_PER_THREAD = 2000, 20
 _DONE: Mapping[Stage, str] = {
     "lattice": "lattices chosen",
     "fields": "transforms",
-    "reduction": "tables reduced",
+    "tables": "parts of tables",
     "proximity": "Hausdorff and Chamfer distances measured",
 }
 
@@ -38,8 +38,8 @@ class Progress:
 
     Attributes:
         stage: "cluster" once there is one, "search" where families are searched for meshes within tolerances,
-            "lattice" while one is chosen for an accuracy, "fields" while meshes are transformed, "reduction" while
-            tables are computed, "proximity" while Hausdorff and Chamfer distances are measured.
+            "lattice" while one is chosen for an accuracy, "fields" while meshes are transformed, "tables" while
+            these are computed, "proximity" while Hausdorff and Chamfer distances are measured.
         done, total: Steps of the stage.
         label: Label of the mesh that was finished, address of the cluster's dashboard, or families; else empty.
         part: Object that is worked on and its number, such as "cow, 2 of 8"; empty where the study names no object.
@@ -59,7 +59,7 @@ class Progress:
         if self.stage == "search":
             return f"searching meshes of {self.label}: each takes several trials, unless it is kept from before"
         if self.record is not None:
-            outcome = self.record.reason or f"{self.record.seconds:.2f} s"
+            outcome = self.record.reason or self.record.remark or f"{self.record.seconds:.2f} s"
             return f"{part}[{self.done}/{self.total}] {self.label}: {self.record.status}, {outcome}"
         return f"{part}{count} {_DONE[self.stage]}"
 

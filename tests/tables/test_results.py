@@ -1,4 +1,4 @@
-"""Results of a reduction in tables, and the rates that follow from them."""
+"""The tables of a study, and the rates that follow from them."""
 
 from __future__ import annotations
 

@@ -60,8 +60,8 @@ class Compared:
 
 
 @dataclass(frozen=True, eq=False)
-class Reducer:
-    """The input that all tiles of one reduction share.
+class Evaluator:
+    """The fields of a store, with what is known of them, as all tasks share it that compute from them.
 
     Attributes:
         reference: Row of the reference, or None if it has no field.
@@ -107,12 +107,12 @@ class Reducer:
         reference: int,
         compared_with: int | None = None,
     ) -> Self:
-        """Return the reducer of rows with stored qualities; distances are to the reference, or another row."""
+        """Return the evaluator of rows with stored qualities; distances are to the reference, or another row."""
         qualities = {row: Quality.from_json(text) for row, text in stored.items()}
         count = sum(part.row_count for _, part in store.stores)
         known = reference if reference in qualities else None
         extents = [quality.extent for quality in qualities.values()]
-        reducer = cls(
+        evaluator = cls(
             store=store,
             lattice=choice.lattice,
             blocks=Fields(store).blocks_of(choice.lattice),
@@ -130,9 +130,9 @@ class Reducer:
             is_given=not choice.basis,
         )
         for row, quality in qualities.items():
-            reducer.areas[row], reducer.errors[:, row] = quality.area, quality.error_norms(reducer.weights)
-            reducer.beyond[:, row] = np.sqrt(quality.beyond_at(orders))
-        return reducer
+            evaluator.areas[row], evaluator.errors[:, row] = quality.area, quality.error_norms(evaluator.weights)
+            evaluator.beyond[:, row] = np.sqrt(quality.beyond_at(orders))
+        return evaluator
 
     @property
     def complete(self) -> list[int]:

@@ -11,7 +11,7 @@ from sobolev_batch.norms.spectrum import ComparedSpectra
 from sobolev_batch.store.layout import SPECTRA_GROUP, SPECTRA_KEYS, Store
 from sobolev_batch.store.metadata import chunk_shape
 from sobolev_batch.store.sealed_chunks import arrays_of, key_in, key_of, missing_chunks, read_chunk, seal
-from sobolev_batch.tables.reducer import Reducer
+from sobolev_batch.tables.evaluator import Evaluator
 
 # Raise it whenever the same fields lead to other spectra: those of older versions are then made again.
 _SPECTRA_VERSION = 3
@@ -52,10 +52,10 @@ def _stored_keys(store: Store, rows: range) -> dict[int, str]:
     return {}
 
 
-def fill_chunk(reducer: Reducer, number: int, keys: Mapping[int, str]) -> None:
+def fill_chunk(evaluator: Evaluator, number: int, keys: Mapping[int, str]) -> None:
     """Compute the spectra of a chunk's rows, but for those that it has with these keys, and write the chunk."""
-    store, rows = reducer.store, list(chunks_of_spectra(reducer.store))[number]
-    widths = {f"{SPECTRA_GROUP}/{name}": width for name, (width, *_) in reducer.axis.arrays().items()}
+    store, rows = evaluator.store, list(chunks_of_spectra(evaluator.store))[number]
+    widths = {f"{SPECTRA_GROUP}/{name}": width for name, (width, *_) in evaluator.axis.arrays().items()}
     arrays = {name: np.full((len(rows), widths[name]), np.nan) for name in arrays_of(store, SPECTRA_KEYS)}
     kept: set[int] = set()
     with suppress(DamageError):
@@ -64,7 +64,7 @@ def fill_chunk(reducer: Reducer, number: int, keys: Mapping[int, str]) -> None:
         for name, values in stored.items():
             arrays[name][_places(kept, rows)] = values[_places(kept, rows)]
     missing = {row for row in rows if row in keys} - kept
-    for name, values in reducer.spectra(sorted(missing)).arrays.items() if missing else ():
+    for name, values in evaluator.spectra(sorted(missing)).arrays.items() if missing else ():
         arrays[f"{SPECTRA_GROUP}/{name}"][_places(missing, rows)] = values
 
     def write_keys(of: set[int]) -> None:
@@ -97,19 +97,19 @@ def read_spectra(store: Store, rows: Sequence[int]) -> ComparedSpectra:
     return ComparedSpectra.joined(parts)[[places[row] for row in rows]]
 
 
-def lower_bounds(reducer: Reducer, row: int, others: Set[int]) -> dict[int, float]:
-    """Return a lower bound on the distance of a row from each of some others, at the reducer's first order.
+def lower_bounds(evaluator: Evaluator, row: int, others: Set[int]) -> dict[int, float]:
+    """Return a lower bound on the distance of a row from each of some others, at the evaluator's first order.
 
     On each shell two fields differ by no less than their norms there, or those of their differences from a third field.
     """
 
     def shells(rows: Sequence[int]) -> Reals:
-        spectra = read_spectra(reducer.store, rows)
-        chosen = spectra.norm if reducer.reference is None else spectra.distance
-        return np.asarray(np.sqrt(np.maximum(chosen.sums[:, : reducer.lattice.shell_count], 0.0)))
+        spectra = read_spectra(evaluator.store, rows)
+        chosen = spectra.norm if evaluator.reference is None else spectra.distance
+        return np.asarray(np.sqrt(np.maximum(chosen.sums[:, : evaluator.lattice.shell_count], 0.0)))
 
-    own, weights, bounds = shells([row]), reducer.weights.per_shell[0], dict[int, float]()
-    for chunk in chunks_of_spectra(reducer.store):
+    own, weights, bounds = shells([row]), evaluator.weights.per_shell[0], dict[int, float]()
+    for chunk in chunks_of_spectra(evaluator.store):
         if rows := [one for one in chunk if one in others]:
             squares = (shells(rows) - own) ** 2 @ weights
             bounds |= zip(rows, ((1 - _ROUNDING) * np.sqrt(squares)).tolist(), strict=True)
