@@ -29,7 +29,7 @@ from sobolev_batch.study.schema import REFERENCE_LABEL
 from sobolev_batch.study.study import Study, StudyLike
 from sobolev_batch.tables.pairs import PAIR_BYTES, tile_count
 from sobolev_batch.tables.rendering import printed_table
-from sobolev_batch.tables.text import beside, duration
+from sobolev_batch.tables.text import beside, duration, spread
 from sobolev_batch.transform.fourier import slowness
 from sobolev_batch.transform.lattice import Lattice
 from sobolev_batch.visible import visible
@@ -352,7 +352,7 @@ def _looked_at(study: Study, location: Location) -> tuple[list[str], float]:
     objects = Objects.read(location)
     recorded = {} if objects is None else objects.recorded()
     left = [name for name in names if ended_before(study.of_object(name), recorded.get(name)) is None]
-    chosen = [left[k * len(left) // _MOST_OBJECTS] for k in range(_MOST_OBJECTS)] if len(left) > _MOST_OBJECTS else left
+    chosen = spread(left, _MOST_OBJECTS)
     return chosen, len(left) / max(1, len(chosen))
 
 
@@ -433,12 +433,11 @@ def _plan(study: Study, location: Location, workers: Workers, client: Client | N
 
 def _doubts_of(plan: Plan, stored: Mapping[str, Record]) -> dict[str, str]:
     """Return why surfaces cannot be read, or what makes one doubt them, by label; none is read twice."""
-    others = {row.label: row for row in plan.rows if row.label != plan.reference}
+    others = {row.label: (row.family, row.member) for row in plan.rows if row.label != plan.reference}
     # What is stored need not be read again.
     known = {label: Quality.from_json(stored[label].quality).extent for label in others if label in stored}
     seen = plan.look
     look = Look({**seen.extents, **known}, dict(seen.set_aside), dict(seen.notes))
-    members = {label: (row.family, row.member) for label, row in others.items()}
-    look.at_all(members, plan.similarity, plan.reference_extent)
+    look.at_all(others, plan.similarity, plan.reference_extent)
     doubts = {label: placement_doubt(extent, plan.reference_extent) for label, extent in look.extents.items()}
     return look.notes | look.set_aside | {label: doubt for label, doubt in doubts.items() if doubt is not None}

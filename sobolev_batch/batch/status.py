@@ -213,9 +213,8 @@ def _tallies(objects: Objects) -> Iterator[tuple[str, ObjectRecord]]:
 def _rate(finished: Sequence[str], run: RunRecord) -> float:
     """Return how many surfaces a run finishes in a second, from the later half of the moments when it finished one."""
     age = age_seconds(run.started)
-    ages = sorted(age_seconds(moment) for moment in finished if moment)
-    latest = [one for one in ages if one <= age]
-    latest = latest[: max(_FEWEST_FOR_RATE, len(latest) // 2)]
+    ages = sorted(one for one in map(age_seconds, filter(None, finished)) if one <= age)
+    latest = ages[: max(_FEWEST_FOR_RATE, len(ages) // 2)]
     if len(latest) < _FEWEST_FOR_RATE or latest[-1] <= latest[0]:
         return math.nan
     return (len(latest) - 1) / (latest[-1] - latest[0])

@@ -42,7 +42,7 @@ def tabulate_fields(cluster: Cluster, workspace: Workspace) -> Stages[Tabulated 
     evaluator = Evaluator.for_fields(store, plan.choice, plan.study.orders, qualities, checksums, workspace.reference)
     # A larger task is tried all the same, with nothing beside it.
     projected_bytes = min(evaluator.task_bytes, cluster.workers.largest_allowed_bytes)
-    keys, meshes = _spectrum_keys(workspace), meshes_table(workspace, placed)
+    keys, meshes = spectrum_keys(_record_keys(workspace), workspace.reference), meshes_table(workspace, placed)
     chunks = stale_chunks(store, keys)
     pairs, tiles, replaced = _pairs(workspace), list[tuple[int, int]](), list[str]()
     if pairs is not None:
@@ -108,16 +108,12 @@ def _record_keys(workspace: Workspace) -> dict[int, str]:
     return {row: record.key for row, record in workspace.complete.items()}
 
 
-def _spectrum_keys(workspace: Workspace) -> dict[int, str]:
-    return spectrum_keys(_record_keys(workspace), workspace.reference)
-
-
 def are_tabulated(workspace: Workspace, digest: str = "") -> bool:
     """Return True where the tables of a store belong to its fields and to the plan, by their digest if it is known."""
     attributes = layout.table_attributes(workspace.store, "convergence")
     if attributes is None or attributes.get("digest") != (digest or _digest(workspace, table_order(workspace))):
         return False
-    if stale_chunks(workspace.store, _spectrum_keys(workspace)):
+    if stale_chunks(workspace.store, spectrum_keys(_record_keys(workspace), workspace.reference)):
         return False
     pairs = _pairs(workspace)
     if pairs is not None and (layout.PAIRS_KEYS not in workspace.store.documents or pairs.stale()):

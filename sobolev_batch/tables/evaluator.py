@@ -256,9 +256,7 @@ class Evaluator:
         if self.reference is None:
             images[len(rows) :] = np.nan
         samples = 0 if self.sampling is None else self.sampling.size
-        reference_octaves = np.full(samples, np.nan, dtype=np.complex128)
-        if self.reference is not None:
-            reference_octaves[:] = self.read_octaves(self.reference)
+        reference_octaves = np.full(samples, np.nan) if self.reference is None else self.read_octaves(self.reference)
         parts = []
         for batch in slices(len(rows), max(1, int(_HELD_BYTES // (_SPECTRUM_BYTES * max(samples, 1))))):
             octaves = np.stack([self.read_octaves(row) for row in rows[batch]]).astype(np.complex128)

@@ -96,9 +96,8 @@ def meshes_table(workspace: Workspace, placed: Sequence[Placed]) -> xr.Dataset:
     for name in ("reason", "remark", "worker", "backend", "key"):
         columns[name] = _strings([getattr(record, name) for record in filled])
     columns["mesh"], metadata = _strings([row.label for row in rows]), _metadata(rows)
-    times = [row.member.time for row in rows]
-    if any(time is not None for time in times):
-        columns["time"] = np.array([np.nan if time is None else time for time in times])
+    if any(row.member.time is not None for row in rows):
+        columns["time"] = np.array([row.member.time for row in rows], dtype=np.float64)
     variables = {name: ("mesh", values) for name, values in {**columns, **metadata}.items()}
     table = xr.Dataset(variables, attrs={"metadata": list(metadata)})
     # Else xarray counts from the first of them, and no two tables have the same metadata.
