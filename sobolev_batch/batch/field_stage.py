@@ -69,7 +69,7 @@ def compute_fields(cluster: Cluster, workspace: Workspace, pending: Sequence[int
 
 
 def _in_groups(tasks: Iterator[Task], seconds: Mapping[str, float], most: int) -> Iterator[Task]:
-    """Yield tasks of fields, with up to so many of small meshes in one: each costs the scheduler some milliseconds."""
+    """Yield tasks of fields, one for up to so many small meshes: each costs the scheduler some milliseconds."""
     group: list[Task] = []
     for task in tasks:
         predicted = seconds.get(task.label, math.inf) if task.function is compute_mesh else math.inf
@@ -85,7 +85,7 @@ def _in_groups(tasks: Iterator[Task], seconds: Mapping[str, float], most: int) -
 
 
 def _grouped(tasks: Sequence[Task]) -> Task:
-    """Return one task that does several of small meshes, which take its place where a worker dies of it."""
+    """Return one task in place of those of several small meshes, which take its place where a worker dies of it."""
     first, *others = tasks
     if not others:
         return first

@@ -1,4 +1,4 @@
-"""How far a mesh may be from the one that it was made of, and how a mesh is made and judged.
+"""How far a mesh may be from its reference, and how a mesh is made and judged.
 
 A question that is clear is answered early: bounds are only as close as it needs.
 """
@@ -44,14 +44,14 @@ _MEASURES = (RELATIVE, *(name for name in NUMBERS if not _OTHERS.search(name)), 
 
 @dataclass(frozen=True)
 class Limit:
-    """Largest distance of a mesh from the one that it was made of, by one measure.
+    """Largest distance of a mesh from its reference, by one measure.
 
     Attributes:
         value: Largest value of the measure, of either sign: a length in the unit of the meshes, degrees or a fraction;
             of "fscore", "precision" and "recall", the smallest.
         measure: Column of tables: "hausdorff", the largest deviation, of each point of either mesh from the closest one
-            of the other; "relative", the Sobolev distance over the norm of the original, in the unit in which its
-            bounding sphere has the radius 1; "area" or "volume", its change over that of the original; or another one
+            of the other; "relative", the Sobolev distance over the norm of the reference, in the unit in which its
+            bounding sphere has the radius 1; "area" or "volume", its change over that of the reference; or another one
             of `proximity`, such as "rms", by random points, as far as it may be off at 99 %.
         order: Order s < -1/2 of the Sobolev distance; None for the others.
     """

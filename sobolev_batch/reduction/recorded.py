@@ -105,7 +105,7 @@ class RecordedSearch:
         return self.reference, self.remesher.member(self.original, size, record.triangles), self.limit, size
 
     def taken(self, record: SearchRecord, outcome: tuple[Trial, Mesh | None]) -> SearchRecord:
-        """Record the outcome of a trial, after the mesh if it is the best one, and return the record."""
+        """Record the outcome of a trial, then write its mesh if that is the best one; return the record."""
         if self.digest != record.digest:
             raise MeshError("a file of it was changed while it was searched; try again")
         trial, mesh = outcome

@@ -104,7 +104,7 @@ class Remesher:
         return self.ends is None or all(map(is_whole_number, self.ends))
 
     def search(self, limit: Limit, triangles: int, radius: float, precision: float = PRECISION) -> Search:
-        """Return the search for a mesh of some triangles and radius that is to be within a limit of itself."""
+        """Return the search for the coarsest mesh within a limit, made of one of some triangles and radius."""
         low, high = self.ends or (min(_FEWEST, triangles), triangles)
         if self.parameter != _TRIANGLES:
             return Search(limit.largest, low, high, self.is_whole, precision=precision)

@@ -218,7 +218,7 @@ class Evaluator:
     def _tail(
         self, spectra: Spectra, remainder: Callable[[int, Sequence[float]], Remainder], rows: Sequence[int]
     ) -> Tail | None:
-        """Return the tails (orders, rows) by spectra, and a function of a row and its energies in octaves."""
+        """Return the tails (orders, rows), from spectra and from a function of a row and its energies in octaves."""
         if self.sampling is None:
             return None
         energies = self.axis.energies(spectra)
@@ -270,7 +270,7 @@ class Evaluator:
         return ComparedSpectra.joined(parts)
 
     def pairs(self, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
-        """Return distances over (orders, rows, others), in batches that fit a task; others are rows, or none."""
+        """Return distances over (orders, rows, others), in batches that fit a task; all others are rows, or none."""
         distances, is_square = np.zeros((5, len(self.orders), len(rows), len(others))), tuple(rows) == tuple(others)
         for batch in slices(len(rows), max(1, self._capacity - self._group - self._read_at_once)):
             first = batch.start if is_square else 0

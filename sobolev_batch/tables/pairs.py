@@ -146,7 +146,7 @@ def fill_tile(evaluator: Evaluator, pairs: Pairs, tile: tuple[int, int]) -> None
 def known_distances(
     evaluator: Evaluator, rows: Sequence[int], others: Sequence[int], complete: Set[int]
 ) -> NormEstimate:
-    """Return distances over (orders, rows, others), of complete rows as `pair_distances`, else NaN."""
+    """Return distances over (orders, rows, others): those of `pair_distances` where both are complete, else NaN."""
     known = [[row for row in side if row in complete] for side in (rows, others)]
     first, second = np.ix_(*([place for place, row in enumerate(side) if row in complete] for side in (rows, others)))
     values = np.full((1 + len(PARTS), len(evaluator.orders), len(rows), len(others)), np.nan)
@@ -156,7 +156,7 @@ def known_distances(
 
 
 def pair_distances(evaluator: Evaluator, rows: Sequence[int], others: Sequence[int]) -> NormEstimate:
-    """Return distances over (orders, rows, others), the same or no rows; those to the reference come from spectra."""
+    """Return distances over (orders, rows, others), see `Evaluator.pairs`; those to the reference come from spectra."""
     reference, sides = evaluator.reference, {*rows, *others}
     if reference is None or not (evaluator.sampling is None or reference in sides):
         return evaluator.pairs(rows, others)

@@ -124,7 +124,7 @@ def _strings(values: Sequence[str]) -> NDArray[np.generic]:
 
 
 def _criterion(study: Study, family: str, rows: Sequence[Row], counts: Sequence[int]) -> Criterion:
-    """Return what orders a family, of whose complete meshes the numbers of triangles are given."""
+    """Return what orders a family, given the numbers of triangles of its complete meshes."""
     if (chosen := next((one.order_by for one in study.object.families if one.name == family), None)) is not None:
         return chosen
     if any(row.member.time is not None for row in rows):
