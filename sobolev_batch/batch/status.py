@@ -38,7 +38,7 @@ class Status(Shown):
         not_compared: Reason for each surface that is computed but lacks the Hausdorff and Chamfer distances that the
             study requests.
         run: Record of the latest run, or None.
-        reduced: True once the store has tables, of all objects that can be carried out.
+        has_tables: True once the store has tables, of all objects that can be carried out.
         silence_seconds: Seconds since the latest sign of life of a run that goes on, else 0.
         rate: Surfaces that the latest run finishes in a second, as at the last of them; NaN before there are a few.
         lost_records: Labels of surfaces that the tables list, and whose completion records are gone, or others. A run
@@ -60,7 +60,7 @@ class Status(Shown):
     failed: dict[str, str]
     not_compared: dict[str, str]
     run: RunRecord | None
-    reduced: bool
+    has_tables: bool
     silence_seconds: float
     rate: float = math.nan
     lost_records: tuple[str, ...] = ()
@@ -94,7 +94,7 @@ class Status(Shown):
             failed=refused | labelled({name: one.failed for name, one in tallies.items()}),
             not_compared=labelled({name: one.not_compared for name, one in tallies.items()}),
             run=run,
-            reduced={one.has_tables for one in tallies.values() if not one.reason} == {True},
+            has_tables={one.has_tables for one in tallies.values() if not one.reason} == {True},
             silence_seconds=age_seconds(run.seen) if run is not None and run.state in _PATIENCE_SECONDS else 0.0,
             rate=math.nan if run is None else _rate(moments, run),
             lost_records=tuple(labelled({name: dict.fromkeys(one.lost_records) for name, one in tallies.items()})),
@@ -162,7 +162,7 @@ class Status(Shown):
             yield f"objects without rows in the tables of all: {few}; run the whole study"
         if self.run is not None:
             yield from self._run_lines(self.run)
-        if not self.reduced:
+        if not self.has_tables:
             yield "no tables yet" if self.going_on else "no tables yet: run the study to its end"
 
     def _run_lines(self, run: RunRecord) -> Iterator[str]:

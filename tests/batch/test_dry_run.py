@@ -256,7 +256,7 @@ def test_a_plan_and_a_status_and_a_run_agree_on_what_is_missing() -> None:
     # First nothing is missing, then tables, then a field.
     assert "nothing is missing" in str(sb.plan(study, place))
     hide_tables(Store.open(place))
-    assert not sb.status(place).reduced
+    assert not sb.status(place).has_tables
     assert "no field is missing, and tables follow" in str(sb.plan(study, place))
     assert sb.run(study, place).computed == ()
     assert "nothing is missing" in str(sb.plan(study, place))

@@ -218,7 +218,7 @@ def test_tables_that_this_package_does_not_write_are_made_again_from_the_fields(
     change(copy, node, lambda document: document.update(changes))
     assert sorted(open_store(copy).children) == ["fourier", "records", "spectra"]
     assert f"{copy}: its tables are not used: {message}" in caplog.text
-    assert not Status.from_store(copy).reduced
+    assert not Status.from_store(copy).has_tables
     assert not verify(copy).is_sound
     prune(Location.parse(copy))
     assert unlock(copy) is None

@@ -175,7 +175,7 @@ def _tables(cutoff: float, order: float, fineness: int) -> tuple[float, Reals, R
         drops[near] += np.einsum("ij,j->i", 1 - fade + 2 * fade * np.sin(np.pi * cycles) ** 2, terms)
         drops[~near] += terms.sum()
     drops, total = (drops + _power_integral(low, order)) / np.pi, total / np.pi
-    # Denser tables by cubic Hermite interpolation, so that straight lines between their entries will do.
+    # Cubic Hermite interpolation makes the tables dense enough for splines between their entries.
     slopes, fractions = np.gradient(drops), np.arange(_DENSER) / _DENSER
     slopes[2:-2] = (8 * (drops[3:-1] - drops[1:-3]) - drops[4:] + drops[:-4]) / 12
     from_start = fractions**2 * (3 - 2 * fractions)
