@@ -17,7 +17,7 @@ from sobolev_batch.geometry.surface import Similarity, placement_doubt
 from sobolev_batch.machine import available_cores
 from sobolev_batch.norms.fields import Quality
 from sobolev_batch.parameters import callback, format_bytes
-from sobolev_batch.shown import Shown, reasons
+from sobolev_batch.shown import Shown, reasons, together
 from sobolev_batch.store.layout import stored_choice
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.objects import Objects, for_each_object, labelled
@@ -210,13 +210,13 @@ class StudyPlan(Shown):
         if "" not in self.objects:
             looked = f", of which {len(self.objects) + len(self.refused)} were looked at" if self.share > 1 else ""
             lines.append(_beside("objects", f"{self.count:,}{looked}; {format_bytes(self.total_bytes)} of fields"))
-        lines += [beside(f"{visible(name)}: ", reason) for name, reason in self.refused.items()]
+        lines += [beside(f"{visible(name)}: ", reason) for name, reason in together(self.refused).items()]
         longest_first = sorted(self.objects.items(), key=lambda named: -named[1].processor_seconds)
         if len(longest_first) > 1:
             rows = [one.summary(visible(name)) for name, one in longest_first]
             lines += ["", *printed_table(rows, _SUMMARY, "text").split("\n"), ""]
             doubts = labelled({name: one.doubtful for name, one in longest_first})
-            lines += starmap(_beside, reasons("doubtful", doubts))
+            lines += starmap(_beside, reasons("doubtful", together(doubts)))
         for name, one in longest_first[:1]:
             lines += [*([f"{visible(name)}:"] if name else []), *starmap(_beside, one.lines)]
         return "\n".join(lines)

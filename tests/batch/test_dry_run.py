@@ -49,6 +49,7 @@ def test_objects_that_cannot_be_planned_lack_something() -> None:
     found = sb.plan(sb.Study.from_table(table), "memory://not-permitted.zarr")
     assert [*found.refused] == ["a", "b"]
     assert "2 of 2 objects cannot be planned" in str(found)
+    assert str(found).count("--allow-commands") == 1
     assert "nothing is missing" not in str(found)
 
 
