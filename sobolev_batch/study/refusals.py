@@ -61,7 +61,9 @@ def _refusals(error: ValidationError, values: Mapping[str, Any]) -> list[str]:
         kind, key = item["type"], _key_in(values, item)
         name = _named(key, values)
         if kind == "extra_forbidden":
-            messages.append(f"{name} is unknown; {known_names(str(key[-1]), _known_keys(values, key[:-1]))}")
+            owner = _section_of(str(key[-1]))
+            hint = f"it belongs to [{owner}]" if owner else known_names(str(key[-1]), _known_keys(values, key[:-1]))
+            messages.append(f"{name} is unknown; {hint}")
         elif kind == "missing":
             messages.append(f"{name} is missing")
         elif kind == "value_error":
@@ -106,6 +108,18 @@ def _key_in(values: object, item: ErrorDetails) -> _Key:
 
 def _value_at(values: Any, key: _Key) -> Any:
     return reduce(getitem, key, values)
+
+
+def _section_of(key: str) -> str | None:
+    """Return the section of settings that has a key, which was found at another place; None where none has."""
+    fields = schema.StudyDocument.model_fields.items()
+    sections = [
+        name
+        for name, field in fields
+        if name not in (*_REPEATED, "mesh", "objects", "reference")
+        and any(key in model.model_fields for model in schema.models_in(field.annotation))
+    ]
+    return sections[0] if len(sections) == 1 else None
 
 
 def _known_keys(values: Mapping[str, Any], key: _Key) -> Iterable[str]:

@@ -313,6 +313,10 @@ StudyLike = Study | str | Path
 
 def as_study(study: StudyLike) -> Study:
     """Return a study, which may be given by the path of its file."""
+    if isinstance(study, Mapping):
+        raise StudyError(
+            "a study is a Study or the path of its file, found a mapping; pass Study.from_table(...) of it"
+        )
     return study if isinstance(study, Study) else Study.from_toml(study)
 
 

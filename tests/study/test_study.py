@@ -176,6 +176,8 @@ SENTENCES = [
     ("norm.width", 1, "[norm]: width is unknown; known are orders"),
     ("lattice", {"xi_max": 5.0}, "[lattice]: M is missing"),
     ("norm", [-2.0], "[norm] must be a table, found [-2.0]"),
+    ("scaling.length_unit", "mm", "[scaling]: length_unit is unknown; it belongs to [study]"),
+    ("length_unit", "mm", "length_unit is unknown; it belongs to [study]"),
     ("accurracy", {}, "[accurracy] is unknown; did you mean accuracy?"),
     ("accuracy", {"rtol": 0.1}, "either a [lattice] or an [accuracy] is needed, and not both"),
     ("transform.quadrature", 1.5, "[transform]: quadrature must be text in quotes or a whole number, found 1.5"),
@@ -343,6 +345,11 @@ def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path) -> None:
 def test_what_is_no_path_is_refused_by_its_type(call: Callable[[Any], object]) -> None:
     with pytest.raises(sb.errors.InputError, match=r"^a path is a text or a pathlib.Path, found int$"):
         call(7)
+
+
+def test_whoever_passes_the_table_of_a_study_is_told_what_makes_a_study_of_it() -> None:
+    with pytest.raises(sb.errors.StudyError, match=r"Study\.from_table"):
+        sb.run(small_table())  # type: ignore[arg-type]
 
 
 _KEYS = "study lattice accuracy norm reference family name xi_max M rtol orders source levels mesh radius paths scale"
