@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -446,3 +447,8 @@ def test_the_plot_by_cost_has_all_members_and_their_front() -> None:
     assert [text.get_text() for text in axes.texts] == ["1", "2", "20"]
     assert axes.get_title().endswith("not drawn: 1 member that not all objects have")
     assert axes.get_xlabel() == "time of making the mesh in seconds"
+
+
+def test_a_place_without_a_store_is_not_taken_for_one_of_one_object(tmp_path: Path) -> None:
+    with pytest.raises(sb.errors.StoreError, match=r"none\.zarr: it does not exist"):
+        sb.league(tmp_path / "none.zarr")
