@@ -198,6 +198,7 @@ def test_compare_to_an_accuracy_and_on_a_lattice(folder: Path) -> None:
     assert re.search(rf"^mean +{near['mean_forward']:.4g} ", shown, re.M)
     chamfer = rf"^Chamfer, the sum of both means: {near['chamfer']:.3f}\d* ± \S+ file units \(s\.e\.\)$"
     assert re.search(chamfer, shown, re.M)
+    assert len(re.findall(r"^[AB]: volume \S+ file units\^3, area \S+ file units\^2, ", shown, re.M)) == 2
     for written, own in (("new/w-a.ply", "1.off"), ("new/w-b.ply", "3.off")):
         assert np.array_equal(sb.read_mesh(folder / written).vertices, sb.read_mesh(folder / own).vertices)
         columns = PlyData.read(folder / written)["vertex"].data

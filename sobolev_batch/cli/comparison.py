@@ -404,11 +404,10 @@ def _proximity_lines(found: Mapping[str, float], meshes: tuple[Mesh, Mesh], unit
         f"({100 * found['precision']:.4g} % of A, {100 * found['recall']:.4g} % of B)"
     )
     for label, mesh in zip("AB", meshes, strict=True):
-        volume = "not closed" if math.isnan(mesh.volume) else f"volume {mesh.volume:.6g}"
+        cubic, square = (f"{value:.6g} {unit}^{power}" for value, power in ((mesh.volume, 3), (mesh.area, 2)))
+        volume = "not closed" if math.isnan(mesh.volume) else f"volume {cubic}"
         angle, ratio = mesh.smallest_angles.min(), mesh.aspect_ratios.max()
-        yield (
-            f"{label}: {volume}, area {mesh.area:.6g}, smallest angle {angle:.3g} deg, aspect ratio at most {ratio:.3g}"
-        )
+        yield f"{label}: {volume}, area {square}, smallest angle {angle:.3g} deg, aspect ratio at most {ratio:.3g}"
 
 
 def _settings_text(attributes: Mapping[str, Any]) -> str:

@@ -90,7 +90,10 @@ def objects_command(store: Location, style: Format, orders: ChosenOrders) -> Non
 @table_options
 @below_option("Take what is below FRACTION, such as 1%, of the norm of the reference.", required=True)
 def smallest_command(store: Location, style: Format, orders: ChosenOrders, below: float) -> None:
-    """Print the smallest mesh below a bound."""
+    """Print the smallest mesh below a bound.
+
+    For a bound on lengths, such as 0.1 mm, see `sobolev-batch reduce --within`.
+    """
     from sobolev_batch.tables.smallest import format_smallest
 
     echo_lines(format_smallest(store, style, orders, below=below), style)
