@@ -409,17 +409,33 @@ def _several_objects(
     references: Mapping[str, PurePosixPath], families: _Families, folder: PurePosixPath
 ) -> tuple[list[str], tuple[str, ...]]:
     """Return the section of a study of several objects, which lists their meshes, and what it holds."""
-    listed = [(name, REFERENCE_LABEL, path) for name, path in references.items()]
-    listed += [(name, method, path) for (name, method), paths in families.items() for path in paths]
+    listed = [(name, REFERENCE_LABEL, path, "") for name, path in references.items()]
+    for (name, method), paths in families.items():
+        own = [_size_of(path, name) for path in paths]
+        # Names of sizes, whatever other files there are: the same ones next time, if one of them is missing then.
+        is_named = all(own) and len({*own}) == len(own)
+        listed += [(name, method, path, one * is_named) for path, one in zip(paths, own, strict=True)]
     meshes = "".join(
-        _filled("mesh", name=_json(name), method=_json(method), path=_json(str(folder / path)))
-        for name, method, path in listed
+        _filled(
+            "mesh",
+            name=_json(name),
+            method=_json(method),
+            own=f"name = {_json(own)}, " if own else "",
+            path=_json(str(folder / path)),
+        )
+        for name, method, path, own in listed
     )
-    counts = Counter(method for _, method, _ in listed[len(references) :])
+    counts = Counter(method for _, method, *_ in listed[len(references) :])
     return [_filled("objects", meshes=meshes)], (
         _objects_text(references),
         *(f"method {method}: {_count(count)}" for method, count in counts.items()),
     )
+
+
+def _size_of(path: PurePosixPath, name: str) -> str:
+    """Return the size that folders say of a file whose own name is that of its object, or nothing: 500/cow.ply."""
+    is_alone = caseless_key(mesh_stem(path)) == caseless_key(name)
+    return "-".join(part for part in path.parent.parts if _SIZE.fullmatch(part)) if is_alone else ""
 
 
 def _objects_text(names: Iterable[str]) -> str:

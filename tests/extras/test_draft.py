@@ -135,6 +135,17 @@ def test_several_objects(tmp_path: Path, layout: str) -> None:
     assert (found, summary[0].lower()) == (own, "2 objects: big cow, cow")
 
 
+@pytest.mark.parametrize("sizes", [("80",), ("80", "320")])
+def test_meshes_in_folders_of_sizes_have_the_same_names_if_others_are_missing(
+    tmp_path: Path, sizes: Sequence[str]
+) -> None:
+    paths = [f"quick/{size}/{name}.ply" for size, name in product(("80", "320"), ("big cow", "cow"))]
+    wanted = [path for path in paths if "big" not in path or path.split("/")[1] in sizes]
+    _, studies = drafted(tmp_path, *wanted, "originals/big cow.ply", "originals/cow.ply")
+    assert {*files_of(studies["big cow"])["quick"]} == {*sizes}
+    assert files_of(studies["cow"])["quick"] == {size: f"quick/{size}/cow.ply" for size in ("80", "320")}
+
+
 def test_meshes_beside_the_reference_that_lack_its_name_are_left_out_where_others_have_it(tmp_path: Path) -> None:
     for path, level in (("cow_5k.ply", 3), ("cow_80.ply", 1), ("dog_80.ply", 1), ("out/80.ply", 1)):
         write(tmp_path / path, level)
