@@ -153,8 +153,11 @@ class RecordedSearch:
         is_original = self.remesher.keeps(best.size, record.triangles)
         of = "original" if self.original is self.reference else "reference"
         itself = ": the smallest of those tried that does is the original itself" if is_original else ""
+        # A search takes sizes that fail for too coarse ones.
+        is_open = failed and failed.reason and not any(0 < one.triangles < best.triangles for one in record.trials)
         texts = (
             f"size {failed.size:g} failed: {failed.reason}" if failed and failed.reason else "",
+            "no mesh with fewer triangles was made, and one may hold" if is_open else "",
             "" if bracket.is_monotone else "not monotone: a finer mesh was worse",
             f"no smaller mesh held{itself}; another method may make one" if best.triangles >= record.triangles else "",
             best.broken and f"it is broken, unlike the {of}: {best.broken}",

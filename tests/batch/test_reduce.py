@@ -356,6 +356,18 @@ def test_a_tolerance_that_nothing_meets_and_one_that_four_triangles_meet() -> No
     assert 4 <= least.bracket.best.triangles <= 8
 
 
+def fine_disc(original: sb.Mesh, edge: float) -> sb.Mesh:
+    if edge > 0.1:
+        raise ValueError("too coarse")
+    return disc(original, edge)
+
+
+def test_where_nothing_coarser_was_made_a_smaller_mesh_is_not_ruled_out() -> None:
+    found = found_by(disc(lumpy(1), 0.01), within=0.1, method=fine_disc, search={"edge": (0.02, 1.5)})
+    assert found.mesh is not None
+    assert any("one may hold" in remark for remark in found.remarks)
+
+
 def test_a_remesher_that_fails_at_a_size() -> None:
     # A ring of n edges is 1 - cos(π/n) within the circle; that of 13 would be the fewest within 0.03.
     original = disc(lumpy(1), 2 * np.pi / 1000)
