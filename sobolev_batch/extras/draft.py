@@ -19,7 +19,7 @@ from sobolev_batch.geometry.formats.by_name import is_mesh_name, mesh_stem
 from sobolev_batch.geometry.formats.readers import expected_size, read_mesh
 from sobolev_batch.geometry.surface import Extent, placement_doubt
 from sobolev_batch.parameters import path_of
-from sobolev_batch.shown import Shown, few_of, reasons
+from sobolev_batch.shown import Shown, few_of, reasons, together
 from sobolev_batch.sources.files import MOST_MESHES
 from sobolev_batch.sources.names import caseless_key, label_problem, name_problem, natural_key, quoted
 from sobolev_batch.study.schema import REFERENCE_LABEL, RESERVED
@@ -80,7 +80,7 @@ class StudyDraft(Shown):
     def __str__(self) -> str:
         file, more = shlex.quote(str(self.path)), len(self.summary) - _MOST_LINES
         families = [*self.summary[:_MOST_LINES], *([f"and {more} more"] if more > 0 else [])]
-        named = reasons("left out", self.left_out), reasons("doubtful", self.doubtful)
+        named = reasons("left out", self.left_out), reasons("doubtful", together(self.doubtful))
         left_out = [f"{name}: {text}" for name, text in chain(*named)]
         following = [f"next: sobolev-batch plan {file}", f"      sobolev-batch run {file}"]
         return "\n".join(map(visible, [f"{self.path}: {families[0]}", *families[1:], *left_out, *following]))
@@ -139,6 +139,10 @@ def init_study(folder: str | Path = ".", output: str | Path = "study.toml") -> S
         if {path, references[name]} <= extents.keys()
     }
     if "" in references:
+        doubts = {
+            **_of_finer_files(used, sizes, references[""]),
+            **{path: doubt for path, doubt in doubts.items() if doubt},
+        }
         lacks = "its name lacks that of the reference"
         sections, summary = _one_object(references[""], families, sizes, below)
     else:
@@ -294,6 +298,20 @@ def _without_strangers(paths: Iterable[PurePosixPath], reference: PurePosixPath 
     beside = [path for path in paths if path.parent == reference.parent and path != reference]
     strange = {path for path in beside if name not in (caseless_key(one) for one, _ in _names_in(path))}
     return [path for path in paths if path not in strange or len(strange) == len(beside)]
+
+
+def _of_finer_files(
+    paths: Iterable[PurePosixPath], sizes: Mapping[PurePosixPath, int], reference: PurePosixPath
+) -> dict[str, str]:
+    """Return a question for each file whose name a much finer one has, which is not the reference of the study."""
+    by_size = sorted(paths, key=lambda path: (sizes[path], natural_key(str(path))))
+    finest = {caseless_key(mesh_stem(path)): path for path in by_size}
+    doubt = (
+        f"a finer file has its name, and is not {reference}; if that is its reference, put all references into one "
+        "folder called originals, and write the study anew"
+    )
+    finer = {path: finest[caseless_key(mesh_stem(path))] for path in by_size}
+    return {str(path): doubt for path, one in finer.items() if one != reference and sizes[one] >= 2 * sizes[path]}
 
 
 def _families(paths: Iterable[PurePosixPath], references: Mapping[str, PurePosixPath]) -> _Families:

@@ -162,6 +162,18 @@ def test_files_of_one_name_belong_together_where_one_is_finer(tmp_path: Path, le
     assert (summary[0] == "3 objects: part_0, part_1, part_2") == is_paired
 
 
+def test_files_whose_name_a_finer_one_has_that_is_not_their_reference_are_doubtful(tmp_path: Path) -> None:
+    for number in range(3):
+        write(tmp_path / f"scans/part_{number}.ply", 2)
+        write(tmp_path / f"same/part_{number}.ply", 2)
+        write(tmp_path / f"low/part_{number}.ply", 1)
+    draft = sb.init_study(tmp_path, tmp_path / "study.toml")
+    assert draft.summary[0].startswith("reference ")
+    assert {"low/part_1.ply", "low/part_2.ply"} <= {*draft.doubtful}
+    assert {*draft.doubtful} <= {f"low/part_{number}.ply" for number in range(3)}
+    assert "originals" in str(draft)
+
+
 @pytest.mark.parametrize("end", ["", "_high", " scan"])
 @pytest.mark.parametrize(("lacking", "level", "found"), [("5", 2, 5), ("45", 3, 1), ("345", 2, 1)])
 def test_objects_need_no_other_mesh_if_most_have_one(
