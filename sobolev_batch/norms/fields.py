@@ -266,7 +266,7 @@ def field_of(
     if lattice is None:
         raise InputError(
             f"a surface such as this {type(a).__name__} needs a lattice or an accuracy: "
-            "pass lattice=Lattice(xi_max=..., M=...), or rtol=... to a norm or distance"
+            "pass rtol, such as 1e-2, to a norm or distance, or lattice=Lattice(xi_max=..., M=...)"
         )
     return fourier_transform(a, lattice, eps, order=orders)
 

@@ -1,17 +1,19 @@
 """The verdict on a study: the nearest meshes, the smallest ones below bounds; and its objects, the worst first."""
 
 import math
+import shlex
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import xarray as xr
 
 from sobolev_batch.shown import few_of
 from sobolev_batch.tables import Format
 from sobolev_batch.tables.convergence import ALONE, joined, notes_of_left_out, remarks, tables_of
-from sobolev_batch.tables.open import AnyStore, as_tree, stores_of
+from sobolev_batch.tables.open import AnyStore, as_tree, source_of, stores_of
 from sobolev_batch.tables.rendering import Column, Section, rendered
 from sobolev_batch.tables.smallest import smallest_of
 from sobolev_batch.tables.text import count, minus, percent, spread, times, wrapped
@@ -272,5 +274,6 @@ def format_objects(
         columns = [one for one in _OBJECT_COLUMNS if one.format is not count or any(row[one.name] for row in shown)]
         sections.append(Section(f"Objects at order {order:g}, the worst first", [(columns, shown)]))
         if len(shown) < len(of_order):
-            more = [f"{len(of_order) - len(shown):,} more: sobolev-batch table objects STORE"]
+            place = shlex.quote(str(source_of(store) or "STORE" if isinstance(store, xr.DataTree) else store))
+            more = [f"{len(of_order) - len(shown):,} more: sobolev-batch table objects {place}"]
     return rendered(style, frame, sections, [*more, *notes_of_left_out(store, frames)])

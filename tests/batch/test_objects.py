@@ -774,4 +774,4 @@ def test_objects_are_listed_from_the_worst_one(store: Path) -> None:
         of_object = table[(table["object"] == row["object"]) & (table["mesh"] != "reference")]
         assert row["relative"] == pytest.approx(of_object["relative"].min(), rel=1e-14)
         assert (row["meshes"], row["missing"]) == (len(of_object), 0)
-    assert f"{len(rows) - 1} more: sobolev-batch table objects" in format_objects(store, most=1)
+    assert f"{len(rows) - 1} more: sobolev-batch table objects {store}" in format_objects(store, most=1)
