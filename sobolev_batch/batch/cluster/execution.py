@@ -27,7 +27,7 @@ _FEWEST_IN_FLIGHT, _IN_FLIGHT_PER_THREAD = 2000, 20
 _DONE: Mapping[Stage, str] = {
     "lattice": "lattices chosen",
     "fields": "transforms",
-    "tables": "parts of tables",
+    "tables": "parts of tables computed",
     "proximity": "Hausdorff and Chamfer distances measured",
 }
 
