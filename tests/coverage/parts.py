@@ -36,6 +36,22 @@ def moved_boxes(rng: np.random.Generator) -> Pair:
     return pair_of(rng, box, _box(sides + amount * np.eye(3)[2]))
 
 
+def little_moves(rng: np.random.Generator) -> Pair:
+    """Return a thin plate, a wire or a box far smaller than the unit, and the same moved by a part of its thickness.
+
+    Opposite faces have one distance, of which a small move takes second differences.
+    """
+    thin, small, choice = 10 ** rng.uniform(-2.5, -1.5), 10 ** rng.uniform(-2.5, -1.0), rng.random()
+    if choice < 0.4:
+        sides = np.array([1.0, 0.7, thin])
+    elif choice < 0.7:
+        sides = np.array([rng.uniform(1.0, 10.0), thin, thin])
+    else:
+        sides = small * rng.uniform(0.2, 1.0, size=3)
+    move, box = float(sides.min()) * 10 ** rng.uniform(-2.5, -1.0), _box(sides)
+    return pair_of(rng, box, box.moved(*(move * direction(rng))))
+
+
 def perforated_plates(rng: np.random.Generator) -> Pair:
     """Return a plate with holes and the same moved by part of a pitch, with other holes, or without any."""
     count, thickness, choice = int(rng.integers(4, 13)), float(rng.uniform(0.02, 0.1)), rng.random()
@@ -204,4 +220,5 @@ PARTS: dict[str, Callable[[np.random.Generator], Pair]] = {
     "woven": woven,
     "corrugations": corrugations,
     "large norms": large_norms,
+    "little moves": little_moves,
 }

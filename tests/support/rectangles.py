@@ -22,8 +22,9 @@ from sobolev_batch.arrays import Reals
 # Times of the finer of two rules. The least resolves gaps from some 1e-6 on.
 TIMES: Reals = np.geomspace(1e-12, 80.0, 481)
 _STEP = float(np.log(TIMES[1] / TIMES[0]))
-# Rounding of a trace, relative to the one without signs.
-_ROUNDING = 1e-14
+# Rounding of a trace, relative to the one without signs. Where all rectangles are narrower than a length, their factors
+# lose digits by the square of what they are narrower by.
+_ROUNDING, _SHORT = 1e-14, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,13 +124,15 @@ class Rectangles:
         """Return the squared distances (orders,) of the two area measures, and their uncertainties."""
         both = self.joined(other)
         signs = np.concatenate([np.ones(len(self.low)), -np.ones(len(other.low))])
-        return integrals_of_traces(*_heat_traces(*_intervals(both), signs), orders)
+        widest = np.sort(both.high - both.low, axis=1)[:, 1].max()
+        traces, scales = _heat_traces(*_intervals(both), signs)
+        return integrals_of_traces(traces, scales * max(1.0, _SHORT / widest) ** 2, orders)
 
 
 def integrals_of_traces(traces: Reals, scales: Reals, orders: Sequence[float]) -> tuple[Reals, Reals]:
     """Return the squared norms (orders,) of heat traces at `TIMES`, and their uncertainties.
 
-    `scales` are sums of the sizes of the terms of the traces.
+    `scales` are sums of the sizes of the terms of the traces, times what rounding exceeds that of one by.
     """
     squares, slacks = [], []
     for order in orders:
