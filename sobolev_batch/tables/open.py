@@ -22,7 +22,7 @@ from sobolev_batch.store.encoding import with_coordinates
 from sobolev_batch.store.layout import Store
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.metadata import mapping_in
-from sobolev_batch.store.objects import Objects, stores_below
+from sobolev_batch.store.objects import stores_below
 from sobolev_batch.tables.all_objects import concatenated
 from sobolev_batch.visible import FILE_UNITS
 
@@ -202,8 +202,7 @@ def objects_of(store: AnyStore | Mapping[str, AnyStore]) -> tuple[str, ...]:
         return tuple(root_attribute(store, "study").get(layout.OBJECTS, ()))
     if isinstance(store, Mapping):
         return tuple(store)
-    found = Objects.read(Location.parse(store))
-    return () if found is None else found.names
+    return tuple(Store(store).attributes(of_objects=None)["study"].get(layout.OBJECTS, ()))
 
 
 def source_of(tree: xr.DataTree) -> str | None:

@@ -87,11 +87,13 @@ def number_text(value: float, unit: str = "") -> str:
 def times(factor: float, digits: int = 3) -> str:
     """Return a factor with some digits, or with as many as tell it from 1.
 
-    >>> times(2.5041), times(1.00042), times(1234.5)
-    ('2.5', '1.0004', '1,234')
+    >>> times(2.5041), times(1.00042), times(1234.5), times(math.inf)
+    ('2.5', '1.0004', '1,234', '?')
     """
+    if not factor < _LARGE:
+        return number_text(factor)
     needed = 1 - math.floor(math.log10(abs(factor - 1))) if factor != 1 else digits
-    return number_text(factor) if factor >= _LARGE else f"{factor:.{max(digits, needed)}g}"
+    return f"{factor:.{max(digits, needed)}g}"
 
 
 def bound(fraction: float) -> str:

@@ -25,7 +25,6 @@ from sobolev_batch.store.layout import Store, hide_tables
 from sobolev_batch.store.location import Location
 from sobolev_batch.store.records import Record, Records
 from sobolev_batch.study.plan import Plan, make_plan
-from sobolev_batch.tables.text import spread
 from sobolev_batch.transform.fourier import TransformSettings, expected_points, field_seconds, transform_block
 from tests.support.commands import call
 from tests.support.studies import balls, methods_of, small_table
@@ -161,7 +160,9 @@ def test_of_many_objects_some_are_looked_at(tmp_path: Path, monkeypatch: pytest.
     study = sb.Study.from_table(small_table(object=balls(**dict.fromkeys(names, 1.0)), family=methods_of()))
     named: list[str] = []
     found = sb.plan(study, tmp_path / "many.zarr", on_progress=named.append)
-    assert named == looked == list(found.objects) == spread(names, 16)
+    assert named == looked == list(found.objects)
+    places = [names.index(name) for name in named]
+    assert (len(places), places[0], places[-1], {*np.diff(places)}) == (16, 0, 39, {2, 3})
     assert (found.count, found.share) == (40, 2.5)
     assert found.total_bytes == 40 * found.objects["ball00"].total_bytes
     assert "for 200 missing fields" in str(found)

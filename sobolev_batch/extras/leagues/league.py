@@ -284,7 +284,6 @@ def league(
         objects = (str(root_attribute(tree, "study")["name"]),)
         stores = {objects[0]: tree}
     else:
-        as_tree(store)  # A place that has no store says so itself.
         place = source_of(store) if isinstance(store, xr.DataTree) else store
         raise StoreError(
             f"{place}: it holds the store of one object; run a study with several objects, or give the stores of "
