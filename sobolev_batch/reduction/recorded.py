@@ -153,7 +153,7 @@ class RecordedSearch:
         is_original = self.remesher.keeps(best.size, record.triangles)
         of = "original" if self.original is self.reference else "reference"
         itself = ": the smallest of those tried that does is the original itself" if is_original else ""
-        # A search takes sizes that fail for too coarse ones.
+        # A search takes sizes that fail beside each other for too coarse ones.
         is_open = failed and failed.reason and not any(0 < one.triangles < best.triangles for one in record.trials)
         texts = (
             f"size {failed.size:g} failed: {failed.reason}" if failed and failed.reason else "",

@@ -29,6 +29,9 @@ _BESIDE = 0.4
 _FEW_TRIALS, _CLOSED = 8, 0.85
 # Widths that differ by this fraction are equal.
 _EQUAL = 1e-9
+# Remeshers fail at single sizes, and at all that are too coarse. So a size that fails between two that do not says
+# nothing, and where only the coarsest one failed, another is tried, so many widths of the last bracket beyond it.
+_BEYOND = 1.5
 # Trials at once lie the last bracket's width apart, or this part of the way to the prediction; first, this logarithm.
 _APART, _SPREAD, _FIRST_APART = 0.9, 0.4, 0.7
 
@@ -57,6 +60,11 @@ class Trial:
     seconds: float = 0.0
     reason: str = ""
     broken: str = ""
+
+    @property
+    def has_distance(self) -> bool:
+        """Whether a mesh was made and compared."""
+        return math.isfinite(self.estimate)
 
 
 @dataclass(frozen=True)
@@ -116,9 +124,9 @@ class Search:
         # Of equal meshes the one of the coarsest size.
         within = [one for one in trials if one.is_within]
         best = min(within, key=lambda one: (one.triangles, -sign * one.size), default=None)
-        others = sorted((one for one in trials if not one.is_within), key=lambda one: sign * one.size)
+        others = [one for one in _told(_ordered(trials, sign)) if not one.is_within]
         coarser = (one for one in others if best is None or sign * one.size > sign * best.size)
-        made = sorted((one for one in trials if one.triangles), key=lambda one: sign * one.size)
+        made = _ordered([one for one in trials if one.triangles], sign)
         return Bracket(best, next(coarser, None), all(a.lower <= b.upper for a, b in combinations(made, 2)))
 
     def next(self, trials: Sequence[Trial], count: int = 1) -> tuple[float, ...]:
@@ -128,19 +136,33 @@ class Search:
         finest, coarsest = sorted(sign * math.log(size) for size in (self.low, self.high))
         start = finest if bracket.best is None else sign * math.log(bracket.best.size)
         end = coarsest if bracket.failed is None else sign * math.log(bracket.failed.size)
-        if len(trials) >= _MOST_TRIALS or not self._is_open(bracket, start, end):
+        again = self._again(_ordered(trials, sign), bracket, sign)
+        if len(trials) >= _MOST_TRIALS or not (again or self._is_open(bracket, start, end)):
             return ()
         points = {
             sign * math.log(one.size): math.log(max(one.estimate / self.limit, math.exp(_LEAST_EXCESS)))
             for one in trials
-            if math.isfinite(one.estimate)
+            if one.has_distance
         }
-        places = self._places(points, len(trials), bracket, start, end, count)
+        # Sizes that failed alone lie inside the bracket, so more places are asked for.
+        wanted = count + len(trials) if points else count
+        places = self._places(points, len(trials), bracket, start, end, wanted)
         if self.first is not None and not trials:
             places = [sign * math.log(self.first) + _FIRST_APART * (k - (count - 1) / 2) for k in range(count)]
         tried = {one.size for one in trials}
-        sizes = dict.fromkeys(self._size(sign, place, bracket) for place in places)
-        return tuple(size for size in sizes if size not in tried)
+        sizes = dict.fromkeys([*again, *(self._size(sign, place, bracket) for place in places)])
+        return tuple(size for size in sizes if size not in tried)[:count]
+
+    def _again(self, ordered: Sequence[Trial], bracket: Bracket, sign: int) -> tuple[float, ...]:
+        """Return a size beyond the coarsest one where only that failed, and a finer one, if any, holds."""
+        finer, last = [None, None, *ordered][-2:]
+        is_open = last is not None and bracket.failed == last and (finer is None or bracket.best is not None)
+        if last is None or not is_open or not _is_only_failure(finer, last, None):
+            return ()
+        size = last.size * math.exp(sign * _BEYOND * math.log1p(self.precision))
+        size = float((math.ceil if sign > 0 else math.floor)(size)) if self.is_whole else size
+        size = min(max(size, self.low), self.high)
+        return () if size == last.size else (size,)
 
     def _sign(self, trials: Sequence[Trial]) -> int:
         """Return 1 where a larger size is coarser, which is assumed until trials tell, and -1 otherwise."""
@@ -179,7 +201,7 @@ class Search:
             guess = far if side * (far - guess) < width else guess
         else:
             # Sobolev distances follow a power closely; the first secant step then arrives.
-            is_first = len(points) == tried == 2
+            is_first = len(points) == 2 and bracket.failed.has_distance
             guess = _extrapolated(points, start) if is_first else _interpolated(points, start, end)
             guess += _BESIDE * width * (1 if 2 * guess < start + end else -1)
             is_hopeless = end - start > 2 * reach
@@ -198,6 +220,22 @@ class Search:
         finer = -sign * math.inf if bracket.best is None else bracket.best.size + sign
         coarser = sign * math.inf if bracket.failed is None else bracket.failed.size - sign
         return float(min(max(round(size), min(finer, coarser)), max(finer, coarser)))
+
+
+def _ordered(trials: Sequence[Trial], sign: int) -> list[Trial]:
+    """Return trials from fine to coarse."""
+    return sorted(trials, key=lambda one: sign * one.size)
+
+
+def _is_only_failure(finer: Trial | None, trial: Trial, coarser: Trial | None) -> bool:
+    """Tell whether a trial failed, and those beside it that were made, if any, did not."""
+    return not trial.has_distance and all(one is None or one.has_distance for one in (finer, coarser))
+
+
+def _told(ordered: Sequence[Trial]) -> list[Trial]:
+    """Return trials that say where the limit is met: those that failed alone do not, but where none is coarser."""
+    beside = zip([None, *ordered], ordered, [*ordered[1:], None], strict=False)
+    return [one for finer, one, coarser in beside if coarser is None or not _is_only_failure(finer, one, coarser)]
 
 
 def _extrapolated(points: Mapping[float, float], end: float) -> float:

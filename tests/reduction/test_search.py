@@ -163,6 +163,25 @@ def test_a_size_that_cannot_be_made_counts_as_failed() -> None:
     assert search.bracket(nothing).best is None
 
 
+@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("seed", range(20))
+def test_a_size_that_fails_alone_is_passed_by(seed: int, count: int) -> None:
+    # One of the sizes that the search tries fails, and all others can be made: each of them in turn.
+    rng = np.random.default_rng(seed)
+    fewest = float(np.exp(rng.uniform(np.log(100), np.log(9e3))))
+    first = fewest * np.exp(rng.uniform(-1.2, 1.2))
+    search = Search(1.0, 4, 20_000, is_whole=True, larger_is_coarser=False, first=first)
+    distance = lambda n: (fewest / n) ** 0.9  # noqa: E731
+    tried = trials_of(search, distance, count)
+    for bad in {one.size for one in tried}:
+        trials = trials_of(search, lambda n, bad=bad: math.nan if n == bad else distance(n), count)  # type: ignore[misc]
+        found = search.bracket(trials)
+        assert found.best is not None
+        # A width beside the bad size, where that one would have been the best.
+        assert fewest <= found.best.size <= 1.15 * fewest
+        assert len(trials) <= len(tried) + (5 if count == 1 else 9)
+
+
 @pytest.mark.parametrize("seed", range(40))
 def test_sizes_that_cannot_be_made_do_not_hold_up_the_search(seed: int) -> None:
     # None of a whole range of sizes, up to seven times wide, can be made, but the finest one can.
