@@ -287,16 +287,16 @@ def plan(
 ) -> StudyPlan:
     """Return what running a study would do, without computing its fields.
 
-    References are loaded; where the study requests an accuracy, a few other surfaces are made and compared. An object
-    that cannot be carried out stops no other. Of many objects, 16 unfinished ones are looked at, and others count as
-    their mean.
+    References are loaded; where the study requests an accuracy, a few other surfaces are made and compared, and
+    searches among them are kept for the run. An object that cannot be carried out stops no other. Of many objects, 16
+    unfinished ones are looked at, and others count as their mean.
 
     Args:
         study: Study, or the path of its file.
         store: Path or URL of a new or existing store; default storage/NAME.zarr.
         client: Client of the cluster to plan for; default processes on this machine, one per core.
         allow_commands: True if the commands of the study may run here, which make the few surfaces that are loaded.
-        on_progress: Called with the name of each object before it is planned.
+        on_progress: Called before each object is planned, with its name and, of several, its place among them.
 
     Raises:
         StudyError, MeshError, LatticeError: The study cannot be carried out.
@@ -330,7 +330,8 @@ def plan(
     part = replace(study, objects={name: study.objects[name] for name in names})
 
     def planned(one: Study, place: Location) -> ObjectPlan:
-        notify(one.object.name or one.name)
+        place_of = f" ({1 + names.index(one.object.name)} of {len(names)})" * (len(names) > 1)
+        notify(f"{one.object.name or one.name}{place_of}")
         return _plan(one, place, workers, client, bases)
 
     plans, refused = for_each_object(part, location, planned)

@@ -160,8 +160,9 @@ def test_of_many_objects_some_are_looked_at(tmp_path: Path, monkeypatch: pytest.
     study = sb.Study.from_table(small_table(object=balls(**dict.fromkeys(names, 1.0)), family=methods_of()))
     named: list[str] = []
     found = sb.plan(study, tmp_path / "many.zarr", on_progress=named.append)
-    assert named == looked == list(found.objects)
-    places = [names.index(name) for name in named]
+    assert looked == list(found.objects)
+    assert named == [f"{name} ({k} of 16)" for k, name in enumerate(looked, 1)]
+    places = [names.index(name) for name in looked]
     assert (len(places), places[0], places[-1], {*np.diff(places)}) == (16, 0, 39, {2, 3})
     assert (found.count, found.share) == (40, 2.5)
     assert found.total_bytes == 40 * found.objects["ball00"].total_bytes
