@@ -287,9 +287,9 @@ def plan(
 ) -> StudyPlan:
     """Return what running a study would do, without computing its fields.
 
-    References are loaded; where the study requests an accuracy, a few other surfaces are made and compared, and
-    searches among them are kept for the run. An object that cannot be carried out stops no other. Of many objects, 16
-    unfinished ones are looked at, and others count as their mean.
+    References are loaded; where the study requests an accuracy, a few other surfaces are made and compared. In place of
+    a search that is not finished, they have the mesh that it would try next. An object that cannot be carried out stops
+    no other. Of many objects, 16 unfinished ones are looked at, and others count as their mean.
 
     Args:
         study: Study, or the path of its file.
@@ -318,7 +318,7 @@ def plan(
     ...
     """
     notify = callback(on_progress)
-    study, location = settled(study, store, may_run=allow_commands)
+    study, location = settled(study, store, may_run=allow_commands, may_search=False)
     if client is not None:
         require_blocking(client)
         workers = prepare_workers(client, study.libraries)

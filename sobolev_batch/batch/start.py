@@ -26,7 +26,7 @@ _DEFAULT_FOLDER = Path("storage")
 MADE_MESHES, _MOST_COMMANDS = "made-meshes", 3
 
 
-def settled(study: StudyLike, store: StoreLike, *, may_run: bool) -> tuple[Study, Location]:
+def settled(study: StudyLike, store: StoreLike, *, may_run: bool, may_search: bool) -> tuple[Study, Location]:
     """Return a study that keeps the meshes that it makes beside its store, and the place of the store.
 
     Stores there share the meshes. The place is storage/NAME.zarr where none is named.
@@ -34,7 +34,7 @@ def settled(study: StudyLike, store: StoreLike, *, may_run: bool) -> tuple[Study
     check_flags(allow_commands=may_run)
     study = as_study(study)
     location = Location.parse(_DEFAULT_FOLDER / f"{study.name}.zarr" if store is None else store)
-    return study.with_cache(MeshCache(location.absolute().beside(MADE_MESHES), may_run)), location
+    return study.with_cache(MeshCache(location.absolute().beside(MADE_MESHES), may_run, may_search)), location
 
 
 def ready_to_run(
@@ -42,7 +42,8 @@ def ready_to_run(
 ) -> tuple[Study, Location]:
     """Return a study that may run, or a part of it, and its place; log what would make the run useless."""
     check_flags(allow_commands=allow_commands)
-    study, location = settled(replace(as_study(study), only=tuple(as_names(only))), store, may_run=True)
+    part = replace(as_study(study), only=tuple(as_names(only)))
+    study, location = settled(part, store, may_run=True, may_search=True)
     require_permission(study, allow_commands)
     _require_members(study, study.only)
     if store is None:

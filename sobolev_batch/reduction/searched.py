@@ -10,6 +10,7 @@ from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationInfo
 
 from sobolev_batch.errors import InputError, MeshError, StudyError, refused_by_pydantic
 from sobolev_batch.geometry.mesh import Mesh
+from sobolev_batch.geometry.surface import Surface
 from sobolev_batch.norms import DEFAULT_ORDER
 from sobolev_batch.reduction.limit import Limit, tried
 from sobolev_batch.reduction.recorded import RecordedSearch, SearchRecord
@@ -90,11 +91,11 @@ class SearchedSource(KeepingSource):
         original = reference if self.mesh is None else single_member(self.mesh, folder)
         parameter, ends = searched_parameter(self.search)
         remesher = Remesher(self.template, parameter, ends, folder.absolute())
-        members = []
+        members, may_search = [], self._cache.may_run and self._cache.may_search
         for name, limit in self.limits().items():
             search = RecordedSearch(original, reference, limit, remesher, self._cache.folder)
             metadata = ("target_tolerance", limit.value), ("target_measure", limit.measure)
-            members.append(SearchedMember(name, -1, search, self._cache.may_run, metadata=metadata))
+            members.append(SearchedMember(name, -1, search, may_search, metadata=metadata))
         return tuple(members)
 
 
@@ -103,12 +104,12 @@ class SearchedMember(Member):
     """The mesh of fewest triangles that a search finds, unless it was found before, or may not run."""
 
     search: RecordedSearch
-    may_run: bool
+    may_search: bool
 
     def load(self) -> Mesh:
         """Return the mesh that is kept, or go on with the search; MeshError where it finds none, or may not run."""
         search, record = self.search, self.search.recorded()
-        if not self.may_run and (record is None or search.next(record)):
+        if not self.may_search and (record is None or search.next(record)):
             raise MeshError(f"no search may run here, and its mesh is not kept in {search.folder}; run the study")
         record = record or search.begun()
         while sizes := search.next(record):
@@ -116,6 +117,15 @@ class SearchedMember(Member):
         if reason := search.reason(record):
             raise MeshError(reason)
         return search.mesh(record)
+
+    def pilot(self) -> Surface:
+        """Return the mesh that is found, or the one that a search would try next where none may run."""
+        search = self.search
+        record = search.recorded() or search.begun()
+        if self.may_search or not (sizes := search.next(record)):
+            return self.load()
+        _, member, *_ = search.trial(record, sizes[0])
+        return member.load()
 
     def cost(self) -> Cost | None:
         """Return what all trials took, as far as that is known."""

@@ -37,7 +37,7 @@ class InMemory(dict[str, bytes]):
 
 @dataclass(frozen=True)
 class MeshCache:
-    """A folder of meshes that programs or functions made, and whether these may run.
+    """A folder of meshes that programs or functions made, and whether these, and searches with them, may run.
 
     A mesh is the file DIGEST.ply; DIGEST.json beside it says what made it and what that took. A file for each command
     that prints the version of a program has what it printed last.
@@ -49,6 +49,7 @@ class MeshCache:
 
     folder: Folder
     may_run: bool = False
+    may_search: bool = True
     assumed: dict[str, tuple[Sequence[str], str]] = field(default_factory=dict, init=False, compare=False, repr=False)
     asked: dict[str, str] = field(default_factory=dict, init=False, compare=False, repr=False)
 

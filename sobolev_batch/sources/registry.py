@@ -201,6 +201,10 @@ class Member(ABC):
             MeshError: The surface cannot be read or made.
         """
 
+    def pilot(self) -> Surface:
+        """Return what decides on the lattice of a study: the surface, or one much like it that is made sooner."""
+        return self.load()
+
     @abstractmethod
     def fingerprint(self) -> Fingerprint:
         """Return JSON-able values that determine the surface: contents of files rather than their names.

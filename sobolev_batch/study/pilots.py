@@ -67,7 +67,7 @@ class Look:
     def at(self, label: str, member: Member, similarity: Similarity, reference: Extent) -> Surface | None:
         """Return a surface in the study's unit; None where it cannot be made, or reaches far beyond the reference."""
         try:
-            surface = similarity.apply(member.load())
+            surface = similarity.apply(member.pilot())
             times = surface.extent.reach / reference.reach
             if times > _FARTHEST:
                 raise MeshError(f"its extent is {times:.3g} times that of the reference; are both in the same unit?")

@@ -171,7 +171,10 @@ def test_a_size_that_fails_alone_is_passed_by(seed: int, count: int) -> None:
     fewest = float(np.exp(rng.uniform(np.log(100), np.log(9e3))))
     first = fewest * np.exp(rng.uniform(-1.2, 1.2))
     search = Search(1.0, 4, 20_000, is_whole=True, larger_is_coarser=False, first=first)
-    distance = lambda n: (fewest / n) ** 0.9  # noqa: E731
+
+    def distance(size: float) -> float:
+        return float((fewest / size) ** 0.9)
+
     tried = trials_of(search, distance, count)
     for bad in {one.size for one in tried}:
         trials = trials_of(search, lambda n, bad=bad: math.nan if n == bad else distance(n), count)  # type: ignore[misc]

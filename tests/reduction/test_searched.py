@@ -105,6 +105,23 @@ def test_meshes_of_two_objects_hold_and_are_those_of_reduce(client: Client, fold
     assert {path.name: path.stat().st_mtime_ns for path in (folder / "made-meshes").iterdir()} == before
 
 
+@pytest.mark.parametrize("allow_commands", [False, True])
+def test_a_plan_takes_the_mesh_of_a_first_trial_for_that_of_a_search(
+    allow_commands: bool, folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.delattr(searched, "tried")
+    described = table({**DECIMATED, "within": ["1 mm", "2 mm"]}, accuracy={"rtol": 0.1})
+    del described["lattice"]
+    study = sb.Study.from_table(described, folder=folder)
+    found = sb.plan(study, folder / "scans.zarr", allow_commands=allow_commands)
+    assert [*found.objects] == ["a", "b"]
+    for one in found.objects.values():
+        assert one.unknown == ("decimated/1mm", "decimated/2mm")
+        assert not one.doubtful
+    assert not caplog.records
+    assert not (folder / "made-meshes").exists()
+
+
 @pytest.mark.parametrize("within", ["0.5 mm", "5 %"])
 def test_a_trial_does_not_depend_on_what_the_process_did_before(within: str, folder: Path) -> None:
     search, found = member(folder, DECIMATED | {"within": within}).search, []  # type: ignore[attr-defined]
