@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import partial
 from ipaddress import IPv6Address, ip_address
-from multiprocessing import resource_tracker
+from multiprocessing import current_process, resource_tracker
 from typing import Any
 
 import dask
@@ -85,6 +85,9 @@ def local_client(workers: int | None = None, memory: float | str | None = None) 
 @contextmanager
 def _pointing_to_the_guard() -> Iterator[None]:
     """Say what a script lacks whose workers run it once more: Dask ends with the failure of a process alone."""
+    if getattr(current_process(), "_inheriting", False):
+        # This is such a worker, while it starts. Its parent tells.
+        raise SystemExit(1)
     try:
         yield
     except RuntimeError as error:
@@ -92,7 +95,7 @@ def _pointing_to_the_guard() -> Iterator[None]:
             raise
         raise ClusterError(
             "no worker process could start; a script needs 'if __name__ == \"__main__\":' around its main part"
-        ) from error
+        ) from None
 
 
 @contextmanager

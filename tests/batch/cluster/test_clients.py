@@ -38,6 +38,8 @@ def test_a_script_without_a_guarded_main_part_is_told_what_it_lacks(tmp_path: Pa
     script.write_text("from sobolev_batch.batch.cluster.clients import local_client\nlocal_client(1).__enter__()\n")
     ended = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False, cwd=tmp_path)
     assert ended.returncode == 1
+    # Neither the workers nor Dask tell the same beside it.
+    assert ended.stderr.count("Traceback") == 1
     assert ended.stderr.splitlines()[-1].endswith("""needs 'if __name__ == "__main__":' around its main part""")
 
 
